@@ -1,0 +1,10 @@
+"""Register tracked 3D boxes to the point cloud stream itself; live on ROS 2 and over recordings."""
+
+from boxreg_ros.config import Config
+from boxreg_ros.errors import BoxregError
+from boxreg_ros.registration import refine
+from boxreg_ros.structures import RefinedTrack, Track
+
+__version__ = '0.1.0'
+
+__all__ = ['BoxregError', 'Config', 'RefinedTrack', 'Track', 'refine']

@@ -1,0 +1,326 @@
+"""
+Every tunable: default, unit, bounds and meaning, once.
+
+Node parameters, ``--set``, YAML files and the table in the README are all read off these
+dataclasses. Deviations are standard deviations: a term's residual is divided by its deviation,
+so doubling one halves the pull of that term.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from boxreg_ros.errors import ConfigError
+
+
+def setting(
+    default: Any,
+    meaning: str,
+    unit: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Return a dataclass field that knows its meaning, unit and bounds."""
+    facts = {'meaning': meaning, 'unit': unit, 'low': low, 'high': high, 'choices': choices}
+    return field(default=default, metadata=facts)
+
+
+class Setting(NamedTuple):
+    """One tunable as the outside sees it; `name` is dotted, as in ``solver.rounds``."""
+
+    name: str
+    default: bool | int | float | str | tuple[str, ...]
+    meaning: str
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SamplingConfig:
+    """Which points an observation keeps."""
+
+    margin: float = setting(
+        0.6, 'points this far outside the input box still count', 'm', 0.05, 5.0
+    )
+    points: int = setting(256, 'points kept per box by farthest point sampling', '', 8, 100000)
+
+
+@dataclass(frozen=True, slots=True)
+class SolverConfig:
+    """L-BFGS and the rounds around it."""
+
+    rounds: int = setting(4, 'outer rounds: correspondences and weights renewed', '', 1, 100)
+    iterations: int = setting(12, 'most L-BFGS iterations per round', '', 1, 10000)
+    history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
+    tolerance: float = setting(
+        1e-4, 'a window ends when a step promises less than this', '', 0.0, 1.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PaperConfig:
+    """Weights of the paper's objective (Eq. 8); read with ``objective: paper`` only."""
+
+    closeness: float = setting(1.0, 'weight of Eq. 4', '1/m^2', 0.0, 1e6)
+    enclosure: float = setting(1.0, 'weight of Eq. 5', '1/m', 0.0, 1e6)
+    smoothness: float = setting(
+        0.1, 'weight of Eq. 6, and first penalty of its constraint', '', 0.0, 1e6
+    )
+    alignment: float = setting(
+        0.1, 'weight of Eq. 7, and first penalty of its constraint', '', 0.0, 1e6
+    )
+    nearest: int = setting(16, 'K, the closest points per visible face in Eq. 4', '', 1, 10000)
+    multiplier_rounds: int = setting(3, 'updates of the two Lagrange multipliers', '', 1, 100)
+    iterations: int = setting(60, 'most L-BFGS iterations per update', '', 1, 10000)
+
+
+@dataclass(frozen=True, slots=True)
+class ClassConfig:
+    """How objects of one kind move and how their boxes err."""
+
+    names: tuple[str, ...] = setting((), 'class names of this kind: any of these words, any case')
+    acceleration: float = setting(1.5, 'expected change of velocity', 'm/s^2', 1e-3, 1e3)
+    vertical: float = setting(0.3, 'expected vertical acceleration', 'm/s^2', 1e-3, 1e3)
+    turning: float = setting(0.4, 'expected change of turn rate', 'rad/s^2', 1e-3, 1e3)
+    tilting: float = setting(0.2, 'expected change of roll and pitch rate', 'rad/s^2', 1e-3, 1e3)
+    slip: float = setting(0.15, 'expected sideways velocity of the rear axle', 'm/s', 1e-3, 1e3)
+    axle: float = setting(0.25, 'rear axle behind the centre, as part of the length', '', 0.0, 0.5)
+    position: float = setting(0.14, 'error of an input centre along the heading', 'm', 1e-3, 10.0)
+    lateral: float = setting(0.08, 'error of an input centre across the heading', 'm', 1e-3, 10.0)
+    height: float = setting(0.07, 'error of an input centre in z', 'm', 1e-3, 10.0)
+    heading: float = setting(0.04, 'error of an input yaw', 'rad', 1e-3, 3.2)
+    tilt: float = setting(0.02, 'error of an input roll and pitch', 'rad', 1e-4, 3.2)
+    extent: float = setting(0.05, 'error of the input extents, as part of each', '', 1e-3, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """Everything that can be set, with defaults that suit road vehicles at 10 Hz."""
+
+    objective: str = setting(
+        'robust', 'which objective: ours, or the paper to the letter', choices=('robust', 'paper')
+    )
+    mode: str = setting(
+        '3d', "free variables: '3d' x y z roll pitch yaw, 'bev' x y yaw", choices=('3d', 'bev')
+    )
+    estimate: str = setting(
+        'track',
+        "which estimate of a box: 'early' as newest of its window, 'final' `lag` observations "
+        "later, 'track' from all of its track",
+        choices=('early', 'final', 'track'),
+    )
+    extent: str = setting(
+        'track',
+        "'track' estimates one extent per track, 'fixed' keeps the input's",
+        choices=('track', 'fixed'),
+    )
+    window: int = setting(10, 'observations per sliding window', '', 3, 1000)
+    lag: int = setting(5, 'observations a final box waits for', '', 0, 999)
+    track_window: int = setting(
+        100, "observations solved together for estimate 'track'", '', 10, 10000
+    )
+    min_observations: int = setting(
+        3, 'a window with fewer observations keeps its input', '', 2, 1000
+    )
+    min_points: int = setting(
+        5, 'a window with fewer points per box, on average, is smoothed only', '', 0, 100000
+    )
+    max_gap: float = setting(1.0, 'a longer silence ends a track', 's', 0.01, 1e4)
+    tolerance: float = setting(0.02, 'boxes and sweep belong together within this', 's', 0.0, 10.0)
+    queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)
+    device: str = setting('cpu', "where windows are solved: 'cpu', 'cuda', 'cuda:1', ...")
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    vehicle: ClassConfig = field(
+        default_factory=lambda: ClassConfig(
+            names=('car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram')
+        )
+    )
+    cyclist: ClassConfig = field(
+        default_factory=lambda: ClassConfig(
+            names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
+            acceleration=2.0, turning=1.5, slip=0.4, axle=0.2, heading=0.15, extent=0.1,
+        )
+    )  # fmt: skip
+    pedestrian: ClassConfig = field(
+        default_factory=lambda: ClassConfig(
+            names=('pedestrian', 'person', 'walker', 'people', 'child'),
+            acceleration=2.0, turning=4.0, slip=1.5, axle=0.0, heading=0.5, extent=0.1,
+        )
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        """Check every value against its bounds, and those that depend on each other."""
+        for item, value in self.items():
+            _check(item, value)
+        if self.lag >= self.window:
+            raise ConfigError(
+                f'lag: expected less than window ({self.window}), got {self.lag}; lower lag or raise window'
+            )
+
+    def items(self) -> Iterator[tuple[Setting, Any]]:
+        """Yield every setting with its present value, groups flattened to dotted names."""
+        for item in settings():
+            value: Any = self
+            for part in item.name.split('.'):
+                value = getattr(value, part)
+            yield item, value
+
+    def class_config(self, class_name: str) -> ClassConfig:
+        """Return how objects of `class_name` move; unknown classes move like vehicles."""
+        words = class_name.lower().replace('_', ' ').replace('-', ' ').replace('.', ' ').split()
+        for kind in (self.cyclist, self.pedestrian):
+            if any(name in words for name in kind.names):
+                return kind
+        return self.vehicle
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return nested plain values, as `from_dict` and YAML take them."""
+        return _to_dict(self)
+
+    def updated(self, changes: Mapping[str, Any]) -> Config:
+        """
+        Return a copy with dotted names set, as in ``{'solver.rounds': 2}``.
+
+        Raises
+        ------
+        ConfigError
+            For a name that does not exist, or a value of the wrong type or out of bounds.
+
+        """
+        values = self.to_dict()
+        for name, value in changes.items():
+            *groups, last = name.split('.')
+            inner = values
+            for group in groups:
+                inner = inner.setdefault(group, {})
+                if not isinstance(inner, dict):
+                    raise ConfigError(f'{name}: no such setting; see the table in the README')
+            inner[last] = value
+        return Config.from_dict(values)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Config:
+        """
+        Build from nested plain values; what is absent keeps its default.
+
+        Raises
+        ------
+        ConfigError
+            For an unknown key, by name, or a value of the wrong type or out of bounds.
+
+        """
+        return cls(**_arguments(cls(), values, ''))
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> Config:
+        """
+        Read a YAML file: plain, or as ROS writes it (``/**: ros__parameters: ...``).
+
+        Raises
+        ------
+        ConfigError
+            If the file cannot be read or holds what `from_dict` refuses.
+
+        """
+        try:
+            values = yaml.safe_load(Path(path).read_text(encoding='utf-8')) or {}
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            reason = ' '.join(str(error).split())
+            raise ConfigError(f'config file {str(path)!r} cannot be read: {reason}') from None
+        if isinstance(values, dict) and len(values) == 1:
+            (inner,) = values.values()
+            if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
+                values = inner['ros__parameters']
+        if not isinstance(values, dict):
+            raise ConfigError(
+                f'config file {str(path)!r}: expected settings by name, got {values!r}'
+            )
+        try:
+            return cls.from_dict(values)
+        except ConfigError as error:
+            raise ConfigError(f'config file {str(path)!r}: {error}') from None
+
+
+def settings() -> Iterator[Setting]:
+    """Yield every setting of `Config` with its default, groups flattened to dotted names."""
+    for item in fields(Config):
+        if item.default is not MISSING:
+            yield Setting(item.name, item.default, **item.metadata)
+        elif item.default_factory is not MISSING:
+            group = item.default_factory()
+            for part in fields(group):
+                yield Setting(
+                    f'{item.name}.{part.name}', getattr(group, part.name), **part.metadata
+                )
+
+
+def _to_dict(group: Any) -> dict[str, Any]:
+    plain: dict[str, Any] = {}
+    for item in fields(group):
+        value = getattr(group, item.name)
+        if is_dataclass(value):
+            value = _to_dict(value)
+        plain[item.name] = list(value) if isinstance(value, tuple) else value
+    return plain
+
+
+def _arguments(default: Any, values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    known = {item.name for item in fields(default)}
+    for key in values:
+        if key not in known:
+            raise ConfigError(
+                f'{prefix}{key}: no such setting; expected one of {", ".join(sorted(known))}'
+            )
+    arguments: dict[str, Any] = {}
+    for name in known:
+        was = getattr(default, name)
+        value = values.get(name, was)
+        if is_dataclass(was) and value is not was:
+            if not isinstance(value, Mapping):
+                raise ConfigError(f'{prefix}{name}: expected a group of settings, got {value!r}')
+            value = type(was)(**_arguments(was, value, f'{prefix}{name}.'))  # type: ignore[operator]
+        elif not is_dataclass(was):
+            value = _cast(f'{prefix}{name}', value, was)
+        arguments[name] = value
+    return arguments
+
+
+def _cast(name: str, value: Any, default: Any) -> Any:
+    if isinstance(default, tuple):
+        if isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value):
+            return tuple(value)
+    elif isinstance(default, float):
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            return float(value)
+        if isinstance(value, str):  # YAML reads 1e-4, without a point, as text
+            try:
+                return float(value)
+            except ValueError:
+                pass
+    elif type(value) is type(default):
+        return value
+    kind = 'list of text' if isinstance(default, tuple) else type(default).__name__
+    raise ConfigError(f'{name}: expected {kind}, got {value!r}')
+
+
+def _check(item: Setting, value: Any) -> None:
+    if item.choices and value not in item.choices:
+        raise ConfigError(f'{item.name}: expected one of {", ".join(item.choices)}, got {value!r}')
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        low = -float('inf') if item.low is None else item.low
+        high = float('inf') if item.high is None else item.high
+        if not low <= value <= high:
+            raise ConfigError(
+                f'{item.name}: expected {low:g} to {high:g} {item.unit}, got {value!r}'
+            )
