@@ -1,0 +1,148 @@
+"""Tables of boxes: what ``boxes.csv`` and truth files hold."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.metrics import EXTENT
+from boxreg_ros.structures import PITCH, ROLL, YAW, BoxArray, Floats, Ints
+
+COLUMNS = (
+    'stamp_ns', 'frame_id', 'track_id', 'class_name', 'score', 'x', 'y', 'z',
+    'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height', 'status', 'num_points',
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class BoxTable:
+    """
+    Boxes of many stamps, one row each, as in ``boxes.csv``.
+
+    Attributes
+    ----------
+    stamps_ns : array, shape (n,)
+        Header stamps [ns].
+    frame_id : str
+        Frame of all `boxes`; ``''`` when there are none.
+    track_ids, class_names, status : tuple of n str
+        Identity over time, category, and where the box comes from.
+    scores : array, shape (n,)
+        Detector confidence.
+    boxes : array, shape (n, 9)
+        As defined in `structures`.
+    num_points : array, shape (n,)
+        Returns of the object, or inside the box.
+
+    """
+
+    stamps_ns: Ints
+    frame_id: str
+    track_ids: tuple[str, ...]
+    class_names: tuple[str, ...]
+    scores: Floats
+    boxes: Floats
+    status: tuple[str, ...]
+    num_points: Ints
+
+    @classmethod
+    def from_arrays(cls, arrays: Sequence[BoxArray], status: str = 'input') -> BoxTable:
+        """
+        Return the rows of box arrays that share one frame, in their order.
+
+        Raises
+        ------
+        RecordingError
+            If the arrays are in several frames.
+
+        """
+        frame_ids = {array.frame_id for array in arrays}
+        if len(frame_ids) > 1:
+            raise RecordingError(
+                f'boxes: expected one frame, got {", ".join(sorted(frame_ids))}; relabel first'
+            )
+        count = sum(len(array.track_ids) for array in arrays)
+        return cls(
+            np.repeat([a.stamp_ns for a in arrays], [len(a.track_ids) for a in arrays]).astype(
+                np.int64
+            ),
+            frame_ids.pop() if frame_ids else '',
+            tuple(name for a in arrays for name in a.track_ids),
+            tuple(name for a in arrays for name in a.class_names),
+            np.concatenate([np.zeros(0)] + [a.scores for a in arrays]),
+            np.concatenate([np.zeros((0, 9))] + [a.boxes for a in arrays]),
+            (status,) * count,
+            np.zeros(count, np.int64),
+        )
+
+    @classmethod
+    def read(cls, path: str | Path) -> BoxTable:
+        """
+        Read a CSV file with the columns of ``boxes.csv``; others beside them are ignored.
+
+        Raises
+        ------
+        RecordingError
+            If the file cannot be read, a column is missing, a value is not what its column
+            needs, or the rows are in several frames.
+
+        """
+        try:
+            with open(path, newline='', encoding='utf-8') as file:
+                reader = csv.DictReader(file)
+                missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+                if missing:
+                    raise RecordingError(
+                        f'{path}: not a table of boxes, columns missing: {", ".join(missing)}'
+                    )
+                rows = list(reader)
+        except (OSError, UnicodeDecodeError, csv.Error) as error:
+            raise RecordingError(f'{path}: cannot be read as CSV: {error}') from None
+        frame_ids = sorted({row['frame_id'] for row in rows})
+        if len(frame_ids) > 1:
+            raise RecordingError(f'{path}: expected one frame, got {", ".join(frame_ids)}')
+        try:
+            stamps = np.array([int(row['stamp_ns']) for row in rows], np.int64)
+            num_points = np.array([int(row['num_points']) for row in rows], np.int64)
+            numbers = np.array(
+                [[float(row[name]) for name in COLUMNS[4:15]] for row in rows]
+            ).reshape(-1, 11)
+        except (TypeError, ValueError) as error:
+            raise RecordingError(f'{path}: a column does not hold numbers: {error}') from None
+        boxes = np.full((len(rows), 9), np.nan)
+        boxes[:, :3], boxes[:, EXTENT] = numbers[:, 1:4], numbers[:, 8:11]
+        turned = (np.linalg.norm(numbers[:, 4:8], axis=1) > 1e-6) & np.isfinite(
+            numbers[:, 4:8]
+        ).all(axis=1)
+        if turned.any():
+            rotation = Rotation.from_quat(numbers[turned, 4:8])
+            boxes[turned, ROLL:] = rotation.as_euler('ZYX')[:, ::-1]
+        return cls(
+            stamps,
+            frame_ids[0] if frame_ids else '',
+            tuple(row['track_id'] for row in rows),
+            tuple(row['class_name'] for row in rows),
+            numbers[:, 0],
+            boxes,
+            tuple(row['status'] for row in rows),
+            num_points,
+        )
+
+    def write(self, path: str | Path) -> None:
+        """Write all rows as CSV, in the columns of ``boxes.csv``."""
+        quaternions = Rotation.from_euler('ZYX', self.boxes[:, [YAW, PITCH, ROLL]]).as_quat()
+        with open(path, 'w', newline='', encoding='utf-8') as file:
+            table = csv.writer(file, lineterminator='\n')
+            table.writerow(COLUMNS)
+            for i, box in enumerate(self.boxes):
+                numbers = (self.scores[i], *box[:3], *quaternions[i], *box[EXTENT])
+                table.writerow([
+                    self.stamps_ns[i], self.frame_id, self.track_ids[i], self.class_names[i],
+                    *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],
+                ])  # fmt: skip

@@ -1,0 +1,135 @@
+"""How well boxes (n, 9) agree with true ones, row by row in one frame: overlap and errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from boxreg_ros.errors import ShapeError
+from boxreg_ros.geometry import rotation_from_rpy
+from boxreg_ros.structures import HEIGHT, LENGTH, ROLL, Floats, checked
+
+PAIRS_AT_ONCE = 1000  # bounds the memory of one clipping step to about 100 MB
+EXTENT = slice(LENGTH, HEIGHT + 1)
+SHIFT = 1e-9  # [m], so much the second box is grown: no two faces are ever in one plane
+
+
+@dataclass(frozen=True, slots=True)
+class PoseErrors:
+    """
+    Predicted minus true, one row per pair.
+
+    Attributes
+    ----------
+    translation, extent : array, shape (n, 3)
+        Of the centre along the true box's axes; of length, width and height [m].
+    rotation : array, shape (n, 3)
+        Of roll, pitch and yaw, each wrapped to [-pi, pi) [rad].
+    is_flipped : array, shape (n,)
+        True where the heading points the wrong way: |yaw error| > pi / 2.
+
+    """
+
+    translation: Floats
+    extent: Floats
+    rotation: Floats
+    is_flipped: NDArray[np.bool_]
+
+
+def iou_bev(boxes: ArrayLike, truth: ArrayLike) -> Floats:
+    """
+    Return the overlap of footprints, intersection over union, shape (n,).
+
+    A footprint is the rectangle length x width turned by yaw; roll and pitch do not count.
+
+    """
+    upright, flat = np.array([1, 1, 0, 1, 1, 0, 0, 0, 1]), np.eye(9)[HEIGHT]
+    a, b = _rows(boxes, truth)
+    return iou_3d(a * upright + flat, b * upright + flat)
+
+
+def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
+    """
+    Return the overlap of boxes turned in any way, intersection over union, shape (n,).
+
+    Boxes that are not finite or have no volume overlap with nothing: 0.
+
+    """
+    a, b = _rows(boxes, truth)
+    overlap = np.zeros(len(a))
+    for start in range(0, len(a), PAIRS_AT_ONCE):
+        part = slice(start, start + PAIRS_AT_ONCE)
+        overlap[part] = _intersection(a[part], b[part])
+    union = a[:, EXTENT].prod(axis=1) + b[:, EXTENT].prod(axis=1) - overlap
+    valid = np.isfinite(overlap) & (overlap > 0)
+    iou: Floats = np.divide(overlap, union, out=np.zeros(len(a)), where=valid)
+    return iou.clip(0.0, 1.0)
+
+
+def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
+    """Return the errors of `boxes`, in the frames `PoseErrors` names."""
+    a, b = _rows(boxes, truth)
+    translation = np.einsum('nij,ni->nj', _rotation(b), a[:, :3] - b[:, :3])
+    rotation = wrap(a[:, ROLL:] - b[:, ROLL:])
+    extent = a[:, EXTENT] - b[:, EXTENT]
+    return PoseErrors(translation, extent, rotation, np.abs(rotation[:, 2]) > np.pi / 2)
+
+
+def wrap(angles: Floats) -> Floats:
+    """Return `angles` in [-pi, pi) [rad]."""
+    wrapped: Floats = (angles + np.pi) % (2 * np.pi) - np.pi
+    return wrapped
+
+
+def _rows(boxes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:
+    a, b = checked('boxes', boxes, (None, 9)), checked('truth', truth, (None, 9))
+    if len(a) != len(b):
+        raise ShapeError(f'boxes, truth: expected as many rows, got {len(a)} and {len(b)}')
+    return a, b
+
+
+def _rotation(boxes: Floats) -> Floats:
+    """Return R (n, 3, 3), box axes as columns."""
+    R: Floats = rotation_from_rpy(torch.from_numpy(boxes[:, ROLL:])).numpy()
+    return R
+
+
+def _intersection(a: Floats, b: Floats) -> Floats:
+    """
+    Return the volume that both boxes of each pair fill [m^3], shape (n,).
+
+    Both boxes together are twelve half-spaces n.x <= d. Where the planes i and j meet, the line is
+    clipped by the other ten; what is left, of length L_ij, is an edge of the intersection. With
+    c = n_i.n_j and s = |n_i x n_j|, the divergence theorem applied twice (volume by faces, face
+    by edges) gives V = 1/6 sum_{i<j} L_ij (2 d_i d_j - c (d_i^2 + d_j^2)) / s.
+
+    """
+    axes = [np.swapaxes(_rotation(rows), 1, 2) for rows in (a, b)]
+    normals = np.concatenate([axes[0], -axes[0], axes[1], -axes[1]], axis=1)  # (n, 12, 3)
+    shift = np.einsum('nij,nj->ni', axes[1], b[:, :3] - a[:, :3])  # origin: the centre of a
+    half_a, half_b = a[:, EXTENT] / 2, b[:, EXTENT] / 2 + SHIFT
+    offsets = np.concatenate([half_a, half_a, half_b + shift, half_b - shift], axis=1)  # (n, 12)
+
+    i, j = np.triu_indices(12, 1)
+    d_i, d_j = offsets[:, i], offsets[:, j]
+    dots = normals @ np.swapaxes(normals, 1, 2)
+    along = np.cross(normals[:, i], normals[:, j])  # (n, 66, 3)
+    sine, cosine = np.linalg.norm(along, axis=2), dots[:, i, j]
+    parallel = sine < 1e-12
+    sine[parallel] = 1.0
+    slope = (along / sine[..., None]) @ np.swapaxes(normals, 1, 2)  # (n, 66, 12)
+    foot_i, foot_j = (d_i - cosine * d_j) / sine**2, (d_j - cosine * d_i) / sine**2
+    foot = foot_i[..., None] * dots[:, i] + foot_j[..., None] * dots[:, j]
+    room = offsets[:, None] - foot
+    edges = np.arange(len(i))
+    room[:, edges, i] = room[:, edges, j] = np.inf  # a line lies in its own two planes
+    with np.errstate(divide='ignore', invalid='ignore'):
+        crossing = np.where(slope == 0, np.copysign(np.inf, room), room / slope)
+        end = np.where(slope >= 0, crossing, np.inf).min(axis=2)
+        start = np.where(slope < 0, crossing, -np.inf).max(axis=2)
+        length = np.where((end > start) & ~parallel, end - start, 0.0)
+    volume: Floats = (length * (2 * d_i * d_j - cosine * (d_i**2 + d_j**2)) / (6 * sine)).sum(1)
+    return volume
