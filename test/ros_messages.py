@@ -1,0 +1,230 @@
+"""Messages and recordings made in tests, with rosbags alone."""
+
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+VISION = {
+    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score\n',
+    'vision_msgs/msg/ObjectHypothesisWithPose': (
+        'vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
+    ),
+    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n',
+    'vision_msgs/msg/Detection3D': (
+        'std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n'
+        'vision_msgs/BoundingBox3D bbox\nstring id\n'
+    ),
+    'vision_msgs/msg/Detection3DArray': (
+        'std_msgs/Header header\nvision_msgs/Detection3D[] detections\n'
+    ),
+}
+TF_MESSAGE = {'tf2_msgs/msg/TFMessage': 'geometry_msgs/TransformStamped[] transforms\n'}
+
+POINTS = 'sensor_msgs/msg/PointCloud2'
+DETECTIONS = 'vision_msgs/msg/Detection3DArray'
+MARKERS = 'visualization_msgs/msg/MarkerArray'
+TF = 'tf2_msgs/msg/TFMessage'
+ODOMETRY = 'nav_msgs/msg/Odometry'
+NUMBERS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 8}
+
+
+def typestore(stock=Stores.ROS2_JAZZY):
+    """Return a typestore that knows vision_msgs and tf2_msgs beside the stock types."""
+    store = get_typestore(stock)
+    extra = {}
+    for name, text in (VISION | TF_MESSAGE).items():
+        if name not in store.types:
+            extra.update(get_types_from_msg(text, name))
+    store.register(extra)
+    return store
+
+
+class Messages:
+    """Makes messages of one typestore (ROS 2 Jazzy, or ROS 1 Noetic)."""
+
+    def __init__(self, ros1=False):
+        self.ros1 = ros1
+        self.store = typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+
+    def make(self, type_name, /, **fields):
+        return self.store.types[type_name](**fields)
+
+    def header(self, stamp_ns, frame_id):
+        stamp = self.make(
+            'builtin_interfaces/msg/Time', sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
+        )
+        extra = {'seq': 0} if self.ros1 else {}
+        return self.make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id, **extra)
+
+    def vector(self, x, y, z):
+        return self.make('geometry_msgs/msg/Vector3', x=float(x), y=float(y), z=float(z))
+
+    def pose(self, position=(0, 0, 0), quaternion_xyzw=(0, 0, 0, 1)):
+        x, y, z, w = map(float, quaternion_xyzw)
+        px, py, pz = map(float, position)
+        return self.make(
+            'geometry_msgs/msg/Pose',
+            position=self.make('geometry_msgs/msg/Point', x=px, y=py, z=pz),
+            orientation=self.make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
+        )
+
+    def cloud(self, stamp_ns, frame_id, columns, order='<', height=1, padding=0, row_padding=0):
+        """Return a PointCloud2; `columns` is a list of (name, type like 'f4', values)."""
+        width = len(columns[0][2]) // height
+        names, kinds, values = zip(*columns, strict=True)
+        layout = np.dtype(
+            {
+                'names': names,
+                'formats': [order + kind for kind in kinds],
+                'offsets': np.cumsum([0, *(int(k[1]) for k in kinds)])[:-1].tolist(),
+                'itemsize': sum(int(k[1]) for k in kinds) + padding,
+            }
+        )
+        table = np.zeros((height, width), layout)
+        for name, value in zip(names, values, strict=True):
+            table[name] = np.reshape(value, (height, width))
+        rows = [row.tobytes() + b'\xff' * row_padding for row in table]
+        fields = [
+            self.make(
+                'sensor_msgs/msg/PointField',
+                name=name, offset=layout.fields[name][1], datatype=NUMBERS[kind], count=1,
+            )
+            for name, kind in zip(names, kinds, strict=True)
+        ]  # fmt: skip
+        return self.make(
+            POINTS,
+            header=self.header(stamp_ns, frame_id), height=height, width=width, fields=fields,
+            is_bigendian=order == '>', point_step=layout.itemsize,
+            row_step=layout.itemsize * width + row_padding,
+            data=np.frombuffer(b''.join(rows), np.uint8), is_dense=False,
+        )  # fmt: skip
+
+    def points(self, stamp_ns, frame_id, xyz):
+        xyz = np.asarray(xyz, np.float32).reshape(-1, 3)
+        columns = [(name, 'f4', xyz[:, i]) for i, name in enumerate('xyz')]
+        return self.cloud(stamp_ns, frame_id, columns)
+
+    def detections(self, stamp_ns, frame_id, boxes):
+        """Return a Detection3DArray; `boxes` are (id, class, score, position, quat, size)."""
+        covariance = np.zeros(36)
+        items = []
+        for track, class_name, score, position, quaternion_xyzw, size in boxes:
+            pose = self.pose(position, quaternion_xyzw)
+            results = [
+                self.make(
+                    'vision_msgs/msg/ObjectHypothesisWithPose',
+                    hypothesis=self.make(
+                        'vision_msgs/msg/ObjectHypothesis', class_id=name, score=value
+                    ),
+                    pose=self.make(
+                        'geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=covariance
+                    ),
+                )
+                for name, value in (('unlikely', 0.01), (class_name, score))
+            ]
+            items.append(
+                self.make(
+                    'vision_msgs/msg/Detection3D',
+                    header=self.header(stamp_ns, frame_id),
+                    results=results,
+                    bbox=self.make(
+                        'vision_msgs/msg/BoundingBox3D', center=pose, size=self.vector(*size)
+                    ),
+                    id=track,
+                )
+            )
+        return self.make(DETECTIONS, header=self.header(stamp_ns, frame_id), detections=items)
+
+    def marker(
+        self, stamp_ns, frame_id, track, class_name, position, quat, size, kind=1, action=0
+    ):
+        empty = np.zeros(0, np.uint8)
+        extra = {}
+        if not self.ros1:
+            extra = {
+                'texture_resource': '',
+                'texture': self.make(
+                    'sensor_msgs/msg/CompressedImage',
+                    header=self.header(0, ''), format='', data=empty,
+                ),
+                'uv_coordinates': [],
+                'mesh_file': self.make(
+                    'visualization_msgs/msg/MeshFile', filename='', data=empty
+                ),
+            }  # fmt: skip
+        return self.make(
+            'visualization_msgs/msg/Marker',
+            header=self.header(stamp_ns, frame_id), ns=class_name, id=track, type=kind,
+            action=action, pose=self.pose(*pose), scale=self.vector(*size),
+            color=self.make('std_msgs/msg/ColorRGBA', r=0.0, g=1.0, b=0.0, a=0.5),
+            lifetime=self.make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
+            frame_locked=False, points=[], colors=[], text='', mesh_resource='',
+            mesh_use_embedded_materials=False, **extra,
+        )  # fmt: skip
+
+    def markers(self, markers):
+        return self.make(MARKERS, markers=markers)
+
+    def transform(self, stamp_ns, parent, child, position=(0, 0, 0), quaternion_xyzw=(0, 0, 0, 1)):
+        pose = self.pose(position, quaternion_xyzw)
+        return self.make(
+            'geometry_msgs/msg/TransformStamped',
+            header=self.header(stamp_ns, parent),
+            child_frame_id=child,
+            transform=self.make(
+                'geometry_msgs/msg/Transform',
+                translation=self.vector(*position), rotation=pose.orientation,
+            ),
+        )  # fmt: skip
+
+    def tf(self, *transforms):
+        return self.make(TF, transforms=list(transforms))
+
+    def odometry(self, stamp_ns, parent, child, position=(0, 0, 0), quaternion_xyzw=(0, 0, 0, 1)):
+        zero = self.vector(0, 0, 0)
+        return self.make(
+            ODOMETRY,
+            header=self.header(stamp_ns, parent),
+            child_frame_id=child,
+            pose=self.make(
+                'geometry_msgs/msg/PoseWithCovariance',
+                pose=self.pose(position, quaternion_xyzw), covariance=np.zeros(36),
+            ),
+            twist=self.make(
+                'geometry_msgs/msg/TwistWithCovariance',
+                twist=self.make('geometry_msgs/msg/Twist', linear=zero, angular=zero),
+                covariance=np.zeros(36),
+            ),
+        )  # fmt: skip
+
+
+def write_recording(path, items, storage='mcap', messages=None):
+    """
+    Write (topic, received_ns, message) as a recording and return its path.
+
+    `storage` is ``mcap`` (one file), ``mcap-folder``, ``sqlite3`` (a folder) or ``rosbag1``.
+
+    """
+    path = Path(path)
+    store = (messages or Messages(ros1=storage == 'rosbag1')).store
+    if storage == 'rosbag1':
+        path = path.with_suffix('.bag')
+        writer = Writer1(path)
+    else:
+        plugin = StoragePlugin.SQLITE3 if storage == 'sqlite3' else StoragePlugin.MCAP
+        writer = Writer(path, version=9, storage_plugin=plugin)
+    with writer:
+        connections = {}
+        for topic, received_ns, message in items:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            to_bytes = store.serialize_ros1 if storage == 'rosbag1' else store.serialize_cdr
+            writer.write(connections[topic], received_ns, to_bytes(message, kind))
+    if storage == 'mcap':
+        (inner,) = path.glob('*.mcap')
+        return inner
+    return path
