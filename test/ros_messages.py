@@ -138,9 +138,7 @@ class Messages:
             )
         return self.make(DETECTIONS, header=self.header(stamp_ns, frame_id), detections=items)
 
-    def marker(
-        self, stamp_ns, frame_id, track, class_name, position, quat, size, kind=1, action=0
-    ):
+    def marker(self, stamp_ns, frame_id, track, class_name, pose, size, kind=1, action=0):
         empty = np.zeros(0, np.uint8)
         extra = {}
         if not self.ros1:
