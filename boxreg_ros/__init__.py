@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.registration import refine
+from boxreg_ros.registrar import refine
 from boxreg_ros.structures import RefinedTrack, Track
 
 __version__ = '0.1.0'

@@ -1,0 +1,321 @@
+"""The one stateful object of the core: sweeps and boxes in, refined boxes out, nothing else."""
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from boxreg_ros.association import Pair, StampMatcher
+from boxreg_ros.config import Config
+from boxreg_ros.registration import Estimate, Window, register
+from boxreg_ros.sampling import Observation, observe
+from boxreg_ros.errors import ShapeError
+from boxreg_ros.structures import (
+    INTERPOLATED,
+    KEPT,
+    BoxArray,
+    RefinedBoxes,
+    RefinedTrack,
+    Sweep,
+    Track,
+)
+
+
+class BoxRegistrar:
+    """
+    Register the boxes of a stream to its sweeps.
+
+    Deterministic: the order of calls is its only input. It knows no clock, no topic, no file and
+    one frame, the fixed frame of all that is added. Not thread-safe.
+
+    Every box array added comes back exactly once with ``is_final=True``, all its boxes in the
+    order of the input, stamps ascending. With `estimate` 'early' or 'final' it comes back once
+    more before that, with ``is_final=False``, as soon as it is paired.
+
+    Attributes
+    ----------
+    counts : Counter
+        Sweeps and boxes taken, boxes by status, and everything dropped or kept by reason.
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self.counts: Counter[str] = Counter()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything but the counts."""
+        config = self._config
+        self._matcher = StampMatcher(round(config.tolerance * 1e9), config.queue, self.counts)
+        self._tracks: dict[str, _TrackBuffer] = {}
+        self._ticks: deque[_Tick] = deque()
+        self._newest_ns: int | None = None
+
+    def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
+        """Take a sweep; return what has become ready."""
+        self.counts['sweeps'] += 1
+        return self._advance(self._matcher.add_sweep(sweep))
+
+    def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
+        """Take a box array; return what has become ready."""
+        self.counts['boxes'] += len(boxes.track_ids)
+        return self._advance(self._matcher.add_boxes(boxes))
+
+    def flush(self) -> list[RefinedBoxes]:
+        """End all tracks and return everything still held."""
+        ready = self._advance(self._matcher.flush())
+        self._end(list(self._tracks))
+        for tick in self._ticks:
+            tick.waiting = 0
+        return ready + self._settled()
+
+    def _advance(self, pairs: list[Pair]) -> list[RefinedBoxes]:
+        ready = []
+        for pair in pairs:
+            tick = self._open(pair)
+            if self._config.estimate == 'track':
+                self._solve([t for t in self._tracks.values() if t.is_full(self._config)])
+            else:
+                self._solve([t for t in self._tracks.values() if t.newest_tick is tick])
+                ready.append(tick.result(is_final=False))
+                for old in list(self._ticks)[: len(self._ticks) - self._config.lag]:
+                    old.waiting = 0
+            ready += self._settled()
+        return ready
+
+    def _open(self, pair: Pair) -> '_Tick':
+        """Start a tick: sort its boxes out and add an observation to the track of each."""
+        boxes, sweep = pair
+        tick = _Tick.of(boxes)
+        self._ticks.append(tick)
+        now_ns = boxes.stamp_ns
+        late = self._newest_ns is not None and now_ns <= self._newest_ns
+        self._newest_ns = max(now_ns, self._newest_ns or now_ns)
+        if sweep is None:
+            self.counts['boxes_without_sweep'] += 1
+        tick.refuse('late' if late else 'no_sweep' if sweep is None else '')
+        admitted = [i for i, reason in enumerate(tick.reasons) if not reason]
+        silent = now_ns - round(self._config.max_gap * 1e9)
+        self._end([name for name, track in self._tracks.items() if track.newest_ns < silent])
+        if sweep is not None and admitted:
+            observations = observe(sweep, boxes.boxes[admitted], now_ns, self._config)
+            for index, observation in zip(admitted, observations, strict=True):
+                name = boxes.track_ids[index]
+                tick.num_points[index] = observation.num_points
+                track = self._tracks.setdefault(name, _TrackBuffer(boxes.class_names[index]))
+                track.entries.append(_Entry(observation, tick, index))
+                tick.waiting += 1
+        return tick
+
+    def _end(self, names: list[str]) -> None:
+        """Close tracks: their last window is solved, what waited for it is settled."""
+        ended = [self._tracks.pop(name) for name in names]
+        if self._config.estimate == 'track':
+            self._solve(ended)
+        for track in ended:
+            track.settle(len(track.entries))
+
+    def _solve(self, tracks: list['_TrackBuffer']) -> None:
+        """Register the window of each track and write the estimates to the ticks they are of."""
+        windows = [Window(t.class_name, [e.observation for e in t.entries]) for t in tracks]
+        for track, estimate in zip(tracks, register(windows, self._config), strict=True):
+            track.write(estimate)
+            track.slide(self._config)
+
+    def _settled(self) -> list[RefinedBoxes]:
+        ready = []
+        while self._ticks and self._ticks[0].waiting == 0:
+            tick = self._ticks.popleft()
+            for status, reason in zip(tick.status, tick.reasons, strict=True):
+                self.counts[status] += 1
+                self.counts[reason] += bool(reason)
+            ready.append(tick.result(is_final=True))
+        return ready
+
+
+@dataclass(eq=False, slots=True)
+class _Tick:
+    """One box array on its way: the best known about each box, and how many still wait."""
+
+    boxes: BoxArray
+    refined: np.ndarray
+    status: list[str]
+    reasons: list[str]
+    num_points: np.ndarray
+    covariances: np.ndarray
+    waiting: int = 0
+
+    @classmethod
+    def of(cls, boxes: BoxArray) -> '_Tick':
+        n = len(boxes.track_ids)
+        unknown = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()
+        return cls(boxes, boxes.boxes.copy(), [KEPT] * n, [''] * n, np.zeros(n, int), unknown)
+
+    def refuse(self, reason: str) -> None:
+        """Give a reason to each box the core cannot take; `reason` holds for all if not empty."""
+        seen: set[str] = set()
+        for i, (name, box) in enumerate(zip(self.boxes.track_ids, self.boxes.boxes, strict=True)):
+            if not np.isfinite(box).all() or (box[3:6] <= 0).any():
+                self.reasons[i] = 'invalid_box'
+            elif not name:
+                self.reasons[i] = 'no_track_id'
+            elif name in seen:
+                self.reasons[i] = 'duplicate_track_id'
+            else:
+                self.reasons[i] = reason
+                seen.add(name)
+
+    def result(self, is_final: bool) -> RefinedBoxes:
+        source = self.boxes
+        boxes = BoxArray(
+            source.stamp_ns,
+            source.frame_id,
+            source.track_ids,
+            source.class_names,
+            source.scores,
+            self.refined.copy(),
+        )
+        return RefinedBoxes(
+            boxes,
+            tuple(self.status),
+            tuple(self.reasons),
+            self.num_points.copy(),
+            self.covariances.copy(),
+            is_final,
+        )
+
+
+@dataclass(slots=True)
+class _Entry:
+    """An observation and the place its estimate belongs to."""
+
+    observation: Observation
+    tick: _Tick
+    index: int
+    is_settled: bool = False
+
+
+@dataclass(eq=False, slots=True)
+class _TrackBuffer:
+    """The observations of one track that windows still need."""
+
+    class_name: str
+    entries: list[_Entry] = field(default_factory=list)
+
+    @property
+    def newest_tick(self) -> _Tick:
+        return self.entries[-1].tick
+
+    @property
+    def newest_ns(self) -> int:
+        return self.entries[-1].observation.stamp_ns
+
+    def is_full(self, config: Config) -> bool:
+        return len(self.entries) >= config.track_window
+
+    def write(self, estimate: Estimate) -> None:
+        for row, entry in enumerate(self.entries):
+            if not entry.is_settled:
+                entry.tick.refined[entry.index] = estimate.boxes[row]
+                entry.tick.covariances[entry.index] = estimate.covariances[row]
+                entry.tick.status[entry.index] = estimate.status[row]
+                entry.tick.reasons[entry.index] = estimate.reasons[row]
+
+    def settle(self, count: int) -> None:
+        for entry in self.entries[:count]:
+            if not entry.is_settled:
+                entry.is_settled = True
+                entry.tick.waiting -= 1
+
+    def slide(self, config: Config) -> None:
+        """Settle and forget what the next window does not need."""
+        if config.estimate != 'track':
+            del self.entries[: len(self.entries) - config.window + 1]
+        elif self.is_full(config):
+            # The ends of a window are its weakest part: a quarter waits for the next window,
+            # which sees another quarter of settled ones before it.
+            overlap = len(self.entries) // 4
+            self.settle(len(self.entries) - overlap)
+            del self.entries[: len(self.entries) - 2 * overlap]
+
+
+def refine(tracks: Sequence[Track], config: Config | None = None) -> list[RefinedTrack]:
+    """
+    Refine whole tracks; the same core, and the same boxes, as node and recordings get.
+
+    Parameters
+    ----------
+    tracks : sequence of Track
+        Objects over time in one fixed frame. Tracks that share a stamp share its sweep: they are
+        fitted knowing each other's boxes.
+    config : Config, optional
+        Settings; `estimate` says which of the estimates of a box is returned.
+
+    Returns
+    -------
+    refined : list of RefinedTrack
+        In the order of `tracks`, rows as in the input. Never NaN: a box given with NaN or without
+        volume comes back interpolated between its neighbours.
+
+    Raises
+    ------
+    ShapeError
+        If a track has no valid box at all, or two tracks the same id.
+
+    """
+    config = config or Config()
+    names = [track.track_id for track in tracks]
+    if len(set(names)) < len(names):
+        raise ShapeError(f'tracks: expected different track ids, got {sorted(names)}')
+    at: dict[int, list[tuple[int, int]]] = {}
+    for index, track in enumerate(tracks):
+        for row, stamp_ns in enumerate(track.stamps_ns):
+            at.setdefault(int(stamp_ns), []).append((index, row))
+    registrar = BoxRegistrar(replace(config, tolerance=0.0))
+    results: list[RefinedBoxes] = []
+    for stamp_ns, places in sorted(at.items()):
+        members = [tracks[index] for index, _ in places]
+        origins = [
+            np.full(3, np.nan) if t.sensor_origins is None else t.sensor_origins[row]
+            for t, (_, row) in zip(members, places, strict=True)
+        ]
+        boxes = np.array([tracks[index].boxes[row] for index, row in places])
+        points = np.concatenate([tracks[index].points[row] for index, row in places])
+        results += registrar.add_sweep(Sweep(stamp_ns, '', points, None, origins[0]))
+        ids, classes = [t.track_id or '?' for t in members], [t.class_name for t in members]
+        results += registrar.add_boxes(
+            BoxArray(stamp_ns, '', tuple(ids), tuple(classes), np.ones(len(ids)), boxes)
+        )
+    results += registrar.flush()
+    wanted = config.estimate != 'early'
+    by_stamp = {r.boxes.stamp_ns: r for r in results if r.is_final == wanted}
+    rows: list[list[tuple[RefinedBoxes, int]]] = [[] for _ in tracks]
+    for stamp_ns, places in sorted(at.items()):
+        for column, (index, _) in enumerate(places):
+            rows[index].append((by_stamp[stamp_ns], column))
+    return [_refined_track(track, row) for track, row in zip(tracks, rows, strict=True)]
+
+
+def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> RefinedTrack:
+    boxes = np.array([r.boxes.boxes[i] for r, i in rows]).reshape(-1, 9)
+    status = [r.status[i] for r, i in rows]
+    valid = np.array([r.reasons[i] != 'invalid_box' for r, i in rows], dtype=bool)
+    if len(rows) and not valid.any():
+        raise ShapeError(f'boxes of track {track.track_id!r}: expected one finite box at least')
+    if not valid.all():
+        boxes[:, 6:9][valid] = np.unwrap(boxes[:, 6:9][valid], axis=0)
+        for column in range(9):
+            boxes[~valid, column] = np.interp(
+                track.stamps_ns[~valid], track.stamps_ns[valid], boxes[valid, column]
+            )
+        boxes[:, 6:9] = np.arctan2(np.sin(boxes[:, 6:9]), np.cos(boxes[:, 6:9]))
+        status = [s if v else INTERPOLATED for s, v in zip(status, valid, strict=True)]
+    return RefinedTrack(
+        track.track_id,
+        boxes,
+        tuple(status),
+        tuple(r.reasons[i] for r, i in rows),
+        np.array([r.covariances[i] for r, i in rows]).reshape(-1, 6, 6),
+    )

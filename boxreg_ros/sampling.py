@@ -1,0 +1,154 @@
+"""From a sweep to what each box sees of it: crop, ownership, road, farthest point sampling."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from boxreg_ros.config import Config
+from boxreg_ros.geometry import rotation_from_rpy
+from boxreg_ros.structures import Floats, Ints, Sweep
+
+RING = 1.0  # how far beside a box the road is looked for [m]
+CLEARANCE = 0.2  # what is lower above the road may be road [m]
+
+
+class Observation(NamedTuple):
+    """
+    One track at one stamp; everything is relative to the centre of its input box.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the box [ns].
+    box : array, shape (9,)
+        Input box in the fixed frame.
+    points : array, shape (M, 3)
+        Returns near the box, above the road, minus its centre; axes of the fixed frame [m].
+    times : array, shape (M,)
+        When each was measured, relative to the stamp [s].
+    origin : array, shape (3,), or None
+        Sensor minus centre [m].
+    ground : float
+        Height of the road beside the box minus z of the centre [m]; NaN where none is seen.
+    num_points : int
+        Sweep points inside the input box.
+
+    """
+
+    stamp_ns: int
+    box: Floats
+    points: NDArray[np.float32]
+    times: NDArray[np.float32]
+    origin: Floats | None
+    ground: float
+    num_points: int
+
+
+def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[Observation]:
+    """
+    Return what `boxes` (n, 9) see of `sweep`, one observation each.
+
+    A point near several boxes belongs to the one it is deepest inside of (or least outside), so
+    that a neighbour's bumper is no evidence. Points lower than the road beside the box plus a
+    clearance are left out, and the road's height is kept instead.
+
+    """
+    points, source = _near_any(sweep.points, boxes, RING + config.sampling.margin)
+    R = rotation_from_rpy(torch.from_numpy(boxes[:, 6:9])).numpy()
+    crops = []
+    nearest = np.full(len(points), np.inf)
+    for box, axes in zip(boxes, R, strict=True):
+        reach = float(np.hypot(*box[3:5])) / 2 + RING
+        first, last = np.searchsorted(points[:, 0], (box[0] - reach, box[0] + reach))
+        offset = points[first:last] - box[:3]
+        outside = np.abs(offset @ axes) - box[3:6] / 2
+        depth = outside.max(1)
+        beside = (np.abs(outside[:, :2].max(1) - RING / 2 - 0.05) < RING / 2) & (
+            np.abs(offset[:, 2] + box[5] / 2) < 0.6
+        )
+        ground = float(np.quantile(offset[beside, 2], 0.3)) if beside.sum() >= 5 else np.nan
+        near = np.flatnonzero(depth < config.sampling.margin)
+        crops.append((first + near, offset[near], depth[near], ground))
+        np.minimum.at(nearest, first + near, depth[near])
+    observations = []
+    for box, (index, offset, depth, ground) in zip(boxes, crops, strict=True):
+        floor = (-box[5] / 2 if np.isnan(ground) else ground) + CLEARANCE
+        own = np.flatnonzero((depth <= nearest[index]) & (offset[:, 2] > floor))
+        kept = own[:: max(1, -(-len(own) // config.sampling.points))]
+        times = np.zeros(len(kept)) if sweep.times is None else sweep.times[source[index[kept]]]
+        observations.append(
+            Observation(
+                stamp_ns,
+                box,
+                offset[kept].astype(np.float32),
+                times.astype(np.float32),
+                sweep.origin - box[:3],
+                ground,
+                int((depth <= 0).sum()),
+            )
+        )
+    return observations
+
+
+def _near_any(points: NDArray[np.floating], boxes: Floats, margin: float) -> tuple[Floats, Ints]:
+    """
+    Return the points near any box, ascending in x, and their rows in the sweep.
+
+    One pass over the sweep with a look-up table of coarse cells, so that the exact tests that
+    follow see the few points that matter.
+
+    """
+    reach = np.linalg.norm(boxes[:, 3:5], axis=1) / 2 + margin
+    low = (boxes[:, :2] - reach[:, None]).min(0)
+    span = (boxes[:, :2] + reach[:, None]).max(0) - low
+    cell = max(1.0, float(span.max()) / 1000)
+    table = np.zeros((span / cell).astype(int) + 3, dtype=bool)
+    for (x, y), r in zip(boxes[:, :2] - low, reach, strict=True):
+        a, b, c, d = (np.array([x - r, x + r, y - r, y + r]) / cell).astype(int) + 1
+        table[a : b + 1, c : d + 1] = True
+    rows = ((points[:, :2] - low) / cell + 1).clip(0, np.array(table.shape) - 1).astype(np.int32)
+    near = np.flatnonzero(table[rows[:, 0], rows[:, 1]])
+    near = near[np.argsort(points[near, 0], kind='stable')]
+    return points[near].astype(np.float64), near
+
+
+def farthest_point_sample(points: Tensor, mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """
+    Choose `count` points that cover the cloud, for all clouds of a batch at once.
+
+    Parameters
+    ----------
+    points : Tensor, shape (..., M, 3)
+        Clouds [m]; padding may hold any finite value.
+    mask : Tensor, shape (..., M)
+        True where a point is real.
+    count : int
+        Points to choose; a cloud with fewer returns all of its own.
+
+    Returns
+    -------
+    chosen : Tensor, shape (..., min(count, M), 3)
+        The first is the one farthest from the mean; each next one farthest from all before.
+    chosen_mask : Tensor, shape (..., min(count, M))
+        False where a cloud had no more points.
+
+    """
+    weight = mask.to(points.dtype)
+    mean = (points * weight[..., None]).sum(-2) / weight.sum(-1, keepdim=True).clamp(min=1)
+    distance = ((points - mean[..., None, :]) ** 2).sum(-1)
+    distance = torch.where(mask, distance, -torch.inf)
+    picks = []
+    for step in range(min(count, points.shape[-2])):
+        pick = distance.argmax(-1, keepdim=True)
+        picks.append(pick)
+        center = points.gather(-2, pick[..., None].expand(*pick.shape, 3))
+        fresh = ((points - center) ** 2).sum(-1)
+        fresh = torch.where(mask, fresh, -torch.inf).scatter(-1, pick, -1.0)
+        distance = fresh if step == 0 else torch.minimum(distance, fresh)
+    index = torch.cat(picks, -1) if picks else mask.new_zeros((*mask.shape[:-1], 0), dtype=int)
+    chosen = points.gather(-2, index[..., None].expand(*index.shape, 3))
+    real = torch.arange(index.shape[-1], device=mask.device) < mask.sum(-1, keepdim=True)
+    return chosen, real
