@@ -1,0 +1,14 @@
+"""What every test has around it: ROS that stays on this machine, by itself, and is strict."""
+
+import os
+from pathlib import Path
+import sys
+import tempfile
+
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+os.environ['ROS_LOG_DIR'] = str(Path(tempfile.gettempdir(), 'boxreg_ros_test_log'))
+# Read when a message class is imported; without it misspelt fields and wrong types pass.
+os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+# The wheels of ROS need it where ROS itself is not installed.
+os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)

@@ -1,0 +1,168 @@
+from pathlib import Path
+
+from boxreg_ros.config import Config, settings
+from boxreg_ros.errors import BoxregError, ConfigError
+import pytest
+import yaml
+
+
+def test_defaults_are_their_own_settings():
+    config = Config()
+    assert [item for item, _ in config.items()] == list(settings())
+    assert all(value == item.default for item, value in config.items() if '.' not in item.name)
+    assert Config.from_dict({}) == config
+
+
+def test_every_setting_says_what_it_means():
+    names = [item.name for item in settings()]
+    assert len(names) == len(set(names)) > 30
+    for item in settings():
+        assert item.meaning, item.name
+        kind = type(item.default)
+        assert kind in (bool, int, float, str, tuple), item.name
+        if kind in (int, float):
+            assert item.low <= item.default <= item.high, item.name
+
+
+def test_dictionary_and_yaml_give_back_what_they_took(tmp_path):
+    config = Config.from_dict(
+        {
+            'objective': 'paper',
+            'window': 7,
+            'lag': 2,
+            'solver': {'rounds': 2, 'tolerance': 1e-6},
+            'pedestrian': {'names': ['human'], 'turning': 2.5},
+        }
+    )
+    assert config.solver.rounds == 2
+    assert config.pedestrian.names == ('human',)
+    assert config.pedestrian.slip == Config().pedestrian.slip != Config().vehicle.slip
+    assert Config.from_dict(config.to_dict()) == config
+    path = tmp_path / 'config.yaml'
+    path.write_text(yaml.safe_dump(config.to_dict()))
+    assert Config.from_yaml(path) == config
+
+
+@pytest.mark.parametrize('node', ['/**', 'boxreg', '/robot/boxreg'])
+def test_parameter_files_of_ros_are_read(tmp_path, node):
+    path = tmp_path / 'params.yaml'
+    path.write_text(f'{node}:\n  ros__parameters:\n    window: 12\n    solver: {{rounds: 3}}\n')
+    config = Config.from_yaml(path)
+    assert (config.window, config.solver.rounds) == (12, 3)
+
+
+def test_empty_file_means_defaults(tmp_path):
+    path = tmp_path / 'empty.yaml'
+    path.write_text('# nothing\n')
+    assert Config.from_yaml(path) == Config()
+
+
+def test_exponents_without_a_point_are_numbers(tmp_path):
+    path = tmp_path / 'config.yaml'
+    path.write_text('solver: {tolerance: 1e-6}\n')
+    assert Config.from_yaml(path).solver.tolerance == 1e-6
+
+
+def test_dotted_names_update_a_copy():
+    config = Config()
+    changed = config.updated({'solver.rounds': 2, 'mode': 'bev', 'vehicle.names': ['Auto']})
+    assert (changed.solver.rounds, changed.mode, changed.vehicle.names) == (2, 'bev', ('Auto',))
+    assert changed.solver.iterations == config.solver.iterations
+    assert config == Config()
+
+
+@pytest.mark.parametrize(
+    ('values', 'name'),
+    [
+        ({'windw': 3}, 'windw'),
+        ({'solver': {'round': 3}}, 'solver.round'),
+        ({'vehicle': {'speed': 3.0}}, 'vehicle.speed'),
+    ],
+)
+def test_unknown_keys_are_refused_by_name(values, name):
+    with pytest.raises(ConfigError, match=rf'^{name}: no such setting; expected one of '):
+        Config.from_dict(values)
+
+
+@pytest.mark.parametrize('name', ['windw', 'solver.round', 'window.size', 'a.b.c'])
+def test_unknown_dotted_names_are_refused(name):
+    with pytest.raises(ConfigError, match='window' if name == 'window.size' else name[0]):
+        Config().updated({name: 3})
+
+
+def bounds():
+    for item in settings():
+        if item.low is not None:
+            yield item.name, item.low - 1
+        if item.high is not None:
+            yield item.name, item.high + 1
+        if item.choices:
+            yield item.name, 'neither'
+
+
+@pytest.mark.parametrize(('name', 'value'), list(bounds()))
+def test_values_out_of_bounds_are_refused_by_name(name, value):
+    with pytest.raises(ConfigError, match=rf'^{name}: expected .* got {value!r}'):
+        Config().updated({name: value})
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('window', 3.5),
+        ('window', '10'),
+        ('window', True),
+        ('max_gap', 'long'),
+        ('max_gap', float('nan')),
+        ('max_gap', True),
+        ('mode', 3),
+        ('vehicle.names', 'car'),
+        ('vehicle.names', [1]),
+        ('solver', 3),
+    ],
+)
+def test_wrong_types_are_refused_by_name(name, value):
+    with pytest.raises(ConfigError, match=rf'^{name}: expected .* got '):
+        Config().updated({name: value})
+
+
+def test_settings_that_depend_on_each_other():
+    with pytest.raises(ConfigError, match='lag'):
+        Config(window=5, lag=5)
+    assert Config(window=5, lag=4).lag == 4
+
+
+@pytest.mark.parametrize(
+    'text', ['- 1\n- 2\n', 'word\n', 'a: [\n', '/**:\n  ros__parameters: 3\n', 'window: 2\n']
+)
+def test_unfit_files_are_named(tmp_path, text):
+    path = tmp_path / 'unfit.yaml'
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r'unfit\.yaml') as caught:
+        Config.from_yaml(path)
+    assert '\n' not in str(caught.value)
+
+
+def test_missing_and_foreign_files_are_named(tmp_path):
+    foreign = tmp_path / 'foreign.yaml'
+    foreign.write_bytes(b'\xff\xfe\x00')
+    for path in (foreign, tmp_path / 'absent.yaml', Path(tmp_path)):
+        with pytest.raises(BoxregError, match=path.name):
+            Config.from_yaml(path)
+
+
+@pytest.mark.parametrize(
+    ('class_name', 'kind'),
+    [
+        ('car', 'vehicle'),
+        ('Pedestrian', 'pedestrian'),
+        ('human.pedestrian.adult', 'pedestrian'),
+        ('motorcycle_rider', 'cyclist'),
+        ('BICYCLE', 'cyclist'),
+        ('carpet', 'vehicle'),
+        ('', 'vehicle'),
+    ],
+)
+def test_class_names_find_their_kind(class_name, kind):
+    config = Config()
+    assert config.class_config(class_name) is getattr(config, kind)
