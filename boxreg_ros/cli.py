@@ -1,0 +1,80 @@
+"""`boxreg`: one command, its subcommands imported only when used."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+import os
+import sys
+
+from boxreg_ros import __version__
+from boxreg_ros.errors import BoxregError, ConfigError
+
+COMMANDS = {
+    'relabel': 'refine the boxes of recordings and write label files',
+    'evaluate': 'compare boxes with true boxes',
+    'simulate': 'make a recording with known truth',
+    'bench': 'measure accuracy and speed',
+    'node': 'run the live node (where there is no ros2 run)',
+}
+DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run a subcommand and return the exit status.
+
+    0 done, 1 the data or the run failed, 2 wrong usage, 130 interrupted; failures are told in
+    one line on stderr.
+
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    is_debug = '--debug' in arguments
+    try:
+        status = _run(arguments)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        # Whoever read the output has seen enough; python must not complain when it flushes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except KeyboardInterrupt:
+        return _fail('interrupted; nothing was written', INTERRUPTED)
+    except (BoxregError, OSError) as error:
+        if is_debug:
+            raise
+        return _fail(str(error), WRONG_USAGE if isinstance(error, ConfigError) else FAILED)
+    except Exception as error:
+        if is_debug:
+            raise
+        text = f'{type(error).__name__}: {error}'
+        return _fail(f'unexpected {text} (--debug shows where)', FAILED)
+
+
+def _run(arguments: list[str]) -> int:
+    """Parse and hand over to the module of the subcommand."""
+    command = next((item for item in arguments if not item.startswith('-')), None)
+    if command == 'node' and arguments[0] == 'node':  # its arguments are those of any ROS node
+        return int(import_module('boxreg_ros.node').main(arguments[1:]) or DONE)
+    parser = argparse.ArgumentParser(
+        'boxreg', description='Register tracked 3D boxes to point clouds.'
+    )
+    parser.add_argument('--version', action='version', version=f'boxreg {__version__}')
+    subparsers = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
+    for name, summary in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=summary, description=f'{summary}.')
+        subparser.add_argument('--debug', action='store_true', help=argparse.SUPPRESS)
+        if name == command and name != 'node':
+            import_module(f'boxreg_ros.{name}').add_arguments(subparser)
+    args = parser.parse_args(arguments)
+    return int(import_module(f'boxreg_ros.{args.command}').run(args))
+
+
+def _fail(message: str, status: int) -> int:
+    print(f'boxreg: {" ".join(message.split())}', file=sys.stderr)
+    return status
+
+
+if __name__ == '__main__':
+    sys.exit(main())

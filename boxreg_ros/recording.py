@@ -1,0 +1,404 @@
+"""
+Recordings: MCAP, rosbag2 (sqlite3 and mcap) and ROS 1 bags as one ordered stream.
+
+Message definitions come from the recording, so nothing of ROS need be installed.
+
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from boxreg_ros.errors import (
+    BoxregError,
+    RecordingError,
+    UnsupportedMessage,
+)
+from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.transforms import TransformTree
+from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+TF_TYPES = ('tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage')
+ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
+
+LOOKAHEAD_NS = 2 * 10**9
+"""Transforms are read this far ahead of the clouds and boxes that need them."""
+PATIENCE_NS = 10 * 10**9
+"""So long is TF given to connect the frames before odometry is taken."""
+MEMORY_NS = 30 * 10**9
+"""Transforms older than this are forgotten."""
+
+# What recordings before ROS 2 Iron leave out, and rosbags does not know.
+VISION_DEFINITIONS = {
+    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score',
+    'vision_msgs/msg/ObjectHypothesisWithPose': (
+        'vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose'
+    ),
+    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size',
+    'vision_msgs/msg/Detection3D': (
+        'std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n'
+        'vision_msgs/BoundingBox3D bbox\nstring id'
+    ),
+    'vision_msgs/msg/Detection3DArray': (
+        'std_msgs/Header header\nvision_msgs/Detection3D[] detections'
+    ),
+}
+
+
+class Record(NamedTuple):
+    """One message as it was recorded, still encoded."""
+
+    connection: Connection
+    received_ns: int
+    data: bytes
+
+
+class Recording:
+    """
+    One or several recordings of one drive, merged by receive time.
+
+    Receive time only orders the stream and cuts out the part between `start` and `end`; stamps
+    are those of the messages' headers. Use as a context manager.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        MCAP files, rosbag2 folders, .db3 files, or ROS 1 bags.
+    points, boxes, odometry : str, optional
+        Topics; found by type where only one fits.
+    start, end : float, optional
+        Part to read, from the beginning of the recording [s].
+
+    Raises
+    ------
+    RecordingError
+        On entering, if something cannot be read or found; the message lists what there is.
+
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        points: str | None = None,
+        boxes: str | None = None,
+        odometry: str | None = None,
+        start: float | None = None,
+        end: float | None = None,
+    ) -> None:
+        self._paths = [Path(path) for path in paths]
+        self._asked = {'points': points, 'boxes': boxes, 'odometry': odometry}
+        self._start, self._end = start or 0.0, end
+
+    def __enter__(self) -> Recording:
+        """Open all files and find the topics."""
+        with _readable(self):
+            self._reader = AnyReader(_files(self._paths), default_typestore=_stock_types())
+            self._reader.open()
+        try:
+            self._find()
+        except BaseException:
+            self._reader.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close all files."""
+        self._reader.close()
+
+    def __str__(self) -> str:
+        """Return the paths."""
+        return ', '.join(map(str, self._paths))
+
+    def records(self, tree: TransformTree) -> Iterator[Record]:
+        """
+        Yield clouds and box arrays in the order they were received.
+
+        `tree` then holds what the recording says about the `LOOKAHEAD_NS` after each, and
+        forgets what is older than `MEMORY_NS`: memory does not grow with the recording.
+
+        """
+        data = self._connections({self.points_topic, self.boxes_topic})
+        motion_topics = self._motion_topics()
+        motion = self._connections(motion_topics)
+        held: deque[Record] = deque()
+        begin, end = self.start_ns - LOOKAHEAD_NS, self.end_ns + LOOKAHEAD_NS
+        for record in self._read([*data, *motion], begin, end):
+            if record.connection.topic in motion_topics:
+                self._add_motion(tree, record)
+            elif self.start_ns <= record.received_ns < self.end_ns:
+                held.append(record)
+            while held and held[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
+                yield held.popleft()
+            tree.forget(record.received_ns - MEMORY_NS)
+        yield from held
+
+    def decode(self, record: Record) -> Sweep | BoxArray:
+        """
+        Return the sweep or the boxes of a record, in the frame they were recorded in.
+
+        Raises
+        ------
+        UnsupportedMessage
+            If its layout is none that can be read.
+        RecordingError
+            If its bytes do not follow the definition in the recording.
+
+        """
+        topic = record.connection.topic
+        try:
+            if topic == self.points_topic:
+                return pointcloud.from_msg(self._message(record))
+            return self._adapter.from_msg(self._message(record))
+        except (UnsupportedMessage, AttributeError) as error:
+            raise UnsupportedMessage(f'topic {topic!r}: {error}') from None
+
+    def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
+        """
+        Find out where the motion of the sensor comes from, and return the fixed frame.
+
+        TF where it connects the frames, else odometry. Without a wish it is the topmost frame
+        the cloud's frame moves in.
+
+        Parameters
+        ----------
+        tree : TransformTree
+            Empty; afterwards it holds the static transforms, and the first ones over time.
+        fixed_frame : str, optional
+            The frame wished for.
+
+        Raises
+        ------
+        RecordingError
+            If no motion is known, or the frame wished for is not connected to the cloud's.
+
+        """
+        frame = self.sensor_frame()
+        for record in self._read(self._connections(self._static_topics())):
+            self._add_motion(tree, record)
+        if fixed_frame is not None and fixed_frame.lstrip('/') == frame:
+            return frame
+        found = self._scout(tree, frame, fixed_frame)
+        if found is None or fixed_frame is None:
+            # Odometry is needed where TF does not lead to a fixed frame, or where the root of
+            # TF is the very frame that odometry moves.
+            relevant = {}
+            for topic in self._candidates((ODOMETRY_TYPE,)):
+                message = self._first(topic)
+                child = message.child_frame_id.lstrip('/')
+                if child == found or (found is None and tree.connects(child, frame)):
+                    relevant[topic] = message
+            if len(relevant) > 1:
+                raise RecordingError(
+                    f'{self}: TF alone does not lead to a fixed frame, and several topics have '
+                    f'odometry: {", ".join(relevant)}; choose one with --odometry'
+                )
+            for topic, message in relevant.items():
+                self.odometry_topic = topic
+                tree.add_odometry(message)
+            found = _fixed_frame(tree, frame, fixed_frame)
+        if found is None and fixed_frame is not None:
+            raise RecordingError(
+                f'{self}: no transforms connect the fixed frame {fixed_frame!r} with the frame '
+                f'of the clouds {frame!r}; known: {tree}'
+            )
+        if found is None:
+            raise RecordingError(
+                f'{self}: neither /tf nor odometry tells how the frame of the clouds {frame!r} '
+                f'moves (known: {tree}); if it does not move, say so with --fixed-frame {frame}'
+            )
+        return found
+
+    def sensor_frame(self) -> str:
+        """Return the frame of the first point cloud."""
+        return str(self._first(self.points_topic).header.frame_id).lstrip('/')
+
+    def _first(self, topic: str) -> Any:
+        """Return the first message on a topic, in the part that is read."""
+        connections = self._connections({topic})
+        for record in self._read(connections, self.start_ns, self.end_ns):
+            return self._message(record)
+        raise RecordingError(f'{self}: no messages on {topic!r} in the part asked for')
+
+    def _find(self) -> None:
+        """Settle topics and times, and complete the message definitions."""
+        self._topics = {
+            c.topic: c.msgtype for c in sorted(self._reader.connections, key=lambda c: c.topic)
+        }
+        self._filled = {c.topic for c in self._reader.connections if c.msgcount}
+        self.points_topic = self._topic('points', 'point clouds', (POINTS_TYPE,))
+        self.boxes_topic = self._topic('boxes', 'boxes', tuple(ADAPTERS))
+        self.odometry_topic: str | None = None
+        if self._asked['odometry']:
+            self.odometry_topic = self._topic('odometry', 'odometry', (ODOMETRY_TYPE,))
+        self._adapter = adapter_for(self._topics[self.boxes_topic])
+
+        known = self._reader.typestore.fielddefs
+        if not known.keys() >= set(self._topics.values()):
+            stock = _stock_types().fielddefs
+            self._reader.typestore.register({k: v for k, v in stock.items() if k not in known})
+
+        begin, self.end_ns = self._reader.start_time, self._reader.end_time
+        if self._end is not None:
+            self.end_ns = min(self.end_ns, begin + round(self._end * 1e9))
+        self.start_ns = begin + round(self._start * 1e9)
+        if self.start_ns >= self.end_ns:
+            end = '' if self._end is None else f'{self._end:g}'
+            raise RecordingError(
+                f'start and end: expected a part of the {self._reader.duration * 1e-9:.1f} s of '
+                f'{self}, got {self._start:g} to {end or "the end"}'
+            )
+
+    def _topic(self, role: str, what: str, types: tuple[str, ...]) -> str:
+        """Return the topic asked for, or the only one of these types."""
+        asked = self._asked[role]
+        there = ', '.join(f'{t} ({kind})' for t, kind in self._topics.items()) or 'no topics'
+        candidates = self._candidates(types)
+        if asked is not None:
+            if asked not in self._topics:
+                fitting = ', '.join(candidates) or 'none'
+                raise RecordingError(f'{self}: no topic {asked!r}; topics with {what}: {fitting}')
+            if self._topics[asked] not in types:
+                raise UnsupportedMessage(
+                    f'topic {asked!r}: {what} expected as one of {", ".join(types)}, got '
+                    f'{self._topics[asked]}'
+                )
+            return asked
+        if not candidates:
+            raise RecordingError(
+                f'{self}: no {what}, expected a topic of type {" or ".join(types)}; there: {there}'
+            )
+        if len(candidates) > 1:
+            raise RecordingError(
+                f'{self}: several topics have {what}: {", ".join(candidates)}; choose one with '
+                f'--{role}'
+            )
+        return candidates[0]
+
+    def _candidates(self, types: Collection[str]) -> list[str]:
+        """Return the topics of these types that have messages, or the odometry asked for."""
+        if types == (ODOMETRY_TYPE,) and self.odometry_topic:
+            return [self.odometry_topic]
+        return [t for t, kind in self._topics.items() if kind in types and t in self._filled]
+
+    def _scout(self, tree: TransformTree, frame: str, wish: str | None) -> str | None:
+        """Feed `tree` from TF until that leads to the fixed frame, and a little longer."""
+        found = _fixed_frame(tree, frame, wish)
+        begin = self.start_ns - LOOKAHEAD_NS
+        until = self.end_ns
+        if self._candidates((ODOMETRY_TYPE,)):
+            until = min(until, begin + PATIENCE_NS)
+        for record in self._read(self._connections(self._tf_topics()), begin):
+            if record.received_ns > until:
+                break
+            self._add_motion(tree, record)
+            was_found, found = found, _fixed_frame(tree, frame, wish)
+            if was_found is None and found is not None:
+                until = record.received_ns + LOOKAHEAD_NS
+        return found
+
+    def _tf_topics(self) -> set[str]:
+        return {t for t, kind in self._topics.items() if kind in TF_TYPES}
+
+    def _static_topics(self) -> set[str]:
+        return {topic for topic in self._tf_topics() if topic.endswith('tf_static')}
+
+    def _motion_topics(self) -> set[str]:
+        return self._tf_topics() | ({self.odometry_topic} if self.odometry_topic else set())
+
+    def _connections(self, topics: Collection[str]) -> list[Connection]:
+        return [c for c in self._reader.connections if c.topic in topics]
+
+    def _read(
+        self,
+        connections: list[Connection],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[Record]:
+        if connections:  # for the reader, none would mean all
+            with _readable(self):
+                for item in self._reader.messages(connections, start_ns, end_ns):
+                    yield Record(*item)
+
+    def _message(self, record: Record) -> Any:
+        connection = record.connection
+        try:
+            return self._reader.deserialize(record.data, connection.msgtype)
+        except Exception as error:  # the bytes are foreign, and so are the errors they cause
+            raise RecordingError(
+                f'{self}: a message on {connection.topic!r} is not a {connection.msgtype} as '
+                f'defined there: {_text(error)}'
+            ) from None
+
+    def _add_motion(self, tree: TransformTree, record: Record) -> None:
+        message = self._message(record)
+        if record.connection.msgtype == ODOMETRY_TYPE:
+            tree.add_odometry(message)
+        else:
+            is_static = record.connection.topic in self._static_topics()
+            tree.add_transforms(message.transforms, is_static)
+
+
+def _fixed_frame(tree: TransformTree, frame: str, wish: str | None) -> str | None:
+    """Return the fixed frame if `tree` connects `frame` with one."""
+    if wish is None:
+        return tree.fixed_frame(frame)
+    return wish.lstrip('/') if tree.connects(wish, frame) else None
+
+
+def _files(paths: Sequence[Path]) -> list[Path]:
+    """Return what the reader can open; folders without metadata stand for the files in them."""
+    files = []
+    for path in paths:
+        if not path.exists():
+            raise RecordingError(f'no such recording: {str(path)!r}')
+        if path.is_dir() and not (path / 'metadata.yaml').exists():
+            inner = sorted(f for f in path.iterdir() if f.suffix in ('.mcap', '.db3', '.bag'))
+            if not inner:
+                raise RecordingError(
+                    f'{str(path)!r} is no recording: expected metadata.yaml, .mcap, .db3 or .bag '
+                    f'files in it'
+                )
+            files += inner
+        else:
+            files.append(path)
+    if len({path.suffix == '.bag' for path in files}) > 1:
+        raise RecordingError(
+            'recordings of ROS 1 and ROS 2 cannot be merged; relabel them one by one'
+        )
+    return files
+
+
+def _stock_types() -> Typestore:
+    """Return the definitions used where a recording has none (before ROS 2 Iron)."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = {}
+    for name, text in VISION_DEFINITIONS.items():
+        types.update(get_types_from_msg(text, name))
+    store.register(types)
+    return store
+
+
+@contextmanager
+def _readable(what: object) -> Iterator[None]:
+    """Turn whatever a reader throws at foreign or broken bytes into a RecordingError."""
+    try:
+        yield
+    except BoxregError:
+        raise
+    except Exception as error:
+        raise RecordingError(
+            f'{what}: cannot be read as MCAP, rosbag2 or ROS 1 bag: {_text(error)}'
+        ) from None
+
+
+def _text(error: Exception) -> str:
+    """Return an error in one line."""
+    return ' '.join(str(error).split()) or type(error).__name__

@@ -1,0 +1,484 @@
+"""
+`boxreg relabel`: recordings in, refined boxes as label files out.
+
+Every box of the recording is written exactly once: refined, or as it was with the reason.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from bisect import insort
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+import hashlib
+from importlib.metadata import version
+import json
+import os
+from pathlib import Path
+import platform
+import shutil
+import sys
+import time
+from typing import Any, TypeVar
+
+from boxreg_ros import __version__
+from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
+from boxreg_ros.labels import LabelWriter, writer_for, WRITERS
+from boxreg_ros.recording import Recording
+from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, RefinedBoxes, Sweep
+from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+import numpy as np
+import yaml
+
+SUMMARY = 'summary.json'
+BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
+
+Progress = Callable[[float, float], None]
+_T = TypeVar('_T')
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """
+    What to relabel, and how.
+
+    Attributes
+    ----------
+    recordings : tuple of Path
+        Files or folders of one drive, merged by time.
+    points, boxes, odometry : str or None
+        Topics; None where the type tells.
+    fixed_frame : str or None
+        Frame to refine in; None for the topmost the cloud's frame moves in.
+    formats : tuple of str
+        Label formats beside ``csv``, which is always written.
+    start, end : float or None
+        Part of the recording, from its beginning [s].
+    config : Config
+        Settings of the core.
+
+    """
+
+    recordings: tuple[Path, ...]
+    points: str | None = None
+    boxes: str | None = None
+    odometry: str | None = None
+    fixed_frame: str | None = None
+    formats: tuple[str, ...] = ('csv', 'openlabel')
+    start: float | None = None
+    end: float | None = None
+    config: Config = field(default_factory=Config)
+
+    def __post_init__(self) -> None:
+        """Refuse formats that do not exist before any work is done."""
+        for name in self.formats:
+            if name not in WRITERS:
+                raise ConfigError(f'format {name!r}: expected one of {", ".join(WRITERS)}')
+
+    def open(self) -> Recording:
+        """Return the recording asked for."""
+        return Recording(
+            self.recordings, self.points, self.boxes, self.odometry, self.start, self.end
+        )
+
+    def fingerprint(self) -> str:
+        """Return a digest of the request and of the files it reads, by size and time."""
+        files = [
+            (str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns)
+            for path in self.recordings
+            for file in sorted([path] if path.is_file() else path.rglob('*'))
+        ]
+        return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
+
+
+def relabel(request: Request, out: Path, progress: Progress | None = None) -> dict[str, Any]:
+    """
+    Refine all boxes of a recording and write ``boxes.csv``, ``summary.json`` and the rest.
+
+    Parameters
+    ----------
+    request : Request
+        What to read, and how.
+    out : Path
+        Folder of results. It appears whole or not at all; results of an earlier run are
+        replaced.
+    progress : callable, optional
+        Called with the part of the recording that is done and all of it [s].
+
+    Returns
+    -------
+    summary : dict
+        What ``summary.json`` holds.
+
+    Raises
+    ------
+    RecordingError
+        If the recording lacks something, or `out` is not ours to replace.
+
+    """
+    clock = _Clock()
+    tree = TransformTree()
+    registrar = BoxRegistrar(request.config)
+    counts: Counter[str] = Counter()
+    names = dict.fromkeys(('csv', *request.formats))
+    with request.open() as recording, whole_folder(out) as folder:
+        with clock('read'):
+            fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
+        writers = [writer_for(name, folder) for name in names]
+        with closing(_Sink(writers, request.config.estimate == 'early', clock)) as sink:
+            for record in clock.each('read', recording.records(tree)):
+                if progress is not None:
+                    done = record.received_ns - recording.start_ns
+                    progress(done * 1e-9, (recording.end_ns - recording.start_ns) * 1e-9)
+                with clock('decode'):
+                    item = recording.decode(record)
+                is_sweep = isinstance(item, Sweep)
+                counts['sweeps' if is_sweep else 'box_arrays'] += 1
+                with clock('transform'):
+                    moved = to_fixed_frame(item, tree, fixed_frame)
+                if isinstance(moved, Sweep):
+                    with clock('registrar'):
+                        ready = registrar.add_sweep(moved)
+                elif moved is not None:
+                    sink.expect(moved)
+                    with clock('registrar'):
+                        ready = registrar.add_boxes(moved)
+                elif isinstance(item, BoxArray):
+                    sink.settle(_kept(item, 'no_transform'))
+                    continue
+                else:
+                    counts['sweep_without_transform'] += 1
+                    continue
+                sink.take(ready)
+            with clock('registrar'):
+                ready = registrar.flush()
+            sink.take(ready)
+        counts.update({k: n for k, n in registrar.counts.items() if '_without_' in k})
+        summary = _summary(request, recording, fixed_frame, counts, sink)
+        summary['seconds'] = clock.seconds()
+        (folder / 'config.yaml').write_text(
+            yaml.safe_dump(request.config.to_dict(), sort_keys=False), encoding='utf-8'
+        )
+        (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+    return summary
+
+
+def input_boxes(path: Path) -> list[BoxArray]:
+    """
+    Return the boxes of a recording as they are, in the fixed frame `relabel` would choose.
+
+    Box arrays without a transform to that frame are left out.
+
+    """
+    tree = TransformTree()
+    with Recording([path]) as recording:
+        fixed_frame = recording.choose_fixed_frame(tree)
+        arrays = []
+        for record in recording.records(tree):
+            if record.connection.topic == recording.boxes_topic:
+                moved = to_fixed_frame(recording.decode(record), tree, fixed_frame)
+                arrays += [moved] if isinstance(moved, BoxArray) else []
+    return arrays
+
+
+def to_fixed_frame(
+    item: Sweep | BoxArray, tree: TransformTree, fixed_frame: str
+) -> Sweep | BoxArray | None:
+    """Return a sweep or boxes in the fixed frame; None where no transform is known."""
+    try:
+        T_fixed_item = tree.lookup(fixed_frame, item.frame_id, item.stamp_ns)
+    except TransformUnavailable:
+        return None
+    if isinstance(item, Sweep):
+        return sweep_to_frame(item, T_fixed_item, fixed_frame)
+    return boxes_to_frame(item, T_fixed_item, fixed_frame)
+
+
+def earlier_summary(out: Path) -> dict[str, Any] | None:
+    """Return the summary of an earlier run in `out`; None if there is none."""
+    try:
+        summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return None
+    return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """
+    Yield a folder to fill that becomes `out` on success, and vanishes otherwise.
+
+    Raises
+    ------
+    RecordingError
+        If `out` exists and is not the result of an earlier run.
+
+    """
+    if out.exists() and earlier_summary(out) is None and not _is_empty(out):
+        raise RecordingError(
+            f'output {str(out)!r}: expected a new folder or an earlier result, got something '
+            f'else; choose another with -o'
+        )
+    out = out.resolve()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(f'.{out.name}.{os.getpid()}.partial')
+    earlier = out.with_name(f'.{out.name}.{os.getpid()}.earlier')
+    partial.mkdir()
+    try:
+        yield partial
+        if out.exists():
+            os.replace(out, earlier)
+        os.replace(partial, out)
+    except BaseException:
+        if earlier.exists():
+            os.replace(earlier, out)
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    shutil.rmtree(earlier, ignore_errors=True)
+
+
+class _Clock:
+    """Adds up what each stage takes [s]."""
+
+    def __init__(self) -> None:
+        self._begun = time.perf_counter()
+        self._seconds: Counter[str] = Counter()
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        begun = time.perf_counter()
+        yield
+        self._seconds[stage] += time.perf_counter() - begun  # type: ignore[assignment]
+
+    def each(self, stage: str, items: Iterator[_T]) -> Iterator[_T]:
+        """Yield `items`, adding up what it takes to get them."""
+        end = object()
+        while True:
+            with self(stage):
+                item = next(items, end)
+            if item is end:
+                return
+            yield item  # type: ignore[misc]
+
+    def seconds(self) -> dict[str, float]:
+        total = time.perf_counter() - self._begun
+        return {**{k: round(v, 4) for k, v in self._seconds.items()}, 'total': round(total, 4)}
+
+
+@dataclass(eq=False, slots=True)
+class _Slot:
+    """The place of one box array in the order of the output."""
+
+    stamp_ns: int
+    count: int
+    result: RefinedBoxes | None = None
+
+
+class _Sink:
+    """Brings results into the order of stamps, each box array once, and has them written."""
+
+    def __init__(self, writers: list[LabelWriter], is_early: bool, clock: _Clock) -> None:
+        self._writers = writers
+        self._is_early = is_early
+        self._clock = clock
+        self._slots: list[_Slot] = []
+        self._unsettled: dict[int, deque[_Slot]] = {}
+        self.boxes_in = 0
+        self.boxes_out = 0
+        self.status: Counter[str] = Counter()
+        self.reasons: Counter[str] = Counter()
+
+    def expect(self, boxes: BoxArray) -> None:
+        """Keep a place for a box array that the registrar is about to get."""
+        slot = self._slot(boxes)
+        self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
+
+    def settle(self, refined: RefinedBoxes) -> None:
+        """Take the result of a box array that the registrar never gets."""
+        self._slot(refined.boxes).result = refined
+        self._write()
+
+    def take(self, ready: Sequence[RefinedBoxes]) -> None:
+        """Take what the registrar returns: per box array one final result, or an early one."""
+        for refined in ready:
+            slots = self._unsettled[refined.boxes.stamp_ns]
+            if refined.is_final:
+                slot = slots.popleft()
+                if not slots:
+                    del self._unsettled[refined.boxes.stamp_ns]
+            elif self._is_early:
+                slot = next(slot for slot in slots if slot.result is None)
+            else:
+                continue
+            slot.result = slot.result or refined
+        self._write()
+
+    def close(self) -> None:
+        """Close the files."""
+        with self._clock('write'):
+            for writer in self._writers:
+                writer.close()
+
+    def missing(self) -> int:
+        """Return how many boxes have gone in and not come out."""
+        return self.boxes_in - sum(
+            self.status[name] for name in self.status if name != INTERPOLATED
+        )
+
+    def _slot(self, boxes: BoxArray) -> _Slot:
+        slot = _Slot(boxes.stamp_ns, len(boxes.track_ids))
+        insort(self._slots, slot, key=lambda slot: slot.stamp_ns)
+        self.boxes_in += slot.count
+        return slot
+
+    def _write(self) -> None:
+        """Write what nothing earlier is missing for."""
+        while self._slots and (refined := self._slots[0].result) is not None:
+            del self._slots[0]
+            self.boxes_out += len(refined.status)
+            self.status.update(refined.status)
+            self.reasons.update(filter(None, refined.reasons))
+            with self._clock('write'):
+                for writer in self._writers:
+                    writer.write(refined)
+
+
+def _kept(boxes: BoxArray, reason: str) -> RefinedBoxes:
+    """Return boxes as they are, with the reason why."""
+    n = len(boxes.track_ids)
+    unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
+    return RefinedBoxes(boxes, (KEPT,) * n, (reason,) * n, np.zeros(n, np.int64), unknown)
+
+
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and not any(folder.iterdir())
+
+
+def _summary(
+    request: Request, recording: Recording, fixed_frame: str, counts: Counter[str], sink: _Sink
+) -> dict[str, Any]:
+    """Return all of summary.json but the timings."""
+    if sink.missing():
+        raise RuntimeError(f'{sink.missing()} of {sink.boxes_in} boxes did not come back')
+    dropped = {name: n for name, n in sorted(counts.items()) if '_without_' in name}
+    return {
+        'recordings': [str(path) for path in request.recordings],
+        'topics': {
+            'points': recording.points_topic,
+            'boxes': recording.boxes_topic,
+            'odometry': recording.odometry_topic,
+        },
+        'fixed_frame': fixed_frame,
+        'estimate': request.config.estimate,
+        'sweeps': counts['sweeps'],
+        'box_arrays': counts['box_arrays'],
+        'boxes_in': sink.boxes_in,
+        'boxes_out': sink.boxes_out,
+        'status': dict(sink.status),
+        'reasons': dict(sink.reasons.most_common()),
+        'dropped': dropped,
+        'versions': {'boxreg_ros': __version__, 'python': platform.python_version()}
+        | {name: version(name) for name in ('torch', 'numpy', 'scipy', 'rosbags')},
+        'fingerprint': request.fingerprint(),
+    }
+
+
+def closing_line(summary: dict[str, Any], out: Path) -> str:
+    """Return what was done, in one line."""
+    reasons = ', '.join(f'{name} {count:,}' for name, count in summary['reasons'].items())
+    status = summary['status']
+    kept = f'{status.get(KEPT, 0):,} kept' + (f' ({reasons})' if reasons else '')
+    return (
+        f'{out}: {summary["boxes_in"]:,} boxes in, {status.get(REFINED, 0):,} refined, {kept} '
+        f'from {summary["sweeps"]:,} sweeps in {summary["seconds"]["total"]:.1f} s, '
+        f'fixed frame {summary["fixed_frame"]}'
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `boxreg relabel`."""
+    parser.add_argument(
+        'recordings', nargs='+', type=Path, metavar='RECORDING',
+        help='MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; several are merged by time',
+    )  # fmt: skip
+    parser.add_argument(
+        '-o', '--out', type=Path, required=True, help='folder of results; appears whole or not'
+    )
+    parser.add_argument('--points', metavar='TOPIC', help='point clouds (default: found by type)')
+    parser.add_argument('--boxes', metavar='TOPIC', help='boxes (default: found by type)')
+    parser.add_argument(
+        '--fixed-frame', metavar='FRAME',
+        help='frame to refine in (default: the topmost the frame of the clouds moves in)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
+    )
+    parser.add_argument('--config', type=Path, metavar='FILE', help='settings as YAML')
+    parser.add_argument(
+        '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
+        help='one setting, as in solver.rounds=2; wins over --config',
+    )  # fmt: skip
+    parser.add_argument(
+        '--formats', default='csv,openlabel', type=lambda text: tuple(text.split(',')),
+        help=f'label formats, of {", ".join(WRITERS)}; csv is always there (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument('--start', type=float, metavar='S', help='from here [s]')
+    parser.add_argument('--end', type=float, metavar='S', help='to here [s]')
+    parser.add_argument(
+        '--resume', action='store_true',
+        help='do nothing if OUT holds the results of the same request, files and settings',
+    )  # fmt: skip
+    parser.add_argument(
+        '--workers', type=int, metavar='N', help='threads of the solver (default: all cores)'
+    )
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """Return name and value of ``KEY=VALUE``, the value read as YAML."""
+    name, equals, value = text.partition('=')
+    if not name or not equals:
+        raise argparse.ArgumentTypeError(f'expected KEY=VALUE, got {text!r}')
+    try:
+        return name, yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise argparse.ArgumentTypeError(f'{name}: not a YAML value: {value!r}') from None
+
+
+def config_from(args: argparse.Namespace) -> Config:
+    """Return the settings of ``--config`` and ``--set``."""
+    config = Config() if args.config is None else Config.from_yaml(args.config)
+    return config.updated(dict(args.set))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Relabel as the command line says; print one closing line."""
+    if args.workers is not None:
+        if args.workers < 1:
+            raise ConfigError(f'--workers: expected 1 or more, got {args.workers}')
+        import torch
+
+        torch.set_num_threads(args.workers)
+    request = Request(
+        tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
+        args.formats, args.start, args.end, config_from(args),
+    )  # fmt: skip
+    earlier = earlier_summary(args.out)
+    if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():
+        print(f'{args.out}: already there, made from the same recording and settings')
+        return 0
+    from tqdm import tqdm
+
+    with tqdm(unit='s', disable=not sys.stderr.isatty(), leave=False, bar_format=BAR) as bar:
+
+        def progress(done: float, total: float) -> None:
+            bar.total = total
+            bar.update(max(0.0, done - bar.n))
+
+        summary = relabel(request, args.out, progress)
+    print(closing_line(summary, args.out))
+    return 0
