@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+import shlex
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import (
@@ -33,8 +34,6 @@ LOOKAHEAD_NS = 2 * 10**9
 """Transforms are read this far ahead of the clouds and boxes that need them."""
 PATIENCE_NS = 10 * 10**9
 """So long is TF given to connect the frames before odometry is taken."""
-MEMORY_NS = 30 * 10**9
-"""Transforms older than this are forgotten."""
 
 # What recordings before ROS 2 Iron leave out, and rosbags does not know.
 VISION_DEFINITIONS = {
@@ -96,6 +95,7 @@ class Recording:
         self._paths = [Path(path) for path in paths]
         self._asked = {'points': points, 'boxes': boxes, 'odometry': odometry}
         self._start, self._end = start or 0.0, end
+        self.odometry_topic: str | None = None
 
     def __enter__(self) -> Recording:
         """Open all files and find the topics."""
@@ -121,8 +121,8 @@ class Recording:
         """
         Yield clouds and box arrays in the order they were received.
 
-        `tree` then holds what the recording says about the `LOOKAHEAD_NS` after each, and
-        forgets what is older than `MEMORY_NS`: memory does not grow with the recording.
+        `tree` then holds the transforms received up to `LOOKAHEAD_NS` after each: a window
+        that moves along, so that memory does not grow with the recording.
 
         """
         data = self._connections({self.points_topic, self.boxes_topic})
@@ -137,7 +137,6 @@ class Recording:
                 held.append(record)
             while held and held[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
                 yield held.popleft()
-            tree.forget(record.received_ns - MEMORY_NS)
         yield from held
 
     def decode(self, record: Record) -> Sweep | BoxArray:
@@ -212,7 +211,8 @@ class Recording:
         if found is None:
             raise RecordingError(
                 f'{self}: neither /tf nor odometry tells how the frame of the clouds {frame!r} '
-                f'moves (known: {tree}); if it does not move, say so with --fixed-frame {frame}'
+                f'moves (known: {tree}); if it does not move, say so with '
+                f'--fixed-frame {shlex.quote(frame)}'
             )
         return found
 
@@ -235,7 +235,6 @@ class Recording:
         self._filled = {c.topic for c in self._reader.connections if c.msgcount}
         self.points_topic = self._topic('points', 'point clouds', (POINTS_TYPE,))
         self.boxes_topic = self._topic('boxes', 'boxes', tuple(ADAPTERS))
-        self.odometry_topic: str | None = None
         if self._asked['odometry']:
             self.odometry_topic = self._topic('odometry', 'odometry', (ODOMETRY_TYPE,))
         self._adapter = adapter_for(self._topics[self.boxes_topic])
@@ -395,7 +394,8 @@ def _readable(what: object) -> Iterator[None]:
         raise
     except Exception as error:
         raise RecordingError(
-            f'{what}: cannot be read as MCAP, rosbag2 or ROS 1 bag: {_text(error)}'
+            f'{what}: {_text(error)}; expected a whole MCAP file, rosbag2 folder, .db3 file or '
+            f'ROS 1 bag'
         ) from None
 
 

@@ -11,7 +11,7 @@ import argparse
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 import hashlib
 from importlib.metadata import version
@@ -23,6 +23,7 @@ import shutil
 import sys
 import time
 from typing import Any, TypeVar
+from uuid import uuid4
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
@@ -125,6 +126,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     tree = TransformTree()
     registrar = BoxRegistrar(request.config)
     counts: Counter[str] = Counter()
+    trouble = ''
     names = dict.fromkeys(('csv', *request.formats))
     with request.open() as recording, whole_folder(out) as folder:
         with clock('read'):
@@ -137,29 +139,26 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                     progress(done * 1e-9, (recording.end_ns - recording.start_ns) * 1e-9)
                 with clock('decode'):
                     item = recording.decode(record)
-                is_sweep = isinstance(item, Sweep)
-                counts['sweeps' if is_sweep else 'box_arrays'] += 1
                 with clock('transform'):
-                    moved = to_fixed_frame(item, tree, fixed_frame)
-                if isinstance(moved, Sweep):
-                    with clock('registrar'):
-                        ready = registrar.add_sweep(moved)
-                elif moved is not None:
-                    sink.expect(moved)
-                    with clock('registrar'):
-                        ready = registrar.add_boxes(moved)
-                elif isinstance(item, BoxArray):
-                    sink.settle(_kept(item, 'no_transform'))
-                    continue
+                    try:
+                        moved = to_fixed_frame(item, tree, fixed_frame)
+                    except TransformUnavailable as error:
+                        moved, trouble = None, trouble or str(error)
+                if isinstance(item, Sweep):
+                    counts['sweeps'] += 1
+                    counts['sweep_without_transform'] += moved is None
                 else:
-                    counts['sweep_without_transform'] += 1
-                    continue
+                    counts['box_arrays'] += 1
+                    sink.expect(item, 'no_transform' if moved is None else '')
+                with clock('registrar'):
+                    ready = _add(registrar, moved)
                 sink.take(ready)
             with clock('registrar'):
                 ready = registrar.flush()
             sink.take(ready)
         counts.update({k: n for k, n in registrar.counts.items() if '_without_' in k})
         summary = _summary(request, recording, fixed_frame, counts, sink)
+        summary['first_missing_transform'] = trouble
         summary['seconds'] = clock.seconds()
         (folder / 'config.yaml').write_text(
             yaml.safe_dump(request.config.to_dict(), sort_keys=False), encoding='utf-8'
@@ -181,19 +180,24 @@ def input_boxes(path: Path) -> list[BoxArray]:
         arrays = []
         for record in recording.records(tree):
             if record.connection.topic == recording.boxes_topic:
-                moved = to_fixed_frame(recording.decode(record), tree, fixed_frame)
-                arrays += [moved] if isinstance(moved, BoxArray) else []
-    return arrays
+                with suppress(TransformUnavailable):
+                    arrays.append(to_fixed_frame(recording.decode(record), tree, fixed_frame))
+    return [array for array in arrays if isinstance(array, BoxArray)]
 
 
 def to_fixed_frame(
     item: Sweep | BoxArray, tree: TransformTree, fixed_frame: str
-) -> Sweep | BoxArray | None:
-    """Return a sweep or boxes in the fixed frame; None where no transform is known."""
-    try:
-        T_fixed_item = tree.lookup(fixed_frame, item.frame_id, item.stamp_ns)
-    except TransformUnavailable:
-        return None
+) -> Sweep | BoxArray:
+    """
+    Return a sweep or boxes in the fixed frame.
+
+    Raises
+    ------
+    TransformUnavailable
+        If none is known at its stamp.
+
+    """
+    T_fixed_item = tree.lookup(fixed_frame, item.frame_id, item.stamp_ns)
     if isinstance(item, Sweep):
         return sweep_to_frame(item, T_fixed_item, fixed_frame)
     return boxes_to_frame(item, T_fixed_item, fixed_frame)
@@ -226,8 +230,8 @@ def whole_folder(out: Path) -> Iterator[Path]:
         )
     out = out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f'.{out.name}.{os.getpid()}.partial')
-    earlier = out.with_name(f'.{out.name}.{os.getpid()}.earlier')
+    unique = f'.{out.name}.{uuid4().hex[:8]}'
+    partial, earlier = out.with_name(f'{unique}.partial'), out.with_name(f'{unique}.earlier')
     partial.mkdir()
     try:
         yield partial
@@ -275,7 +279,6 @@ class _Slot:
     """The place of one box array in the order of the output."""
 
     stamp_ns: int
-    count: int
     result: RefinedBoxes | None = None
 
 
@@ -293,15 +296,21 @@ class _Sink:
         self.status: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
 
-    def expect(self, boxes: BoxArray) -> None:
-        """Keep a place for a box array that the registrar is about to get."""
-        slot = self._slot(boxes)
-        self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
-
-    def settle(self, refined: RefinedBoxes) -> None:
-        """Take the result of a box array that the registrar never gets."""
-        self._slot(refined.boxes).result = refined
-        self._write()
+    def expect(self, boxes: BoxArray, reason: str = '') -> None:
+        """Keep a place for a box array; with a reason, it is written there as it is."""
+        n = len(boxes.track_ids)
+        slot = _Slot(boxes.stamp_ns)
+        self.boxes_in += n
+        if not reason:
+            self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
+        elif not n:
+            return
+        else:
+            unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
+            slot.result = RefinedBoxes(
+                boxes, (KEPT,) * n, (reason,) * n, np.zeros(n, np.int64), unknown
+            )
+        insort(self._slots, slot, key=lambda slot: slot.stamp_ns)
 
     def take(self, ready: Sequence[RefinedBoxes]) -> None:
         """Take what the registrar returns: per box array one final result, or an early one."""
@@ -330,12 +339,6 @@ class _Sink:
             self.status[name] for name in self.status if name != INTERPOLATED
         )
 
-    def _slot(self, boxes: BoxArray) -> _Slot:
-        slot = _Slot(boxes.stamp_ns, len(boxes.track_ids))
-        insort(self._slots, slot, key=lambda slot: slot.stamp_ns)
-        self.boxes_in += slot.count
-        return slot
-
     def _write(self) -> None:
         """Write what nothing earlier is missing for."""
         while self._slots and (refined := self._slots[0].result) is not None:
@@ -348,11 +351,10 @@ class _Sink:
                     writer.write(refined)
 
 
-def _kept(boxes: BoxArray, reason: str) -> RefinedBoxes:
-    """Return boxes as they are, with the reason why."""
-    n = len(boxes.track_ids)
-    unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
-    return RefinedBoxes(boxes, (KEPT,) * n, (reason,) * n, np.zeros(n, np.int64), unknown)
+def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[RefinedBoxes]:
+    if item is None:
+        return []
+    return registrar.add_sweep(item) if isinstance(item, Sweep) else registrar.add_boxes(item)
 
 
 def _is_empty(folder: Path) -> bool:
@@ -473,7 +475,9 @@ def run(args: argparse.Namespace) -> int:
         return 0
     from tqdm import tqdm
 
-    with tqdm(unit='s', disable=not sys.stderr.isatty(), leave=False, bar_format=BAR) as bar:
+    with tqdm(
+        total=1.0, unit='s', disable=not sys.stderr.isatty(), leave=False, bar_format=BAR
+    ) as bar:
 
         def progress(done: float, total: float) -> None:
             bar.total = total

@@ -20,6 +20,8 @@ from scipy.spatial.transform import Rotation
 
 MAX_EXTRAPOLATION = 0.2
 """How far beyond the first and the last transform a motion is carried on [s]."""
+MEMORY = 30.0
+"""How long transforms are remembered [s]."""
 FLOAT32_RANGE = 4096.0
 """Nearer than this to its origin [m], a frame is resolved to 0.5 mm by float32."""
 
@@ -28,7 +30,7 @@ class TransformTree:
     """
     Frames and the transforms between them, looked up by integer stamp.
 
-    State: per pair of parent and child the samples added since the last `forget`, or one static
+    State: per pair of parent and child the samples of the last `memory` seconds, or one static
     transform. Not thread-safe.
 
     Parameters
@@ -37,11 +39,16 @@ class TransformTree:
         How far outside of the known samples a stamp may lie [s]; there, the last known motion is
         carried on. Between samples, however far apart, positions are interpolated linearly and
         orientations along the shortest turn, as tf2 does.
+    memory : float
+        How long a sample is kept after the newest of its pair [s].
 
     """
 
-    def __init__(self, max_extrapolation: float = MAX_EXTRAPOLATION) -> None:
+    def __init__(
+        self, max_extrapolation: float = MAX_EXTRAPOLATION, memory: float = MEMORY
+    ) -> None:
         self._max_extrapolation_ns = round(max_extrapolation * 1e9)
+        self._memory_ns = round(memory * 1e9)
         self.clear()
 
     def clear(self) -> None:
@@ -61,11 +68,6 @@ class TransformTree:
         pose = msg.pose.pose
         self._add(self._odometry, msg, pose.position, pose.orientation, False)
 
-    def forget(self, before_ns: int) -> None:
-        """Drop the samples that no stamp from `before_ns` on needs."""
-        for edge in self._edges():
-            edge.forget(before_ns)
-
     def lookup(self, target: str, source: str, stamp_ns: int) -> Floats:
         """
         Return ``T_target_source`` (4, 4) at a stamp.
@@ -82,20 +84,26 @@ class TransformTree:
             T_target_source = (T if is_upward else inverse(T)) @ T_target_source
         return T_target_source
 
-    def covers(self, target: str, source: str, stamp_ns: int) -> bool:
-        """Tell whether `lookup` would neither fail nor extrapolate."""
+    def connects(self, target: str, source: str) -> bool:
+        """Tell whether transforms lead from `source` to `target`, at whatever stamp."""
         try:
-            route = self._route(target, source)
+            self._route(target, source)
         except TransformUnavailable:
             return False
-        return all(edge.covers(stamp_ns) for edge, _ in route)
+        return True
+
+    def covers(self, target: str, source: str, stamp_ns: int) -> bool:
+        """Tell whether `lookup` would neither fail nor extrapolate."""
+        return self.connects(target, source) and all(
+            edge.covers(stamp_ns) for edge, _ in self._route(target, source)
+        )
 
     def fixed_frame(self, source: str) -> str | None:
         """
         Return the frame that `source` moves in: the topmost it hangs from.
 
-        That is the root of TF where TF knows a motion, else the header frame of the odometry
-        it is connected to; None if neither is there.
+        That is the root of TF where TF knows a motion, or the header frame of the odometry that
+        moves this root or is connected to `source` otherwise; None if nothing moves.
 
         """
         source = _name(source)
@@ -103,15 +111,18 @@ class TransformTree:
         while top in self._tf and self._tf[top] not in path:
             path.append(self._tf[top])
             top = path[-1].parent
+        if top in self._odometry:
+            return self._odometry[top].parent
         if any(not edge.is_static for edge in path):
             return top
         for edge in self._odometry.values():
-            try:
-                self._route(edge.parent, source)
-            except TransformUnavailable:
-                continue
-            return edge.parent
+            if self.connects(edge.parent, source):
+                return edge.parent
         return None
+
+    def __str__(self) -> str:
+        """Return all pairs of parent and child."""
+        return ', '.join(f'{e.parent} -> {e.child}' for e in self._edges()) or 'none'
 
     def frames(self) -> list[str]:
         """Return the names of all frames, sorted."""
@@ -125,7 +136,7 @@ class TransformTree:
             return  # connects nothing, as tf2 has it; a failing lookup lists what is connected
         edge = edges.get(child)
         if edge is None or edge.parent != parent:
-            edge = edges[child] = _Edge(parent, child)
+            edge = edges[child] = _Edge(parent, child, self._memory_ns)
             self._routes.clear()
         edge.is_static |= is_static
         stamp = item.header.stamp
@@ -143,9 +154,8 @@ class TransformTree:
             if route is None:
                 route = _connect(*key, self._edges())
             if route is None:
-                known = ', '.join(f'{e.parent} -> {e.child}' for e in self._edges()) or 'none'
                 raise TransformUnavailable(
-                    f'no transform from {source!r} to {target!r}; known: {known}; publish what '
+                    f'no transform from {source!r} to {target!r}; known: {self}; publish what '
                     f'is missing on /tf or as odometry, or choose another fixed frame'
                 )
             self._routes[key] = route
@@ -155,9 +165,10 @@ class TransformTree:
 class _Edge:
     """One parent and child: a static pose, or poses over time."""
 
-    def __init__(self, parent: str, child: str) -> None:
+    def __init__(self, parent: str, child: str, memory_ns: int) -> None:
         self.parent = parent
         self.child = child
+        self._memory_ns = memory_ns
         self.is_static = False
         self._stamps: list[int] = []
         self._poses: list[Floats] = []
@@ -172,12 +183,10 @@ class _Edge:
         else:
             first, end = bisect_left(self._stamps, stamp_ns), bisect_right(self._stamps, stamp_ns)
         self._stamps[first:end], self._poses[first:end] = [stamp_ns], [values]
-
-    def forget(self, before_ns: int) -> None:
-        # Two samples stay, whatever their age: a motion can only be carried on from two.
-        count = min(bisect_right(self._stamps, before_ns) - 1, len(self._stamps) - 2)
-        if count > 0 and not self.is_static:
-            del self._stamps[:count], self._poses[:count]
+        old = bisect_left(self._stamps, self._stamps[-1] - self._memory_ns)
+        # Two samples stay, whatever their age: a motion is carried on from two.
+        old = max(min(old, len(self._stamps) - 2), 0)
+        del self._stamps[:old], self._poses[:old]
 
     def covers(self, stamp_ns: int) -> bool:
         if self.is_static:
