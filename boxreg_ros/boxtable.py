@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.metrics import EXTENT
-from boxreg_ros.structures import PITCH, ROLL, YAW, BoxArray, Floats, Ints
+from boxreg_ros.structures import BoxArray, Floats, Ints, PITCH, ROLL, YAW
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 COLUMNS = (
     'stamp_ns', 'frame_id', 'track_id', 'class_name', 'score', 'x', 'y', 'z',

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import json
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+import json
+import math
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.metrics import EXTENT, iou_3d, iou_bev, pose_errors, wrap
-from boxreg_ros.structures import YAW, Floats, Ints
+from boxreg_ros.structures import Floats, Ints, YAW
+import numpy as np
+from numpy.typing import NDArray
 
 RECALLS = (0.5, 0.7, 0.8)
 POINT_BINS = (0, 10, 30, 100, 300, 1000)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
-
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.geometry import rotation_from_rpy
-from boxreg_ros.structures import HEIGHT, LENGTH, ROLL, Floats, checked
+from boxreg_ros.structures import checked, Floats, HEIGHT, LENGTH, ROLL
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+import torch
 
 PAIRS_AT_ONCE = 1000  # bounds the memory of one clipping step to about 100 MB
 EXTENT = slice(LENGTH, HEIGHT + 1)
