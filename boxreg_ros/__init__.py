@@ -1,4 +1,4 @@
-"""Register tracked 3D boxes to the point cloud stream itself; live on ROS 2 and over recordings."""
+"""Register tracked 3D boxes to the point clouds themselves: live on ROS 2, over recordings."""
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError

@@ -10,13 +10,12 @@ so doubling one halves the pull of that term.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, MISSING
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
 from boxreg_ros.errors import ConfigError
+import yaml
 
 
 def setting(
@@ -165,7 +164,8 @@ class Config:
             _check(item, value)
         if self.lag >= self.window:
             raise ConfigError(
-                f'lag: expected less than window ({self.window}), got {self.lag}; lower lag or raise window'
+                f'lag: expected less than window ({self.window}), got {self.lag}; '
+                'lower lag or raise window'
             )
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
@@ -289,7 +289,8 @@ def _arguments(default: Any, values: Mapping[str, Any], prefix: str) -> dict[str
         if is_dataclass(was) and value is not was:
             if not isinstance(value, Mapping):
                 raise ConfigError(f'{prefix}{name}: expected a group of settings, got {value!r}')
-            value = type(was)(**_arguments(was, value, f'{prefix}{name}.'))  # type: ignore[operator]
+            group: Any = type(was)
+            value = group(**_arguments(was, value, f'{prefix}{name}.'))
         elif not is_dataclass(was):
             value = _cast(f'{prefix}{name}', value, was)
         arguments[name] = value

@@ -17,7 +17,7 @@ def rotation_from_rpy(rpy: Tensor) -> Tensor:
         *(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
         *(-sp, cp * sr, cp * cr),
     ]
-    return torch.stack(entries, -1).unflatten(-1, (3, 3))
+    return torch.stack(entries, -1).reshape(*rpy.shape[:-1], 3, 3)
 
 
 def rotation_derivatives(rpy: Tensor) -> tuple[Tensor, Tensor]:

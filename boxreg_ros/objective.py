@@ -7,21 +7,20 @@ W, adding r' W r / 2; W holds the expected deviations and the robust weights of 
 
 """
 
-from dataclasses import dataclass, fields
 from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import NamedTuple
-
-import torch
-from torch import Tensor
 
 from boxreg_ros.geometry import (
     FACE_AXIS,
-    FACE_SIGN,
     face_distances,
+    FACE_SIGN,
     rotation_derivatives,
     rotation_from_rpy,
     wrap_angle,
 )
+import torch
+from torch import Tensor
 
 EPSILON = 1e-9  # inside roots, so that the paper's norms have a gradient at zero
 

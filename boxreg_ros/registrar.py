@@ -4,22 +4,21 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from boxreg_ros.association import Pair, StampMatcher
 from boxreg_ros.config import Config
-from boxreg_ros.registration import Estimate, Window, register
-from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.errors import ShapeError
+from boxreg_ros.registration import Estimate, register, Window
+from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import (
+    BoxArray,
     INTERPOLATED,
     KEPT,
-    BoxArray,
     RefinedBoxes,
     RefinedTrack,
     Sweep,
     Track,
 )
+import numpy as np
 
 
 class BoxRegistrar:

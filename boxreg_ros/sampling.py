@@ -2,14 +2,13 @@
 
 from typing import NamedTuple
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
-
 from boxreg_ros.config import Config
 from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.structures import Floats, Ints, Sweep
+import numpy as np
+from numpy.typing import NDArray
+import torch
+from torch import Tensor
 
 RING = 1.0  # how far beside a box the road is looked for [m]
 CLEARANCE = 0.2  # what is lower above the road may be road [m]
@@ -148,7 +147,9 @@ def farthest_point_sample(points: Tensor, mask: Tensor, count: int) -> tuple[Ten
         fresh = ((points - center) ** 2).sum(-1)
         fresh = torch.where(mask, fresh, -torch.inf).scatter(-1, pick, -1.0)
         distance = fresh if step == 0 else torch.minimum(distance, fresh)
-    index = torch.cat(picks, -1) if picks else mask.new_zeros((*mask.shape[:-1], 0), dtype=int)
+    index = (
+        torch.cat(picks, -1) if picks else mask.new_zeros((*mask.shape[:-1], 0), dtype=torch.long)
+    )
     chosen = points.gather(-2, index[..., None].expand(*index.shape, 3))
     real = torch.arange(index.shape[-1], device=mask.device) < mask.sum(-1, keepdim=True)
     return chosen, real

@@ -14,10 +14,9 @@ message header.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from boxreg_ros.errors import ShapeError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from boxreg_ros.errors import ShapeError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
