@@ -79,7 +79,7 @@ class BoxRegistrar:
             else:
                 self._solve([t for t in self._tracks.values() if t.newest_tick is tick])
                 ready.append(tick.result(is_final=False))
-                for old in list(self._ticks)[: len(self._ticks) - self._config.lag]:
+                for old in list(self._ticks)[: max(0, len(self._ticks) - self._config.lag)]:
                     old.waiting = 0
             ready += self._settled()
         return ready
@@ -231,7 +231,7 @@ class _TrackBuffer:
     def slide(self, config: Config) -> None:
         """Settle and forget what the next window does not need."""
         if config.estimate != 'track':
-            del self.entries[: len(self.entries) - config.window + 1]
+            del self.entries[: max(0, len(self.entries) - config.window + 1)]
         elif self.is_full(config):
             # The ends of a window are its weakest part: a quarter waits for the next window,
             # which sees another quarter of settled ones before it.
