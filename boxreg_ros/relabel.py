@@ -367,7 +367,7 @@ def _summary(
     """Return all of summary.json but the timings."""
     if sink.missing():
         raise RuntimeError(f'{sink.missing()} of {sink.boxes_in} boxes did not come back')
-    dropped = {name: n for name, n in sorted(counts.items()) if '_without_' in name}
+    dropped = {name: n for name, n in sorted(counts.items()) if n and '_without_' in name}
     return {
         'recordings': [str(path) for path in request.recordings],
         'topics': {

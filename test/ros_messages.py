@@ -226,3 +226,80 @@ def write_recording(path, items, storage='mcap', messages=None):
         (inner,) = path.glob('*.mcap')
         return inner
     return path
+
+
+SECOND = 10**9
+START = 1_700_000_000 * SECOND
+
+
+class Drive:
+    """
+    A car with a LiDAR 2 m above its base drives along x past a parked and a moving car.
+
+    `items` are (topic, received_ns, message) in order; `truth` has, per stamp, the true boxes
+    (2, 9) in frame odom: of track 1, parked, and of track 2, moving.
+
+    """
+
+    def __init__(self, sweeps=8, boxes='vision', motion='tf', ros1=False, seed=5):
+        self.messages = m = Messages(ros1)
+        self.items, self.truth, self.stamps = [], {}, []
+        rng = np.random.default_rng(seed)
+        self.items.append(
+            ('/tf_static', START, m.tf(m.transform(START, 'base', 'lidar', (0, 0, 2))))
+        )
+        for k in range(sweeps):
+            stamp = START + k * SECOND // 10
+            self.stamps.append(stamp)
+            ego = np.array([0.5 * k, 0.0, 0.0])
+            sensor = ego + np.array([0.0, 0.0, 2.0])
+            true = np.array(
+                [
+                    [10.0, 4.0, 0.8, 4.2, 1.8, 1.6, 0, 0, 0.1],
+                    [15.0 + 0.8 * k, -3.0, 0.9, 4.6, 1.9, 1.8, 0, 0, 0.0],
+                ]
+            )
+            self.truth[stamp] = true
+            if motion == 'tf':
+                message = m.tf(m.transform(stamp, 'odom', 'base', ego))
+                self.items.append(('/tf', stamp, message))
+            elif motion == 'odometry':
+                self.items.append(('/odom', stamp, m.odometry(stamp, 'odom', 'base', ego)))
+            surface = np.concatenate([_surface(box, rng) for box in true]) - sensor
+            self.items.append(('/points', stamp, m.points(stamp, 'lidar', surface)))
+            noisy = true + rng.normal(0, 0.05, true.shape) * [1, 1, 1, 0, 0, 0, 0, 0, 0.3]
+            self.items.append(('/boxes', stamp, self._boxes(boxes, stamp, noisy, sensor)))
+
+    def _boxes(self, kind, stamp, boxes, sensor):
+        m = self.messages
+        found = []
+        for track, box in enumerate(boxes, start=1):
+            half = box[8] / 2
+            pose = (box[:3] - sensor, (0, 0, np.sin(half), np.cos(half)))
+            found.append((track, pose, box[3:6]))
+        if kind == 'vision':
+            detections = [(str(t), 'car', 0.9, *pose, size) for t, pose, size in found]
+            return m.detections(stamp, 'lidar', detections)
+        return m.markers([m.marker(stamp, 'lidar', t, 'car', p, s) for t, p, s in found])
+
+    def replace(self, topic, index, change):
+        """Apply `change` to the message number `index` on a topic."""
+        at = [i for i, item in enumerate(self.items) if item[0] == topic][index]
+        change(self.items[at][2])
+
+    def write(self, path, storage='mcap'):
+        """Write the recording and return its path."""
+        return write_recording(path, self.items, storage, self.messages)
+
+
+def _surface(box, rng):
+    """Return points on the sides of a box with yaw only."""
+    unit = rng.uniform(-0.5, 0.5, (120, 3))
+    side = np.arange(120) % 2
+    unit[np.arange(120), side] = -0.5 * np.sign([box[0], box[1]])[side]
+    cos, sin = np.cos(box[8]), np.sin(box[8])
+    local = unit * box[3:6]
+    turned = np.stack(
+        [cos * local[:, 0] - sin * local[:, 1], sin * local[:, 0] + cos * local[:, 1]]
+    )
+    return np.column_stack([*turned, local[:, 2]]) + box[:3]

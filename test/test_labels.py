@@ -1,0 +1,162 @@
+import csv
+import json
+
+from boxreg_ros.errors import ConfigError
+from boxreg_ros.labels import writer_for, WRITERS
+from boxreg_ros.structures import BoxArray, RefinedBoxes
+import numpy as np
+import pytest
+
+TILTED = [1.5, -2.25, 0.1, 4.5, 1.8, 1.6, 0.1, -0.2, 2.5]
+# The product of the half-angle quaternions about z (2.5), y (-0.2) and x (0.1).
+TILTED_XYZW = (0.110302793714, 0.015752145824, 0.944636920052, 0.308619916523)
+COLUMNS = (
+    'stamp_ns,frame_id,track_id,class_name,score,x,y,z,qx,qy,qz,qw,length,width,height,status,'
+    'num_points'
+)
+
+
+def refined(stamp_ns, tracks, boxes=None, frame_id='odom', status=None):
+    n = len(tracks)
+    boxes = np.array([TILTED] * n if boxes is None else boxes, dtype=float).reshape(n, 9)
+    return RefinedBoxes(
+        BoxArray(stamp_ns, frame_id, tuple(tracks), ('car',) * n, np.full(n, 0.75), boxes),
+        status or ('refined',) * n,
+        tuple('' if s == 'refined' else 'no_points' for s in status or ('refined',) * n),
+        np.arange(n) + 7,
+        np.zeros((n, 6, 6)),
+    )
+
+
+def written(name, folder, results):
+    writer = writer_for(name, folder)
+    for result in results:
+        writer.write(result)
+    writer.close()
+
+
+def rows_of(folder):
+    with (folder / 'boxes.csv').open(newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def openlabel_of(folder):
+    """Return the content, checked against the standard's schema and rules."""
+    path = folder / 'openlabel' / 'labels.json'
+    checker = pytest.importorskip('openlabel_checker', reason='openlabel-checker not installed')
+    report = checker.check_file(str(path))
+    assert [issue for outcome in report.outcomes for issue in outcome.issues] == []
+    return json.loads(path.read_text())['openlabel']
+
+
+# boxes.csv -------------------------------------------------------------------------------------
+
+
+def test_columns_and_golden_values(tmp_path):
+    written('csv', tmp_path, [refined(1_700_000_000_123_456_789, ['a,"b'], status=('kept',))])
+    assert (tmp_path / 'boxes.csv').read_text().splitlines()[0] == COLUMNS
+    (row,) = rows_of(tmp_path)
+    assert row['stamp_ns'] == '1700000000123456789'
+    assert (row['frame_id'], row['track_id'], row['class_name']) == ('odom', 'a,"b', 'car')
+    assert (row['score'], row['status'], row['num_points']) == ('0.75', 'kept', '7')
+    numbers = [float(row[name]) for name in ('x', 'y', 'z', 'length', 'width', 'height')]
+    assert numbers == TILTED[:6]
+    quaternion = [float(row[name]) for name in ('qx', 'qy', 'qz', 'qw')]
+    np.testing.assert_allclose(quaternion, TILTED_XYZW, atol=1e-9)
+
+
+def test_numbers_keep_their_full_precision(tmp_path):
+    box = np.array(TILTED)
+    box[0] = 1 / 3 + 5e5
+    written('csv', tmp_path, [refined(1, ['a'], [box])])
+    assert float(rows_of(tmp_path)[0]['x']) == box[0]
+
+
+def test_what_is_not_finite_is_an_empty_cell(tmp_path):
+    boxes = np.array([TILTED, TILTED])
+    boxes[0, 1], boxes[1, 8] = np.nan, np.inf
+    written('csv', tmp_path, [refined(1, ['a', 'b'], boxes)])
+    first, second = rows_of(tmp_path)
+    assert (first['x'], first['y'], first['qw'] != '') == ('1.5', '', True)
+    assert (second['x'], second['qx'], second['qy'], second['qz'], second['qw']) == (
+        '1.5', '', '', '', '',
+    )  # fmt: skip
+
+
+def test_rows_are_sorted_by_stamp_even_when_boxes_come_late(tmp_path):
+    results = [refined(10, ['a', 'b']), refined(30, ['c']), refined(20, ['e', 'd'])]
+    written('csv', tmp_path, [*results, refined(10, ['f'])])
+    assert [row['track_id'] for row in rows_of(tmp_path)] == ['a', 'b', 'f', 'e', 'd', 'c']
+
+
+def test_no_boxes_leave_a_header(tmp_path):
+    written('csv', tmp_path, [refined(1, [])])
+    assert (tmp_path / 'boxes.csv').read_text() == COLUMNS + '\n'
+
+
+# OpenLABEL -------------------------------------------------------------------------------------
+
+
+def test_openlabel_golden_values(tmp_path):
+    written('openlabel', tmp_path, [refined(1_500_000_000, ['x7'], status=('kept',))])
+    label = openlabel_of(tmp_path)
+    assert label['metadata']['schema_version'] == '1.0.0'
+    frame = label['frames']['0']
+    assert frame['frame_properties'] == {'timestamp': 1.5, 'stamp_ns': 1_500_000_000}
+    (cuboid,) = frame['objects']['0']['object_data']['cuboid']
+    assert cuboid['coordinate_system'] == 'odom'
+    np.testing.assert_allclose(cuboid['val'], [*TILTED[:3], *TILTED_XYZW, *TILTED[3:6]], atol=1e-9)
+    texts = {item['name']: item['val'] for item in cuboid['attributes']['text']}
+    numbers = {item['name']: item['val'] for item in cuboid['attributes']['num']}
+    assert texts == {'status': 'kept', 'reason': 'no_points'}
+    assert numbers == {'num_points': 7, 'score': 0.75}
+    assert (label['objects']['0']['name'], label['objects']['0']['type']) == ('x7', 'car')
+    assert list(label['coordinate_systems']) == ['odom']
+
+
+def test_openlabel_intervals_follow_the_tracks(tmp_path):
+    seen = [['a', 'b'], ['a'], ['b', 'a'], [], ['b']]
+    written('openlabel', tmp_path, [refined(k, names) for k, names in enumerate(seen)])
+    label = openlabel_of(tmp_path)
+    assert label['frame_intervals'] == [{'frame_start': 0, 'frame_end': 4}]
+    assert list(label['frames']) == ['0', '1', '2', '3', '4']
+    intervals = {
+        item['name']: [(i['frame_start'], i['frame_end']) for i in item['frame_intervals']]
+        for item in label['objects'].values()
+    }
+    assert intervals == {'a': [(0, 2)], 'b': [(0, 0), (2, 2), (4, 4)]}
+    for item in label['objects'].values():
+        pointer = item['object_data_pointers']['box']
+        assert (pointer['type'], pointer['frame_intervals']) == ('cuboid', item['frame_intervals'])
+
+
+def test_openlabel_boxes_without_identity_are_objects_of_their_own(tmp_path):
+    written('openlabel', tmp_path, [refined(1, ['', 'a', '', 'a']), refined(2, ['', 'a'])])
+    label = openlabel_of(tmp_path)
+    assert [item['name'] for item in label['objects'].values()] == ['', 'a', '', 'a', '']
+    assert sorted(label['frames']['1']['objects']) == ['1', '4']
+
+
+def test_openlabel_leaves_invalid_boxes_out(tmp_path):
+    boxes = np.array([TILTED, TILTED, TILTED, TILTED])
+    boxes[0, 0], boxes[1, 8], boxes[2, 4] = np.nan, np.inf, 0.0
+    written('openlabel', tmp_path, [refined(1, ['a', 'b', 'c', 'd'], boxes)])
+    assert [item['name'] for item in openlabel_of(tmp_path)['objects'].values()] == ['d']
+
+
+def test_openlabel_of_nothing(tmp_path):
+    written('openlabel', tmp_path, [])
+    label = openlabel_of(tmp_path)
+    assert (label['frames'], label['objects']) == ({}, {})
+
+
+def test_openlabel_names_every_frame_of_reference(tmp_path):
+    results = [refined(1, ['a']), refined(2, ['a'], frame_id='lidar')]
+    written('openlabel', tmp_path, results)
+    assert sorted(openlabel_of(tmp_path)['coordinate_systems']) == ['lidar', 'odom']
+
+
+def test_formats():
+    assert list(WRITERS) == ['csv', 'openlabel']
+    with pytest.raises(ConfigError, match=r"'kiti': expected one of csv, openlabel"):
+        writer_for('kiti', None)

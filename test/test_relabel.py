@@ -1,0 +1,335 @@
+import csv
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
+from boxreg_ros.relabel import input_boxes, relabel, Request
+import numpy as np
+import pytest
+from ros_messages import Drive, Messages, SECOND, write_recording
+
+QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
+M = Messages()
+
+
+def run(recording, out, **options):
+    """Relabel quickly; return the summary and the rows of boxes.csv."""
+    config = QUICK.updated(options.pop('settings', {}))
+    summary = relabel(Request((Path(recording),), config=config, **options), Path(out))
+    return summary, rows_of(out)
+
+
+def rows_of(out):
+    with (Path(out) / 'boxes.csv').open(newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def keys(rows):
+    return [(int(row['stamp_ns']), row['track_id']) for row in rows]
+
+
+@pytest.mark.parametrize('estimate', ['track', 'final', 'early'])
+@pytest.mark.parametrize('boxes', ['vision', 'markers'])
+def test_every_box_comes_out_once_in_order(tmp_path, estimate, boxes):
+    drive = Drive(sweeps=7, boxes=boxes)
+    summary, rows = run(
+        drive.write(tmp_path / 'drive'),
+        tmp_path / 'out',
+        settings={'estimate': estimate, 'window': 4, 'lag': 2},
+    )
+    assert keys(rows) == [(stamp, track) for stamp in drive.stamps for track in ('1', '2')]
+    assert {row['frame_id'] for row in rows} == {'odom'}
+    assert (summary['sweeps'], summary['box_arrays']) == (7, 7)
+    assert (summary['boxes_in'], summary['boxes_out']) == (14, 14)
+    assert sum(summary['status'].values()) == 14
+    assert sum(summary['reasons'].values()) == summary['status'].get('kept', 0)
+    assert summary['status'].get('refined', 0) > 0
+
+
+def test_boxes_land_on_the_truth_in_the_fixed_frame(tmp_path):
+    drive = Drive(sweeps=7)
+    _, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    for row in rows:
+        true = drive.truth[int(row['stamp_ns'])][int(row['track_id']) - 1]
+        found = [float(row[name]) for name in ('x', 'y', 'z')]
+        np.testing.assert_allclose(found, true[:3], atol=0.35)
+    assert sum(int(row['num_points']) for row in rows) > 500
+
+
+def test_boxes_and_clouds_in_different_frames(tmp_path):
+    drive = Drive(sweeps=6)
+    plain = run(drive.write(tmp_path / 'plain'), tmp_path / 'plain_out')[1]
+    items = []
+    for topic, stamp, message in drive.items:
+        if topic == '/boxes':  # the same boxes, given in the frame of the base
+            message.header.frame_id = 'base'
+            for detection in message.detections:
+                detection.header.frame_id = 'base'
+                detection.bbox.center.position.z += 2.0
+        items.append((topic, stamp, message))
+    moved = run(write_recording(tmp_path / 'moved', items), tmp_path / 'moved_out')[1]
+    for before, after in zip(plain, moved, strict=True):
+        for name in ('x', 'y', 'z', 'qz', 'length'):
+            assert float(after[name]) == pytest.approx(float(before[name]), abs=1e-6)
+
+
+def test_several_recordings_are_one_drive(tmp_path):
+    drive = Drive(sweeps=6)
+    whole = run(drive.write(tmp_path / 'whole'), tmp_path / 'whole_out')[1]
+    half = len(drive.items) // 2
+    parts = tuple(
+        write_recording(tmp_path / f'part{i}', part)
+        for i, part in enumerate([drive.items[:half], drive.items[half:]])
+    )
+    relabel(Request(parts, config=QUICK), tmp_path / 'parts_out')
+    assert rows_of(tmp_path / 'parts_out') == whole
+
+
+def test_a_part_of_the_recording(tmp_path):
+    drive = Drive(sweeps=10)
+    rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out', start=0.25, end=0.75)[1]
+    assert sorted({stamp for stamp, _ in keys(rows)}) == drive.stamps[3:8]
+
+
+def test_output_folder_holds_what_the_design_says(tmp_path):
+    path = Drive(sweeps=4).write(tmp_path / 'drive')
+    summary, _ = run(path, tmp_path / 'out', settings={'solver.iterations': 2})
+    out = tmp_path / 'out'
+    assert sorted(item.name for item in out.iterdir()) == [
+        'boxes.csv', 'config.yaml', 'openlabel', 'summary.json',
+    ]  # fmt: skip
+    assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.iterations': 2})
+    assert json.loads((out / 'summary.json').read_text()) == summary
+    assert summary['topics'] == {'points': '/points', 'boxes': '/boxes', 'odometry': None}
+    assert summary['fixed_frame'] == 'odom'
+    assert set(summary['versions']) >= {'boxreg_ros', 'torch', 'numpy', 'rosbags'}
+    assert set(summary['seconds']) == {
+        'read', 'decode', 'transform', 'registrar', 'write', 'total',
+    }  # fmt: skip
+    label = json.loads((out / 'openlabel' / 'labels.json').read_text())['openlabel']
+    assert len(label['frames']) == 4
+
+
+def test_csv_alone(tmp_path):
+    run(Drive(sweeps=3).write(tmp_path / 'drive'), tmp_path / 'out', formats=('csv',))
+    assert not (tmp_path / 'out' / 'openlabel').exists()
+    assert (tmp_path / 'out' / 'boxes.csv').exists()
+
+
+# What goes wrong -------------------------------------------------------------------------------
+
+
+def test_bad_boxes_come_back_as_they_are(tmp_path):
+    drive = Drive(sweeps=5)
+
+    def spoil(message):
+        good = message.detections[0]
+        m = drive.messages
+        stamp = good.header.stamp.sec * SECOND + good.header.stamp.nanosec
+        pose = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))
+        message.detections += m.detections(
+            stamp,
+            'lidar',
+            [
+                ('flat', 'car', 0.5, *pose, (4.0, 0.0, 1.5)),
+                ('inside out', 'car', 0.5, *pose, (4.0, -2.0, 1.5)),
+                ('nowhere', 'car', 0.5, (np.nan, 0.0, 0.0), pose[1], (4.0, 2.0, 1.5)),
+                ('unturned', 'car', 0.5, pose[0], (0.0, 0.0, 0.0, 0.0), (4.0, 2.0, 1.5)),
+                ('', 'car', 0.5, *pose, (4.0, 2.0, 1.5)),
+                ('1', 'car', 0.5, *pose, (4.0, 2.0, 1.5)),
+                ('once', 'car', 0.5, *pose, (4.0, 2.0, 1.5)),
+            ],
+        ).detections
+
+    drive.replace('/boxes', 2, spoil)
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    bad = {row['track_id']: row for row in rows if int(row['stamp_ns']) == drive.stamps[2]}
+    assert len(rows) == 17
+    assert [row['track_id'] for row in rows[4:13]] == [
+        '1', '2', 'flat', 'inside out', 'nowhere', 'unturned', '', '1', 'once',
+    ]  # fmt: skip
+    for name in ('flat', 'inside out', 'nowhere', 'unturned', '', 'once'):
+        assert bad[name]['status'] == 'kept', name
+    assert bad['nowhere']['x'] == ''
+    assert bad['unturned']['qw'] == ''
+    assert float(bad['inside out']['width']) == -2.0
+    reasons = summary['reasons']
+    assert reasons['invalid_box'] == 4
+    assert reasons['no_track_id'] == 1
+    assert reasons['duplicate_track_id'] == 1
+    assert summary['status']['kept'] == sum(reasons.values())
+    label = json.loads((tmp_path / 'out' / 'openlabel' / 'labels.json').read_text())
+    assert len(label['openlabel']['frames']['2']['objects']) == 5
+
+
+def test_missing_transforms_keep_the_boxes_in_their_frame(tmp_path):
+    drive = Drive(sweeps=10)
+    gone = drive.stamps[:4]
+    drive.items = [item for item in drive.items if item[0] != '/tf' or item[1] not in gone]
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    # Motion is carried on for 0.2 s: the stamps 0.2 and 0.3 s are still covered.
+    early = [row for row in rows if int(row['stamp_ns']) in drive.stamps[:2]]
+    assert {(row['frame_id'], row['status']) for row in early} == {('lidar', 'kept')}
+    assert {row['frame_id'] for row in rows[4:]} == {'odom'}
+    assert keys(rows) == [(stamp, track) for stamp in drive.stamps for track in ('1', '2')]
+    assert summary['reasons']['no_transform'] == 4
+    assert summary['dropped']['sweep_without_transform'] == 2
+    assert 'odom -> base is known from' in summary['first_missing_transform']
+
+
+def test_boxes_in_a_frame_that_nothing_connects(tmp_path):
+    drive = Drive(sweeps=3)
+    for topic, _, message in drive.items:
+        if topic == '/boxes':
+            message.header.frame_id = 'radar'
+            for detection in message.detections:
+                detection.header.frame_id = 'radar'
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert summary['reasons'] == {'no_transform': 6}
+    assert {row['frame_id'] for row in rows} == {'radar'}
+    assert "'radar'" in summary['first_missing_transform']
+
+
+def test_sweeps_and_boxes_that_miss_each_other(tmp_path):
+    drive = Drive(sweeps=6)
+    drive.items = [
+        item
+        for item in drive.items
+        if (item[0], item[1]) not in {('/points', drive.stamps[1]), ('/boxes', drive.stamps[4])}
+    ]
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert len(rows) == 10
+    assert {row['status'] for row in rows[2:4]} == {'kept'}
+    assert summary['reasons']['no_sweep'] == 2
+    assert summary['dropped']['sweep_without_boxes'] == 1
+
+
+def test_boxes_of_one_stamp_in_two_messages(tmp_path):
+    drive = Drive(sweeps=5)
+    extra = [item for item in drive.items if item[0] == '/boxes'][1]
+    drive.items.insert(drive.items.index(extra) + 1, extra)
+    for estimate in ('track', 'early', 'final'):
+        rows = run(
+            drive.write(tmp_path / estimate),
+            tmp_path / f'{estimate}_out',
+            settings={'estimate': estimate, 'window': 4, 'lag': 2},
+        )[1]
+        stamps = [stamp for stamp, _ in keys(rows)]
+        assert stamps == sorted(2 * [*drive.stamps, drive.stamps[1]])
+
+
+def test_empty_clouds_and_empty_arrays(tmp_path):
+    drive = Drive(sweeps=5, boxes='markers')
+    m = drive.messages
+    drive.items += [
+        ('/points', drive.stamps[-1] + 1, m.points(drive.stamps[-1] + 10**8, 'lidar', [])),
+        ('/boxes', drive.stamps[-1] + 2, m.markers([])),
+    ]
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert len(rows) == 10
+    assert (summary['sweeps'], summary['box_arrays']) == (6, 6)
+
+
+def test_boxes_that_never_have_points_and_lone_boxes(tmp_path):
+    drive = Drive(sweeps=4)
+    pose = ((-30.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    for topic, stamp, message in drive.items:
+        if topic == '/boxes':
+            more = drive.messages.detections(
+                stamp, 'lidar', [('empty', 'car', 0.5, *pose, (4.0, 2.0, 1.5))]
+            )
+            message.detections += more.detections
+    rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')[1]
+    assert len(rows) == 12
+    empty = [row for row in rows if row['track_id'] == 'empty']
+    assert all(row['num_points'] == '0' for row in empty)
+    assert all(np.isfinite(float(row['x'])) for row in empty)
+
+
+def test_failures_leave_nothing_behind(tmp_path):
+    drive = Drive(sweeps=6)
+    drive.replace('/points', 5, lambda message: setattr(message, 'point_step', 2))
+    with pytest.raises(UnsupportedMessage, match="topic '/points'"):
+        run(drive.write(tmp_path / 'drive'), tmp_path / 'results' / 'out')
+    assert list((tmp_path / 'results').iterdir()) == []
+
+
+def test_earlier_results_survive_a_failure_and_are_replaced_by_success(tmp_path):
+    good = Drive(sweeps=3).write(tmp_path / 'good')
+    run(good, tmp_path / 'out')
+    before = (tmp_path / 'out' / 'boxes.csv').read_bytes()
+    broken = Drive(sweeps=3)
+    broken.replace('/points', 2, lambda message: setattr(message, 'point_step', 2))
+    with pytest.raises(UnsupportedMessage):
+        run(broken.write(tmp_path / 'broken'), tmp_path / 'out')
+    assert (tmp_path / 'out' / 'boxes.csv').read_bytes() == before
+    (tmp_path / 'out' / 'old').touch()
+    assert len(run(Drive(sweeps=5).write(tmp_path / 'more'), tmp_path / 'out')[1]) == 10
+    assert not (tmp_path / 'out' / 'old').exists()
+    assert not [item for item in tmp_path.iterdir() if item.name.startswith('.')]
+
+
+@pytest.mark.parametrize('content', ['notes.txt', 'summary.json'])
+def test_folders_of_others_are_left_alone(tmp_path, content):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / content).write_text('{"mine": true}')
+    with pytest.raises(RecordingError, match='choose another'):
+        run(Drive(sweeps=3).write(tmp_path / 'drive'), out)
+    assert [item.name for item in out.iterdir()] == [content]
+    (tmp_path / 'file').write_text('mine')
+    with pytest.raises(RecordingError, match='choose another'):
+        run(tmp_path / 'drive' / 'drive.mcap', tmp_path / 'file')
+
+
+def test_unknown_format_is_refused_at_once():
+    with pytest.raises(ConfigError, match="format 'kiti'"):
+        Request((Path('nothing'),), formats=('csv', 'kiti'))
+
+
+def test_fingerprint_tells_requests_apart(tmp_path):
+    path = Drive(sweeps=3).write(tmp_path / 'drive')
+    first = Request((path,)).fingerprint()
+    assert Request((path,)).fingerprint() == first
+    assert Request((path,), end=1.0).fingerprint() != first
+    assert Request((path,), config=QUICK).fingerprint() != first
+    path.write_bytes(path.read_bytes() + b'x')
+    assert Request((path,)).fingerprint() != first
+
+
+# The input as it is ----------------------------------------------------------------------------
+
+
+def test_input_boxes_are_those_of_the_recording_in_the_fixed_frame(tmp_path):
+    drive = Drive(sweeps=4)
+    arrays = input_boxes(drive.write(tmp_path / 'drive'))
+    assert [array.stamp_ns for array in arrays] == drive.stamps
+    for array in arrays:
+        assert (array.frame_id, array.track_ids) == ('odom', ('1', '2'))
+        np.testing.assert_allclose(array.boxes, drive.truth[array.stamp_ns], atol=0.25)
+
+
+# Real data -------------------------------------------------------------------------------------
+
+SHARED = Path(__file__).resolve().parents[2] / 'shared'
+KITTI = SHARED / 'data' / 'kitti_raw_0001.npz'
+MAKER = SHARED / 'tools' / 'make_recording.py'
+
+
+@pytest.mark.skipif(not (KITTI.exists() and MAKER.exists()), reason='real data is not here')
+@pytest.mark.parametrize(('storage', 'boxes'), [('mcap', 'vision'), ('sqlite3', 'markers')])
+def test_real_boxes_come_back_each_once(tmp_path, storage, boxes):
+    command = [sys.executable, MAKER, KITTI, tmp_path, '--noise', 'real', '--seed', '7']
+    options = ['--storage', storage, '--boxes', boxes, '--max-sweeps', '15']
+    subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL)
+    recording = tmp_path / ('recording' if storage == 'sqlite3' else 'recording.mcap')
+    given = [
+        (array.stamp_ns, track) for array in input_boxes(recording) for track in array.track_ids
+    ]
+    summary, rows = run(recording, tmp_path / 'out')
+    assert len(given) > 50
+    assert keys(rows) == given
+    assert summary['fixed_frame'] == 'odom'
