@@ -54,10 +54,34 @@ class SamplingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class FaceConfig:
+    """
+    How the outermost points of a face tell where it is.
+
+    The gaps are the annotation rule: how far outside of its outermost points a label's face
+    stands. With `learn` they are the expectation that the input's own boxes correct.
+
+    """
+
+    outermost: float = setting(0.05, 'part of the points that stands for a face', '', 1e-3, 1.0)
+    ends: float = setting(0.12, 'error of one sight of front or back', 'm', 1e-3, 10.0)
+    sides: float = setting(0.08, 'error of one sight of left or right', 'm', 1e-3, 10.0)
+    top: float = setting(0.08, 'error of one sight of the roof', 'm', 1e-3, 10.0)
+    bottom: float = setting(0.05, 'error of one sight of the road', 'm', 1e-3, 10.0)
+    outlier: float = setting(0.15, 'a face this far from its points loses its say', 'm', 1e-3, 10.0)
+    gap_ends: float = setting(0.05, 'label outside the points, front and back', 'm', -2.0, 2.0)
+    gap_sides: float = setting(0.03, 'label outside the points, left and right', 'm', -2.0, 2.0)
+    gap_top: float = setting(0.05, 'label above the roof points', 'm', -2.0, 2.0)
+    gap_bottom: float = setting(0.0, 'label below the road', 'm', -2.0, 2.0)
+    spread: float = setting(0.07, 'difference of gaps between objects', 'm', 1e-4, 1.0)
+    learn: bool = setting(True, 'learn the gaps from the input as it comes')
+
+
+@dataclass(frozen=True, slots=True)
 class SolverConfig:
     """L-BFGS and the rounds around it."""
 
-    rounds: int = setting(4, 'outer rounds: correspondences and weights renewed', '', 1, 100)
+    rounds: int = setting(4, 'outer rounds: outermost points and weights renewed', '', 1, 100)
     iterations: int = setting(12, 'most L-BFGS iterations per round', '', 1, 10000)
     history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
     tolerance: float = setting(
@@ -92,7 +116,9 @@ class ClassConfig:
     turning: float = setting(0.4, 'expected change of turn rate', 'rad/s^2', 1e-3, 1e3)
     tilting: float = setting(0.2, 'expected change of roll and pitch rate', 'rad/s^2', 1e-3, 1e3)
     slip: float = setting(0.15, 'expected sideways velocity of the rear axle', 'm/s', 1e-3, 1e3)
+    climb: float = setting(0.5, 'expected velocity along its own z axis', 'm/s', 1e-3, 1e3)
     axle: float = setting(0.25, 'rear axle behind the centre, as part of the length', '', 0.0, 0.5)
+    drift: float = setting(0.02, 'step of a parked box: map and ego drift', 'm', 1e-4, 1.0)
     position: float = setting(0.14, 'error of an input centre along the heading', 'm', 1e-3, 10.0)
     lateral: float = setting(0.08, 'error of an input centre across the heading', 'm', 1e-3, 10.0)
     height: float = setting(0.07, 'error of an input centre in z', 'm', 1e-3, 10.0)
@@ -138,6 +164,7 @@ class Config:
     queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)
     device: str = setting('cpu', "where windows are solved: 'cpu', 'cuda', 'cuda:1', ...")
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    faces: FaceConfig = field(default_factory=FaceConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     vehicle: ClassConfig = field(

@@ -19,6 +19,7 @@ from boxreg_ros.geometry import (
     rotation_from_rpy,
     wrap_angle,
 )
+from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor
 
@@ -57,6 +58,11 @@ class Problem:
     origins: Tensor
     ground: Tensor
     deviations: dict[str, Tensor]
+
+    @property
+    def pose(self) -> Tensor:
+        """Input poses x y z roll pitch yaw, shape (B, N, 6)."""
+        return self.boxes[..., POSE]
 
     def select(self, rows: Tensor) -> 'Problem':
         """Return the windows `rows` alone."""
@@ -143,7 +149,7 @@ def smoothness(boxes: Tensor, valid: Tensor) -> Tensor:
     Steps of the angles are wrapped; a small number inside the root gives equal steps a gradient.
 
     """
-    pose = boxes[..., [0, 1, 2, 6, 7, 8]]
+    pose = boxes[..., POSE]
     step = pose[:, 1:] - pose[:, :-1]
     step = torch.cat([step[..., :3], wrap_angle(step[..., 3:])], -1).abs()
     change = (step[:, 1:] - step[:, :-1]).square().sum(-1)
@@ -178,18 +184,23 @@ def _mean(values: Tensor, real: Tensor) -> Tensor:
 
 # --- ours ---------------------------------------------------------------------------------------
 
+SHARED = 15  # extent (3), bias of the input (6), gap of the faces (6)
+EXTENT, BIAS, GAP = slice(0, 3), slice(3, 9), slice(9, 15)
+TOP, BOTTOM = 4, 5
+LEAST = 3  # points without which a face is not seen
+
 
 class State(NamedTuple):
     """
-    What is estimated: poses of a window and what all its boxes share.
+    What is estimated: the poses of a window, and what all its observations share.
 
     Attributes
     ----------
     pose : Tensor, shape (B, N, 6)
-        x y z roll pitch yaw.
+        x y z roll pitch yaw [m, rad].
     shared : Tensor, shape (B, 15)
-        Extent (3) [m]; bias of the input (6), lon lat z roll pitch yaw; gap (6) between each
-        face of the box and the outermost points on it [m].
+        Extent [m]; bias of the input poses, along their axes [m, rad]; gap from the outermost
+        points of each face out to the face [m].
 
     """
 
@@ -198,7 +209,7 @@ class State(NamedTuple):
 
     @classmethod
     def unpack(cls, x: Tensor, length: int) -> 'State':
-        """Split variables (B, 6 N + 15)."""
+        """Return views into variables (B, 6 N + 15)."""
         return cls(x[:, : 6 * length].unflatten(1, (length, 6)), x[:, 6 * length :])
 
     def pack(self) -> Tensor:
@@ -210,11 +221,8 @@ class Linearised(NamedTuple):
     """
     A term at one state: n stencils of k observations in a row, F groups of R residuals each.
 
-    Attributes
-    ----------
-    residual : Tensor, shape (B, n, F, R)
-    by_pose : Tensor, shape (B, n, F, R, k, 6)
-    by_shared : Tensor, shape (B, n, F, R, 15), or None
+    `residual` is (B, n, F, R), its derivative `by_pose` (B, n, F, R, k, 6) and `by_shared`
+    (B, n, F, R, 15) or None.
 
     """
 
@@ -232,7 +240,7 @@ class Term(NamedTuple):
     data: Tensor | None = None
 
     def linearise(self, state: State) -> Linearised:
-        """Return residual and Jacobian at `state`."""
+        """Return residual and derivatives at `state`."""
         return self.function(self.problem, state, self.data)
 
     def select(self, rows: Tensor) -> 'Term':
@@ -298,11 +306,11 @@ def faces(problem: Problem, state: State, _: None = None) -> Linearised:
 
     """
     R, dR = rotation_derivatives(state.pose[..., 3:])
-    shift = state.pose[..., :3] - problem.boxes[..., :3]
+    shift = state.pose[..., :3] - problem.pose[..., :3]
     sign = FACE_SIGN.to(R)
     normal = R.mT[..., FACE_AXIS, :] * sign[:, None]
     turned = dR.mT[..., FACE_AXIS, :] * sign[:, None]  # (B, N, 3, 6, 3)
-    extent, gap = state.shared[:, :3], state.shared[:, 9:15]
+    extent, gap = state.shared[:, EXTENT], state.shared[:, GAP]
     constant = gap - extent[:, FACE_AXIS] / 2
     offset = constant[:, None] - (normal * shift[..., None, :]).sum(-1)
     residual = torch.cat([normal, offset[..., None]], -1)
@@ -318,22 +326,18 @@ def faces(problem: Problem, state: State, _: None = None) -> Linearised:
     return Linearised(residual, by_pose, by_shared)
 
 
-def prior(problem: Problem, state: State, anchor: Tensor) -> Linearised:
-    """Deviation of the pose from the input, bias removed; `anchor` (B, N, 3) is the point held."""
-    given = problem.boxes[..., [0, 1, 2, 6, 7, 8]]
+def prior(problem: Problem, state: State, _: None = None) -> Linearised:
+    """Deviation of the poses from the input, along its axes, less the bias [m, rad]."""
+    given = problem.pose
     R = rotation_from_rpy(given[..., 3:])
     difference = state.pose - given
     along = (R.mT @ difference[..., :3, None])[..., 0]
-    grown = state.shared[:, None, :3] - problem.boxes[..., 3:6]
-    along = along + anchor * grown / 2
-    residual = torch.cat([along, difference[..., 3:]], -1) - state.shared[:, None, 3:9]
-    B, N = residual.shape[:2]
-    by_pose = R.new_zeros((B, N, 1, 6, 1, 6))
+    residual = torch.cat([along, difference[..., 3:]], -1) - state.shared[:, None, BIAS]
+    by_pose = residual.new_zeros((*residual.shape[:2], 1, 6, 1, 6))
     by_pose[:, :, 0, :3, 0, :3] = R.mT
-    by_pose[:, :, 0, 3:, 0, 3:] = torch.eye(3, dtype=R.dtype)
-    by_shared = R.new_zeros((B, N, 1, 6, SHARED))
-    by_shared[:, :, 0, :3, :3] = torch.diag_embed(anchor) / 2
-    by_shared[:, :, 0, :, 3:9] = -torch.eye(6, dtype=R.dtype)
+    by_pose[:, :, 0, 3:, 0, 3:] = torch.eye(3).to(R)
+    by_shared = residual.new_zeros((*residual.shape[:2], 1, 6, SHARED))
+    by_shared[..., BIAS] = -torch.eye(6).to(R)
     return Linearised(residual[:, :, None], by_pose, by_shared)
 
 
@@ -345,7 +349,7 @@ def acceleration(problem: Problem, state: State, _: None = None) -> Linearised:
     p = state.pose
     residual = ((p[:, 2:] - p[:, 1:-1]) / second - (p[:, 1:-1] - p[:, :-2]) / first) / mean
     weights = torch.stack([1 / first, -1 / first - 1 / second, 1 / second], -1) / mean[..., None]
-    eye = torch.eye(6, dtype=p.dtype)
+    eye = torch.eye(6).to(p)
     by_pose = weights[:, :, 0, None, :, None] * eye[:, None, :]
     return Linearised(residual[:, :, None], by_pose[:, :, None], None)
 
@@ -353,7 +357,7 @@ def acceleration(problem: Problem, state: State, _: None = None) -> Linearised:
 def rest(problem: Problem, state: State, _: None = None) -> Linearised:
     """First differences of the pose of what is parked [m, rad]."""
     p = state.pose
-    eye = torch.eye(6, dtype=p.dtype)
+    eye = torch.eye(6).to(p)
     by_pose = torch.stack([-eye, eye], -2).expand(*p[:, 1:].shape[:2], 6, 2, 6)
     return Linearised((p[:, 1:] - p[:, :-1])[:, :, None], by_pose[:, :, None], None)
 
@@ -388,11 +392,85 @@ def slip(problem: Problem, state: State, _: None = None) -> Linearised:
 def shared_prior(problem: Problem, state: State, expected: Tensor) -> Linearised:
     """Deviation of what is shared from what is expected of it, (B, 15)."""
     residual = (state.shared - expected)[:, None, None]
-    B = len(residual)
-    eye = torch.eye(SHARED, dtype=residual.dtype)
-    return Linearised(
-        residual, residual.new_zeros((B, 1, 1, SHARED, 1, 6)), eye.expand(B, 1, 1, -1, -1)
-    )
+    by_shared = torch.eye(SHARED).to(residual).expand(len(expected), 1, 1, SHARED, SHARED)
+    by_pose = residual.new_zeros((len(expected), 1, 1, SHARED, 1, 6))
+    return Linearised(residual, by_pose, by_shared)
 
 
-SHARED = 15
+class Support(NamedTuple):
+    """
+    What stands out furthest on each face, in one round.
+
+    Attributes
+    ----------
+    moments : Tensor, shape (B, N, 6, 4, 4)
+        Mean of (p, 1)(p, 1)' over the outermost points, p minus the centre of the input box.
+    outwardness : Tensor, shape (B, N, 6)
+        How far these stand out of the box less its gap, on average [m].
+    seen : Tensor, shape (B, N, 6)
+        Which faces have enough of them and are turned to the sensor; the roof always is, the
+        bottom is where the road beside the box is known.
+    count : Tensor, shape (B, N)
+        Points in and near the box.
+
+    """
+
+    moments: Tensor
+    outwardness: Tensor
+    seen: Tensor
+    count: Tensor
+
+
+def support(problem: Problem, state: State, margin: float, outermost: float) -> Support:
+    """
+    Find the outermost points of each face, the part `outermost` of all [Eq. 4].
+
+    Notes
+    -----
+    The paper takes the K points closest to a face, visible by their centre of mass. We take
+    those furthest out toward a face the sensor can see: the closest ones may lie anywhere on a
+    face that is given too far inside. Only points within `margin` of the present face count, and
+    0.3 m more on its inside.
+
+    """
+    shift = state.pose[..., :3] - problem.pose[..., :3]
+    local = (problem.points - shift[..., None, :]) @ rotation_from_rpy(state.pose[..., 3:])
+    half = (state.shared[:, EXTENT] / 2)[:, None, None]
+    beyond = local.abs() - half
+    near = torch.where(problem.mask[..., None], beyond, torch.inf)
+    beside = near[..., [1, 0, 0]].maximum(near[..., [2, 2, 1]]) < 0.2
+    out = local[..., FACE_AXIS] * FACE_SIGN.to(local) - half[..., FACE_AXIS]
+    out = out + state.shared[:, None, None, GAP]
+    candidate = beside[..., FACE_AXIS] & (out < margin) & (out > -margin - 0.3)
+    count = (near < margin).all(-1).sum(-1)
+    wanted = (outermost * count).clamp(min=LEAST)[..., None, None]
+    most = min(out.shape[2], max(LEAST, int(outermost * out.shape[2]) + 1))
+    height, index = torch.where(candidate, out, -torch.inf).topk(most, dim=2)
+    rank = torch.arange(most, device=out.device)[:, None]
+    chosen = height.isfinite() & (rank < wanted)
+    number = chosen.sum(2)
+    share = chosen / number.clamp(min=1)[:, :, None]
+    rows = index[..., None].expand(*index.shape, 3)
+    points = problem.points.gather(2, rows.flatten(2, 3)).unflatten(2, (most, 6))
+    points = torch.cat([points, torch.ones_like(points[..., :1])], -1)
+    moments = torch.einsum('bnkf,bnkfi,bnkfj->bnfij', share.to(points), points, points)
+    outwardness = (torch.where(chosen, height, 0.0) * share).sum(2)
+    seen = (visible_faces(problem) & (number >= LEAST)) | (number >= LEAST) & _is(TOP, number)
+    return _with_road(problem, state, Support(moments, outwardness, seen, count))
+
+
+def _is(face: int, like: Tensor) -> Tensor:
+    return torch.arange(6, device=like.device) == face
+
+
+def _with_road(problem: Problem, state: State, support: Support) -> Support:
+    """Let a point of the road under the centre of the box stand for its bottom face."""
+    known = problem.ground.isfinite() & problem.valid
+    road = torch.nan_to_num(problem.ground)
+    shift = state.pose[..., :3] - problem.pose[..., :3]
+    point = torch.stack([shift[..., 0], shift[..., 1], road, torch.ones_like(road)], -1)
+    support.moments[..., BOTTOM, :, :] = point[..., :, None] * point[..., None, :]
+    below = shift[..., 2] - road - state.shared[:, None, 2] / 2 + state.shared[:, None, 14]
+    support.outwardness[..., BOTTOM] = below
+    support.seen[..., BOTTOM] = known
+    return support

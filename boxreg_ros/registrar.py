@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from boxreg_ros.association import Pair, StampMatcher
+from boxreg_ros.calibration import AnnotationRule
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.registration import Estimate, register, Window
@@ -51,6 +52,9 @@ class BoxRegistrar:
         self._tracks: dict[str, _TrackBuffer] = {}
         self._ticks: deque[_Tick] = deque()
         self._newest_ns: int | None = None
+        self._rule = AnnotationRule(config.faces)
+        self._ended: list[_TrackBuffer] = []
+        self._count = 0
 
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
         """Take a sweep; return what has become ready."""
@@ -66,6 +70,7 @@ class BoxRegistrar:
         """End all tracks and return everything still held."""
         ready = self._advance(self._matcher.flush())
         self._end(list(self._tracks))
+        self._solve_tracks()
         for tick in self._ticks:
             tick.waiting = 0
         return ready + self._settled()
@@ -74,15 +79,24 @@ class BoxRegistrar:
         ready = []
         for pair in pairs:
             tick = self._open(pair)
-            if self._config.estimate == 'track':
-                self._solve([t for t in self._tracks.values() if t.is_full(self._config)])
-            else:
+            self._count += 1
+            if self._config.estimate != 'track':
                 self._solve([t for t in self._tracks.values() if t.newest_tick is tick])
                 ready.append(tick.result(is_final=False))
                 for old in list(self._ticks)[: max(0, len(self._ticks) - self._config.lag)]:
                     old.waiting = 0
+            elif self._count % (self._config.track_window // 2) == 0:
+                self._solve_tracks()
             ready += self._settled()
         return ready
+
+    def _solve_tracks(self) -> None:
+        """Solve, all at once, the tracks that have ended and those whose window is full."""
+        full = self._config.track_window // 2
+        self._solve(self._ended + [t for t in self._tracks.values() if len(t.entries) > full])
+        for track in self._ended:
+            track.settle(len(track.entries))
+        self._ended.clear()
 
     def _open(self, pair: Pair) -> '_Tick':
         """Start a tick: sort its boxes out and add an observation to the track of each."""
@@ -103,23 +117,25 @@ class BoxRegistrar:
             for index, observation in zip(admitted, observations, strict=True):
                 name = boxes.track_ids[index]
                 tick.num_points[index] = observation.num_points
-                track = self._tracks.setdefault(name, _TrackBuffer(boxes.class_names[index]))
+                track = self._tracks.setdefault(name, _TrackBuffer(name, boxes.class_names[index]))
                 track.entries.append(_Entry(observation, tick, index))
                 tick.waiting += 1
         return tick
 
     def _end(self, names: list[str]) -> None:
-        """Close tracks: their last window is solved, what waited for it is settled."""
+        """Close tracks; in estimate 'track' they are solved with the next batch."""
         ended = [self._tracks.pop(name) for name in names]
         if self._config.estimate == 'track':
-            self._solve(ended)
-        for track in ended:
-            track.settle(len(track.entries))
+            self._ended += ended
+        else:
+            for track in ended:
+                track.settle(len(track.entries))
 
     def _solve(self, tracks: list['_TrackBuffer']) -> None:
         """Register the window of each track and write the estimates to the ticks they are of."""
-        windows = [Window(t.class_name, [e.observation for e in t.entries]) for t in tracks]
-        for track, estimate in zip(tracks, register(windows, self._config), strict=True):
+        windows = [track.window() for track in tracks]
+        estimates = register(windows, self._config, self._rule)
+        for track, estimate in zip(tracks, estimates, strict=True):
             track.write(estimate)
             track.slide(self._config)
 
@@ -129,7 +145,8 @@ class BoxRegistrar:
             tick = self._ticks.popleft()
             for status, reason in zip(tick.status, tick.reasons, strict=True):
                 self.counts[status] += 1
-                self.counts[reason] += bool(reason)
+                if reason:
+                    self.counts[reason] += 1
             ready.append(tick.result(is_final=True))
         return ready
 
@@ -193,6 +210,7 @@ class _Entry:
     observation: Observation
     tick: _Tick
     index: int
+    is_solved: bool = False
     is_settled: bool = False
 
 
@@ -200,6 +218,7 @@ class _Entry:
 class _TrackBuffer:
     """The observations of one track that windows still need."""
 
+    track_id: str
     class_name: str
     entries: list[_Entry] = field(default_factory=list)
 
@@ -211,11 +230,14 @@ class _TrackBuffer:
     def newest_ns(self) -> int:
         return self.entries[-1].observation.stamp_ns
 
-    def is_full(self, config: Config) -> bool:
-        return len(self.entries) >= config.track_window
+    def window(self) -> Window:
+        observations = [entry.observation for entry in self.entries]
+        fresh = sum(not entry.is_solved for entry in self.entries)
+        return Window(self.track_id, self.class_name, observations, fresh)
 
     def write(self, estimate: Estimate) -> None:
         for row, entry in enumerate(self.entries):
+            entry.is_solved = True
             if not entry.is_settled:
                 entry.tick.refined[entry.index] = estimate.boxes[row]
                 entry.tick.covariances[entry.index] = estimate.covariances[row]
@@ -232,12 +254,12 @@ class _TrackBuffer:
         """Settle and forget what the next window does not need."""
         if config.estimate != 'track':
             del self.entries[: max(0, len(self.entries) - config.window + 1)]
-        elif self.is_full(config):
+        else:
             # The ends of a window are its weakest part: a quarter waits for the next window,
             # which sees another quarter of settled ones before it.
-            overlap = len(self.entries) // 4
-            self.settle(len(self.entries) - overlap)
-            del self.entries[: len(self.entries) - 2 * overlap]
+            overlap = config.track_window // 4
+            self.settle(max(0, len(self.entries) - overlap))
+            del self.entries[: max(0, len(self.entries) - 2 * overlap)]
 
 
 def refine(tracks: Sequence[Track], config: Config | None = None) -> list[RefinedTrack]:
