@@ -110,7 +110,7 @@ class BoxTable:
             stamps = np.array([int(row['stamp_ns']) for row in rows], np.int64)
             num_points = np.array([int(row['num_points']) for row in rows], np.int64)
             numbers = np.array(
-                [[float(row[name]) for name in COLUMNS[4:15]] for row in rows]
+                [[float(row[name] or 'nan') for name in COLUMNS[4:15]] for row in rows]
             ).reshape(-1, 11)
         except (TypeError, ValueError) as error:
             raise RecordingError(f'{path}: a column does not hold numbers: {error}') from None

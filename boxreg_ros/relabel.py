@@ -81,12 +81,6 @@ class Request:
             if name not in WRITERS:
                 raise ConfigError(f'format {name!r}: expected one of {", ".join(WRITERS)}')
 
-    def open(self) -> Recording:
-        """Return the recording asked for."""
-        return Recording(
-            self.recordings, self.points, self.boxes, self.odometry, self.start, self.end
-        )
-
     def fingerprint(self) -> str:
         """Return a digest of the request and of the files it reads, by size and time."""
         files = [
@@ -128,7 +122,15 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     counts: Counter[str] = Counter()
     trouble = ''
     names = dict.fromkeys(('csv', *request.formats))
-    with request.open() as recording, whole_folder(out) as folder:
+    recording = Recording(
+        request.recordings,
+        request.points,
+        request.boxes,
+        request.odometry,
+        request.start,
+        request.end,
+    )
+    with recording, whole_folder(out) as folder:
         with clock('read'):
             fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         writers = [writer_for(name, folder) for name in names]

@@ -4,6 +4,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.relabel import input_boxes, relabel, Request
@@ -155,6 +156,10 @@ def test_bad_boxes_come_back_as_they_are(tmp_path):
         assert bad[name]['status'] == 'kept', name
     assert bad['nowhere']['x'] == ''
     assert bad['unturned']['qw'] == ''
+    table = BoxTable.read(tmp_path / 'out' / 'boxes.csv')
+    assert np.isnan(table.boxes[8, 0])
+    assert np.isnan(table.boxes[9, 6:]).all()
+    assert np.isfinite(np.delete(table.boxes, [8, 9], axis=0)).all()
     assert float(bad['inside out']['width']) == -2.0
     reasons = summary['reasons']
     assert reasons['invalid_box'] == 4
