@@ -401,4 +401,4 @@ def _readable(what: object) -> Iterator[None]:
 
 def _text(error: Exception) -> str:
     """Return an error in one line."""
-    return ' '.join(str(error).split()) or type(error).__name__
+    return ' '.join(str(error).split()).rstrip('.') or type(error).__name__

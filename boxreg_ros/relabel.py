@@ -428,7 +428,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='one setting, as in solver.rounds=2; wins over --config',
     )  # fmt: skip
     parser.add_argument(
-        '--formats', default='csv,openlabel', type=lambda text: tuple(text.split(',')),
+        '--formats', default='csv,openlabel', metavar='NAME,...',
+        type=lambda text: tuple(text.split(',')),
         help=f'label formats, of {", ".join(WRITERS)}; csv is always there (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument('--start', type=float, metavar='S', help='from here [s]')

@@ -122,7 +122,8 @@ class TransformTree:
 
     def __str__(self) -> str:
         """Return all pairs of parent and child."""
-        return ', '.join(f'{e.parent} -> {e.child}' for e in self._edges()) or 'none'
+        pairs = dict.fromkeys(f'{edge.parent} -> {edge.child}' for edge in self._edges())
+        return ', '.join(pairs) or 'none'
 
     def frames(self) -> list[str]:
         """Return the names of all frames, sorted."""

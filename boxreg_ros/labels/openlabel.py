@@ -67,15 +67,16 @@ class Writer:
         objects: dict[int, Any] = {}
         for i in np.flatnonzero(is_valid):
             number = self._number(boxes.track_ids[i], boxes.class_names[i], objects)
-            score = float(boxes.scores[i])
+            numbers = {'num_points': int(refined.num_points[i]), 'score': float(boxes.scores[i])}
             attributes = {
                 'text': [
                     {'name': 'status', 'val': refined.status[i]},
                     {'name': 'reason', 'val': refined.reasons[i]},
                 ],
                 'num': [
-                    {'name': 'num_points', 'val': int(refined.num_points[i])},
-                    {'name': 'score', 'val': score if np.isfinite(score) else 0.0},
+                    {'name': name, 'val': value}
+                    for name, value in numbers.items()
+                    if np.isfinite(value)
                 ],
             }
             cuboid = {
