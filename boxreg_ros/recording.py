@@ -185,13 +185,17 @@ class Recording:
         if fixed_frame is not None and fixed_frame.lstrip('/') == frame:
             return frame
         found = self._scout(tree, frame, fixed_frame)
+        odometry: list[str] = []
         if found is None or fixed_frame is None:
             # Odometry is needed where TF does not lead to a fixed frame, or where the root of
             # TF is the very frame that odometry moves.
             relevant = {}
             for topic in self._candidates((ODOMETRY_TYPE,)):
                 message = self._first(topic)
+                if message is None:
+                    continue
                 child = message.child_frame_id.lstrip('/')
+                odometry.append(f'{topic} ({message.header.frame_id} -> {child})')
                 if child == found or (found is None and tree.connects(child, frame)):
                     relevant[topic] = message
             if len(relevant) > 1:
@@ -206,26 +210,28 @@ class Recording:
         if found is None and fixed_frame is not None:
             raise RecordingError(
                 f'{self}: no transforms connect the fixed frame {fixed_frame!r} with the frame '
-                f'of the clouds {frame!r}; known: {tree}'
+                f'of the clouds {frame!r}; TF: {tree}; odometry: {", ".join(odometry) or "none"}'
             )
         if found is None:
             raise RecordingError(
                 f'{self}: neither /tf nor odometry tells how the frame of the clouds {frame!r} '
-                f'moves (known: {tree}); if it does not move, say so with '
-                f'--fixed-frame {shlex.quote(frame)}'
+                f'moves; TF: {tree}; odometry: {", ".join(odometry) or "none"}; if it does not '
+                f'move, say so with --fixed-frame {shlex.quote(frame)}'
             )
         return found
 
     def sensor_frame(self) -> str:
         """Return the frame of the first point cloud."""
-        return str(self._first(self.points_topic).header.frame_id).lstrip('/')
+        cloud = self._first(self.points_topic)
+        if cloud is None:
+            raise RecordingError(f'{self}: no point clouds on {self.points_topic!r} in this part')
+        return str(cloud.header.frame_id).lstrip('/')
 
     def _first(self, topic: str) -> Any:
-        """Return the first message on a topic, in the part that is read."""
+        """Return the first message on a topic in the part that is read, or None."""
         connections = self._connections({topic})
-        for record in self._read(connections, self.start_ns, self.end_ns):
-            return self._message(record)
-        raise RecordingError(f'{self}: no messages on {topic!r} in the part asked for')
+        records = self._read(connections, self.start_ns, self.end_ns)
+        return next((self._message(record) for record in records), None)
 
     def _find(self) -> None:
         """Settle topics and times, and complete the message definitions."""

@@ -130,6 +130,33 @@ def test_odometry_serves_where_tf_does_not(tmp_path):
     np.testing.assert_allclose(T[:3, 3], [1.5, 0, 2])
 
 
+def test_odometry_of_the_sensor_itself_needs_no_tf(tmp_path):
+    drive = Drive(motion='none')
+    drive.items = [item for item in drive.items if item[0] != '/tf_static']
+    drive.items += [
+        ('/odom', stamp, M.odometry(stamp, 'world', 'lidar', (1, 2, 3))) for stamp in drive.stamps
+    ]
+    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    tree = TransformTree()
+    assert read(path, tree)[2] == 'world'
+    np.testing.assert_array_equal(tree.lookup('world', 'lidar', START)[:3, 3], [1, 2, 3])
+
+
+def test_odometry_of_something_else_is_named(tmp_path):
+    drive = Drive(motion='none')
+    drive.items.append(('/odom', START, M.odometry(START, 'world', 'trailer')))
+    text = refused(drive.write(tmp_path / 'drive'))
+    assert 'odometry: /odom (world -> trailer)' in text
+    assert 'base -> lidar' in text
+
+
+def test_odometry_that_starts_late_does_not_matter_beside_tf(tmp_path):
+    drive = Drive(sweeps=10, motion='tf')
+    stamp = drive.stamps[-1]
+    drive.items.append(('/odom', stamp, M.odometry(stamp, 'world', 'base')))
+    assert read(drive.write(tmp_path / 'drive'), end=0.5)[2] == 'odom'
+
+
 def test_tf_wins_over_odometry(tmp_path):
     drive = Drive(motion='tf')
     for stamp in drive.stamps:
