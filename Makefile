@@ -44,6 +44,6 @@ $(runtime): constraints.txt setup.py package.xml
 	@touch $@
 
 $(tests): $(runtime) $(shell find test/interfaces test/build_interfaces.py -type f)
-	$(INSTALL) -e '.[ros,test,interfaces]'
+	$(INSTALL) -e '.[ros,bench,test,interfaces]'
 	$(BIN)/python test/build_interfaces.py
 	@touch $@

@@ -38,6 +38,8 @@ setup(
         'tqdm>=4.60',
     ],
     extras_require={
+        # A baseline of `boxreg bench`.
+        'bench': ['small-gicp'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [

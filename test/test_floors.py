@@ -13,7 +13,7 @@ FLOORS = (
     ('structures', 'config', 'errors'),
     ('geometry', 'metrics'),
     ('sampling', 'objective', 'lbfgs'),
-    ('window', 'registration'),
+    ('calibration', 'window', 'registration'),
     ('association', 'registrar'),
     ('boxtable', 'labels', 'recording', 'transforms'),
 )
