@@ -32,6 +32,8 @@ class Matches:
 
     Attributes
     ----------
+    rows : array, shape (n,)
+        Where the true boxes are in their table.
     class_names : tuple of n str
         Of the true boxes.
     num_points : array, shape (n,)
@@ -56,6 +58,7 @@ class Matches:
 
     """
 
+    rows: Ints
     class_names: tuple[str, ...]
     num_points: Ints
     is_matched: Mask
@@ -165,6 +168,7 @@ def match(
         return full
 
     return Matches(
+        rows=kept,
         class_names=tuple(truth.class_names[i] for i in kept),
         num_points=truth.num_points[kept],
         is_matched=matched,

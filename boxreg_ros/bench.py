@@ -1,0 +1,449 @@
+"""
+`boxreg bench`: the paper's experiment, recordings with known truth, and speed.
+
+All methods of a table see the same sweeps and the same boxes, in the same run.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import pairwise
+import json
+import math
+from pathlib import Path
+import sys
+from typing import Any
+
+from boxreg_ros.baselines import icp, l_shaped, smoothed
+from boxreg_ros.boxtable import BoxTable
+from boxreg_ros.config import Config
+from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
+from boxreg_ros.evaluate import finite, match, Matches, RECALLS, summarise
+from boxreg_ros.metrics import EXTENT
+from boxreg_ros.recording import Recording
+from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.relabel import to_fixed_frame
+from boxreg_ros.simulate import Scene, simulate
+from boxreg_ros.structures import (
+    BoxArray,
+    Floats,
+    Ints,
+    LENGTH,
+    PITCH,
+    RefinedBoxes,
+    ROLL,
+    Sweep,
+    Track,
+    WIDTH,
+    YAW,
+)
+from boxreg_ros.transforms import sweep_to_frame, TransformTree
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+MARGIN = 1.0  # [m], points this far outside a box are handed to the baselines
+RANGE_BINS = (0, 20, 40, 80, math.inf)  # [m]
+POINT_BINS = (0, 30, 100, 300, 1000, math.inf)
+VARIABLES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+
+# Table I: mean absolute errors [m, rad] and IoU, as published.
+PUBLISHED: dict[str, dict[str, tuple[float, ...]]] = {
+    '3d': {
+        'initial, published': (0.392, 0.124, 0.082, 0.083, 0.1, 0.18, 0.573),
+        'refined, published': (0.121, 0.049, 0.012, 0.031, 0.034, 0.053, 0.816),
+    },
+    'bev': {
+        'initial, published': (0.392, 0.124, math.nan, math.nan, math.nan, 0.18, 0.618),
+        'refined, published': (0.054, 0.006, math.nan, math.nan, math.nan, 0.032, 0.896),
+    },
+}
+SCENARIOS = {'3d': 'paper', 'bev': 'paper-bev'}
+
+BASELINES: dict[str, Callable[[Track], Floats]] = {
+    'smoothing only': smoothed,
+    'L-shape per sweep': l_shaped,
+    'ICP on box points': icp,
+}
+RUNS = len(BASELINES) + 3
+
+Methods = dict[str, BoxTable | str]
+"""Boxes by the name of their method, or why there are none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """Sweeps and noisy boxes of one drive, in time order, in the frame of its true boxes."""
+
+    sweeps: tuple[Sweep, ...]
+    boxes: tuple[BoxArray, ...]
+    truth: BoxTable
+
+    @classmethod
+    def from_scene(cls, scene: Scene) -> Drive:
+        """Return what was simulated."""
+        sweeps = zip(scene.sweeps, scene.T_fixed_sensor, strict=True)
+        moved = tuple(sweep_to_frame(sweep, T, 'odom') for sweep, T in sweeps)
+        return cls(moved, tuple(scene.fixed_detections()), scene.truth)
+
+    @classmethod
+    def read(cls, folder: Path) -> Drive:
+        """
+        Read the one recording in a folder and the ``truth.csv`` beside it.
+
+        Raises
+        ------
+        RecordingError
+            If they are not there, or cannot be read.
+
+        """
+        if not folder.is_dir():
+            raise RecordingError(f'{folder}: expected a folder with a recording and truth.csv')
+        truth = BoxTable.read(folder / 'truth.csv')
+        found = [p for p in sorted(folder.iterdir()) if p.suffix in ('.mcap', '.bag', '.db3')]
+        found = found or [p.parent for p in sorted(folder.glob('*/metadata.yaml'))]
+        if len(found) != 1:
+            raise RecordingError(f'{folder}: expected one recording in it, got {len(found)}')
+        tree = TransformTree()
+        sweeps, boxes = [], []
+        with Recording(found) as recording:
+            fixed_frame = recording.choose_fixed_frame(tree, truth.frame_id)
+            for record in recording.records(tree):
+                item = to_fixed_frame(recording.decode(record), tree, fixed_frame)
+                if isinstance(item, Sweep):
+                    sweeps.append(item)
+                else:
+                    boxes.append(item)
+        if not sweeps:
+            raise RecordingError(f'{found[0]}: expected sweeps, got none')
+        return cls(
+            tuple(sorted(sweeps, key=lambda sweep: sweep.stamp_ns)),
+            tuple(sorted(boxes, key=lambda array: array.stamp_ns)),
+            truth,
+        )
+
+    def tracks(self) -> list[Track]:
+        """Return the boxes as tracks, with the points around each."""
+        rows: dict[str, list[tuple[BoxArray, int]]] = {}
+        for array in self.boxes:
+            for i, track_id in enumerate(array.track_ids):
+                rows.setdefault(track_id, []).append((array, i))
+        tracks = []
+        for track_id, places in rows.items():
+            boxes = np.array([array.boxes[i] for array, i in places])
+            stamps = np.array([array.stamp_ns for array, _ in places])
+            near = self._sweeps_at(stamps)
+            points = [_crop(sweep.points, box) for sweep, box in zip(near, boxes, strict=True)]
+            origins = np.array([sweep.origin for sweep in near])
+            array, i = places[0]
+            tracks.append(Track(track_id, array.class_names[i], stamps, boxes, points, origins))
+        return tracks
+
+    def ranges(self, rows: Ints) -> Floats:
+        """Return how far the true boxes in `rows` are from the sensor, in the plane [m]."""
+        near = self._sweeps_at(self.truth.stamps_ns[rows])
+        origins = np.array([sweep.origin for sweep in near]).reshape(-1, 3)
+        apart: Floats = np.linalg.norm((self.truth.boxes[rows, :3] - origins)[:, :2], axis=1)
+        return apart
+
+    def _sweeps_at(self, stamps_ns: Ints) -> list[Sweep]:
+        """Return the sweep nearest in time to each stamp."""
+        own = np.array([sweep.stamp_ns for sweep in self.sweeps])
+        after = np.searchsorted(own, stamps_ns).clip(0, len(own) - 1)
+        before = (after - 1).clip(0)
+        rows = np.where(stamps_ns - own[before] < own[after] - stamps_ns, before, after)
+        return [self.sweeps[row] for row in rows]
+
+
+def run_methods(
+    drive: Drive, mode: str = '3d', done: Callable[[], object] = lambda: None
+) -> Methods:
+    """
+    Return what every method makes of the boxes of a drive.
+
+    Parameters
+    ----------
+    drive : Drive
+        What all of them see.
+    mode : str
+        As `Config.mode`, for the methods that know it.
+    done : callable
+        Called after each run, of which there are `RUNS`.
+
+    """
+    methods: Methods = {'input': BoxTable.from_arrays(drive.boxes)}
+    tracks = drive.tracks()
+    for name, baseline in BASELINES.items():
+        try:
+            methods[name] = _table(tracks, [baseline(track) for track in tracks], drive)
+        except ImportError as error:
+            methods[name] = f'skipped: {error.name} is not installed'
+        done()
+    for name, config in (
+        ('paper', Config(objective='paper', mode=mode)),
+        ('ours', Config(estimate='final', mode=mode)),
+        ('ours', Config(mode=mode)),
+    ):
+        for estimate, boxes in _registered(drive, config).items():
+            methods[f'{name}, {estimate}'] = boxes
+        done()
+    return methods
+
+
+def bench_paper(args: argparse.Namespace) -> int:
+    """Print the paper's Table I beside ours, over several seeds, and draw its two figures."""
+    if args.seeds < 1:
+        raise ConfigError(f'--seeds: expected 1 or more, got {args.seeds}')
+    results: dict[str, dict[str, list[tuple[float, ...] | str]]] = {}
+    with _progress(args, 2 * args.seeds * RUNS) as bar:
+        for mode, scenario in SCENARIOS.items():
+            found = results.setdefault(mode, {})
+            for seed in range(args.seeds):
+                drive = Drive.from_scene(simulate(scenario, seed))
+                methods = run_methods(drive, mode, bar.update)
+                for name, boxes in methods.items():
+                    found.setdefault(name, []).append(
+                        boxes if isinstance(boxes, str) else paper_row(boxes, drive.truth, mode)
+                    )
+                if seed == 0:
+                    draw_paper(args.output, mode, methods, drive.truth)
+    names = (*VARIABLES, 'iou', 'iou_first', 'iou_last')
+    means = {
+        mode: {name: _mean_row(rows) for name, rows in found.items()}
+        for mode, found in results.items()
+    }
+    if args.json:
+        print(json.dumps(finite({
+            mode: {
+                name: row if isinstance(row, str) else dict(zip(names, row, strict=False))
+                for name, row in (PUBLISHED[mode] | rows).items()
+            }
+            for mode, rows in means.items()
+        })))  # fmt: skip
+        return 0
+    for mode, rows in means.items():
+        iou = 'IoU 3D' if mode == '3d' else 'IoU BEV'
+        print(_line(f'Table I, {mode}', (*VARIABLES, iou, 'first', 'last')))
+        for name, row in (PUBLISHED[mode] | rows).items():
+            print(_line(name, row))
+        print()
+    print(
+        f'{args.seeds} seeds. Mean absolute errors [m, rad], x and y along and across the '
+        f'vehicle; IoU of all, of the first and of the last box. Figures: {args.output}'
+    )
+    return 0
+
+
+def paper_row(boxes: BoxTable, truth: BoxTable, mode: str) -> tuple[float, ...]:
+    """Return six mean absolute errors [m, rad], and the IoU of all, the first and the last box."""
+    matches = match(boxes, truth)
+    errors = np.abs(np.concatenate([matches.translation, matches.rotation], axis=1)).mean(axis=0)
+    iou = matches.iou_3d if mode == '3d' else matches.iou_bev
+    return (*map(float, errors), float(iou.mean()), float(iou[0]), float(iou[-1]))
+
+
+def bench_real(args: argparse.Namespace) -> int:
+    """Print, for every recording, what each method makes of its boxes."""
+    report: dict[str, Any] = {}
+    with _progress(args, len(args.data) * RUNS) as bar:
+        for folder in args.data:
+            drive = Drive.read(folder)
+            methods = run_methods(drive, done=bar.update)
+            classes = [word for part in args.classes for word in part.split(',') if word]
+            found = {
+                name: boxes
+                if isinstance(boxes, str)
+                else match(boxes, drive.truth, args.min_points, classes)
+                for name, boxes in methods.items()
+            }
+            if not args.json:
+                bar.clear()
+                print_real(folder, drive, found)
+            report[str(folder)] = {
+                name: m if isinstance(m, str) else asdict(summarise(m))
+                for name, m in found.items()
+            }
+    if args.json:
+        print(json.dumps(finite(report)))
+    return 0
+
+
+def print_real(folder: Path, drive: Drive, found: Mapping[str, Matches | str]) -> None:
+    """Print one table of scores, and 3D IoU by range and by number of points."""
+    whole = next(m for m in found.values() if not isinstance(m, str))
+    print(f'{folder}: {len(whole.rows)} true boxes')
+    names = ['BEV', '3D', *(f'R@{level}' for level in RECALLS), 'ATE', 'ASE', 'AOE', 'flips']
+    print(_line('', (*names, 'jitter')))
+    for name, matches in found.items():
+        if isinstance(matches, str):
+            print(_line(name, matches))
+            continue
+        s = summarise(matches)
+        numbers = (s.iou_bev, s.iou_3d, *s.recall_3d, s.ate, s.ase, s.aoe, s.flips, s.jitter)
+        print(_line(name, numbers))
+    for what, values, edges in (
+        ('3D by range [m]', drive.ranges(whole.rows), RANGE_BINS),
+        ('3D by points', whole.num_points, POINT_BINS),
+    ):
+        bins = []
+        for low, high in pairwise(edges):
+            label = f'{low:g}-{high:g}' if math.isfinite(high) else f'{low:g}+'
+            bins.append((label, (values >= low) & (values < high)))
+        bins = [(label, mask) for label, mask in bins if mask.any()]
+        print(_line(what, [label for label, _ in bins]))
+        for name, matches in found.items():
+            if not isinstance(matches, str):
+                print(_line(name, [summarise(matches, mask).iou_3d for _, mask in bins]))
+    print()
+
+
+def draw_paper(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> None:
+    """Draw trajectory and errors over time, as PNG files, of the first seed."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise BoxregError('figures need matplotlib: pip install matplotlib') from None
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+
+    folder.mkdir(parents=True, exist_ok=True)
+    shown = {'truth': truth, 'initial': methods['input'], 'refined': methods['ours, track']}
+    colors = {'truth': 'tab:red', 'initial': 'tab:green', 'refined': 'tab:blue'}
+    figure, axes = pyplot.subplots(figsize=(7, 9))
+    for name, boxes in shown.items():
+        assert isinstance(boxes, BoxTable)
+        for i, box in enumerate(boxes.boxes[::5]):
+            outline = _footprint(box)
+            axes.plot(*outline.T, color=colors[name], lw=0.9, label=name if i == 0 else None)
+    axes.set(aspect='equal', xlabel='x [m]', ylabel='y [m]', title=f'every fifth box, {mode}')
+    axes.legend()
+    figure.savefig(folder / f'paper_{mode}_trajectory.png', dpi=150, bbox_inches='tight')
+    pyplot.close(figure)
+
+    figure, panels = pyplot.subplots(3, 2, figsize=(11, 8), sharex=True)
+    for name in ('initial', 'refined'):
+        boxes = shown[name]
+        assert isinstance(boxes, BoxTable)
+        matches = match(boxes, truth)
+        seconds = (truth.stamps_ns - truth.stamps_ns[0]) / 1e9
+        errors = np.concatenate([matches.translation, matches.rotation], axis=1)
+        for variable, panel, values in zip(VARIABLES, panels.T.flat, errors.T, strict=True):
+            panel.plot(seconds, values, color=colors[name], lw=0.9, label=name)
+            panel.set_ylabel(f'{variable} [{"m" if variable in "xyz" else "rad"}]')
+            panel.axhline(0, color='gray', lw=0.5)
+    panels[0, 0].legend()
+    for panel in panels[-1]:
+        panel.set_xlabel('time [s]')
+    figure.savefig(folder / f'paper_{mode}_errors.png', dpi=150, bbox_inches='tight')
+    pyplot.close(figure)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what `run` reads."""
+    kinds = parser.add_subparsers(dest='kind', required=True, metavar='{paper,real,speed}')
+    paper = kinds.add_parser('paper', help="the paper's experiment: its Table I and two figures")
+    paper.add_argument(
+        '--seeds', type=int, default=3, metavar='N', help='repetitions (default: 3)'
+    )
+    paper.add_argument(
+        '-o', '--output', type=Path, default=Path('out/bench'), metavar='DIR',
+        help='where the figures go (default: out/bench)',
+    )  # fmt: skip
+    real = kinds.add_parser('real', help='recordings with known truth')
+    real.add_argument(
+        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
+    )
+    real.add_argument(
+        '--min-points', type=int, default=100, metavar='N',
+        help='leave out true boxes with fewer points (default: 100)',
+    )  # fmt: skip
+    real.add_argument(
+        '--classes', nargs='+', default=['car', 'van', 'truck'], metavar='WORD',
+        help='only true boxes whose class name holds one of these words (default: car van truck)',
+    )  # fmt: skip
+    for kind in (paper, real):
+        kind.add_argument('--json', action='store_true', help='print one JSON object')
+    if find_spec('boxreg_ros.bench_speed'):
+        speed = kinds.add_parser('speed', help='time per tick, per box and per window')
+        import_module('boxreg_ros.bench_speed').add_arguments(speed)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run one kind of bench and print its table."""
+    if args.kind == 'speed':
+        return int(import_module('boxreg_ros.bench_speed').run(args))
+    return bench_paper(args) if args.kind == 'paper' else bench_real(args)
+
+
+def _registered(drive: Drive, config: Config) -> dict[str, BoxTable]:
+    """Return boxes by estimate: 'early' and 'final' come from one run, 'track' from another."""
+    registrar = BoxRegistrar(config)
+    results: list[RefinedBoxes] = []
+    items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
+    for item in sorted(items, key=lambda item: item.stamp_ns):
+        if isinstance(item, Sweep):
+            results += registrar.add_sweep(item)
+        else:
+            results += registrar.add_boxes(item)
+    results += registrar.flush()
+    arrays: dict[str, list[BoxArray]] = {}
+    for result in results:
+        arrays.setdefault(config.estimate if result.is_final else 'early', []).append(result.boxes)
+    return {name: BoxTable.from_arrays(found) for name, found in sorted(arrays.items())}
+
+
+def _table(tracks: Sequence[Track], boxes: Sequence[Floats], drive: Drive) -> BoxTable:
+    total = sum(len(track.boxes) for track in tracks)
+    return BoxTable(
+        np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)]),
+        drive.truth.frame_id,
+        tuple(track.track_id for track in tracks for _ in track.boxes),
+        tuple(track.class_name for track in tracks for _ in track.boxes),
+        np.ones(total),
+        np.concatenate([np.zeros((0, 9)), *boxes]),
+        ('baseline',) * total,
+        np.zeros(total, np.int64),
+    )
+
+
+def _crop(points: NDArray[Any], box: Floats) -> NDArray[Any]:
+    """Return the points within `MARGIN` of a box."""
+    reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + 2 * MARGIN
+    near = points[(np.abs(points[:, :2] - box[:2]) < reach).all(axis=1)]
+    R = Rotation.from_euler('ZYX', box[[YAW, PITCH, ROLL]]).as_matrix()
+    inside = (np.abs((near - box[:3]) @ R) < box[EXTENT] / 2 + MARGIN).all(axis=1)
+    cropped: NDArray[Any] = near[inside]
+    return cropped
+
+
+def _footprint(box: Floats) -> Floats:
+    """Return the outline (6, 2) of a box from above, with a stroke forward."""
+    corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [1.4, 0]])
+    R = Rotation.from_euler('ZYX', box[[YAW, PITCH, ROLL]]).as_matrix()[:2, :2]
+    outline: Floats = corners * box[[LENGTH, WIDTH]] / 2 @ R.T + box[:2]
+    return outline
+
+
+def _mean_row(found: Sequence[tuple[float, ...] | str]) -> tuple[float, ...] | str:
+    rows = [row for row in found if not isinstance(row, str)]
+    return tuple(np.mean(rows, axis=0).tolist()) if rows else str(found[0])
+
+
+def _line(name: str, row: Sequence[float | str] | str) -> str:
+    if isinstance(row, str):
+        return f'{name:20} {row}'
+    cells = (
+        value if isinstance(value, str) else '-' if math.isnan(value) else f'{value:.3f}'
+        for value in row
+    )
+    return f'{name:20}' + ''.join(f'{cell:>9}' for cell in cells)
+
+
+def _progress(args: argparse.Namespace, total: int) -> Any:
+    return tqdm(total=total, leave=False, disable=not sys.stderr.isatty() or args.json)
