@@ -68,7 +68,7 @@ class FaceConfig:
     sides: float = setting(0.08, 'error of one sight of left or right', 'm', 1e-3, 10.0)
     top: float = setting(0.08, 'error of one sight of the roof', 'm', 1e-3, 10.0)
     bottom: float = setting(0.05, 'error of one sight of the road', 'm', 1e-3, 10.0)
-    outlier: float = setting(0.15, 'a face this far from its points loses its say', 'm', 1e-3, 10.0)
+    outlier: float = setting(0.15, 'a face this far off its points loses its say', 'm', 1e-3, 10.0)
     gap_ends: float = setting(0.05, 'label outside the points, front and back', 'm', -2.0, 2.0)
     gap_sides: float = setting(0.03, 'label outside the points, left and right', 'm', -2.0, 2.0)
     gap_top: float = setting(0.05, 'label above the roof points', 'm', -2.0, 2.0)
@@ -111,13 +111,16 @@ class ClassConfig:
     """How objects of one kind move and how their boxes err."""
 
     names: tuple[str, ...] = setting((), 'class names of this kind: any of these words, any case')
-    acceleration: float = setting(1.5, 'expected change of velocity', 'm/s^2', 1e-3, 1e3)
+    acceleration: float = setting(1.5, 'expected change of speed', 'm/s^2', 1e-3, 1e3)
+    cornering: float = setting(4.0, 'expected acceleration sideways', 'm/s^2', 1e-3, 1e3)
     vertical: float = setting(0.3, 'expected vertical acceleration', 'm/s^2', 1e-3, 1e3)
     turning: float = setting(0.4, 'expected change of turn rate', 'rad/s^2', 1e-3, 1e3)
     tilting: float = setting(0.2, 'expected change of roll and pitch rate', 'rad/s^2', 1e-3, 1e3)
     slip: float = setting(0.15, 'expected sideways velocity of the rear axle', 'm/s', 1e-3, 1e3)
     climb: float = setting(0.5, 'expected velocity along its own z axis', 'm/s', 1e-3, 1e3)
-    axle: float = setting(0.25, 'rear axle behind the centre, as part of the length', '', 0.0, 0.5)
+    pivot: float = setting(
+        0.25, 'what does not slip sideways, behind the centre, part of the length', '', 0.0, 0.5
+    )
     drift: float = setting(0.02, 'step of a parked box: map and ego drift', 'm', 1e-4, 1.0)
     position: float = setting(0.14, 'error of an input centre along the heading', 'm', 1e-3, 10.0)
     lateral: float = setting(0.08, 'error of an input centre across the heading', 'm', 1e-3, 10.0)
@@ -175,13 +178,15 @@ class Config:
     cyclist: ClassConfig = field(
         default_factory=lambda: ClassConfig(
             names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
-            acceleration=2.0, turning=1.5, slip=0.4, axle=0.2, heading=0.15, extent=0.1,
+            acceleration=2.0,
+            cornering=2.0, turning=1.5, slip=0.4, pivot=0.2, heading=0.15, extent=0.1,
         )
     )  # fmt: skip
     pedestrian: ClassConfig = field(
         default_factory=lambda: ClassConfig(
             names=('pedestrian', 'person', 'walker', 'people', 'child'),
-            acceleration=2.0, turning=4.0, slip=1.5, axle=0.0, heading=0.5, extent=0.1,
+            acceleration=2.0,
+            cornering=2.0, turning=4.0, slip=1.5, pivot=0.0, heading=0.5, extent=0.1,
         )
     )  # fmt: skip
 

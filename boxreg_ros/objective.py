@@ -71,23 +71,6 @@ class Problem:
         return Problem(**chosen, deviations={k: v[rows] for k, v in self.deviations.items()})
 
 
-def visible_faces(problem: Problem) -> Tensor:
-    """
-    Return which of the six faces (B, N, 6) the sensor sees: it is on their outer side.
-
-    Where no sensor is known the points' centre of mass decides, as in the paper.
-
-    """
-    R = rotation_from_rpy(problem.boxes[..., 6:9])
-    weight = problem.mask.to(R)
-    mean = (problem.points * weight[..., None]).sum(-2) / weight.sum(-1, keepdim=True).clamp(min=1)
-    known = problem.origins.isfinite().all(-1, keepdim=True)
-    toward = torch.where(known, problem.origins, mean)[..., None, :] @ R
-    outward = toward[..., 0, :][..., FACE_AXIS] * FACE_SIGN.to(R)
-    half = problem.boxes[..., 3:6][..., FACE_AXIS] / 2
-    return outward > torch.where(known, half, torch.zeros_like(half))
-
-
 # --- the paper ----------------------------------------------------------------------------------
 
 
@@ -184,9 +167,11 @@ def _mean(values: Tensor, real: Tensor) -> Tensor:
 
 # --- ours ---------------------------------------------------------------------------------------
 
-SHARED = 15  # extent (3), bias of the input (6), gap of the faces (6)
+SHARED = 16  # extent (3), bias of the input (6), gap of the faces (6), pivot
 EXTENT, BIAS, GAP = slice(0, 3), slice(3, 9), slice(9, 15)
+PIVOT = 15
 TOP, BOTTOM = 4, 5
+HIDDEN, VEIL = 1.0, 0.5
 LEAST = 3  # points without which a face is not seen
 
 
@@ -198,9 +183,10 @@ class State(NamedTuple):
     ----------
     pose : Tensor, shape (B, N, 6)
         x y z roll pitch yaw [m, rad].
-    shared : Tensor, shape (B, 15)
+    shared : Tensor, shape (B, 16)
         Extent [m]; bias of the input poses, along their axes [m, rad]; gap from the outermost
-        points of each face out to the face [m].
+        points of each face out to the face [m]; the point that does not slip sideways, behind the
+        centre, as part of the length.
 
     """
 
@@ -209,11 +195,11 @@ class State(NamedTuple):
 
     @classmethod
     def unpack(cls, x: Tensor, length: int) -> 'State':
-        """Return views into variables (B, 6 N + 15)."""
+        """Return views into variables (B, 6 N + 16)."""
         return cls(x[:, : 6 * length].unflatten(1, (length, 6)), x[:, 6 * length :])
 
     def pack(self) -> Tensor:
-        """Return the variables as one row per window (B, 6 N + 15)."""
+        """Return the variables as one row per window (B, 6 N + 16)."""
         return torch.cat([self.pose.flatten(1), self.shared], 1)
 
 
@@ -222,7 +208,7 @@ class Linearised(NamedTuple):
     A term at one state: n stencils of k observations in a row, F groups of R residuals each.
 
     `residual` is (B, n, F, R), its derivative `by_pose` (B, n, F, R, k, 6) and `by_shared`
-    (B, n, F, R, 15) or None.
+    (B, n, F, R, 16) or None.
 
     """
 
@@ -296,7 +282,7 @@ def curvature(terms: list[Term], x: Tensor, length: int) -> Tensor:
     return H
 
 
-def faces(problem: Problem, state: State, _: None = None) -> Linearised:
+def faces(problem: Problem, state: State, inset: Tensor) -> Linearised:
     """
     Planes of the six faces as 4-vectors v: v . (p, 1) is how far p stands out of the face [m].
 
@@ -311,8 +297,8 @@ def faces(problem: Problem, state: State, _: None = None) -> Linearised:
     normal = R.mT[..., FACE_AXIS, :] * sign[:, None]
     turned = dR.mT[..., FACE_AXIS, :] * sign[:, None]  # (B, N, 3, 6, 3)
     extent, gap = state.shared[:, EXTENT], state.shared[:, GAP]
-    constant = gap - extent[:, FACE_AXIS] / 2
-    offset = constant[:, None] - (normal * shift[..., None, :]).sum(-1)
+    constant = (gap - extent[:, FACE_AXIS] / 2)[:, None] + inset
+    offset = constant - (normal * shift[..., None, :]).sum(-1)
     residual = torch.cat([normal, offset[..., None]], -1)
     B, N = shift.shape[:2]
     by_pose = R.new_zeros((B, N, 6, 4, 1, 6))
@@ -363,38 +349,55 @@ def rest(problem: Problem, state: State, _: None = None) -> Linearised:
 
 
 def slip(problem: Problem, state: State, _: None = None) -> Linearised:
-    """Sideways and vertical velocity of the rear axle in the body frame [m/s]."""
+    """Velocity of the pivot, to the left and upward in the body frame [m/s] [for Eq. 7]."""
     dt = problem.times.diff(dim=1)[..., None]
-    p = state.pose
-    axle = problem.deviations['axle'][:, None] * state.shared[:, :1]
-    middle = (p[:, 1:, 3:] + p[:, :-1, 3:]) / 2
-    R, dR = rotation_derivatives(middle)
-    Re, dRe = rotation_derivatives(p[..., 3:])
-    rear = p[..., :3] - axle[..., None] * Re[..., 0]
-    step = (rear[:, 1:] - rear[:, :-1]) / dt
-    across = R[..., 1:].mT  # left and up
+    p, length, ratio = state.pose, state.shared[:, :1, None], state.shared[:, PIVOT, None, None]
+    across, by_angle = rotation_derivatives((p[:, 1:, 3:] + p[:, :-1, 3:]) / 2)
+    across, by_angle = across[..., 1:].mT, by_angle[..., 1:].mT
+    R, dR = rotation_derivatives(p[..., 3:])
+    rear = p[..., :3] - length * ratio * R[..., 0]
+    step = rear.diff(dim=1) / dt
     residual = (across @ step[..., None])[..., 0]
-    B, n = residual.shape[:2]
-    by_pose = p.new_zeros((B, n, 1, 2, 2, 6))
+    by_pose = p.new_zeros((*residual.shape[:2], 1, 2, 2, 6))
+    tilt = 0.5 * (by_angle @ step[..., None, :, None])[..., 0].mT
     for k, (sign, end) in enumerate(((-1.0, slice(None, -1)), (1.0, slice(1, None)))):
+        swing = -(length * ratio)[..., None] * dR[:, end, :, :, 0] * sign / dt[..., None]
         by_pose[:, :, 0, :, k, :3] = sign * across / dt[..., None]
-        turn = -axle[..., None, None] * dRe[:, end, :, :, 0] * sign / dt[..., None]
-        by_pose[:, :, 0, :, k, 3:] = (
-            across @ turn.mT + 0.5 * (dR[..., 1:].mT @ step[..., None, :, None])[..., 0].mT
-        )
-    by_shared = p.new_zeros((B, n, 1, 2, SHARED))
-    ratio = problem.deviations['axle'][:, None, None]
-    turned = (Re[:, 1:, :, 0] - Re[:, :-1, :, 0]) / dt
-    by_shared[:, :, 0, :, 0] = -ratio * (across @ turned[..., None])[..., 0]
+        by_pose[:, :, 0, :, k, 3:] = across @ swing.mT + tilt
+    turned = -(across @ (R[..., 0].diff(dim=1) / dt)[..., None])[..., 0]
+    by_shared = p.new_zeros((*residual.shape[:2], 1, 2, SHARED))
+    by_shared[:, :, 0, :, 0], by_shared[:, :, 0, :, PIVOT] = ratio * turned, length * turned
     return Linearised(residual[:, :, None], by_pose, by_shared)
 
 
 def shared_prior(problem: Problem, state: State, expected: Tensor) -> Linearised:
-    """Deviation of what is shared from what is expected of it, (B, 15)."""
+    """Deviation of what is shared from what is expected of it, (B, 16)."""
     residual = (state.shared - expected)[:, None, None]
     by_shared = torch.eye(SHARED).to(residual).expand(len(expected), 1, 1, SHARED, SHARED)
     by_pose = residual.new_zeros((len(expected), 1, 1, SHARED, 1, 6))
     return Linearised(residual, by_pose, by_shared)
+
+
+def aspect(problem: Problem) -> Tensor:
+    """
+    Return how openly the sensor sees each face, shape (B, N, 6).
+
+    The tangent of the angle between the face's plane and the line of sight, in the horizontal
+    for the four upright faces: above 0 the sensor is on the outer side, below 0 the face is
+    hidden behind its own edge. The roof counts as open, the bottom as hidden. Where no sensor is
+    known the side of the points' centre of mass is open, as in the paper, the other hidden.
+
+    """
+    R = rotation_from_rpy(problem.boxes[..., 6:9])
+    weight = problem.mask.to(R)[..., None]
+    mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
+    known = problem.origins.isfinite().all(-1, keepdim=True)
+    toward = (torch.where(known, problem.origins, 1e6 * mean)[..., None, :] @ R)[..., 0, :]
+    outward = toward[..., [0, 0, 1, 1]] * FACE_SIGN[:4].to(R)
+    half = problem.boxes[..., [3, 3, 4, 4]] / 2
+    across = toward[..., [1, 1, 0, 0]].abs() - problem.boxes[..., [4, 4, 3, 3]] / 2
+    sides = (outward - half) / across.clamp(min=0.5)
+    return torch.cat([sides, torch.full_like(sides[..., :1], 9), torch.full_like(sides[..., :1], -9)], -1)
 
 
 class Support(NamedTuple):
@@ -419,9 +422,24 @@ class Support(NamedTuple):
     outwardness: Tensor
     seen: Tensor
     count: Tensor
+    retreat: Tensor
 
 
-def support(problem: Problem, state: State, margin: float, outermost: float) -> Support:
+def retreat(aspect: Tensor, depths: Tensor) -> Tensor:
+    """
+    Return how much further in the outermost points of a face stand for its aspect [m].
+
+    A body is round at its edges: what is seen of a face from the side, or of its edge from
+    behind, stands further in the less open the face is, up to `depths` (6,).
+
+    """
+    shifted = aspect + aspect.new_tensor([0, 0, 0.2, 0.2, 0, 0])
+    return depths * (0.5 - 0.5 * shifted / (shifted.square() + 0.25).sqrt())
+
+
+def support(
+    problem: Problem, state: State, margin: float, outermost: float, depths: Tensor
+) -> Support:
     """
     Find the outermost points of each face, the part `outermost` of all [Eq. 4].
 
@@ -440,7 +458,9 @@ def support(problem: Problem, state: State, margin: float, outermost: float) -> 
     near = torch.where(problem.mask[..., None], beyond, torch.inf)
     beside = near[..., [1, 0, 0]].maximum(near[..., [2, 2, 1]]) < 0.2
     out = local[..., FACE_AXIS] * FACE_SIGN.to(local) - half[..., FACE_AXIS]
-    out = out + state.shared[:, None, None, GAP]
+    open_ = aspect(problem)
+    inset = state.shared[:, None, GAP] + retreat(open_, depths)
+    out = out + inset[..., None, :]
     candidate = beside[..., FACE_AXIS] & (out < margin) & (out > -margin - 0.3)
     count = (near < margin).all(-1).sum(-1)
     wanted = (outermost * count).clamp(min=LEAST)[..., None, None]
@@ -455,12 +475,8 @@ def support(problem: Problem, state: State, margin: float, outermost: float) -> 
     points = torch.cat([points, torch.ones_like(points[..., :1])], -1)
     moments = torch.einsum('bnkf,bnkfi,bnkfj->bnfij', share.to(points), points, points)
     outwardness = (torch.where(chosen, height, 0.0) * share).sum(2)
-    seen = (visible_faces(problem) & (number >= LEAST)) | (number >= LEAST) & _is(TOP, number)
-    return _with_road(problem, state, Support(moments, outwardness, seen, count))
-
-
-def _is(face: int, like: Tensor) -> Tensor:
-    return torch.arange(6, device=like.device) == face
+    seen = (number >= LEAST) * torch.where(open_ > 0, 1.0, torch.where(open_ > -HIDDEN, VEIL, 0.0))
+    return _with_road(problem, state, Support(moments, outwardness, seen, count, retreat(open_, depths)))
 
 
 def _with_road(problem: Problem, state: State, support: Support) -> Support:
@@ -472,5 +488,6 @@ def _with_road(problem: Problem, state: State, support: Support) -> Support:
     support.moments[..., BOTTOM, :, :] = point[..., :, None] * point[..., None, :]
     below = shift[..., 2] - road - state.shared[:, None, 2] / 2 + state.shared[:, None, 14]
     support.outwardness[..., BOTTOM] = below
-    support.seen[..., BOTTOM] = known
+    support.seen[..., BOTTOM] = known.to(road)
+    support.retreat[..., BOTTOM] = 0.0
     return support

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from boxreg_ros.association import Pair, StampMatcher
-from boxreg_ros.calibration import AnnotationRule
+from boxreg_ros.calibration import InputModel
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.registration import Estimate, register, Window
@@ -52,7 +52,7 @@ class BoxRegistrar:
         self._tracks: dict[str, _TrackBuffer] = {}
         self._ticks: deque[_Tick] = deque()
         self._newest_ns: int | None = None
-        self._rule = AnnotationRule(config.faces)
+        self._model = InputModel(config.faces)
         self._ended: list[_TrackBuffer] = []
         self._count = 0
 
@@ -134,7 +134,7 @@ class BoxRegistrar:
     def _solve(self, tracks: list['_TrackBuffer']) -> None:
         """Register the window of each track and write the estimates to the ticks they are of."""
         windows = [track.window() for track in tracks]
-        estimates = register(windows, self._config, self._rule)
+        estimates = register(windows, self._config, self._model)
         for track, estimate in zip(tracks, estimates, strict=True):
             track.write(estimate)
             track.slide(self._config)

@@ -5,9 +5,9 @@ from dataclasses import fields
 from typing import NamedTuple
 
 from boxreg_ros import objective
-from boxreg_ros.calibration import AnnotationRule, InputNoise
+from boxreg_ros.calibration import InputModel, InputNoise, scatter
 from boxreg_ros.config import ClassConfig, Config
-from boxreg_ros.geometry import to_box_frame
+from boxreg_ros.geometry import rotation_from_rpy, to_box_frame
 from boxreg_ros.lbfgs import minimize
 from boxreg_ros.objective import Problem, SHARED, State, Support, Term
 from boxreg_ros.sampling import Observation
@@ -20,6 +20,7 @@ MARGINS = (
     0.4,
     0.3,
 )  # around the box, where a face's points are looked for: first round, later [m]
+DEPTHS = torch.tensor([0.36, 0.36, 0.18, 0.18, 0.0, 0.0], dtype=torch.float64)
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
@@ -56,7 +57,7 @@ class Estimate(NamedTuple):
     covariances: Floats
 
 
-def register(windows: Sequence[Window], config: Config, rule: AnnotationRule) -> list[Estimate]:
+def register(windows: Sequence[Window], config: Config, model: InputModel) -> list[Estimate]:
     """
     Refine the boxes of many windows.
 
@@ -66,8 +67,8 @@ def register(windows: Sequence[Window], config: Config, rule: AnnotationRule) ->
         Each of its own track.
     config : Config
         Settings.
-    rule : AnnotationRule
-        Learns from the fresh observations, then tells the gaps to expect.
+    model : InputModel
+        Learns from the fresh observations, then tells the gaps and errors to expect.
 
     Returns
     -------
@@ -80,16 +81,22 @@ def register(windows: Sequence[Window], config: Config, rule: AnnotationRule) ->
         (rows, stack([windows[i] for i in rows], config)) for rows in _batches(windows, config)
     ]
     for rows, (problem, _) in batches:
-        _learn(rule, problem, [windows[i] for i in rows])
+        _learn(model, problem, [windows[i] for i in rows])
     for rows, (problem, origins) in batches:
-        state, covariances = solve(problem, config, rule)
+        state, covariances = solve(problem, config, model)
         boxes = _boxes(problem, state, origins, config)
+        if config.estimate != 'track':
+            settled = torch.tensor(
+                [max(0, len(windows[i].observations) - 1 - config.lag) for i in rows]
+            )
+            deviation = scatter(problem, state)[torch.arange(len(rows)), settled].cpu().numpy()
+            model.learn_noise([windows[i].track_id for i in rows], deviation)
         for row, index in enumerate(rows):
             estimates[index] = _judge(windows[index], boxes[row], covariances[row])
     return estimates
 
 
-def solve(problem: Problem, config: Config, rule: AnnotationRule) -> tuple[State, Tensor]:
+def solve(problem: Problem, config: Config, model: InputModel) -> tuple[State, Tensor]:
     """
     Minimise the robust objective: rounds of correspondence, weighting and L-BFGS.
 
@@ -98,12 +105,12 @@ def solve(problem: Problem, config: Config, rule: AnnotationRule) -> tuple[State
 
     """
     length = problem.boxes.shape[1]
-    expected = _expected(problem, rule)
+    expected = _expected(problem, model)
     state = State(problem.pose.clone(), expected.clone())
     free = _free(problem, config)
-    noise = None
+    noise = model.noise()
     for turn in range(config.solver.rounds):
-        support = objective.support(problem, state, MARGINS[min(turn, 1)], config.faces.outermost)
+        support = objective.support(problem, state, MARGINS[min(turn, 1)], config.faces.outermost, DEPTHS)
         terms = weigh(problem, state, support, expected, noise, config)
         x = state.pack()
         H = objective.curvature(terms, x, length) * free[:, :, None] * free[:, None, :]
@@ -122,7 +129,8 @@ def solve(problem: Problem, config: Config, rule: AnnotationRule) -> tuple[State
             function, x, settings.iterations, settings.history, settings.tolerance, metric
         )
         state = State.unpack(found.x, length)
-        noise = InputNoise.measure(problem, state)
+        if config.estimate == 'track':
+            noise = InputNoise.measure(scatter(problem, state), problem.valid)
     blocks = torch.cholesky_inverse(L)[:, : 6 * length, : 6 * length]
     blocks = blocks.unflatten(1, (length, 6)).unflatten(3, (length, 6))
     return state, blocks.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
@@ -161,18 +169,24 @@ def weigh(
     inflation = torch.tensor(INFLATION).to(error)
     bias, extent = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]), kind['extent'][:, None]
     if noise is not None:
-        ratio = (noise.deviation[:6] / error).clamp(0.25, 4.0)
+        ratio = (noise.deviation[:6] / error).clamp(0.05, 4.0)
         slow = (noise.correlation / 0.4).clamp(0.1, 1.0)
         error = error * ratio
         inflation = ((1 + noise.correlation[:6]) / (1 - noise.correlation[:6])).sqrt()
-        bias = bias * slow[:6] * ratio.clamp(0.5, 2.0)
+        bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
         extent = extent * slow[6:]
     off = objective.prior(problem, state).residual[:, :, 0] / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     gap = torch.full_like(expected[:, :6], faces.spread)
-    shared = torch.cat([expected[:, :3] * extent, bias, gap], 1) ** -2
+    shared = (
+        torch.cat([expected[:, :3] * extent, bias, gap, torch.full_like(gap[:, :1], 0.25)], 1)
+        ** -2
+    )
     # Motion: smoothness, alignment, rest.
-    change = of('acceleration', 'acceleration', 'vertical', 'tilting', 'tilting', 'turning') ** -2
+    change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2
+    turn = torch.eye(6).to(state.pose).expand(*state.pose.shape[:2], 6, 6).clone()
+    turn[..., :3, :3] = rotation_from_rpy(state.pose[..., 3:])
+    change = (turn * change[:, None, None]) @ turn.mT
     slip = of('slip', 'climb') ** -2
     still = (of('drift') * error.new_tensor([1, 1, 0.5, 0.15, 0.15, 0.15])) ** -2
 
@@ -180,9 +194,13 @@ def weigh(
         return torch.diag_embed(weight)[:, :, None]
 
     return [
-        Term(objective.faces, problem, support.moments * trust[..., None, None]),
+        Term(objective.faces, problem, support.moments * trust[..., None, None], support.retreat),
         Term(objective.prior, problem, diagonal(hold)),
-        Term(objective.acceleration, problem, diagonal(change[:, None] * valid[:, 2:, None])),
+        Term(
+            objective.acceleration,
+            problem,
+            (change[:, 1:-1] * valid[:, 2:, None, None])[:, :, None],
+        ),
         Term(objective.slip, problem, diagonal(slip[:, None] * valid[:, 1:, None])),
         Term(objective.rest, problem, diagonal(still[:, None] * _parked(problem)[..., None])),
         Term(objective.shared_prior, problem, diagonal(shared[:, None]), expected),
@@ -205,8 +223,8 @@ def _parked(problem: Problem) -> Tensor:
     return (is_parked[:, None] & problem.valid[:, 1:]).to(where)
 
 
-def _expected(problem: Problem, rule: AnnotationRule) -> Tensor:
-    """Return the expectation of what is shared (B, 15): mean input extent, no bias, the rule."""
+def _expected(problem: Problem, model: InputModel) -> Tensor:
+    """Return the expectation of what is shared (B, 16): mean input extent, no bias, the rule, the axle."""
     extents = problem.boxes[..., 3:6]
     count = problem.valid.sum(1)
     ranked = torch.where(problem.valid[..., None], extents, torch.inf).sort(1).values
@@ -214,12 +232,12 @@ def _expected(problem: Problem, rule: AnnotationRule) -> Tensor:
     index = torch.arange(extents.shape[1], device=count.device)
     kept = ((index >= cut) & (index < count[:, None] - cut))[..., None]
     mean = torch.where(kept, ranked, 0.0).sum(1) / kept.sum(1)
-    gaps = rule.gaps().to(mean).expand(len(mean), 6)
-    return torch.cat([mean, torch.zeros_like(gaps), gaps], 1)
+    gaps = model.gaps().to(mean).expand(len(mean), 6)
+    return torch.cat([mean, torch.zeros_like(gaps), gaps, problem.deviations['pivot'][:, None]], 1)
 
 
 def _free(problem: Problem, config: Config) -> Tensor:
-    """Return 1 for every variable (B, 6 N + 15) to be solved for, 0 for those that stay."""
+    """Return 1 for every variable (B, 6 N + 16) to be solved for, 0 for those that stay."""
     pose = problem.valid[..., None].to(problem.boxes).expand(-1, -1, 6).clone()
     shared = pose.new_ones((len(pose), SHARED))
     if config.mode == 'bev':
@@ -229,13 +247,13 @@ def _free(problem: Problem, config: Config) -> Tensor:
     return State(pose, shared).pack()
 
 
-def _learn(rule: AnnotationRule, problem: Problem, windows: list[Window]) -> None:
+def _learn(model: InputModel, problem: Problem, windows: list[Window]) -> None:
     """Show the rule the fresh observations at their input boxes."""
-    expected = _expected(problem, rule)
-    support = objective.support(problem, State(problem.pose, expected), MARGINS[0], 0.05)
+    expected = _expected(problem, model)
+    support = objective.support(problem, State(problem.pose, expected), MARGINS[0], 0.05, DEPTHS)
     first = torch.tensor([len(w.observations) - w.fresh for w in windows])
     fresh = torch.arange(problem.valid.shape[1]) >= first[:, None]
-    rule.learn(
+    model.learn_gaps(
         [w.track_id for w in windows], support, fresh & problem.valid, expected[:, objective.GAP]
     )
 
@@ -321,7 +339,7 @@ def _judge(window: Window, boxes: Floats, covariances: Tensor) -> Estimate:
             reasons[i] = 'no_points'
         elif not np.isfinite(boxes[i]).all() or (boxes[i, 3:6] <= 0).any():
             reasons[i] = 'not_finite'
-        elif held[1] < 0.8 * held[0] - 3:
+        elif held[1] < 0.5 * held[0] - 3:
             reasons[i] = 'no_gain'
         else:
             result[i], status[i], spread[i] = boxes[i], REFINED, covariances[i].cpu().numpy()

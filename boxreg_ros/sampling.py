@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 RING = 1.0  # how far beside a box the road is looked for [m]
+ROAD, FLAT = (0.1, 0.3, 0.6), (np.nan,) * 3
 CLEARANCE = 0.2  # what is lower above the road may be road [m]
 
 
@@ -68,7 +69,8 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
         beside = (np.abs(outside[:, :2].max(1) - RING / 2 - 0.05) < RING / 2) & (
             np.abs(offset[:, 2] + box[5] / 2) < 0.6
         )
-        ground = float(np.quantile(offset[beside, 2], 0.3)) if beside.sum() >= 5 else np.nan
+        low, ground, high = np.quantile(offset[beside, 2], ROAD) if beside.sum() >= 5 else FLAT
+        ground = ground if high - low < 0.15 else np.nan  # a wall, a kerb, a vehicle
         near = np.flatnonzero(depth < config.sampling.margin)
         crops.append((first + near, offset[near], depth[near], ground))
         np.minimum.at(nearest, first + near, depth[near])
