@@ -1,17 +1,16 @@
 """Scores of boxes whose errors are known."""
 
 import argparse
-import json
 from dataclasses import replace
-
-import numpy as np
-import pytest
+import json
 
 from boxreg_ros import evaluate as cli
-from boxreg_ros.boxtable import COLUMNS, BoxTable
+from boxreg_ros.boxtable import BoxTable, COLUMNS
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.evaluate import evaluate, groups, has_word, match, summarise
 from boxreg_ros.structures import BoxArray
+import numpy as np
+import pytest
 
 STEP = 100_000_000
 

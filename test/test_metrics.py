@@ -1,14 +1,13 @@
 """Overlap and pose errors against answers known by hand, shapely and Monte Carlo."""
 
+from boxreg_ros.errors import ShapeError
+from boxreg_ros.metrics import iou_3d, iou_bev, pose_errors, wrap
 import numpy as np
 import pytest
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 from shapely import affinity, geometry
-
-from boxreg_ros.errors import ShapeError
-from boxreg_ros.metrics import iou_3d, iou_bev, pose_errors, wrap
 
 CAR = np.array([[10.0, -5.0, 1.0, 4.5, 1.9, 1.6, 0.0, 0.0, 0.3]])
 
