@@ -170,8 +170,8 @@ def test_interrupt_leaves_nothing(tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    # Python ends by the signal itself where that came amid an exec() of text, as in rosbags'
-    # generated readers; a shell shows 130 for both.
+    # Started by -m, Python ends by the signal itself where that came amid an exec() of text, as
+    # of rosbags' generated readers; a shell shows 130 for both.
     assert process.returncode in (130, -signal.SIGINT)
     assert (out, err) == ('', 'boxreg: interrupted; nothing was written\n')
     assert list((tmp_path / 'results').iterdir()) == []
