@@ -50,6 +50,13 @@ class InputNoise(NamedTuple):
         return cls(deviation, correlation.clamp(0.0, 0.9))
 
 
+class Rule(NamedTuple):
+    """Gap of each face (6,) [m], and how much further in its points stand if it is hidden."""
+
+    gaps: Tensor
+    depths: Tensor
+
+
 def scatter(problem: Problem, state: State) -> Tensor:
     """Return input minus fit along the box axes, as `InputNoise` counts them, (B, N, 9)."""
     difference = problem.pose - state.pose
@@ -74,21 +81,28 @@ class InputModel:
         self._sights: OrderedDict[str, Floats] = OrderedDict()
         self._scatter: OrderedDict[str, deque[Floats]] = OrderedDict()
 
-    def learn_gaps(
-        self, names: Sequence[str], support: Support, fresh: Tensor, gaps: Tensor
+    def learn_rule(
+        self, names: Sequence[str], support: Support, fresh: Tensor, rule: Rule
     ) -> None:
         """
         Take the observations `fresh` (B, N) of tracks `names`, sighted at their input boxes.
 
-        `gaps` (B, 6) are those that `support` was made with.
+        `rule` is what `support` was made with.
 
         """
-        sights = (gaps[:, None] - support.outwardness).cpu().numpy()
-        enough = (support.seen >= 1) & (fresh & (support.count >= 30))[..., None]
-        weight = enough.cpu().numpy() & (np.abs(sights) < 0.5)
+        out, retreat = support.outwardness.cpu().numpy(), support.retreat.cpu().numpy()
+        share = retreat / np.maximum(rule.depths.cpu().numpy(), 1e-6)
+        usable = ((support.seen > 0) & (fresh & (support.count >= 30))[..., None]).cpu().numpy()
+        usable &= np.abs(out) < 0.5
+        sights = (
+            rule.gaps.cpu().numpy() - out,
+            rule.depths.cpu().numpy() - out / np.maximum(share, 0.5),
+        )
         for b, name in enumerate(names):
-            known = self._sights.setdefault(name, np.zeros((2, 6)))
-            known += np.stack([(sights[b] * weight[b]).sum(0), weight[b].sum(0)])
+            known = self._sights.setdefault(name, np.zeros((2, 2, 6)))
+            for k, which in enumerate((share < 0.25, share > 0.5)):
+                weight = (usable & which)[b]
+                known[k] += np.stack([(sights[k][b] * weight).sum(0), weight.sum(0)])
         _forget(self._sights, names)
 
     def learn_noise(self, names: Sequence[str], scatters: Floats) -> None:
@@ -97,22 +111,26 @@ class InputModel:
             self._scatter.setdefault(name, deque(maxlen=SCATTERS)).append(row)
         _forget(self._scatter, names)
 
-    def gaps(self) -> Tensor:
-        """Return the gap to expect of each face, shape (6,) [m]."""
+    def rule(self) -> Rule:
+        """Return the annotation rule to expect."""
         c = self._config
-        expected = (c.gap_ends, c.gap_sides, c.gap_top, c.gap_bottom)
-        gaps = torch.zeros(6, dtype=torch.float64)
-        known = np.array(list(self._sights.values())).reshape(-1, 2, 6)
-        for faces, gap, deviation in zip(KINDS, expected, RULE_ERROR, strict=True):
+        gaps = self._median(0, (c.gap_ends, c.gap_sides, c.gap_top, c.gap_bottom))
+        return Rule(gaps, self._median(1, (c.depth_ends, c.depth_sides, 0.0, 0.0)))
+
+    def _median(self, which: int, expected: Sequence[float]) -> Tensor:
+        """Weigh what is `expected` of each kind of face against the median over tracks."""
+        known = np.array(list(self._sights.values())).reshape(-1, 2, 2, 6)[:, which]
+        values = torch.zeros(6, dtype=torch.float64)
+        for faces, value, deviation in zip(KINDS, expected, RULE_ERROR, strict=True):
             total, count = known[:, 0, faces].ravel(), known[:, 1, faces].ravel()
             sights = total[count >= 3] / count[count >= 3]
-            if c.learn and len(sights) >= 3:
+            if self._config.learn and len(sights) >= 3:
                 middle = np.median(sights)
                 error = 1.25 * (1.48 * np.median(np.abs(sights - middle)) + 0.02)
                 trust = deviation**2 / (deviation**2 + error**2 / len(sights))
-                gap = gap + trust * (middle - gap)
-            gaps[faces] = float(gap)
-        return gaps
+                value = value + trust * (middle - value)
+            values[faces] = float(value)
+        return values
 
     def noise(self) -> InputNoise | None:
         """Return the noise of what `learn_noise` took; None as long as that is too little."""

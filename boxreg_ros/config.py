@@ -73,6 +73,8 @@ class FaceConfig:
     gap_sides: float = setting(0.03, 'label outside the points, left and right', 'm', -2.0, 2.0)
     gap_top: float = setting(0.05, 'label above the roof points', 'm', -2.0, 2.0)
     gap_bottom: float = setting(0.0, 'label below the road', 'm', -2.0, 2.0)
+    depth_ends: float = setting(0.36, 'points further in, ends seen from behind', 'm', 0.0, 2.0)
+    depth_sides: float = setting(0.18, 'points further in, sides seen from behind', 'm', 0.0, 2.0)
     spread: float = setting(0.07, 'difference of gaps between objects', 'm', 1e-4, 1.0)
     learn: bool = setting(True, 'learn the gaps from the input as it comes')
 

@@ -171,7 +171,7 @@ SHARED = 16  # extent (3), bias of the input (6), gap of the faces (6), pivot
 EXTENT, BIAS, GAP = slice(0, 3), slice(3, 9), slice(9, 15)
 PIVOT = 15
 TOP, BOTTOM = 4, 5
-HIDDEN, VEIL = 1.0, 0.5
+HIDDEN, VEIL = 9.0, 0.4
 LEAST = 3  # points without which a face is not seen
 
 
@@ -397,7 +397,9 @@ def aspect(problem: Problem) -> Tensor:
     half = problem.boxes[..., [3, 3, 4, 4]] / 2
     across = toward[..., [1, 1, 0, 0]].abs() - problem.boxes[..., [4, 4, 3, 3]] / 2
     sides = (outward - half) / across.clamp(min=0.5)
-    return torch.cat([sides, torch.full_like(sides[..., :1], 9), torch.full_like(sides[..., :1], -9)], -1)
+    return torch.cat(
+        [sides, torch.full_like(sides[..., :1], 9), torch.full_like(sides[..., :1], -9)], -1
+    )
 
 
 class Support(NamedTuple):
@@ -476,7 +478,9 @@ def support(
     moments = torch.einsum('bnkf,bnkfi,bnkfj->bnfij', share.to(points), points, points)
     outwardness = (torch.where(chosen, height, 0.0) * share).sum(2)
     seen = (number >= LEAST) * torch.where(open_ > 0, 1.0, torch.where(open_ > -HIDDEN, VEIL, 0.0))
-    return _with_road(problem, state, Support(moments, outwardness, seen, count, retreat(open_, depths)))
+    return _with_road(
+        problem, state, Support(moments, outwardness, seen, count, retreat(open_, depths))
+    )
 
 
 def _with_road(problem: Problem, state: State, support: Support) -> Support:

@@ -5,7 +5,7 @@ from dataclasses import fields
 from typing import NamedTuple
 
 from boxreg_ros import objective
-from boxreg_ros.calibration import InputModel, InputNoise, scatter
+from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.geometry import rotation_from_rpy, to_box_frame
 from boxreg_ros.lbfgs import minimize
@@ -20,7 +20,7 @@ MARGINS = (
     0.4,
     0.3,
 )  # around the box, where a face's points are looked for: first round, later [m]
-DEPTHS = torch.tensor([0.36, 0.36, 0.18, 0.18, 0.0, 0.0], dtype=torch.float64)
+RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
@@ -105,12 +105,15 @@ def solve(problem: Problem, config: Config, model: InputModel) -> tuple[State, T
 
     """
     length = problem.boxes.shape[1]
-    expected = _expected(problem, model)
+    rule = model.rule()
+    expected = _expected(problem, rule)
     state = State(problem.pose.clone(), expected.clone())
     free = _free(problem, config)
     noise = model.noise()
     for turn in range(config.solver.rounds):
-        support = objective.support(problem, state, MARGINS[min(turn, 1)], config.faces.outermost, DEPTHS)
+        support = objective.support(
+            problem, state, MARGINS[min(turn, 1)], config.faces.outermost, rule.depths
+        )
         terms = weigh(problem, state, support, expected, noise, config)
         x = state.pack()
         H = objective.curvature(terms, x, length) * free[:, :, None] * free[:, None, :]
@@ -177,7 +180,8 @@ def weigh(
         extent = extent * slow[6:]
     off = objective.prior(problem, state).residual[:, :, 0] / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
-    gap = torch.full_like(expected[:, :6], faces.spread)
+    hidden = (support.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
+    gap = (faces.spread**2 + (RETREAT_SPREAD * hidden) ** 2).sqrt()
     shared = (
         torch.cat([expected[:, :3] * extent, bias, gap, torch.full_like(gap[:, :1], 0.25)], 1)
         ** -2
@@ -223,7 +227,7 @@ def _parked(problem: Problem) -> Tensor:
     return (is_parked[:, None] & problem.valid[:, 1:]).to(where)
 
 
-def _expected(problem: Problem, model: InputModel) -> Tensor:
+def _expected(problem: Problem, rule: Rule) -> Tensor:
     """Return the expectation of what is shared (B, 16): mean input extent, no bias, the rule, the axle."""
     extents = problem.boxes[..., 3:6]
     count = problem.valid.sum(1)
@@ -232,7 +236,7 @@ def _expected(problem: Problem, model: InputModel) -> Tensor:
     index = torch.arange(extents.shape[1], device=count.device)
     kept = ((index >= cut) & (index < count[:, None] - cut))[..., None]
     mean = torch.where(kept, ranked, 0.0).sum(1) / kept.sum(1)
-    gaps = model.gaps().to(mean).expand(len(mean), 6)
+    gaps = rule.gaps.to(mean).expand(len(mean), 6)
     return torch.cat([mean, torch.zeros_like(gaps), gaps, problem.deviations['pivot'][:, None]], 1)
 
 
@@ -249,13 +253,14 @@ def _free(problem: Problem, config: Config) -> Tensor:
 
 def _learn(model: InputModel, problem: Problem, windows: list[Window]) -> None:
     """Show the rule the fresh observations at their input boxes."""
-    expected = _expected(problem, model)
-    support = objective.support(problem, State(problem.pose, expected), MARGINS[0], 0.05, DEPTHS)
+    rule = model.rule()
+    expected = _expected(problem, rule)
+    support = objective.support(
+        problem, State(problem.pose, expected), MARGINS[0], 0.05, rule.depths
+    )
     first = torch.tensor([len(w.observations) - w.fresh for w in windows])
     fresh = torch.arange(problem.valid.shape[1]) >= first[:, None]
-    model.learn_gaps(
-        [w.track_id for w in windows], support, fresh & problem.valid, expected[:, objective.GAP]
-    )
+    model.learn_rule([w.track_id for w in windows], support, fresh & problem.valid, rule)
 
 
 def _batches(windows: Sequence[Window], config: Config) -> list[list[int]]:
