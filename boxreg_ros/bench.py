@@ -205,7 +205,7 @@ def bench_paper(args: argparse.Namespace) -> int:
         for mode, scenario in SCENARIOS.items():
             found = results.setdefault(mode, {})
             for seed in range(args.seeds):
-                drive = Drive.from_scene(simulate(scenario, seed))
+                drive = Drive.from_scene(simulate(scenario, seed, args.steps))
                 methods = run_methods(drive, mode, bar.update)
                 for name, boxes in methods.items():
                     found.setdefault(name, []).append(
@@ -350,6 +350,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     paper = kinds.add_parser('paper', help="the paper's experiment: its Table I and two figures")
     paper.add_argument(
         '--seeds', type=int, default=3, metavar='N', help='repetitions (default: 3)'
+    )
+    paper.add_argument(
+        '--steps', type=int, metavar='N', help='boxes per repetition (default: all 100)'
     )
     paper.add_argument(
         '-o', '--output', type=Path, default=Path('out/bench'), metavar='DIR',
