@@ -75,7 +75,7 @@ class FaceConfig:
     gap_bottom: float = setting(0.0, 'label below the road', 'm', -2.0, 2.0)
     depth_ends: float = setting(0.36, 'points further in, ends seen from behind', 'm', 0.0, 2.0)
     depth_sides: float = setting(0.18, 'points further in, sides seen from behind', 'm', 0.0, 2.0)
-    spread: float = setting(0.07, 'difference of gaps between objects', 'm', 1e-4, 1.0)
+    spread: float = setting(0.06, 'difference of gaps between objects', 'm', 1e-4, 1.0)
     learn: bool = setting(True, 'learn the gaps from the input as it comes')
 
 
@@ -115,11 +115,11 @@ class ClassConfig:
     names: tuple[str, ...] = setting((), 'class names of this kind: any of these words, any case')
     acceleration: float = setting(1.5, 'expected change of speed', 'm/s^2', 1e-3, 1e3)
     cornering: float = setting(4.0, 'expected acceleration sideways', 'm/s^2', 1e-3, 1e3)
-    vertical: float = setting(0.3, 'expected vertical acceleration', 'm/s^2', 1e-3, 1e3)
-    turning: float = setting(0.4, 'expected change of turn rate', 'rad/s^2', 1e-3, 1e3)
+    vertical: float = setting(1.0, 'expected vertical acceleration', 'm/s^2', 1e-3, 1e3)
+    turning: float = setting(0.8, 'expected change of turn rate', 'rad/s^2', 1e-3, 1e3)
     tilting: float = setting(0.2, 'expected change of roll and pitch rate', 'rad/s^2', 1e-3, 1e3)
     slip: float = setting(0.15, 'expected sideways velocity of the rear axle', 'm/s', 1e-3, 1e3)
-    climb: float = setting(0.5, 'expected velocity along its own z axis', 'm/s', 1e-3, 1e3)
+    climb: float = setting(0.25, 'expected velocity along its own z axis', 'm/s', 1e-3, 1e3)
     pivot: float = setting(
         0.25, 'what does not slip sideways, behind the centre, part of the length', '', 0.0, 0.5
     )

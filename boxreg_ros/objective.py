@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
+from boxreg_ros.config import PaperConfig
 from boxreg_ros.geometry import (
     FACE_AXIS,
     face_distances,
@@ -157,6 +158,29 @@ def alignment(boxes: Tensor, valid: Tensor) -> Tensor:
     forward = torch.where((heading * direction).sum(-1) < 0, -1.0, 1.0)[..., None]
     gap = ((heading - forward * direction).square().sum(-1) + EPSILON).sqrt()
     return _mean(gap * (length / 0.1).clamp(max=1.0), valid[:, 1:])
+
+
+def total(
+    boxes: Tensor, problem: Problem, weights: PaperConfig, multipliers: Tensor
+) -> tuple[Tensor, Tensor]:
+    """
+    Return the objective (B,) [Eq. 8] and the violation (B, 2) of its two constraints.
+
+    Notes
+    -----
+    The paper names weights and augmented Lagrange multipliers without saying how they go
+    together. Smoothness and alignment are constraints c = 0 here, each adding m c + w c^2 / 2
+    with its weight w and its multiplier m, which `multipliers` (B, 2) holds.
+
+    """
+    points = problem.points + problem.boxes[..., None, :3]
+    violation = torch.stack(
+        [smoothness(boxes, problem.valid), alignment(boxes, problem.valid)], -1
+    )
+    penalty = violation.new_tensor([weights.smoothness, weights.alignment])
+    loss = weights.closeness * closeness(boxes, points, problem.mask, weights.nearest)
+    loss = loss + weights.enclosure * enclosure(boxes, points, problem.mask)
+    return loss + (multipliers * violation + penalty * violation**2 / 2).sum(-1), violation
 
 
 def _mean(values: Tensor, real: Tensor) -> Tensor:

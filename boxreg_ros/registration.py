@@ -83,7 +83,10 @@ def register(windows: Sequence[Window], config: Config, model: InputModel) -> li
     for rows, (problem, _) in batches:
         _learn(model, problem, [windows[i] for i in rows])
     for rows, (problem, origins) in batches:
-        state, covariances = solve(problem, config, model)
+        if config.objective == 'paper':
+            state, covariances = solve_paper(problem, config)
+        else:
+            state, covariances = solve(problem, config, model)
         boxes = _boxes(problem, state, origins, config)
         if config.estimate != 'track':
             settled = torch.tensor(
@@ -137,6 +140,46 @@ def solve(problem: Problem, config: Config, model: InputModel) -> tuple[State, T
     blocks = torch.cholesky_inverse(L)[:, : 6 * length, : 6 * length]
     blocks = blocks.unflatten(1, (length, 6)).unflatten(3, (length, 6))
     return state, blocks.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+
+
+def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
+    """
+    Minimise the paper's objective (Eq. 8) by L-BFGS, multipliers updated in between.
+
+    Returns the state, extents as the windows' input means them, and the squared errors of the
+    input as covariances: the paper's terms have no scale to derive any from.
+
+    """
+    length, settings = problem.boxes.shape[1], config.paper
+    expected = _expected(problem, Rule(torch.zeros(6), torch.zeros(6)))
+    extent = expected[:, None, objective.EXTENT].expand(-1, length, -1)
+    free = _free(problem, config)[:, : 6 * length]
+    x = problem.pose.flatten(1)
+    multipliers = x.new_tensor([settings.smoothness, settings.alignment]).repeat(len(x), 1)
+
+    def boxes(x: Tensor, rows: Tensor) -> Tensor:
+        pose = x.unflatten(1, (length, 6))
+        return torch.cat([pose[..., :3], extent[rows], pose[..., 3:]], -1)
+
+    def function(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        part = problem if len(rows) == len(extent) else problem.select(rows)
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            loss, _ = objective.total(boxes(x, rows), part, settings, multipliers[rows])
+            (gradient,) = torch.autograd.grad(loss.sum(), x)
+        return loss.detach(), gradient * free[rows]
+
+    for _ in range(settings.multiplier_rounds):
+        x = minimize(function, x, settings.iterations, config.solver.history, 1e-9).x
+        everything = torch.arange(len(x), device=x.device)
+        _, violation = objective.total(boxes(x, everything), problem, settings, multipliers)
+        multipliers += violation * x.new_tensor([settings.smoothness, settings.alignment])
+    kind = problem.deviations
+    names = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
+    spread = torch.stack([kind[name] for name in names], -1) ** 2
+    return State(x.unflatten(1, (length, 6)), expected), torch.diag_embed(spread)[:, None].expand(
+        -1, length, -1, -1
+    )
 
 
 def weigh(

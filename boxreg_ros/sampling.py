@@ -78,7 +78,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     for box, (index, offset, depth, ground) in zip(boxes, crops, strict=True):
         floor = (-box[5] / 2 if np.isnan(ground) else ground) + CLEARANCE
         own = np.flatnonzero((depth <= nearest[index]) & (offset[:, 2] > floor))
-        kept = own[:: max(1, -(-len(own) // config.sampling.points))]
+        kept = own[_thinned(offset[own], config)]
         times = np.zeros(len(kept)) if sweep.times is None else sweep.times[source[index[kept]]]
         observations.append(
             Observation(
@@ -92,6 +92,15 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
             )
         )
     return observations
+
+
+def _thinned(points: Floats, config: Config) -> Ints:
+    """Return which of `points` (M, 3) to keep: farthest ones for the paper, else every n-th."""
+    count = config.sampling.points
+    if config.objective != 'paper' or len(points) <= count:
+        return np.arange(0, len(points), max(1, -(-len(points) // count)))
+    mask = torch.ones(len(points), dtype=torch.bool)
+    return farthest_point_sample(torch.from_numpy(points), mask, count).numpy()
 
 
 def _near_any(points: NDArray[np.floating], boxes: Floats, margin: float) -> tuple[Floats, Ints]:
@@ -116,7 +125,7 @@ def _near_any(points: NDArray[np.floating], boxes: Floats, margin: float) -> tup
     return points[near].astype(np.float64), near
 
 
-def farthest_point_sample(points: Tensor, mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def farthest_point_sample(points: Tensor, mask: Tensor, count: int) -> Tensor:
     """
     Choose `count` points that cover the cloud, for all clouds of a batch at once.
 
@@ -127,31 +136,24 @@ def farthest_point_sample(points: Tensor, mask: Tensor, count: int) -> tuple[Ten
     mask : Tensor, shape (..., M)
         True where a point is real.
     count : int
-        Points to choose; a cloud with fewer returns all of its own.
+        Points to choose, at most M.
 
     Returns
     -------
-    chosen : Tensor, shape (..., min(count, M), 3)
-        The first is the one farthest from the mean; each next one farthest from all before.
-    chosen_mask : Tensor, shape (..., min(count, M))
-        False where a cloud had no more points.
+    index : Tensor, shape (..., count)
+        The first is the one farthest from the mean, each next one farthest from all before;
+        padding comes last, where a cloud has fewer points than that.
 
     """
     weight = mask.to(points.dtype)
     mean = (points * weight[..., None]).sum(-2) / weight.sum(-1, keepdim=True).clamp(min=1)
-    distance = ((points - mean[..., None, :]) ** 2).sum(-1)
-    distance = torch.where(mask, distance, -torch.inf)
+    distance = torch.where(mask, (points - mean[..., None, :]).square().sum(-1), -2.0)
     picks = []
-    for step in range(min(count, points.shape[-2])):
+    for step in range(count):
         pick = distance.argmax(-1, keepdim=True)
-        picks.append(pick)
         center = points.gather(-2, pick[..., None].expand(*pick.shape, 3))
-        fresh = ((points - center) ** 2).sum(-1)
-        fresh = torch.where(mask, fresh, -torch.inf).scatter(-1, pick, -1.0)
-        distance = fresh if step == 0 else torch.minimum(distance, fresh)
-    index = (
-        torch.cat(picks, -1) if picks else mask.new_zeros((*mask.shape[:-1], 0), dtype=torch.long)
-    )
-    chosen = points.gather(-2, index[..., None].expand(*index.shape, 3))
-    real = torch.arange(index.shape[-1], device=mask.device) < mask.sum(-1, keepdim=True)
-    return chosen, real
+        fresh = (points - center).square().sum(-1)
+        distance = torch.where(mask, fresh if step == 0 else distance.minimum(fresh), -2.0)
+        picks.append(pick)
+        distance = distance.scatter(-1, pick, -3.0)  # once is enough: minima stay below
+    return torch.cat(picks, -1)
