@@ -5,6 +5,8 @@ from pathlib import Path
 import sys
 import tempfile
 
+import torch
+
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 os.environ['ROS_LOG_DIR'] = str(Path(tempfile.gettempdir(), 'boxreg_ros_test_log'))
@@ -12,3 +14,6 @@ os.environ['ROS_LOG_DIR'] = str(Path(tempfile.gettempdir(), 'boxreg_ros_test_log
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 # The wheels of ROS need it where ROS itself is not installed.
 os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+
+# Small problems on few cores: threads cost more than they bring.
+torch.set_num_threads(1)

@@ -1,0 +1,641 @@
+"""The terms: the paper's equations by hand, ours against automatic differentiation."""
+
+from boxreg_ros import objective
+from boxreg_ros.config import PaperConfig
+from boxreg_ros.geometry import face_distances
+from boxreg_ros.objective import Problem, SHARED, State, Term
+import numpy as np
+import pytest
+import torch
+
+D = torch.float64
+NIL = objective.EPSILON**0.5  # what a norm is at zero, with the small number inside its root
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=D)
+
+
+def at(*poses, extent=(4.0, 2.0, 2.0)):
+    """Return boxes (1, N, 9) of poses (x, y, z, roll, pitch, yaw); what is left out is 0."""
+    rows = [[*p[:3], *extent, *p[3:]] for p in ((*p, *[0.0] * (6 - len(p))) for p in poses)]
+    return tensor([rows])
+
+
+def real(boxes):
+    return torch.ones(boxes.shape[:2], dtype=torch.bool)
+
+
+def random_problem(B=3, N=6, M=20, seed=0):
+    rng = np.random.default_rng(seed)
+    boxes = rng.normal(size=(B, N, 9))
+    boxes[..., 3:6] = [4, 2, 1.5] + 0.1 * rng.random((B, N, 3))
+    boxes[..., 6:8] *= 0.1
+    valid = np.arange(N) < np.array([N, N - 1, N - 2])[:B, None]
+    return Problem(
+        boxes=torch.from_numpy(boxes),
+        valid=torch.from_numpy(valid),
+        times=torch.from_numpy(np.cumsum(rng.random((B, N)) + 0.05, 1)),
+        points=torch.from_numpy(rng.normal(size=(B, N, M, 3))),
+        mask=torch.from_numpy((rng.random((B, N, M)) < 0.8) & valid[..., None]),
+        origins=torch.from_numpy(20 * rng.normal(size=(B, N, 3))),
+        ground=torch.from_numpy(rng.normal(size=(B, N))),
+        deviations={'drift': tensor([0.02] * B)},
+    )
+
+
+# --- Eq. 4 ----------------------------------------------------------------------------------------
+
+# In a box of 4 x 2 x 2 m; their centre of mass is ahead, left and up, so front, left and top are
+# seen. Distances to the front: 0.1 and 1.0; left: 0.5 and 0.1; top: 0.8 and 0.6.
+TWO = tensor([[[[1.9, 0.5, 0.2], [1.0, 0.9, 0.4]]]])
+
+
+def closeness(boxes, points, nearest, mask=None):
+    mask = torch.ones(points.shape[:-1], dtype=torch.bool) if mask is None else mask
+    return objective.closeness(boxes, points, mask, nearest)
+
+
+@pytest.mark.parametrize(
+    'nearest, known',
+    [
+        (1, 0.1**2 + 0.1**2 + 0.6**2),
+        (2, (0.1**2 + 1.0**2 + 0.5**2 + 0.1**2 + 0.8**2 + 0.6**2) / 2),
+        (99, (0.1**2 + 1.0**2 + 0.5**2 + 0.1**2 + 0.8**2 + 0.6**2) / 2),
+    ],
+)
+def test_closeness_by_hand(nearest, known):
+    assert closeness(at((0, 0, 0)), TWO, nearest).item() == pytest.approx(known)
+
+
+def test_closeness_takes_the_faces_on_the_side_of_the_centre_of_mass():
+    # Mirrored points see the opposite faces, at the same distances.
+    mirrored = closeness(at((0, 0, 0)), -TWO, 2)
+    assert mirrored.item() == pytest.approx(closeness(at((0, 0, 0)), TWO, 2).item())
+
+
+def test_closeness_is_zero_for_points_in_the_visible_corner():
+    # Front, left, top corner of the box; seen from outside or inside makes no difference.
+    box = at((5, -3, 1, 0, 0, 0.4))
+    corner = tensor([5, -3, 1]) + torch.stack(
+        [
+            2 * torch.cos(tensor(0.4)) - torch.sin(tensor(0.4)),
+            2 * torch.sin(tensor(0.4)) + torch.cos(tensor(0.4)),
+            tensor(1.0),
+        ]
+    )
+    assert closeness(box, corner.expand(1, 1, 3, 3), 2).item() == pytest.approx(0, abs=1e-25)
+
+
+def test_closeness_is_the_mean_over_observations_with_points():
+    boxes = at((0, 0, 0), (0, 0, 0), (0, 0, 0))
+    points = torch.cat([TWO, TWO, 1e3 + TWO], 1)
+    mask = torch.tensor([[[True, True], [True, False], [False, False]]])
+    # Of the second box only the first point is real: 0.1^2 + 0.5^2 + 0.8^2 = 0.9.
+    both = (0.1**2 + 1.0**2 + 0.5**2 + 0.1**2 + 0.8**2 + 0.6**2) / 2
+    assert closeness(boxes, points, 2, mask).item() == pytest.approx((both + 0.9) / 2)
+
+
+# --- Eq. 5 ----------------------------------------------------------------------------------------
+
+
+def enclosure(boxes, points, mask=None):
+    mask = torch.ones(points.shape[:-1], dtype=torch.bool) if mask is None else mask
+    return objective.enclosure(boxes, points, mask)
+
+
+def test_enclosure_is_constant_inside():
+    # Two opposite faces are together one extent away: (4 + 2 + 2) / 6, wherever inside.
+    for point in ([0.0, 0, 0], [1.9, -0.9, 0.99], [-2.0, 1.0, 1.0]):
+        value = enclosure(at((0, 0, 0)), tensor([[[point]]]))
+        assert value.item() == pytest.approx(8 / 6)
+
+
+def test_enclosure_grows_linearly_outside():
+    # 0.5 m out of one face is 0.5 m further from it and from the opposite one: 2 * 0.5 / 6 more.
+    # One of two points, so half of that.
+    points = tensor([[[[2.5, 0, 0], [0, 0, 0]]]])
+    assert enclosure(at((0, 0, 0)), points).item() == pytest.approx(8 / 6 + 0.5 / 6)
+
+
+def test_points_inside_do_not_pull():
+    boxes = at((0.1, 0.2, 0.1, 0.02, 0.01, 0.1)).requires_grad_()
+    inside = tensor([[[[0.3, 0.2, 0.1], [-1.0, 0.3, -0.4]]]])
+    enclosure(boxes, inside).sum().backward()
+    np.testing.assert_allclose(boxes.grad[..., [0, 1, 2, 6, 7, 8]], 0, atol=1e-15)
+
+
+# --- Eq. 6 ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'poses, known',
+    [
+        ([(0, 0, 0), (1, 2, 0), (2, 4, 0)], NIL),  # equal steps
+        ([(0, 0, 0), (1, 0, 0), (3, 0, 0)], 1.0),  # steps of 1 and 2
+        ([(0, 0, 0), (3, 0, 0), (6, 4, 0)], 4.0),  # 4 more in y alone
+        ([(0, 0, 0), (1, 0, 0), (0, 0, 0)], NIL),  # the equation compares magnitudes
+        ([(0, 0, 0), (0, 0, 0, 0, 0, 0.3), (0, 0, 0, 0, 0.4, 0.6)], 0.4),  # pitch alone
+        ([(0, 0, 0), (1, 0, 0), (3, 0, 0), (5, 0, 0)], (1.0 + NIL) / 2),  # mean of two
+        ([(0, 0, 0), (5, 0, 0)], 0.0),  # too few to tell
+        ([(0, 0, 0)], 0.0),
+    ],
+)
+def test_smoothness_by_hand(poses, known):
+    boxes = at(*poses)
+    assert objective.smoothness(boxes, real(boxes)).item() == pytest.approx(known, rel=1e-6)
+
+
+def test_smoothness_wraps_angles():
+    # A constant turn of 0.3 rad across half a turn, yaw given wrapped.
+    yaw = np.array([2.8, 3.1, 3.4 - 2 * np.pi, 3.7 - 2 * np.pi])
+    boxes = at(*[(0, 0, 0, 0, 0, y) for y in yaw])
+    assert objective.smoothness(boxes, real(boxes)).item() == pytest.approx(NIL, rel=1e-6)
+
+
+# --- Eq. 7 ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'poses, known',
+    [
+        ([(0, 0, 0), (1, 0, 0)], NIL),  # where it heads
+        ([(0, 0, 0), (-1, 0, 0)], NIL),  # reversing
+        ([(0, 0, 0), (0, 1, 0)], 2**0.5),  # sideways: unit vectors at a right angle
+        ([(0, 0, 0, 0, 0, np.pi / 3), (1, 0, 0)], 1.0),  # 60 degrees off
+        ([(0, 0, 0, 0, 0, np.pi), (-2, 0, 0)], NIL),
+        ([(0, 0, 0, 0, -np.pi / 4, 0), (1, 0, 1)], NIL),  # uphill: a negative pitch looks up
+        ([(0, 0, 0), (0, 0.05, 0)], 2**0.5 / 2),  # a step of half the full length
+        ([(0, 0, 0), (0, 0, 0)], 0.0),  # at rest
+        ([(0, 0, 0), (1, 0, 0), (1, 1, 0)], (NIL + 2**0.5) / 2),  # mean of two
+        ([(0, 0, 0)], 0.0),
+    ],
+)
+def test_alignment_by_hand(poses, known):
+    boxes = at(*poses)
+    # At rest the root's small number leaves NIL / 0.1 of the full weight: 3e-4.
+    assert objective.alignment(boxes, real(boxes)).item() == pytest.approx(known, abs=5e-4)
+
+
+# --- all of the paper's ---------------------------------------------------------------------------
+
+
+def poses_of(boxes):
+    return boxes[..., objective.POSE].clone().requires_grad_()
+
+
+def with_poses(boxes, pose):
+    return torch.cat([pose[..., :3], boxes[..., 3:6], pose[..., 3:]], -1)
+
+
+PAPER = {
+    'closeness': lambda b, p: objective.closeness(b, p.points, p.mask, 5),
+    'enclosure': lambda b, p: objective.enclosure(b, p.points, p.mask),
+    'smoothness': lambda b, p: objective.smoothness(b, p.valid),
+    'alignment': lambda b, p: objective.alignment(b, p.valid),
+    'total': lambda b, p: objective.total(b, p, PaperConfig(nearest=5), MULTIPLIERS)[0],
+}
+MULTIPLIERS = tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+each_term = pytest.mark.parametrize('term', PAPER.values(), ids=PAPER)
+
+
+@each_term
+def test_gradients_of_the_paper(term):
+    problem = random_problem(M=8)
+    pose = poses_of(problem.boxes)
+    assert torch.autograd.gradcheck(
+        lambda pose: term(with_poses(problem.boxes, pose), problem), pose, eps=1e-7, atol=1e-5
+    )
+
+
+@each_term
+@pytest.mark.parametrize('moving', [False, True])
+def test_the_gradient_is_finite_where_the_paper_has_none(term, moving):
+    # At rest all poses coincide; in even motion all steps are equal, along the heading. Points
+    # lie on faces, on edges, at the centre and upon each other.
+    problem = random_problem(B=1, M=4)
+    boxes = at(*[(0.5 * i * moving, 0, 0) for i in range(6)])
+    points = tensor([[2, 1, 1], [2, 0, 0], [0, 0, 0], [0, 0, 0]]).expand(1, 6, 4, 3)
+    problem = Problem(
+        **{
+            **{name: getattr(problem, name) for name in Problem.__dataclass_fields__},
+            'boxes': boxes, 'points': points, 'mask': torch.ones(1, 6, 4, dtype=torch.bool),
+        }
+    )  # fmt: skip
+    pose = poses_of(boxes)
+    value = term(with_poses(boxes, pose), problem)
+    value.sum().backward()
+    assert value.isfinite().all()
+    assert pose.grad.isfinite().all()
+
+
+@each_term
+def test_nothing_real_gives_zero_and_no_gradient(term):
+    problem = random_problem()
+    nothing = Problem(
+        **{
+            **{name: getattr(problem, name) for name in Problem.__dataclass_fields__},
+            'mask': torch.zeros_like(problem.mask), 'valid': torch.zeros_like(problem.valid),
+        }
+    )  # fmt: skip
+    pose = poses_of(problem.boxes)
+    value = term(with_poses(problem.boxes, pose), nothing)
+    value.sum().backward()
+    np.testing.assert_array_equal(value.detach(), 0)
+    np.testing.assert_array_equal(pose.grad, 0)
+
+
+@each_term
+def test_padding_order_and_batch_do_not_matter(term):
+    problem = random_problem()
+    known = term(problem.boxes, problem)
+    # Other order of points, and padding filled with other numbers.
+    order = torch.from_numpy(np.random.default_rng(1).permutation(problem.points.shape[2]))
+    points = torch.where(problem.mask[..., None], problem.points, -1e4)[:, :, order]
+    given = {name: getattr(problem, name) for name in Problem.__dataclass_fields__}
+    other = Problem(**{**given, 'points': points, 'mask': problem.mask[:, :, order]})
+    boxes = torch.where(problem.valid[..., None], problem.boxes, 77.0)
+    np.testing.assert_allclose(term(problem.boxes, other), known, rtol=1e-12)
+    if term is not PAPER['total']:  # whose points are relative to the boxes
+        np.testing.assert_allclose(term(boxes, other), known, rtol=1e-12)
+
+
+@pytest.mark.parametrize('name', ['closeness', 'enclosure'])
+def test_duplicates_do_not_matter(name):
+    # Every point three times, and three times the K: the same means.
+    problem = random_problem()
+    term = getattr(objective, name)
+    more = [5] if name == 'closeness' else []
+    known = term(problem.boxes, problem.points, problem.mask, *more)
+    points, mask = problem.points.repeat(1, 1, 3, 1), problem.mask.repeat(1, 1, 3)
+    found = term(problem.boxes, points, mask, *[3 * k for k in more])
+    np.testing.assert_allclose(found, known, rtol=1e-12)
+
+
+def test_total_is_the_weighted_sum_with_multipliers():
+    # Eq. 8 with c the two constraints: closeness and enclosure weighted, m c + w c^2 / 2.
+    problem = random_problem()
+    weights = PaperConfig(closeness=2.0, enclosure=3.0, smoothness=0.5, alignment=0.7, nearest=5)
+    boxes = problem.boxes + 0.1
+    points = problem.points + problem.boxes[..., None, :3]
+    loss, violation = objective.total(boxes, problem, weights, MULTIPLIERS)
+    c = [objective.smoothness(boxes, problem.valid), objective.alignment(boxes, problem.valid)]
+    known = 2 * objective.closeness(boxes, points, problem.mask, 5)
+    known += 3 * objective.enclosure(boxes, points, problem.mask)
+    known += MULTIPLIERS[:, 0] * c[0] + 0.5 * c[0] ** 2 / 2
+    known += MULTIPLIERS[:, 1] * c[1] + 0.7 * c[1] ** 2 / 2
+    np.testing.assert_allclose(loss, known)
+    np.testing.assert_allclose(violation, torch.stack(c, -1))
+
+
+# --- ours: derivatives ----------------------------------------------------------------------------
+
+
+def spd(rng, *shape):
+    """Return random symmetric positive definite weights (*shape, shape[-1])."""
+    root = torch.from_numpy(rng.normal(size=(*shape, shape[-1])))
+    return root @ root.mT
+
+
+def terms_of(problem, seed=1):
+    rng = np.random.default_rng(seed)
+    B, N = problem.valid.shape
+    inset = torch.from_numpy(rng.random((B, N, 6)))
+    expected = torch.from_numpy(rng.normal(size=(B, SHARED)))
+    return {
+        'faces': Term(objective.faces, problem, spd(rng, B, N, 6, 4), inset),
+        'prior': Term(objective.prior, problem, spd(rng, B, N, 1, 6)),
+        'acceleration': Term(objective.acceleration, problem, spd(rng, B, N - 2, 1, 6)),
+        'rest': Term(objective.rest, problem, spd(rng, B, N - 1, 1, 6)),
+        'slip': Term(objective.slip, problem, spd(rng, B, N - 1, 1, 2)),
+        'shared_prior': Term(objective.shared_prior, problem, spd(rng, B, 1, 1, SHARED), expected),
+    }
+
+
+def variables(problem, seed=2):
+    rng = np.random.default_rng(seed)
+    B, N = problem.valid.shape
+    pose = problem.pose + 0.1 * torch.from_numpy(rng.normal(size=(B, N, 6)))
+    shared = 3 + torch.from_numpy(rng.normal(size=(B, SHARED)))
+    return State(pose, shared).pack()
+
+
+NAMES = ['faces', 'prior', 'acceleration', 'rest', 'slip', 'shared_prior']
+
+
+def test_state_packs_and_unpacks():
+    problem = random_problem()
+    x = variables(problem)
+    state = State.unpack(x, 6)
+    assert state.pose.shape == (3, 6, 6)
+    assert state.shared.shape == (3, SHARED)
+    np.testing.assert_array_equal(state.pack(), x)
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_jacobians_equal_automatic_differentiation(name):
+    problem = random_problem()
+    term, x = terms_of(problem)[name], variables(problem)
+    B, N = problem.valid.shape
+
+    def residual(x):
+        return term.linearise(State.unpack(x, N)).residual
+
+    known = torch.autograd.functional.jacobian(residual, x)
+    r, by_pose, by_shared = term.linearise(State.unpack(x, N))
+    found = torch.zeros_like(known)
+    for b in range(B):
+        pose, shared = State.unpack(found[b, ..., b, :].flatten(0, -2), N)
+        pose = pose.unflatten(0, r.shape[1:])
+        for i in range(r.shape[1]):
+            pose[i, :, :, i : i + by_pose.shape[-2]] = by_pose[b, i]
+        if by_shared is not None:
+            shared = by_shared[b].flatten(0, -2)
+        found[b, ..., b, :] = State(pose.flatten(0, 2), shared).pack().unflatten(0, r.shape[1:])
+    np.testing.assert_allclose(found, known, atol=1e-9)
+
+
+@pytest.mark.parametrize('names', [[name] for name in NAMES] + [NAMES], ids=[*NAMES, 'all'])
+def test_value_gradient_and_curvature(names):
+    # sum of r' W r / 2 by automatic differentiation; J' W J by the Jacobian of the residuals.
+    problem = random_problem()
+    terms = [terms_of(problem)[name] for name in names]
+    x = variables(problem)
+    B, N = problem.valid.shape
+
+    def loss(x):
+        value = 0.0
+        for term in terms:
+            r = term.linearise(State.unpack(x, N)).residual
+            value = value + 0.5 * torch.einsum('bnfr,bnfrs,bnfs->b', r, term.weight, r)
+        return value
+
+    given = x.clone().requires_grad_()
+    (known,) = torch.autograd.grad(loss(given).sum(), given)
+    value, gradient = objective.value_and_gradient(terms, x, N)
+    np.testing.assert_allclose(value, loss(x), rtol=1e-12)
+    np.testing.assert_allclose(gradient, known, atol=1e-9 * known.abs().max())
+
+    curvature = torch.zeros(B, x.shape[1], x.shape[1], dtype=D)
+    for term in terms:
+        J = torch.autograd.functional.jacobian(
+            lambda x, term=term: term.linearise(State.unpack(x, N)).residual, x
+        )
+        for b in range(B):
+            own = J[b, ..., b, :]
+            curvature[b] += torch.einsum('nfrd,nfrs,nfse->de', own, term.weight[b], own)
+    found = objective.curvature(terms, x, N)
+    np.testing.assert_allclose(found, curvature, atol=1e-9 * curvature.abs().max())
+    np.testing.assert_allclose(found, found.mT, atol=1e-9 * curvature.abs().max())
+
+
+def test_windows_selected_stand_alone():
+    problem = random_problem()
+    terms, x, rows = list(terms_of(problem).values()), variables(problem), torch.tensor([2, 0])
+    value, gradient = objective.value_and_gradient(terms, x, 6)
+    part = [term.select(rows) for term in terms]
+    for found, known in zip(
+        objective.value_and_gradient(part, x[rows], 6), (value[rows], gradient[rows]), strict=True
+    ):
+        np.testing.assert_allclose(found, known, rtol=1e-12)
+
+
+# --- ours: values ---------------------------------------------------------------------------------
+
+
+def test_faces_by_moments_equal_the_sum_over_points():
+    # The weight is the mean of (p, 1)(p, 1)' over the points of a face, so r' W r must be the
+    # mean squared distance out of that face, plus what is expected of it (gap and inset).
+    problem = random_problem()
+    state = State.unpack(variables(problem), 6)
+    rng = np.random.default_rng(3)
+    inset = torch.from_numpy(rng.random((3, 6, 6)))
+    homogeneous = torch.cat([problem.points, torch.ones_like(problem.points[..., :1])], -1)
+    moment = torch.einsum('bnmi,bnmj->bnij', homogeneous, homogeneous) / 20
+    term = Term(objective.faces, problem, moment[:, :, None].expand(-1, -1, 6, -1, -1), inset)
+    r = term.linearise(state).residual
+    found = torch.einsum('bnfr,bnfrs,bnfs->bnf', r, term.weight, r)
+    extent = state.shared[:, None, :3].expand(-1, 6, -1)
+    boxes = torch.cat([state.pose[..., :3], extent, state.pose[..., 3:]], -1)
+    out = face_distances(problem.points + problem.boxes[..., None, :3], boxes)
+    out = out + (inset + state.shared[:, None, objective.GAP])[..., None, :]
+    np.testing.assert_allclose(found, out.square().mean(2), rtol=1e-9)
+
+
+def problem_at(pose, times, **changes):
+    """Return a problem of one window of 4 x 2 x 2 m boxes at `pose` (N, 6), without points."""
+    pose = torch.as_tensor(pose, dtype=D)
+    n = len(pose)
+    given = {
+        'boxes': at(*pose.tolist()),
+        'valid': torch.ones(1, n, dtype=torch.bool),
+        'times': tensor([times]),
+        'points': torch.zeros(1, n, 1, 3, dtype=D),
+        'mask': torch.zeros(1, n, 1, dtype=torch.bool),
+        'origins': torch.full((1, n, 3), torch.nan, dtype=D),
+        'ground': torch.full((1, n), torch.nan, dtype=D),
+        'deviations': {},
+    }
+    return Problem(**{**given, **changes})
+
+
+def shared_of(**parts):
+    shared = torch.zeros(1, SHARED, dtype=D)
+    shared[0, :3] = tensor([4.0, 2.0, 2.0])
+    for name, value in parts.items():
+        shared[0, getattr(objective, name)] = tensor(value)
+    return shared
+
+
+def test_acceleration_by_hand():
+    # x = a t^2 / 2 at uneven times: the second difference over true time steps is a, exactly;
+    # uniform motion in y and an even turn have none.
+    t = np.array([0.0, 0.1, 0.3, 0.35])
+    pose = np.c_[1.5 * t**2, 7 * t, 0 * t, 0 * t, 0 * t, 0.4 * t]
+    problem = problem_at(pose, t.tolist())
+    found = objective.acceleration(problem, State(problem.pose, shared_of())).residual
+    known = np.tile([3.0, 0, 0, 0, 0, 0], (1, 2, 1, 1))
+    np.testing.assert_allclose(found, known, atol=1e-12)
+
+
+def test_rest_by_hand():
+    pose = [[0, 0, 0, 0, 0, 0], [1, 2, 3, 0.1, 0.2, 0.3], [1, 2, 3, 0.1, 0.2, 0.4]]
+    problem = problem_at(pose, [0, 0.1, 0.2])
+    found = objective.rest(problem, State(problem.pose, shared_of())).residual
+    known = [[[[1, 2, 3, 0.1, 0.2, 0.3]], [[0, 0, 0, 0, 0, 0.1]]]]
+    np.testing.assert_allclose(found, known, atol=1e-15)
+
+
+def test_prior_by_hand():
+    # The input heads along +y: a pose 0.3 m further along y is 0.3 m ahead; one 0.2 m further
+    # along x is 0.2 m to its right. Less the bias, 0.1 m ahead and 0.05 rad of yaw.
+    problem = problem_at([[0, 0, 0, 0, 0, np.pi / 2]], [0.0])
+    pose = problem.pose + tensor([0.2, 0.3, 0.5, 0.01, 0.02, 0.06])
+    found = objective.prior(problem, State(pose, shared_of(BIAS=[0.1, 0, 0, 0, 0, 0.05])))
+    known = [[[[0.2, -0.2, 0.5, 0.01, 0.02, 0.01]]]]
+    np.testing.assert_allclose(found.residual, known, atol=1e-15)
+
+
+def test_shared_prior_by_hand():
+    problem = problem_at([[0.0] * 6], [0.0])
+    state = State(problem.pose, shared_of(BIAS=[0.1, 0, 0, 0, 0, 0]))
+    expected = shared_of(EXTENT=[3.5, 2, 2])
+    found = objective.shared_prior(problem, state, expected).residual
+    known = np.zeros((1, 1, 1, SHARED))
+    known[..., 0], known[..., 3] = 0.5, 0.1
+    np.testing.assert_allclose(found, known, atol=1e-15)
+
+
+def test_a_vehicle_on_a_circle_does_not_slip():
+    # Its rear axle, a quarter of 4 m behind the centre, moves on a circle of 8 m: every chord
+    # of a circle lies along the mean of the headings at its ends.
+    yaw = np.array([0.0, 0.2, 0.5, 0.6])
+    axle = 8 * np.c_[np.sin(yaw), -np.cos(yaw)]
+    center = axle + 0.25 * 4 * np.c_[np.cos(yaw), np.sin(yaw)]
+    pose = np.c_[center, np.zeros((4, 3)), yaw]
+    problem = problem_at(pose, [0, 0.1, 0.3, 0.4])
+    state = State(problem.pose, shared_of(PIVOT=0.25))
+    np.testing.assert_allclose(objective.slip(problem, state).residual, 0, atol=1e-12)
+    # Its centre does: 1 m before the axle, it swings out to the left by twice the sine of half
+    # the turn.
+    state = State(problem.pose, shared_of(PIVOT=0.0))
+    known = 2 * np.sin(np.diff(yaw) / 2) / [0.1, 0.2, 0.1]
+    np.testing.assert_allclose(objective.slip(problem, state).residual[0, :, 0, 0], known)
+
+
+@pytest.mark.parametrize('yaw', [0.0, np.pi / 2, 3.0])
+def test_slip_by_hand(yaw):
+    # 0.1 m to its left and 0.02 m up in 0.1 s, beside 1 m ahead: 1 m/s and 0.2 m/s; reversing
+    # does not count as slip.
+    ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    for way in (1.0, -1.0):
+        x, y = way * ahead + 0.1 * left
+        problem = problem_at([[0, 0, 0, 0, 0, yaw], [x, y, 0.02, 0, 0, yaw]], [0.0, 0.1])
+        found = objective.slip(problem, State(problem.pose, shared_of(PIVOT=0.25))).residual
+        np.testing.assert_allclose(found, [[[[1.0, 0.2]]]], atol=1e-12)
+
+
+# --- ours: which points tell where a face is ------------------------------------------------------
+
+
+def seen_from(origin, points=None, **changes):
+    points = tensor([[[0.0, 0, 0]]]) if points is None else torch.as_tensor(points, dtype=D)[None]
+    return problem_at(
+        [[0, 0, 0, 0, 0, changes.pop('yaw', 0.0)]], [0.0], points=points[None],
+        mask=torch.ones(1, 1, points.shape[1], dtype=torch.bool),
+        origins=tensor([[origin]]), **changes,
+    )  # fmt: skip
+
+
+def test_aspect_by_hand():
+    # From 12 m ahead and 5 m to the left of a 4 x 2 m box: 10 m before the plane of the front,
+    # 4 m to the side of its edge; 4 m before the left plane, 10 m ahead of its edge. From the
+    # back plane 14 m on the wrong side, the right one 6 m.
+    aspect = objective.aspect(seen_from([12.0, 5.0, 1.0]))
+    known = [[[10 / 4, -14 / 4, 4 / 10, -6 / 10, 9, -9]]]
+    np.testing.assert_allclose(aspect, known)
+
+
+def test_aspect_turns_with_the_box():
+    turned = objective.aspect(seen_from([-5.0, 12.0, 1.0], yaw=np.pi / 2))
+    np.testing.assert_allclose(turned, objective.aspect(seen_from([12.0, 5.0, 1.0])))
+
+
+def test_without_a_sensor_the_centre_of_mass_tells_the_open_faces():
+    aspect = objective.aspect(seen_from([np.nan] * 3, [[-1.5, 0.5, 0.3], [-1.9, 0.8, 0.1]]))
+    assert (aspect[0, 0, :4] > 0).tolist() == [False, True, True, False]
+
+
+def test_retreat_grows_as_a_face_turns_away():
+    aspect = torch.linspace(-50, 50, 201, dtype=D)[:, None].expand(-1, 6)
+    depths = tensor([0.4, 0.4, 0.2, 0.2, 0.0, 0.0])
+    found = objective.retreat(aspect, depths)
+    assert (found.diff(dim=0) <= 0).all()
+    np.testing.assert_allclose(found[0], depths, atol=1e-4)
+    np.testing.assert_allclose(found[-1], 0, atol=1e-4)
+
+
+def on_faces(inside, n=40, faces=(0, 2, 4)):
+    """Return points on front, left and top of 4 x 2 x 2 m, `inside` m further in."""
+    rng = np.random.default_rng(4)
+    points = []
+    for face in faces:
+        axis, sign = face // 2, 1 - 2 * (face % 2)
+        p = rng.uniform(-0.9, 0.9, (n, 3)) * [2, 1, 1]
+        p[:, axis] = sign * ([2, 1, 1][axis] - inside)
+        points.append(p)
+    return np.concatenate(points)
+
+
+def supported(problem, gap=0.0, outermost=0.05, depths=0.0):
+    state = State(problem.pose, shared_of(GAP=[gap] * 6))
+    depths = torch.full((6,), depths, dtype=D)
+    return objective.support(problem, state, 0.4, outermost, depths)
+
+
+@pytest.mark.parametrize('gap', [0.0, 0.04])
+def test_points_on_faces_stand_as_far_out_as_expected(gap):
+    # The points are 0.1 m inside, `gap` of it expected: outwardness gap - 0.1.
+    found = supported(seen_from([30.0, 30.0, 2.0], on_faces(0.1)), gap)
+    assert found.seen[0, 0].tolist()[:5:2] == [1, 1, 1]
+    np.testing.assert_allclose(found.outwardness[0, 0, [0, 2, 4]], gap - 0.1, atol=1e-6)
+    assert found.count.item() == 120
+
+
+def test_outermost_points_are_the_furthest_out():
+    # Five of 100 points (0.05) on the front, told by hand: their moment and their mean.
+    rng = np.random.default_rng(5)
+    points = np.c_[rng.uniform(1.5, 1.95, 100), rng.uniform(-0.7, 0.7, (100, 2))]
+    found = supported(seen_from([30.0, 0.0, 0.0], points))
+    outer = points[np.argsort(-points[:, 0])[:5]]
+    homogeneous = np.c_[outer, np.ones(5)]
+    np.testing.assert_allclose(found.moments[0, 0, 0], homogeneous.T @ homogeneous / 5)
+    assert found.outwardness[0, 0, 0].item() == pytest.approx(outer[:, 0].mean() - 2)
+    assert found.seen[0, 0, 0] == 1
+
+
+def test_faces_turned_away_have_less_say():
+    # Points on front and back, seen from the front.
+    points = on_faces(0.05, faces=(0, 1, 2))
+    found = supported(seen_from([30.0, 0.0, 0.0], points))
+    assert found.seen[0, 0, 0] == 1
+    assert found.seen[0, 0, 1] < 1
+
+
+def test_a_face_without_points_is_not_seen():
+    # Two points are fewer than it takes.
+    found = supported(seen_from([30.0, 0.0, 0.0], on_faces(0.05, n=2, faces=(0,))))
+    assert found.seen[0, 0, 0] == 0
+    assert found.outwardness.isfinite().all()
+    assert found.moments.isfinite().all()
+
+
+def test_points_far_off_are_no_evidence():
+    # 1 m ahead of the front is beyond the margin of 0.4 m.
+    found = supported(seen_from([30.0, 0.0, 0.0], on_faces(-1.0, faces=(0,))))
+    assert found.seen[0, 0, 0] == 0
+    assert found.count.item() == 0
+
+
+def test_the_road_stands_for_the_bottom():
+    # The road is 1.2 m below the centre of a box whose bottom is 1 m below it: 0.2 m too high.
+    problem = seen_from([30.0, 0.0, 0.0], on_faces(0.0), ground=tensor([[-1.2]]))
+    found = supported(problem)
+    assert found.seen[0, 0, 5] == 1
+    assert found.outwardness[0, 0, 5].item() == pytest.approx(0.2)
+    assert supported(seen_from([30.0, 0.0, 0.0], on_faces(0.0))).seen[0, 0, 5] == 0
+
+
+def test_order_and_padding_of_points_do_not_matter_to_the_support():
+    problem = random_problem()
+    given = {name: getattr(problem, name) for name in Problem.__dataclass_fields__}
+    order = torch.from_numpy(np.random.default_rng(6).permutation(20))
+    points = torch.where(problem.mask[..., None], problem.points, 0.0)[:, :, order]
+    other = Problem(**{**given, 'points': points, 'mask': problem.mask[:, :, order]})
+    shared = shared_of().expand(3, -1)
+    for found, known in zip(
+        objective.support(other, State(other.pose, shared), 0.4, 0.2, torch.ones(6, dtype=D)),
+        objective.support(problem, State(problem.pose, shared), 0.4, 0.2, torch.ones(6, dtype=D)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, known, atol=1e-12)

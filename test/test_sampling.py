@@ -1,0 +1,242 @@
+"""What a box sees of a sweep, against values known by hand and brute force."""
+
+from boxreg_ros.config import Config
+from boxreg_ros.sampling import farthest_point_sample, observe
+from boxreg_ros.structures import Sweep
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+import torch
+
+STAMP_NS = 5 * 10**8
+CAR = np.array([10.0, 20.0, 1.0, 4.0, 2.0, 2.0, 0.0, 0.0, 0.0])  # stands on z = 0
+
+
+def sweep(points, **more):
+    return Sweep(STAMP_NS, 'odom', np.asarray(points, dtype=np.float32).reshape(-1, 3), **more)
+
+
+def see(points, *boxes, changes=None, **more):
+    config = Config().updated(changes or {})
+    return observe(sweep(points, **more), np.array(boxes), STAMP_NS, config)
+
+
+def rows(array):
+    return sorted(map(tuple, np.round(np.asarray(array, dtype=float), 4).tolist()))
+
+
+def road(height, inside=0.5, count=40):
+    """Return points `inside` m left of the car, along its side."""
+    x = CAR[0] + np.linspace(-2, 2, count)
+    return np.c_[x, np.full(count, CAR[1] + CAR[4] / 2 + inside), np.broadcast_to(height, count)]
+
+
+# --- crop -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('axis, sign', [(0, 1), (0, -1), (1, 1), (1, -1), (2, 1)])
+def test_points_within_the_margin_are_kept(axis, sign):
+    # The margin is 0.6 m: of two points 0.59 m and 0.61 m out of a face one is kept.
+    offsets = np.zeros((2, 3))
+    offsets[:, axis] = sign * (CAR[3 + axis] / 2 + np.array([0.59, 0.61]))
+    (seen,) = see(CAR[:3] + offsets, CAR)
+    np.testing.assert_allclose(seen.points, offsets[:1], atol=1e-5)
+    assert seen.points.dtype == np.float32
+    assert seen.num_points == 0  # both are outside the box itself
+
+
+def test_the_crop_turns_with_the_box():
+    # Heading along +y, the box reaches 2 m along y and 1 m along x, and 0.6 m more.
+    turned = CAR + [0, 0, 0, 0, 0, 0, 0, 0, np.pi / 2]
+    offsets = np.array([[0, 2.5, 0], [1.5, 0, 0], [2.5, 0, 0], [0, 0.5, 0]])
+    (seen,) = see(CAR[:3] + offsets, turned)
+    assert rows(seen.points) == rows(offsets[[0, 1, 3]])
+    assert seen.num_points == 1
+
+
+def test_observation_is_relative_to_the_center():
+    times = np.array([0.05, -0.02])
+    origin = np.array([1.0, 2.0, 3.0])
+    (seen,) = see(CAR[:3] + [[1.0, 0, 0], [-1.0, 0, 0]], CAR, times=times, origin=origin)
+    assert seen.stamp_ns == STAMP_NS
+    np.testing.assert_array_equal(seen.box, CAR)
+    np.testing.assert_array_equal(seen.origin, origin - CAR[:3])
+    assert seen.num_points == 2
+    by_x = np.argsort(seen.points[:, 0])
+    np.testing.assert_allclose(seen.points[by_x], [[-1, 0, 0], [1, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(seen.times[by_x], [-0.02, 0.05], atol=1e-8)
+
+
+def test_times_are_zero_where_unknown():
+    (seen,) = see(CAR[:3] + [[1.0, 0, 0]], CAR)
+    np.testing.assert_array_equal(seen.times, [0.0])
+
+
+@pytest.mark.parametrize('points', [np.empty((0, 3)), [[1e4, -1e4, 0.0]]])
+def test_a_box_without_points(points):
+    (seen,) = see(points, CAR)
+    assert seen.points.shape == (0, 3)
+    assert seen.times.shape == (0,)
+    assert seen.num_points == 0
+    assert np.isnan(seen.ground)
+
+
+# --- ownership ------------------------------------------------------------------------------------
+
+# Two cars that overlap: the first reaches to x = 12, the second begins at x = 11.5.
+OTHER = CAR + [3.5, 0, 0, 0, 0, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize('x, owner', [(11.7, 0), (11.8, 1), (11.4, 0), (12.1, 1), (13.0, 1)])
+def test_a_point_belongs_to_the_box_it_is_deeper_in(x, owner):
+    # At 11.7: 0.3 m inside the first, 0.2 m inside the second; at 11.8 the other way round. At
+    # 11.4 it is 0.1 m out of the second, in whose margin it lies.
+    seen = see([[x, 20.0, 1.0]], CAR, OTHER)
+    assert [len(observation.points) for observation in seen] == [owner == 0, owner == 1]
+
+
+def test_num_points_counts_what_is_inside_whoever_owns_it():
+    seen = see([[11.7, 20.0, 1.0], [11.8, 20.0, 1.0], [10.0, 20.0, 1.0]], CAR, OTHER)
+    assert [observation.num_points for observation in seen] == [3, 2]
+
+
+def test_many_boxes_equal_brute_force():
+    # The look-up table and the sorting are for speed: every box must see what a plain loop sees.
+    rng = np.random.default_rng(5)
+    n = 25
+    boxes = np.c_[
+        rng.uniform(-20, 20, (n, 2)), rng.uniform(-1, 1, n), rng.uniform(0.5, 9, (n, 3)),
+        rng.uniform(-0.1, 0.1, (n, 2)), rng.uniform(-4, 4, n),
+    ]  # fmt: skip
+    points = rng.uniform(-25, 25, (3000, 3)) * [1, 1, 0.2]
+    points = points.astype(np.float32).astype(np.float64)
+    outside = []
+    for box in boxes:
+        local = (points - box[:3]) @ Rotation.from_euler('ZYX', box[[8, 7, 6]]).as_matrix()
+        outside.append((np.abs(local) - box[3:6] / 2).max(1))
+    outside = np.array(outside)
+    seen = see(points, *boxes, changes={'sampling.points': 100000})
+    assert sum(len(observation.points) for observation in seen) > 500
+    for i, (box, observation) in enumerate(zip(boxes, seen, strict=True)):
+        ground = -box[5] / 2 if np.isnan(observation.ground) else observation.ground
+        above = points[:, 2] - box[2] > ground + 0.2
+        own = (outside[i] < 0.6) & (outside.argmin(0) == i) & above
+        assert rows(observation.points) == rows((points[own] - box[:3]).astype(np.float32))
+        assert observation.num_points == (outside[i] <= 0).sum()
+
+
+# --- road -----------------------------------------------------------------------------------------
+
+
+def test_the_road_beside_the_box_is_found_and_left_out():
+    # The road lies 0.1 m above the bottom of the box, so 0.9 m below its centre. What is 0.1 m
+    # above the road is within the clearance of 0.2 m, what is 0.3 m above it is the car's.
+    on_car = CAR[:3] + [[1.9, 0.9, -0.8], [1.9, 0.9, -0.6]]
+    (seen,) = see(np.r_[road(0.1), on_car], CAR)
+    assert seen.ground == pytest.approx(-0.9, abs=1e-6)
+    np.testing.assert_allclose(seen.points, [[1.9, 0.9, -0.6]], atol=1e-5)
+
+
+def test_without_road_the_bottom_of_the_box_stands_for_it():
+    # The bottom is 1 m below the centre: what is lower than 0.8 m below it is left out.
+    (seen,) = see(CAR[:3] + [[1.0, 0, -0.9], [1.0, 0, -0.7]], CAR)
+    assert np.isnan(seen.ground)
+    np.testing.assert_allclose(seen.points, [[1.0, 0, -0.7]], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    'points',
+    [
+        road(np.linspace(0, 0.55, 40)),  # a wall: heights from 0 to 0.55 m
+        road(0.0, count=4),  # too few to tell
+        road(0.0, inside=-0.5),  # below the box, not beside it
+        road(0.0, inside=1.2),  # too far off
+        road(0.8),  # as high as the car's middle
+    ],
+    ids=['wall', 'few', 'under', 'far', 'high'],
+)
+def test_what_is_no_road(points):
+    (seen,) = see(points, CAR)
+    assert np.isnan(seen.ground)
+
+
+def test_a_sloping_road_is_taken_at_its_lower_part():
+    # Heights spread evenly over 0 to 0.1 m: 0.05 m from the first to the sixth tenth, flat
+    # enough; the third tenth is at 0.03 m.
+    (seen,) = see(road(np.linspace(0, 0.1, 101), count=101), CAR)
+    assert seen.ground == pytest.approx(-1 + 0.03, abs=1e-6)
+
+
+# --- thinning -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('objective', ['robust', 'paper'])
+@pytest.mark.parametrize('count', [40, 41, 79, 80, 81, 500])
+def test_at_most_the_points_asked_for_are_kept(objective, count):
+    rng = np.random.default_rng(6)
+    points = CAR[:3] + rng.uniform(-0.7, 0.7, (count, 3))
+    changes = {'sampling.points': 40, 'objective': objective}
+    (seen,) = see(points, CAR, changes=changes, times=np.arange(count) * 1e-3)
+    assert min(count, 40) // 2 <= len(seen.points) <= 40
+    assert seen.num_points == count
+    # Times stay with their points.
+    given = {tuple(p): t for p, t in zip((points - CAR[:3]).round(3), range(count), strict=True)}
+    for point, time in zip(seen.points.round(3).astype(float), seen.times, strict=True):
+        nearest = min(given, key=lambda p: np.abs(np.array(p) - point).sum())
+        assert given[nearest] == pytest.approx(1e3 * time, abs=1e-3)
+
+
+def test_the_paper_keeps_the_farthest_points():
+    rng = np.random.default_rng(7)
+    points = (CAR[:3] + rng.uniform(-0.7, 0.7, (60, 3))).astype(np.float32).astype(float)
+    (seen,) = see(points, CAR, changes={'sampling.points': 20, 'objective': 'paper'})
+    known = brute_force(points - CAR[:3], 20)
+    assert rows(seen.points) == rows((points - CAR[:3])[known])
+
+
+def brute_force(points, count):
+    """Return the rows a plain loop of farthest point sampling picks."""
+    picks = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    while len(picks) < count:
+        gaps = [min(np.linalg.norm(p - points[i]) for i in picks) for p in points]
+        picks.append(int(np.argmax(gaps)))
+    return picks
+
+
+def test_farthest_points_equal_brute_force():
+    rng = np.random.default_rng(8)
+    points = rng.normal(size=(50, 3))
+    mask = torch.ones(50, dtype=torch.bool)
+    found = farthest_point_sample(torch.from_numpy(points), mask, 20)
+    assert found.tolist() == brute_force(points, 20)
+
+
+def test_farthest_points_by_hand():
+    # Mean 2.875 without the padding: farthest from it is 10, from that 0, then 1 is 1 m from 0
+    # where 0.5 is 0.5 m from it.
+    x = torch.tensor([0.0, 0.5, 1.0, 10.0, -0.5], dtype=torch.float64)
+    points = torch.stack([x, 0 * x, 0 * x], -1)
+    mask = torch.tensor([True, True, True, True, False])
+    assert farthest_point_sample(points, mask, 4).tolist() == [3, 0, 2, 1]
+
+
+def test_farthest_points_of_a_batch_equal_a_loop():
+    rng = np.random.default_rng(9)
+    points = torch.from_numpy(rng.normal(size=(3, 4, 30, 3)))
+    mask = torch.from_numpy(rng.random((3, 4, 30)) < 0.8)
+    many = farthest_point_sample(points, mask, 12)
+    for index in np.ndindex(3, 4):
+        alone = farthest_point_sample(points[index], mask[index], 12)
+        assert many[index].tolist() == alone.tolist()
+
+
+@pytest.mark.parametrize('real', [0, 1, 5, 12])
+def test_padding_is_chosen_last(real):
+    # Padding far away and equal real points are no reason to take padding early.
+    rng = np.random.default_rng(10)
+    mask = torch.zeros(12, dtype=torch.bool)
+    mask[torch.from_numpy(rng.permutation(12)[:real])] = True
+    points = torch.where(mask[:, None], 1.0, 1e6 * torch.from_numpy(rng.normal(size=(12, 3))))
+    found = farthest_point_sample(points, mask, 12)
+    assert mask[found[:real]].all()
+    assert sorted(found[:real].tolist()) == mask.nonzero()[:, 0].tolist()
