@@ -44,7 +44,7 @@ def random_problem(B=3, N=6, M=20, seed=0):
     )
 
 
-# --- Eq. 4 ----------------------------------------------------------------------------------------
+# --- Eq. 4 --------------------------------------------------------------------------------------
 
 # In a box of 4 x 2 x 2 m; their centre of mass is ahead, left and up, so front, left and top are
 # seen. Distances to the front: 0.1 and 1.0; left: 0.5 and 0.1; top: 0.8 and 0.6.
@@ -96,7 +96,7 @@ def test_closeness_is_the_mean_over_observations_with_points():
     assert closeness(boxes, points, 2, mask).item() == pytest.approx((both + 0.9) / 2)
 
 
-# --- Eq. 5 ----------------------------------------------------------------------------------------
+# --- Eq. 5 --------------------------------------------------------------------------------------
 
 
 def enclosure(boxes, points, mask=None):
@@ -125,7 +125,7 @@ def test_points_inside_do_not_pull():
     np.testing.assert_allclose(boxes.grad[..., [0, 1, 2, 6, 7, 8]], 0, atol=1e-15)
 
 
-# --- Eq. 6 ----------------------------------------------------------------------------------------
+# --- Eq. 6 --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_smoothness_wraps_angles():
     assert objective.smoothness(boxes, real(boxes)).item() == pytest.approx(NIL, rel=1e-6)
 
 
-# --- Eq. 7 ----------------------------------------------------------------------------------------
+# --- Eq. 7 --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_alignment_by_hand(poses, known):
     assert objective.alignment(boxes, real(boxes)).item() == pytest.approx(known, abs=5e-4)
 
 
-# --- all of the paper's ---------------------------------------------------------------------------
+# --- all of the paper's -------------------------------------------------------------------------
 
 
 def poses_of(boxes):
@@ -288,7 +288,7 @@ def test_total_is_the_weighted_sum_with_multipliers():
     np.testing.assert_allclose(violation, torch.stack(c, -1))
 
 
-# --- ours: derivatives ----------------------------------------------------------------------------
+# --- ours: derivatives --------------------------------------------------------------------------
 
 
 def spd(rng, *shape):
@@ -400,7 +400,7 @@ def test_windows_selected_stand_alone():
         np.testing.assert_allclose(found, known, rtol=1e-12)
 
 
-# --- ours: values ---------------------------------------------------------------------------------
+# --- ours: values -------------------------------------------------------------------------------
 
 
 def test_faces_by_moments_equal_the_sum_over_points():
@@ -515,7 +515,7 @@ def test_slip_by_hand(yaw):
         np.testing.assert_allclose(found, [[[[1.0, 0.2]]]], atol=1e-12)
 
 
-# --- ours: which points tell where a face is ------------------------------------------------------
+# --- ours: which points tell where a face is ----------------------------------------------------
 
 
 def seen_from(origin, points=None, **changes):

@@ -21,6 +21,10 @@ def see(points, *boxes, changes=None, **more):
     return observe(sweep(points, **more), np.array(boxes), STAMP_NS, config)
 
 
+def near(*offsets):
+    return CAR[:3] + np.array(offsets)
+
+
 def rows(array):
     return sorted(map(tuple, np.round(np.asarray(array, dtype=float), 4).tolist()))
 
@@ -31,7 +35,7 @@ def road(height, inside=0.5, count=40):
     return np.c_[x, np.full(count, CAR[1] + CAR[4] / 2 + inside), np.broadcast_to(height, count)]
 
 
-# --- crop -----------------------------------------------------------------------------------------
+# --- crop ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('axis, sign', [(0, 1), (0, -1), (1, 1), (1, -1), (2, 1)])
@@ -47,7 +51,7 @@ def test_points_within_the_margin_are_kept(axis, sign):
 
 def test_the_crop_turns_with_the_box():
     # Heading along +y, the box reaches 2 m along y and 1 m along x, and 0.6 m more.
-    turned = CAR + [0, 0, 0, 0, 0, 0, 0, 0, np.pi / 2]
+    turned = CAR + np.eye(9)[8] * np.pi / 2
     offsets = np.array([[0, 2.5, 0], [1.5, 0, 0], [2.5, 0, 0], [0, 0.5, 0]])
     (seen,) = see(CAR[:3] + offsets, turned)
     assert rows(seen.points) == rows(offsets[[0, 1, 3]])
@@ -57,7 +61,7 @@ def test_the_crop_turns_with_the_box():
 def test_observation_is_relative_to_the_center():
     times = np.array([0.05, -0.02])
     origin = np.array([1.0, 2.0, 3.0])
-    (seen,) = see(CAR[:3] + [[1.0, 0, 0], [-1.0, 0, 0]], CAR, times=times, origin=origin)
+    (seen,) = see(near([1.0, 0, 0], [-1.0, 0, 0]), CAR, times=times, origin=origin)
     assert seen.stamp_ns == STAMP_NS
     np.testing.assert_array_equal(seen.box, CAR)
     np.testing.assert_array_equal(seen.origin, origin - CAR[:3])
@@ -68,7 +72,7 @@ def test_observation_is_relative_to_the_center():
 
 
 def test_times_are_zero_where_unknown():
-    (seen,) = see(CAR[:3] + [[1.0, 0, 0]], CAR)
+    (seen,) = see(near([1.0, 0, 0]), CAR)
     np.testing.assert_array_equal(seen.times, [0.0])
 
 
@@ -81,10 +85,10 @@ def test_a_box_without_points(points):
     assert np.isnan(seen.ground)
 
 
-# --- ownership ------------------------------------------------------------------------------------
+# --- ownership ----------------------------------------------------------------------------------
 
 # Two cars that overlap: the first reaches to x = 12, the second begins at x = 11.5.
-OTHER = CAR + [3.5, 0, 0, 0, 0, 0, 0, 0, 0]
+OTHER = CAR + np.eye(9)[0] * 3.5
 
 
 @pytest.mark.parametrize('x, owner', [(11.7, 0), (11.8, 1), (11.4, 0), (12.1, 1), (13.0, 1)])
@@ -125,13 +129,13 @@ def test_many_boxes_equal_brute_force():
         assert observation.num_points == (outside[i] <= 0).sum()
 
 
-# --- road -----------------------------------------------------------------------------------------
+# --- road ---------------------------------------------------------------------------------------
 
 
 def test_the_road_beside_the_box_is_found_and_left_out():
     # The road lies 0.1 m above the bottom of the box, so 0.9 m below its centre. What is 0.1 m
     # above the road is within the clearance of 0.2 m, what is 0.3 m above it is the car's.
-    on_car = CAR[:3] + [[1.9, 0.9, -0.8], [1.9, 0.9, -0.6]]
+    on_car = near([1.9, 0.9, -0.8], [1.9, 0.9, -0.6])
     (seen,) = see(np.r_[road(0.1), on_car], CAR)
     assert seen.ground == pytest.approx(-0.9, abs=1e-6)
     np.testing.assert_allclose(seen.points, [[1.9, 0.9, -0.6]], atol=1e-5)
@@ -139,7 +143,7 @@ def test_the_road_beside_the_box_is_found_and_left_out():
 
 def test_without_road_the_bottom_of_the_box_stands_for_it():
     # The bottom is 1 m below the centre: what is lower than 0.8 m below it is left out.
-    (seen,) = see(CAR[:3] + [[1.0, 0, -0.9], [1.0, 0, -0.7]], CAR)
+    (seen,) = see(near([1.0, 0, -0.9], [1.0, 0, -0.7]), CAR)
     assert np.isnan(seen.ground)
     np.testing.assert_allclose(seen.points, [[1.0, 0, -0.7]], atol=1e-5)
 
@@ -167,7 +171,7 @@ def test_a_sloping_road_is_taken_at_its_lower_part():
     assert seen.ground == pytest.approx(-1 + 0.03, abs=1e-6)
 
 
-# --- thinning -------------------------------------------------------------------------------------
+# --- thinning -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('objective', ['robust', 'paper'])
