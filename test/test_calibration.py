@@ -1,0 +1,261 @@
+"""What is learnt of the input, from input whose rule and noise are known."""
+
+from boxreg_ros import objective
+from boxreg_ros.calibration import InputModel, InputNoise, LEAST, RULE_ERROR, scatter, TRACKS
+from boxreg_ros.config import FaceConfig
+from boxreg_ros.objective import Problem, SHARED, State, Support
+import numpy as np
+import pytest
+import torch
+
+D = torch.float64
+FACES = FaceConfig()
+EXPECTED = [FACES.gap_ends] * 2 + [FACES.gap_sides] * 2 + [FACES.gap_top, FACES.gap_bottom]
+
+
+def real(values):
+    return torch.ones(values.shape[:2], dtype=torch.bool)
+
+
+# --- noise --------------------------------------------------------------------------------------
+
+
+def autoregressive(B, N, deviation, correlation, seed=0):
+    rng = np.random.default_rng(seed)
+    state = rng.normal(size=(B, 9))
+    values = np.empty((B, N, 9))
+    for i in range(N):
+        fresh = rng.normal(size=(B, 9))
+        state = correlation * state + np.sqrt(1 - correlation**2) * fresh if i else fresh
+        values[:, i] = state
+    return torch.from_numpy(values * deviation)
+
+
+@pytest.mark.parametrize('correlation', [0.0, 0.5, 0.8])
+def test_noise_is_measured(correlation):
+    # 30 tracks of 60: some hundred independent values per column even at a correlation of 0.8.
+    # Tracks lose their own mean, which lowers a slow noise: (1 + c) / (1 - c) / 60 of its power,
+    # 15 % at 0.8.
+    deviation = np.array([0.3, 0.1, 0.05, 0.01, 0.02, 0.03, 0.1, 0.2, 0.05])
+    values = autoregressive(30, 60, deviation, correlation)
+    noise = InputNoise.measure(values, real(values))
+    np.testing.assert_allclose(noise.deviation, deviation, rtol=0.2)
+    np.testing.assert_allclose(noise.correlation, correlation, atol=0.1)
+
+
+def test_noise_does_not_hang_on_outliers_or_on_bias():
+    values = autoregressive(30, 60, np.ones(9), 0.0)
+    known = InputNoise.measure(values, real(values))
+    rng = np.random.default_rng(1)
+    spoilt = values + 7 * torch.from_numpy(rng.normal(size=(30, 1, 9)))  # one bias per track
+    found = InputNoise.measure(spoilt, real(values))
+    np.testing.assert_allclose(found.deviation, known.deviation, rtol=1e-9)
+    np.testing.assert_allclose(found.correlation, known.correlation, atol=1e-9)
+    spoilt = values.clone()
+    spoilt[:, 7] += 30.0  # one of 60 flips
+    found = InputNoise.measure(spoilt, real(values))
+    np.testing.assert_allclose(found.deviation, known.deviation, rtol=0.25)
+
+
+def test_correlation_stays_in_its_bounds():
+    steady = torch.linspace(-1, 1, 50, dtype=D)[None, :, None].expand(2, 50, 9)
+    np.testing.assert_allclose(InputNoise.measure(steady, real(steady)).correlation, 0.9)
+    zigzag = ((-1.0) ** torch.arange(50, dtype=D))[None, :, None].expand(2, 50, 9)
+    np.testing.assert_allclose(InputNoise.measure(zigzag, real(zigzag)).correlation, 0.0)
+    nothing = torch.zeros(2, 50, 9, dtype=D)
+    noise = InputNoise.measure(nothing, real(nothing))
+    np.testing.assert_array_equal(noise.deviation, 0)
+    assert noise.correlation.isfinite().all()
+
+
+def test_short_tracks_do_not_tell_and_padding_does_not_count():
+    values = autoregressive(3, 40, np.ones(9), 0.3)
+    valid = real(values)
+    assert InputNoise.measure(values[:, : LEAST - 1], valid[:, : LEAST - 1]) is None
+    known = InputNoise.measure(values[:2, :30], valid[:2, :30])
+    valid[:2, 30:] = False
+    valid[2, LEAST - 1 :] = False
+    values[~valid] = 1e6
+    values[2] *= 100  # too short to be heard
+    found = InputNoise.measure(values, valid)
+    np.testing.assert_allclose(found.deviation, known.deviation)
+    np.testing.assert_allclose(found.correlation, known.correlation)
+
+
+def test_scatter_by_hand():
+    # The input heads along +y; the fit is 0.3 m behind it along y and 0.2 m to its right (+x),
+    # so the input is 0.3 m ahead and 0.2 m to the left. 4.4 m given for 4 m is a tenth too long.
+    box = [0.0, 0, 0, 4.4, 2, 1.5, 0.0, 0.0, np.pi / 2]
+    n = torch.zeros(1, 1, dtype=D)
+    problem = Problem(torch.tensor([[box]], dtype=D), n == 0, n, n, n, n, n, {})
+    pose = torch.tensor([[[0.2, -0.3, 0.1, -0.01, -0.02, np.pi / 2 - 0.05]]], dtype=D)
+    shared = torch.zeros(1, SHARED, dtype=D)
+    shared[0, :3] = torch.tensor([4.0, 2.0, 2.0])
+    found = scatter(problem, State(pose, shared))
+    known = [[[0.3, 0.2, -0.1, 0.01, 0.02, 0.05, 0.1, 0.0, -0.25]]]
+    np.testing.assert_allclose(found, known, atol=1e-12)
+
+
+def test_noise_of_a_stream():
+    # One observation after the other, tracks of different length, equals all at once.
+    values = autoregressive(4, 40, np.ones(9), 0.5, seed=2)
+    lengths = [40, 30, LEAST, LEAST - 1]
+    model = InputModel(FACES)
+    assert model.noise() is None
+    for i in range(40):
+        alive = [b for b in range(4) if i < lengths[b]]
+        model.learn_noise([str(b) for b in alive], values[alive, i].numpy())
+        if i == LEAST - 2:
+            assert model.noise() is None
+    valid = torch.arange(40) < torch.tensor(lengths)[:, None]
+    known = InputNoise.measure(values, valid)
+    np.testing.assert_allclose(model.noise().deviation, known.deviation)
+    np.testing.assert_allclose(model.noise().correlation, known.correlation)
+
+
+# --- rule ---------------------------------------------------------------------------------------
+
+
+def sighted(model, names, gaps, n=5, count=100, seen=1.0, retreat=0.0, fresh=True):
+    """Show `model` tracks whose outermost points stand `gaps` (b, 6) inside of their faces."""
+    rule = model.rule()
+    b = len(names)
+    gaps = torch.as_tensor(np.broadcast_to(gaps, (b, 6)).copy(), dtype=D)
+    # Outwardness is how far points stand out of the box less the gap expected of them.
+    out = (rule.gaps - gaps)[:, None].expand(b, n, 6)
+    whole = torch.ones(b, n, 6, dtype=D)
+    support = Support(
+        torch.zeros(b, n, 6, 4, 4, dtype=D), out, seen * whole, count * whole[..., 0],
+        retreat * whole,
+    )  # fmt: skip
+    model.learn_rule(names, support, torch.full((b, n), fresh), rule)
+
+
+def test_the_expected_rule_comes_from_the_settings():
+    rule = InputModel(FACES).rule()
+    np.testing.assert_allclose(rule.gaps, EXPECTED)
+    np.testing.assert_allclose(rule.depths[:4], [FACES.depth_ends] * 2 + [FACES.depth_sides] * 2)
+    np.testing.assert_allclose(rule.depths[4:], 0)
+
+
+def test_the_rule_of_the_input_is_learnt():
+    # 200 tracks agree on 0.02 m more than expected but for 0.05 m of noise that is their own:
+    # the error of a median of 400 sights (two ends, two sides) is some 3 mm, far less than the
+    # 0.05 m by which the rule may be off.
+    rng = np.random.default_rng(3)
+    model = InputModel(FACES)
+    gaps = np.array(EXPECTED) + 0.02 + 0.05 * rng.normal(size=(200, 6))
+    for start in range(0, 200, 20):
+        part = slice(start, start + 20)
+        sighted(model, [str(i) for i in range(200)[part]], gaps[part])
+    np.testing.assert_allclose(model.rule().gaps, np.array(EXPECTED) + 0.02, atol=0.01)
+
+
+def test_the_mean_of_a_track_does_not_hang_on_how_it_comes():
+    # Sights are of the gap itself: the rule of the moment must not leave traces.
+    rng = np.random.default_rng(4)
+    gaps = np.array(EXPECTED) + 0.1 * rng.normal(size=(30, 6))
+    names = [str(i) for i in range(30)]
+    at_once, in_parts = InputModel(FACES), InputModel(FACES)
+    sighted(at_once, names, gaps, n=10)
+    for _ in range(2):
+        for name, row in zip(names, gaps, strict=True):
+            sighted(in_parts, [name], row[None])
+    np.testing.assert_allclose(in_parts.rule().gaps, at_once.rule().gaps, atol=1e-12)
+
+
+def test_few_or_discordant_sights_change_little():
+    # Trust is d^2 / (d^2 + e^2 / n): d how far a rule may be off, e how sights scatter. Three
+    # tracks at -0.4, 0.0 and 0.4 m around the expected gap plus 0.2 have e of 0.77 m at least.
+    model = InputModel(FACES)
+    gaps = np.array(EXPECTED) + np.array([[-0.2], [0.2], [0.4]])
+    sighted(model, ['a', 'b', 'c'], gaps)
+    change = (model.rule().gaps - torch.tensor(EXPECTED, dtype=D)).numpy()
+    assert (np.abs(change) < 0.2 * 0.75).all()
+    assert (np.abs(change[:4]) < 0.2 * 0.25).all()
+    assert max(RULE_ERROR) < 0.2
+
+
+@pytest.mark.parametrize(
+    'unfit',
+    [
+        {'seen': 0.0},
+        {'count': 29},
+        {'fresh': False},
+        {'gaps': np.array(EXPECTED) + 0.6},
+        {'n': 2},
+    ],
+    ids=['hidden', 'few points', 'known before', 'half a metre off', 'two sights'],
+)
+def test_what_tells_nothing_of_the_rule(unfit):
+    model = InputModel(FACES)
+    given = {'gaps': np.array(EXPECTED) + 0.04, **unfit}
+    sighted(model, [str(i) for i in range(50)], **given)
+    np.testing.assert_allclose(model.rule().gaps, EXPECTED)
+
+
+def test_depths_are_learnt_from_faces_seen_from_behind_alone():
+    # The whole expected depth of retreat: faces hidden. Outwardness 0 confirms the depth, and
+    # tells nothing of the gap of open faces.
+    model = InputModel(FACES)
+    rule = model.rule()
+    names, whole = [str(i) for i in range(50)], torch.ones(50, 5, 6, dtype=D)
+    support = Support(
+        torch.zeros(50, 5, 6, 4, 4, dtype=D), 0.05 * whole, whole, 100 * whole[..., 0],
+        rule.depths.expand_as(whole),
+    )  # fmt: skip
+    model.learn_rule(names, support, torch.ones(50, 5, dtype=torch.bool), rule)
+    found = model.rule()
+    # Points 0.05 m further out than expected: the depth is that much less, but for trust.
+    assert FACES.depth_ends - 0.05 <= found.depths[0] < FACES.depth_ends - 0.045
+    assert FACES.depth_sides - 0.05 <= found.depths[2] < FACES.depth_sides - 0.045
+    np.testing.assert_allclose(found.gaps[:4], EXPECTED[:4])
+
+
+def test_learning_can_be_switched_off():
+    model = InputModel(FaceConfig(learn=False))
+    sighted(model, [str(i) for i in range(50)], np.array(EXPECTED) + 0.04)
+    np.testing.assert_allclose(model.rule().gaps, EXPECTED)
+
+
+def test_only_the_tracks_seen_last_are_remembered():
+    # As many tracks as are remembered say +0.1, then as many others say -0.02: these count.
+    model = InputModel(FACES)
+    sighted(model, [f'old {i}' for i in range(TRACKS)], np.array(EXPECTED) + 0.1)
+    known = InputModel(FACES)
+    new = [f'new {i}' for i in range(TRACKS)]
+    for learner in (model, known):
+        sighted(learner, new, np.array(EXPECTED) - 0.02)
+    np.testing.assert_allclose(model.rule().gaps, known.rule().gaps)
+    assert model.rule().gaps[0] == pytest.approx(EXPECTED[0] - 0.02, abs=1e-3)
+
+
+def test_support_of_boxes_drawn_by_a_rule_teaches_it():
+    # Through `support` itself: boxes 0.11 m larger on every side than what their points show.
+    rng = np.random.default_rng(5)
+    B, N, half = 12, 6, np.array([2.0, 1.0, 1.0])
+    n = 300
+    axis = rng.integers(0, 3, (B, N, n))
+    points = rng.uniform(-1, 1, (B, N, n, 3)) * (half - 0.11)
+    on = axis[..., None] == np.arange(3)
+    points = np.where(on, np.sign(points) * (half - 0.11), points)
+    origins = np.tile([[30.0, 30.0, 2.0], [-30.0, -30.0, 2.0]], (6, 1))
+    boxes = np.zeros((B, N, 9))
+    boxes[..., 3:6] = 2 * half
+    problem = Problem(
+        torch.from_numpy(boxes), torch.ones(B, N, dtype=torch.bool),
+        torch.arange(N, dtype=D).expand(B, N), torch.from_numpy(points),
+        torch.ones(B, N, n, dtype=torch.bool),
+        torch.from_numpy(np.repeat(origins[:, None], N, 1)),
+        torch.full((B, N), torch.nan, dtype=D), {},
+    )  # fmt: skip
+    shared = torch.zeros(B, SHARED, dtype=D)
+    shared[:, :3] = torch.tensor([4.0, 2.0, 2.0])
+    model = InputModel(FaceConfig(depth_ends=0.0, depth_sides=0.0))
+    rule = model.rule()
+    shared[:, objective.GAP] = rule.gaps
+    support = objective.support(problem, State(problem.pose, shared), 0.4, 0.05, rule.depths)
+    model.learn_rule([str(b) for b in range(B)], support, torch.ones(B, N, dtype=torch.bool), rule)
+    # The median moves but for trust: its error, 1.25 * 0.02 m / sqrt(12), against 0.05 m.
+    np.testing.assert_allclose(model.rule().gaps[:5], 0.11, atol=0.003)
+    assert model.rule().gaps[5] == pytest.approx(FACES.gap_bottom)
