@@ -1,17 +1,17 @@
 """What the input tells about itself: its annotation rule, and how it errs."""
 
-from collections import OrderedDict, deque
+from collections import deque, OrderedDict
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from boxreg_ros.config import FaceConfig
+from boxreg_ros.correspondence import Support
+from boxreg_ros.geometry import rotation_from_rpy
+from boxreg_ros.objective import EXTENT, Problem, State
+from boxreg_ros.structures import Floats
 import numpy as np
 import torch
 from torch import Tensor
-
-from boxreg_ros.config import FaceConfig
-from boxreg_ros.geometry import rotation_from_rpy
-from boxreg_ros.objective import EXTENT, Problem, State, Support
-from boxreg_ros.structures import Floats
 
 KINDS = ([0, 1], [2, 3], [4], [5])  # ends, sides, top, bottom
 RULE_ERROR = (0.05, 0.05, 0.05, 0.15)  # how far a rule may be from the expected one [m]
@@ -92,7 +92,7 @@ class InputModel:
         """
         out, retreat = support.outwardness.cpu().numpy(), support.retreat.cpu().numpy()
         share = retreat / np.maximum(rule.depths.cpu().numpy(), 1e-6)
-        usable = ((support.seen > 0) & (fresh & (support.count >= 30))[..., None]).cpu().numpy()
+        usable = ((support.trust > 0) & (fresh & (support.points >= 30))[..., None]).cpu().numpy()
         usable &= np.abs(out) < 0.5
         sights = (
             rule.gaps.cpu().numpy() - out,

@@ -83,8 +83,8 @@ class FaceConfig:
 class SolverConfig:
     """L-BFGS and the rounds around it."""
 
-    rounds: int = setting(4, 'outer rounds: outermost points and weights renewed', '', 1, 100)
-    iterations: int = setting(12, 'most L-BFGS iterations per round', '', 1, 10000)
+    rounds: int = setting(3, 'outer rounds: outermost points and weights renewed', '', 1, 100)
+    iterations: int = setting(3, 'most L-BFGS iterations per round', '', 1, 10000)
     history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
     tolerance: float = setting(
         1e-4, 'a window ends when a step promises less than this', '', 0.0, 1.0

@@ -85,8 +85,7 @@ def minimize(
     Armijo condition holds. Ended rows leave the batch as soon as they are half of it.
 
     """
-    B, D = start.shape
-    rows = torch.arange(B, device=start.device)
+    rows = torch.arange(len(start), device=start.device)
     value, gradient = function(start, rows)
     finite = value.isfinite() & gradient.isfinite().all(1)
     best = Minimum(

@@ -36,12 +36,16 @@ class Problem:
     ----------
     boxes : Tensor, shape (B, N, 9)
         Input boxes, yaw unwrapped along the window and half turns undone [m, rad].
+    start : Tensor, shape (B, N, 9)
+        Where the search starts: the input, or what the window before made of it.
     valid : Tensor, shape (B, N)
         True where an observation is real.
     times : Tensor, shape (B, N)
         Since the first observation, growing over the padding too [s].
     points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
         Returns minus the centre of their input box [m]; True where real.
+    delays : Tensor, shape (B, N, M)
+        When each return was measured, relative to the stamp of its box [s].
     origins : Tensor, shape (B, N, 3)
         Sensor minus the centre of the input box [m]; NaN where unknown.
     ground : Tensor, shape (B, N)
@@ -52,10 +56,12 @@ class Problem:
     """
 
     boxes: Tensor
+    start: Tensor
     valid: Tensor
     times: Tensor
     points: Tensor
     mask: Tensor
+    delays: Tensor
     origins: Tensor
     ground: Tensor
     deviations: dict[str, Tensor]
@@ -147,15 +153,17 @@ def alignment(boxes: Tensor, valid: Tensor) -> Tensor:
     Notes
     -----
     The direction of a step of no length is undefined: a step counts in full from 0.1 m on and
-    fades to nothing at rest. The paper wraps the angle into [-pi/2, pi/2], that is it compares
-    axes: a step against the heading is that of a reversing object, not an error.
+    fades to nothing at rest. A window that moves against its headings on the whole is that of a
+    reversing object: its direction is turned around. The paper also wraps its alpha, the roll,
+    into [-pi/2, pi/2], which this term does not depend on.
 
     """
     heading = rotation_from_rpy(boxes[:, :-1, 6:9])[..., 0]
     step = boxes[:, 1:, :3] - boxes[:, :-1, :3]
     length = (step.square().sum(-1) + EPSILON).sqrt()
     direction = step / length[..., None]
-    forward = torch.where((heading * direction).sum(-1) < 0, -1.0, 1.0)[..., None]
+    along = ((heading * step).sum(-1) * valid[:, 1:]).sum(-1)
+    forward = torch.where(along < 0, -1.0, 1.0)[:, None, None]
     gap = ((heading - forward * direction).square().sum(-1) + EPSILON).sqrt()
     return _mean(gap * (length / 0.1).clamp(max=1.0), valid[:, 1:])
 
@@ -194,9 +202,6 @@ def _mean(values: Tensor, real: Tensor) -> Tensor:
 SHARED = 16  # extent (3), bias of the input (6), gap of the faces (6), pivot
 EXTENT, BIAS, GAP = slice(0, 3), slice(3, 9), slice(9, 15)
 PIVOT = 15
-TOP, BOTTOM = 4, 5
-HIDDEN, VEIL = 9.0, 0.4
-LEAST = 3  # points without which a face is not seen
 
 
 class State(NamedTuple):
@@ -400,122 +405,3 @@ def shared_prior(problem: Problem, state: State, expected: Tensor) -> Linearised
     by_shared = torch.eye(SHARED).to(residual).expand(len(expected), 1, 1, SHARED, SHARED)
     by_pose = residual.new_zeros((len(expected), 1, 1, SHARED, 1, 6))
     return Linearised(residual, by_pose, by_shared)
-
-
-def aspect(problem: Problem) -> Tensor:
-    """
-    Return how openly the sensor sees each face, shape (B, N, 6).
-
-    The tangent of the angle between the face's plane and the line of sight, in the horizontal
-    for the four upright faces: above 0 the sensor is on the outer side, below 0 the face is
-    hidden behind its own edge. The roof counts as open, the bottom as hidden. Where no sensor is
-    known the side of the points' centre of mass is open, as in the paper, the other hidden.
-
-    """
-    R = rotation_from_rpy(problem.boxes[..., 6:9])
-    weight = problem.mask.to(R)[..., None]
-    mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
-    known = problem.origins.isfinite().all(-1, keepdim=True)
-    toward = (torch.where(known, problem.origins, 1e6 * mean)[..., None, :] @ R)[..., 0, :]
-    outward = toward[..., [0, 0, 1, 1]] * FACE_SIGN[:4].to(R)
-    half = problem.boxes[..., [3, 3, 4, 4]] / 2
-    across = toward[..., [1, 1, 0, 0]].abs() - problem.boxes[..., [4, 4, 3, 3]] / 2
-    sides = (outward - half) / across.clamp(min=0.5)
-    return torch.cat(
-        [sides, torch.full_like(sides[..., :1], 9), torch.full_like(sides[..., :1], -9)], -1
-    )
-
-
-class Support(NamedTuple):
-    """
-    What stands out furthest on each face, in one round.
-
-    Attributes
-    ----------
-    moments : Tensor, shape (B, N, 6, 4, 4)
-        Mean of (p, 1)(p, 1)' over the outermost points, p minus the centre of the input box.
-    outwardness : Tensor, shape (B, N, 6)
-        How far these stand out of the box less its gap, on average [m].
-    seen : Tensor, shape (B, N, 6)
-        Which faces have enough of them and are turned to the sensor; the roof always is, the
-        bottom is where the road beside the box is known.
-    count : Tensor, shape (B, N)
-        Points in and near the box.
-
-    """
-
-    moments: Tensor
-    outwardness: Tensor
-    seen: Tensor
-    count: Tensor
-    retreat: Tensor
-
-
-def retreat(aspect: Tensor, depths: Tensor) -> Tensor:
-    """
-    Return how much further in the outermost points of a face stand for its aspect [m].
-
-    A body is round at its edges: what is seen of a face from the side, or of its edge from
-    behind, stands further in the less open the face is, up to `depths` (6,).
-
-    """
-    shifted = aspect + aspect.new_tensor([0, 0, 0.2, 0.2, 0, 0])
-    return depths * (0.5 - 0.5 * shifted / (shifted.square() + 0.25).sqrt())
-
-
-def support(
-    problem: Problem, state: State, margin: float, outermost: float, depths: Tensor
-) -> Support:
-    """
-    Find the outermost points of each face, the part `outermost` of all [Eq. 4].
-
-    Notes
-    -----
-    The paper takes the K points closest to a face, visible by their centre of mass. We take
-    those furthest out toward a face the sensor can see: the closest ones may lie anywhere on a
-    face that is given too far inside. Only points within `margin` of the present face count, and
-    0.3 m more on its inside.
-
-    """
-    shift = state.pose[..., :3] - problem.pose[..., :3]
-    local = (problem.points - shift[..., None, :]) @ rotation_from_rpy(state.pose[..., 3:])
-    half = (state.shared[:, EXTENT] / 2)[:, None, None]
-    beyond = local.abs() - half
-    near = torch.where(problem.mask[..., None], beyond, torch.inf)
-    beside = near[..., [1, 0, 0]].maximum(near[..., [2, 2, 1]]) < 0.2
-    out = local[..., FACE_AXIS] * FACE_SIGN.to(local) - half[..., FACE_AXIS]
-    open_ = aspect(problem)
-    inset = state.shared[:, None, GAP] + retreat(open_, depths)
-    out = out + inset[..., None, :]
-    candidate = beside[..., FACE_AXIS] & (out < margin) & (out > -margin - 0.3)
-    count = (near < margin).all(-1).sum(-1)
-    wanted = (outermost * count).clamp(min=LEAST)[..., None, None]
-    most = min(out.shape[2], max(LEAST, int(outermost * out.shape[2]) + 1))
-    height, index = torch.where(candidate, out, -torch.inf).topk(most, dim=2)
-    rank = torch.arange(most, device=out.device)[:, None]
-    chosen = height.isfinite() & (rank < wanted)
-    number = chosen.sum(2)
-    share = chosen / number.clamp(min=1)[:, :, None]
-    rows = index[..., None].expand(*index.shape, 3)
-    points = problem.points.gather(2, rows.flatten(2, 3)).unflatten(2, (most, 6))
-    points = torch.cat([points, torch.ones_like(points[..., :1])], -1)
-    moments = torch.einsum('bnkf,bnkfi,bnkfj->bnfij', share.to(points), points, points)
-    outwardness = (torch.where(chosen, height, 0.0) * share).sum(2)
-    seen = (number >= LEAST) * torch.where(open_ > 0, 1.0, torch.where(open_ > -HIDDEN, VEIL, 0.0))
-    return _with_road(
-        problem, state, Support(moments, outwardness, seen, count, retreat(open_, depths))
-    )
-
-
-def _with_road(problem: Problem, state: State, support: Support) -> Support:
-    """Let a point of the road under the centre of the box stand for its bottom face."""
-    known = problem.ground.isfinite() & problem.valid
-    road = torch.nan_to_num(problem.ground)
-    shift = state.pose[..., :3] - problem.pose[..., :3]
-    point = torch.stack([shift[..., 0], shift[..., 1], road, torch.ones_like(road)], -1)
-    support.moments[..., BOTTOM, :, :] = point[..., :, None] * point[..., None, :]
-    below = shift[..., 2] - road - state.shared[:, None, 2] / 2 + state.shared[:, None, 14]
-    support.outwardness[..., BOTTOM] = below
-    support.seen[..., BOTTOM] = known.to(road)
-    support.retreat[..., BOTTOM] = 0.0
-    return support

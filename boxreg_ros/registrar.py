@@ -8,10 +8,11 @@ from boxreg_ros.association import Pair, StampMatcher
 from boxreg_ros.calibration import InputModel
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ShapeError
-from boxreg_ros.registration import Estimate, register, Window
+from boxreg_ros.registration import Estimate, register
 from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import (
     BoxArray,
+    Floats,
     INTERPOLATED,
     KEPT,
     RefinedBoxes,
@@ -19,6 +20,7 @@ from boxreg_ros.structures import (
     Sweep,
     Track,
 )
+from boxreg_ros.window import Window
 import numpy as np
 
 
@@ -210,7 +212,7 @@ class _Entry:
     observation: Observation
     tick: _Tick
     index: int
-    is_solved: bool = False
+    estimate: Floats | None = None
     is_settled: bool = False
 
 
@@ -232,12 +234,15 @@ class _TrackBuffer:
 
     def window(self) -> Window:
         observations = [entry.observation for entry in self.entries]
-        fresh = sum(not entry.is_solved for entry in self.entries)
-        return Window(self.track_id, self.class_name, observations, fresh)
+        solved = [entry.estimate for entry in self.entries if entry.estimate is not None]
+        fresh = len(observations) - len(solved)
+        return Window(
+            self.track_id, self.class_name, observations, fresh, np.array(solved).reshape(-1, 9)
+        )
 
     def write(self, estimate: Estimate) -> None:
         for row, entry in enumerate(self.entries):
-            entry.is_solved = True
+            entry.estimate = estimate.boxes[row]
             if not entry.is_settled:
                 entry.tick.refined[entry.index] = estimate.boxes[row]
                 entry.tick.covariances[entry.index] = estimate.covariances[row]

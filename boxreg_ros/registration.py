@@ -1,17 +1,17 @@
 """Windows in, refined boxes out: the method in one readable function."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import NamedTuple
 
 from boxreg_ros import objective
 from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
-from boxreg_ros.config import ClassConfig, Config
-from boxreg_ros.geometry import rotation_from_rpy, to_box_frame
+from boxreg_ros.config import Config
+from boxreg_ros.correspondence import Support, support
+from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.lbfgs import minimize
-from boxreg_ros.objective import Problem, SHARED, State, Support, Term
-from boxreg_ros.sampling import Observation
-from boxreg_ros.structures import Floats, HEIGHT, KEPT, LENGTH, POSE, REFINED, YAW
+from boxreg_ros.objective import EXTENT, Problem, SHARED, State, Term
+from boxreg_ros.structures import Floats, KEPT, POSE, REFINED
+from boxreg_ros.window import batches, stack, Window
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,28 +24,6 @@ RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
-BATCH_VALUES = 3e7  # most point coordinates, or entries of the curvature, solved at once
-
-
-class Window(NamedTuple):
-    """
-    Observations of one track, in order.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        Identity and category.
-    observations : sequence of N Observation
-        In the order of their stamps.
-    fresh : int
-        How many of them, the last ones, no window has had before.
-
-    """
-
-    track_id: str
-    class_name: str
-    observations: Sequence[Observation]
-    fresh: int
 
 
 class Estimate(NamedTuple):
@@ -77,29 +55,68 @@ def register(windows: Sequence[Window], config: Config, model: InputModel) -> li
 
     """
     estimates = [_kept(window, 'short_track') for window in windows]
-    batches = [
-        (rows, stack([windows[i] for i in rows], config)) for rows in _batches(windows, config)
-    ]
-    for rows, (problem, _) in batches:
-        _learn(model, problem, [windows[i] for i in rows])
-    for rows, (problem, origins) in batches:
+    groups = batches(windows, config)
+    for rows in groups:
+        _learn(model, [windows[i] for i in rows], config)
+    for rows in groups:
+        part = [windows[i] for i in rows]
+        problem, base = stack(part, config)
         if config.objective == 'paper':
             state, covariances = solve_paper(problem, config)
         else:
-            state, covariances = solve(problem, config, model)
-        boxes = _boxes(problem, state, origins, config)
+            rounds = 1 if part[0].is_warm else config.solver.rounds
+            state, covariances = solve(problem, config, model, rounds)
         if config.estimate != 'track':
-            settled = torch.tensor(
-                [max(0, len(windows[i].observations) - 1 - config.lag) for i in rows]
-            )
-            deviation = scatter(problem, state)[torch.arange(len(rows)), settled].cpu().numpy()
-            model.learn_noise([windows[i].track_id for i in rows], deviation)
-        for row, index in enumerate(rows):
-            estimates[index] = _judge(windows[index], boxes[row], covariances[row])
+            _learn_noise(model, part, problem, state, config)
+        for i, estimate in zip(
+            rows, _estimates(part, problem, base, state, covariances, config), strict=True
+        ):
+            estimates[i] = estimate
     return estimates
 
 
-def solve(problem: Problem, config: Config, model: InputModel) -> tuple[State, Tensor]:
+def _estimates(
+    windows: Sequence[Window],
+    problem: Problem,
+    base: Floats,
+    state: State,
+    covariances: Tensor,
+    config: Config,
+) -> list[Estimate]:
+    """Return what a solved batch says of each window, in the fixed frame."""
+    given = problem.boxes[..., 3:6]
+    extent = given if config.extent == 'fixed' else state.shared[:, None, EXTENT].expand_as(given)
+    held = torch.stack(
+        [_held(problem, problem.pose, given), _held(problem, state.pose, extent)], 1
+    )
+    angles = torch.atan2(state.pose[..., 3:].sin(), state.pose[..., 3:].cos())
+    boxes = torch.cat([state.pose[..., :3], extent, angles], -1).cpu().numpy()
+    boxes[..., :3] += base[:, None]
+    spread, counts = covariances.cpu().numpy(), held.cpu().numpy()
+    estimates = []
+    for b, window in enumerate(windows):
+        n = len(window.observations)
+        before = np.array([o.box for o in window.observations])
+        estimates.append(_judge(window, before, boxes[b, :n], counts[b, :, :n], spread[b, :n]))
+    return estimates
+
+
+def _learn_noise(
+    model: InputModel,
+    windows: Sequence[Window],
+    problem: Problem,
+    state: State,
+    config: Config,
+) -> None:
+    """Show the model how the input scatters where a window knows it best, `lag` from its end."""
+    best = torch.tensor([max(0, len(w.observations) - 1 - config.lag) for w in windows])
+    rows = scatter(problem, state)[torch.arange(len(windows)), best]
+    model.learn_noise([w.track_id for w in windows], rows.cpu().numpy())
+
+
+def solve(
+    problem: Problem, config: Config, model: InputModel, rounds: int
+) -> tuple[State, Tensor]:
     """
     Minimise the robust objective: rounds of correspondence, weighting and L-BFGS.
 
@@ -107,39 +124,66 @@ def solve(problem: Problem, config: Config, model: InputModel) -> tuple[State, T
     the curvature, which is also the metric L-BFGS starts from in every round.
 
     """
-    length = problem.boxes.shape[1]
-    rule = model.rule()
+    length, settings = problem.boxes.shape[1], config.solver
+    rule, noise = model.rule(), model.noise()
     expected = _expected(problem, rule)
-    state = State(problem.pose.clone(), expected.clone())
+    state = State(problem.start[..., POSE].clone(), expected.clone())
     free = _free(problem, config)
-    noise = model.noise()
-    for turn in range(config.solver.rounds):
-        support = objective.support(
-            problem, state, MARGINS[min(turn, 1)], config.faces.outermost, rule.depths
-        )
-        terms = weigh(problem, state, support, expected, noise, config)
-        x = state.pack()
-        H = objective.curvature(terms, x, length) * free[:, :, None] * free[:, None, :]
-        L = torch.linalg.cholesky(H + torch.diag_embed(1.0 - free + 1e-9))
-
-        def function(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-            part = terms if len(rows) == len(L) else [term.select(rows) for term in terms]
-            value, gradient = objective.value_and_gradient(part, x, length)
-            return value, gradient * free[rows]
-
-        def metric(vector: Tensor, rows: Tensor) -> Tensor:
-            return torch.cholesky_solve(vector[..., None], L[rows])[..., 0]
-
-        settings = config.solver
+    for turn in range(rounds):
+        margin = MARGINS[0] if turn == 0 and rounds > 1 else MARGINS[1]
+        sights = support(problem, state, margin, config.faces.outermost, rule.depths)
+        terms = weigh(problem, state, sights, expected, noise, config)
+        metric = _Metric(objective.curvature(terms, state.pack(), length), free)
         found = minimize(
-            function, x, settings.iterations, settings.history, settings.tolerance, metric
+            _Sum(terms, length, free),
+            state.pack(),
+            settings.iterations,
+            settings.history,
+            settings.tolerance,
+            metric,
         )
         state = State.unpack(found.x, length)
         if config.estimate == 'track':
             noise = InputNoise.measure(scatter(problem, state), problem.valid)
-    blocks = torch.cholesky_inverse(L)[:, : 6 * length, : 6 * length]
-    blocks = blocks.unflatten(1, (length, 6)).unflatten(3, (length, 6))
-    return state, blocks.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+    return state, metric.blocks(length)
+
+
+class _Sum:
+    """The sum of terms as a function of the free variables of some rows."""
+
+    def __init__(self, terms: list[Term], length: int, free: Tensor) -> None:
+        self._terms, self._length, self._free = terms, length, free
+        self._part: tuple[Tensor, list[Term]] | None = None
+
+    def __call__(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        terms = self._terms
+        if len(rows) < len(self._free):
+            if self._part is None or self._part[0] is not rows:
+                self._part = rows, [term.select(rows) for term in terms]
+            terms = self._part[1]
+        value, gradient = objective.value_and_gradient(terms, x, self._length)
+        return value, gradient * (self._free if terms is self._terms else self._free[rows])
+
+
+class _Metric:
+    """The inverse of the curvature in the free variables, factorised once."""
+
+    def __init__(self, curvature: Tensor, free: Tensor) -> None:
+        curvature *= free[:, :, None]
+        curvature *= free[:, None, :]
+        curvature.diagonal(dim1=1, dim2=2).add_(1.0 - free + 1e-9)
+        self._factor = torch.linalg.cholesky(curvature)
+
+    def __call__(self, vector: Tensor, rows: Tensor) -> Tensor:
+        factor = self._factor if len(rows) == len(self._factor) else self._factor[rows]
+        return torch.cholesky_solve(vector[..., None], factor)[..., 0]
+
+    def blocks(self, length: int) -> Tensor:
+        """Return the covariances of the poses (B, N, 6, 6)."""
+        inverse = torch.cholesky_inverse(self._factor)[:, : 6 * length, : 6 * length]
+        inverse = inverse.unflatten(1, (length, 6)).unflatten(3, (length, 6))
+        blocks: Tensor = inverse.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+        return blocks
 
 
 def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
@@ -152,7 +196,7 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
     """
     length, settings = problem.boxes.shape[1], config.paper
     expected = _expected(problem, Rule(torch.zeros(6), torch.zeros(6)))
-    extent = expected[:, None, objective.EXTENT].expand(-1, length, -1)
+    extent = expected[:, None, EXTENT].expand(-1, length, -1)
     free = _free(problem, config)[:, : 6 * length]
     x = problem.pose.flatten(1)
     multipliers = x.new_tensor([settings.smoothness, settings.alignment]).repeat(len(x), 1)
@@ -185,7 +229,7 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
 def weigh(
     problem: Problem,
     state: State,
-    support: Support,
+    sights: Support,
     expected: Tensor,
     noise: InputNoise | None,
     config: Config,
@@ -207,8 +251,8 @@ def weigh(
 
     # Closeness and enclosure: outermost points on their faces.
     errors = [faces.ends] * 2 + [faces.sides] * 2 + [faces.top, faces.bottom]
-    trust = support.seen * (support.count / (support.count + 5.0))[..., None]
-    trust = trust / (1 + (support.outwardness / faces.outlier) ** 2) ** 2
+    trust = sights.trust * (sights.points / (sights.points + 5.0))[..., None]
+    trust = trust / (1 + (sights.outwardness / faces.outlier) ** 2) ** 2
     trust = trust * valid[..., None] / torch.tensor(errors).to(trust) ** 2
     # The input, its bias and its extents.
     error = of('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
@@ -223,7 +267,7 @@ def weigh(
         extent = extent * slow[6:]
     off = objective.prior(problem, state).residual[:, :, 0] / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
-    hidden = (support.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
+    hidden = (sights.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
     gap = (faces.spread**2 + (RETREAT_SPREAD * hidden) ** 2).sqrt()
     shared = (
         torch.cat([expected[:, :3] * extent, bias, gap, torch.full_like(gap[:, :1], 0.25)], 1)
@@ -241,7 +285,7 @@ def weigh(
         return torch.diag_embed(weight)[:, :, None]
 
     return [
-        Term(objective.faces, problem, support.moments * trust[..., None, None], support.retreat),
+        Term(objective.faces, problem, sights.moments * trust[..., None, None], sights.retreat),
         Term(objective.prior, problem, diagonal(hold)),
         Term(
             objective.acceleration,
@@ -265,13 +309,14 @@ def _parked(problem: Problem) -> Tensor:
         return (where * part[..., None]).sum(1) / part.sum(1, keepdim=True)
 
     change = mean((index >= count - third) & problem.valid) - mean(index < third)
-    moved = change[:, :2].norm(dim=1)
+    moved: Tensor = change[:, :2].norm(dim=1)
     is_parked = (moved < PARKED[0] * change[:, 2]) & (moved < PARKED[1])
-    return (is_parked[:, None] & problem.valid[:, 1:]).to(where)
+    still: Tensor = (is_parked[:, None] & problem.valid[:, 1:]).to(where)
+    return still
 
 
 def _expected(problem: Problem, rule: Rule) -> Tensor:
-    """Return the expectation of what is shared (B, 16): mean input extent, no bias, the rule, the axle."""
+    """Return the expectation of what is shared (B, 16): mean extent, no bias, rule, pivot."""
     extents = problem.boxes[..., 3:6]
     count = problem.valid.sum(1)
     ranked = torch.where(problem.valid[..., None], extents, torch.inf).sort(1).values
@@ -294,104 +339,46 @@ def _free(problem: Problem, config: Config) -> Tensor:
     return State(pose, shared).pack()
 
 
-def _learn(model: InputModel, problem: Problem, windows: list[Window]) -> None:
-    """Show the rule the fresh observations at their input boxes."""
+def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None:
+    """Show the model the fresh observations at their input boxes."""
+    problem, _ = stack([window.fresh_part() for window in windows], config)
     rule = model.rule()
-    expected = _expected(problem, rule)
-    support = objective.support(
-        problem, State(problem.pose, expected), MARGINS[0], 0.05, rule.depths
-    )
-    first = torch.tensor([len(w.observations) - w.fresh for w in windows])
-    fresh = torch.arange(problem.valid.shape[1]) >= first[:, None]
-    model.learn_rule([w.track_id for w in windows], support, fresh & problem.valid, rule)
+    state = State(problem.pose, _expected(problem, rule))
+    sights = support(problem, state, MARGINS[0], config.faces.outermost, rule.depths)
+    model.learn_rule([w.track_id for w in windows], sights, problem.valid, rule)
 
 
-def _batches(windows: Sequence[Window], config: Config) -> list[list[int]]:
-    """Return groups of windows of similar length and bounded size; short ones are left out."""
-    lengths = [len(window.observations) for window in windows]
-    rows = [i for i, n in enumerate(lengths) if n >= config.min_observations]
-    batches: list[list[int]] = []
-    for i in sorted(rows, key=lambda i: (lengths[i], i)):
-        size = max((6 * lengths[i] + SHARED) ** 2, lengths[i] * config.sampling.points * 18)
-        if not batches or (len(batches[-1]) + 1) * size > BATCH_VALUES:
-            batches.append([])
-        batches[-1].append(i)
-    return batches
-
-
-def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
-    """Return padded tensors of `windows` and the point (B, 3) their centres are relative to."""
-    B, N = len(windows), max(len(w.observations) for w in windows)
-    M = max(1, *(len(o.points) for w in windows for o in w.observations))
-    boxes, times, valid = np.zeros((B, N, 9)), np.zeros((B, N)), np.zeros((B, N), dtype=bool)
-    points, mask = np.zeros((B, N, M, 3)), np.zeros((B, N, M), dtype=bool)
-    origins, ground = np.full((B, N, 3), np.nan), np.full((B, N), np.nan)
-    for b, window in enumerate(windows):
-        n = len(window.observations)
-        given = np.array([o.box for o in window.observations])
-        given[:, YAW] = one_heading(given[:, YAW])
-        boxes[b, :n], boxes[b, n:], valid[b, :n] = given, given[-1], True
-        for i, o in enumerate(window.observations):
-            points[b, i, : len(o.points)], mask[b, i, : len(o.points)] = o.points, True
-            times[b, i] = (o.stamp_ns - window.observations[0].stamp_ns) * 1e-9
-            origins[b, i], ground[b, i] = o.origin, o.ground
-        times[b, n:] = times[b, n - 1] + 0.1 * np.arange(1, N - n + 1)
-    start = boxes[:, 0, :3].copy()
-    boxes[:, :, :3] -= start[:, None]
-    kinds = [config.class_config(window.class_name) for window in windows]
-    deviations = {
-        f.name: torch.tensor([getattr(kind, f.name) for kind in kinds], dtype=torch.float64)
-        for f in fields(ClassConfig)
-        if f.name != 'names'
-    }
-    arrays = (boxes, valid, times, points, mask, origins, ground)
-    tensors = (torch.from_numpy(array).to(config.device) for array in arrays)
-    return Problem(*tensors, {k: v.to(config.device) for k, v in deviations.items()}), start
-
-
-def one_heading(yaw: Floats) -> Floats:
-    """Return `yaw` (N,) unwrapped [rad], with the half turns undone that are in the minority."""
-    chain = np.unwrap(yaw, period=np.pi)
-    turned = np.cos(yaw - chain) < 0
-    return chain + np.pi if turned.mean() > 0.5 else chain
-
-
-def _boxes(problem: Problem, state: State, origins: Floats, config: Config) -> Floats:
-    """Return the boxes (B, N, 9) of a state, in the fixed frame."""
-    boxes = problem.boxes.cpu().numpy().copy()
-    boxes[..., POSE] = state.pose.cpu().numpy()
-    boxes[..., :3] += origins[:, None]
-    if config.extent == 'track':
-        boxes[..., LENGTH : HEIGHT + 1] = state.shared[:, None, objective.EXTENT].cpu().numpy()
-    boxes[..., 6:9] = np.arctan2(np.sin(boxes[..., 6:9]), np.cos(boxes[..., 6:9]))
-    return boxes
-
-
-def _judge(window: Window, boxes: Floats, covariances: Tensor) -> Estimate:
+def _judge(
+    window: Window, given: Floats, boxes: Floats, held: Floats, covariances: Floats
+) -> Estimate:
     """
     Return the refined boxes, or the input where they do not deserve trust.
 
     Beside points at all and finite numbers, a refined box must hold nearly as many of the points
-    as the input box does: a test the objective does not make.
+    as the input box does: a test the objective does not make. `held` (2, N) counts them.
 
     """
-    kept = _kept(window, '')
-    result, status, reasons = kept.boxes.copy(), list(kept.status), list(kept.reasons)
-    spread = kept.covariances.copy()
-    for i, observation in enumerate(window.observations):
-        points = torch.from_numpy(observation.points).double()
-        pair = torch.from_numpy(np.stack([observation.box, boxes[i]]))
-        local = to_box_frame(points + pair[0, :3], pair).abs()
-        held = (local < pair[:, None, 3:6] / 2 + 0.05).all(-1).sum(-1)
-        if len(points) == 0:
-            reasons[i] = 'no_points'
-        elif not np.isfinite(boxes[i]).all() or (boxes[i, 3:6] <= 0).any():
-            reasons[i] = 'not_finite'
-        elif held[1] < 0.5 * held[0] - 3:
-            reasons[i] = 'no_gain'
-        else:
-            result[i], status[i], spread[i] = boxes[i], REFINED, covariances[i].cpu().numpy()
-    return Estimate(result, tuple(status), tuple(reasons), spread)
+    finite = np.isfinite(boxes).all(1) & (boxes[:, 3:6] > 0).all(1)
+    empty = np.array([len(o.points) == 0 for o in window.observations])
+    checks = (
+        ('no_points', empty),
+        ('not_finite', ~finite),
+        ('no_gain', held[1] < held[0] / 2 - 3),
+    )
+    reasons = [next((name for name, bad in checks if bad[i]), '') for i in range(len(boxes))]
+    good = np.array([not reason for reason in reasons])
+    status = tuple(REFINED if ok else KEPT for ok in good)
+    covariances = np.where(good[:, None, None], covariances, np.eye(6))
+    return Estimate(np.where(good[:, None], boxes, given), status, tuple(reasons), covariances)
+
+
+def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
+    """Return how many points lie in boxes of `pose` (B, N, 6) and `extent` (B, N, 3), (B, N)."""
+    shift = (pose[..., :3] - problem.pose[..., :3]).to(problem.points)
+    R = rotation_from_rpy(pose[..., 3:]).to(problem.points)
+    local = ((problem.points - shift[..., None, :]) @ R).abs()
+    inside = (local < extent[..., None, :].to(local) / 2 + 0.05).all(-1)
+    return (inside & problem.mask).sum(-1)
 
 
 def _kept(window: Window, reason: str) -> Estimate:

@@ -27,10 +27,10 @@ class Observation(NamedTuple):
         Input box in the fixed frame.
     points : array, shape (M, 3)
         Returns near the box, above the road, minus its centre; axes of the fixed frame [m].
-    times : array, shape (M,)
+    delays : array, shape (M,)
         When each was measured, relative to the stamp [s].
-    origin : array, shape (3,), or None
-        Sensor minus centre [m].
+    origin : array, shape (3,)
+        Sensor minus centre [m]; NaN where unknown.
     ground : float
         Height of the road beside the box minus z of the centre [m]; NaN where none is seen.
     num_points : int
@@ -41,8 +41,8 @@ class Observation(NamedTuple):
     stamp_ns: int
     box: Floats
     points: NDArray[np.float32]
-    times: NDArray[np.float32]
-    origin: Floats | None
+    delays: NDArray[np.float32]
+    origin: Floats
     ground: float
     num_points: int
 
@@ -79,13 +79,13 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
         floor = (-box[5] / 2 if np.isnan(ground) else ground) + CLEARANCE
         own = np.flatnonzero((depth <= nearest[index]) & (offset[:, 2] > floor))
         kept = own[_thinned(offset[own], config)]
-        times = np.zeros(len(kept)) if sweep.times is None else sweep.times[source[index[kept]]]
+        delays = np.zeros(len(kept)) if sweep.times is None else sweep.times[source[index[kept]]]
         observations.append(
             Observation(
                 stamp_ns,
                 box,
                 offset[kept].astype(np.float32),
-                times.astype(np.float32),
+                delays.astype(np.float32),
                 sweep.origin - box[:3],
                 ground,
                 int((depth <= 0).sum()),
