@@ -1,10 +1,23 @@
-"""Register tracked 3D boxes to the point clouds themselves: live on ROS 2, over recordings."""
+"""Register tracked 3D boxes to the point cloud stream; live on ROS 2 and over recordings."""
+
+from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.registrar import refine
 from boxreg_ros.structures import RefinedTrack, Track
+
+if TYPE_CHECKING:
+    from boxreg_ros.tracks import refine
 
 __version__ = '0.1.0'
 
 __all__ = ['BoxregError', 'Config', 'RefinedTrack', 'Track', 'refine']
+
+
+def __getattr__(name: str) -> Any:
+    """Import what needs torch when it is first asked for: it takes seconds."""
+    if name == 'refine':
+        from boxreg_ros.tracks import refine
+
+        return refine
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -47,6 +47,9 @@ class Setting(NamedTuple):
 class SamplingConfig:
     """Which points an observation keeps."""
 
+    deskew: bool = setting(
+        False, 'carry points by their own times to where a moving object is at the stamp'
+    )
     margin: float = setting(
         0.6, 'points this far outside the input box still count', 'm', 0.05, 5.0
     )

@@ -11,7 +11,7 @@ BOTTOM = 5
 LEAST = 3  # points without which a face is not seen
 BESIDE = 0.2  # outside the edges of a face, points still count for it [m]
 INSIDE = 0.3  # more room on the inner side of a face than on its outer side [m]
-VEILED = 0.4  # say of a face that is hidden behind its edge
+VEILED = 0.25  # say of a face that is hidden behind its edge
 TURN = 0.25  # how fast a face is lost when it turns away; its edges are rounder at the ends
 LEAD = (0.0, 0.0, 0.2, 0.2, 0.0, 0.0)
 

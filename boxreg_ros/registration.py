@@ -359,13 +359,10 @@ def _judge(
 
     """
     finite = np.isfinite(boxes).all(1) & (boxes[:, 3:6] > 0).all(1)
-    empty = np.array([len(o.points) == 0 for o in window.observations])
-    checks = (
-        ('no_points', empty),
-        ('not_finite', ~finite),
-        ('no_gain', held[1] < held[0] / 2 - 3),
-    )
-    reasons = [next((name for name, bad in checks if bad[i]), '') for i in range(len(boxes))]
+    empty = np.array([len(o.points) == 0 for o in window.observations], dtype=bool)
+    lost = held[1] < held[0] / 2 - 3
+    names = ['no_points', 'not_finite', 'no_gain']
+    reasons: list[str] = np.select([empty, ~finite, lost], names, '').tolist()
     good = np.array([not reason for reason in reasons])
     status = tuple(REFINED if ok else KEPT for ok in good)
     covariances = np.where(good[:, None, None], covariances, np.eye(6))

@@ -28,7 +28,7 @@ class Observation(NamedTuple):
     points : array, shape (M, 3)
         Returns near the box, above the road, minus its centre; axes of the fixed frame [m].
     delays : array, shape (M,)
-        When each was measured, relative to the stamp [s].
+        When each was measured, relative to the stamp [s]; 0 unless `deskew` asks for it.
     origin : array, shape (3,)
         Sensor minus centre [m]; NaN where unknown.
     ground : float
@@ -79,7 +79,9 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
         floor = (-box[5] / 2 if np.isnan(ground) else ground) + CLEARANCE
         own = np.flatnonzero((depth <= nearest[index]) & (offset[:, 2] > floor))
         kept = own[_thinned(offset[own], config)]
-        delays = np.zeros(len(kept)) if sweep.times is None else sweep.times[source[index[kept]]]
+        delays = np.zeros(len(kept))
+        if config.sampling.deskew and sweep.times is not None:
+            delays = sweep.times[source[index[kept]]]
         observations.append(
             Observation(
                 stamp_ns,
