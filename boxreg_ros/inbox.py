@@ -1,0 +1,63 @@
+"""Between the threads of the node: what has been received and waits for the worker."""
+
+from __future__ import annotations
+
+from collections import deque
+from threading import Event, Lock
+import time
+from typing import Any, NamedTuple
+
+
+class Message(NamedTuple):
+    """A message as received, in the order and at the time of its arrival."""
+
+    number: int
+    topic: str
+    content: Any
+    received: float
+
+
+class Inbox:
+    """
+    What waits for the worker: transforms, and a bounded number of clouds and of box arrays.
+
+    Thread-safe: the executor puts, the worker takes; neither waits for the other.
+
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._lock = Lock()
+        self._number = 0
+        self._motion: deque[tuple[str, Any]] = deque()
+        self._waiting: dict[str, deque[Message]] = {'points': deque(), 'boxes': deque()}
+        self.news = Event()
+
+    def put_motion(self, topic: str, content: Any) -> None:
+        """Take a message with transforms; none is dropped, the worker is quick with them."""
+        self._motion.append((topic, content))
+        self.news.set()
+
+    def put(self, topic: str, content: Any) -> Message | None:
+        """Take a cloud or boxes; return the oldest of its kind if there are too many."""
+        with self._lock:
+            self._number += 1
+            queue = self._waiting[topic]
+            queue.append(Message(self._number, topic, content, time.monotonic()))
+            dropped = queue.popleft() if len(queue) > self._capacity else None
+        self.news.set()
+        return dropped
+
+    def take_motion(self) -> list[tuple[str, Any]]:
+        """Return the transforms that have come since the last call."""
+        return [self._motion.popleft() for _ in range(len(self._motion))]
+
+    def take(self) -> Message | None:
+        """Return the cloud or boxes that have waited longest."""
+        with self._lock:
+            filled = [queue for queue in self._waiting.values() if queue]
+            return min(filled, key=lambda queue: queue[0].number).popleft() if filled else None
+
+    def sizes(self) -> dict[str, int]:
+        """Return how many wait."""
+        return {f'{topic}_waiting': len(queue) for topic, queue in self._waiting.items()}

@@ -1,0 +1,259 @@
+"""Messages in, messages with refined boxes out: the node without its topics and threads."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from boxreg_ros import refine
+from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep, Track
+from boxreg_ros.transforms import boxes_to_frame, inverse, sweep_to_frame, TransformTree
+from msg_adapters import Adapter
+import numpy as np
+
+SETTLE = 0.3
+"""Transforms are collected this long before a fixed frame is chosen among them [s]."""
+
+
+class Arrival(NamedTuple):
+    """A decoded message, and when it was received by a clock that never jumps [s]."""
+
+    message: Any
+    content: Sweep | BoxArray
+    received: float
+
+
+class Outgoing(NamedTuple):
+    """
+    A message to publish.
+
+    `given` and `refined` are in the frame of `message`; both are None where the input message
+    is passed through as it came.
+
+    """
+
+    message: Any
+    is_final: bool
+    given: BoxArray | None = None
+    refined: RefinedBoxes | None = None
+
+
+@dataclass(eq=False, slots=True)
+class _Pending:
+    """A box array the registrar has: its message waits for the boxes that replace its own."""
+
+    message: Any
+    given: BoxArray
+    T_output_fixed: Floats
+    is_early_out: bool = False
+
+
+class LiveRegistrar:
+    """
+    Bring messages into the fixed frame, register them, and make the messages to publish.
+
+    Holds the transforms, the registrar and, until their final boxes come, the input messages.
+    Belongs to one thread.
+
+    Parameters
+    ----------
+    config : Config
+        Settings of the core; `estimate` must be ``final``.
+    fixed_frame, output_frame : str
+        Frames to refine and to publish in. Empty: the topmost frame the clouds' frame moves in,
+        chosen once; and the frame of each input message.
+    transform_timeout : float
+        How long an arrival waits for transforms that cover its stamp [s]. After that it takes
+        what a short extrapolation gives.
+    trouble : callable
+        Told the reason, as counted, and the text of everything that is not refined here.
+
+    Attributes
+    ----------
+    tree : TransformTree
+        To be fed with what comes.
+    fixed_frame, cloud_frame : str
+        The frame chosen, and the frame of the clouds, to be set; empty while not known.
+    adapter : Adapter
+        Reads and writes the boxes; to be set before the first.
+
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        fixed_frame: str,
+        output_frame: str,
+        transform_timeout: float,
+        trouble: Callable[[str, str], None],
+    ) -> None:
+        self.tree = TransformTree()
+        self.fixed_frame = fixed_frame.lstrip('/')
+        self._output_frame = output_frame.lstrip('/')
+        self._timeout = transform_timeout
+        self._trouble = trouble
+        self._registrar = BoxRegistrar(config)
+        self._pending: dict[int, deque[_Pending]] = {}
+        self.cloud_frame = ''
+        self._choose_at: float | None = None
+        self.adapter: Adapter | None = None
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Sweeps, boxes by status, and reasons of the registrar; see `BoxRegistrar`."""
+        return self._registrar.counts
+
+    def is_ready(self, item: Arrival, now: float) -> bool:
+        """Tell whether the transforms of an arrival have come, or are no longer waited for."""
+        content = item.content
+        if now >= item.received + self._timeout:
+            return True
+        if self._choose_at is None:
+            self._choose_at = now + SETTLE
+        if not self.fixed_frame and now < self._choose_at:
+            return False
+        try:
+            return all(self.tree.covers(*frames, content.stamp_ns) for frames in self._hops(item))
+        except TransformUnavailable:
+            return False
+
+    def process(self, item: Arrival) -> list[Outgoing]:
+        """Register an arrival; return what has become ready."""
+        content = item.content
+        stamp_ns = content.stamp_ns
+        if isinstance(content, BoxArray) and not content.track_ids and not content.frame_id:
+            return self.passed_through(item.message)  # an empty MarkerArray has no stamp either
+        try:
+            T_fixed_item, *others = [
+                self.tree.lookup(*frames, stamp_ns) for frames in self._hops(item)
+            ]
+        except TransformUnavailable as error:
+            self._trouble('no_transform', str(error))
+            return [] if isinstance(content, Sweep) else self.passed_through(item.message)
+        if isinstance(content, Sweep):
+            sweep = sweep_to_frame(content, T_fixed_item, self.fixed_frame)
+            return self._outgoing(self._registrar.add_sweep(sweep))
+        T_output_fixed = others[0] if others else inverse(T_fixed_item)
+        given = boxes_to_frame(content, T_output_fixed @ T_fixed_item, self._output_of(content))
+        pending = _Pending(item.message, given, T_output_fixed)
+        self._pending.setdefault(stamp_ns, deque()).append(pending)
+        boxes = boxes_to_frame(content, T_fixed_item, self.fixed_frame)
+        return self._outgoing(self._registrar.add_boxes(boxes))
+
+    def flush(self) -> list[Outgoing]:
+        """End all tracks and return everything still held."""
+        return self._outgoing(self._registrar.flush())
+
+    def abandon(self) -> list[Outgoing]:
+        """Start afresh after a fault; return the messages held, with the boxes they came with."""
+        self._registrar.reset()
+        held = [p for _, pending in sorted(self._pending.items()) for p in pending]
+        self._pending.clear()
+        return [
+            out
+            for p in held
+            for out in self.passed_through(p.message)
+            if out.is_final or not p.is_early_out
+        ]
+
+    @staticmethod
+    def passed_through(message: Any) -> list[Outgoing]:
+        """Return a message as it came, as early and as final."""
+        return [Outgoing(message, False), Outgoing(message, True)]
+
+    def _output_of(self, boxes: BoxArray) -> str:
+        return self._output_frame or boxes.frame_id
+
+    def _hops(self, item: Arrival) -> list[tuple[str, str]]:
+        """
+        Return the pairs (target, source) of frames an arrival needs.
+
+        First from its frame to the fixed one, then, for boxes to be published elsewhere than in
+        their own frame, from there to the output frame.
+
+        """
+        content = item.content
+        if not self.fixed_frame:
+            self._choose_fixed_frame(content)
+        hops = [(self.fixed_frame, content.frame_id)]
+        if isinstance(content, BoxArray) and self._output_of(content) != content.frame_id:
+            hops.append((self._output_frame, self.fixed_frame))
+        return hops
+
+    def _choose_fixed_frame(self, content: Sweep | BoxArray) -> None:
+        frame = self.cloud_frame
+        if not frame:
+            raise TransformUnavailable(
+                f'no point cloud has come, so there is no telling how the boxes in '
+                f'{content.frame_id!r} move; check the topic of the clouds and its QoS'
+            )
+        found = self.tree.fixed_frame(frame)
+        if found is None:
+            raise TransformUnavailable(
+                f'neither /tf nor odometry tells how the frame of the clouds {frame!r} moves; '
+                f'known: {self.tree}; if it does not move, say so with fixed_frame:={frame}'
+            )
+        self.fixed_frame = found
+
+    def _outgoing(self, ready: list[RefinedBoxes]) -> list[Outgoing]:
+        outgoing = []
+        for refined in ready:
+            stamp_ns = refined.boxes.stamp_ns
+            waiting = self._pending[stamp_ns]
+            if refined.is_final:
+                pending = waiting.popleft()
+                if not waiting:
+                    del self._pending[stamp_ns]
+            else:
+                pending = next(p for p in waiting if not p.is_early_out)
+                pending.is_early_out = True
+            moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
+            assert self.adapter is not None  # it has read the message
+            message = self.adapter.to_msg(pending.message, moved.boxes, moved.covariances)
+            outgoing.append(Outgoing(message, refined.is_final, pending.given, moved))
+        return outgoing
+
+
+def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
+    """
+    Return refined boxes, and their covariances, in another frame.
+
+    Covariances of roll, pitch and yaw stay as they are: that is exact for frames that differ by
+    a turn about z, and the tilt between those in use is small.
+
+    """
+    J = np.eye(6)
+    J[:3, :3] = T_frame_boxes[:3, :3]
+    return replace(
+        refined,
+        boxes=boxes_to_frame(refined.boxes, T_frame_boxes, frame_id),
+        covariances=J @ refined.covariances @ J.T,
+    )
+
+
+def warm_up(config: Config) -> None:
+    """
+    Solve a made-up track: the first real one must not wait for what is loaded lazily.
+
+    Raises
+    ------
+    ConfigError
+        If the device is none that can be used here.
+
+    """
+    rng = np.random.default_rng(0)
+    boxes = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0] for k in range(4)])
+    points = [rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + box[:3] for box in boxes]
+    track = Track('1', 'car', np.arange(4) * 10**8, boxes, points, np.zeros((4, 3)))
+    try:
+        refine([track], config)
+    except (AssertionError, RuntimeError) as error:  # what torch raises for a device
+        raise ConfigError(
+            f'device: expected one that torch can use here, such as cpu, got '
+            f'{config.device!r}: {error}'
+        ) from None

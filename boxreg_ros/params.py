@@ -1,0 +1,122 @@
+"""ROS parameters: every setting of `Config` under its dotted name, and those of the node."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from boxreg_ros.config import Config, Setting, settings
+from boxreg_ros.errors import ConfigError
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+NODE_SETTINGS = (
+    Setting(
+        'boxes_type', '',
+        'message type of the boxes, as package/msg/Type; empty: that of the first publisher',
+        '', None, None, (),
+    ),
+    Setting(
+        'fixed_frame', '',
+        'frame to refine in; empty: the topmost frame that the frame of the clouds moves in',
+        '', None, None, (),
+    ),
+    Setting(
+        'output_frame', '', 'frame of the refined boxes; empty: that of the input boxes',
+        '', None, None, (),
+    ),
+    Setting(
+        'transform_timeout', 0.3, 'how long a cloud or boxes wait for their transform',
+        's', 0.0, 60.0, (),
+    ),
+    Setting(
+        'backlog', 5, 'clouds, and box arrays, waiting for the solver; the oldest are dropped',
+        '', 1, 10000, (),
+    ),
+)  # fmt: skip
+
+ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+
+
+class NodeOptions(NamedTuple):
+    """What the node is told beside `Config`; see `NODE_SETTINGS`."""
+
+    boxes_type: str
+    fixed_frame: str
+    output_frame: str
+    transform_timeout: float
+    backlog: int
+
+
+def declare(node: Node) -> tuple[Config, NodeOptions]:
+    """
+    Declare all parameters of a node and return what they are set to.
+
+    The node must have been made with ``automatically_declare_parameters_from_overrides``: so
+    whole numbers can be given for real ones, and names that do not exist be told.
+
+    Raises
+    ------
+    ConfigError
+        For a value of the wrong type or out of its bounds, by name.
+
+    Notes
+    -----
+    `estimate` has no say here: the node publishes the early and the final estimate.
+
+    """
+    parameters: dict[str, Any] = node.get_parameters_by_prefix('')  # typed wrongly in rclpy
+    given = {name: parameter.value for name, parameter in parameters.items()}
+    changes = {item.name: given[item.name] for item in settings() if item.name in given}
+    config = Config().updated(changes)
+    if changes.get('estimate', 'final') != 'final':
+        node.get_logger().warning(
+            f'estimate {config.estimate!r} is for recordings: this node publishes early and final'
+        )
+    config = replace(config, estimate='final')
+    options = NodeOptions(
+        *(_checked(item, given.get(item.name, item.default)) for item in NODE_SETTINGS)
+    )
+    values = [*config.items(), *zip(NODE_SETTINGS, options, strict=True)]
+    for item, value in values:
+        if item.name in given:
+            node.undeclare_parameter(item.name)
+        plain = list(value) if isinstance(value, tuple) else value
+        node.declare_parameter(item.name, plain, describe(item), ignore_override=True)
+    known = {item.name for item, _ in values}
+    if unknown := sorted(n for n in given if n not in known and not n.startswith(ROS_OWN)):
+        node.get_logger().warning(
+            f'no such parameters here: {", ".join(unknown)}; see the table in the README'
+        )
+    return config, options
+
+
+def _checked(item: Setting, value: Any) -> Any:
+    """Return the value of a setting of the node in its type, or raise ConfigError."""
+    kind: Any = type(item.default)
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        raise ConfigError(f'{item.name}: expected {kind.__name__}, got {value!r}')
+    if item.low is not None and item.high is not None and not item.low <= value <= item.high:
+        bounds = f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
+        raise ConfigError(f'{item.name}: expected {bounds}, got {value!r}')
+    return value
+
+
+def describe(item: Setting) -> ParameterDescriptor:
+    """Return what a setting means, its unit and its bounds, as ROS tools show it."""
+    unit = f' [{item.unit}]' if item.unit else ''
+    descriptor = ParameterDescriptor(
+        description=f'{item.meaning}{unit}',
+        additional_constraints=f'one of {", ".join(item.choices)}' if item.choices else '',
+        read_only=True,
+    )
+    if item.low is not None and item.high is not None:
+        if isinstance(item.default, float):
+            bounds = FloatingPointRange(from_value=float(item.low), to_value=float(item.high))
+            descriptor.floating_point_range = [bounds]
+        elif isinstance(item.default, int):
+            whole = IntegerRange(from_value=int(item.low), to_value=int(item.high), step=1)
+            descriptor.integer_range = [whole]
+    return descriptor

@@ -1,0 +1,170 @@
+"""A ROS graph for tests: the node as a process of its own, and this process as its neighbour."""
+
+from contextlib import contextmanager
+import itertools
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from boxreg_ros.node import import_message
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosbags.highlevel import AnyReader
+
+ROOT = Path(__file__).resolve().parents[1]
+PATIENCE = 40.0  # [s]; nodes start slowly on a busy machine
+RELIABLE = [
+    part
+    for topic in ('/points', '/odom')
+    for part in ('-p', f'qos_overrides.{topic}.subscription.reliability:=reliable')
+]
+_domains = itertools.count(os.getpid())
+
+
+class Graph:
+    """One node in this process, and the processes started beside it, in a domain of their own."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.domain = 1 + next(_domains) % 100
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=self.domain)
+        self.node = rclpy.create_node('neighbour', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.processes = []
+        self.publishers = {}
+
+    def start(self, *ros_args, command=('-m', 'boxreg_ros.node')):
+        """Start the node; its arguments are those after --ros-args."""
+        process = NodeProcess(self, [sys.executable, *command, '--ros-args', *ros_args])
+        self.processes.append(process)
+        return process
+
+    def publisher(self, type_name, topic, is_latched=False):
+        """Return a reliable publisher."""
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=100, durability=durability)
+        publisher = self.node.create_publisher(import_message(type_name), topic, qos)
+        self.publishers[topic] = publisher
+        return publisher
+
+    def collect(self, type_name, topic):
+        """Return a list that fills with what is published."""
+        received = []
+        kind = import_message(type_name)
+        self.node.create_subscription(kind, topic, received.append, QoSProfile(depth=100))
+        return received
+
+    def wait(self, condition, what, seconds=PATIENCE):
+        """Spin until `condition` holds."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, f'waited {seconds} s for {what}; {self.outputs()}'
+            for process in self.processes:
+                assert process.popen.poll() is None or process.is_ending, self.outputs()
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def wait_until_connected(self):
+        """Wait until every publisher of ours has a subscriber, and every subscriber a writer."""
+        for topic, publisher in self.publishers.items():
+            self.wait(lambda p=publisher: p.get_subscription_count() > 0, f'readers of {topic}')
+        for item in self.node.subscriptions:
+            name = item.topic_name
+            self.wait(lambda n=name: self.node.count_publishers(n) > 0, f'a writer of {name}')
+
+    def outputs(self):
+        return [process.output() for process in self.processes]
+
+    def close(self):
+        for process in self.processes:
+            process.kill()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+class NodeProcess:
+    """A node that was started; what it says goes to a file."""
+
+    def __init__(self, graph, command):
+        self._graph = graph
+        self._log = graph.folder / f'node{len(graph.processes)}.log'
+        self.is_ending = False
+        environment = {
+            **os.environ,
+            'ROS_DOMAIN_ID': str(graph.domain),
+            'ROS_LOG_DIR': str(graph.folder),
+        }
+        with self._log.open('w') as log:
+            self.popen = subprocess.Popen(
+                command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT
+            )
+
+    def output(self):
+        return self._log.read_text()
+
+    def stop(self, number=signal.SIGINT):
+        """Signal the node, spin until it has ended, and return how many seconds that took."""
+        self.is_ending = True
+        begun = time.monotonic()
+        self.popen.send_signal(number)
+        self._graph.wait(lambda: self.popen.poll() is not None, 'the node to end', 10.0)
+        took = time.monotonic() - begun
+        for _ in range(20):  # what is on its way
+            self._graph.executor.spin_once(timeout_sec=0.01)
+        return took
+
+    def kill(self):
+        self.is_ending = True
+        if self.popen.poll() is None:
+            self.popen.kill()
+        self.popen.wait()
+
+
+@contextmanager
+def graph_in(folder):
+    """Yield a Graph and clean up after it."""
+    graph = Graph(folder)
+    try:
+        yield graph
+    finally:
+        graph.close()
+
+
+def stamp_of(message):
+    """Return the stamp of boxes [ns]."""
+    header = message.header if hasattr(message, 'header') else message.markers[0].header
+    return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def play(graph, path, early, boxes_topic='/boxes', until=None):
+    """
+    Publish a recording, byte by byte, as fast as boxes come back.
+
+    `early` is the list in which the node's early boxes arrive: the next record is published
+    when those of the last boxes are there.
+
+    """
+    with AnyReader([path]) as reader:
+        for count, (connection, _, data) in enumerate(reader.messages()):
+            if until is not None and count >= until:
+                return
+            graph.publishers[connection.topic].publish(bytes(data))
+            if connection.topic == boxes_topic:
+                stamp_ns = stamp_of(reader.deserialize(data, connection.msgtype))
+                graph.wait(
+                    lambda s=stamp_ns: any(stamp_of(m) == s for m in early), f'boxes of {stamp_ns}'
+                )
+
+
+def publish_topics_of(graph, path):
+    """Make a publisher for every topic of a recording."""
+    with AnyReader([path]) as reader:
+        for connection in reader.connections:
+            topic = connection.topic
+            graph.publisher(connection.msgtype, topic, is_latched=topic == '/tf_static')
