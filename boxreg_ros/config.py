@@ -89,6 +89,7 @@ class SolverConfig:
     rounds: int = setting(3, 'outer rounds: outermost points and weights renewed', '', 1, 100)
     iterations: int = setting(3, 'most L-BFGS iterations per round', '', 1, 10000)
     history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
+    threads: int = setting(1, 'cores of the solver; more pay only where all are idle', '', 1, 256)
     tolerance: float = setting(
         1e-4, 'a window ends when a step promises less than this', '', 0.0, 1.0
     )

@@ -54,6 +54,16 @@ def register(windows: Sequence[Window], config: Config, model: InputModel) -> li
         In the order of `windows`.
 
     """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(config.solver.threads)  # tensors are small: threads wait, not work
+    try:
+        return _register(windows, config, model)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _register(windows: Sequence[Window], config: Config, model: InputModel) -> list[Estimate]:
+    """Do what `register` says."""
     estimates = [_kept(window, 'short_track') for window in windows]
     groups = batches(windows, config)
     for rows in groups:

@@ -439,7 +439,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='do nothing if OUT holds the results of the same request, files and settings',
     )  # fmt: skip
     parser.add_argument(
-        '--workers', type=int, metavar='N', help='threads of the solver (default: all cores)'
+        '--workers', type=int, metavar='N', help='cores of the solver (solver.threads)'
     )
 
 
@@ -462,15 +462,12 @@ def config_from(args: argparse.Namespace) -> Config:
 
 def run(args: argparse.Namespace) -> int:
     """Relabel as the command line says; print one closing line."""
+    config = config_from(args)
     if args.workers is not None:
-        if args.workers < 1:
-            raise ConfigError(f'--workers: expected 1 or more, got {args.workers}')
-        import torch
-
-        torch.set_num_threads(args.workers)
+        config = config.updated({'solver.threads': args.workers})
     request = Request(
         tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
-        args.formats, args.start, args.end, config_from(args),
+        args.formats, args.start, args.end, config,
     )  # fmt: skip
     earlier = earlier_summary(args.out)
     if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():
