@@ -1,11 +1,12 @@
 """What is learnt of the input, from input whose rule and noise are known."""
 
-from boxreg_ros import objective
 from boxreg_ros.calibration import InputModel, InputNoise, LEAST, RULE_ERROR, scatter, TRACKS
 from boxreg_ros.config import FaceConfig
-from boxreg_ros.objective import Problem, SHARED, State, Support
+from boxreg_ros.correspondence import Support, support
+from boxreg_ros.objective import State
 import numpy as np
 import pytest
+from scenes import problem_of, shared_of
 import torch
 
 D = torch.float64
@@ -86,11 +87,9 @@ def test_scatter_by_hand():
     # The input heads along +y; the fit is 0.3 m behind it along y and 0.2 m to its right (+x),
     # so the input is 0.3 m ahead and 0.2 m to the left. 4.4 m given for 4 m is a tenth too long.
     box = [0.0, 0, 0, 4.4, 2, 1.5, 0.0, 0.0, np.pi / 2]
-    n = torch.zeros(1, 1, dtype=D)
-    problem = Problem(torch.tensor([[box]], dtype=D), n == 0, n, n, n, n, n, {})
+    problem = problem_of([[box]])
     pose = torch.tensor([[[0.2, -0.3, 0.1, -0.01, -0.02, np.pi / 2 - 0.05]]], dtype=D)
-    shared = torch.zeros(1, SHARED, dtype=D)
-    shared[0, :3] = torch.tensor([4.0, 2.0, 2.0])
+    shared = shared_of()
     found = scatter(problem, State(pose, shared))
     known = [[[0.3, 0.2, -0.1, 0.01, 0.02, 0.05, 0.1, 0.0, -0.25]]]
     np.testing.assert_allclose(found, known, atol=1e-12)
@@ -124,11 +123,11 @@ def sighted(model, names, gaps, n=5, count=100, seen=1.0, retreat=0.0, fresh=Tru
     # Outwardness is how far points stand out of the box less the gap expected of them.
     out = (rule.gaps - gaps)[:, None].expand(b, n, 6)
     whole = torch.ones(b, n, 6, dtype=D)
-    support = Support(
-        torch.zeros(b, n, 6, 4, 4, dtype=D), out, seen * whole, count * whole[..., 0],
-        retreat * whole,
+    sights = Support(
+        torch.zeros(b, n, 6, 4, 4, dtype=D), out, seen * whole, retreat * whole,
+        count * whole[..., 0],
     )  # fmt: skip
-    model.learn_rule(names, support, torch.full((b, n), fresh), rule)
+    model.learn_rule(names, sights, torch.full((b, n), fresh), rule)
 
 
 def test_the_expected_rule_comes_from_the_settings():
@@ -200,11 +199,11 @@ def test_depths_are_learnt_from_faces_seen_from_behind_alone():
     model = InputModel(FACES)
     rule = model.rule()
     names, whole = [str(i) for i in range(50)], torch.ones(50, 5, 6, dtype=D)
-    support = Support(
-        torch.zeros(50, 5, 6, 4, 4, dtype=D), 0.05 * whole, whole, 100 * whole[..., 0],
-        rule.depths.expand_as(whole),
+    sights = Support(
+        torch.zeros(50, 5, 6, 4, 4, dtype=D), 0.05 * whole, whole, rule.depths.expand_as(whole),
+        100 * whole[..., 0],
     )  # fmt: skip
-    model.learn_rule(names, support, torch.ones(50, 5, dtype=torch.bool), rule)
+    model.learn_rule(names, sights, torch.ones(50, 5, dtype=torch.bool), rule)
     found = model.rule()
     # Points 0.05 m further out than expected: the depth is that much less, but for trust.
     assert FACES.depth_ends - 0.05 <= found.depths[0] < FACES.depth_ends - 0.045
@@ -242,20 +241,12 @@ def test_support_of_boxes_drawn_by_a_rule_teaches_it():
     origins = np.tile([[30.0, 30.0, 2.0], [-30.0, -30.0, 2.0]], (6, 1))
     boxes = np.zeros((B, N, 9))
     boxes[..., 3:6] = 2 * half
-    problem = Problem(
-        torch.from_numpy(boxes), torch.ones(B, N, dtype=torch.bool),
-        torch.arange(N, dtype=D).expand(B, N), torch.from_numpy(points),
-        torch.ones(B, N, n, dtype=torch.bool),
-        torch.from_numpy(np.repeat(origins[:, None], N, 1)),
-        torch.full((B, N), torch.nan, dtype=D), {},
-    )  # fmt: skip
-    shared = torch.zeros(B, SHARED, dtype=D)
-    shared[:, :3] = torch.tensor([4.0, 2.0, 2.0])
+    problem = problem_of(boxes, points=points, origins=np.repeat(origins[:, None], N, 1))
     model = InputModel(FaceConfig(depth_ends=0.0, depth_sides=0.0))
     rule = model.rule()
-    shared[:, objective.GAP] = rule.gaps
-    support = objective.support(problem, State(problem.pose, shared), 0.4, 0.05, rule.depths)
-    model.learn_rule([str(b) for b in range(B)], support, torch.ones(B, N, dtype=torch.bool), rule)
+    state = State(problem.pose, shared_of(B=B, GAP=rule.gaps))
+    sights = support(problem, state, 0.4, 0.05, rule.depths)
+    model.learn_rule([str(b) for b in range(B)], sights, problem.valid, rule)
     # The median moves but for trust: its error, 1.25 * 0.02 m / sqrt(12), against 0.05 m.
     np.testing.assert_allclose(model.rule().gaps[:5], 0.11, atol=0.003)
     assert model.rule().gaps[5] == pytest.approx(FACES.gap_bottom)

@@ -1,11 +1,14 @@
 """The terms: the paper's equations by hand, ours against automatic differentiation."""
 
+from dataclasses import replace
+
 from boxreg_ros import objective
 from boxreg_ros.config import PaperConfig
 from boxreg_ros.geometry import face_distances
-from boxreg_ros.objective import Problem, SHARED, State, Term
+from boxreg_ros.objective import SHARED, State, Term
 import numpy as np
 import pytest
+from scenes import problem_of, shared_of
 import torch
 
 D = torch.float64
@@ -32,15 +35,12 @@ def random_problem(B=3, N=6, M=20, seed=0):
     boxes[..., 3:6] = [4, 2, 1.5] + 0.1 * rng.random((B, N, 3))
     boxes[..., 6:8] *= 0.1
     valid = np.arange(N) < np.array([N, N - 1, N - 2])[:B, None]
-    return Problem(
-        boxes=torch.from_numpy(boxes),
-        valid=torch.from_numpy(valid),
-        times=torch.from_numpy(np.cumsum(rng.random((B, N)) + 0.05, 1)),
-        points=torch.from_numpy(rng.normal(size=(B, N, M, 3))),
-        mask=torch.from_numpy((rng.random((B, N, M)) < 0.8) & valid[..., None]),
-        origins=torch.from_numpy(20 * rng.normal(size=(B, N, 3))),
-        ground=torch.from_numpy(rng.normal(size=(B, N))),
-        deviations={'drift': tensor([0.02] * B)},
+    return problem_of(
+        boxes,
+        valid=valid,
+        times=np.cumsum(rng.random((B, N)) + 0.05, 1),
+        points=rng.normal(size=(B, N, M, 3)),
+        mask=(rng.random((B, N, M)) < 0.8) & valid[..., None],
     )
 
 
@@ -168,6 +168,8 @@ def test_smoothness_wraps_angles():
         ([(0, 0, 0), (0, 0.05, 0)], 2**0.5 / 2),  # a step of half the full length
         ([(0, 0, 0), (0, 0, 0)], 0.0),  # at rest
         ([(0, 0, 0), (1, 0, 0), (1, 1, 0)], (NIL + 2**0.5) / 2),  # mean of two
+        ([(0, 0, 0), (3, 0, 0), (2, 0, 0)], (NIL + 2) / 2),  # forward on the whole, once back
+        ([(0, 0, 0), (-3, 0, 0), (-2, 0, 0)], (NIL + 2) / 2),  # backward on the whole
         ([(0, 0, 0)], 0.0),
     ],
 )
@@ -213,15 +215,9 @@ def test_gradients_of_the_paper(term):
 def test_the_gradient_is_finite_where_the_paper_has_none(term, moving):
     # At rest all poses coincide; in even motion all steps are equal, along the heading. Points
     # lie on faces, on edges, at the centre and upon each other.
-    problem = random_problem(B=1, M=4)
     boxes = at(*[(0.5 * i * moving, 0, 0) for i in range(6)])
     points = tensor([[2, 1, 1], [2, 0, 0], [0, 0, 0], [0, 0, 0]]).expand(1, 6, 4, 3)
-    problem = Problem(
-        **{
-            **{name: getattr(problem, name) for name in Problem.__dataclass_fields__},
-            'boxes': boxes, 'points': points, 'mask': torch.ones(1, 6, 4, dtype=torch.bool),
-        }
-    )  # fmt: skip
+    problem = problem_of(boxes, points=points)
     pose = poses_of(boxes)
     value = term(with_poses(boxes, pose), problem)
     value.sum().backward()
@@ -232,12 +228,9 @@ def test_the_gradient_is_finite_where_the_paper_has_none(term, moving):
 @each_term
 def test_nothing_real_gives_zero_and_no_gradient(term):
     problem = random_problem()
-    nothing = Problem(
-        **{
-            **{name: getattr(problem, name) for name in Problem.__dataclass_fields__},
-            'mask': torch.zeros_like(problem.mask), 'valid': torch.zeros_like(problem.valid),
-        }
-    )  # fmt: skip
+    nothing = replace(
+        problem, mask=torch.zeros_like(problem.mask), valid=torch.zeros_like(problem.valid)
+    )
     pose = poses_of(problem.boxes)
     value = term(with_poses(problem.boxes, pose), nothing)
     value.sum().backward()
@@ -252,8 +245,7 @@ def test_padding_order_and_batch_do_not_matter(term):
     # Other order of points, and padding filled with other numbers.
     order = torch.from_numpy(np.random.default_rng(1).permutation(problem.points.shape[2]))
     points = torch.where(problem.mask[..., None], problem.points, -1e4)[:, :, order]
-    given = {name: getattr(problem, name) for name in Problem.__dataclass_fields__}
-    other = Problem(**{**given, 'points': points, 'mask': problem.mask[:, :, order]})
+    other = replace(problem, points=points, mask=problem.mask[:, :, order])
     boxes = torch.where(problem.valid[..., None], problem.boxes, 77.0)
     np.testing.assert_allclose(term(problem.boxes, other), known, rtol=1e-12)
     if term is not PAPER['total']:  # whose points are relative to the boxes
@@ -422,29 +414,9 @@ def test_faces_by_moments_equal_the_sum_over_points():
     np.testing.assert_allclose(found, out.square().mean(2), rtol=1e-9)
 
 
-def problem_at(pose, times, **changes):
-    """Return a problem of one window of 4 x 2 x 2 m boxes at `pose` (N, 6), without points."""
-    pose = torch.as_tensor(pose, dtype=D)
-    n = len(pose)
-    given = {
-        'boxes': at(*pose.tolist()),
-        'valid': torch.ones(1, n, dtype=torch.bool),
-        'times': tensor([times]),
-        'points': torch.zeros(1, n, 1, 3, dtype=D),
-        'mask': torch.zeros(1, n, 1, dtype=torch.bool),
-        'origins': torch.full((1, n, 3), torch.nan, dtype=D),
-        'ground': torch.full((1, n), torch.nan, dtype=D),
-        'deviations': {},
-    }
-    return Problem(**{**given, **changes})
-
-
-def shared_of(**parts):
-    shared = torch.zeros(1, SHARED, dtype=D)
-    shared[0, :3] = tensor([4.0, 2.0, 2.0])
-    for name, value in parts.items():
-        shared[0, getattr(objective, name)] = tensor(value)
-    return shared
+def problem_at(pose, times):
+    """Return a problem of one window of 4 x 2 x 2 m boxes at `pose` (N, 6) [m, rad]."""
+    return problem_of(at(*pose), times=[times])
 
 
 def test_acceleration_by_hand():
@@ -513,129 +485,3 @@ def test_slip_by_hand(yaw):
         problem = problem_at([[0, 0, 0, 0, 0, yaw], [x, y, 0.02, 0, 0, yaw]], [0.0, 0.1])
         found = objective.slip(problem, State(problem.pose, shared_of(PIVOT=0.25))).residual
         np.testing.assert_allclose(found, [[[[1.0, 0.2]]]], atol=1e-12)
-
-
-# --- ours: which points tell where a face is ----------------------------------------------------
-
-
-def seen_from(origin, points=None, **changes):
-    points = tensor([[[0.0, 0, 0]]]) if points is None else torch.as_tensor(points, dtype=D)[None]
-    return problem_at(
-        [[0, 0, 0, 0, 0, changes.pop('yaw', 0.0)]], [0.0], points=points[None],
-        mask=torch.ones(1, 1, points.shape[1], dtype=torch.bool),
-        origins=tensor([[origin]]), **changes,
-    )  # fmt: skip
-
-
-def test_aspect_by_hand():
-    # From 12 m ahead and 5 m to the left of a 4 x 2 m box: 10 m before the plane of the front,
-    # 4 m to the side of its edge; 4 m before the left plane, 10 m ahead of its edge. From the
-    # back plane 14 m on the wrong side, the right one 6 m.
-    aspect = objective.aspect(seen_from([12.0, 5.0, 1.0]))
-    known = [[[10 / 4, -14 / 4, 4 / 10, -6 / 10, 9, -9]]]
-    np.testing.assert_allclose(aspect, known)
-
-
-def test_aspect_turns_with_the_box():
-    turned = objective.aspect(seen_from([-5.0, 12.0, 1.0], yaw=np.pi / 2))
-    np.testing.assert_allclose(turned, objective.aspect(seen_from([12.0, 5.0, 1.0])))
-
-
-def test_without_a_sensor_the_centre_of_mass_tells_the_open_faces():
-    aspect = objective.aspect(seen_from([np.nan] * 3, [[-1.5, 0.5, 0.3], [-1.9, 0.8, 0.1]]))
-    assert (aspect[0, 0, :4] > 0).tolist() == [False, True, True, False]
-
-
-def test_retreat_grows_as_a_face_turns_away():
-    aspect = torch.linspace(-50, 50, 201, dtype=D)[:, None].expand(-1, 6)
-    depths = tensor([0.4, 0.4, 0.2, 0.2, 0.0, 0.0])
-    found = objective.retreat(aspect, depths)
-    assert (found.diff(dim=0) <= 0).all()
-    np.testing.assert_allclose(found[0], depths, atol=1e-4)
-    np.testing.assert_allclose(found[-1], 0, atol=1e-4)
-
-
-def on_faces(inside, n=40, faces=(0, 2, 4)):
-    """Return points on front, left and top of 4 x 2 x 2 m, `inside` m further in."""
-    rng = np.random.default_rng(4)
-    points = []
-    for face in faces:
-        axis, sign = face // 2, 1 - 2 * (face % 2)
-        p = rng.uniform(-0.9, 0.9, (n, 3)) * [2, 1, 1]
-        p[:, axis] = sign * ([2, 1, 1][axis] - inside)
-        points.append(p)
-    return np.concatenate(points)
-
-
-def supported(problem, gap=0.0, outermost=0.05, depths=0.0):
-    state = State(problem.pose, shared_of(GAP=[gap] * 6))
-    depths = torch.full((6,), depths, dtype=D)
-    return objective.support(problem, state, 0.4, outermost, depths)
-
-
-@pytest.mark.parametrize('gap', [0.0, 0.04])
-def test_points_on_faces_stand_as_far_out_as_expected(gap):
-    # The points are 0.1 m inside, `gap` of it expected: outwardness gap - 0.1.
-    found = supported(seen_from([30.0, 30.0, 2.0], on_faces(0.1)), gap)
-    assert found.seen[0, 0].tolist()[:5:2] == [1, 1, 1]
-    np.testing.assert_allclose(found.outwardness[0, 0, [0, 2, 4]], gap - 0.1, atol=1e-6)
-    assert found.count.item() == 120
-
-
-def test_outermost_points_are_the_furthest_out():
-    # Five of 100 points (0.05) on the front, told by hand: their moment and their mean.
-    rng = np.random.default_rng(5)
-    points = np.c_[rng.uniform(1.5, 1.95, 100), rng.uniform(-0.7, 0.7, (100, 2))]
-    found = supported(seen_from([30.0, 0.0, 0.0], points))
-    outer = points[np.argsort(-points[:, 0])[:5]]
-    homogeneous = np.c_[outer, np.ones(5)]
-    np.testing.assert_allclose(found.moments[0, 0, 0], homogeneous.T @ homogeneous / 5)
-    assert found.outwardness[0, 0, 0].item() == pytest.approx(outer[:, 0].mean() - 2)
-    assert found.seen[0, 0, 0] == 1
-
-
-def test_faces_turned_away_have_less_say():
-    # Points on front and back, seen from the front.
-    points = on_faces(0.05, faces=(0, 1, 2))
-    found = supported(seen_from([30.0, 0.0, 0.0], points))
-    assert found.seen[0, 0, 0] == 1
-    assert found.seen[0, 0, 1] < 1
-
-
-def test_a_face_without_points_is_not_seen():
-    # Two points are fewer than it takes.
-    found = supported(seen_from([30.0, 0.0, 0.0], on_faces(0.05, n=2, faces=(0,))))
-    assert found.seen[0, 0, 0] == 0
-    assert found.outwardness.isfinite().all()
-    assert found.moments.isfinite().all()
-
-
-def test_points_far_off_are_no_evidence():
-    # 1 m ahead of the front is beyond the margin of 0.4 m.
-    found = supported(seen_from([30.0, 0.0, 0.0], on_faces(-1.0, faces=(0,))))
-    assert found.seen[0, 0, 0] == 0
-    assert found.count.item() == 0
-
-
-def test_the_road_stands_for_the_bottom():
-    # The road is 1.2 m below the centre of a box whose bottom is 1 m below it: 0.2 m too high.
-    problem = seen_from([30.0, 0.0, 0.0], on_faces(0.0), ground=tensor([[-1.2]]))
-    found = supported(problem)
-    assert found.seen[0, 0, 5] == 1
-    assert found.outwardness[0, 0, 5].item() == pytest.approx(0.2)
-    assert supported(seen_from([30.0, 0.0, 0.0], on_faces(0.0))).seen[0, 0, 5] == 0
-
-
-def test_order_and_padding_of_points_do_not_matter_to_the_support():
-    problem = random_problem()
-    given = {name: getattr(problem, name) for name in Problem.__dataclass_fields__}
-    order = torch.from_numpy(np.random.default_rng(6).permutation(20))
-    points = torch.where(problem.mask[..., None], problem.points, 0.0)[:, :, order]
-    other = Problem(**{**given, 'points': points, 'mask': problem.mask[:, :, order]})
-    shared = shared_of().expand(3, -1)
-    for found, known in zip(
-        objective.support(other, State(other.pose, shared), 0.4, 0.2, torch.ones(6, dtype=D)),
-        objective.support(problem, State(problem.pose, shared), 0.4, 0.2, torch.ones(6, dtype=D)),
-        strict=True,
-    ):
-        np.testing.assert_allclose(found, known, atol=1e-12)

@@ -61,26 +61,31 @@ def test_the_crop_turns_with_the_box():
 def test_observation_is_relative_to_the_center():
     times = np.array([0.05, -0.02])
     origin = np.array([1.0, 2.0, 3.0])
-    (seen,) = see(near([1.0, 0, 0], [-1.0, 0, 0]), CAR, times=times, origin=origin)
+    changes = {'sampling.deskew': True}
+    points = near([1.0, 0, 0], [-1.0, 0, 0])
+    (seen,) = see(points, CAR, changes=changes, times=times, origin=origin)
     assert seen.stamp_ns == STAMP_NS
     np.testing.assert_array_equal(seen.box, CAR)
     np.testing.assert_array_equal(seen.origin, origin - CAR[:3])
     assert seen.num_points == 2
     by_x = np.argsort(seen.points[:, 0])
     np.testing.assert_allclose(seen.points[by_x], [[-1, 0, 0], [1, 0, 0]], atol=1e-6)
-    np.testing.assert_allclose(seen.times[by_x], [-0.02, 0.05], atol=1e-8)
+    np.testing.assert_allclose(seen.delays[by_x], [-0.02, 0.05], atol=1e-8)
 
 
-def test_times_are_zero_where_unknown():
-    (seen,) = see(near([1.0, 0, 0]), CAR)
-    np.testing.assert_array_equal(seen.times, [0.0])
+@pytest.mark.parametrize(
+    'changes, more', [({}, {'times': np.ones(1)}), ({'sampling.deskew': True}, {})]
+)
+def test_delays_are_zero_where_not_asked_for_or_unknown(changes, more):
+    (seen,) = see(near([1.0, 0, 0]), CAR, changes=changes, **more)
+    np.testing.assert_array_equal(seen.delays, [0.0])
 
 
 @pytest.mark.parametrize('points', [np.empty((0, 3)), [[1e4, -1e4, 0.0]]])
 def test_a_box_without_points(points):
     (seen,) = see(points, CAR)
     assert seen.points.shape == (0, 3)
-    assert seen.times.shape == (0,)
+    assert seen.delays.shape == (0,)
     assert seen.num_points == 0
     assert np.isnan(seen.ground)
 
@@ -179,13 +184,13 @@ def test_a_sloping_road_is_taken_at_its_lower_part():
 def test_at_most_the_points_asked_for_are_kept(objective, count):
     rng = np.random.default_rng(6)
     points = CAR[:3] + rng.uniform(-0.7, 0.7, (count, 3))
-    changes = {'sampling.points': 40, 'objective': objective}
+    changes = {'sampling.points': 40, 'sampling.deskew': True, 'objective': objective}
     (seen,) = see(points, CAR, changes=changes, times=np.arange(count) * 1e-3)
     assert min(count, 40) // 2 <= len(seen.points) <= 40
     assert seen.num_points == count
     # Times stay with their points.
     given = {tuple(p): t for p, t in zip((points - CAR[:3]).round(3), range(count), strict=True)}
-    for point, time in zip(seen.points.round(3).astype(float), seen.times, strict=True):
+    for point, time in zip(seen.points.round(3).astype(float), seen.delays, strict=True):
         nearest = min(given, key=lambda p: np.abs(np.array(p) - point).sum())
         assert given[nearest] == pytest.approx(1e3 * time, abs=1e-3)
 

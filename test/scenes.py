@@ -1,0 +1,132 @@
+"""A car and what a sensor that stands still sees of it, known exactly; and problems by hand."""
+
+from boxreg_ros import objective
+from boxreg_ros.objective import Problem, SHARED
+from boxreg_ros.sampling import observe
+from boxreg_ros.structures import BoxArray, Sweep, Track
+from boxreg_ros.window import Window
+import numpy as np
+from scipy.spatial.transform import Rotation
+import torch
+
+EXTENT = np.array([4.4, 1.8, 1.5])
+PERIOD_NS = 10**8
+START_NS = 1_700_000_000 * 10**9
+# How far inside of the box its outermost points stand, as the annotation rule expects by default:
+# front, back, left, right, top; see `FaceConfig`.
+GAPS = np.array([0.05, 0.05, 0.03, 0.03, 0.05])
+
+
+def drive(n, speed=5.0, turn=0.3, start=(5.0, 6.0, 0.2), z=0.75):
+    """Return true boxes (n, 9), one every 0.1 s, of a car that moves where its rear axle heads."""
+    t = np.arange(n) * PERIOD_NS * 1e-9
+    yaw = start[2] + turn * t
+    path = speed * t
+    if turn:
+        axle = speed / turn * np.c_[np.sin(yaw) - np.sin(start[2]), np.cos(start[2]) - np.cos(yaw)]
+    else:
+        axle = path[:, None] * [[np.cos(start[2]), np.sin(start[2])]]
+    center = axle + EXTENT[0] / 4 * np.c_[np.cos(yaw), np.sin(yaw)] + start[:2]
+    boxes = np.zeros((n, 9))
+    boxes[:, :2], boxes[:, 2], boxes[:, 3:6], boxes[:, 8] = center, z, EXTENT, yaw
+    return boxes
+
+
+def returns(box, rng, count=300, origin=(0.0, 0.0, 1.5), noise=0.01):
+    """Return points (M, 3) on those faces of `box` that look at `origin`, as far in as `GAPS`."""
+    R = Rotation.from_euler('ZYX', box[[8, 7, 6]]).as_matrix()
+    toward = (np.asarray(origin) - box[:3]) @ R
+    half = box[3:6] / 2
+    points = []
+    for face, gap in enumerate(GAPS):
+        axis, sign = face // 2, 1 - 2 * (face % 2)
+        if sign * toward[axis] > half[axis]:
+            local = rng.uniform(-0.95, 0.95, (count // 3, 3)) * half
+            local[:, axis] = sign * (half[axis] - gap)
+            points.append(local)
+    local = np.concatenate(points) if points else np.empty((0, 3))
+    return (local + noise * rng.normal(size=local.shape)) @ R.T + box[:3]
+
+
+def jittered(boxes, rng, position=0.15, heading=0.05, extent=0.0):
+    """Return `boxes` (n, 9) as a detector might give them."""
+    n = len(boxes)
+    noisy = boxes.copy()
+    noisy[:, :2] += position * rng.normal(size=(n, 2))
+    noisy[:, 2] += position / 3 * rng.normal(size=n)
+    noisy[:, 8] += heading * rng.normal(size=n)
+    noisy[:, 3:6] *= 1 + extent * rng.normal(size=(n, 3))
+    return noisy
+
+
+def stamps(n):
+    """Return `n` stamps [ns], one every 0.1 s."""
+    return START_NS + PERIOD_NS * np.arange(n)
+
+
+def track_of(truth, rng, name='1', **noise):
+    """Return a track along the true boxes `truth` (n, 9), its boxes jittered."""
+    n = len(truth)
+    points = [returns(box, rng) for box in truth]
+    boxes = jittered(truth, rng, **noise)
+    return Track(name, 'car', stamps(n), boxes, points, np.tile([0.0, 0.0, 1.5], (n, 1)))
+
+
+def stream_of(tracks):
+    """Return one (Sweep, BoxArray) per stamp of `tracks`, points of all of them together."""
+    pairs = []
+    for stamp_ns in sorted({int(s) for track in tracks for s in track.stamps_ns}):
+        here = [(t, i) for t in tracks for i in np.flatnonzero(t.stamps_ns == stamp_ns)]
+        points = np.concatenate([t.points[i] for t, i in here])
+        origin = here[0][0].sensor_origins[here[0][1]]
+        sweep = Sweep(stamp_ns, 'odom', points, None, origin)
+        boxes = BoxArray(
+            stamp_ns, 'odom', tuple(t.track_id for t, _ in here),
+            tuple(t.class_name for t, _ in here), np.ones(len(here)),
+            np.array([t.boxes[i] for t, i in here]),
+        )  # fmt: skip
+        pairs.append((sweep, boxes))
+    return pairs
+
+
+def window_of(track, config):
+    """Return the window of all observations of `track`, none of which was solved before."""
+    observations = [
+        observe(sweep, boxes.boxes, boxes.stamp_ns, config)[0]
+        for sweep, boxes in stream_of([track])
+    ]
+    name, n = track.track_id, len(observations)
+    return Window(name, track.class_name, observations, n, np.zeros((0, 9)))
+
+
+def problem_of(boxes, **changes):
+    """Return the problem of `boxes` (B, N, 9), one every 0.1 s, without points, but `changes`."""
+    boxes = torch.as_tensor(boxes, dtype=torch.float64)
+    B, N = boxes.shape[:2]
+    points = torch.as_tensor(changes.get('points', np.zeros((B, N, 1, 3))))
+    given = {
+        'boxes': boxes,
+        'start': boxes,
+        'valid': torch.ones(B, N, dtype=torch.bool),
+        'times': 0.1 * torch.arange(N, dtype=torch.float64).expand(B, N),
+        'points': points,
+        'mask': torch.full(points.shape[:3], 'points' in changes),
+        'delays': torch.zeros(points.shape[:3], dtype=torch.float64),
+        'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
+        'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
+        'deviations': {},
+    }
+    more = {
+        name: value if name == 'deviations' else torch.as_tensor(np.asarray(value))
+        for name, value in changes.items()
+    }
+    return Problem(**{**given, **more})
+
+
+def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
+    """Return what a window shares (B, 16): `extent`, and parts by the names of their slices."""
+    shared = torch.zeros(B, SHARED, dtype=torch.float64)
+    shared[:, :3] = torch.tensor(extent)
+    for name, value in parts.items():
+        shared[:, getattr(objective, name)] = torch.as_tensor(value, dtype=torch.float64)
+    return shared

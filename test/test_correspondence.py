@@ -1,0 +1,154 @@
+"""Which points tell where a face is, against boxes whose points are placed by hand."""
+
+from dataclasses import replace
+
+from boxreg_ros.correspondence import aspect, retreat, support
+from boxreg_ros.objective import State
+import numpy as np
+import pytest
+from scenes import problem_of, shared_of
+import torch
+
+D = torch.float64
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=D)
+
+
+def seen_from(origin, points=((0.0, 0, 0),), yaw=0.0, **changes):
+    """Return a problem of a box of 4 x 2 x 2 m at the origin, and the sensor at `origin`."""
+    box = [0, 0, 0, 4, 2, 2, 0, 0, yaw]
+    return problem_of([[box]], points=np.array([[points]]), origins=[[origin]], **changes)
+
+
+def test_aspect_by_hand():
+    # From 12 m ahead and 5 m to the left of a 4 x 2 m box: 10 m before the plane of the front,
+    # 4 m to the side of its edge; 4 m before the left plane, 10 m ahead of its edge. From the
+    # back plane 14 m on the wrong side, the right one 6 m.
+    known = [[[10 / 4, -14 / 4, 4 / 10, -6 / 10, 9, -9]]]
+    np.testing.assert_allclose(aspect(seen_from([12.0, 5.0, 1.0])), known)
+
+
+def test_aspect_turns_with_the_box():
+    turned = aspect(seen_from([-5.0, 12.0, 1.0], yaw=np.pi / 2))
+    np.testing.assert_allclose(turned, aspect(seen_from([12.0, 5.0, 1.0])))
+
+
+def test_without_a_sensor_the_centre_of_mass_tells_the_open_faces():
+    found = aspect(seen_from([np.nan] * 3, [[-1.5, 0.5, 0.3], [-1.9, 0.8, 0.1]]))
+    assert (found[0, 0, :4] > 0).tolist() == [False, True, True, False]
+
+
+def test_retreat_grows_as_a_face_turns_away():
+    open_ = torch.linspace(-50, 50, 201, dtype=D)[:, None].expand(-1, 6)
+    depths = tensor([0.4, 0.4, 0.2, 0.2, 0.0, 0.0])
+    found = retreat(open_, depths)
+    assert (found.diff(dim=0) <= 0).all()
+    np.testing.assert_allclose(found[0], depths, atol=1e-4)
+    np.testing.assert_allclose(found[-1], 0, atol=1e-4)
+
+
+def on_faces(inside, n=40, faces=(0, 2, 4)):
+    """Return points on front, left and top of 4 x 2 x 2 m, `inside` m further in."""
+    rng = np.random.default_rng(4)
+    points = []
+    for face in faces:
+        axis, sign = face // 2, 1 - 2 * (face % 2)
+        p = rng.uniform(-0.9, 0.9, (n, 3)) * [2, 1, 1]
+        p[:, axis] = sign * ([2, 1, 1][axis] - inside)
+        points.append(p)
+    return np.concatenate(points)
+
+
+def supported(problem, gap=0.0, outermost=0.05, depths=0.0):
+    state = State(problem.pose, shared_of(GAP=[gap] * 6))
+    depths = torch.full((6,), depths, dtype=D)
+    return support(problem, state, 0.4, outermost, depths)
+
+
+@pytest.mark.parametrize('gap', [0.0, 0.04])
+def test_points_on_faces_stand_as_far_out_as_expected(gap):
+    # The points are 0.1 m inside, `gap` of it expected: outwardness gap - 0.1.
+    found = supported(seen_from([30.0, 30.0, 2.0], on_faces(0.1)), gap)
+    assert found.trust[0, 0].tolist()[:5:2] == [1, 1, 1]
+    np.testing.assert_allclose(found.outwardness[0, 0, [0, 2, 4]], gap - 0.1, atol=1e-6)
+    assert found.points.item() == 120
+
+
+def test_outermost_points_are_the_furthest_out():
+    # Five of 100 points (0.05) on the front, told by hand: their moment and their mean.
+    rng = np.random.default_rng(5)
+    points = np.c_[rng.uniform(1.5, 1.95, 100), rng.uniform(-0.7, 0.7, (100, 2))]
+    found = supported(seen_from([30.0, 0.0, 0.0], points))
+    outer = points[np.argsort(-points[:, 0])[:5]]
+    homogeneous = np.c_[outer, np.ones(5)]
+    np.testing.assert_allclose(found.moments[0, 0, 0], homogeneous.T @ homogeneous / 5)
+    assert found.outwardness[0, 0, 0].item() == pytest.approx(outer[:, 0].mean() - 2)
+    assert found.trust[0, 0, 0] == 1
+
+
+def test_faces_turned_away_have_less_say():
+    # Points on front and back, seen from the front.
+    points = on_faces(0.05, faces=(0, 1, 2))
+    found = supported(seen_from([30.0, 0.0, 0.0], points))
+    assert found.trust[0, 0, 0] == 1
+    assert found.trust[0, 0, 1] < 1
+
+
+def test_a_face_without_points_is_not_seen():
+    # Two points are fewer than it takes.
+    found = supported(seen_from([30.0, 0.0, 0.0], on_faces(0.05, n=2, faces=(0,))))
+    assert found.trust[0, 0, 0] == 0
+    assert found.outwardness.isfinite().all()
+    assert found.moments.isfinite().all()
+
+
+def test_points_far_off_are_no_evidence():
+    # 1 m ahead of the front is beyond the margin of 0.4 m.
+    found = supported(seen_from([30.0, 0.0, 0.0], on_faces(-1.0, faces=(0,))))
+    assert found.trust[0, 0, 0] == 0
+    assert found.points.item() == 0
+
+
+def test_the_road_stands_for_the_bottom():
+    # The road is 1.2 m below the centre of a box whose bottom is 1 m below it: 0.2 m too high.
+    problem = seen_from([30.0, 0.0, 0.0], on_faces(0.0), ground=[[-1.2]])
+    found = supported(problem)
+    assert found.trust[0, 0, 5] == 1
+    assert found.outwardness[0, 0, 5].item() == pytest.approx(0.2)
+    assert supported(seen_from([30.0, 0.0, 0.0], on_faces(0.0))).trust[0, 0, 5] == 0
+
+
+def test_order_and_padding_of_points_do_not_matter():
+    rng = np.random.default_rng(6)
+    points = np.array([[on_faces(0.05), on_faces(0.1)]]) + 0.02 * rng.normal(size=(1, 2, 120, 3))
+    mask = rng.random((1, 2, 120)) < 0.8
+    boxes = [[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 2]
+    order = rng.permutation(120)
+    known, found = (
+        support(problem, State(problem.pose, shared_of()), 0.4, 0.2, torch.ones(6, dtype=D))
+        for problem in (
+            problem_of(boxes, points=points, mask=mask, origins=[[[9.0, 9.0, 9.0]] * 2]),
+            problem_of(
+                boxes,
+                points=np.where(mask[..., None], points, 0.0)[:, :, order],
+                mask=mask[:, :, order],
+                origins=[[[9.0, 9.0, 9.0]] * 2],
+            ),
+        )
+    )
+    for a, b in zip(found, known, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_points_are_carried_to_the_stamp():
+    # A car at 10 m/s, points on its front measured 50 ms before each stamp: half a metre back.
+    boxes = np.array([[[i * 1.0, 0, 0, 4, 2, 2, 0, 0, 0] for i in range(4)]])
+    front = on_faces(0.0, faces=(0,))
+    points = np.tile(front - [0.5, 0, 0], (1, 4, 1, 1))
+    origins = np.array([[[30.0, 0, 0]] * 4])
+    late = problem_of(boxes, points=points, origins=origins, delays=np.full((1, 4, 40), -0.05))
+    found = supported(late)
+    np.testing.assert_allclose(found.outwardness[..., 0], 0, atol=1e-6)
+    assert (supported(replace(late, delays=0 * late.delays)).outwardness[..., 0] < -0.4).all()
