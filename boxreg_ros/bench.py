@@ -66,12 +66,12 @@ PUBLISHED: dict[str, dict[str, tuple[float, ...]]] = {
 }
 SCENARIOS = {'3d': 'paper', 'bev': 'paper-bev'}
 
-BASELINES: dict[str, Callable[[Track], Floats]] = {
-    'smoothing only': smoothed,
-    'L-shape per sweep': l_shaped,
-    'ICP on box points': icp,
+BASELINES: dict[str, tuple[str, Callable[[Track], Floats]]] = {
+    'smoothing': ('smoothing only', smoothed),
+    'l-shape': ('L-shape per sweep', l_shaped),
+    'icp': ('ICP on box points', icp),
 }
-RUNS = len(BASELINES) + 3
+METHODS = (*BASELINES, 'paper', 'ours')
 
 Methods = dict[str, BoxTable | str]
 """Boxes by the name of their method, or why there are none."""
@@ -162,7 +162,10 @@ class Drive:
 
 
 def run_methods(
-    drive: Drive, mode: str = '3d', done: Callable[[], object] = lambda: None
+    drive: Drive,
+    mode: str = '3d',
+    wanted: Sequence[str] = METHODS,
+    done: Callable[[], object] = lambda: None,
 ) -> Methods:
     """
     Return what every method makes of the boxes of a drive.
@@ -173,25 +176,30 @@ def run_methods(
         What all of them see.
     mode : str
         As `Config.mode`, for the methods that know it.
+    wanted : sequence of str
+        Some of `METHODS`.
     done : callable
-        Called after each run, of which there are `RUNS`.
+        Called after each of them.
 
     """
     methods: Methods = {'input': BoxTable.from_arrays(drive.boxes)}
-    tracks = drive.tracks()
-    for name, baseline in BASELINES.items():
-        try:
-            methods[name] = _table(tracks, [baseline(track) for track in tracks], drive)
-        except ImportError as error:
-            methods[name] = f'skipped: {error.name} is not installed'
-        done()
-    for name, config in (
-        ('paper', Config(objective='paper', mode=mode)),
-        ('ours', Config(estimate='final', mode=mode)),
-        ('ours', Config(mode=mode)),
-    ):
-        for estimate, boxes in _registered(drive, config).items():
-            methods[f'{name}, {estimate}'] = boxes
+    tracks = drive.tracks() if not BASELINES.keys().isdisjoint(wanted) else []
+    for method in METHODS:
+        if method not in wanted:
+            continue
+        if method in BASELINES:
+            name, baseline = BASELINES[method]
+            try:
+                methods[name] = _table(tracks, [baseline(track) for track in tracks], drive)
+            except ImportError as error:
+                methods[name] = f'skipped: {error.name} is not installed'
+        else:
+            objective = 'paper' if method == 'paper' else Config().objective
+            estimates = ('track',) if method == 'paper' else ('final', 'track')
+            for estimate in estimates:
+                config = Config(objective=objective, estimate=estimate, mode=mode)
+                found = _registered(drive, config)
+                methods |= {f'{method}, {name}': boxes for name, boxes in found.items()}
         done()
     return methods
 
@@ -201,12 +209,12 @@ def bench_paper(args: argparse.Namespace) -> int:
     if args.seeds < 1:
         raise ConfigError(f'--seeds: expected 1 or more, got {args.seeds}')
     results: dict[str, dict[str, list[tuple[float, ...] | str]]] = {}
-    with _progress(args, 2 * args.seeds * RUNS) as bar:
+    with _progress(args, 2 * args.seeds) as bar:
         for mode, scenario in SCENARIOS.items():
             found = results.setdefault(mode, {})
             for seed in range(args.seeds):
                 drive = Drive.from_scene(simulate(scenario, seed, args.steps))
-                methods = run_methods(drive, mode, bar.update)
+                methods = run_methods(drive, mode, args.methods, bar.update)
                 for name, boxes in methods.items():
                     found.setdefault(name, []).append(
                         boxes if isinstance(boxes, str) else paper_row(boxes, drive.truth, mode)
@@ -251,10 +259,10 @@ def paper_row(boxes: BoxTable, truth: BoxTable, mode: str) -> tuple[float, ...]:
 def bench_real(args: argparse.Namespace) -> int:
     """Print, for every recording, what each method makes of its boxes."""
     report: dict[str, Any] = {}
-    with _progress(args, len(args.data) * RUNS) as bar:
+    with _progress(args, len(args.data)) as bar:
         for folder in args.data:
             drive = Drive.read(folder)
-            methods = run_methods(drive, done=bar.update)
+            methods = run_methods(drive, '3d', args.methods, bar.update)
             classes = [word for part in args.classes for word in part.split(',') if word]
             found = {
                 name: boxes
@@ -304,7 +312,7 @@ def print_real(folder: Path, drive: Drive, found: Mapping[str, Matches | str]) -
 
 
 def draw_paper(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> None:
-    """Draw trajectory and errors over time, as PNG files, of the first seed."""
+    """Draw trajectory and errors over time as PNG files: truth, input and the last method."""
     try:
         import matplotlib
     except ImportError:
@@ -313,11 +321,11 @@ def draw_paper(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> No
     from matplotlib import pyplot
 
     folder.mkdir(parents=True, exist_ok=True)
-    shown = {'truth': truth, 'initial': methods['input'], 'refined': methods['ours, track']}
+    found = [boxes for boxes in methods.values() if isinstance(boxes, BoxTable)]
+    shown = {'truth': truth, 'initial': found[0], 'refined': found[-1]}
     colors = {'truth': 'tab:red', 'initial': 'tab:green', 'refined': 'tab:blue'}
     figure, axes = pyplot.subplots(figsize=(7, 9))
     for name, boxes in shown.items():
-        assert isinstance(boxes, BoxTable)
         for i, box in enumerate(boxes.boxes[::5]):
             outline = _footprint(box)
             axes.plot(*outline.T, color=colors[name], lw=0.9, label=name if i == 0 else None)
@@ -328,9 +336,7 @@ def draw_paper(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> No
 
     figure, panels = pyplot.subplots(3, 2, figsize=(11, 8), sharex=True)
     for name in ('initial', 'refined'):
-        boxes = shown[name]
-        assert isinstance(boxes, BoxTable)
-        matches = match(boxes, truth)
+        matches = match(shown[name], truth)
         seconds = (truth.stamps_ns - truth.stamps_ns[0]) / 1e9
         errors = np.concatenate([matches.translation, matches.rotation], axis=1)
         for variable, panel, values in zip(VARIABLES, panels.T.flat, errors.T, strict=True):
@@ -371,6 +377,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='only true boxes whose class name holds one of these words (default: car van truck)',
     )  # fmt: skip
     for kind in (paper, real):
+        kind.add_argument(
+            '--methods', nargs='+', choices=METHODS, default=METHODS, metavar='METHOD',
+            help=f'only some of {", ".join(METHODS)}',
+        )  # fmt: skip
         kind.add_argument('--json', action='store_true', help='print one JSON object')
     if find_spec('boxreg_ros.bench_speed'):
         speed = kinds.add_parser('speed', help='time per tick, per box and per window')
@@ -449,4 +459,5 @@ def _line(name: str, row: Sequence[float | str] | str) -> str:
 
 
 def _progress(args: argparse.Namespace, total: int) -> Any:
+    total *= len(args.methods)
     return tqdm(total=total, leave=False, disable=not sys.stderr.isatty() or args.json)

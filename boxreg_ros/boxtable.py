@@ -101,7 +101,9 @@ class BoxTable:
                         f'{path}: not a table of boxes, columns missing: {", ".join(missing)}'
                     )
                 rows = list(reader)
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
+        except OSError as error:
+            raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        except (UnicodeDecodeError, csv.Error) as error:
             raise RecordingError(f'{path}: cannot be read as CSV: {error}') from None
         frame_ids = sorted({row['frame_id'] for row in rows})
         if len(frame_ids) > 1:

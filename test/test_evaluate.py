@@ -172,8 +172,8 @@ def test_bad_table(tmp_path, text, message):
 
 def test_absent_or_binary_table(tmp_path):
     (tmp_path / 'binary.csv').write_bytes(bytes(range(256)))
-    for name in ('absent.csv', 'binary.csv'):
-        with pytest.raises(RecordingError, match='cannot be read as CSV'):
+    for name, reason in (('absent.csv', 'read: No such file'), ('binary.csv', 'read as CSV')):
+        with pytest.raises(RecordingError, match=f'cannot be {reason}'):
             BoxTable.read(tmp_path / name)
 
 
