@@ -1,0 +1,403 @@
+"""Every box in comes back once, in order, with its status; the same calls give the same boxes."""
+
+from dataclasses import replace
+
+from boxreg_ros import Config, refine
+from boxreg_ros.geometry import face_distances
+from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.structures import BoxArray, Sweep
+import numpy as np
+import pytest
+from scenes import drive, PERIOD_NS, stamps, stream_of, track_of
+import torch
+
+ESTIMATES = ['early', 'final', 'track']
+each_estimate = pytest.mark.parametrize('estimate', ESTIMATES)
+
+
+@pytest.fixture(scope='module')
+def tracks():
+    """Return two cars that never meet, the second there from the third to the tenth stamp only."""
+    rng = np.random.default_rng(0)
+    first = track_of(drive(14), rng, 'a')
+    second = track_of(drive(14, start=(-12.0, -6.0, 3.0)), rng, 'b')
+    part = slice(2, 10)
+    return [
+        first,
+        replace(
+            second, stamps_ns=second.stamps_ns[part], boxes=second.boxes[part],
+            points=second.points[part], sensor_origins=second.sensor_origins[part],
+        ),
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def stream(tracks):
+    return stream_of(tracks)
+
+
+def setup(estimate='final', **changes):
+    # Few points suffice here, and are fast.
+    base = {'estimate': estimate, 'window': 6, 'lag': 3, 'sampling.points': 64}
+    return Config().updated({**base, **changes})
+
+
+def fed(registrar, stream):
+    results = []
+    for sweep, boxes in stream:
+        results += registrar.add_sweep(sweep)
+        results += registrar.add_boxes(boxes)
+    return results
+
+
+def run(stream, config):
+    registrar = BoxRegistrar(config)
+    return fed(registrar, stream) + registrar.flush(), registrar.counts
+
+
+def finals(results):
+    return [result for result in results if result.is_final]
+
+
+def assert_equal(results, known, atol=0.0):
+    assert len(results) == len(known)
+    for a, b in zip(results, known, strict=True):
+        assert (a.boxes.stamp_ns, a.boxes.track_ids, a.is_final) == (
+            b.boxes.stamp_ns, b.boxes.track_ids, b.is_final,
+        )  # fmt: skip
+        np.testing.assert_allclose(a.boxes.boxes, b.boxes.boxes, rtol=0, atol=atol)
+        assert (a.status, a.reasons) == (b.status, b.reasons)
+
+
+# --- what comes back ----------------------------------------------------------------------------
+
+
+@each_estimate
+def test_every_box_comes_back_once_in_order(stream, estimate):
+    results, counts = run(stream, setup(estimate))
+    assert [r.boxes.stamp_ns for r in finals(results)] == [b.stamp_ns for _, b in stream]
+    for result, (sweep, given) in zip(finals(results), stream, strict=True):
+        n = len(given.track_ids)
+        boxes = result.boxes
+        assert (boxes.track_ids, boxes.class_names) == (given.track_ids, given.class_names)
+        assert boxes.frame_id == 'odom'
+        np.testing.assert_array_equal(boxes.scores, given.scores)
+        assert len(result.status) == len(result.reasons) == len(result.num_points) == n
+        assert result.covariances.shape == (n, 6, 6)
+        assert set(result.status) == {'refined'}
+        assert set(result.reasons) <= {''}
+        assert np.abs(boxes.boxes - given.boxes).max() > 1e-3
+        out = face_distances(torch.from_numpy(sweep.points), torch.from_numpy(given.boxes))
+        np.testing.assert_array_equal(result.num_points, (out <= 0).all(-1).sum(-1))
+    assert counts == {'sweeps': 14, 'boxes': 22, 'refined': 22}
+
+
+@each_estimate
+def test_early_estimates_come_at_once(stream, estimate):
+    registrar = BoxRegistrar(setup(estimate))
+    for sweep, boxes in stream:
+        assert registrar.add_sweep(sweep) == []
+        early = [r for r in registrar.add_boxes(boxes) if not r.is_final]
+        assert [r.boxes.stamp_ns for r in early] == [boxes.stamp_ns][: estimate != 'track']
+    assert all(r.is_final for r in registrar.flush())
+
+
+@pytest.mark.parametrize('lag', [0, 1, 3])
+@pytest.mark.parametrize('estimate', ['early', 'final'])
+def test_finals_come_lag_ticks_later(stream, estimate, lag):
+    registrar = BoxRegistrar(setup(estimate, lag=lag))
+    order = [boxes.stamp_ns for _, boxes in stream]
+    for tick, (sweep, boxes) in enumerate(stream):
+        ready = finals(registrar.add_sweep(sweep) + registrar.add_boxes(boxes))
+        known = order[tick - lag : tick - lag + 1] if tick >= lag else []
+        assert [r.boxes.stamp_ns for r in ready] == known
+    assert [r.boxes.stamp_ns for r in registrar.flush()] == order[len(order) - lag :]
+    assert registrar.flush() == []
+
+
+def test_finals_are_better_than_early_estimates():
+    # Neighbours on both sides tell more than those before alone.
+    errors = []
+    for seed in range(4):
+        truth = drive(14)
+        track = track_of(truth, np.random.default_rng(seed))
+        results, _ = run(stream_of([track]), setup('final'))
+        boxes = [
+            np.array([r.boxes.boxes[0] for r in results if r.is_final == is_final])
+            for is_final in (False, True)
+        ]
+        errors.append([np.linalg.norm((b - truth)[:, :2], axis=1).mean() for b in boxes])
+    early, final = np.mean(errors, axis=0)
+    assert final < 0.9 * early
+
+
+def test_a_window_of_the_whole_track_comes_back_in_parts():
+    # With windows of 12, tracks are solved every 6 ticks, and a quarter of the window waits.
+    stream = stream_of([track_of(drive(40), np.random.default_rng(0))])
+    registrar = BoxRegistrar(setup('track', track_window=12))
+    held = []
+    results = []
+    for i, pair in enumerate(stream):
+        results += fed(registrar, [pair])
+        held.append(i + 1 - len(results))
+    assert max(held) <= 12
+    results += registrar.flush()
+    assert [r.boxes.stamp_ns for r in results] == [b.stamp_ns for _, b in stream]
+    assert {s for r in results for s in r.status} == {'refined'}
+
+
+@each_estimate
+def test_boxes_may_come_before_their_sweeps(stream, estimate):
+    known, counts = run(stream, setup(estimate))
+    registrar = BoxRegistrar(setup(estimate))
+    results = []
+    for _, boxes in stream[:5]:
+        results += registrar.add_boxes(boxes)
+    assert results == []
+    for sweep, _ in stream[:5]:
+        results += registrar.add_sweep(sweep)
+    for sweep, boxes in stream[5:]:
+        results += registrar.add_boxes(boxes) + registrar.add_sweep(sweep)
+    assert_equal(results + registrar.flush(), known)
+    assert registrar.counts == counts
+
+
+@each_estimate
+def test_sweeps_may_come_long_before_their_boxes(stream, estimate):
+    known, counts = run(stream, setup(estimate))
+    registrar = BoxRegistrar(setup(estimate))
+    for sweep, _ in stream:
+        assert registrar.add_sweep(sweep) == []
+    results = [result for _, boxes in stream for result in registrar.add_boxes(boxes)]
+    assert_equal(results + registrar.flush(), known)
+    assert registrar.counts == counts
+
+
+# --- determinism --------------------------------------------------------------------------------
+
+
+@each_estimate
+def test_the_same_calls_give_the_same_boxes(stream, estimate):
+    known, counts = run(stream, setup(estimate))
+    again, again_counts = run(stream, setup(estimate))
+    assert_equal(again, known)
+    assert again_counts == counts
+
+
+@each_estimate
+def test_reset_forgets_all_but_the_counts(stream, estimate):
+    known, counts = run(stream, setup(estimate))
+    registrar = BoxRegistrar(setup(estimate))
+    fed(registrar, stream[:7])
+    registrar.reset()
+    assert registrar.counts['sweeps'] == 7
+    registrar.counts.clear()
+    assert_equal(fed(registrar, stream) + registrar.flush(), known)
+    assert registrar.counts == counts
+
+
+@each_estimate
+def test_input_is_not_written_to(stream, estimate):
+    copies = [(sweep.points.copy(), boxes.boxes.copy()) for sweep, boxes in stream]
+    results, _ = run(stream, setup(estimate))
+    for result in results:
+        result.boxes.boxes[:] = np.nan  # nor does what comes back share memory with it
+    for (sweep, boxes), (points, values) in zip(stream, copies, strict=True):
+        np.testing.assert_array_equal(sweep.points, points)
+        np.testing.assert_array_equal(boxes.boxes, values)
+
+
+@pytest.mark.parametrize('estimate', ESTIMATES)
+def test_refine_gives_the_same(tracks, stream, estimate):
+    config = setup(estimate)
+    results, _ = run(stream, config)
+    wanted = [r for r in results if r.is_final == (estimate != 'early')]
+    for track, refined in zip(tracks, refine(tracks, config), strict=True):
+        known = [
+            r.boxes.boxes[r.boxes.track_ids.index(track.track_id)]
+            for r in wanted
+            if track.track_id in r.boxes.track_ids
+        ]
+        np.testing.assert_allclose(refined.boxes, known, rtol=0, atol=1e-9)
+
+
+# --- reasons ------------------------------------------------------------------------------------
+
+
+def named(*track_ids):
+    return lambda boxes: replace(boxes, track_ids=track_ids)
+
+
+def valued(column, value):
+    """Return what sets one number of the first box."""
+
+    def spoil(boxes):
+        values = boxes.boxes.copy()
+        values[0, column] = value
+        return replace(boxes, boxes=values)
+
+    return spoil
+
+
+@each_estimate
+@pytest.mark.parametrize(
+    'spoil, reasons',
+    [
+        (named('', 'b'), ('no_track_id', '')),
+        (named('a', 'a'), ('', 'duplicate_track_id')),
+        (valued(1, np.nan), ('invalid_box', '')),
+        (valued(8, np.inf), ('invalid_box', '')),
+        (valued(4, 0.0), ('invalid_box', '')),
+        (valued(3, -4.4), ('invalid_box', '')),
+    ],
+    ids=['no id', 'same id', 'nan', 'infinite', 'flat', 'negative'],
+)
+def test_boxes_that_cannot_be_refined_come_back_as_they_are(stream, estimate, spoil, reasons):
+    spoilt = list(stream)
+    spoilt[5] = (stream[5][0], spoil(stream[5][1]))
+    results, counts = run(spoilt, setup(estimate))
+    for result in (r for r in results if r.boxes.stamp_ns == spoilt[5][1].stamp_ns):
+        assert tuple(r if r != 'short_track' else '' for r in result.reasons) == reasons
+        row = next(i for i, reason in enumerate(reasons) if reason)
+        assert result.status[row] == 'kept'
+        np.testing.assert_array_equal(result.boxes.boxes[row], spoilt[5][1].boxes[row])
+        assert np.isfinite(result.covariances).all()
+    assert counts[next(filter(None, reasons))] == 1
+    assert counts['kept'] == 1
+    assert counts['kept'] + counts['refined'] == counts['boxes'] == 22
+    # The rest of the track goes on across it.
+    others = [r for r in finals(results) if r.boxes.stamp_ns != spoilt[5][1].stamp_ns]
+    assert {s for r in others for s in r.status} == {'refined'}
+
+
+@each_estimate
+def test_boxes_without_a_sweep(stream, estimate):
+    registrar = BoxRegistrar(setup(estimate))
+    results = []
+    for i, (sweep, boxes) in enumerate(stream):
+        if i != 5:
+            results += registrar.add_sweep(sweep)
+        results += registrar.add_boxes(boxes)
+    results += registrar.flush()
+    assert [r.boxes.stamp_ns for r in finals(results)] == [b.stamp_ns for _, b in stream]
+    alone = finals(results)[5]
+    assert alone.reasons == ('no_sweep', 'no_sweep')
+    assert alone.status == ('kept', 'kept')
+    np.testing.assert_array_equal(alone.boxes.boxes, stream[5][1].boxes)
+    assert registrar.counts['boxes_without_sweep'] == 1
+    assert registrar.counts['no_sweep'] == 2
+
+
+def test_a_sweep_without_boxes_is_counted(stream):
+    registrar = BoxRegistrar(setup())
+    for i, (sweep, boxes) in enumerate(stream):
+        registrar.add_sweep(sweep)
+        if i != 5:
+            registrar.add_boxes(boxes)
+    registrar.flush()
+    assert registrar.counts['sweep_without_boxes'] == 1
+    assert registrar.counts['sweeps'] == 14
+
+
+@each_estimate
+def test_an_empty_box_array_comes_back(stream, estimate):
+    sweep, boxes = stream[5]
+    empty = BoxArray(boxes.stamp_ns, 'odom', (), (), np.zeros(0), np.zeros((0, 9)))
+    results, counts = run([*stream[:5], (sweep, empty), *stream[6:]], setup(estimate))
+    assert [r.boxes.stamp_ns for r in finals(results)] == [b.stamp_ns for _, b in stream]
+    assert finals(results)[5].boxes.boxes.shape == (0, 9)
+    assert counts['refined'] == 20
+
+
+@each_estimate
+def test_late_boxes_come_back_as_they_are(stream, estimate):
+    # A box array that comes again after a younger one has been paired.
+    results, counts = run([*stream[:6], stream[3], *stream[6:]], setup(estimate))
+    assert counts['late'] == 2
+    late = [r for r in finals(results) if 'late' in r.reasons]
+    assert len(late) == 1
+    assert late[0].status == ('kept', 'kept')
+    np.testing.assert_array_equal(late[0].boxes.boxes, stream[3][1].boxes)
+    others = [r for r in finals(results) if r is not late[0]]
+    assert [r.boxes.stamp_ns for r in others] == [b.stamp_ns for _, b in stream]
+    assert {s for r in others for s in r.status} == {'refined'}
+
+
+@each_estimate
+def test_short_tracks_and_boxes_without_points(stream, estimate):
+    # The second car shows twice only; the first has no points at one stamp.
+    sweep, _ = stream[7]
+    nothing = Sweep(sweep.stamp_ns, 'odom', sweep.points[:0], None, sweep.origin)
+    part = [
+        (s, b if i < 4 else replace(
+            b, track_ids=('a',), class_names=('car',), scores=b.scores[:1], boxes=b.boxes[:1]
+        ))
+        for i, (s, b) in enumerate(stream)
+    ]  # fmt: skip
+    part[7] = (nothing, part[7][1])
+    results, counts = run(part, setup(estimate))
+    assert counts['short_track'] == 2
+    assert [r.reasons for r in finals(results)][2:4] == [('', 'short_track')] * 2
+    assert counts['no_points'] == 1
+    blind = finals(results)[7]
+    assert blind.reasons == ('no_points',)
+    assert blind.num_points.tolist() == [0]
+    np.testing.assert_array_equal(blind.boxes.boxes, part[7][1].boxes)
+    assert counts['kept'] == 3
+    assert counts['refined'] == 13
+
+
+# --- tracks end ---------------------------------------------------------------------------------
+
+
+@each_estimate
+def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate):
+    # The same id, after 0.9 s or 1.1 s of silence: after the longer one the boxes that follow
+    # are refined as if nothing had been before, but for what is learnt of the input.
+    config = setup(estimate, **{'faces.learn': False})
+    track = track_of(drive(28), np.random.default_rng(0))
+    whole = stream_of([track])
+    for gap, is_new in ((8, False), (9, False), (10, True)):
+        start = 8 + gap  # the tick after the silence is gap + 1 periods after the last before
+        results, _ = run(whole[:8] + whole[start : start + 8], config)
+        alone, _ = run(whole[start : start + 8], config)
+        found, known = (
+            next(r for r in rs if r.boxes.stamp_ns == whole[start][1].stamp_ns)
+            for rs in (results, alone)
+        )
+        difference = np.abs(found.boxes.boxes - known.boxes.boxes).max()
+        assert (difference < 1e-6) == is_new
+
+
+def test_a_track_that_ends_comes_back_before_the_end():
+    # With estimate 'track' a track that has been silent for long must not hold up all others.
+    rng = np.random.default_rng(0)
+    short, long = track_of(drive(5), rng, 'short'), track_of(drive(60, speed=0, turn=0), rng, 'l')
+    registrar = BoxRegistrar(setup('track', track_window=12))
+    assert len(fed(registrar, stream_of([short, long]))) >= 60 - 12
+
+
+@each_estimate
+def test_memory_is_bounded(estimate):
+    # A parked car, a visitor with a new id at every third tick, and sweeps nobody asks for.
+    rng = np.random.default_rng(0)
+    parked = track_of(drive(20, speed=0, turn=0), rng)
+    config = setup(estimate, track_window=10, max_gap=0.3, **{'sampling.points': 16})
+    registrar = BoxRegistrar(config)
+    returned, held = 0, []
+    for i in range(60):
+        now_ns = int(stamps(1)[0]) + i * PERIOD_NS
+        points = parked.points[i % 20]
+        boxes = np.array([parked.boxes[i % 20], parked.boxes[0] + np.eye(9)[1] * 10])
+        array = BoxArray(now_ns, 'odom', ('p', f'v{i // 3}'), ('car',) * 2, np.ones(2), boxes)
+        registrar.add_sweep(Sweep(now_ns - PERIOD_NS // 2, 'odom', points))
+        results = registrar.add_sweep(Sweep(now_ns, 'odom', points)) + registrar.add_boxes(array)
+        returned += len(finals(results))
+        held.append(i + 1 - returned)
+        entries = sum(len(t.entries) for t in registrar._tracks.values())
+        entries += sum(len(t.entries) for t in registrar._ended)
+        assert entries <= 2 * 10 + 3 * 5
+        assert len(registrar._tracks) <= 4
+    # Ticks wait for the lag, or for a window of 10 that is solved every 5 ticks.
+    assert max(held) <= 15
+    assert max(held[40:]) <= max(held[:40])
