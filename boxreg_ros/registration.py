@@ -136,9 +136,9 @@ def solve(
     """
     length, settings = problem.boxes.shape[1], config.solver
     rule, noise = model.rule(), model.noise()
-    expected = _expected(problem, rule)
+    expected = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), expected.clone())
-    free = _free(problem, config)
+    free = free_variables(problem, config)
     for turn in range(rounds):
         margin = MARGINS[0] if turn == 0 and rounds > 1 else MARGINS[1]
         sights = support(problem, state, margin, config.faces.outermost, rule.depths)
@@ -182,11 +182,17 @@ class _Metric:
         curvature *= free[:, :, None]
         curvature *= free[:, None, :]
         curvature.diagonal(dim1=1, dim2=2).add_(1.0 - free + 1e-9)
-        self._factor = torch.linalg.cholesky(curvature)
+        self._factor, failed = torch.linalg.cholesky_ex(curvature)
+        if bool(failed.any()):
+            # A window out of all proportion (stamps a microsecond apart, a box at the moon) is
+            # left to the line search with its diagonal alone; the others must not notice.
+            diagonal = curvature.diagonal(dim1=1, dim2=2)[failed > 0].nan_to_num().clamp(min=1e-9)
+            self._factor[failed > 0] = torch.diag_embed(diagonal.sqrt())
+        self._rough = self._factor.float()  # good enough for a direction, half the memory
 
     def __call__(self, vector: Tensor, rows: Tensor) -> Tensor:
-        factor = self._factor if len(rows) == len(self._factor) else self._factor[rows]
-        return torch.cholesky_solve(vector[..., None], factor)[..., 0]
+        factor = self._rough if len(rows) == len(self._rough) else self._rough[rows]
+        return torch.cholesky_solve(vector[..., None].float(), factor)[..., 0].to(vector)
 
     def blocks(self, length: int) -> Tensor:
         """Return the covariances of the poses (B, N, 6, 6)."""
@@ -205,9 +211,9 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
 
     """
     length, settings = problem.boxes.shape[1], config.paper
-    expected = _expected(problem, Rule(torch.zeros(6), torch.zeros(6)))
+    expected = expected_shared(problem, Rule(torch.zeros(6), torch.zeros(6)))
     extent = expected[:, None, EXTENT].expand(-1, length, -1)
-    free = _free(problem, config)[:, : 6 * length]
+    free = free_variables(problem, config)[:, : 6 * length]
     x = problem.pose.flatten(1)
     multipliers = x.new_tensor([settings.smoothness, settings.alignment]).repeat(len(x), 1)
 
@@ -325,7 +331,7 @@ def _parked(problem: Problem) -> Tensor:
     return still
 
 
-def _expected(problem: Problem, rule: Rule) -> Tensor:
+def expected_shared(problem: Problem, rule: Rule) -> Tensor:
     """Return the expectation of what is shared (B, 16): mean extent, no bias, rule, pivot."""
     extents = problem.boxes[..., 3:6]
     count = problem.valid.sum(1)
@@ -338,7 +344,7 @@ def _expected(problem: Problem, rule: Rule) -> Tensor:
     return torch.cat([mean, torch.zeros_like(gaps), gaps, problem.deviations['pivot'][:, None]], 1)
 
 
-def _free(problem: Problem, config: Config) -> Tensor:
+def free_variables(problem: Problem, config: Config) -> Tensor:
     """Return 1 for every variable (B, 6 N + 16) to be solved for, 0 for those that stay."""
     pose = problem.valid[..., None].to(problem.boxes).expand(-1, -1, 6).clone()
     shared = pose.new_ones((len(pose), SHARED))
@@ -351,9 +357,12 @@ def _free(problem: Problem, config: Config) -> Tensor:
 
 def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None:
     """Show the model the fresh observations at their input boxes."""
+    windows = [window for window in windows if window.fresh > 0]
+    if not windows:
+        return
     problem, _ = stack([window.fresh_part() for window in windows], config)
     rule = model.rule()
-    state = State(problem.pose, _expected(problem, rule))
+    state = State(problem.pose, expected_shared(problem, rule))
     sights = support(problem, state, MARGINS[0], config.faces.outermost, rule.depths)
     model.learn_rule([w.track_id for w in windows], sights, problem.valid, rule)
 
@@ -369,6 +378,7 @@ def _judge(
 
     """
     finite = np.isfinite(boxes).all(1) & (boxes[:, 3:6] > 0).all(1)
+    finite &= np.isfinite(covariances).all((1, 2))
     empty = np.array([len(o.points) == 0 for o in window.observations], dtype=bool)
     lost = held[1] < held[0] / 2 - 3
     names = ['no_points', 'not_finite', 'no_gain']
