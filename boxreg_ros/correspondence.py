@@ -6,6 +6,7 @@ from boxreg_ros.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
 from boxreg_ros.objective import EXTENT, GAP, Problem, State
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 BOTTOM = 5
 LEAST = 3  # points without which a face is not seen
@@ -143,12 +144,11 @@ def support(
 
 
 def _velocity(problem: Problem, state: State) -> Tensor:
-    """Return the velocity of the centres (B, N, 3), differences across two steps [m/s]."""
+    """Return the velocity of the centres (B, N, 3), over the real steps beside each [m/s]."""
     where = torch.cat([state.pose[..., :3], problem.times[..., None]], -1)
-    change = torch.empty_like(where)
-    change[:, 1:-1] = where[:, 2:] - where[:, :-2]
-    change[:, [0, -1]] = where[:, [1, -1]] - where[:, [0, -2]]
-    return change[..., :3] / change[..., 3:]
+    steps = where.diff(dim=1) * problem.valid[:, 1:, None]
+    change = pad(steps, (0, 0, 1, 0)) + pad(steps, (0, 0, 0, 1))
+    return change[..., :3] / change[..., 3:].clamp(min=1e-9)  # a single observation rests
 
 
 def _with_road(problem: Problem, state: State, support: Support) -> Support:

@@ -59,6 +59,7 @@ def refine(tracks: Sequence[Track], config: Config | None = None) -> list[Refine
         ]
         boxes = np.array([tracks[index].boxes[row] for index, row in places])
         points = np.concatenate([tracks[index].points[row] for index, row in places])
+        points = points[np.isfinite(points).all(1)]
         results += registrar.add_sweep(Sweep(stamp_ns, '', points, None, origins[0]))
         ids, classes = [t.track_id or '?' for t in members], [t.class_name for t in members]
         results += registrar.add_boxes(
