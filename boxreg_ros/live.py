@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from boxreg_ros import refine
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.errors import ConfigError, TransformUnavailable
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep, Track
@@ -240,6 +240,8 @@ def warm_up(config: Config) -> None:
     """
     Solve a made-up track: the first real one must not wait for what is loaded lazily.
 
+    A few steps of the solver are enough for that.
+
     Raises
     ------
     ConfigError
@@ -250,8 +252,13 @@ def warm_up(config: Config) -> None:
     boxes = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0] for k in range(4)])
     points = [rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + box[:3] for box in boxes]
     track = Track('1', 'car', np.arange(4) * 10**8, boxes, points, np.zeros((4, 3)))
+    quick = Config(
+        objective=config.objective, mode=config.mode, device=config.device,
+        solver=SolverConfig(rounds=1, iterations=2),
+        paper=PaperConfig(multiplier_rounds=1, iterations=2),
+    )  # fmt: skip
     try:
-        refine([track], config)
+        refine([track], quick)
     except (AssertionError, RuntimeError) as error:  # what torch raises for a device
         raise ConfigError(
             f'device: expected one that torch can use here, such as cpu, got '

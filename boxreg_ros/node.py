@@ -28,7 +28,7 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -70,16 +70,17 @@ class BoxregNode(Node):
             self._trouble,
         )  # fmt: skip
         self._board = MarkerBoard()
-        self._cloud_frame = ''
+        self._cloud_frame = self._fixed_frame = ''
         self._stopping = Event()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on when /clock does not
         self._markers = self.create_publisher(MarkerArray, 'refined_markers', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(STATUS_PERIOD, self._publish_status, clock=steady)
-        self._subscribe(PointCloud2, 'points', self._on_points, qos_profile_sensor_data)
-        sensor_data = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._subscribe(Odometry, 'odom', self._on_odometry, sensor_data)
+        best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._subscribe(PointCloud2, 'points', self._on_points, best_effort(depth=5))
+        self._subscribe(Odometry, 'odom', self._on_odometry, best_effort(depth=50))
         self._subscribe_to_tf()
+        self._final_depth = 10 + config.lag  # so many may leave at once, at the end
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         if options.boxes_type:
@@ -126,8 +127,8 @@ class BoxregNode(Node):
         self._live.adapter = adapter
         overrides = QoSOverridingOptions.with_default_policies()
         self._early, self._final = (
-            self.create_publisher(kind, topic, 10, qos_overriding_options=overrides)
-            for topic in ('refined_boxes', 'refined_boxes_final')
+            self.create_publisher(kind, topic, depth, qos_overriding_options=overrides)
+            for topic, depth in (('refined_boxes', 10), ('refined_boxes_final', self._final_depth))
         )
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._subscribe(kind, 'boxes', self._on_boxes, qos)
@@ -153,7 +154,7 @@ class BoxregNode(Node):
 
     def _publish_status(self) -> None:
         facts = {
-            'fixed_frame': self._live.fixed_frame or 'not known yet',
+            'fixed_frame': self._fixed_frame or 'not known yet',
             **self._inbox.sizes(),
         }
         status = self._health.status(f'{self.get_fully_qualified_name()}: registration', facts)
@@ -216,14 +217,14 @@ class BoxregNode(Node):
         return Arrival(message.content, content, message.received)
 
     def _process(self, item: Arrival) -> None:
-        knew_frame = bool(self._live.fixed_frame)
         try:
             ready = self._live.process(item)
         except Exception as error:  # one bad tick must not end weeks of running
             self._trouble('failed', f'{type(error).__name__}: {error}')
             ready = self._live.abandon()
-        if not knew_frame and self._live.fixed_frame:
-            self.get_logger().info(f'fixed frame is {self._live.fixed_frame!r}')
+        if self._fixed_frame != self._live.fixed_frame:
+            self._fixed_frame = self._live.fixed_frame
+            self.get_logger().info(f'fixed frame is {self._fixed_frame!r}')
         self._publish(ready)
         self._health.set_counts(self._live.counts)
         if any(not out.is_final for out in ready):

@@ -8,11 +8,12 @@ import signal
 import subprocess
 import sys
 import time
+from typing import NamedTuple
 
 from boxreg_ros.node import import_message
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,10 +46,13 @@ class Graph:
         self.processes.append(process)
         return process
 
-    def publisher(self, type_name, topic, is_latched=False):
-        """Return a reliable publisher."""
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(depth=100, durability=durability)
+    def publisher(self, type_name, topic, is_latched=False, is_reliable=True):
+        """Return a publisher."""
+        qos = QoSProfile(depth=100)
+        if is_latched:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        if not is_reliable:
+            qos.reliability = ReliabilityPolicy.BEST_EFFORT
         publisher = self.node.create_publisher(import_message(type_name), topic, qos)
         self.publishers[topic] = publisher
         return publisher
@@ -142,29 +146,45 @@ def stamp_of(message):
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
-def play(graph, path, early, boxes_topic='/boxes', until=None):
-    """
-    Publish a recording, byte by byte, as fast as boxes come back.
+class Record(NamedTuple):
+    """A recorded message: its bytes, and, of boxes, the stamp."""
 
-    `early` is the list in which the node's early boxes arrive: the next record is published
-    when those of the last boxes are there.
+    topic: str
+    type_name: str
+    data: bytes
+    boxes_stamp_ns: int | None
 
-    """
+
+def records_of(path, boxes_topic='/boxes'):
+    """Return all records of a recording in the order they were received."""
+    records = []
     with AnyReader([path]) as reader:
-        for count, (connection, _, data) in enumerate(reader.messages()):
-            if until is not None and count >= until:
-                return
-            graph.publishers[connection.topic].publish(bytes(data))
-            if connection.topic == boxes_topic:
-                stamp_ns = stamp_of(reader.deserialize(data, connection.msgtype))
-                graph.wait(
-                    lambda s=stamp_ns: any(stamp_of(m) == s for m in early), f'boxes of {stamp_ns}'
-                )
+        for connection, _, data in reader.messages():
+            topic, type_name, stamp_ns = connection.topic, connection.msgtype, None
+            if topic == boxes_topic:
+                stamp_ns = stamp_of(reader.deserialize(data, type_name))
+            records.append(Record(topic, type_name, bytes(data), stamp_ns))
+    return records
 
 
-def publish_topics_of(graph, path):
+def publishers_for(graph, records):
     """Make a publisher for every topic of a recording."""
-    with AnyReader([path]) as reader:
-        for connection in reader.connections:
-            topic = connection.topic
-            graph.publisher(connection.msgtype, topic, is_latched=topic == '/tf_static')
+    for topic, type_name in {record.topic: record.type_name for record in records}.items():
+        graph.publisher(type_name, topic, is_latched=topic == '/tf_static')
+
+
+def play(graph, records, early=None):
+    """
+    Publish records, byte by byte.
+
+    With `early`, the list in which the node's early boxes arrive, as fast as they come back: the
+    next record is published when the boxes of the last stamp are there.
+
+    """
+    for record in records:
+        graph.publishers[record.topic].publish(record.data)
+        stamp_ns = record.boxes_stamp_ns
+        if early is not None and stamp_ns is not None:
+            graph.wait(
+                lambda s=stamp_ns: any(stamp_of(m) == s for m in early), f'boxes of {stamp_ns} ns'
+            )

@@ -10,7 +10,7 @@ import pytest
 from ros_messages import DETECTIONS, Drive, MARKERS
 
 pytest.importorskip('rclpy', reason='rclpy is not installed')
-from ros_graph import graph_in, play, publish_topics_of, RELIABLE, stamp_of
+from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, stamp_of
 
 SETTINGS = {'window': 5, 'lag': 3}
 
@@ -53,12 +53,13 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, boxes, motion):
         # Patient, so that no transform is extrapolated because a machine is busy.
         options = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=100']
         options += [f'{key}:={value}' for key, value in SETTINGS.items()]
-        publish_topics_of(graph, path)
+        records = records_of(path)
+        publishers_for(graph, records)
         early = graph.collect(type_name, '/refined_boxes')
         final = graph.collect(type_name, '/refined_boxes_final')
         node = graph.start(*RELIABLE, *(part for option in options for part in ('-p', option)))
         graph.wait_until_connected()
-        play(graph, path, early)
+        play(graph, records, early)
         node.stop()
         assert node.popen.returncode == 0, node.output()
     # All of them, also those that the node still held when it was told to end.

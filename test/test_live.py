@@ -1,0 +1,172 @@
+"""What the node does between its topics: waiting, moving, passing through, starting afresh."""
+
+from boxreg_ros.config import Config
+from boxreg_ros.live import Arrival, LiveRegistrar, refined_to_frame
+from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
+from boxreg_ros.transforms import matrix
+from msg_adapters import pointcloud, vision
+import numpy as np
+import pytest
+from ros_messages import Drive, SECOND, START
+
+
+class Live(LiveRegistrar):
+    """Fed from a Drive."""
+
+    def __init__(self, fixed_frame='', output_frame='', timeout=1.0, adapter=vision, **settings):
+        self.told = []
+        config = Config(estimate='final').updated({'window': 5, 'lag': 2} | settings)
+        super().__init__(
+            config, fixed_frame, output_frame, timeout, lambda *words: self.told.append(words)
+        )
+        self.adapter = adapter
+        self.cloud_frame = 'lidar'
+
+    def feed(self, drive, now=0.0):
+        """Process all of a drive, as soon as it is ready; return what comes out."""
+        out = []
+        for topic, _, message in drive.items:
+            if topic in ('/tf', '/tf_static'):
+                self.tree.add_transforms(message.transforms, topic == '/tf_static')
+            elif topic == '/odom':
+                self.tree.add_odometry(message)
+            else:
+                item = arrival(topic, message, now)
+                assert self.is_ready(item, now + 0.5) or not self.fixed_frame
+                out += self.process(item)
+        return out
+
+
+def arrival(topic, message, now=0.0):
+    reader = pointcloud if topic == '/points' else vision
+    return Arrival(message, reader.from_msg(message), now)
+
+
+def items_of(drive, topic):
+    return [message for name, _, message in drive.items if name == topic]
+
+
+def test_every_message_comes_back_early_and_final_in_its_own_frame():
+    drive = Drive(sweeps=6)
+    live = Live()
+    out = live.feed(drive) + live.flush()
+    assert live.fixed_frame == 'odom'
+    for is_final in (False, True):
+        messages = [item.message for item in out if item.is_final == is_final]
+        arrays = [vision.from_msg(message) for message in messages]
+        assert [array.stamp_ns for array in arrays] == drive.stamps
+        for array, message in zip(arrays, items_of(drive, '/boxes'), strict=True):
+            given = vision.from_msg(message)
+            assert array.frame_id == 'lidar'
+            assert array.track_ids == given.track_ids
+            assert np.abs(array.boxes - given.boxes).max() < 0.5
+    refined = [item for item in out if item.is_final]
+    assert all(REFINED in item.refined.status for item in refined)
+    assert not live.told
+
+
+def test_output_frame_is_the_one_asked_for():
+    drive = Drive(sweeps=5)
+    out = Live(output_frame='odom').feed(drive)
+    assert out
+    for item in out:
+        array = vision.from_msg(item.message)
+        assert array.frame_id == item.given.frame_id == item.refined.boxes.frame_id == 'odom'
+        assert np.abs(array.boxes[:, :3] - drive.truth[array.stamp_ns][:, :3]).max() < 0.5
+
+
+def test_arrivals_wait_until_transforms_cover_them_but_not_for_ever():
+    drive = Drive(sweeps=3)
+    live = Live(timeout=1.0)
+    static, *moving = [m for t, _, m in drive.items if t.startswith('/tf')]
+    clouds = [arrival('/points', m, 10.0) for m in items_of(drive, '/points')]
+    live.tree.add_transforms(static.transforms, is_static=True)
+    assert not live.is_ready(clouds[0], 10.0)
+    live.tree.add_transforms(moving[0].transforms)
+    live.tree.add_transforms(moving[1].transforms)
+    assert not live.is_ready(clouds[1], 10.1)  # a fixed frame is not chosen in a hurry
+    assert live.is_ready(clouds[1], 10.5)
+    assert live.fixed_frame == 'odom'
+    assert not live.is_ready(clouds[2], 10.5)
+    assert live.is_ready(clouds[2], 11.0)  # 0.1 s further on a transform can be extrapolated
+    assert live.process(clouds[2]) == []
+    assert not live.told
+
+
+def test_boxes_without_transform_pass_through_with_the_remedy():
+    drive = Drive(sweeps=2, motion='none')
+    live = Live()
+    cloud, boxes = items_of(drive, '/points')[0], items_of(drive, '/boxes')[0]
+    assert not live.is_ready(arrival('/points', cloud), 0.9)
+    assert live.is_ready(arrival('/points', cloud), 1.0)
+    assert live.process(arrival('/points', cloud)) == []
+    out = live.process(arrival('/boxes', boxes))
+    assert [item.is_final for item in out] == [False, True]
+    assert all(item.message is boxes for item in out)
+    (reason, text), _ = live.told
+    assert reason == 'no_transform'
+    assert 'fixed_frame:=lidar' in text
+
+
+def test_a_sensor_that_does_not_move_needs_no_transform():
+    live = Live(fixed_frame='lidar')
+    out = live.feed(Drive(sweeps=4, motion='none'))
+    assert sum(not item.is_final for item in out) == 4
+    assert not live.told
+
+
+def test_boxes_before_any_cloud_say_what_is_missing():
+    drive = Drive(sweeps=1)
+    live = Live()
+    live.cloud_frame = ''
+    out = live.process(arrival('/boxes', items_of(drive, '/boxes')[0]))
+    assert len(out) == 2
+    assert 'no point cloud' in live.told[0][1]
+
+
+def test_after_a_fault_all_that_is_held_passes_through_once():
+    drive = Drive(sweeps=6)
+    live = Live()
+    before = live.feed(drive)
+    after = live.abandon()
+    for is_final in (False, True):
+        stamps = [
+            vision.from_msg(item.message).stamp_ns
+            for item in before + after
+            if item.is_final == is_final
+        ]
+        assert stamps == drive.stamps
+    again = Drive(sweeps=6)
+    for _, _, message in again.items:
+        for item in getattr(message, 'transforms', [message]):
+            item.header.stamp.sec += 5
+    assert len(live.feed(again) + live.flush()) == 12
+
+
+def test_boxes_of_one_stamp_come_back_each_in_its_own_message():
+    drive = Drive(sweeps=4)
+    boxes = items_of(drive, '/boxes')
+    boxes[2].header.stamp = boxes[1].header.stamp
+    live = Live()
+    out = live.feed(drive) + live.flush()
+    for is_final in (False, True):
+        assert sum(item.is_final == is_final for item in out) == 4
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.7, 2.5])
+def test_covariances_turn_with_the_frame(yaw):
+    stamp = START + SECOND
+    spread = np.diag([4.0, 1.0, 0.25, 0.1, 0.2, 0.3])  # along x
+    boxes = BoxArray(
+        stamp, 'a', ('1',), ('car',), np.ones(1), np.array([[1.0, 2, 3, 4, 2, 1, 0, 0, 0]])
+    )
+    refined = RefinedBoxes(boxes, (KEPT,), ('',), np.zeros(1, int), spread[None])
+    T = matrix(np.array([5.0, 0, 0, 0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]))
+    moved = refined_to_frame(refined, T, 'b')
+    assert moved.boxes.frame_id == 'b'
+    (covariance,) = moved.covariances
+    along = np.array([np.cos(yaw), np.sin(yaw), 0])
+    across = np.array([-np.sin(yaw), np.cos(yaw), 0])
+    assert along @ covariance[:3, :3] @ along == pytest.approx(4.0)
+    assert across @ covariance[:3, :3] @ across == pytest.approx(1.0)
+    assert covariance[3:, 3:] == pytest.approx(spread[3:, 3:])

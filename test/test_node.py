@@ -1,0 +1,280 @@
+"""The real node, a process of its own, over DDS."""
+
+import signal
+import subprocess
+import sys
+import time
+
+from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
+from msg_adapters import markers, vision
+import numpy as np
+import pytest
+from ros_messages import DETECTIONS, Drive, MARKERS, START
+
+pytest.importorskip('rclpy', reason='rclpy is not installed')
+from boxreg_ros.diagnostics import Health
+from boxreg_ros.visual import MarkerBoard
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+
+DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
+QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=50')
+WITHOUT_TF2_MSGS = (
+    'import sys; sys.modules["tf2_msgs"] = None\n'
+    'from boxreg_ros.node import main\n'
+    'sys.exit(main())'
+)
+
+
+@pytest.fixture
+def graph(tmp_path):
+    with graph_in(tmp_path) as graph:
+        yield graph
+
+
+def ended_cleanly(node, number=signal.SIGINT):
+    took = node.stop(number)
+    assert node.popen.returncode == 0, node.output()
+    assert 'Traceback' not in node.output()
+    assert took < 2.0
+    return True
+
+
+def values_of(diagnostics):
+    newest = diagnostics[-1].status[0].values if diagnostics else []
+    return {item.key: item.value for item in newest}
+
+
+def test_odometry_alone_is_enough(graph, tmp_path):
+    """Type from the graph, a best-effort publisher of boxes, no tf2_msgs; markers, diagnostics."""
+    drive = Drive(sweeps=6, boxes='markers', motion='odometry')
+    leaving = [item[2] for item in drive.items if item[0] == '/boxes'][4:]
+    for message in leaving:
+        del message.markers[1]
+    drive.items = [item for item in drive.items if item[0] != '/tf_static']
+    for _, _, message in drive.items:
+        if hasattr(message, 'child_frame_id'):
+            message.child_frame_id = 'lidar'
+            message.pose.pose.position.z = 2.0
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, [record for record in records if record.topic != '/boxes'])
+    graph.publisher(MARKERS, '/boxes', is_reliable=False)
+    early = graph.collect(MARKERS, '/refined_boxes')
+    shown = graph.collect(MARKERS, '/refined_markers')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK, command=('-c', WITHOUT_TF2_MSGS))
+    graph.wait_until_connected()
+    begun = time.monotonic()
+    play(graph, records[:3], early)
+    assert time.monotonic() - begun < 2.0
+    play(graph, records[3:], early)
+    graph.wait(lambda: len(shown) == 6, 'markers')
+    graph.wait(lambda: values_of(diagnostics).get('early_published') == '6', 'diagnostics')
+    assert values_of(diagnostics)['fixed_frame'] == 'odom'
+    assert int(values_of(diagnostics)['refined']) > 0
+    assert diagnostics[-1].status[0].level == DiagnosticStatus.OK, diagnostics[-1]
+    assert ended_cleanly(node)
+    assert "fixed frame is 'odom'" in node.output()
+    assert node.output().count('tf2_msgs') >= 1
+    assert node.output().count('WARN') == 1, node.output()
+
+    array = markers.from_msg(early[-1])
+    assert array.frame_id == 'lidar' and array.track_ids == ('1',)
+    added = [{m.ns for m in message.markers if m.action == 0} for message in shown[:6]]
+    assert added == [{'input', 'refined', 'heading', 'id'}] * 6
+    colours = {(m.ns, m.color.g) for m in shown[3].markers if m.ns in ('input', 'refined')}
+    assert len({green for _, green in colours}) == 2
+    numbers = {m.text: m.id for m in shown[3].markers if m.ns == 'id'}
+    assert numbers.keys() == {'1', '2'}
+    deleted = [{m.id for m in message.markers if m.action == 2} for message in shown[:6]]
+    assert deleted == [set(), set(), set(), set(), {numbers['2']}, set()]
+    assert shown[-1].markers[0].action == 3  # all are removed when the node ends
+
+
+def test_transforms_may_come_late_and_bad_messages_do_no_harm(graph, tmp_path):
+    drive = Drive(sweeps=8)
+    drive.replace(
+        '/boxes', 3, lambda m: setattr(m.detections[0].bbox.center.position, 'x', np.nan)
+    )
+    drive.replace('/points', 4, lambda m: setattr(m, 'width', 10**6))
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=20')
+    graph.wait_until_connected()
+    moving = [record for record in records if record.topic == '/tf']
+    play(graph, [record for record in records if record.topic != '/tf'])
+    for _ in range(20):
+        graph.executor.spin_once(timeout_sec=0.02)
+    assert not early  # they wait
+    play(graph, moving)
+    graph.wait(lambda: len(early) == 8, 'early boxes')
+    graph.wait(lambda: values_of(diagnostics).get('unreadable') == '1', 'the unreadable cloud')
+    assert ended_cleanly(node, signal.SIGTERM)
+    assert 'unreadable' in node.output() and 'width' in node.output()
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+    # Kept as it came, in place; the detector's NaN is not made worse nor better.
+    assert [d.id for d in final[3].detections] == ['1', '2']
+    assert np.isnan(final[3].detections[0].bbox.center.position.x)
+    for message in final:
+        array = vision.from_msg(message)
+        assert array.frame_id == 'lidar'
+        ego = np.array([0.5 * drive.stamps.index(array.stamp_ns), 0, 2.0])
+        error = array.boxes[:, :3] + ego - drive.truth[array.stamp_ns][:, :3]
+        assert np.nanmax(np.abs(error)) < 0.4
+
+
+def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path):
+    drive = Drive(sweeps=4, boxes='vision', motion='none')
+    path = drive.write(tmp_path / 'drive')
+    records = records_of(path)
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=0.1')
+    graph.wait_until_connected()
+    play(graph, records, early)
+    graph.wait(lambda: len(final) == 4, 'final boxes')
+    given = [message for topic, _, message in drive.items if topic == '/boxes']
+    for before, after in zip(given, final, strict=True):
+        assert np.array_equal(vision.from_msg(before).boxes, vision.from_msg(after).boxes)
+    assert ended_cleanly(node)
+    assert 'fixed_frame:=lidar' in node.output()
+
+    early.clear()
+    final.clear()
+    settings = ('-p', 'fixed_frame:=lidar', '-p', f'boxes_type:={DETECTIONS}')
+    second = graph.start(*RELIABLE, *QUICK, *settings)
+    graph.wait_until_connected()
+    play(graph, records, early)
+    assert ended_cleanly(second)
+    assert len(final) == 4
+    assert 'WARN' not in second.output()
+    refined = np.array([vision.from_msg(message).boxes for message in final])
+    assert np.abs(refined - [vision.from_msg(message).boxes for message in given]).max() > 1e-4
+
+
+def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
+    drive = Drive(sweeps=30)
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    reliable = [*RELIABLE, '-p', 'qos_overrides./points.subscription.depth:=100']
+    reliable += ['-p', 'qos_overrides./boxes.subscription.depth:=100']
+    slow = ('-p', 'solver.rounds:=40', '-p', 'solver.iterations:=400', '-p', 'fixed_frame:=odom')
+    node = graph.start(*reliable, *slow, '-p', 'backlog:=2')
+    graph.wait_until_connected()
+    play(graph, records)
+    graph.wait(lambda: len(early) == 30, 'early boxes')
+    graph.wait(lambda: int(values_of(diagnostics).get('early_published', 0)) == 30, 'counters')
+    assert int(values_of(diagnostics)['points_queue_full']) > 5
+    assert 'points_queue_full' in node.output()
+    assert ended_cleanly(node)
+    assert sorted(stamp_of(m) for m in early) == drive.stamps
+    assert sorted(stamp_of(m) for m in final) == drive.stamps
+
+
+def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
+    records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    endless = ('-p', 'solver.rounds:=100', '-p', 'solver.iterations:=10000', '-p', 'window:=30')
+    node = graph.start(*RELIABLE, *endless, '-p', 'solver.tolerance:=0.0', '-p', 'backlog:=100')
+    graph.wait_until_connected()
+    play(graph, records)
+    graph.wait(lambda: len(early) >= 4, 'some boxes')
+    assert len(early) < 25
+    assert ended_cleanly(node)
+
+
+@pytest.fixture(scope='module')
+def refused(tmp_path_factory):
+    """Start nodes with bad arguments side by side; return status and output of each."""
+    cases = {
+        'range': ['--ros-args', '-p', 'window:=2'],
+        'boxes': ['--ros-args', '-p', 'boxes_type:=std_msgs/msg/String'],
+        'device': ['--ros-args', '-p', 'device:=abacus'],
+        'file': ['--ros-args', '--params-file', 'missing.yaml'],
+    }
+    started = {
+        name: subprocess.Popen(
+            [sys.executable, '-m', 'boxreg_ros.node', *arguments], cwd=ROOT,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )
+        for name, arguments in cases.items()
+    }  # fmt: skip
+    return {
+        name: (process.communicate(timeout=60)[0], process.returncode)
+        for name, process in started.items()
+    }
+
+
+@pytest.mark.parametrize(
+    'case, status, words',
+    [
+        ('range', 2, ('window', '3', 'got 2')),
+        ('boxes', 1, ('std_msgs/msg/String', 'Detection3DArray')),
+        ('device', 2, ('device', 'abacus', 'cpu')),
+        ('file', 2, ('missing.yaml',)),
+    ],
+)
+def test_bad_arguments_are_told_in_one_line(refused, case, status, words):
+    output, returned = refused[case]
+    assert returned == status, output
+    ours = [line for line in output.splitlines() if '[rcl]' not in line]  # rcl adds its own
+    assert len(ours) == 1, output
+    for word in words:
+        assert word in ours[0]
+
+
+def boxes_of(*track_ids, x=0.0):
+    n = len(track_ids)
+    boxes = np.tile([x, 0, 0, 4, 2, 1.5, 0, 0, 0], (n, 1))
+    return BoxArray(START, 'odom', track_ids, ('car',) * n, np.ones(n), boxes)
+
+
+def refined_of(boxes, *status):
+    n = len(boxes.track_ids)
+    return RefinedBoxes(boxes, status, ('',) * n, np.zeros(n, int), np.tile(np.eye(6), (n, 1, 1)))
+
+
+def test_markers_stay_with_their_track():
+    board = MarkerBoard()
+    given = boxes_of('a', 'b', '', '')
+    first = board.update(given, refined_of(given, REFINED, KEPT, KEPT, KEPT)).markers
+    assert len({(m.ns, m.id) for m in first}) == len(first) == 16
+    cubes = {m.id: m.color.r for m in first if m.ns == 'refined'}
+    assert cubes[0] != cubes[1]
+    given = boxes_of('c', 'b')
+    given.boxes[0, 0] = np.nan  # no viewer takes it
+    second = board.update(given, refined_of(given, KEPT, KEPT)).markers
+    assert {m.id for m in second if m.action == 0} == {1}
+    assert {(m.ns, m.id) for m in second if m.action == 2} == {
+        (ns, number) for ns in ('input', 'refined', 'heading', 'id') for number in (0, 2, 3)
+    }
+    assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 4
+
+
+def test_health_tells_the_worst_of_the_last_period():
+    health = Health()
+    health.count('points_received')
+    health.count('boxes_received')
+    health.add_latency(0.05)
+    status = health.status('node', {'fixed_frame': 'odom'})
+    assert status.level == DiagnosticStatus.OK
+    values = {item.key: item.value for item in status.values}
+    assert values['latency median [ms]'] == '50.0'
+    assert values['fixed_frame'] == 'odom'
+    assert health.status('node', {}).level == DiagnosticStatus.WARN  # nothing more came
+    health.set_counts({'no_sweep': 3, 'refined': 5})
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message.startswith('no_sweep') and 'stamp' in status.message
+    health.count('failed')
+    assert health.status('node', {}).level == DiagnosticStatus.ERROR
+    assert health.is_time_to_warn('late') and not health.is_time_to_warn('late')
+    assert health.is_time_to_warn('no_sweep')

@@ -1,0 +1,109 @@
+"""Every setting is a ROS parameter, with its meaning, unit and bounds."""
+
+from boxreg_ros.config import Config, settings
+from boxreg_ros.errors import ConfigError
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed')
+from boxreg_ros.params import declare, NODE_SETTINGS
+import rclpy
+from rclpy.parameter import Parameter
+import yaml
+
+
+@pytest.fixture(scope='module')
+def context():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def make_node(context):
+    nodes = []
+
+    def make(cli_args=None, **given):
+        node = rclpy.create_node(
+            'params', context=context, automatically_declare_parameters_from_overrides=True,
+            parameter_overrides=[Parameter(name, value=value) for name, value in given.items()],
+            cli_args=cli_args,
+        )  # fmt: skip
+        nodes.append(node)
+        return node
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+
+
+def test_every_setting_is_a_parameter(make_node):
+    node = make_node()
+    config, options = declare(node)
+    assert config == Config(estimate='final')
+    assert options.boxes_type == options.fixed_frame == options.output_frame == ''
+    for item in [*settings(), *NODE_SETTINGS]:
+        descriptor = node.describe_parameter(item.name)
+        assert descriptor.description.startswith(item.meaning)
+        assert not item.unit or f'[{item.unit}]' in descriptor.description
+        assert descriptor.read_only
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        assert [(r.from_value, r.to_value) for r in ranges] == (
+            [] if item.low is None else [(item.low, item.high)]
+        )
+        for choice in item.choices:
+            assert choice in descriptor.additional_constraints
+        value = node.get_parameter(item.name).value
+        default = 'final' if item.name == 'estimate' else item.default
+        assert (tuple(value) if isinstance(default, tuple) else value) == default
+
+
+def test_values_are_taken_and_kept_in_their_type(make_node):
+    node = make_node(
+        **{'sampling.margin': 1, 'window': 7, 'vehicle.names': ['ute'], 'transform_timeout': 2}
+    )
+    config, options = declare(node)
+    assert config == Config(estimate='final').updated(
+        {'sampling.margin': 1.0, 'window': 7, 'vehicle.names': ['ute']}
+    )
+    assert type(node.get_parameter('sampling.margin').value) is float
+    assert type(options.transform_timeout) is float
+    assert options.transform_timeout == 2.0
+
+
+def test_one_yaml_file_serves_node_and_recordings(make_node, tmp_path):
+    path = tmp_path / 'params.yaml'
+    values = {'window': 6, 'lag': 2, 'solver': {'rounds': 2}, 'faces': {'learn': False}}
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {**values, 'estimate': 'final'}}}))
+    config, _ = declare(make_node(cli_args=['--ros-args', '--params-file', str(path)]))
+    assert config == Config.from_yaml(path)
+    assert config.solver.rounds == 2 and not config.faces.learn
+
+
+@pytest.mark.parametrize(
+    'name, value, words',
+    [
+        ('window', 2, ('window', '3', '2')),
+        ('window', 'abc', ('window', 'int', 'abc')),
+        ('lag', 10, ('lag', 'window')),
+        ('mode', '4d', ('mode', 'bev', '4d')),
+        ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
+        ('backlog', 2.5, ('backlog', 'int', '2.5')),
+        ('boxes_type', 3, ('boxes_type', 'str', '3')),
+        ('faces.learn', 1, ('faces.learn', 'bool', '1')),
+    ],
+)
+def test_bad_values_are_refused_by_name(make_node, name, value, words):
+    with pytest.raises(ConfigError) as caught:
+        declare(make_node(**{name: value}))
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_parameters_cannot_be_changed_behind_the_node(make_node):
+    node = make_node()
+    declare(node)
+    (result,) = node.set_parameters([Parameter('window', value=5)])
+    assert not result.successful
+    assert 'read-only' in result.reason
+    assert node.get_parameter('window').value == Config().window
