@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 RING = 1.0  # how far beside a box the road is looked for [m]
-ROAD, FLAT = (0.1, 0.3, 0.6), (np.nan,) * 3
 CLEARANCE = 0.2  # what is lower above the road may be road [m]
 
 
@@ -63,17 +62,15 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     for box, axes in zip(boxes, R, strict=True):
         reach = float(np.hypot(*box[3:5])) / 2 + RING
         first, last = np.searchsorted(points[:, 0], (box[0] - reach, box[0] + reach))
-        offset = points[first:last] - box[:3]
-        outside = np.abs(offset @ axes) - box[3:6] / 2
-        depth = outside.max(1)
-        beside = (np.abs(outside[:, :2].max(1) - RING / 2 - 0.05) < RING / 2) & (
-            np.abs(offset[:, 2] + box[5] / 2) < 0.6
-        )
-        low, ground, high = np.quantile(offset[beside, 2], ROAD) if beside.sum() >= 5 else FLAT
-        ground = ground if high - low < 0.15 else np.nan  # a wall, a kerb, a vehicle
+        index = first + np.flatnonzero(np.abs(points[first:last, 1] - box[1]) < reach)
+        offset = points[index] - box[:3]
+        x, y, z = (np.abs(offset @ axes) - box[3:6] / 2).T
+        aside = np.maximum(x, y)
+        depth = np.maximum(aside, z)
+        beside = (aside > 0.05) & (aside < RING) & (np.abs(offset[:, 2] + box[5] / 2) < 0.6)
         near = np.flatnonzero(depth < config.sampling.margin)
-        crops.append((first + near, offset[near], depth[near], ground))
-        np.minimum.at(nearest, first + near, depth[near])
+        crops.append((index[near], offset[near], depth[near], _road(offset[beside, 2])))
+        np.minimum.at(nearest, index[near], depth[near])
     observations = []
     for box, (index, offset, depth, ground) in zip(boxes, crops, strict=True):
         floor = (-box[5] / 2 if np.isnan(ground) else ground) + CLEARANCE
@@ -94,6 +91,14 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
             )
         )
     return observations
+
+
+def _road(heights: Floats) -> float:
+    """Return the height of the road among what is beside a box; NaN if that is not flat [m]."""
+    if len(heights) < 5:
+        return np.nan
+    low, road, high = np.sort(heights)[(len(heights) * np.array([0.1, 0.3, 0.6])).astype(int)]
+    return float(road) if high - low < 0.15 else np.nan  # no wall, kerb or vehicle
 
 
 def _thinned(points: Floats, config: Config) -> Ints:
@@ -121,8 +126,9 @@ def _near_any(points: NDArray[np.floating], boxes: Floats, margin: float) -> tup
     for (x, y), r in zip(boxes[:, :2] - low, reach, strict=True):
         a, b, c, d = (np.array([x - r, x + r, y - r, y + r]) / cell).astype(int) + 1
         table[a : b + 1, c : d + 1] = True
-    rows = ((points[:, :2] - low) / cell + 1).clip(0, np.array(table.shape) - 1).astype(np.int32)
-    near = np.flatnonzero(table[rows[:, 0], rows[:, 1]])
+    scaled = (points[:, :2] - low.astype(points.dtype)) * np.asarray(1 / cell, points.dtype) + 1
+    x, y = (scaled[:, i].clip(0, table.shape[i] - 1).astype(np.int32) for i in (0, 1))
+    near = np.flatnonzero(table[x, y])
     near = near[np.argsort(points[near, 0], kind='stable')]
     return points[near].astype(np.float64), near
 
