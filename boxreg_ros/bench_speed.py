@@ -32,6 +32,7 @@ from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame
 from boxreg_ros.window import stack, Window
 from msg_adapters import pointcloud
 import numpy as np
+from numpy.typing import NDArray
 import torch
 from torch import Tensor
 
@@ -91,9 +92,11 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
     result['reference'] = 1e3 * (perf_counter() - begin) / references
     ours = [solve(one, config, InputModel(config.faces), rounds)[0] for one in part]
     result['value, reference'] = float(
-        np.mean([_value(p, s, config) for p, s in zip(part, found)])
+        np.mean([_value(p, s, config) for p, s in zip(part, found, strict=True)])
     )
-    result['value, ours'] = float(np.mean([_value(p, s, config) for p, s in zip(part, ours)]))
+    result['value, ours'] = float(
+        np.mean([_value(p, s, config) for p, s in zip(part, ours, strict=True)])
+    )
     for name, states in (('input', None), ('reference', found), ('ours', ours)):
         boxes = [p.boxes[0].cpu().numpy().copy() for p in part]
         for i, box in enumerate(boxes):
@@ -102,18 +105,18 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
                 box[:, 3:6] = states[i].shared[0, EXTENT].cpu().numpy()
             box[:, :3] += base[i]
         result[f'IoU, {name}'] = float(
-            np.mean([iou_3d(b, t).mean() for b, t in zip(boxes, truth)])
+            np.mean([iou_3d(b, t).mean() for b, t in zip(boxes, truth[:references], strict=True)])
         )
     return result
 
 
 def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
     """Return the cost of a window [ms] over windows, their length, and points per box."""
-    counts, lengths, points = (1, 8, 64, 512), (5, 10, 20, 40, 80), (128, 512, 2048, 4096)
+    counts, lengths, points = [1, 8, 64, 512], [5, 10, 20, 40, 80], [128, 512, 2048, 4096]
     if config.device != 'cpu':
-        counts = (64, 1024, 16384)
+        counts = [64, 1024, 16384]
     if quick:
-        counts, lengths, points = (1, 8), (5, 10), (128, 512)
+        counts, lengths, points = [1, 8], [5, 10], [128, 512]
     cases = {
         'windows': [(n, n, config.window, 128) for n in counts],
         'length': [(n, 16, n, 128) for n in lengths],
@@ -169,7 +172,8 @@ def tick(config: Config, tracks: int, points: int) -> dict[str, float]:
         decode, transform, crop, both, encode = np.diff(marks) * 1e3
         times.append((decode, transform, crop, both - crop, encode))
     middle = np.median(np.array(times)[config.window + 2 :], axis=0)
-    result = dict(zip(('decode', 'transform', 'crop and sample', 'solve', 'encode'), middle))
+    stages = ('decode', 'transform', 'crop and sample', 'solve', 'encode')
+    result = dict(zip(stages, middle, strict=True))
     return {**{k: float(v) for k, v in result.items()}, 'total': float(middle.sum())}
 
 
@@ -247,7 +251,7 @@ def _surface(count: int, box: Floats, rng: np.random.Generator) -> Floats:
     return points
 
 
-def _message(points: Floats) -> SimpleNamespace:
+def _message(points: NDArray[np.floating]) -> SimpleNamespace:
     """Return a PointCloud2 as decoded, with an intensity beside x y z."""
     data = np.zeros((len(points), 4), dtype='<f4')
     data[:, :3] = points
