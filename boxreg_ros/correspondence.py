@@ -74,7 +74,7 @@ def retreat(aspect: Tensor, depths: Tensor) -> Tensor:
 
     """
     shifted = aspect + aspect.new_tensor(LEAD)
-    return depths * (0.5 - 0.5 * shifted / (shifted.square() + TURN).sqrt())
+    return depths.to(aspect) * (0.5 - 0.5 * shifted / (shifted.square() + TURN).sqrt())
 
 
 def support(

@@ -275,10 +275,11 @@ def weigh(
     inflation = torch.tensor(INFLATION).to(error)
     bias, extent = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]), kind['extent'][:, None]
     if noise is not None:
-        ratio = (noise.deviation[:6] / error).clamp(0.05, 4.0)
-        slow = (noise.correlation / 0.4).clamp(0.1, 1.0)
+        deviation, correlation = noise.deviation.to(error), noise.correlation.to(error)
+        ratio = (deviation[:6] / error).clamp(0.05, 4.0)
+        slow = (correlation / 0.4).clamp(0.1, 1.0)
         error = error * ratio
-        inflation = ((1 + noise.correlation[:6]) / (1 - noise.correlation[:6])).sqrt()
+        inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
         bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
         extent = extent * slow[6:]
     off = objective.prior(problem, state).residual[:, :, 0] / error[:, None]
