@@ -10,7 +10,7 @@ import sys
 import time
 from typing import NamedTuple
 
-from boxreg_ros.node import import_message
+from boxreg_ros.boxreg_node import import_message
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy

@@ -5,17 +5,15 @@ import subprocess
 import sys
 import time
 
+from boxreg_ros.diagnostics import Health
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
+from boxreg_ros.visual import MarkerBoard
+from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import markers, vision
 import numpy as np
 import pytest
-from ros_messages import DETECTIONS, Drive, MARKERS, START
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
-from boxreg_ros.diagnostics import Health
-from boxreg_ros.visual import MarkerBoard
-from diagnostic_msgs.msg import DiagnosticStatus
 from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_messages import DETECTIONS, Drive, MARKERS, START
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=50')
@@ -278,3 +276,26 @@ def test_health_tells_the_worst_of_the_last_period():
     assert health.status('node', {}).level == DiagnosticStatus.ERROR
     assert health.is_time_to_warn('late') and not health.is_time_to_warn('late')
     assert health.is_time_to_warn('no_sweep')
+
+
+def test_without_ros_the_remedy_is_told():
+    code = 'import sys; sys.modules["rclpy"] = None; from boxreg_ros.cli import main; '
+    process = subprocess.run(
+        [sys.executable, '-c', f'{code}sys.exit(main(["node"]))'], cwd=ROOT, capture_output=True,
+        text=True, timeout=60,
+    )  # fmt: skip
+    assert process.returncode == 1
+    (line,) = process.stderr.splitlines()
+    assert 'rclpy' in line and 'boxreg_ros[ros]' in line
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_starting_ends_it_quietly(number):
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'boxreg_ros.node'], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    time.sleep(0.8)
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=10)
+    assert (process.returncode, output) == (0, '')

@@ -2,10 +2,8 @@
 
 from boxreg_ros.config import Config, settings
 from boxreg_ros.errors import ConfigError
-import pytest
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
 from boxreg_ros.params import declare, NODE_SETTINGS
+import pytest
 import rclpy
 from rclpy.parameter import Parameter
 import yaml

@@ -7,10 +7,8 @@ from msg_adapters import adapter_for
 from msg_adapters.poses import quaternions_of
 import numpy as np
 import pytest
-from ros_messages import DETECTIONS, Drive, MARKERS
-
-pytest.importorskip('rclpy', reason='rclpy is not installed')
 from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, stamp_of
+from ros_messages import DETECTIONS, Drive, MARKERS
 
 SETTINGS = {'window': 5, 'lag': 3}
 
