@@ -277,7 +277,7 @@ def weigh(
     if noise is not None:
         deviation, correlation = noise.deviation.to(error), noise.correlation.to(error)
         ratio = (deviation[:6] / error).clamp(0.05, 4.0)
-        slow = (correlation / 0.4).clamp(0.1, 1.0)
+        slow = ((correlation - 0.15) / 0.3).clamp(0.1, 1.0)
         error = error * ratio
         inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
         bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
