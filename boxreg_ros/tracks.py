@@ -82,12 +82,12 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
     if len(rows) and not valid.any():
         raise ShapeError(f'boxes of track {track.track_id!r}: expected one finite box at least')
     if not valid.all():
-        boxes[:, 6:9][valid] = np.unwrap(boxes[:, 6:9][valid], axis=0)
-        for column in range(9):
-            boxes[~valid, column] = np.interp(
-                track.stamps_ns[~valid], track.stamps_ns[valid], boxes[valid, column]
-            )
-        boxes[:, 6:9] = np.arctan2(np.sin(boxes[:, 6:9]), np.cos(boxes[:, 6:9]))
+        known = boxes[valid]
+        known[:, 6:9] = np.unwrap(known[:, 6:9], axis=0)
+        when, stamps = track.stamps_ns[~valid], track.stamps_ns[valid]
+        between = np.stack([np.interp(when, stamps, column) for column in known.T], 1)
+        between[:, 6:9] = np.arctan2(np.sin(between[:, 6:9]), np.cos(between[:, 6:9]))
+        boxes[~valid] = between
         status = [s if v else INTERPOLATED for s, v in zip(status, valid, strict=True)]
     return RefinedTrack(
         track.track_id,

@@ -152,3 +152,26 @@ def test_points_are_carried_to_the_stamp():
     found = supported(late)
     np.testing.assert_allclose(found.outwardness[..., 0], 0, atol=1e-6)
     assert (supported(replace(late, delays=0 * late.delays)).outwardness[..., 0] < -0.4).all()
+
+
+def test_what_is_carried_does_not_hang_on_padding():
+    # The same two boxes alone, and padded to three as a window of a batch is.
+    boxes = np.array([[[i * 1.0, 0, 0, 4, 2, 2, 0, 0, 0] for i in (0, 1, 1)]])
+    points = np.tile(on_faces(0.0, faces=(0,)) - [0.5, 0, 0], (1, 3, 1, 1))
+    whole = problem_of(
+        boxes, points=points, delays=np.full((1, 3, 40), -0.05), valid=[[True, True, False]],
+        origins=np.full((1, 3, 3), 30.0),
+    )  # fmt: skip
+    alone = problem_of(
+        boxes[:, :2], points=points[:, :2], delays=np.full((1, 2, 40), -0.05),
+        origins=np.full((1, 2, 3), 30.0),
+    )  # fmt: skip
+    found, known = supported(whole).outwardness[:, :2], supported(alone).outwardness
+    np.testing.assert_allclose(known[..., 0], 0, atol=1e-6)
+    np.testing.assert_allclose(found, known)
+
+
+def test_what_is_seen_once_is_not_carried():
+    points = on_faces(0.0, faces=(0,))
+    once = seen_from([30.0, 0.0, 0.0], points, delays=np.full((1, 1, 40), -0.05))
+    assert supported(once).outwardness[0, 0, 0].item() == pytest.approx(0, abs=1e-6)

@@ -98,6 +98,34 @@ def test_the_order_of_windows_does_not_matter(config):
         np.testing.assert_allclose(a.boxes, b.boxes, atol=1e-8)
 
 
+def test_a_window_out_of_proportion_does_not_touch_its_neighbours():
+    # Stamps a nanosecond apart let the curvature lose its definiteness in rounding.
+    many = windows()
+    known = register(many, ALONE, InputModel(ALONE.faces))
+    bad = [o._replace(stamp_ns=i) for i, o in enumerate(many[2].observations)]
+    many[2] = many[2]._replace(observations=bad)
+    found = register(many, ALONE, InputModel(ALONE.faces))
+    for i in (0, 1, 3):
+        np.testing.assert_allclose(found[i].boxes, known[i].boxes, atol=1e-6)
+        assert found[i].status == known[i].status
+    assert np.isfinite(found[2].boxes).all()
+    assert np.isfinite(found[2].covariances).all()
+
+
+def test_what_was_seen_before_is_not_learnt_again():
+    config = ALONE.updated({'faces.learn': True})
+    model = InputModel(config.faces)
+    many = [window(drive(12), seed, config, str(seed)) for seed in range(4)]
+    register(many, config, model)
+    known = model.rule().gaps
+    assert (known - InputModel(config.faces).rule().gaps).abs().max() > 1e-4
+    again = [
+        w._replace(fresh=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
+    ]
+    register(again, config, model)
+    np.testing.assert_array_equal(model.rule().gaps, known)
+
+
 def test_short_windows_are_kept():
     many = [window(drive(2), 0, name='a'), window(drive(3), 0, name='b')]
     short, long = register(many, ALONE, InputModel(ALONE.faces))
