@@ -227,6 +227,8 @@ class BoxregNode(Node):
             assert publisher is not None  # it was made before boxes were subscribed to
             publisher.publish(out.message)
             self._health.count('final_published' if out.is_final else 'early_published')
+        if not self._markers.get_subscription_count():
+            return  # they take longer than the boxes
         for out in ready:
             if not out.is_final and out.given is not None and out.refined is not None:
                 self._markers.publish(self._board.update(out.given, out.refined))

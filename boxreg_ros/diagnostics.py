@@ -14,17 +14,22 @@ LOG_PERIOD = 10.0
 """The same trouble is logged this often at most [s]."""
 
 REMEDIES = {
-    'boxes_queue_full': TOO_SLOW,
     'failed': 'a fault of boxreg_ros: please report it with the log',
+    'points_queue_full': TOO_SLOW,
+    'boxes_queue_full': TOO_SLOW,
+    'unreadable': 'the log has the reason',
+    'no_transform': 'the log has the frames',
     'late': 'boxes came after younger ones: publish them in the order of their stamps',
-    'no_sweep': 'no cloud within tolerance of the stamp of the boxes: copy the stamp of the cloud',
     'no_track_id': 'boxes need an id that stays with the object: put a tracker before this node',
     'duplicate_track_id': 'an id may occur once per message',
-    'no_transform': 'see the log',
-    'points_queue_full': TOO_SLOW,
-    'unreadable': 'see the log',
+    'no_sweep': 'no cloud within tolerance of the stamp of the boxes: copy the stamp of the cloud',
 }
-"""Reasons that are the fault of someone, with what to do; the others are in the nature of data."""
+"""
+Reasons someone can do something about, the weightiest first, and what.
+
+The others, such as boxes without points, are in the nature of the data.
+
+"""
 
 
 class Health:
@@ -94,11 +99,10 @@ class Health:
 
 def _verdict(fresh: Counter[str]) -> tuple[bytes, str]:
     """Return level and message for what happened since the last time."""
-    faults = [reason for reason, _ in fresh.most_common() if reason in REMEDIES]
-    if fresh['failed']:
-        return DiagnosticStatus.ERROR, f'failed: {REMEDIES["failed"]}'
-    if faults:
-        return DiagnosticStatus.WARN, f'{faults[0]}: {REMEDIES[faults[0]]}'
+    fault = next((reason for reason in REMEDIES if fresh[reason]), None)
+    if fault is not None:
+        level = DiagnosticStatus.ERROR if fault == 'failed' else DiagnosticStatus.WARN
+        return level, f'{fault}: {REMEDIES[fault]}'
     missing = [name for name in ('points', 'boxes') if not fresh[f'{name}_received']]
     if missing:
         return DiagnosticStatus.WARN, f'nothing received on {" and ".join(missing)}'

@@ -21,12 +21,20 @@ class Inbox:
     """
     What waits for the worker: transforms, and a bounded number of clouds and of box arrays.
 
+    Many more box arrays than clouds: those whose cloud was dropped cost the solver nothing, and
+    come out in order with the others.
+
     Thread-safe: the executor puts, the worker takes; neither waits for the other.
+
+    Parameters
+    ----------
+    backlog : int
+        Clouds that may wait.
 
     """
 
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
+    def __init__(self, backlog: int) -> None:
+        self._capacity = {'points': backlog, 'boxes': 20 * backlog}
         self._lock = Lock()
         self._number = 0
         self._motion: deque[tuple[str, Any]] = deque()
@@ -44,7 +52,7 @@ class Inbox:
             self._number += 1
             queue = self._waiting[topic]
             queue.append(Message(self._number, topic, content, time.monotonic()))
-            dropped = queue.popleft() if len(queue) > self._capacity else None
+            dropped = queue.popleft() if len(queue) > self._capacity[topic] else None
         self.news.set()
         return dropped
 

@@ -30,7 +30,7 @@ NODE_SETTINGS = (
         's', 0.0, 60.0, (),
     ),
     Setting(
-        'backlog', 5, 'clouds, and box arrays, waiting for the solver; the oldest are dropped',
+        'backlog', 5, 'clouds waiting for the solver; beyond, the oldest are dropped',
         '', 1, 10000, (),
     ),
 )  # fmt: skip
