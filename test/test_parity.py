@@ -7,8 +7,8 @@ from msg_adapters import adapter_for
 from msg_adapters.poses import quaternions_of
 import numpy as np
 import pytest
-from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, stamp_of
-from ros_messages import DETECTIONS, Drive, MARKERS
+from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_messages import Drive
 
 SETTINGS = {'window': 5, 'lag': 3}
 
@@ -42,20 +42,26 @@ def as_published(messages, type_name):
     return found
 
 
-@pytest.mark.parametrize('boxes, motion', [('vision', 'tf'), ('markers', 'odometry')])
-def test_final_boxes_equal_those_of_relabel(tmp_path, boxes, motion):
-    type_name = DETECTIONS if boxes == 'vision' else MARKERS
-    path = Drive(sweeps=10, boxes=boxes, motion=motion).write(tmp_path / 'drive')
+@pytest.mark.parametrize('recording', ['vision-tf', 'markers-odometry', 'street'])
+def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
+    if recording == 'street':
+        path, boxes_topic = ROOT / 'bags' / 'street.mcap', '/detections'
+    else:
+        boxes, motion = recording.split('-')
+        path = Drive(sweeps=10, boxes=boxes, motion=motion).write(tmp_path / 'drive')
+        boxes_topic = '/boxes'
     expected = relabelled(path, tmp_path / 'out')
+    records = records_of(path, boxes_topic)
+    (type_name,) = {record.type_name for record in records if record.topic == boxes_topic}
     with graph_in(tmp_path) as graph:
         # Patient, so that no transform is extrapolated because a machine is busy.
         options = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=100']
         options += [f'{key}:={value}' for key, value in SETTINGS.items()]
-        records = records_of(path)
         publishers_for(graph, records)
         early = graph.collect(type_name, '/refined_boxes')
         final = graph.collect(type_name, '/refined_boxes_final')
-        node = graph.start(*RELIABLE, *(part for option in options for part in ('-p', option)))
+        parameters = [part for option in options for part in ('-p', option)]
+        node = graph.start(*RELIABLE, *parameters, '-r', f'boxes:={boxes_topic}')
         graph.wait_until_connected()
         play(graph, records, early)
         node.stop()
