@@ -106,12 +106,13 @@ class BoxregNode(Node):
         readable = sorted(name for name in types if name in ADAPTERS)
         try:
             if readable:
-                self._search.cancel()
                 self._open_boxes(readable[0])
+                self._search.cancel()
             elif types:
                 adapter_for(types.pop())
         except UnsupportedMessage as error:
-            self._trouble('unreadable', f'{self.resolve_topic_name("boxes")}: {error}')
+            if self._health.is_time_to_warn('boxes_type'):
+                self.get_logger().warning(f'{self.resolve_topic_name("boxes")}: {error}')
 
     def _open_boxes(self, type_name: str) -> None:
         adapter, kind = adapter_for(type_name), import_message(type_name)
@@ -212,7 +213,7 @@ class BoxregNode(Node):
             ready = self._live.process(item)
         except Exception as error:  # one bad tick must not end weeks of running
             self._trouble('failed', f'{type(error).__name__}: {error}')
-            ready = self._live.abandon()
+            ready = self._live.abandon(item)
         if self._fixed_frame != self._live.fixed_frame:
             self._fixed_frame = self._live.fixed_frame
             self.get_logger().info(f'fixed frame is {self._fixed_frame!r}')

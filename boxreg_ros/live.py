@@ -149,17 +149,20 @@ class LiveRegistrar:
         """End all tracks and return everything still held."""
         return self._outgoing(self._registrar.flush())
 
-    def abandon(self) -> list[Outgoing]:
-        """Start afresh after a fault; return the messages held, with the boxes they came with."""
+    def abandon(self, item: Arrival) -> list[Outgoing]:
+        """Start afresh after a fault with an arrival; pass it and what is held through."""
         self._registrar.reset()
         held = [p for _, pending in sorted(self._pending.items()) for p in pending]
         self._pending.clear()
-        return [
+        passed = [
             out
             for p in held
             for out in self.passed_through(p.message)
             if out.is_final or not p.is_early_out
         ]
+        if isinstance(item.content, BoxArray) and all(p.message is not item.message for p in held):
+            passed += self.passed_through(item.message)
+        return passed
 
     @staticmethod
     def passed_through(message: Any) -> list[Outgoing]:

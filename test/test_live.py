@@ -126,9 +126,10 @@ def test_boxes_before_any_cloud_say_what_is_missing():
 
 def test_after_a_fault_all_that_is_held_passes_through_once():
     drive = Drive(sweeps=6)
+    faulty = arrival(*drive.items.pop()[::2])
     live = Live()
     before = live.feed(drive)
-    after = live.abandon()
+    after = live.abandon(faulty)
     for is_final in (False, True):
         stamps = [
             vision.from_msg(item.message).stamp_ns
