@@ -43,7 +43,8 @@ class StampMatcher:
     def add_sweep(self, sweep: Sweep) -> list[Pair]:
         """Take a sweep; return the pairs that are complete now."""
         insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
-        self._newest_sweep_ns = max(sweep.stamp_ns, self._newest_sweep_ns or sweep.stamp_ns)
+        newest = self._newest_sweep_ns
+        self._newest_sweep_ns = sweep.stamp_ns if newest is None else max(sweep.stamp_ns, newest)
         pairs = self._complete()
         while len(self._sweeps) > self._capacity:
             self._forget_sweep(0)

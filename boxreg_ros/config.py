@@ -47,13 +47,9 @@ class Setting(NamedTuple):
 class SamplingConfig:
     """Which points an observation keeps."""
 
-    deskew: bool = setting(
-        False, 'carry points by their own times to where a moving object is at the stamp'
-    )
-    margin: float = setting(
-        0.6, 'points this far outside the input box still count', 'm', 0.05, 5.0
-    )
-    points: int = setting(256, 'points kept per box by farthest point sampling', '', 8, 100000)
+    deskew: bool = setting(False, 'carry points by their times to where a moving object is')
+    margin: float = setting(0.6, 'points this far outside a box count', 'm', 0.05, 5.0)
+    points: int = setting(256, 'points kept per box', '', 8, 100000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +86,7 @@ class SolverConfig:
     iterations: int = setting(3, 'most L-BFGS iterations per round', '', 1, 10000)
     history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
     threads: int = setting(1, 'cores of the solver; more pay only where all are idle', '', 1, 256)
-    tolerance: float = setting(
-        1e-4, 'a window ends when a step promises less than this', '', 0.0, 1.0
-    )
+    tolerance: float = setting(1e-4, 'a step that promises less ends a window', '', 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +95,8 @@ class PaperConfig:
 
     closeness: float = setting(1.0, 'weight of Eq. 4', '1/m^2', 0.0, 1e6)
     enclosure: float = setting(1.0, 'weight of Eq. 5', '1/m', 0.0, 1e6)
-    smoothness: float = setting(
-        0.1, 'weight of Eq. 6, and first penalty of its constraint', '', 0.0, 1e6
-    )
-    alignment: float = setting(
-        0.1, 'weight of Eq. 7, and first penalty of its constraint', '', 0.0, 1e6
-    )
+    smoothness: float = setting(0.1, 'weight of Eq. 6 and of its constraint', '', 0.0, 1e6)
+    alignment: float = setting(0.1, 'weight of Eq. 7 and of its constraint', '', 0.0, 1e6)
     nearest: int = setting(16, 'K, the closest points per visible face in Eq. 4', '', 1, 10000)
     multiplier_rounds: int = setting(3, 'updates of the two Lagrange multipliers', '', 1, 100)
     iterations: int = setting(60, 'most L-BFGS iterations per update', '', 1, 10000)
@@ -124,9 +114,7 @@ class ClassConfig:
     tilting: float = setting(0.2, 'expected change of roll and pitch rate', 'rad/s^2', 1e-3, 1e3)
     slip: float = setting(0.15, 'expected sideways velocity of the rear axle', 'm/s', 1e-3, 1e3)
     climb: float = setting(0.25, 'expected velocity along its own z axis', 'm/s', 1e-3, 1e3)
-    pivot: float = setting(
-        0.25, 'what does not slip sideways, behind the centre, part of the length', '', 0.0, 0.5
-    )
+    pivot: float = setting(0.25, 'rear axle behind the centre, by length', '', 0.0, 0.5)
     drift: float = setting(0.02, 'step of a parked box: map and ego drift', 'm', 1e-4, 1.0)
     position: float = setting(0.14, 'error of an input centre along the heading', 'm', 1e-3, 10.0)
     lateral: float = setting(0.08, 'error of an input centre across the heading', 'm', 1e-3, 10.0)
@@ -159,15 +147,8 @@ class Config:
     )
     window: int = setting(10, 'observations per sliding window', '', 3, 1000)
     lag: int = setting(5, 'observations a final box waits for', '', 0, 999)
-    track_window: int = setting(
-        100, "observations solved together for estimate 'track'", '', 10, 10000
-    )
-    min_observations: int = setting(
-        3, 'a window with fewer observations keeps its input', '', 2, 1000
-    )
-    min_points: int = setting(
-        5, 'a window with fewer points per box, on average, is smoothed only', '', 0, 100000
-    )
+    track_window: int = setting(100, "observations solved at once for 'track'", '', 10, 10000)
+    min_observations: int = setting(3, 'shorter windows keep their input', '', 2, 1000)
     max_gap: float = setting(1.0, 'a longer silence ends a track', 's', 0.01, 1e4)
     tolerance: float = setting(0.02, 'boxes and sweep belong together within this', 's', 0.0, 10.0)
     queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)
@@ -359,7 +340,6 @@ def _check(item: Setting, value: Any) -> None:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         low = -float('inf') if item.low is None else item.low
         high = float('inf') if item.high is None else item.high
+        unit = f' {item.unit}' if item.unit else ''
         if not low <= value <= high:
-            raise ConfigError(
-                f'{item.name}: expected {low:g} to {high:g} {item.unit}, got {value!r}'
-            )
+            raise ConfigError(f'{item.name}: expected {low:g} to {high:g}{unit}, got {value!r}')

@@ -27,8 +27,8 @@ class BoxRegistrar:
     one frame, the fixed frame of all that is added. Not thread-safe.
 
     Every box array added comes back exactly once with ``is_final=True``, all its boxes in the
-    order of the input, stamps ascending. With `estimate` 'early' or 'final' it comes back once
-    more before that, with ``is_final=False``, as soon as it is paired.
+    order of the input, stamps ascending but for what came late. With `estimate` 'early' or
+    'final' it comes back once more before that, with ``is_final=False``, as soon as it is paired.
 
     Attributes
     ----------
@@ -80,7 +80,8 @@ class BoxRegistrar:
             if self._config.estimate != 'track':
                 self._solve([t for t in self._tracks.values() if t.newest_tick is tick])
                 ready.append(tick.result(is_final=False))
-                for old in list(self._ticks)[: max(0, len(self._ticks) - self._config.lag)]:
+                paired = [t for t in self._ticks if t.is_paired]
+                for old in paired[: max(0, len(paired) - self._config.lag)]:
                     old.waiting = 0
             elif self._count % (self._config.track_window // 2) == 0:
                 self._solve_tracks()
@@ -102,7 +103,8 @@ class BoxRegistrar:
         self._ticks.append(tick)
         now_ns = boxes.stamp_ns
         late = self._newest_ns is not None and now_ns <= self._newest_ns
-        self._newest_ns = max(now_ns, self._newest_ns or now_ns)
+        self._newest_ns = now_ns if self._newest_ns is None else max(now_ns, self._newest_ns)
+        tick.is_paired = sweep is not None and not late
         if sweep is None:
             self.counts['boxes_without_sweep'] += 1
         tick.refuse('late' if late else 'no_sweep' if sweep is None else '')
@@ -159,6 +161,7 @@ class _Tick:
     num_points: np.ndarray
     covariances: np.ndarray
     waiting: int = 0
+    is_paired: bool = False
 
     @classmethod
     def of(cls, boxes: BoxArray) -> '_Tick':

@@ -16,10 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-MARGINS = (
-    0.4,
-    0.3,
-)  # around the box, where a face's points are looked for: first round, later [m]
+# Around the box, where a face's points are looked for: first round, later [m].
+MARGINS = 0.4, 0.3
 RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
@@ -142,7 +140,7 @@ def solve(
     for turn in range(rounds):
         margin = MARGINS[0] if turn == 0 and rounds > 1 else MARGINS[1]
         sights = support(problem, state, margin, config.faces.outermost, rule.depths)
-        terms = weigh(problem, state, sights, expected, noise, config)
+        terms = weigh(problem, state, sights, expected, noise, config, is_first=turn == 0)
         metric = _Metric(objective.curvature(terms, state.pack(), length), free)
         found = minimize(
             _Sum(terms, length, free),
@@ -234,12 +232,10 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
         everything = torch.arange(len(x), device=x.device)
         _, violation = objective.total(boxes(x, everything), problem, settings, multipliers)
         multipliers += violation * x.new_tensor([settings.smoothness, settings.alignment])
-    kind = problem.deviations
     names = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
-    spread = torch.stack([kind[name] for name in names], -1) ** 2
-    return State(x.unflatten(1, (length, 6)), expected), torch.diag_embed(spread)[:, None].expand(
-        -1, length, -1, -1
-    )
+    errors = torch.stack([problem.deviations[name] for name in names], -1)
+    spread = torch.diag_embed(errors**2)[:, None].expand(-1, length, -1, -1)
+    return State(x.unflatten(1, (length, 6)), expected), spread
 
 
 def weigh(
@@ -249,6 +245,7 @@ def weigh(
     expected: Tensor,
     noise: InputNoise | None,
     config: Config,
+    is_first: bool = False,
 ) -> list[Term]:
     """
     Return the terms of one round, weighted by expected deviations and by how far off they are.
@@ -282,7 +279,8 @@ def weigh(
         inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
         bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
         extent = extent * slow[6:]
-    off = objective.prior(problem, state).residual[:, :, 0] / error[:, None]
+    off = objective.prior(problem, state).residual[:, :, 0]
+    off = (off.abs() + surprise(problem) * is_first) / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     hidden = (sights.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
     gap = (faces.spread**2 + (RETREAT_SPREAD * hidden) ** 2).sqrt()
@@ -315,6 +313,29 @@ def weigh(
     ]
 
 
+def surprise(problem: Problem) -> Tensor:
+    """
+    Return how far each input pose is off what its neighbours make expect, shape (B, N, 6).
+
+    The least of what two before, two after and one on each side say, along the axes of the box:
+    before anything is solved, an outlier is told by all of them, its neighbours by two at most.
+    A third of it counts: noise alone makes so much more of it than of the noise itself.
+
+    """
+    pose, t = problem.pose, problem.times[..., None]
+    axes = rotation_from_rpy(pose[..., 3:])
+    least = torch.full_like(pose, torch.inf)
+    for first, second in ((-2, -1), (-1, 1), (1, 2)):
+        low, high = max(0, -first), max(0, -first, pose.shape[1] - max(0, second))
+        a, b, here = (slice(low + k, high + k) for k in (first, second, 0))
+        share = (t[:, here] - t[:, a]) / (t[:, b] - t[:, a])
+        off = pose[:, here] - pose[:, a] - share * (pose[:, b] - pose[:, a])
+        off = torch.cat([(axes[:, here].mT @ off[..., :3, None])[..., 0], off[..., 3:]], -1).abs()
+        real = (problem.valid[:, a] & problem.valid[:, b])[..., None]
+        least[:, here] = least[:, here].minimum(torch.where(real, off, torch.inf))
+    return torch.where(least.isfinite(), least, 0.0) / 3
+
+
 def _parked(problem: Problem) -> Tensor:
     """Return 1 for the steps (B, N - 1) of windows whose input hardly moves, else 0."""
     count = problem.valid.sum(1, keepdim=True)
@@ -322,10 +343,10 @@ def _parked(problem: Problem) -> Tensor:
     third = (count + 2) // 3
     where = torch.cat([problem.boxes[..., :2], problem.times[..., None]], -1)
 
-    def mean(part: Tensor) -> Tensor:
-        return (where * part[..., None]).sum(1) / part.sum(1, keepdim=True)
+    def middle(part: Tensor) -> Tensor:
+        return torch.where(part[..., None], where, torch.nan).nanmedian(1).values
 
-    change = mean((index >= count - third) & problem.valid) - mean(index < third)
+    change = middle((index >= count - third) & problem.valid) - middle(index < third)
     moved: Tensor = change[:, :2].norm(dim=1)
     is_parked = (moved < PARKED[0] * change[:, 2]) & (moved < PARKED[1])
     still: Tensor = (is_parked[:, None] & problem.valid[:, 1:]).to(where)

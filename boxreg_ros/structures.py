@@ -129,7 +129,7 @@ class RefinedBoxes:
     reasons : tuple of n str
         Why a box was kept; empty for the others.
     num_points : array, shape (n,)
-        Sweep points inside the box that is returned.
+        Sweep points inside the input box.
     covariances : array, shape (n, 6, 6)
         Of x y z roll pitch yaw; NaN-free, large where nothing is known.
     is_final : bool

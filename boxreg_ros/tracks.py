@@ -24,8 +24,8 @@ def refine(tracks: Sequence[Track], config: Config | None = None) -> list[Refine
     Parameters
     ----------
     tracks : sequence of Track
-        Objects over time in one fixed frame. Tracks that share a stamp share its sweep: they are
-        fitted knowing each other's boxes.
+        Objects over time in one fixed frame. Tracks that share a stamp share its sweep and its
+        sensor: they are fitted knowing each other's boxes.
     config : Config, optional
         Settings; `estimate` says which of the estimates of a box is returned.
 
@@ -54,13 +54,15 @@ def refine(tracks: Sequence[Track], config: Config | None = None) -> list[Refine
     for stamp_ns, places in sorted(at.items()):
         members = [tracks[index] for index, _ in places]
         origins = [
-            np.full(3, np.nan) if t.sensor_origins is None else t.sensor_origins[row]
-            for t, (_, row) in zip(members, places, strict=True)
+            track.sensor_origins[row]
+            for track, (_, row) in zip(members, places, strict=True)
+            if track.sensor_origins is not None
         ]
+        origin = origins[0] if origins else np.full(3, np.nan)
         boxes = np.array([tracks[index].boxes[row] for index, row in places])
         points = np.concatenate([tracks[index].points[row] for index, row in places])
         points = points[np.isfinite(points).all(1)]
-        results += registrar.add_sweep(Sweep(stamp_ns, '', points, None, origins[0]))
+        results += registrar.add_sweep(Sweep(stamp_ns, '', points, None, origin))
         ids, classes = [t.track_id or '?' for t in members], [t.class_name for t in members]
         results += registrar.add_boxes(
             BoxArray(stamp_ns, '', tuple(ids), tuple(classes), np.ones(len(ids)), boxes)

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     ('structures', 'config', 'errors'),
     ('geometry', 'metrics'),
-    ('sampling', 'objective', 'lbfgs'),
+    ('sampling', 'objective', 'correspondence', 'lbfgs'),
     ('calibration', 'window', 'registration'),
     ('association', 'registrar'),
     ('boxtable', 'labels', 'recording', 'transforms'),
@@ -148,7 +148,7 @@ boxes = np.array([[10.0 + i, 0, 0, 4, 1.8, 1.5, 0, 0, 0] for i in range(6)])
 points = [box[:3] + rear for box in boxes]
 boxes[2, 0] += 0.3
 track = Track('7', 'car', stamps, boxes, points, sensor_origins=np.zeros((6, 3)))
-(refined,) = refine([track], Config(min_points=1))
+(refined,) = refine([track], Config())
 assert refined.track_id == '7' and refined.boxes.shape == (6, 9)
 assert np.isfinite(refined.boxes).all()
 assert set(refined.status) <= {{'refined', 'kept', 'interpolated'}}, refined.status
