@@ -75,10 +75,9 @@ def _register(windows: Sequence[Window], config: Config, model: InputModel) -> l
             rounds = 1 if part[0].is_warm else config.solver.rounds
             state, covariances = solve(problem, config, model, rounds)
         if config.estimate != 'track':
-            _learn_noise(model, part, problem, state, config)
-        for i, estimate in zip(
-            rows, _estimates(part, problem, base, state, covariances, config), strict=True
-        ):
+            _learn_noise(model, part, problem, state, config.lag)
+        found = _estimates(part, problem, base, state, covariances, config)
+        for i, estimate in zip(rows, found, strict=True):
             estimates[i] = estimate
     return estimates
 
@@ -94,9 +93,8 @@ def _estimates(
     """Return what a solved batch says of each window, in the fixed frame."""
     given = problem.boxes[..., 3:6]
     extent = given if config.extent == 'fixed' else state.shared[:, None, EXTENT].expand_as(given)
-    held = torch.stack(
-        [_held(problem, problem.pose, given), _held(problem, state.pose, extent)], 1
-    )
+    pairs = ((problem.pose, given), (state.pose, extent))
+    held = torch.stack([_held(problem, *pair) for pair in pairs], 1)
     angles = torch.atan2(state.pose[..., 3:].sin(), state.pose[..., 3:].cos())
     boxes = torch.cat([state.pose[..., :3], extent, angles], -1).cpu().numpy()
     boxes[..., :3] += base[:, None]
@@ -110,14 +108,10 @@ def _estimates(
 
 
 def _learn_noise(
-    model: InputModel,
-    windows: Sequence[Window],
-    problem: Problem,
-    state: State,
-    config: Config,
+    model: InputModel, windows: Sequence[Window], problem: Problem, state: State, lag: int
 ) -> None:
     """Show the model how the input scatters where a window knows it best, `lag` from its end."""
-    best = torch.tensor([max(0, len(w.observations) - 1 - config.lag) for w in windows])
+    best = torch.tensor([max(0, len(w.observations) - 1 - lag) for w in windows])
     rows = scatter(problem, state)[torch.arange(len(windows)), best]
     model.learn_noise([w.track_id for w in windows], rows.cpu().numpy())
 
