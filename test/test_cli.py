@@ -79,7 +79,7 @@ def test_resume_does_what_is_left_to_do(tmp_path, capsys):
     before = (tmp_path / 'out' / 'boxes.csv').stat().st_mtime_ns
     assert 'already there' in boxreg(capsys, *command)[1]
     assert (tmp_path / 'out' / 'boxes.csv').stat().st_mtime_ns == before
-    assert ' boxes in' in boxreg(capsys, *command, '--set', 'min_points=9')[1]
+    assert ' boxes in' in boxreg(capsys, *command, '--set', 'max_gap=0.9')[1]
 
 
 @pytest.mark.parametrize(
