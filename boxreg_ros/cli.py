@@ -57,18 +57,23 @@ def _run(arguments: list[str]) -> int:
     command = next((item for item in arguments if not item.startswith('-')), None)
     if command == 'node' and arguments[0] == 'node':  # its arguments are those of any ROS node
         return int(import_module('boxreg_ros.node').main(arguments[1:]) or DONE)
-    parser = argparse.ArgumentParser(
+    args = parser(command).parse_args(arguments)
+    return int(import_module(f'boxreg_ros.{args.command}').run(args))
+
+
+def parser(command: str | None) -> argparse.ArgumentParser:
+    """Return the parser of `boxreg`, with the options of one `command` alone."""
+    whole = argparse.ArgumentParser(
         'boxreg', description='Register tracked 3D boxes to point clouds.'
     )
-    parser.add_argument('--version', action='version', version=f'boxreg {__version__}')
-    subparsers = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
+    whole.add_argument('--version', action='version', version=f'boxreg {__version__}')
+    subparsers = whole.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for name, summary in COMMANDS.items():
         subparser = subparsers.add_parser(name, help=summary, description=f'{summary}.')
         subparser.add_argument('--debug', action='store_true', help=argparse.SUPPRESS)
         if name == command and name != 'node':
             import_module(f'boxreg_ros.{name}').add_arguments(subparser)
-    args = parser.parse_args(arguments)
-    return int(import_module(f'boxreg_ros.{args.command}').run(args))
+    return whole
 
 
 def _fail(message: str, status: int) -> int:

@@ -1,0 +1,59 @@
+"""What the README shows is so; `python test/test_readme.py` writes its table of parameters anew."""
+
+from pathlib import Path
+import re
+import shlex
+
+from boxreg_ros.cli import parser
+from boxreg_ros.config import settings
+
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / 'README.md'
+BEGIN, END = '<!-- parameters', '<!-- end of parameters -->'
+
+
+def table():
+    rows = ['| name | default | unit | range | meaning |', '|---|---|---|---|---|']
+    for item in settings():
+        bounds = ', '.join(item.choices)
+        if item.low is not None:
+            bounds = f'{item.low:g} to {item.high:g}'
+        default = item.default
+        if isinstance(default, tuple):
+            default = ', '.join(default)
+        cells = (f'`{item.name}`', f'{default}', item.unit, bounds, item.meaning)
+        rows.append(f'| {" | ".join(cells)} |')
+    return '\n'.join(rows)
+
+
+def with_table(text):
+    first = text.index('\n', text.index(BEGIN))
+    return f'{text[:first]}\n\n{table()}\n\n{text[text.index(END) :]}'
+
+
+def commands():
+    lines = README.read_text(encoding='utf-8').splitlines()
+    return [line.strip() for line in lines if re.match(r'    boxreg \w', line)]
+
+
+def test_parameters_are_those_of_config():
+    text = README.read_text(encoding='utf-8')
+    assert text == with_table(text), 'run: python test/test_readme.py'
+
+
+def test_commands_are_understood():
+    assert len(commands()) >= 3
+    for command in commands():
+        words = shlex.split(command)[1:]
+        parser(words[0]).parse_args(words)
+
+
+def test_links_lead_somewhere():
+    links = re.findall(r'\]\(([^)]+)\)', README.read_text(encoding='utf-8'))
+    files = [link for link in links if not link.startswith('http')]
+    assert len(files) >= 3
+    assert [link for link in files if not (ROOT / link).exists()] == []
+
+
+if __name__ == '__main__':
+    README.write_text(with_table(README.read_text(encoding='utf-8')), encoding='utf-8')
