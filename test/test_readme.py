@@ -1,4 +1,4 @@
-"""What the README shows is so; `python test/test_readme.py` writes its table of parameters anew."""
+"""The README shows what is so; `python test/test_readme.py` writes its table of parameters."""
 
 from pathlib import Path
 import re
