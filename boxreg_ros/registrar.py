@@ -1,11 +1,12 @@
 """The one stateful object of the core: sweeps and boxes in, refined boxes out, nothing else."""
 
 from collections import Counter, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from boxreg_ros.association import Pair, StampMatcher
 from boxreg_ros.calibration import InputModel
 from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError
 from boxreg_ros.registration import Estimate, register
 from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import (
@@ -17,6 +18,7 @@ from boxreg_ros.structures import (
 )
 from boxreg_ros.window import Window
 import numpy as np
+import torch
 
 
 class BoxRegistrar:
@@ -38,6 +40,12 @@ class BoxRegistrar:
     """
 
     def __init__(self, config: Config) -> None:
+        try:
+            torch.zeros(1, device=config.device)
+        except (AssertionError, RuntimeError) as error:  # torch says it in either way
+            reason = str(error).splitlines()[0]
+            wanted = "device: expected one that torch can use here, such as 'cpu', got "
+            raise ConfigError(f'{wanted}{config.device!r}: {reason}') from None
         self._config = config
         self.counts: Counter[str] = Counter()
         self.reset()
@@ -184,15 +192,7 @@ class _Tick:
                 seen.add(name)
 
     def result(self, is_final: bool) -> RefinedBoxes:
-        source = self.boxes
-        boxes = BoxArray(
-            source.stamp_ns,
-            source.frame_id,
-            source.track_ids,
-            source.class_names,
-            source.scores,
-            self.refined.copy(),
-        )
+        boxes = replace(self.boxes, boxes=self.refined.copy())
         return RefinedBoxes(
             boxes,
             tuple(self.status),
