@@ -115,6 +115,7 @@ class ClassConfig:
     slip: float = setting(0.15, 'expected sideways velocity of the rear axle', 'm/s', 1e-3, 1e3)
     climb: float = setting(0.25, 'expected velocity along its own z axis', 'm/s', 1e-3, 1e3)
     pivot: float = setting(0.25, 'rear axle behind the centre, by length', '', 0.0, 0.5)
+    shape: float = setting(0.03, 'how far its surface is from rigid', 'm', 1e-3, 1.0)
     drift: float = setting(0.02, 'step of a parked box: map and ego drift', 'm', 1e-4, 1.0)
     position: float = setting(0.14, 'error of an input centre along the heading', 'm', 1e-3, 10.0)
     lateral: float = setting(0.08, 'error of an input centre across the heading', 'm', 1e-3, 10.0)
@@ -166,14 +167,14 @@ class Config:
         default_factory=lambda: ClassConfig(
             names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
             acceleration=2.0,
-            cornering=2.0, turning=1.5, slip=0.4, pivot=0.2, heading=0.15, extent=0.1,
+            cornering=2.0, turning=1.5, slip=0.4, pivot=0.2, shape=0.06, heading=0.15, extent=0.1,
         )
     )  # fmt: skip
     pedestrian: ClassConfig = field(
         default_factory=lambda: ClassConfig(
             names=('pedestrian', 'person', 'walker', 'people', 'child'),
             acceleration=2.0,
-            cornering=2.0, turning=4.0, slip=1.5, pivot=0.0, heading=0.5, extent=0.1,
+            cornering=2.0, turning=4.0, slip=1.5, pivot=0.0, shape=0.15, heading=0.5, extent=0.1,
         )
     )  # fmt: skip
 

@@ -199,9 +199,10 @@ def _mean(values: Tensor, real: Tensor) -> Tensor:
 
 # --- ours ---------------------------------------------------------------------------------------
 
-SHARED = 16  # extent (3), bias of the input (6), gap of the faces (6), pivot
+SHARED = 22  # extent (3), bias of the input (6), gap of the faces (6), pivot, anchor (6)
 EXTENT, BIAS, GAP = slice(0, 3), slice(3, 9), slice(9, 15)
 PIVOT = 15
+ANCHOR = slice(16, 22)
 
 
 class State(NamedTuple):
@@ -339,6 +340,28 @@ def faces(problem: Problem, state: State, inset: Tensor) -> Linearised:
     by_shared[..., face, 3, FACE_AXIS] = -0.5
     by_shared[..., face, 3, 9 + face] = 1.0
     return Linearised(residual, by_pose, by_shared)
+
+
+def shape(problem: Problem, state: State, data: Tensor) -> Linearised:
+    """Pose against where the track's shape wants it, in body axes; data (B, N, 24)."""
+    start, wanted = data[..., :6], data[..., 6:]
+    by_body = start.new_zeros((*start.shape, 6))
+    R = rotation_from_rpy(start[..., 3:])
+    by_body[..., :3, :3] = R.mT
+    by_body[..., 3:, 3:] = body_rates(start[..., 3:])
+    moved = (by_body @ (state.pose - start)[..., None])[..., 0]
+    residual = moved - wanted - state.shared[:, None, ANCHOR]
+    by_shared = residual.new_zeros((*residual.shape[:2], 1, 6, SHARED))
+    by_shared[..., ANCHOR] = -torch.eye(6).to(R)
+    return Linearised(residual[:, :, None], by_body[:, :, None, :, None, :], by_shared)
+
+
+def body_rates(rpy: Tensor) -> Tensor:
+    """Return the matrix (..., 3, 3) from changes of roll pitch yaw to rotation in body axes."""
+    cr, cp, _ = torch.cos(rpy).unbind(-1)
+    sr, sp, _ = torch.sin(rpy).unbind(-1)
+    zero, one = torch.zeros_like(cr), torch.ones_like(cr)
+    return torch.stack([one, zero, -sp, zero, cr, sr * cp, zero, -sr, cr * cp], -1).unflatten(-1, (3, 3))
 
 
 def prior(problem: Problem, state: State, _: None = None) -> Linearised:

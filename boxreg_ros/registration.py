@@ -10,6 +10,7 @@ from boxreg_ros.correspondence import Support, support
 from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.lbfgs import minimize
 from boxreg_ros.objective import EXTENT, Problem, SHARED, State, Term
+from boxreg_ros.shape import agreement
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED
 from boxreg_ros.window import batches, stack, Window
 import numpy as np
@@ -21,6 +22,7 @@ MARGINS = 0.4, 0.3
 RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
+GAP_OUTLIER = 3.0
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 
@@ -135,6 +137,11 @@ def solve(
         margin = MARGINS[0] if turn == 0 and rounds > 1 else MARGINS[1]
         sights = support(problem, state, margin, config.faces.outermost, rule.depths)
         terms = weigh(problem, state, sights, expected, noise, config, is_first=turn == 0)
+        if turn > 0 and config.estimate == 'track':
+            state.shared[:, objective.ANCHOR] = 0.0
+            information, wanted = agreement(problem, state)
+            data = torch.cat([state.pose, wanted], -1)
+            terms.append(Term(objective.shape, problem, information[:, :, None], data))
         metric = _Metric(objective.curvature(terms, state.pack(), length), free)
         found = minimize(
             _Sum(terms, length, free),
@@ -278,8 +285,10 @@ def weigh(
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     hidden = (sights.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
     gap = (faces.spread**2 + (RETREAT_SPREAD * hidden) ** 2).sqrt()
+    unusual = (state.shared[:, objective.GAP] - expected[:, objective.GAP]) / gap
+    gap = gap * (1 + (unusual / GAP_OUTLIER) ** 2).sqrt()
     shared = (
-        torch.cat([expected[:, :3] * extent, bias, gap, torch.full_like(gap[:, :1], 0.25)], 1)
+        torch.cat([expected[:, :3] * extent, bias, gap, torch.full_like(gap[:, :1], 0.25), torch.full_like(gap, 1.0)], 1)
         ** -2
     )
     # Motion: smoothness, alignment, rest.
@@ -357,7 +366,7 @@ def expected_shared(problem: Problem, rule: Rule) -> Tensor:
     kept = ((index >= cut) & (index < count[:, None] - cut))[..., None]
     mean = torch.where(kept, ranked, 0.0).sum(1) / kept.sum(1)
     gaps = rule.gaps.to(mean).expand(len(mean), 6)
-    return torch.cat([mean, torch.zeros_like(gaps), gaps, problem.deviations['pivot'][:, None]], 1)
+    return torch.cat([mean, torch.zeros_like(gaps), gaps, problem.deviations['pivot'][:, None], torch.zeros_like(gaps)], 1)
 
 
 def free_variables(problem: Problem, config: Config) -> Tensor:
