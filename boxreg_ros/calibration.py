@@ -60,7 +60,7 @@ class Rule(NamedTuple):
 def scatter(problem: Problem, state: State) -> Tensor:
     """Return input minus fit along the box axes, as `InputNoise` counts them, (B, N, 9)."""
     difference = problem.pose - state.pose
-    along = (rotation_from_rpy(problem.pose[..., 3:]).mT @ difference[..., :3, None])[..., 0]
+    along = (rotation_from_rpy(state.pose[..., 3:]).mT @ difference[..., :3, None])[..., 0]
     extent = problem.boxes[..., 3:6] / state.shared[:, None, EXTENT] - 1
     return torch.cat([along, difference[..., 3:], extent], -1)
 

@@ -82,8 +82,8 @@ class FaceConfig:
 class SolverConfig:
     """L-BFGS and the rounds around it."""
 
-    rounds: int = setting(3, 'outer rounds: outermost points and weights renewed', '', 1, 100)
-    iterations: int = setting(3, 'most L-BFGS iterations per round', '', 1, 10000)
+    rounds: int = setting(15, 'most outer rounds: outermost points and weights renewed', '', 1, 100)
+    iterations: int = setting(2, 'most L-BFGS iterations per round', '', 1, 10000)
     history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
     threads: int = setting(1, 'cores of the solver; more pay only where all are idle', '', 1, 256)
     tolerance: float = setting(1e-4, 'a step that promises less ends a window', '', 0.0, 1.0)

@@ -364,11 +364,10 @@ def body_rates(rpy: Tensor) -> Tensor:
     return torch.stack([one, zero, -sp, zero, cr, sr * cp, zero, -sr, cr * cp], -1).unflatten(-1, (3, 3))
 
 
-def prior(problem: Problem, state: State, _: None = None) -> Linearised:
-    """Deviation of the poses from the input, along its axes, less the bias [m, rad]."""
-    given = problem.pose
-    R = rotation_from_rpy(given[..., 3:])
-    difference = state.pose - given
+def prior(problem: Problem, state: State, axes: Tensor) -> Linearised:
+    """Deviation of the poses from the input along `axes` (B, N, 3, 3), less the bias [m, rad]."""
+    R = axes
+    difference = state.pose - problem.pose
     along = (R.mT @ difference[..., :3, None])[..., 0]
     residual = torch.cat([along, difference[..., 3:]], -1) - state.shared[:, None, BIAS]
     by_pose = residual.new_zeros((*residual.shape[:2], 1, 6, 1, 6))

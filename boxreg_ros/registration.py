@@ -22,7 +22,9 @@ MARGINS = 0.4, 0.3
 RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
-GAP_OUTLIER = 3.0
+
+GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
+SETTLED = 0.1  # a window whose boxes move less, in errors of the input, is done
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 
@@ -132,29 +134,42 @@ def solve(
     rule, noise = model.rule(), model.noise()
     expected = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), expected.clone())
+    covariances = state.pose.new_zeros((*state.pose.shape, 6))
     free = free_variables(problem, config)
+    rows = torch.arange(len(expected), device=expected.device)
+    everything = problem
     for turn in range(rounds):
         margin = MARGINS[0] if turn == 0 and rounds > 1 else MARGINS[1]
-        sights = support(problem, state, margin, config.faces.outermost, rule.depths)
-        terms = weigh(problem, state, sights, expected, noise, config, is_first=turn == 0)
+        part = State(state.pose[rows], state.shared[rows])
+        sights = support(problem, part, margin, config.faces.outermost, rule.depths)
+        terms = weigh(problem, part, sights, expected[rows], noise, config, is_first=turn == 0)
         if turn > 0 and config.estimate == 'track':
-            state.shared[:, objective.ANCHOR] = 0.0
-            information, wanted = agreement(problem, state)
-            data = torch.cat([state.pose, wanted], -1)
+            part.shared[:, objective.ANCHOR] = 0.0
+            information, wanted = agreement(problem, part)
+            data = torch.cat([part.pose, wanted], -1)
             terms.append(Term(objective.shape, problem, information[:, :, None], data))
-        metric = _Metric(objective.curvature(terms, state.pack(), length), free)
+        metric = _Metric(objective.curvature(terms, part.pack(), length), free[rows])
         found = minimize(
-            _Sum(terms, length, free),
-            state.pack(),
+            _Sum(terms, length, free[rows]),
+            part.pack(),
             settings.iterations,
             settings.history,
             settings.tolerance,
             metric,
         )
-        state = State.unpack(found.x, length)
+        fresh = State.unpack(found.x, length)
+        state.pose[rows], state.shared[rows] = fresh.pose, fresh.shared
+        covariances[rows] = metric.blocks(length)
         if config.estimate == 'track':
-            noise = InputNoise.measure(scatter(problem, state), problem.valid)
-    return state, metric.blocks(length)
+            noise = InputNoise.measure(scatter(everything, state), everything.valid)
+        errors = torch.stack([problem.deviations[n] for n in ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')], -1)
+        moved = ((fresh.pose - part.pose) / errors[:, None]).square().mean(2).amax(1).sqrt()
+        moving = moved > SETTLED
+        if turn > 1:
+            rows, problem = rows[moving], problem.select(moving.nonzero()[:, 0])
+        if not len(rows):
+            break
+    return state, covariances
 
 
 class _Sum:
@@ -280,7 +295,8 @@ def weigh(
         inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
         bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
         extent = extent * slow[6:]
-    off = objective.prior(problem, state).residual[:, :, 0]
+    axes = rotation_from_rpy(state.pose[..., 3:])
+    off = objective.prior(problem, state, axes).residual[:, :, 0]
     off = (off.abs() + surprise(problem) * is_first) / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     hidden = (sights.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
@@ -294,7 +310,7 @@ def weigh(
     # Motion: smoothness, alignment, rest.
     change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2
     turn = torch.eye(6).to(state.pose).expand(*state.pose.shape[:2], 6, 6).clone()
-    turn[..., :3, :3] = rotation_from_rpy(state.pose[..., 3:])
+    turn[..., :3, :3] = axes
     change = (turn * change[:, None, None]) @ turn.mT
     slip = of('slip', 'climb') ** -2
     still = (of('drift') * error.new_tensor([1, 1, 0.5, 0.15, 0.15, 0.15])) ** -2
@@ -304,7 +320,7 @@ def weigh(
 
     return [
         Term(objective.faces, problem, sights.moments * trust[..., None, None], sights.retreat),
-        Term(objective.prior, problem, diagonal(hold)),
+        Term(objective.prior, problem, diagonal(hold), axes),
         Term(
             objective.acceleration,
             problem,
