@@ -53,6 +53,31 @@ def nuscenes(folder, version):
     return boxes
 
 
+def t4(tables):
+    """Return all tables as the schema classes of the T4 devkit hold them."""
+    without_door('t4_devkit')  # imports a viewer
+    from t4_devkit.schema import build_schema, SchemaName
+
+    found = {}
+    for name in SchemaName:
+        if not name.is_optional():
+            rows = build_schema(name, str(Path(tables, name.filename)))
+            found[name.value] = [vars(row) for row in rows]
+    return json.loads(json.dumps(found, default=lambda value: getattr(value, 'q', value).tolist()))
+
+
+def without_door(name):
+    """Have a package imported without what its __init__ does: its parts need less."""
+    import importlib.util
+    import types
+
+    parent, _, last = name.rpartition('.')
+    found = importlib.util.find_spec(parent or last).submodule_search_locations
+    package = types.ModuleType(name)
+    package.__path__ = [str(Path(item, last)) for item in found] if parent else list(found)
+    sys.modules[name] = package
+
+
 def av2(path):
     """Return centre, extents, rotation and vertices of every cuboid."""
     from av2.structures.cuboid import CuboidList
@@ -68,6 +93,70 @@ def av2(path):
         }
         for cuboid in CuboidList.from_feather(Path(path)).cuboids
     ]
+
+
+def av2_log(folder, stamp_ns):
+    """Return a sweep, the pose of the vehicle and that of the LiDAR, as av2 reads them."""
+    from av2.utils.io import (
+        read_city_SE3_ego,
+        read_ego_SE3_sensor,
+        read_lidar_sweep,
+    )
+
+    return {
+        'points': read_lidar_sweep(
+            Path(folder, 'sensors', 'lidar', f'{stamp_ns}.feather')
+        ).tolist(),
+        'city_SE3_ego': read_city_SE3_ego(Path(folder))[int(stamp_ns)].transform_matrix.tolist(),
+        'ego_SE3_lidar': read_ego_SE3_sensor(Path(folder))['up_lidar'].transform_matrix.tolist(),
+    }
+
+
+def waymo(boxes, poses):
+    """Return what the data set's own components make of the first row of two tables."""
+    without_door('waymo_open_dataset.v2')  # imports all of TensorFlow
+    from pyarrow import parquet
+    from waymo_open_dataset.v2.perception.box import BoxType, LiDARBoxComponent
+    from waymo_open_dataset.v2.perception.pose import VehiclePoseComponent
+
+    table = parquet.read_table(boxes)
+    schema = LiDARBoxComponent.schema()
+    label = LiDARBoxComponent.from_dict(table.select(schema.names).to_pylist()[0])
+    pose = VehiclePoseComponent.from_dict(parquet.read_table(poses).to_pylist()[0])
+    box = {
+        'types_agree': table.select(schema.names).schema.equals(schema),
+        'id': label.key.laser_object_id,
+        'type': BoxType(label.type).name,
+        'points': label.num_lidar_points_in_box,
+        'box': [*label.box.center.numpy, *label.box.size.numpy, label.box.heading],
+    }
+    return box, pose.world_from_vehicle.transform
+
+
+def pykitti(folder):
+    """Return what pykitti reads of a sequence: calibration and sweep."""
+    from pykitti import utils
+
+    folder = Path(folder)
+    calibration = utils.read_calib_file(folder / 'calib' / '0000.txt')
+    return {
+        **{name: calibration[name].tolist() for name in ('P2', 'Tr_velo_cam')},
+        'points': utils.load_velo_scan(folder / 'velodyne' / '0000' / '000000.bin').tolist(),
+    }
+
+
+def pandas(path):
+    """Return columns of a table."""
+    import pandas
+
+    read = pandas.read_parquet if path.endswith('parquet') else pandas.read_csv
+    table = read(path)
+    names = ('stamp_ns', 'x', 'num_points')
+    return {
+        'x of 7': table[table.track_id.astype(str) == '7'].x.tolist(),
+        'stamps': sorted(table.stamp_ns.unique().tolist()),
+        'kinds': {name: str(table[name].dtype) for name in names},
+    }
 
 
 if __name__ == '__main__':

@@ -28,7 +28,14 @@ import numpy as np
 
 FORMATS = {
     'csv': 'boxreg_ros.labels.csv',
+    'parquet': 'boxreg_ros.labels.parquet',
     'openlabel': 'boxreg_ros.labels.openlabel',
+    'kitti': 'boxreg_ros.labels.kitti',
+    'tracklets': 'boxreg_ros.labels.tracklets',
+    'nuscenes': 'boxreg_ros.labels.nuscenes',
+    't4': 'boxreg_ros.labels.t4',
+    'argoverse2': 'boxreg_ros.labels.argoverse2',
+    'waymo': 'boxreg_ros.labels.waymo',
 }
 INPUT = 'input'
 """Status of boxes whose file does not say where they come from."""
@@ -180,8 +187,7 @@ class Options:
     camera : Path or None
         Calibration file, for the formats that look through a camera.
     swap_axes : bool
-        Write length and width where Datumaro and CVAT look for them, not where the format
-        says.
+        Write extents where Datumaro and CVAT look for them, not where the format says.
 
     """
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime, UTC
 from itertools import count
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import INPUT, LabelFrame, Provenance
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 STAMPS, POSES, ORIGIN = 'timestamps.txt', 'poses.txt', 'boxreg.json'
 FIRST_GIVEN_NUMBER = 10**6
@@ -26,30 +27,47 @@ def refined_boxes(
     track_ids: Sequence[str],
     class_names: Sequence[str],
     boxes: ArrayLike,
-    scores: ArrayLike | None = None,
-    status: Sequence[str] | None = None,
+    scores: Sequence[float | None] | Floats | None = None,
+    status: Sequence[str | None] | None = None,
     num_points: ArrayLike | None = None,
-    covariances: ArrayLike | None = None,
-    reasons: Sequence[str] | None = None,
+    covariances: Sequence[ArrayLike | None] | None = None,
+    reasons: Sequence[str | None] | None = None,
 ) -> RefinedBoxes:
-    """Return boxes as read from a file, filled up where the file says nothing."""
+    """
+    Return boxes as read from a file.
+
+    Where the file says nothing, or None, the score is NaN, the status `INPUT`, the number of
+    points 0 and the covariance the unit matrix.
+
+    """
     n = len(track_ids)
+    unknown = [None] * n
+    covariance = [np.eye(6) if c is None else c for c in covariances or unknown]
     return RefinedBoxes(
         BoxArray(
             stamp_ns,
             frame_id,
             tuple(track_ids),
             tuple(class_names),
-            np.ones(n) if scores is None else np.asarray(scores, np.float64),
+            np.array(unknown if scores is None else scores, np.float64),
             np.asarray(boxes, np.float64).reshape(n, 9),
         ),
-        (INPUT,) * n if status is None else tuple(status),
-        ('',) * n if reasons is None else tuple(reasons),
+        tuple(item or INPUT for item in status or unknown),
+        tuple(item or '' for item in reasons or unknown),
         np.zeros(n, np.int64) if num_points is None else np.asarray(num_points, np.int64),
-        np.broadcast_to(np.eye(6), (n, 6, 6))
-        if covariances is None
-        else np.asarray(covariances, np.float64).reshape(n, 6, 6),
+        np.array([np.asarray(c, np.float64).reshape(6, 6) for c in covariance]).reshape(n, 6, 6),
     )
+
+
+def boxes_from(centres: ArrayLike, extents: ArrayLike, quaternions_xyzw: ArrayLike) -> Floats:
+    """Return boxes (n, 9); the angles of quaternions that are none are NaN."""
+    parts = [np.asarray(part, np.float64) for part in (centres, extents, quaternions_xyzw)]
+    centre, extent, quaternion = (part.reshape(-1, part.shape[-1]) for part in parts)
+    angles = np.full((len(centre), 3), np.nan)
+    turned = np.linalg.norm(quaternion, axis=1) > 1e-6  # False for NaN
+    if turned.any():
+        angles[turned] = Rotation.from_quat(quaternion[turned]).as_euler('ZYX')[:, ::-1]
+    return np.hstack([centre, extent, angles])
 
 
 def to_json(value: Any) -> str:
@@ -106,6 +124,10 @@ class TrackNumbers:
         self._numbers: dict[str, int] = {}
         self._next = count(FIRST_GIVEN_NUMBER)
 
+    def names(self) -> dict[str, str]:
+        """Return the names behind the numbers that were given, the numbers as text."""
+        return {str(number): name for name, number in self._numbers.items()}
+
     def of(self, track_id: str) -> int:
         """Return the number of a track."""
         if track_id.isascii() and track_id.isdigit() and len(track_id) <= 6:
@@ -143,11 +165,16 @@ class Timeline:
         self._poses.write(' '.join(map(repr, rows.ravel().tolist())) + '\n')
         self._origin |= {'fixed_frame': frame.fixed_frame, 'sensor_frame': frame.sensor_frame}
 
-    def close(self) -> None:
-        """Complete the files."""
+    def close(self, tracks: Mapping[str, str] | None = None) -> None:
+        """Complete the files; `tracks` are names that the labels have numbers for."""
         self._stamps.close()
         self._poses.close()
-        (self._folder / ORIGIN).write_text(to_json(self._origin) + '\n', encoding='utf-8')
+        write_origin(self._folder, self._origin | ({'tracks': tracks} if tracks else {}))
+
+
+def write_origin(folder: Path, origin: Mapping[str, Any]) -> None:
+    """Write ``boxreg.json``: `Provenance` as a dict, and what else is known."""
+    (folder / ORIGIN).write_text(to_json(origin) + '\n', encoding='utf-8')
 
 
 def frame_names(folder: Path, fixed: str = 'map', sensor: str = 'lidar') -> tuple[str, str]:
@@ -201,7 +228,7 @@ def read_poses(path: Path, count: int) -> list[Floats | None]:
         If the file is there, but not `count` lines of twelve numbers.
 
     """
-    if not path.exists():
+    if not path.exists() or not count:
         return [None] * count
     try:
         rows = np.loadtxt(path, ndmin=2).reshape(-1, 3, 4)
@@ -211,3 +238,36 @@ def read_poses(path: Path, count: int) -> list[Floats | None]:
         raise RecordingError(f'{path}: expected {count} poses, one per stamp, got {len(rows)}')
     last = np.array([[0.0, 0.0, 0.0, 1.0]])
     return [np.vstack([row, last]) if np.isfinite(row).all() else None for row in rows]
+
+
+class ReadTimeline(NamedTuple):
+    """What a `Timeline` left: stamps [ns], poses, and the names of frames and tracks."""
+
+    stamps_ns: list[int]
+    poses: list[Floats | None]
+    fixed_frame: str
+    sensor_frame: str
+    tracks: dict[str, str]
+
+    def frame(self, index: int, refined: RefinedBoxes) -> LabelFrame:
+        """Return a frame with boxes in the sensor's frame."""
+        return LabelFrame(refined, self.fixed_frame, self.sensor_frame, self.poses[index])
+
+
+def read_timeline(folder: Path, count: int, stamps: Path | None = None) -> ReadTimeline:
+    """
+    Return the timeline beside labels of at least `count` frames.
+
+    Raises
+    ------
+    RecordingError
+        If there are no stamps in `stamps` (default: ``timestamps.txt``), or fewer than frames.
+
+    """
+    path = stamps or folder / STAMPS
+    stamps_ns = read_stamps(path)
+    if len(stamps_ns) < count:
+        raise RecordingError(f'{path}: expected a stamp for {count} frames, got {len(stamps_ns)}')
+    origin = from_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}
+    poses = read_poses(folder / POSES, len(stamps_ns))
+    return ReadTimeline(stamps_ns, poses, *frame_names(folder), origin.get('tracks', {}))

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import Format, INPUT, LabelFrame, Options, Provenance
+from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.files import from_json, refined_boxes, to_json
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, X, Z
 from msg_adapters.poses import quaternions_of
@@ -219,11 +219,11 @@ def _frames(
             [names[uid] for uid, _ in items],
             [classes[uid] for uid, _ in items],
             [_box(cuboid['val']) for _, cuboid in items],
-            [found.get('score', 1.0) for found in attributes],
-            [found.get('status', INPUT) for found in attributes],
+            [found.get('score') for found in attributes],
+            [found.get('status') for found in attributes],
             [found.get('num_points', 0) for found in attributes],
-            [found.get('covariance', np.eye(6).ravel()) for found in attributes],
-            [found.get('reason', '') for found in attributes],
+            [found.get('covariance') for found in attributes],
+            [found.get('reason') for found in attributes],
         )
         T_fixed_sensor, fixed, sensor = None, system, ''
         for item in transforms:
