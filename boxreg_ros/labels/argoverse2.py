@@ -40,8 +40,8 @@ FORMAT = Format(
     files='annotations.feather, city_SE3_egovehicle.feather, calibration/, sensors/',
     packages=('pyarrow',),
 )
-POSE = {name: 'double' for name in ('qw', 'qx', 'qy', 'qz', 'tx_m', 'ty_m', 'tz_m')}
-EXTENT = {name: 'double' for name in ('length_m', 'width_m', 'height_m')}
+POSE = dict.fromkeys(('qw', 'qx', 'qy', 'qz', 'tx_m', 'ty_m', 'tz_m'), 'double')
+EXTENT = dict.fromkeys(('length_m', 'width_m', 'height_m'), 'double')
 ANNOTATION = {
     'timestamp_ns': 'int64', 'track_uuid': 'string', 'category': 'string', **EXTENT, **POSE,
     'num_interior_pts': 'int64',

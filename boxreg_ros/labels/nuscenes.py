@@ -59,6 +59,7 @@ class Writer:
     """
 
     version, channel, clouds = 'v1.0-boxreg', 'LIDAR_TOP', 'samples/LIDAR_TOP'
+    captured = 'date_captured'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
@@ -133,7 +134,7 @@ class Writer:
                 'camera_intrinsic': [], 'camera_distortion': [],
             }],
             'log': [{
-                'token': log, 'logfile': recordings, 'vehicle': '', 'date_captured': '',
+                'token': log, 'logfile': recordings, 'vehicle': '', self.captured: '',
                 'location': '',
             }],
             'scene': [{

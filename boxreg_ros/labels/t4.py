@@ -18,3 +18,4 @@ class Writer(nuscenes.Writer):
     """Write the tables where T4 has them."""
 
     version, channel, clouds = 'annotation', 'LIDAR_CONCAT', 'data/LIDAR_CONCAT'
+    captured = 'data_captured'
