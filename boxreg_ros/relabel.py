@@ -27,7 +27,8 @@ from uuid import uuid4
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.errors import RecordingError, TransformUnavailable
+from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
+from boxreg_ros.labelled import LabelledRecording
 from boxreg_ros.labels import (
     LabelFrame,
     LabelWriter,
@@ -81,6 +82,10 @@ class Request:
         Settings of the core.
     options : Options
         Settings of the label formats.
+    labels : tuple of str and Path, or None
+        Format and files that the boxes come from instead of a topic.
+    label_frame : str or None
+        Frame that stands for the sensor's in label formats; None for that of the clouds.
 
     """
 
@@ -94,17 +99,34 @@ class Request:
     end: float | None = None
     config: Config = field(default_factory=Config)
     options: Options = field(default_factory=Options)
+    labels: tuple[str, Path] | None = None
+    label_frame: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse formats that do not exist or lack a package before any work is done."""
-        for name in self.formats:
-            module_of(name)
+        """Refuse what cannot work before any work is done."""
+        if self.labels is not None and self.boxes is not None:
+            raise ConfigError('boxes: expected a topic or label files, got both; leave one out')
+        for name in (*self.formats, *(self.labels or ())[:1]):
+            module_of(str(name))
+
+    def recording(self) -> Recording:
+        """Return the recording, not yet open."""
+        options: dict[str, Any] = {
+            'points': self.points,
+            'odometry': self.odometry,
+            'start': self.start,
+            'end': self.end,
+        }
+        if self.labels is not None:
+            return LabelledRecording(self.labels, self.recordings, **options)
+        return Recording(self.recordings, boxes=self.boxes, **options)
 
     def fingerprint(self) -> str:
         """Return a digest of the request and of the files it reads, by size and time."""
+        label_files = (self.labels or ())[1:]
         files = [
             (str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns)
-            for path in (*self.recordings, *filter(None, (self.options.camera,)))
+            for path in (*self.recordings, *filter(None, (self.options.camera, *label_files)))
             for file in sorted([path] if path.is_file() else path.rglob('*'))
         ]
         return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
@@ -141,18 +163,11 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     counts: Counter[str] = Counter()
     trouble = ''
     names = dict.fromkeys(('csv', *request.formats))
-    recording = Recording(
-        request.recordings,
-        request.points,
-        request.boxes,
-        request.odometry,
-        request.start,
-        request.end,
-    )
+    recording = request.recording()
     with recording, whole_folder(out) as folder:
         with clock('read'):
             fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
-        sensor_frame = recording.sensor_frame()
+        sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
         spool = None
         if request.options.with_points:
             spool = Spool(folder / SPOOL, round(request.config.tolerance * 1e9))
@@ -171,13 +186,14 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                         moved = to_fixed_frame(item, tree, fixed_frame)
                     except TransformUnavailable as error:
                         moved, trouble = None, trouble or str(error)
-                    T_fixed_sensor = _pose(tree, fixed_frame, sensor_frame, item.stamp_ns)
+                    T_fixed_sensor = pose_of(tree, fixed_frame, sensor_frame, item.stamp_ns)
                 if isinstance(item, Sweep):
                     counts['sweeps'] += 1
                     counts['sweep_without_transform'] += moved is None
-                    if spool and T_fixed_sensor is not None and item.frame_id == sensor_frame:
+                    T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
+                    if spool and T_fixed_sweep is not None:
                         with clock('write'):
-                            spool.add(item, T_fixed_sensor)
+                            spool.add(item, T_fixed_sweep)
                 else:
                     counts['box_arrays'] += 1
                     boxes = item if not isinstance(moved, BoxArray) else moved
@@ -188,7 +204,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             with clock('registrar'):
                 ready = registrar.flush()
             sink.take(ready)
-        shutil.rmtree(folder / SPOOL, ignore_errors=True)
+        if spool is not None:
+            spool.remove()
         counts.update({k: n for k, n in registrar.counts.items() if '_without_' in k})
         summary = _summary(request, recording, fixed_frame, counts, sink)
         summary['first_missing_transform'] = trouble
@@ -234,6 +251,35 @@ def to_fixed_frame(
     if isinstance(item, Sweep):
         return sweep_to_frame(item, T_fixed_item, fixed_frame)
     return boxes_to_frame(item, T_fixed_item, fixed_frame)
+
+
+def pose_of(tree: TransformTree, fixed_frame: str, frame: str, stamp_ns: int) -> Floats | None:
+    """Return the pose of `frame` in the fixed frame; None if unknown."""
+    try:
+        return tree.lookup(fixed_frame, frame, stamp_ns)
+    except TransformUnavailable:
+        return None
+
+
+def label_frame_of(
+    recording: Recording, tree: TransformTree, fixed_frame: str, wish: str | None
+) -> str:
+    """
+    Return the frame that stands for the sensor's in label files: that of the clouds, or `wish`.
+
+    Raises
+    ------
+    RecordingError
+        If nothing connects it with the fixed frame.
+
+    """
+    frame = (wish or recording.sensor_frame()).lstrip('/')
+    if not tree.connects(fixed_frame, frame):
+        raise RecordingError(
+            f'{recording}: label frame {frame!r}: expected one that is connected with '
+            f'{fixed_frame!r}; TF: {tree}'
+        )
+    return frame
 
 
 def earlier_summary(out: Path) -> dict[str, Any] | None:
@@ -419,14 +465,6 @@ def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[Refined
     return registrar.add_sweep(item) if isinstance(item, Sweep) else registrar.add_boxes(item)
 
 
-def _pose(tree: TransformTree, fixed_frame: str, frame: str, stamp_ns: int) -> Floats | None:
-    """Return the pose of `frame` in the fixed frame; None if unknown."""
-    try:
-        return tree.lookup(fixed_frame, frame, stamp_ns)
-    except TransformUnavailable:
-        return None
-
-
 def _is_empty(folder: Path) -> bool:
     return folder.is_dir() and not any(folder.iterdir())
 
@@ -442,9 +480,10 @@ def _summary(
         'recordings': [str(path) for path in request.recordings],
         'topics': {
             'points': recording.points_topic,
-            'boxes': recording.boxes_topic,
+            'boxes': recording.boxes_topic or None,
             'odometry': recording.odometry_topic,
         },
+        'labels': _labels(request, recording),
         'fixed_frame': fixed_frame,
         'estimate': request.config.estimate,
         'sweeps': counts['sweeps'],
@@ -459,6 +498,14 @@ def _summary(
         | {name: version(name) for name in ('torch', 'numpy', 'scipy', 'rosbags')},
         'fingerprint': request.fingerprint(),
     }
+
+
+def _labels(request: Request, recording: Recording) -> dict[str, Any] | None:
+    """Return where the boxes come from, if not from the recording."""
+    if request.labels is None or not isinstance(recording, LabelledRecording):
+        return None
+    name, path = request.labels
+    return {'format': name, 'path': str(path), 'boxes_outside_part': recording.left_out}
 
 
 def closing_line(summary: dict[str, Any], out: Path) -> str:
@@ -501,11 +548,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=lambda text: tuple(text.split(',')),
         help='label formats, see `boxreg formats`; csv is always there (default: %(default)s)',
     )  # fmt: skip
-    add_label_arguments(parser)
     parser.add_argument(
-        '--with-points', action='store_true',
-        help='write the clouds that the label formats need beside their labels',
+        '--labels', type=_labels_argument, metavar='FORMAT:PATH',
+        help='take the boxes from label files instead of a topic',
     )  # fmt: skip
+    add_label_arguments(parser)
     parser.add_argument('--start', type=float, metavar='S', help='from here [s]')
     parser.add_argument('--end', type=float, metavar='S', help='to here [s]')
     parser.add_argument(
@@ -525,8 +572,24 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--swap-axes', action='store_true',
-        help='length and width where Datumaro and CVAT look for them',
+        help='extents where Datumaro and CVAT look for them',
     )  # fmt: skip
+    parser.add_argument(
+        '--with-points', action='store_true',
+        help='write the clouds that the label formats need beside their labels',
+    )  # fmt: skip
+    parser.add_argument(
+        '--label-frame', metavar='FRAME',
+        help='frame that stands for the sensor in label files (default: that of the clouds)',
+    )  # fmt: skip
+
+
+def _labels_argument(text: str) -> tuple[str, Path]:
+    """Return format and path of ``FORMAT:PATH``."""
+    name, colon, path = text.partition(':')
+    if not name or not colon or not path:
+        raise argparse.ArgumentTypeError(f'expected FORMAT:PATH, got {text!r}')
+    return name, Path(path)
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -554,7 +617,7 @@ def run(args: argparse.Namespace) -> int:
     request = Request(
         tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
         args.formats, args.start, args.end, config,
-        Options(args.with_points, args.camera, args.swap_axes),
+        Options(args.with_points, args.camera, args.swap_axes), args.labels, args.label_frame,
     )  # fmt: skip
     earlier = earlier_summary(args.out)
     if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():

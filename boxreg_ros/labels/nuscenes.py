@@ -217,7 +217,7 @@ class Writer:
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the samples of all scenes, scene after scene.
+    Yield the samples of all scenes, by time.
 
     `path` is the folder of the tables, or one that holds it. Tracks are instances, by name where
     they have one; stamps are whole microseconds unless our own column has them.
@@ -239,9 +239,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         annotations: dict[str, list[dict[str, Any]]] = {}
         for item in from_json(tables / 'sample_annotation.json'):
             annotations.setdefault(item['sample_token'], []).append(item)
-        scenes = [item['token'] for item in from_json(tables / 'scene.json')]
-        samples = from_json(tables / 'sample.json')
-        samples.sort(key=lambda item: (scenes.index(item['scene_token']), item['timestamp']))
+        samples = sorted(from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
         fixed, sensor = frame_names(folder)
         for sample in samples:
             items = annotations.get(sample['token'], [])
