@@ -17,10 +17,12 @@ from collections import Counter
 from itertools import product
 import json
 from math import atan2, cos, pi, radians, sin, sqrt
+import tracemalloc
 from xml.etree import ElementTree
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.labels import (
+    arrow,
     FORMATS,
     frames_of,
     LabelFrame,
@@ -284,6 +286,47 @@ def test_parquet(tmp_path):
     assert (origin['tool'], origin['config_hash']) == ('boxreg_ros', 'cafe')
 
 
+def test_openlabel_holds_the_pose_of_the_sensor(tmp_path):
+    checker = pytest.importorskip('openlabel_checker', reason='openlabel-checker not installed')
+    _, folder = written('openlabel', tmp_path)
+    report = checker.check_file(str(folder / 'labels.json'))
+    assert [issue for outcome in report.outcomes for issue in outcome.issues] == []
+    label = json.loads((folder / 'labels.json').read_text())['openlabel']
+    transform = label['frames']['0']['frame_properties']['transforms']['lidar_to_odom']
+    assert (transform['src'], transform['dst']) == ('lidar', 'odom')
+    # Of the standard: X_dst = matrix4x4 X_src.
+    matrix = np.reshape(transform['transform_src_to_dst']['matrix4x4'], (4, 4))
+    np.testing.assert_allclose(matrix @ [6, -3, 1, 1], [13, 8, 2, 1], atol=1e-9)
+    systems = label['coordinate_systems']
+    assert systems['lidar'] == {'type': 'sensor_cs', 'parent': 'odom', 'children': []}
+    assert systems['odom'] == {'type': 'scene_cs', 'parent': '', 'children': ['lidar']}
+    assert label['metadata']['config_hash'] == 'cafe'
+
+
+def test_openlabel_of_others(tmp_path):
+    """Nine values per cuboid, text stamps, objects by uid; what is null is no cuboid."""
+    values = [*IN_SENSOR[:3], radians(60), radians(30), 0.0, *EXTENT]
+    cuboids = [
+        {'name': 'shape', 'val': values, 'coordinate_system': 'top'},
+        {'name': 'gone', 'val': None},
+    ]
+    frame = {
+        'frame_properties': {'timestamp': '12.5'},
+        'objects': {'3': {'object_data': {'cuboid': cuboids}}},
+    }
+    objects = {'3': {'name': 'car number three', 'type': 'Car'}}
+    label = {'metadata': {'schema_version': '1.0.0'}, 'objects': objects, 'frames': {'4': frame}}
+    path = tmp_path / 'labels.json'
+    path.write_text(json.dumps({'openlabel': label}))
+    (found,) = frames_of('openlabel', path)
+    boxes = found.refined.boxes
+    assert (boxes.stamp_ns, boxes.frame_id) == (12_500_000_000, 'top')
+    assert (boxes.track_ids, boxes.class_names) == (('3',), ('Car',))
+    np.testing.assert_allclose(boxes.boxes, [IN_SENSOR])
+    assert (found.refined.status, found.refined.reasons) == (('input',), ('',))
+    assert np.isnan(boxes.scores).all()
+
+
 # Back again ------------------------------------------------------------------------------------
 
 
@@ -495,6 +538,26 @@ def test_pandas_opens_it(tmp_path, name):
     assert found['x of 7'] == pytest.approx(expected)
     assert found['stamps'] == [frame.refined.boxes.stamp_ns for frame in drive()]
     assert found['kinds'] == {'stamp_ns': 'int64', 'x': 'float64', 'num_points': 'int64'}
+
+
+# Memory ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('name', [name for name in OURS if name != 'tracklets'])
+def test_writing_takes_no_memory_per_frame(tmp_path, name, monkeypatch):
+    """A tracklet is written when its track ends; all others, as their boxes come."""
+    monkeypatch.setattr(arrow, 'ROWS', 20)
+    writer = writer_for(name, tmp_path, Provenance(), options_in(tmp_path))
+    held = []
+    tracemalloc.start()
+    for i in range(120):
+        boxes, tracks = [IN_FIXED] * 20, [f'track {k}' for k in range(20)]
+        writer.write(frame_of(boxes, tracks, STAMP + i * 10**8))
+        if i in (59, 119):
+            held.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    writer.close()
+    assert held[1] - held[0] < 60 * 20 * 72 / 2  # bytes; the boxes alone have 72 each
 
 
 # Any to any ------------------------------------------------------------------------------------

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, X, YAW, Z
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, PITCH, ROLL, X, YAW, Z
 from boxreg_ros.transforms import inverse
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 import yaml
+
+Mask = NDArray[np.bool_]
 
 KITTI_SIZE = (1242, 375)
 NEAREST = 0.1
@@ -101,43 +104,43 @@ class Camera:
         T_rect_camera[:3, :3] = self.rectification
         return T_rect_camera @ self.T_camera_sensor
 
-    def view(self, box: Floats) -> tuple[Floats | None, bool]:
+    def views(self, boxes: Floats) -> tuple[Floats, Mask]:
         """
-        Return what the image shows of a box, and whether that is all of it.
+        Return what the image shows of boxes, and of which it shows all.
 
         Parameters
         ----------
-        box : array, shape (9,)
+        boxes : array, shape (n, 9)
             In the LiDAR's frame.
 
         Returns
         -------
-        rectangle : array, shape (4,), or None
-            Left, top, right and bottom [px] within the image; None if it is outside.
-        is_whole : bool
-            False if a part is outside of the image or behind the camera.
+        rectangles : array, shape (n, 4)
+            Left, top, right and bottom [px] within the image; NaN where it shows nothing.
+        is_whole : array, shape (n,)
+            False where a part is outside of the image or behind the camera.
 
         """
-        R = Rotation.from_euler('ZYX', box[[YAW, YAW - 1, YAW - 2]]).as_matrix()
-        corners = CORNERS * box[LENGTH : HEIGHT + 1] @ R.T + box[X : Z + 1]
-        T = self.T_rect_sensor
-        corners = corners @ T[:3, :3].T + T[:3, 3]
-        starts, ends = corners[EDGES[:, 0]], corners[EDGES[:, 1]]
-        is_before = corners[:, 2] >= NEAREST
-        if not is_before.any():
-            return None, False
-        crossing = (starts[:, 2] >= NEAREST) != (ends[:, 2] >= NEAREST)
-        a, b = starts[crossing], ends[crossing]
-        share = (NEAREST - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
-        seen = np.vstack([corners[is_before], a + share * (b - a)])
-        pixels = np.c_[seen, np.ones(len(seen))] @ self.projection.T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        T, P = self.T_rect_sensor, self.projection
+        turned = Rotation.from_euler('ZYX', boxes[:, [YAW, PITCH, ROLL]]).as_matrix()
+        corners = (CORNERS * boxes[:, None, LENGTH : HEIGHT + 1]) @ turned.transpose(0, 2, 1)
+        corners = (corners + boxes[:, None, X : Z + 1]) @ T[:3, :3].T + T[:3, 3]
+        a, b = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]
+        is_before = corners[..., 2] >= NEAREST
+        crosses = (a[..., 2] >= NEAREST) != (b[..., 2] >= NEAREST)
+        rise = np.where(crosses, b[..., 2] - a[..., 2], 1.0)
+        cut = a + ((NEAREST - a[..., 2]) / rise)[..., None] * (b - a)
+        seen = np.concatenate([corners, cut], axis=1)
+        is_seen = np.concatenate([is_before, crosses], axis=1)[..., None]
+        pixels = np.where(is_seen, seen, [0.0, 0.0, 1.0]) @ P[:, :3].T + P[:, 3]
+        pixels = pixels[..., :2] / pixels[..., 2:]
+        low = np.where(is_seen, pixels, np.inf).min(axis=1)
+        high = np.where(is_seen, pixels, -np.inf).max(axis=1)
         edge = np.array(self.size) - 1.0
-        if (high < 0).any() or (low > edge).any():
-            return None, False
-        is_whole = bool(is_before.all() and (low >= 0).all() and (high <= edge).all())
-        return np.r_[np.maximum(low, 0), np.minimum(high, edge)], is_whole
+        is_inside = ((high >= 0) & (low <= edge)).all(axis=1)
+        is_whole = is_before.all(axis=1) & ((low >= 0) & (high <= edge)).all(axis=1)
+        rectangles = np.hstack([np.maximum(low, 0), np.minimum(high, edge)])
+        return np.where(is_inside[:, None], rectangles, np.nan), is_whole
 
     def upright(self, boxes: Floats) -> tuple[Floats, Floats]:
         """
@@ -149,7 +152,7 @@ class Camera:
         """
         T = self.T_rect_sensor
         centres = boxes[:, X : Z + 1] @ T[:3, :3].T + T[:3, 3]
-        turned = Rotation.from_euler('ZYX', boxes[:, [YAW, YAW - 1, YAW - 2]]).as_matrix()
+        turned = Rotation.from_euler('ZYX', boxes[:, [YAW, PITCH, ROLL]]).as_matrix()
         headings = turned[:, :, 0] @ T[:3, :3].T
         return centres, np.arctan2(-headings[:, 2], headings[:, 0])
 

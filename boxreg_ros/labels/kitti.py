@@ -38,7 +38,6 @@ CLASSES = {
 }
 """Names as the benchmark spells them; others stay as they are."""
 UNKNOWN_OCCLUSION = 3
-OUTSIDE = np.full(4, -1.0)
 
 
 class Writer:
@@ -70,13 +69,17 @@ class Writer:
         rows, boxes = frame.placed('sensor', self.dropped)
         given = frame.refined.boxes
         centres, turns = self._camera.upright(boxes)
-        for row, box, centre, turn in zip(rows, boxes, centres, turns, strict=True):
-            seen, is_whole = self._camera.view(box)
-            truncated = 2 if seen is None else 0 if is_whole else 1
+        views, are_whole = self._camera.views(boxes)
+        is_outside = np.isnan(views).any(axis=1)
+        views[is_outside] = -1.0
+        truncation = np.where(is_outside, 2, np.where(are_whole, 0, 1))
+        for i, (row, box, centre, turn) in enumerate(
+            zip(rows, boxes, centres, turns, strict=True)
+        ):
             alpha = _wrapped(turn - np.arctan2(centre[0], centre[2]))
             numbers = [
                 alpha,
-                *(OUTSIDE if seen is None else seen),
+                *views[i],
                 *box[[HEIGHT, WIDTH, LENGTH]],
                 centre[0],
                 centre[1] + box[HEIGHT] / 2,
@@ -86,7 +89,9 @@ class Writer:
             if np.isfinite(given.scores[row]):
                 numbers.append(given.scores[row])
             number, name = self._numbers.of(given.track_ids[row]), _spelt(given.class_names[row])
-            self._file.write(f'{self._frames} {number} {name} {truncated} {UNKNOWN_OCCLUSION} ')
+            self._file.write(
+                f'{self._frames} {number} {name} {truncation[i]} {UNKNOWN_OCCLUSION} '
+            )
             self._file.write(' '.join(f'{value:.6f}' for value in numbers) + '\n')
         if frame.sweep is not None:
             write_cloud(self._clouds / f'{self._frames:06d}.bin', frame.sweep.points)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
 
@@ -154,6 +155,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         yield LabelFrame(refined, fixed, sensor, T_world_vehicle.get(items[0][MICROS]))
 
 
+@lru_cache
 def _type(class_name: str) -> int:
     """Return the number of the data set's class that the words of a name tell."""
     for character in '_-./':
