@@ -14,6 +14,7 @@ As a quaternion x y z w, half angles multiplied: (c15 s30, s15 c30, -s15 s30, c1
 """
 
 from collections import Counter
+import gc
 from itertools import product
 import json
 from math import atan2, cos, pi, radians, sin, sqrt
@@ -554,6 +555,7 @@ def test_writing_takes_no_memory_per_frame(tmp_path, name, monkeypatch):
         boxes, tracks = [IN_FIXED] * 20, [f'track {k}' for k in range(20)]
         writer.write(frame_of(boxes, tracks, STAMP + i * 10**8))
         if i in (59, 119):
+            gc.collect()
             held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     writer.close()
