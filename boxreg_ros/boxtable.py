@@ -92,6 +92,14 @@ class BoxTable:
             needs, or the rows are in several frames.
 
         """
+        tables = cls.read_frames(path)
+        if len(tables) > 1:
+            raise RecordingError(f'{path}: expected one frame, got {", ".join(sorted(tables))}')
+        return next(iter(tables.values()), cls.from_arrays([]))
+
+    @classmethod
+    def read_frames(cls, path: str | Path) -> dict[str, BoxTable]:
+        """Return a table per frame of a file, and raise as `read` does but for several frames."""
         try:
             with open(path, newline='', encoding='utf-8') as file:
                 reader = csv.DictReader(file)
@@ -105,9 +113,13 @@ class BoxTable:
             raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
         except (UnicodeDecodeError, csv.Error) as error:
             raise RecordingError(f'{path}: cannot be read as CSV: {error}') from None
-        frame_ids = sorted({row['frame_id'] for row in rows})
-        if len(frame_ids) > 1:
-            raise RecordingError(f'{path}: expected one frame, got {", ".join(frame_ids)}')
+        of_frame: dict[str, list[dict[str, str]]] = {}
+        for row in rows:
+            of_frame.setdefault(row['frame_id'], []).append(row)
+        return {name: cls._parsed(path, name, part) for name, part in of_frame.items()}
+
+    @classmethod
+    def _parsed(cls, path: str | Path, frame_id: str, rows: list[dict[str, str]]) -> BoxTable:
         try:
             stamps = np.array([int(row['stamp_ns']) for row in rows], np.int64)
             num_points = np.array([int(row['num_points']) for row in rows], np.int64)
@@ -126,7 +138,7 @@ class BoxTable:
             boxes[turned, ROLL:] = rotation.as_euler('ZYX')[:, ::-1]
         return cls(
             stamps,
-            frame_ids[0] if frame_ids else '',
+            frame_id,
             tuple(row['track_id'] for row in rows),
             tuple(row['class_name'] for row in rows),
             numbers[:, 0],

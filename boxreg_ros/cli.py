@@ -13,6 +13,8 @@ from boxreg_ros.errors import BoxregError, ConfigError
 
 COMMANDS = {
     'relabel': 'refine the boxes of recordings and write label files',
+    'convert': 'write labels of one format in others',
+    'formats': 'list the label formats and their conventions',
     'evaluate': 'compare boxes with true boxes',
     'simulate': 'make a recording with known truth',
     'bench': 'measure accuracy and speed',

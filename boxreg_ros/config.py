@@ -93,12 +93,12 @@ class SolverConfig:
 class PaperConfig:
     """Weights of the paper's objective (Eq. 8); read with ``objective: paper`` only."""
 
-    closeness: float = setting(1.0, 'weight of Eq. 4', '1/m^2', 0.0, 1e6)
+    closeness: float = setting(0.1, 'weight of Eq. 4', '1/m^2', 0.0, 1e6)
     enclosure: float = setting(1.0, 'weight of Eq. 5', '1/m', 0.0, 1e6)
     smoothness: float = setting(0.1, 'weight of Eq. 6 and of its constraint', '', 0.0, 1e6)
-    alignment: float = setting(0.1, 'weight of Eq. 7 and of its constraint', '', 0.0, 1e6)
-    nearest: int = setting(16, 'K, the closest points per visible face in Eq. 4', '', 1, 10000)
-    multiplier_rounds: int = setting(3, 'updates of the two Lagrange multipliers', '', 1, 100)
+    alignment: float = setting(0.3, 'weight of Eq. 7 and of its constraint', '', 0.0, 1e6)
+    nearest: int = setting(8, 'K, the closest points per visible face in Eq. 4', '', 1, 10000)
+    multiplier_rounds: int = setting(5, 'updates of the two Lagrange multipliers', '', 1, 100)
     iterations: int = setting(60, 'most L-BFGS iterations per update', '', 1, 10000)
 
 

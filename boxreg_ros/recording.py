@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 import shlex
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from boxreg_ros.errors import (
     BoxregError,
@@ -76,12 +76,19 @@ class Recording:
     start, end : float, optional
         Part to read, from the beginning of the recording [s].
 
+    Attributes
+    ----------
+    has_boxes : bool
+        Whether there have to be boxes; without them `boxes_topic` is ''.
+
     Raises
     ------
     RecordingError
         On entering, if something cannot be read or found; the message lists what there is.
 
     """
+
+    has_boxes = True
 
     def __init__(
         self,
@@ -97,7 +104,7 @@ class Recording:
         self._start, self._end = start or 0.0, end
         self.odometry_topic: str | None = None
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> Self:
         """Open all files and find the topics."""
         with _readable(self):
             self._reader = AnyReader(_files(self._paths), default_typestore=_stock_types())
@@ -240,10 +247,11 @@ class Recording:
         }
         self._filled = {c.topic for c in self._reader.connections if c.msgcount}
         self.points_topic = self._topic('points', 'point clouds', (POINTS_TYPE,))
-        self.boxes_topic = self._topic('boxes', 'boxes', tuple(ADAPTERS))
+        self.boxes_topic = self._topic('boxes', 'boxes', tuple(ADAPTERS)) if self.has_boxes else ''
         if self._asked['odometry']:
             self.odometry_topic = self._topic('odometry', 'odometry', (ODOMETRY_TYPE,))
-        self._adapter = adapter_for(self._topics[self.boxes_topic])
+        if self.has_boxes:
+            self._adapter = adapter_for(self._topics[self.boxes_topic])
 
         known = self._reader.typestore.fielddefs
         if not known.keys() >= set(self._topics.values()):

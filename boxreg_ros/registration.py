@@ -6,10 +6,10 @@ from typing import NamedTuple
 from boxreg_ros import objective
 from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
 from boxreg_ros.config import Config
-from boxreg_ros.correspondence import Support, support
+from boxreg_ros.correspondence import in_box_axes, Support, support
 from boxreg_ros.geometry import rotation_from_rpy
-from boxreg_ros.lbfgs import minimize
-from boxreg_ros.objective import EXTENT, Problem, SHARED, State, Term
+from boxreg_ros.lbfgs import minimize, select
+from boxreg_ros.objective import ANCHOR, EXTENT, GAP, Problem, SHARED, State, Sum, Term
 from boxreg_ros.shape import agreement
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED
 from boxreg_ros.window import batches, stack, Window
@@ -25,6 +25,7 @@ INFLATION = 1.5  # of the deviation of an input whose error is correlated over t
 
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
 SETTLED = 0.1  # a window whose boxes move less, in errors of the input, is done
+ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 
@@ -130,7 +131,8 @@ def solve(
     the curvature, which is also the metric L-BFGS starts from in every round.
 
     """
-    length, settings = problem.boxes.shape[1], config.solver
+    length, solver = problem.boxes.shape[1], config.solver
+    limits = solver.iterations, solver.history, solver.tolerance
     rule, noise = model.rule(), model.noise()
     expected = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), expected.clone())
@@ -141,79 +143,27 @@ def solve(
     for turn in range(rounds):
         margin = MARGINS[0] if turn == 0 and rounds > 1 else MARGINS[1]
         part = State(state.pose[rows], state.shared[rows])
+        part.shared[:, ANCHOR] = 0.0
         sights = support(problem, part, margin, config.faces.outermost, rule.depths)
         terms = weigh(problem, part, sights, expected[rows], noise, config, is_first=turn == 0)
         if turn > 0 and config.estimate == 'track':
-            part.shared[:, objective.ANCHOR] = 0.0
             information, wanted = agreement(problem, part)
-            data = torch.cat([part.pose, wanted], -1)
-            terms.append(Term(objective.shape, problem, information[:, :, None], data))
-        metric = _Metric(objective.curvature(terms, part.pack(), length), free[rows])
-        found = minimize(
-            _Sum(terms, length, free[rows]),
-            part.pack(),
-            settings.iterations,
-            settings.history,
-            settings.tolerance,
-            metric,
-        )
-        fresh = State.unpack(found.x, length)
-        state.pose[rows], state.shared[rows] = fresh.pose, fresh.shared
-        covariances[rows] = metric.blocks(length)
+            terms.append(Term(objective.shape, information[:, :, None], (part.pose, wanted)))
+        x = part.pack()
+        total = Sum(terms, x, length, free[rows])
+        found = State.unpack(minimize(total, x, *limits, total.newton).x, length)
+        state.pose[rows], state.shared[rows] = found
+        covariances[rows] = total.factor.inverse_of_links(length)
         if config.estimate == 'track':
             noise = InputNoise.measure(scatter(everything, state), everything.valid)
-        errors = torch.stack([problem.deviations[n] for n in ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')], -1)
-        moved = ((fresh.pose - part.pose) / errors[:, None]).square().mean(2).amax(1).sqrt()
-        moving = moved > SETTLED
         if turn > 1:
-            rows, problem = rows[moving], problem.select(moving.nonzero()[:, 0])
+            errors = problem.errors[:, None]
+            moved = ((found.pose - part.pose) / errors).square().mean(2).amax(1).sqrt()
+            moving = (moved > SETTLED).nonzero()[:, 0]
+            rows, problem = rows[moving], problem.select(moving)
         if not len(rows):
             break
     return state, covariances
-
-
-class _Sum:
-    """The sum of terms as a function of the free variables of some rows."""
-
-    def __init__(self, terms: list[Term], length: int, free: Tensor) -> None:
-        self._terms, self._length, self._free = terms, length, free
-        self._part: tuple[Tensor, list[Term]] | None = None
-
-    def __call__(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        terms = self._terms
-        if len(rows) < len(self._free):
-            if self._part is None or self._part[0] is not rows:
-                self._part = rows, [term.select(rows) for term in terms]
-            terms = self._part[1]
-        value, gradient = objective.value_and_gradient(terms, x, self._length)
-        return value, gradient * (self._free if terms is self._terms else self._free[rows])
-
-
-class _Metric:
-    """The inverse of the curvature in the free variables, factorised once."""
-
-    def __init__(self, curvature: Tensor, free: Tensor) -> None:
-        curvature *= free[:, :, None]
-        curvature *= free[:, None, :]
-        curvature.diagonal(dim1=1, dim2=2).add_(1.0 - free + 1e-9)
-        self._factor, failed = torch.linalg.cholesky_ex(curvature)
-        if bool(failed.any()):
-            # A window out of all proportion (stamps a microsecond apart, a box at the moon) is
-            # left to the line search with its diagonal alone; the others must not notice.
-            diagonal = curvature.diagonal(dim1=1, dim2=2)[failed > 0].nan_to_num().clamp(min=1e-9)
-            self._factor[failed > 0] = torch.diag_embed(diagonal.sqrt())
-        self._rough = self._factor.float()  # good enough for a direction, half the memory
-
-    def __call__(self, vector: Tensor, rows: Tensor) -> Tensor:
-        factor = self._rough if len(rows) == len(self._rough) else self._rough[rows]
-        return torch.cholesky_solve(vector[..., None].float(), factor)[..., 0].to(vector)
-
-    def blocks(self, length: int) -> Tensor:
-        """Return the covariances of the poses (B, N, 6, 6)."""
-        inverse = torch.cholesky_inverse(self._factor)[:, : 6 * length, : 6 * length]
-        inverse = inverse.unflatten(1, (length, 6)).unflatten(3, (length, 6))
-        blocks: Tensor = inverse.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
-        return blocks
 
 
 def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
@@ -222,6 +172,11 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
 
     Returns the state, extents as the windows' input means them, and the squared errors of the
     input as covariances: the paper's terms have no scale to derive any from.
+
+    Notes
+    -----
+    A zigzag satisfies Eq. 6, and norms that are not squared hold a search at their kinks. So the
+    norms of Eq. 6 and 7 are rounded off, less in every round: the last one is to the letter.
 
     """
     length, settings = problem.boxes.shape[1], config.paper
@@ -239,18 +194,17 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
         part = problem if len(rows) == len(extent) else problem.select(rows)
         with torch.enable_grad():
             x = x.detach().requires_grad_()
-            loss, _ = objective.total(boxes(x, rows), part, settings, multipliers[rows])
+            loss, _ = objective.total(boxes(x, rows), part, settings, multipliers[rows], rounding)
             (gradient,) = torch.autograd.grad(loss.sum(), x)
         return loss.detach(), gradient * free[rows]
 
-    for _ in range(settings.multiplier_rounds):
+    for turn in range(settings.multiplier_rounds):
+        rounding = max(ROUNDING * 0.01**turn, objective.EPSILON)
         x = minimize(function, x, settings.iterations, config.solver.history, 1e-9).x
-        everything = torch.arange(len(x), device=x.device)
-        _, violation = objective.total(boxes(x, everything), problem, settings, multipliers)
+        rows = torch.arange(len(x), device=x.device)
+        _, violation = objective.total(boxes(x, rows), problem, settings, multipliers, rounding)
         multipliers += violation * x.new_tensor([settings.smoothness, settings.alignment])
-    names = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
-    errors = torch.stack([problem.deviations[name] for name in names], -1)
-    spread = torch.diag_embed(errors**2)[:, None].expand(-1, length, -1, -1)
+    spread = torch.diag_embed(problem.errors**2)[:, None].expand(-1, length, -1, -1)
     return State(x.unflatten(1, (length, 6)), expected), spread
 
 
@@ -274,6 +228,7 @@ def weigh(
 
     """
     kind, valid, faces = problem.deviations, problem.valid.to(state.pose), config.faces
+    given = problem.pose
 
     def of(*names: str) -> Tensor:
         return torch.stack([kind[name] for name in names], -1)
@@ -284,7 +239,7 @@ def weigh(
     trust = trust / (1 + (sights.outwardness / faces.outlier) ** 2) ** 2
     trust = trust * valid[..., None] / torch.tensor(errors).to(trust) ** 2
     # The input, its bias and its extents.
-    error = of('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
+    error = problem.errors
     inflation = torch.tensor(INFLATION).to(error)
     bias, extent = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]), kind['extent'][:, None]
     if noise is not None:
@@ -296,7 +251,7 @@ def weigh(
         bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
         extent = extent * slow[6:]
     axes = rotation_from_rpy(state.pose[..., 3:])
-    off = objective.prior(problem, state, axes).residual[:, :, 0]
+    off = objective.prior(state, given, axes).residual[:, :, 0]
     off = (off.abs() + surprise(problem) * is_first) / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     hidden = (sights.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
@@ -311,7 +266,7 @@ def weigh(
     change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2
     turn = torch.eye(6).to(state.pose).expand(*state.pose.shape[:2], 6, 6).clone()
     turn[..., :3, :3] = axes
-    change = (turn * change[:, None, None]) @ turn.mT
+    change = ((turn * change[:, None, None]) @ turn.mT)[:, 1:-1] * valid[:, 2:, None, None]
     slip = of('slip', 'climb') ** -2
     still = (of('drift') * error.new_tensor([1, 1, 0.5, 0.15, 0.15, 0.15])) ** -2
 
@@ -319,16 +274,12 @@ def weigh(
         return torch.diag_embed(weight)[:, :, None]
 
     return [
-        Term(objective.faces, problem, sights.moments * trust[..., None, None], sights.retreat),
-        Term(objective.prior, problem, diagonal(hold), axes),
-        Term(
-            objective.acceleration,
-            problem,
-            (change[:, 1:-1] * valid[:, 2:, None, None])[:, :, None],
-        ),
-        Term(objective.slip, problem, diagonal(slip[:, None] * valid[:, 1:, None])),
-        Term(objective.rest, problem, diagonal(still[:, None] * _parked(problem)[..., None])),
-        Term(objective.shared_prior, problem, diagonal(shared[:, None]), expected),
+        Term(objective.faces, sights.moments * trust[..., None, None], (given, sights.retreat)),
+        Term(objective.prior, diagonal(hold), (given, axes)),
+        Term(objective.acceleration, change[:, :, None], (problem.times,)),
+        Term(objective.slip, diagonal(slip[:, None] * valid[:, 1:, None]), (problem.times,)),
+        Term(objective.rest, diagonal(still[:, None] * _parked(problem)[..., None])),
+        Term(objective.shared_prior, diagonal(shared[:, None]), (expected,)),
     ]
 
 
@@ -373,7 +324,7 @@ def _parked(problem: Problem) -> Tensor:
 
 
 def expected_shared(problem: Problem, rule: Rule) -> Tensor:
-    """Return the expectation of what is shared (B, 16): mean extent, no bias, rule, pivot."""
+    """Return the expectation of what is shared (B, 22): mean extent, no bias, rule, pivot."""
     extents = problem.boxes[..., 3:6]
     count = problem.valid.sum(1)
     ranked = torch.where(problem.valid[..., None], extents, torch.inf).sort(1).values
@@ -382,11 +333,12 @@ def expected_shared(problem: Problem, rule: Rule) -> Tensor:
     kept = ((index >= cut) & (index < count[:, None] - cut))[..., None]
     mean = torch.where(kept, ranked, 0.0).sum(1) / kept.sum(1)
     gaps = rule.gaps.to(mean).expand(len(mean), 6)
-    return torch.cat([mean, torch.zeros_like(gaps), gaps, problem.deviations['pivot'][:, None], torch.zeros_like(gaps)], 1)
+    none = torch.zeros_like(gaps)
+    return torch.cat([mean, none, gaps, problem.deviations['pivot'][:, None], none], 1)
 
 
 def free_variables(problem: Problem, config: Config) -> Tensor:
-    """Return 1 for every variable (B, 6 N + 16) to be solved for, 0 for those that stay."""
+    """Return 1 for every variable (B, 6 N + 22) to be solved for, 0 for those that stay."""
     pose = problem.valid[..., None].to(problem.boxes).expand(-1, -1, 6).clone()
     shared = pose.new_ones((len(pose), SHARED))
     if config.mode == 'bev':
@@ -432,11 +384,9 @@ def _judge(
 
 def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     """Return how many points lie in boxes of `pose` (B, N, 6) and `extent` (B, N, 3), (B, N)."""
-    shift = (pose[..., :3] - problem.pose[..., :3]).to(problem.points)
-    R = rotation_from_rpy(pose[..., 3:]).to(problem.points)
-    local = ((problem.points - shift[..., None, :]) @ R).abs()
-    inside = (local < extent[..., None, :].to(local) / 2 + 0.05).all(-1)
-    return (inside & problem.mask).sum(-1)
+    local = in_box_axes(problem.points, problem, pose).abs()
+    x, y, z = (local < extent[..., None].to(local) / 2 + 0.05).unbind(-2)
+    return (x & y & z & problem.mask).sum(-1)
 
 
 def _kept(window: Window, reason: str) -> Estimate:

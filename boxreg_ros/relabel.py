@@ -28,15 +28,33 @@ from uuid import uuid4
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
-from boxreg_ros.labels import LabelWriter, writer_for, WRITERS
+from boxreg_ros.labelled import LabelledRecording
+from boxreg_ros.labels import (
+    LabelFrame,
+    LabelWriter,
+    module_of,
+    Options,
+    Provenance,
+    writer_for,
+)
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, RefinedBoxes, Sweep
+from boxreg_ros.spool import Spool
+from boxreg_ros.structures import (
+    BoxArray,
+    Floats,
+    INTERPOLATED,
+    KEPT,
+    REFINED,
+    RefinedBoxes,
+    Sweep,
+)
 from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame, TransformTree
 import numpy as np
 import yaml
 
 SUMMARY = 'summary.json'
+SPOOL = '.clouds'
 BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
 
 Progress = Callable[[float, float], None]
@@ -62,6 +80,12 @@ class Request:
         Part of the recording, from its beginning [s].
     config : Config
         Settings of the core.
+    options : Options
+        Settings of the label formats.
+    labels : tuple of str and Path, or None
+        Format and files that the boxes come from instead of a topic.
+    label_frame : str or None
+        Frame that stands for the sensor's in label formats; None for that of the clouds.
 
     """
 
@@ -74,18 +98,35 @@ class Request:
     start: float | None = None
     end: float | None = None
     config: Config = field(default_factory=Config)
+    options: Options = field(default_factory=Options)
+    labels: tuple[str, Path] | None = None
+    label_frame: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse formats that do not exist before any work is done."""
-        for name in self.formats:
-            if name not in WRITERS:
-                raise ConfigError(f'format {name!r}: expected one of {", ".join(WRITERS)}')
+        """Refuse what cannot work before any work is done."""
+        if self.labels is not None and self.boxes is not None:
+            raise ConfigError('boxes: expected a topic or label files, got both; leave one out')
+        for name in (*self.formats, *(self.labels or ())[:1]):
+            module_of(str(name))
+
+    def recording(self) -> Recording:
+        """Return the recording, not yet open."""
+        options: dict[str, Any] = {
+            'points': self.points,
+            'odometry': self.odometry,
+            'start': self.start,
+            'end': self.end,
+        }
+        if self.labels is not None:
+            return LabelledRecording(self.labels, self.recordings, **options)
+        return Recording(self.recordings, boxes=self.boxes, **options)
 
     def fingerprint(self) -> str:
         """Return a digest of the request and of the files it reads, by size and time."""
+        label_files = (self.labels or ())[1:]
         files = [
             (str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns)
-            for path in self.recordings
+            for path in (*self.recordings, *filter(None, (self.options.camera, *label_files)))
             for file in sorted([path] if path.is_file() else path.rglob('*'))
         ]
         return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
@@ -122,19 +163,18 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     counts: Counter[str] = Counter()
     trouble = ''
     names = dict.fromkeys(('csv', *request.formats))
-    recording = Recording(
-        request.recordings,
-        request.points,
-        request.boxes,
-        request.odometry,
-        request.start,
-        request.end,
-    )
+    recording = request.recording()
     with recording, whole_folder(out) as folder:
         with clock('read'):
             fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
-        writers = [writer_for(name, folder) for name in names]
-        with closing(_Sink(writers, request.config.estimate == 'early', clock)) as sink:
+        sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
+        spool = None
+        if request.options.with_points:
+            spool = Spool(folder / SPOOL, round(request.config.tolerance * 1e9))
+        provenance = Provenance.of(request.recordings, request.config)
+        writers = {name: writer_for(name, folder, provenance, request.options) for name in names}
+        is_early = request.config.estimate == 'early'
+        with closing(_Sink(writers, spool, fixed_frame, sensor_frame, is_early, clock)) as sink:
             for record in clock.each('read', recording.records(tree)):
                 if progress is not None:
                     done = record.received_ns - recording.start_ns
@@ -146,18 +186,26 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                         moved = to_fixed_frame(item, tree, fixed_frame)
                     except TransformUnavailable as error:
                         moved, trouble = None, trouble or str(error)
+                    T_fixed_sensor = pose_of(tree, fixed_frame, sensor_frame, item.stamp_ns)
                 if isinstance(item, Sweep):
                     counts['sweeps'] += 1
                     counts['sweep_without_transform'] += moved is None
+                    T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
+                    if spool and T_fixed_sweep is not None:
+                        with clock('write'):
+                            spool.add(item, T_fixed_sweep)
                 else:
                     counts['box_arrays'] += 1
-                    sink.expect(item, 'no_transform' if moved is None else '')
+                    boxes = item if not isinstance(moved, BoxArray) else moved
+                    sink.expect(boxes, T_fixed_sensor, 'no_transform' if moved is None else '')
                 with clock('registrar'):
                     ready = _add(registrar, moved)
                 sink.take(ready)
             with clock('registrar'):
                 ready = registrar.flush()
             sink.take(ready)
+        if spool is not None:
+            spool.remove()
         counts.update({k: n for k, n in registrar.counts.items() if '_without_' in k})
         summary = _summary(request, recording, fixed_frame, counts, sink)
         summary['first_missing_transform'] = trouble
@@ -203,6 +251,35 @@ def to_fixed_frame(
     if isinstance(item, Sweep):
         return sweep_to_frame(item, T_fixed_item, fixed_frame)
     return boxes_to_frame(item, T_fixed_item, fixed_frame)
+
+
+def pose_of(tree: TransformTree, fixed_frame: str, frame: str, stamp_ns: int) -> Floats | None:
+    """Return the pose of `frame` in the fixed frame; None if unknown."""
+    try:
+        return tree.lookup(fixed_frame, frame, stamp_ns)
+    except TransformUnavailable:
+        return None
+
+
+def label_frame_of(
+    recording: Recording, tree: TransformTree, fixed_frame: str, wish: str | None
+) -> str:
+    """
+    Return the frame that stands for the sensor's in label files: that of the clouds, or `wish`.
+
+    Raises
+    ------
+    RecordingError
+        If nothing connects it with the fixed frame.
+
+    """
+    frame = (wish or recording.sensor_frame()).lstrip('/')
+    if not tree.connects(fixed_frame, frame):
+        raise RecordingError(
+            f'{recording}: label frame {frame!r}: expected one that is connected with '
+            f'{fixed_frame!r}; TF: {tree}'
+        )
+    return frame
 
 
 def earlier_summary(out: Path) -> dict[str, Any] | None:
@@ -281,14 +358,25 @@ class _Slot:
     """The place of one box array in the order of the output."""
 
     stamp_ns: int
+    T_fixed_sensor: Floats | None
     result: RefinedBoxes | None = None
 
 
 class _Sink:
     """Brings results into the order of stamps, each box array once, and has them written."""
 
-    def __init__(self, writers: list[LabelWriter], is_early: bool, clock: _Clock) -> None:
+    def __init__(
+        self,
+        writers: dict[str, LabelWriter],
+        spool: Spool | None,
+        fixed_frame: str,
+        sensor_frame: str,
+        is_early: bool,
+        clock: _Clock,
+    ) -> None:
         self._writers = writers
+        self._spool = spool
+        self._fixed_frame, self._sensor_frame = fixed_frame, sensor_frame
         self._is_early = is_early
         self._clock = clock
         self._slots: list[_Slot] = []
@@ -298,10 +386,12 @@ class _Sink:
         self.status: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
 
-    def expect(self, boxes: BoxArray, reason: str = '') -> None:
+    def expect(
+        self, boxes: BoxArray, T_fixed_sensor: Floats | None = None, reason: str = ''
+    ) -> None:
         """Keep a place for a box array; with a reason, it is written there as it is."""
         n = len(boxes.track_ids)
-        slot = _Slot(boxes.stamp_ns)
+        slot = _Slot(boxes.stamp_ns, T_fixed_sensor)
         self.boxes_in += n
         if not reason:
             self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
@@ -332,8 +422,16 @@ class _Sink:
     def close(self) -> None:
         """Close the files."""
         with self._clock('write'):
-            for writer in self._writers:
+            for writer in self._writers.values():
                 writer.close()
+
+    def left_out(self) -> dict[str, dict[str, int]]:
+        """Return the boxes that a format has no place for, by format and reason."""
+        return {
+            name: dict(+writer.dropped)
+            for name, writer in self._writers.items()
+            if +writer.dropped
+        }
 
     def missing(self) -> int:
         """Return how many boxes have gone in and not come out."""
@@ -344,13 +442,21 @@ class _Sink:
     def _write(self) -> None:
         """Write what nothing earlier is missing for."""
         while self._slots and (refined := self._slots[0].result) is not None:
-            del self._slots[0]
+            slot = self._slots.pop(0)
             self.boxes_out += len(refined.status)
             self.status.update(refined.status)
             self.reasons.update(filter(None, refined.reasons))
             with self._clock('write'):
-                for writer in self._writers:
-                    writer.write(refined)
+                sweep = None
+                if self._spool and slot.T_fixed_sensor is not None:
+                    sweep = self._spool.take(
+                        slot.stamp_ns, self._sensor_frame, slot.T_fixed_sensor
+                    )
+                frame = LabelFrame(
+                    refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep
+                )
+                for writer in self._writers.values():
+                    writer.write(frame)
 
 
 def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[RefinedBoxes]:
@@ -374,9 +480,10 @@ def _summary(
         'recordings': [str(path) for path in request.recordings],
         'topics': {
             'points': recording.points_topic,
-            'boxes': recording.boxes_topic,
+            'boxes': recording.boxes_topic or None,
             'odometry': recording.odometry_topic,
         },
+        'labels': _labels(request, recording),
         'fixed_frame': fixed_frame,
         'estimate': request.config.estimate,
         'sweeps': counts['sweeps'],
@@ -386,10 +493,19 @@ def _summary(
         'status': dict(sink.status),
         'reasons': dict(sink.reasons.most_common()),
         'dropped': dropped,
+        'left_out_of_labels': sink.left_out(),
         'versions': {'boxreg_ros': __version__, 'python': platform.python_version()}
         | {name: version(name) for name in ('torch', 'numpy', 'scipy', 'rosbags')},
         'fingerprint': request.fingerprint(),
     }
+
+
+def _labels(request: Request, recording: Recording) -> dict[str, Any] | None:
+    """Return where the boxes come from, if not from the recording."""
+    if request.labels is None or not isinstance(recording, LabelledRecording):
+        return None
+    name, path = request.labels
+    return {'format': name, 'path': str(path), 'boxes_outside_part': recording.left_out}
 
 
 def closing_line(summary: dict[str, Any], out: Path) -> str:
@@ -430,8 +546,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--formats', default='csv,openlabel', metavar='NAME,...',
         type=lambda text: tuple(text.split(',')),
-        help=f'label formats, of {", ".join(WRITERS)}; csv is always there (default: %(default)s)',
+        help='label formats, see `boxreg formats`; csv is always there (default: %(default)s)',
     )  # fmt: skip
+    parser.add_argument(
+        '--labels', type=_labels_argument, metavar='FORMAT:PATH',
+        help='take the boxes from label files instead of a topic',
+    )  # fmt: skip
+    add_label_arguments(parser)
     parser.add_argument('--start', type=float, metavar='S', help='from here [s]')
     parser.add_argument('--end', type=float, metavar='S', help='to here [s]')
     parser.add_argument(
@@ -441,6 +562,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--workers', type=int, metavar='N', help='cores of the solver (solver.threads)'
     )
+
+
+def add_label_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that label formats need, whoever writes them."""
+    parser.add_argument(
+        '--camera', type=Path, metavar='FILE',
+        help='calibration, for formats that look through a camera',
+    )  # fmt: skip
+    parser.add_argument(
+        '--swap-axes', action='store_true',
+        help='extents where Datumaro and CVAT look for them',
+    )  # fmt: skip
+    parser.add_argument(
+        '--with-points', action='store_true',
+        help='write the clouds that the label formats need beside their labels',
+    )  # fmt: skip
+    parser.add_argument(
+        '--label-frame', metavar='FRAME',
+        help='frame that stands for the sensor in label files (default: that of the clouds)',
+    )  # fmt: skip
+
+
+def _labels_argument(text: str) -> tuple[str, Path]:
+    """Return format and path of ``FORMAT:PATH``."""
+    name, colon, path = text.partition(':')
+    if not name or not colon or not path:
+        raise argparse.ArgumentTypeError(f'expected FORMAT:PATH, got {text!r}')
+    return name, Path(path)
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -468,6 +617,7 @@ def run(args: argparse.Namespace) -> int:
     request = Request(
         tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
         args.formats, args.start, args.end, config,
+        Options(args.with_points, args.camera, args.swap_axes), args.labels, args.label_frame,
     )  # fmt: skip
     earlier = earlier_summary(args.out)
     if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     ('structures', 'config', 'errors'),
     ('geometry', 'metrics'),
-    ('sampling', 'objective', 'correspondence', 'lbfgs'),
+    ('chain', 'sampling', 'objective', 'correspondence', 'lbfgs'),
     ('calibration', 'window', 'registration'),
     ('association', 'registrar'),
     ('boxtable', 'labels', 'recording', 'transforms'),
@@ -55,7 +55,7 @@ def imports_of(path):
                 )
                 base = '.'.join([*package[: len(package) - node.level + 1], *base.split('.')])
             if base == 'boxreg_ros':  # from boxreg_ros import objective
-                names = [alias.name for alias in node.names]
+                names = [a.name for a in node.names if not a.name.startswith('__')]
                 yield from ((f'{base}.{name}', node.lineno) for name in names)
             else:
                 yield base, node.lineno

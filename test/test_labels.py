@@ -2,7 +2,7 @@ import csv
 import json
 
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.labels import writer_for, WRITERS
+from boxreg_ros.labels import FORMATS, LabelFrame, module_of, Provenance, writer_for
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
 import pytest
@@ -29,10 +29,11 @@ def refined(stamp_ns, tracks, boxes=None, frame_id='odom', status=None):
 
 
 def written(name, folder, results):
-    writer = writer_for(name, folder)
+    writer = writer_for(name, folder, Provenance(('drive.mcap',), 'cafe'))
     for result in results:
-        writer.write(result)
+        writer.write(LabelFrame(result, 'odom', 'lidar'))
     writer.close()
+    return writer
 
 
 def rows_of(folder):
@@ -157,6 +158,9 @@ def test_openlabel_names_every_frame_of_reference(tmp_path):
 
 
 def test_formats():
-    assert list(WRITERS) == ['csv', 'openlabel']
-    with pytest.raises(ConfigError, match=r"'kiti': expected one of csv, openlabel"):
-        writer_for('kiti', None)
+    with pytest.raises(ConfigError, match=r"'kiti': expected one of csv, "):
+        writer_for('kiti', None, Provenance())
+    for name in FORMATS:
+        facts = module_of(name).FORMAT
+        assert facts.name == name
+        assert all(getattr(facts, field) for field in facts.__slots__ if field != 'packages')

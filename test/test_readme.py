@@ -1,4 +1,4 @@
-"""The README shows what is so; `python test/test_readme.py` writes its table of parameters."""
+"""The README shows what is so; `python test/test_readme.py` writes its tables."""
 
 from pathlib import Path
 import re
@@ -6,14 +6,14 @@ import shlex
 
 from boxreg_ros.cli import parser
 from boxreg_ros.config import settings
+from boxreg_ros.formats import HEAD, rows
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / 'README.md'
-BEGIN, END = '<!-- parameters', '<!-- end of parameters -->'
 
 
-def table():
-    rows = ['| name | default | unit | range | meaning |', '|---|---|---|---|---|']
+def parameters():
+    lines = ['| name | default | unit | range | meaning |', '|---|---|---|---|---|']
     for item in settings():
         bounds = ', '.join(item.choices)
         if item.low is not None:
@@ -22,13 +22,22 @@ def table():
         if isinstance(default, tuple):
             default = ', '.join(default)
         cells = (f'`{item.name}`', f'{default}', item.unit, bounds, item.meaning)
-        rows.append(f'| {" | ".join(cells)} |')
-    return '\n'.join(rows)
+        lines.append(f'| {" | ".join(cells)} |')
+    return '\n'.join(lines)
 
 
-def with_table(text):
-    first = text.index('\n', text.index(BEGIN))
-    return f'{text[:first]}\n\n{table()}\n\n{text[text.index(END) :]}'
+def formats():
+    lines = [f'| {" | ".join(HEAD)} |', f'|{"---|" * len(HEAD)}']
+    for name, *facts in rows():
+        lines.append(f'| `{name}` | {" | ".join(facts)} |')
+    return '\n'.join(lines)
+
+
+def with_tables(text):
+    for name, table in (('parameters', parameters()), ('formats', formats())):
+        first = text.index('\n', text.index(f'<!-- {name}'))
+        text = f'{text[:first]}\n\n{table}\n\n{text[text.index(f"<!-- end of {name} -->") :]}'
+    return text
 
 
 def commands():
@@ -36,9 +45,9 @@ def commands():
     return [line.strip() for line in lines if re.match(r'    boxreg \w', line)]
 
 
-def test_parameters_are_those_of_config():
+def test_tables_are_those_of_the_code():
     text = README.read_text(encoding='utf-8')
-    assert text == with_table(text), 'run: python test/test_readme.py'
+    assert text == with_tables(text), 'run: python test/test_readme.py'
 
 
 def test_commands_are_understood():
@@ -56,4 +65,4 @@ def test_links_lead_somewhere():
 
 
 if __name__ == '__main__':
-    README.write_text(with_table(README.read_text(encoding='utf-8')), encoding='utf-8')
+    README.write_text(with_tables(README.read_text(encoding='utf-8')), encoding='utf-8')

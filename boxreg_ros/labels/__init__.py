@@ -1,46 +1,282 @@
 """
-Refined boxes to label files; one module per format.
+Label files: one module per format, all behind one protocol.
 
-A writer gets a folder of its own to write to, then one `RefinedBoxes` after the other, stamps
-ascending, and never holds more than the tracks' names.
+A module states its conventions once, as `FORMAT`; its ``Writer(folder, provenance, options)``
+takes one `LabelFrame` after the other and never holds more than the tracks' names; and where
+files can be read back, ``read(path)`` yields the same frames.
 
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+import hashlib
 from importlib import import_module
+import json
 from pathlib import Path
-from typing import cast, Protocol
+from types import ModuleType
+from typing import Protocol
 
+from boxreg_ros import __version__
+from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.structures import RefinedBoxes
+from boxreg_ros.structures import Floats, HEIGHT, Ints, LENGTH, RefinedBoxes, Sweep
+from boxreg_ros.transforms import boxes_to_frame, inverse
+import numpy as np
 
-WRITERS = {
+FORMATS = {
     'csv': 'boxreg_ros.labels.csv',
+    'parquet': 'boxreg_ros.labels.parquet',
     'openlabel': 'boxreg_ros.labels.openlabel',
+    'kitti': 'boxreg_ros.labels.kitti',
+    'tracklets': 'boxreg_ros.labels.tracklets',
+    'nuscenes': 'boxreg_ros.labels.nuscenes',
+    't4': 'boxreg_ros.labels.t4',
+    'argoverse2': 'boxreg_ros.labels.argoverse2',
+    'waymo': 'boxreg_ros.labels.waymo',
 }
+INPUT = 'input'
+"""Status of boxes whose file does not say where they come from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """
+    The conventions of a format, as ``boxreg formats`` and the README state them.
+
+    Attributes
+    ----------
+    name, title : str
+        What ``--formats`` calls it, and what people do.
+    frame : str
+        Frame of the boxes.
+    reference : str
+        Point of the box that its position is of.
+    sizes : str
+        Order of the extents.
+    rotation : str
+        What is kept of the orientation, and how it is written.
+    files : str
+        What the writer leaves in its folder.
+    packages : tuple of str
+        Packages of pip that are needed beyond those of boxreg_ros itself.
+
+    """
+
+    name: str
+    title: str
+    frame: str
+    reference: str
+    sizes: str
+    rotation: str
+    files: str
+    packages: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LabelFrame:
+    """
+    The boxes of one stamp, and what a format needs to write them in a frame of its own.
+
+    Attributes
+    ----------
+    refined : RefinedBoxes
+        Boxes with their evidence; in the fixed frame, but for those nothing connects with it.
+        Covariances are in the same axes.
+    fixed_frame, sensor_frame : str
+        Names of the frames below.
+    T_fixed_sensor : array, shape (4, 4), or None
+        Pose of the sensor at the boxes' stamp; None if unknown.
+    sweep : Sweep or None
+        The cloud of that stamp in the sensor's frame, where points are asked for.
+
+    """
+
+    refined: RefinedBoxes
+    fixed_frame: str
+    sensor_frame: str
+    T_fixed_sensor: Floats | None = None
+    sweep: Sweep | None = None
+
+    def placed(self, frame: str, dropped: Counter[str]) -> tuple[Ints, Floats]:
+        """
+        Return rows of `refined` and their boxes in the 'fixed' or the 'sensor' frame.
+
+        Parameters
+        ----------
+        frame : str
+            Which of the two.
+        dropped : Counter
+            Boxes left out, by reason, are added: ``invalid_box`` (NaN, or an extent that is not
+            positive) and ``no_transform`` (nothing leads to `frame`).
+
+        Returns
+        -------
+        rows : array, shape (k,)
+            Rows of `refined` that have a place.
+        boxes : array, shape (k, 9)
+            Those boxes.
+
+        """
+        boxes = self.refined.boxes
+        is_finite = np.isfinite(boxes.boxes).all(axis=1)
+        rows = np.flatnonzero(is_finite & (boxes.boxes[:, LENGTH : HEIGHT + 1] > 0).all(axis=1))
+        dropped['invalid_box'] += len(boxes.boxes) - len(rows)
+        target = self.fixed_frame if frame == 'fixed' else self.sensor_frame
+        if boxes.frame_id == target:
+            return rows, boxes.boxes[rows]
+        T = self.T_fixed_sensor
+        if T is None or boxes.frame_id not in (self.fixed_frame, self.sensor_frame):
+            dropped['no_transform'] += len(rows)
+            return rows[:0], boxes.boxes[:0]
+        moved = boxes_to_frame(boxes, T if frame == 'fixed' else inverse(T), target)
+        return rows, moved.boxes[rows]
+
+    def moved(self, frame: str) -> LabelFrame:
+        """Return the frame with all its boxes in the 'fixed' or the 'sensor' frame, if known."""
+        boxes, T = self.refined.boxes, self.T_fixed_sensor
+        source, target = self.sensor_frame, self.fixed_frame
+        if frame == 'sensor':
+            source, target = target, source
+        if boxes.frame_id == target or boxes.frame_id != source or T is None:
+            return self
+        there = boxes_to_frame(boxes, T if frame == 'fixed' else inverse(T), target)
+        return replace(self, refined=replace(self.refined, boxes=there))
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """
+    Where labels come from, for the formats that have room to say so.
+
+    Attributes
+    ----------
+    recordings : tuple of str
+        Names of the files the boxes are of.
+    config_hash : str
+        First 16 digits of the SHA-256 of the settings as JSON; '' if none were used.
+    tool, version : str
+        What made them.
+
+    """
+
+    recordings: tuple[str, ...] = ()
+    config_hash: str = ''
+    tool: str = 'boxreg_ros'
+    version: str = __version__
+
+    @classmethod
+    def of(cls, recordings: tuple[Path, ...], config: Config | None = None) -> Provenance:
+        """Return the provenance of labels of `recordings`, made with `config`."""
+        text = '' if config is None else json.dumps(config.to_dict(), sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16] if text else ''
+        return cls(tuple(path.name for path in recordings), digest)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """
+    What a user may say about label files.
+
+    Attributes
+    ----------
+    with_points : bool
+        Also write the clouds that a tool needs beside its labels.
+    camera : Path or None
+        Calibration file, for the formats that look through a camera.
+    swap_axes : bool
+        Write extents where Datumaro and CVAT look for them, not where the format says.
+
+    """
+
+    with_points: bool = False
+    camera: Path | None = None
+    swap_axes: bool = False
 
 
 class LabelWriter(Protocol):
-    """What ``Writer(folder)`` of every module named in `WRITERS` offers."""
+    """
+    What ``Writer(folder, provenance, options)`` of every module in `FORMATS` offers.
 
-    def write(self, refined: RefinedBoxes) -> None:
-        """Add the boxes of one stamp."""
+    `folder` exists, is empty and the writer's own (that of ``csv`` is the folder of results).
+
+    Attributes
+    ----------
+    dropped : Counter
+        Boxes the format has no place for, by reason.
+
+    """
+
+    dropped: Counter[str]
+
+    def write(self, frame: LabelFrame) -> None:
+        """Add the boxes of one stamp; stamps ascend, but for what came late."""
 
     def close(self) -> None:
         """Complete the files."""
 
 
-def writer_for(name: str, folder: Path) -> LabelWriter:
+def module_of(name: str) -> ModuleType:
     """
-    Return a writer of this format for the results in `folder`.
+    Return the module of a format.
 
     Raises
     ------
     ConfigError
-        For a format that does not exist.
+        For a format that does not exist, or one that needs a package that is not installed.
 
     """
-    if name not in WRITERS:
-        raise ConfigError(f'format {name!r}: expected one of {", ".join(WRITERS)}')
-    return cast(LabelWriter, import_module(WRITERS[name]).Writer(folder))
+    if name not in FORMATS:
+        raise ConfigError(f'format {name!r}: expected one of {", ".join(FORMATS)}')
+    module = import_module(FORMATS[name])
+    for package in module.FORMAT.packages:
+        try:
+            import_module(package.replace('-', '_'))
+        except ImportError as error:
+            raise ConfigError(
+                f'format {name!r} needs {package}: pip install {package} ({error})'
+            ) from None
+    return module
+
+
+def writer_for(
+    name: str, out: Path, provenance: Provenance, options: Options | None = None
+) -> LabelWriter:
+    """
+    Return a writer of this format for the results in the folder `out`.
+
+    Raises
+    ------
+    ConfigError
+        As in `module_of`, or if the format needs an option that is not given.
+
+    """
+    module = module_of(name)
+    folder = out if name == 'csv' else out / name
+    folder.mkdir(exist_ok=True)
+    writer: LabelWriter = module.Writer(folder, provenance, options or Options())
+    return writer
+
+
+def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
+    """
+    Yield the frames of a label file or folder.
+
+    Boxes whose file does not say otherwise have the status ``input`` and unit covariances.
+
+    Raises
+    ------
+    ConfigError
+        As in `module_of`, or if the format cannot be read.
+    RecordingError
+        If the files are not what the format says.
+
+    """
+    module = module_of(name)
+    if not hasattr(module, 'read'):
+        able = [other for other in FORMATS if hasattr(import_module(FORMATS[other]), 'read')]
+        raise ConfigError(f'format {name!r} can only be written; readable: {", ".join(able)}')
+    frames: Iterator[LabelFrame] = module.read(path)
+    return frames

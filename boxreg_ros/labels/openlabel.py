@@ -9,15 +9,30 @@ the format wants it, and carry the track id as their name.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict
 from itertools import count
-import json
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.structures import HEIGHT, LENGTH, RefinedBoxes, X, Z
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.files import from_json, refined_boxes, to_json
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+FORMAT = Format(
+    name='openlabel',
+    title='ASAM OpenLABEL 1.0',
+    frame='fixed, named with each cuboid',
+    reference='centre',
+    sizes='length width height',
+    rotation='quaternion x y z w',
+    files='labels.json',
+)
 SCHEMA_VERSION = '1.0.0'
 POINTER = {
     'type': 'cuboid',
@@ -26,6 +41,7 @@ POINTER = {
         'reason': 'text',
         'num_points': 'num',
         'score': 'num',
+        'covariance': 'vec',
     },
 }
 
@@ -39,21 +55,24 @@ class Writer:
 
     """
 
-    def __init__(self, folder: Path) -> None:
-        path = folder / 'openlabel'
-        path.mkdir()
-        self._file = (path / 'labels.json').open('w', encoding='utf-8')
+    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._file = (folder / 'labels.json').open('w', encoding='utf-8')
         self._file.write('{"openlabel": {\n"metadata": ')
-        self._file.write(_json({'schema_version': SCHEMA_VERSION, 'annotator': 'boxreg_ros'}))
+        origin = asdict(provenance)
+        metadata = {'schema_version': SCHEMA_VERSION, 'annotator': origin['tool'], **origin}
+        self._file.write(to_json(metadata))
         self._file.write(',\n"frames": {')
         self._frames = 0
         self._numbers = count()
         self._tracks: dict[str, int] = {}
         self._objects: dict[int, dict[str, Any]] = {}
         self._frame_ids: set[str] = set()
+        self._sensors: dict[str, str] = {}
 
-    def write(self, refined: RefinedBoxes) -> None:
+    def write(self, frame: LabelFrame) -> None:
         """Add a frame."""
+        refined = frame.refined
         boxes = refined.boxes
         values = np.hstack(
             [
@@ -63,6 +82,7 @@ class Writer:
             ]
         )
         is_valid = np.isfinite(values).all(axis=1) & (values[:, 7:] > 0).all(axis=1)
+        self.dropped['invalid_box'] += int((~is_valid).sum())
         self._frame_ids.add(boxes.frame_id)
         objects: dict[int, Any] = {}
         for i in np.flatnonzero(is_valid):
@@ -78,6 +98,7 @@ class Writer:
                     for name, value in numbers.items()
                     if np.isfinite(value)
                 ],
+                'vec': [{'name': 'covariance', 'val': refined.covariances[i].ravel().tolist()}],
             }
             cuboid = {
                 'name': 'box',
@@ -86,9 +107,22 @@ class Writer:
                 'attributes': attributes,
             }
             objects[number] = {'object_data': {'cuboid': [cuboid]}}
-        properties = {'timestamp': boxes.stamp_ns / 1e9, 'stamp_ns': boxes.stamp_ns}
-        frame = {'frame_properties': properties, 'objects': objects}
-        self._file.write(f'{"," if self._frames else ""}\n"{self._frames}": {_json(frame)}')
+        properties: dict[str, Any] = {
+            'timestamp': boxes.stamp_ns / 1e9,
+            'stamp_ns': boxes.stamp_ns,
+        }
+        if frame.T_fixed_sensor is not None and frame.sensor_frame != frame.fixed_frame:
+            self._frame_ids |= {frame.sensor_frame, frame.fixed_frame}
+            self._sensors[frame.sensor_frame] = frame.fixed_frame
+            properties['transforms'] = {
+                f'{frame.sensor_frame}_to_{frame.fixed_frame}': {
+                    'src': frame.sensor_frame,
+                    'dst': frame.fixed_frame,
+                    'transform_src_to_dst': {'matrix4x4': frame.T_fixed_sensor.ravel().tolist()},
+                }
+            }
+        content = to_json({'frame_properties': properties, 'objects': objects})
+        self._file.write(f'{"," if self._frames else ""}\n"{self._frames}": {content}')
         self._frames += 1
 
     def close(self) -> None:
@@ -97,13 +131,17 @@ class Writer:
             'objects': self._objects,
             'frame_intervals': _intervals(self._frames),
             'coordinate_systems': {
-                name: {'type': 'scene_cs', 'parent': '', 'children': []}
+                name: {
+                    'type': 'sensor_cs' if name in self._sensors else 'scene_cs',
+                    'parent': self._sensors.get(name, ''),
+                    'children': [k for k, parent in self._sensors.items() if parent == name],
+                }
                 for name in sorted(self._frame_ids)
             },
         }
         self._file.write('\n}')
         for name, value in rest.items():
-            self._file.write(f',\n"{name}": {_json(value)}')
+            self._file.write(f',\n"{name}": {to_json(value)}')
         self._file.write('\n}}\n')
         self._file.close()
 
@@ -133,5 +171,81 @@ def _intervals(frames: int) -> list[dict[str, int]]:
     return [{'frame_start': 0, 'frame_end': frames - 1}] if frames else []
 
 
-def _json(value: Any) -> str:
-    return json.dumps(value, allow_nan=False, ensure_ascii=False)
+def read(path: Path) -> Iterator[LabelFrame]:
+    """
+    Yield the cuboids of each frame and coordinate system.
+
+    The track is the object's uid, in our own files its name. Rotations of three values are
+    taken as roll, pitch and yaw about the axes of `structures`.
+
+    """
+    if path.is_dir():
+        path = path / 'labels.json'
+    content = from_json(path)
+    try:
+        label = content['openlabel']
+        is_ours = label.get('metadata', {}).get('annotator') == Provenance().tool
+        objects = label.get('objects', {})
+        names = {uid: item['name'] if is_ours else uid for uid, item in objects.items()}
+        classes = {uid: str(item.get('type', '')) for uid, item in objects.items()}
+        for _, frame in sorted(label.get('frames', {}).items(), key=lambda item: int(item[0])):
+            yield from _frames(frame, names, classes)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise RecordingError(
+            f'{path}: expected frames with stamps and cuboids as in ASAM OpenLABEL 1.0: '
+            f'{type(error).__name__} {error}'
+        ) from None
+
+
+def _frames(
+    frame: dict[str, Any], names: dict[str, str], classes: dict[str, str]
+) -> Iterator[LabelFrame]:
+    """Yield the content of one frame, a `LabelFrame` for each coordinate system."""
+    properties = frame['frame_properties']
+    stamp_ns = properties.get('stamp_ns')
+    stamp_ns = round(float(properties['timestamp']) * 1e9) if stamp_ns is None else int(stamp_ns)
+    transforms = list(properties.get('transforms', {}).values())
+    of_system: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    for uid, item in frame.get('objects', {}).items():
+        for cuboid in item.get('object_data', {}).get('cuboid', ()):
+            if cuboid['val'] is not None:
+                system = cuboid.get('coordinate_system', '')
+                of_system.setdefault(system, []).append((uid, cuboid))
+    for system, items in of_system.items():
+        attributes = [_attributes(cuboid) for _, cuboid in items]
+        refined = refined_boxes(
+            stamp_ns,
+            system,
+            [names[uid] for uid, _ in items],
+            [classes[uid] for uid, _ in items],
+            [_box(cuboid['val']) for _, cuboid in items],
+            [found.get('score') for found in attributes],
+            [found.get('status') for found in attributes],
+            [found.get('num_points', 0) for found in attributes],
+            [found.get('covariance') for found in attributes],
+            [found.get('reason') for found in attributes],
+        )
+        T_fixed_sensor, fixed, sensor = None, system, ''
+        for item in transforms:
+            if (
+                system in (item['src'], item['dst'])
+                and 'matrix4x4' in item['transform_src_to_dst']
+            ):
+                fixed, sensor = item['dst'], item['src']
+                matrix = item['transform_src_to_dst']['matrix4x4']
+                T_fixed_sensor = np.array(matrix, np.float64).reshape(4, 4)
+        yield LabelFrame(refined, fixed, sensor, T_fixed_sensor)
+
+
+def _attributes(cuboid: dict[str, Any]) -> dict[str, Any]:
+    """Return the attributes of a cuboid by name."""
+    groups = cuboid.get('attributes', {}).values()
+    return {item['name']: item['val'] for group in groups for item in group}
+
+
+def _box(values: list[float]) -> Floats:
+    """Return a box (9,) from nine or ten values of a cuboid."""
+    if len(values) == 9:
+        return np.array([*values[:3], *values[6:], *values[3:6]])
+    angles = Rotation.from_quat(values[3:7]).as_euler('ZYX')[::-1]
+    return np.array([*values[:3], *values[7:], *angles])

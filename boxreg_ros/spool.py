@@ -1,0 +1,67 @@
+"""Clouds on their way to label files, on disk: the boxes of a cloud may be ready much later."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from pathlib import Path
+import shutil
+
+from boxreg_ros.structures import Floats, Sweep
+from boxreg_ros.transforms import inverse, sweep_to_frame
+import numpy as np
+
+
+class Spool:
+    """
+    Sweeps in their own frame, each a file until nothing can ask for it any more.
+
+    Parameters
+    ----------
+    folder : Path
+        Made here, and removed by `remove`.
+    tolerance_ns : int
+        A cloud belongs to boxes within this [ns].
+
+    """
+
+    def __init__(self, folder: Path, tolerance_ns: int) -> None:
+        self._folder = folder
+        self._tolerance_ns = tolerance_ns
+        self._poses: dict[int, tuple[str, Floats]] = {}
+        self._stamps: list[int] = []
+        folder.mkdir()
+
+    def add(self, sweep: Sweep, T_fixed_sweep: Floats) -> None:
+        """Store a sweep with the pose of its frame; of one stamp, the first."""
+        if sweep.stamp_ns not in self._poses:
+            insort(self._stamps, sweep.stamp_ns)
+            self._poses[sweep.stamp_ns] = sweep.frame_id, T_fixed_sweep
+            np.save(self._file(sweep.stamp_ns), sweep.points)
+
+    def take(self, stamp_ns: int, frame_id: str, T_fixed_frame: Floats) -> Sweep | None:
+        """
+        Return the cloud nearest to a stamp, in a frame as that was at the stamp.
+
+        Clouds that are older are removed. None if there is none within the tolerance.
+
+        """
+        first = bisect_left(self._stamps, stamp_ns - self._tolerance_ns)
+        for old in self._stamps[:first]:
+            self._file(old).unlink()
+            del self._poses[old]
+        del self._stamps[:first]
+        nearest = min(self._stamps, key=lambda stamp: abs(stamp - stamp_ns), default=None)
+        if nearest is None or abs(nearest - stamp_ns) > self._tolerance_ns:
+            return None
+        own_frame, T_fixed_sweep = self._poses[nearest]
+        sweep = Sweep(nearest, own_frame, np.load(self._file(nearest)))
+        if (nearest, own_frame) == (stamp_ns, frame_id):
+            return sweep
+        return sweep_to_frame(sweep, inverse(T_fixed_frame) @ T_fixed_sweep, frame_id)
+
+    def remove(self) -> None:
+        """Remove all that is left."""
+        shutil.rmtree(self._folder)
+
+    def _file(self, stamp_ns: int) -> Path:
+        return self._folder / f'{stamp_ns}.npy'

@@ -1,0 +1,163 @@
+"""
+What the libraries of others make of our label files; `test/consumers.txt` says which.
+
+Run by their own environment as a program: the name of a function below and its arguments; prints
+what the function returns as JSON. Tests call `consumer`.
+
+"""
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+HOME = Path(__file__).resolve().parents[1] / '.venv-consumers'
+
+
+def consumer(name, *arguments):
+    """Run a function below in the environment of consumers; return what it returns."""
+    import pytest
+
+    if not (HOME / 'bin' / 'python').exists():
+        pytest.skip('.venv-consumers is not there: make test sets it up')
+    command = [HOME / 'bin' / 'python', '-W', 'ignore', __file__, name, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def nuscenes(folder, version):
+    """Return every annotation as the devkit gives it: globally, and in the LiDAR's frame."""
+    from nuscenes.nuscenes import NuScenes
+    from nuscenes.utils.data_classes import LidarPointCloud
+
+    data = NuScenes(version, folder, verbose=False)
+    boxes = []
+    for sample in data.sample:
+        channel, token = next(iter(sample['data'].items()))
+        path, local, _ = data.get_sample_data(token)
+        points = None
+        if Path(path).exists():
+            points = LidarPointCloud.from_file(path).points[:3].T.tolist()
+        for there, name in zip(local, sample['anns'], strict=True):
+            row, box = data.get('sample_annotation', name), data.get_box(name)
+            boxes.append({
+                'channel': channel, 'timestamp': sample['timestamp'], 'name': box.name,
+                'center': box.center.tolist(), 'wlh': box.wlh.tolist(),
+                'matrix': box.rotation_matrix.tolist(), 'corners': box.corners().T.tolist(),
+                'local': there.center.tolist(), 'points': points,
+                'velocity': data.box_velocity(name).tolist(),
+                'track': row['instance_token'], 'num_points': row['num_lidar_pts'],
+                'next': row['next'], 'prev': row['prev'],
+            })  # fmt: skip
+    return boxes
+
+
+def t4(tables):
+    """Return all tables as the schema classes of the T4 devkit hold them."""
+    without_door('t4_devkit')  # imports a viewer
+    from t4_devkit.schema import build_schema, SchemaName
+
+    found = {}
+    for name in SchemaName:
+        if not name.is_optional():
+            rows = build_schema(name, str(Path(tables, name.filename)))
+            found[name.value] = [vars(row) for row in rows]
+    return json.loads(json.dumps(found, default=lambda value: getattr(value, 'q', value).tolist()))
+
+
+def without_door(name):
+    """Have a package imported without what its __init__ does: its parts need less."""
+    import importlib.util
+    import types
+
+    parent, _, last = name.rpartition('.')
+    found = importlib.util.find_spec(parent or last).submodule_search_locations
+    package = types.ModuleType(name)
+    package.__path__ = [str(Path(item, last)) for item in found] if parent else list(found)
+    sys.modules[name] = package
+
+
+def av2(path):
+    """Return centre, extents, rotation and vertices of every cuboid."""
+    from av2.structures.cuboid import CuboidList
+
+    return [
+        {
+            'category': cuboid.category,
+            'stamp_ns': int(cuboid.timestamp_ns),
+            'center': cuboid.xyz_center_m.tolist(),
+            'lwh': cuboid.dims_lwh_m.tolist(),
+            'matrix': cuboid.dst_SE3_object.rotation.tolist(),
+            'vertices': cuboid.vertices_m.tolist(),
+        }
+        for cuboid in CuboidList.from_feather(Path(path)).cuboids
+    ]
+
+
+def av2_log(folder, stamp_ns):
+    """Return a sweep, the pose of the vehicle and that of the LiDAR, as av2 reads them."""
+    from av2.utils.io import (
+        read_city_SE3_ego,
+        read_ego_SE3_sensor,
+        read_lidar_sweep,
+    )
+
+    return {
+        'points': read_lidar_sweep(
+            Path(folder, 'sensors', 'lidar', f'{stamp_ns}.feather')
+        ).tolist(),
+        'city_SE3_ego': read_city_SE3_ego(Path(folder))[int(stamp_ns)].transform_matrix.tolist(),
+        'ego_SE3_lidar': read_ego_SE3_sensor(Path(folder))['up_lidar'].transform_matrix.tolist(),
+    }
+
+
+def waymo(boxes, poses):
+    """Return what the data set's own components make of the first row of two tables."""
+    without_door('waymo_open_dataset.v2')  # imports all of TensorFlow
+    from pyarrow import parquet
+    from waymo_open_dataset.v2.perception.box import BoxType, LiDARBoxComponent
+    from waymo_open_dataset.v2.perception.pose import VehiclePoseComponent
+
+    table = parquet.read_table(boxes)
+    schema = LiDARBoxComponent.schema()
+    label = LiDARBoxComponent.from_dict(table.select(schema.names).to_pylist()[0])
+    pose = VehiclePoseComponent.from_dict(parquet.read_table(poses).to_pylist()[0])
+    box = {
+        'types_agree': table.select(schema.names).schema.equals(schema),
+        'id': label.key.laser_object_id,
+        'type': BoxType(label.type).name,
+        'points': label.num_lidar_points_in_box,
+        'box': [*label.box.center.numpy, *label.box.size.numpy, label.box.heading],
+    }
+    return box, pose.world_from_vehicle.transform
+
+
+def pykitti(folder):
+    """Return what pykitti reads of a sequence: calibration and sweep."""
+    from pykitti import utils
+
+    folder = Path(folder)
+    calibration = utils.read_calib_file(folder / 'calib' / '0000.txt')
+    return {
+        **{name: calibration[name].tolist() for name in ('P2', 'Tr_velo_cam')},
+        'points': utils.load_velo_scan(folder / 'velodyne' / '0000' / '000000.bin').tolist(),
+    }
+
+
+def pandas(path):
+    """Return columns of a table."""
+    import pandas
+
+    read = pandas.read_parquet if path.endswith('parquet') else pandas.read_csv
+    table = read(path)
+    names = ('stamp_ns', 'x', 'num_points')
+    return {
+        'x of 7': table[table.track_id.astype(str) == '7'].x.tolist(),
+        'stamps': sorted(table.stamp_ns.unique().tolist()),
+        'kinds': {name: str(table[name].dtype) for name in names},
+    }
+
+
+if __name__ == '__main__':
+    json.dump(globals()[sys.argv[1]](*sys.argv[2:]), sys.stdout)
