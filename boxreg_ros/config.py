@@ -10,7 +10,7 @@ so doubling one halves the pull of that term.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, MISSING
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, MISSING
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,7 +82,9 @@ class FaceConfig:
 class SolverConfig:
     """L-BFGS and the rounds around it."""
 
-    rounds: int = setting(15, 'most outer rounds: outermost points and weights renewed', '', 1, 100)
+    rounds: int = setting(
+        15, 'most outer rounds: outermost points and weights renewed', '', 1, 100
+    )
     iterations: int = setting(2, 'most L-BFGS iterations per round', '', 1, 10000)
     history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
     threads: int = setting(1, 'cores of the solver; more pay only where all are idle', '', 1, 256)
@@ -206,7 +208,11 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, as `from_dict` and YAML take them."""
-        return _to_dict(self)
+
+        def plain(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+            return {k: list(v) if isinstance(v, tuple) else v for k, v in pairs}
+
+        return asdict(self, dict_factory=plain)
 
     def updated(self, changes: Mapping[str, Any]) -> Config:
         """
@@ -283,16 +289,6 @@ def settings() -> Iterator[Setting]:
                 yield Setting(
                     f'{item.name}.{part.name}', getattr(group, part.name), **part.metadata
                 )
-
-
-def _to_dict(group: Any) -> dict[str, Any]:
-    plain: dict[str, Any] = {}
-    for item in fields(group):
-        value = getattr(group, item.name)
-        if is_dataclass(value):
-            value = _to_dict(value)
-        plain[item.name] = list(value) if isinstance(value, tuple) else value
-    return plain
 
 
 def _arguments(default: Any, values: Mapping[str, Any], prefix: str) -> dict[str, Any]:

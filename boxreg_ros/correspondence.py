@@ -109,10 +109,7 @@ def support(
     What moves is measured at its own time: points are carried along to the stamp of the box.
 
     """
-    points, openness = problem.points, aspect(problem)
-    if bool(problem.delays.any()):
-        carried = _velocity(problem, state)[..., None, :].to(points) * problem.delays[..., None]
-        points = points - carried
+    points, openness = carried(problem, state), aspect(problem)
     half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]
     inset = retreat(openness, depths)
     offset = (state.shared[:, None, GAP] + inset).to(points)[..., None] - half[..., FACE_AXIS, :]
@@ -158,9 +155,12 @@ def in_box_axes(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:
     return rotation_from_rpy(pose[..., 3:]).to(points).mT @ (points - shift[..., None, :]).mT
 
 
-def _velocity(problem: Problem, state: State) -> Tensor:
-    """Return the velocity of the centres (B, N, 3), over the real steps beside each [m/s]."""
+def carried(problem: Problem, state: State) -> Tensor:
+    """Return the points (B, N, M, 3), each carried with its box to the stamp of that."""
+    if not bool(problem.delays.any()):
+        return problem.points
     where = torch.cat([state.pose[..., :3], problem.times[..., None]], -1)
     steps = where.diff(dim=1) * problem.valid[:, 1:, None]
-    change = pad(steps, (0, 0, 1, 0)) + pad(steps, (0, 0, 0, 1))
-    return change[..., :3] / change[..., 3:].clamp(min=1e-9)  # a single observation rests
+    change = pad(steps, (0, 0, 1, 0)) + pad(steps, (0, 0, 0, 1))  # real steps on either side
+    velocity = change[..., :3] / change[..., 3:].clamp(min=1e-9)  # a single observation rests
+    return problem.points - velocity[..., None, :].to(problem.points) * problem.delays[..., None]

@@ -8,8 +8,8 @@ from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
 from boxreg_ros.config import Config
 from boxreg_ros.correspondence import in_box_axes, Support, support
 from boxreg_ros.geometry import rotation_from_rpy
-from boxreg_ros.lbfgs import minimize, select
-from boxreg_ros.objective import ANCHOR, EXTENT, GAP, Problem, SHARED, State, Sum, Term
+from boxreg_ros.lbfgs import minimize
+from boxreg_ros.objective import ANCHOR, EXTENT, Problem, SHARED, State, Sum, Term
 from boxreg_ros.shape import agreement
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED
 from boxreg_ros.window import batches, stack, Window
@@ -259,7 +259,16 @@ def weigh(
     unusual = (state.shared[:, objective.GAP] - expected[:, objective.GAP]) / gap
     gap = gap * (1 + (unusual / GAP_OUTLIER) ** 2).sqrt()
     shared = (
-        torch.cat([expected[:, :3] * extent, bias, gap, torch.full_like(gap[:, :1], 0.25), torch.full_like(gap, 1.0)], 1)
+        torch.cat(
+            [
+                expected[:, :3] * extent,
+                bias,
+                gap,
+                torch.full_like(gap[:, :1], 0.25),
+                torch.full_like(gap, 1.0),
+            ],
+            1,
+        )
         ** -2
     )
     # Motion: smoothness, alignment, rest.

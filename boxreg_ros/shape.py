@@ -1,6 +1,6 @@
 """One rigid shape per track: what all its observations say of it in the frame of its box."""
 
-from boxreg_ros.geometry import rotation_from_rpy
+from boxreg_ros.correspondence import carried, in_box_axes
 from boxreg_ros.objective import EXTENT, Problem, State
 import torch
 from torch import Tensor
@@ -30,37 +30,37 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     planes are linear in a small step of the pose: their sums of squares are all that is kept.
 
     """
-    B, N, M = problem.mask.shape
-    R = rotation_from_rpy(state.pose[..., 3:]).to(problem.points)
-    shift = (state.pose[..., :3] - problem.pose[..., :3]).to(problem.points)
-    local = (problem.points - shift[..., None, :]) @ R
+    B, N = problem.valid.shape
+    local = in_box_axes(carried(problem, state), problem, state.pose).mT
     half = (state.shared[:, None, None, EXTENT] / 2).to(local)
-    counts = torch.tensor(CELLS, device=local.device)
     near = ((local.abs() - half).amax(-1) < MARGIN) & problem.mask
     window, step, _ = near.nonzero(as_tuple=True)
     p = local[near]
-    index = ((local / half + 1) / 2 * counts).long()[near].clamp(counts * 0, counts - 1)
-    cell = ((window * CELLS[0] + index[:, 0]) * CELLS[1] + index[:, 1]) * CELLS[2] + index[:, 2]
-    products = (p[:, :, None] * p[:, None]).flatten(1)
-    sums = p.new_zeros(B * int(counts.prod()), 13)
-    sums.index_add_(0, cell, torch.cat([torch.ones_like(p[:, :1]), p, products], 1))
+    counts = torch.tensor(CELLS, device=p.device)
+    place = ((p / half[window, 0, 0] + 1) / 2 * counts).long().clamp(counts * 0, counts - 1)
+    cell = (place * place.new_tensor([CELLS[1] * CELLS[2], CELLS[2], 1])).sum(1)
+    cell += window * (count := int(counts.prod()))
+    # Number, sum and sum of squares of the points in each cell; a plane through them.
+    sums = p.new_zeros(B * count, 13)
+    sums.index_add_(0, cell, torch.cat([torch.ones_like(p[:, :1]), p, _squares(p)], 1))
     number = sums[:, :1].clamp(min=1)
-    mean = sums[:, 1:4] / number
-    spread = (sums[:, 4:] / number).unflatten(1, (3, 3)) - mean[:, :, None] * mean[:, None]
-    power, axes = torch.linalg.eigh(spread)
-    thickness = power[:, 0].clamp(min=0) + problem.deviations['shape'].to(p).repeat_interleave(int(counts.prod()))**2
-    flat = (power[:, 1] > FLATNESS * thickness) & (number[:, 0] >= LEAST)
-    weight = torch.where(flat, 1 / thickness, 0.0)
-    plane = torch.cat([axes[:, :, 0], mean, thickness[:, None], weight[:, None]], 1)[cell]
-    normal, thickness, weight = plane[:, :3], plane[:, 6], plane[:, 7]
-    off = (normal * (p - plane[:, 3:6])).sum(1)
-    weight = weight / (1 + off**2 / thickness)
+    mean, squares = sums[:, 1:4] / number, sums[:, 4:] / number
+    power, axes = torch.linalg.eigh((squares - _squares(mean)).unflatten(1, (3, 3)))
+    rough = problem.deviations['shape'].to(p).repeat_interleave(count) ** 2
+    thickness = power[:, 0].clamp(min=0) + rough
+    is_surface = (power[:, 1] > FLATNESS * thickness) & (number[:, 0] >= LEAST)
+    normal, thickness = axes[cell, :, 0], thickness[cell]
+    off = (normal * (p - mean[cell])).sum(1)
+    weight = torch.where(is_surface[cell], 1 / (thickness + off**2), 0.0)[:, None]
     lever = torch.cat([normal, torch.linalg.cross(p, normal)], 1)
-    parts = [(lever[:, :, None] * lever[:, None]).flatten(1), lever * off[:, None]]
-    parts = torch.cat([*parts, (weight[:, None] > 0).to(p) / weight[:, None].clamp(min=1e-9)], 1) * weight[:, None]
-    total = p.new_zeros(B * N, 43).index_add_(0, window * N + step, parts).to(state.pose)
-    total = total * (SAY / total[:, 42:].clamp(min=SAY))
-    information = total[:, :36].reshape(B, N, 6, 6)
-    eye = 1e-3 * torch.eye(6).to(information)
-    wanted = torch.linalg.solve(information + eye, total[:, 36:42].reshape(B, N, 6))
-    return information, wanted
+    parts = torch.cat([_squares(lever), lever * off[:, None]], 1) * weight
+    total = p.new_zeros(B * N, 43)
+    total.index_add_(0, window * N + step, torch.cat([parts, (weight > 0).to(p)], 1))
+    total = (total * (SAY / total[:, 42:].clamp(min=SAY))).to(state.pose).unflatten(0, (B, N))
+    information, pull = total[..., :36].unflatten(2, (6, 6)), total[..., 36:42]
+    return information, torch.linalg.solve(information + 1e-3 * torch.eye(6).to(pull), pull)
+
+
+def _squares(rows: Tensor) -> Tensor:
+    """Return the products (n, d d) of all pairs within rows (n, d)."""
+    return (rows[:, :, None] * rows[:, None]).flatten(1)

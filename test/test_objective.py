@@ -5,7 +5,7 @@ from dataclasses import replace
 from boxreg_ros import objective
 from boxreg_ros.chain import Chain
 from boxreg_ros.config import PaperConfig
-from boxreg_ros.geometry import face_distances
+from boxreg_ros.geometry import face_distances, rotation_from_rpy
 from boxreg_ros.objective import SHARED, State, Term
 import numpy as np
 import pytest
@@ -295,9 +295,12 @@ def terms_of(problem, seed=1):
     B, N = problem.valid.shape
     inset = torch.from_numpy(rng.random((B, N, 6)))
     expected = torch.from_numpy(rng.normal(size=(B, SHARED)))
+    axes = rotation_from_rpy(problem.pose[..., 3:] + 0.1)
+    wanted = torch.from_numpy(rng.normal(size=(B, N, 6)))
     return {
         'faces': Term(objective.faces, spd(rng, B, N, 6, 4), (problem.pose, inset)),
-        'prior': Term(objective.prior, spd(rng, B, N, 1, 6), (problem.pose,)),
+        'prior': Term(objective.prior, spd(rng, B, N, 1, 6), (problem.pose, axes)),
+        'shape': Term(objective.shape, spd(rng, B, N, 1, 6), (0.9 * problem.pose, wanted)),
         'acceleration': Term(objective.acceleration, spd(rng, B, N - 2, 1, 6), (problem.times,)),
         'rest': Term(objective.rest, spd(rng, B, N - 1, 1, 6)),
         'slip': Term(objective.slip, spd(rng, B, N - 1, 1, 2), (problem.times,)),
@@ -313,7 +316,7 @@ def variables(problem, seed=2):
     return State(pose, shared).pack()
 
 
-NAMES = ['faces', 'prior', 'acceleration', 'rest', 'slip', 'shared_prior']
+NAMES = ['faces', 'prior', 'shape', 'acceleration', 'rest', 'slip', 'shared_prior']
 
 
 def test_state_packs_and_unpacks():
@@ -472,9 +475,34 @@ def test_prior_by_hand():
     # along x is 0.2 m to its right. Less the bias, 0.1 m ahead and 0.05 rad of yaw.
     problem = problem_at([[0, 0, 0, 0, 0, np.pi / 2]], [0.0])
     pose = problem.pose + tensor([0.2, 0.3, 0.5, 0.01, 0.02, 0.06])
-    found = objective.prior(State(pose, shared_of(BIAS=[0.1, 0, 0, 0, 0, 0.05])), problem.pose)
+    axes = rotation_from_rpy(problem.pose[..., 3:])
+    state = State(pose, shared_of(BIAS=[0.1, 0, 0, 0, 0, 0.05]))
+    found = objective.prior(state, problem.pose, axes)
     known = [[[[0.2, -0.2, 0.5, 0.01, 0.02, 0.01]]]]
     np.testing.assert_allclose(found.residual, known, atol=1e-15)
+
+
+def test_shape_by_hand():
+    # Boxes head along +y: a step of 0.3 m along y and 0.2 m along x is 0.3 m ahead and 0.2 m to
+    # the right, and yaw is a turn about z. The shape stands 0.1 m ahead in its box.
+    problem = problem_at([[0, 0, 0, 0, 0, np.pi / 2]], [0.0])
+    wanted = tensor([[[0.05, 0, 0, 0, 0, 0.01]]])
+    state = State(
+        problem.pose + tensor([0.2, 0.3, 0.5, 0, 0, 0.06]), shared_of(ANCHOR=[0.1, 0, 0, 0, 0, 0])
+    )
+    found = objective.shape(state, problem.pose, wanted).residual
+    np.testing.assert_allclose(found, [[[[0.15, -0.2, 0.5, 0, 0, 0.05]]]], atol=1e-15)
+
+
+def test_turns_of_the_shape_are_those_of_the_box():
+    # A small step of roll, pitch and yaw turns the box about its own axes: the turn R' R_new is
+    # 1 + [w]x to first order, w the last three of the step in box axes.
+    start = tensor([[[0, 0, 0, 0.3, -0.4, 1.1]]])
+    step = tensor([[[0, 0, 0, 3e-6, -2e-6, 4e-6]]])
+    found = objective.shape(State(start + step, shared_of()), start, 0 * start).residual
+    turn = rotation_from_rpy(start[..., 3:]).mT @ rotation_from_rpy((start + step)[..., 3:])
+    known = [turn[0, 0, 2, 1], turn[0, 0, 0, 2], turn[0, 0, 1, 0]]
+    np.testing.assert_allclose(found[0, 0, 0, 3:], known, atol=1e-10)
 
 
 def test_shared_prior_by_hand():
