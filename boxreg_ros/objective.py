@@ -74,7 +74,7 @@ class Problem:
 
     @property
     def errors(self) -> Tensor:
-        """Return the expected errors of the input along its axes and of its angles, shape (B, 6)."""
+        """Return the expected errors of the input, along its axes and of angles, (B, 6)."""
         names = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
         return torch.stack([self.deviations[name] for name in names], -1)
 

@@ -1,5 +1,7 @@
 """Windows solved together, alone, and by torch's own L-BFGS; and how they are stacked."""
 
+from dataclasses import replace
+
 from boxreg_ros import objective
 from boxreg_ros.calibration import InputModel
 from boxreg_ros.config import Config
@@ -18,6 +20,7 @@ D = torch.float64
 # Nothing is learnt from the neighbours, so that windows are independent.
 ALONE = Config().updated({'estimate': 'final', 'faces.learn': False})
 PAPER = ALONE.updated({'objective': 'paper', 'sampling.points': 40, 'paper.nearest': 8})
+WEIGHTS = replace(PAPER.paper, closeness=1.0, alignment=0.1)  # points against motion, about even
 # The paper's terms have kinks, at which rounding is enough to end elsewhere: before it gets there.
 BRIEF = PAPER.updated({'paper.iterations': 5, 'paper.multiplier_rounds': 2})
 
@@ -233,7 +236,7 @@ def paper_problem():
     def total(x, rows, multipliers, rounding=objective.EPSILON):
         pose = x.unflatten(1, (extent.shape[1], 6))
         boxes = torch.cat([pose[..., :3], extent[rows], pose[..., 3:]], -1)
-        return objective.total(boxes, problem.select(rows), PAPER.paper, multipliers, rounding)
+        return objective.total(boxes, problem.select(rows), WEIGHTS, multipliers, rounding)
 
     return problem, x, total
 
