@@ -151,6 +151,7 @@ class Config:
     min_observations: int = setting(3, 'shorter windows keep their input', '', 2, 1000)
     max_gap: float = setting(1.0, 'a longer silence ends a track', 's', 0.01, 1e4)
     tolerance: float = setting(0.02, 'boxes and sweep belong together within this', 's', 0.0, 10.0)
+    reach: float = setting(0.06, 'a sweep this far off serves, moved along', 's', 0.0, 10.0)
     queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)
     device: str = setting('cpu', "where windows are solved: 'cpu', 'cuda', 'cuda:1', ...")
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
