@@ -22,8 +22,8 @@ class StampMatcher:
 
     A sweep within the tolerance is taken at once, one within reach when a sweep younger than the
     boxes has come: then none can be closer, in whatever order the two kinds arrive. One sweep
-    may serve several box arrays. A sweep without points stands for one that was lost: its boxes
-    leave alone. Neither kind waits longer than for `queue` others.
+    may serve several box arrays. The boxes of a sweep that is lost leave alone at once. Neither
+    kind waits longer than for `queue` others.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class StampMatcher:
             if away <= self._reach_ns:
                 sweep = self._sweeps[distances.index(away)]
                 self._used.add(sweep.stamp_ns)
-                near = sweep if len(sweep.points) else None
+                near = None if sweep.is_lost else sweep
             pairs.append(Pair(self._boxes.pop(0), near))
             self._forget_before(stamp_ns - self._reach_ns)
         return pairs

@@ -83,7 +83,7 @@ class BoxRegistrar:
             tick = self._open(pair)
             self._count += 1
             if self.config.estimate != 'track':
-                self._solve([t for t in self._tracks.values() if t.newest.tick is tick])
+                self._solve([t for t in self._tracks.values() if t.entries[-1].tick is tick])
                 ready.append(tick.result(is_final=False))
                 paired = [t for t in self._ticks if t.is_paired]
                 for old in paired[: max(0, len(paired) - self.config.lag)]:
@@ -107,17 +107,15 @@ class BoxRegistrar:
         tick = _Tick.of(boxes)
         self._ticks.append(tick)
         now_ns = boxes.stamp_ns
-        late = now_ns <= self._newest_ns
-        reason = 'duplicate_stamp' if now_ns == self._newest_ns else 'late' if late else ''
-        self._newest_ns = max(now_ns, self._newest_ns)
+        newest_ns, self._newest_ns = self._newest_ns, max(now_ns, self._newest_ns)
+        late = '' if now_ns > newest_ns else 'late' if now_ns < newest_ns else 'duplicate_stamp'
         tick.is_paired = sweep is not None and not late
         if sweep is None:
             self.counts['boxes_without_sweep'] += 1
-        tick.refuse(reason or ('no_sweep' if sweep is None else ''))
+        tick.refuse(late or ('no_sweep' if sweep is None else ''))
         admitted = [i for i, reason in enumerate(tick.reasons) if not reason]
         silent = now_ns - round(self.config.max_gap * 1e9)
-        last = {name: t.newest.observation.stamp_ns for name, t in self._tracks.items()}
-        self._end([name for name, stamp_ns in last.items() if stamp_ns < silent])
+        self._end([name for name, track in self._tracks.items() if track.newest_ns < silent])
         if sweep is not None and admitted:
             fresh = [_TrackBuffer(boxes.track_ids[i], boxes.class_names[i]) for i in admitted]
             tracks = [self._tracks.setdefault(track.track_id, track) for track in fresh]
@@ -218,8 +216,8 @@ class _TrackBuffer:
     entries: list[_Entry] = field(default_factory=list)
 
     @property
-    def newest(self) -> _Entry:
-        return self.entries[-1]
+    def newest_ns(self) -> int:
+        return self.entries[-1].observation.stamp_ns
 
     def window(self) -> Window:
         observations = [entry.observation for entry in self.entries]

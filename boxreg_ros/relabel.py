@@ -53,6 +53,7 @@ from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame, TransformTree
 import numpy as np
 import yaml
 
+UNUSED = 'sweep_', 'boxes_'  # reasons of what was not used begin so
 SUMMARY = 'summary.json'
 SPOOL = '.clouds'
 BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
@@ -206,7 +207,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             sink.take(ready)
         if spool is not None:
             spool.remove()
-        counts.update({k: n for k, n in registrar.counts.items() if '_without_' in k})
+        counts.update({k: n for k, n in registrar.counts.items() if k.startswith(UNUSED)})
         summary = _summary(request, recording, fixed_frame, counts, sink)
         summary['first_missing_transform'] = trouble
         summary['seconds'] = clock.seconds()
@@ -475,7 +476,7 @@ def _summary(
     """Return all of summary.json but the timings."""
     if sink.missing():
         raise RuntimeError(f'{sink.missing()} of {sink.boxes_in} boxes did not come back')
-    dropped = {name: n for name, n in sorted(counts.items()) if n and '_without_' in name}
+    dropped = {name: n for name, n in sorted(counts.items()) if n and name.startswith(UNUSED)}
     return {
         'recordings': [str(path) for path in request.recordings],
         'topics': {

@@ -12,8 +12,8 @@ import pytest
 TOLERANCE_NS, REACH_NS = 20, 60
 
 
-def sweep(stamp_ns, points=1):
-    return Sweep(stamp_ns, 'odom', np.zeros((points, 3)))
+def sweep(stamp_ns, is_lost=False):
+    return Sweep(stamp_ns, 'odom', np.zeros((0, 3)), is_lost=is_lost)
 
 
 def boxes(stamp_ns):
@@ -24,7 +24,7 @@ class Feed:
     """
     A matcher that takes ``'s100'`` or ``'b105'`` and tells pairs as stamps.
 
-    ``'e100'`` is a sweep without points.
+    ``'l100'`` is a sweep that is lost.
 
     """
 
@@ -37,8 +37,8 @@ class Feed:
         pairs = []
         for item in items:
             stamp_ns = int(item[1:])
-            if item[0] in 'se':
-                pairs += self.matcher.add_sweep(sweep(stamp_ns, points=int(item[0] == 's')))
+            if item[0] in 'sl':
+                pairs += self.matcher.add_sweep(sweep(stamp_ns, is_lost=item[0] == 'l'))
             else:
                 pairs += self.matcher.add_boxes(boxes(stamp_ns))
         return told(pairs)
@@ -109,10 +109,10 @@ def test_boxes_at_twice_the_rate_share_sweeps():
     assert feed.counts == {}
 
 
-def test_a_sweep_without_points_stands_for_one_that_was_lost():
+def test_the_boxes_of_a_lost_sweep_leave_alone():
     feed = Feed(reach=REACH_NS)
-    assert feed.add('s100', 'e150', 'b150') == [(150, None)]  # at once, and not with 100
-    assert feed.add('b200', 'e200') == [(200, None)]
+    assert feed.add('s100', 'l150', 'b150') == [(150, None)]  # at once, and not with 100
+    assert feed.add('b200', 'l200') == [(200, None)]
 
 
 def test_sweeps_that_come_twice_or_too_late_are_counted():

@@ -372,7 +372,7 @@ def test_late_boxes_come_back_as_they_are(stream, estimate):
 def test_short_tracks_and_boxes_without_points(stream, estimate):
     # The second car shows twice only; the first has no points at one stamp.
     sweep, _ = stream[7]
-    nothing = Sweep(sweep.stamp_ns, 'odom', np.full((1, 3), 99.0), None, sweep.origin)
+    nothing = Sweep(sweep.stamp_ns, 'odom', sweep.points[:0], None, sweep.origin)
     part = [
         (s, b if i < 4 else replace(
             b, track_ids=('a',), class_names=('car',), scores=b.scores[:1], boxes=b.boxes[:1]
