@@ -132,6 +132,7 @@ class Recording:
         that moves along, so that memory does not grow with the recording.
 
         """
+        tree.rewind(0)  # motions that were read to choose a frame come again
         data = self._connections({self.points_topic, self.boxes_topic})
         motion_topics = self._motion_topics()
         motion = self._connections(motion_topics)
