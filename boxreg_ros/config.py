@@ -245,7 +245,7 @@ class Config:
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
         """
-        Read a YAML file: plain, or as ROS writes it (``/**: ros__parameters: ...``).
+        Read a YAML file: plain, or as ROS writes it (``/**: ros__parameters: ...``, the first).
 
         Raises
         ------
@@ -258,8 +258,8 @@ class Config:
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             reason = ' '.join(str(error).split())
             raise ConfigError(f'config file {str(path)!r} cannot be read: {reason}') from None
-        if isinstance(values, dict) and len(values) == 1:
-            (inner,) = values.values()
+        if isinstance(values, dict) and values:
+            inner = next(iter(values.values()))
             if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
                 values = inner['ros__parameters']
         if not isinstance(values, dict):
