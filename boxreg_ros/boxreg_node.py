@@ -71,7 +71,8 @@ class BoxregNode(Node):
         self.add_post_set_parameters_callback(self._take_parameters)
         warm_up(config)
         self._health = Health()
-        self._inbox = Inbox(options.backlog)
+        self._inbox = Inbox(config.queue)
+        self._backlog, self._idle_at = options.backlog, 0.0
         self._live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
             self._trouble,
@@ -185,11 +186,7 @@ class BoxregNode(Node):
         self._health.count(f'{topic}_received')
         dropped = self._inbox.put(topic, msg)
         if dropped is not None:
-            self._trouble(f'{topic}_queue_full', REASONS[f'{topic}_queue_full'].remedy)
-            if topic == 'boxes':
-                self._publish(LiveRegistrar.passed_through(dropped.content))
-            else:
-                self._inbox.put_news('lost', stamp_ns(dropped.content.header))
+            self._drop(dropped)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._inbox.put_news('reset', None)
@@ -247,18 +244,30 @@ class BoxregNode(Node):
         while not self._stopping.is_set():
             self._inbox.news.clear()
             self._take_news()
-            item = item or self._decoded(self._inbox.take())
+            item = item or self._decoded(self._take())
             if item is not None and self._live.is_ready(item, time.monotonic()):
                 self._process(item)
                 item = None
             elif item is not None:
                 self._inbox.news.wait(POLL)
+                self._idle_at = time.monotonic()
             elif not any(self._inbox.sizes().values()):
                 if self._live.is_silent(time.monotonic()):
                     self._publish(self._live.flush())
                     self._markers.publish(self._board.clear())
                 self._inbox.news.wait(STATUS_PERIOD)
+                self._idle_at = time.monotonic()
         self._finish_work(item)
+
+    def _take(self) -> Message | None:
+        """Return what has waited longest, but for clouds that have waited for the solver."""
+        message = self._inbox.take()
+        if message is None or message.topic != 'points':
+            return message
+        if time.monotonic() <= max(message.received, self._idle_at) + self._backlog:
+            return message
+        self._drop(message)
+        return None
 
     def _finish_work(self, item: Arrival | None) -> None:
         """Process what is left as long as there is time, then publish what is held."""
@@ -336,6 +345,15 @@ class BoxregNode(Node):
                 self._markers.publish(self._board.update(out.given, out.refined))
 
     # ------------------------------------------------------------ both
+
+    def _drop(self, message: Message) -> None:
+        """Leave out what the solver has no time for; boxes pass through."""
+        reason = f'{message.topic}_queue_full'
+        self._trouble(reason, REASONS[reason].remedy)
+        if message.topic == 'boxes':
+            self._publish(LiveRegistrar.passed_through(message.content))
+        else:
+            self._inbox.put_news('lost', stamp_ns(message.content.header))
 
     def _trouble(self, reason: str, text: str, number: int = 1) -> None:
         """Count what went wrong, and tell it at a limited rate."""

@@ -28,13 +28,13 @@ class Inbox:
 
     Parameters
     ----------
-    backlog : int
+    capacity : int
         Clouds that may wait.
 
     """
 
-    def __init__(self, backlog: int) -> None:
-        self._capacity = {'points': backlog, 'boxes': 20 * backlog}
+    def __init__(self, capacity: int) -> None:
+        self._capacity = {'points': capacity, 'boxes': 20 * capacity}
         self._lock = Lock()
         self._number = 0
         self._news: deque[tuple[str, Any]] = deque()

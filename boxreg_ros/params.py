@@ -33,8 +33,8 @@ NODE_SETTINGS = (
         's', 0.0, 60.0, (),
     ),
     Setting(
-        'backlog', 5, 'clouds waiting for the solver; beyond, the oldest are dropped',
-        '', 1, 10000, (),
+        'backlog', 0.1, 'a cloud that has waited longer for the solver is dropped',
+        's', 0.0, 3600.0, (),
     ),
     Setting(
         'config_file', 'boxreg_node.yaml', 'where ~/save_config writes all parameters',
@@ -58,7 +58,7 @@ class NodeOptions(NamedTuple):
     fixed_frame: str
     output_frame: str
     transform_timeout: float
-    backlog: int
+    backlog: float
     config_file: str
 
 

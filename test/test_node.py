@@ -16,7 +16,7 @@ from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
-QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=50')
+QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=60.0')
 WITHOUT_TF2_MSGS = (
     'import sys; sys.modules["tf2_msgs"] = None\n'
     'from boxreg_ros.node import main\n'
@@ -164,7 +164,7 @@ def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
     reliable = [*RELIABLE, '-p', 'qos_overrides./points.subscription.depth:=100']
     reliable += ['-p', 'qos_overrides./boxes.subscription.depth:=100']
     slow = ('-p', 'solver.rounds:=40', '-p', 'solver.iterations:=400')
-    node = graph.start(*reliable, *slow, '-p', 'backlog:=2')
+    node = graph.start(*reliable, *slow, '-p', 'backlog:=0.2')
     graph.wait_until_connected()
     play(graph, records)
     graph.wait(lambda: len(early) == 30, 'early boxes')
@@ -181,7 +181,16 @@ def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
     early = graph.collect(DETECTIONS, '/refined_boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     endless = ('-p', 'solver.rounds:=100', '-p', 'solver.iterations:=10000', '-p', 'window:=30')
-    node = graph.start(*RELIABLE, *endless, '-p', 'solver.tolerance:=0.0', '-p', 'backlog:=100')
+    node = graph.start(
+        *RELIABLE,
+        *endless,
+        '-p',
+        'solver.tolerance:=0.0',
+        '-p',
+        'backlog:=60.0',
+        '-p',
+        'queue:=100',
+    )
     graph.wait_until_connected()
     play(graph, records)
     graph.wait(lambda: len(early) >= 4, 'some boxes')

@@ -94,7 +94,7 @@ def test_one_yaml_file_serves_node_and_recordings(make_node, tmp_path):
         ('lag', 10, ('lag', 'window')),
         ('mode', '4d', ('mode', 'bev', '4d')),
         ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
-        ('backlog', 2.5, ('backlog', 'int', '2.5')),
+        ('backlog', 'x', ('backlog', 'float', 'x')),
         ('boxes_type', 3, ('boxes_type', 'str', '3')),
         ('faces.learn', 1, ('faces.learn', 'bool', '1')),
     ],
@@ -136,7 +136,7 @@ def test_a_parameter_file_says_it_all_and_serves_both(make_node, tmp_path):
         {'window': 7, 'vehicle.names': ['ute', 'car'], 'solver.tolerance': 1e-5, 'mode': 'bev'}
     )
     _, options = declare(make_node())
-    options = options._replace(fixed_frame='map', backlog=9)
+    options = options._replace(fixed_frame='map', backlog=9.0)
     path.write_text(parameters_yaml(config, options, '/**/params'))
     again = declare(make_node(cli_args=['--ros-args', '--params-file', str(path)]))
     assert again == (config, options)

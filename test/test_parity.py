@@ -55,7 +55,7 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
     (type_name,) = {record.type_name for record in records if record.topic == boxes_topic}
     with graph_in(tmp_path) as graph:
         # Patient, so that no transform is extrapolated because a machine is busy.
-        options = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=100']
+        options = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=60.0']
         options += [f'{key}:={value}' for key, value in SETTINGS.items()]
         publishers_for(graph, records)
         early = graph.collect(type_name, '/refined_boxes')
