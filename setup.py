@@ -1,5 +1,6 @@
 """Package for pip and, as ament_python, for colcon; pins that work together: constraints.txt."""
 
+from glob import glob
 from xml.etree import ElementTree
 
 from setuptools import setup
@@ -16,8 +17,9 @@ setup(
     packages=[NAME, f'{NAME}.labels', 'msg_adapters'],
     data_files=[
         ('share/ament_index/resource_index/packages', [f'{NAME}/resource/{NAME}']),
-        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
     ],
+    package_data={NAME: ['share/*']},  # `boxreg bench node` runs without an installation too
     entry_points={
         'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.node:main']
     },
