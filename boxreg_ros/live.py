@@ -118,7 +118,7 @@ class LiveRegistrar:
 
     @property
     def config(self) -> Config:
-        """Settings of the core; see `BoxRegistrar` for what may change."""
+        """Return the settings of the core; see `BoxRegistrar` for what may change."""
         return self._registrar.config
 
     @config.setter

@@ -92,9 +92,9 @@ def test_wishes_at_run_time(graph, tmp_path):
     assert not answer.success
     assert 'config_file' in answer.message
     assert ended_cleanly(node)
-    # What was saved starts a node.
-    again = graph.start('--params-file', str(file))
-    graph.wait(lambda: graph.node.count_publishers('/refined_markers') == 1, 'the second node')
+    # What was saved starts a node, in another namespace too.
+    again = graph.start('--params-file', str(file), '-r', '__ns:=/front')
+    graph.wait(lambda: graph.node.count_publishers('/front/refined_markers'), 'the second node')
     assert ended_cleanly(again)
     assert 'no such parameters' not in again.output()
 

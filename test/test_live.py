@@ -250,6 +250,7 @@ def test_boxes_of_one_stamp_come_back_each_in_its_own_message():
     out = live.feed(drive) + live.flush()
     for is_final in (False, True):
         assert sum(item.is_final == is_final for item in out) == 4
+    assert live.counts['duplicate_stamp'] == 2
 
 
 @pytest.mark.parametrize('yaw', [0.0, 0.7, 2.5])
