@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 import os
@@ -253,7 +254,7 @@ class BoxregNode(Node):
                 self._idle_at = time.monotonic()
             elif not any(self._inbox.sizes().values()):
                 if self._live.is_silent(time.monotonic()):
-                    self._publish(self._live.flush())
+                    self._publish(self._guarded(self._live.flush))
                     self._markers.publish(self._board.clear())
                 self._inbox.news.wait(STATUS_PERIOD)
                 self._idle_at = time.monotonic()
@@ -280,7 +281,7 @@ class BoxregNode(Node):
             if item is not None:
                 self._process(item)
                 item = None
-        self._publish(self._live.flush())
+        self._publish(self._guarded(self._live.flush))
         self._markers.publish(self._board.clear())
         for publisher in (self._early, self._final, self._markers):
             if publisher is not None:
@@ -291,9 +292,9 @@ class BoxregNode(Node):
             if topic == 'odom':
                 self._live.tree.add_odometry(news)
             elif topic == 'lost':
-                self._publish(self._live.lose(news))
+                self._publish(self._guarded(partial(self._live.lose, news)))
             elif topic == 'reset':
-                self._publish(self._live.reset())
+                self._publish(self._guarded(self._live.reset))
             elif topic == 'settings':
                 self._live.config, options = news
                 self._live.output_frame = options.output_frame.lstrip('/')
@@ -317,11 +318,7 @@ class BoxregNode(Node):
         return Arrival(message.content, content, message.received)
 
     def _process(self, item: Arrival) -> None:
-        try:
-            ready = self._live.process(item)
-        except Exception as error:  # one bad tick must not end weeks of running
-            self._trouble('failed', f'{type(error).__name__}: {error}')
-            ready = self._live.abandon(item)
+        ready = self._guarded(partial(self._live.process, item), item)
         if self._fixed_frame != self._live.fixed_frame:
             self._fixed_frame = self._live.fixed_frame
             self.get_logger().info(f'fixed frame is {self._fixed_frame!r}')
@@ -329,6 +326,16 @@ class BoxregNode(Node):
         self._health.set_counts(self._live.counts)
         if any(not out.is_final for out in ready):
             self._health.add_latency(time.monotonic() - item.received)
+
+    def _guarded(
+        self, task: Callable[[], list[Outgoing]], item: Arrival | None = None
+    ) -> list[Outgoing]:
+        """Return what a task returns; one bad tick must not end weeks of running."""
+        try:
+            return task()
+        except Exception as error:
+            self._trouble('failed', f'{type(error).__name__}: {error}')
+            return self._live.abandon(item)
 
     def _publish(self, ready: list[Outgoing]) -> None:
         for out in ready:

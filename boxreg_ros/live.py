@@ -201,8 +201,8 @@ class LiveRegistrar:
         self._rewinds = Rewind(), Rewind()
         return ready
 
-    def abandon(self, item: Arrival) -> list[Outgoing]:
-        """Start afresh after a fault with an arrival; pass it and what is held through."""
+    def abandon(self, item: Arrival | None) -> list[Outgoing]:
+        """Start afresh after a fault; pass what is held, and the arrival at fault, through."""
         self._registrar.reset()
         held = [p for _, pending in sorted(self._pending.items()) for p in pending]
         self._pending.clear()
@@ -212,7 +212,8 @@ class LiveRegistrar:
             for out in self.passed_through(p.message)
             if out.is_final or not p.is_early_out
         ]
-        if isinstance(item.content, BoxArray) and all(p.message is not item.message for p in held):
+        is_held = item is None or any(p.message is item.message for p in held)
+        if item is not None and isinstance(item.content, BoxArray) and not is_held:
             passed += self.passed_through(item.message)
         return passed
 

@@ -74,7 +74,7 @@ def test_every_reason_that_is_counted_is_explained():
             r"sink\.expect\(item, '(\w+)'",
         ):
             found |= set(re.findall(pattern, text))
-    totals = {'sweeps', 'boxes', 'box_arrays'}
+    totals = {'sweeps', 'boxes', 'box_arrays', 'frames'}
     assert len(found) > 10
     assert sorted(found - totals - set(REASONS)) == []
     files = {*(ROOT / 'boxreg_ros').glob('*.py')} - {ROOT / 'boxreg_ros' / 'reasons.py'}
