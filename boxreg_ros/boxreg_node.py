@@ -45,7 +45,7 @@ POLL = 0.02
 """The worker looks this often whether an arrival has waited long enough [s]."""
 GRAPH_PERIOD = 0.2
 STATUS_PERIOD = 1.0
-LAST_WORK, LAST_ACKNOWLEDGEMENT = 1.0, 0.4
+LAST_WORK, LAST_ACKNOWLEDGEMENT = 0.8, 0.4
 """So long may, on shutdown, the worker go on, and subscribers take what it published [s]."""
 
 
