@@ -29,7 +29,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.11',
     install_requires=[
-        'mcap>=1.2,<2',
+        'mcap>=1.6,<2',
         'numpy>=1.26,<3',
         'pyyaml>=6',
         'rosbags>=0.11,<0.12',

@@ -153,18 +153,20 @@ def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
             if isinstance(item, Sweep):
                 T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
                 if spool is not None and T_fixed_sweep is not None:
-                    spool.add(item, T_fixed_sweep)
+                    spool.add(item, T_fixed_sweep, recording.intensities(record))
                 continue
             T_fixed_boxes = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
             boxes = item
             if T_fixed_boxes is not None:
                 boxes = boxes_to_frame(item, T_fixed_boxes, fixed_frame)
             T_fixed_sensor = pose_of(tree, fixed_frame, sensor_frame, item.stamp_ns)
-            sweep = None
+            sweep = intensities = None
             if spool is not None and T_fixed_sensor is not None:
-                sweep = spool.take(item.stamp_ns, sensor_frame, T_fixed_sensor)
+                sweep, intensities = spool.take(item.stamp_ns, sensor_frame, T_fixed_sensor)
             refined = replace(recording.label.refined, boxes=boxes)
-            yield LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor, sweep)
+            yield LabelFrame(
+                refined, fixed_frame, sensor_frame, T_fixed_sensor, sweep, intensities
+            )
     if spool is not None:
         spool.remove()
 

@@ -19,7 +19,7 @@ from boxreg_ros.errors import (
     RecordingError,
     UnsupportedMessage,
 )
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.structures import BoxArray, Floats, Sweep
 from boxreg_ros.transforms import TransformTree
 from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE
 from rosbags.highlevel import AnyReader
@@ -65,7 +65,7 @@ class Recording:
     One or several recordings of one drive, merged by receive time.
 
     Receive time only orders the stream and cuts out the part between `start` and `end`; stamps
-    are those of the messages' headers. Use as a context manager.
+    are those of the messages' headers. Use as a context manager; a copy can be opened once more.
 
     Parameters
     ----------
@@ -107,7 +107,8 @@ class Recording:
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
         with _readable(self):
-            self._reader = AnyReader(_files(self._paths), default_typestore=_stock_types())
+            self.files = _files(self._paths)
+            self._reader = AnyReader(self.files, default_typestore=stock_types())
             self._reader.open()
         try:
             self._find()
@@ -165,6 +166,28 @@ class Recording:
             return self._adapter.from_msg(self._message(record))
         except (UnsupportedMessage, AttributeError) as error:
             raise UnsupportedMessage(f'topic {topic!r}: {error}') from None
+
+    def intensities(self, record: Record) -> Floats | None:
+        """Return the intensities of a sweep's points; None if the record has none."""
+        return pointcloud.intensities(self._message(record))
+
+    def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
+        """Return a message of the boxes' topic from its bytes, and the boxes in it."""
+        connection = self._connections({self.boxes_topic})[0]
+        message = self._message(Record(connection, 0, data))
+        return message, self._adapter.from_msg(message)
+
+    def with_boxes(self, message: Any, boxes: BoxArray, covariances: Floats) -> bytes:
+        """Return the bytes of a message of the boxes' topic with its boxes replaced."""
+        replaced = self._adapter.to_msg(message, boxes, covariances)
+        store, kind = self._reader.typestore, self._topics[self.boxes_topic]
+        encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
+        return bytes(encode(replaced, kind))
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Return all topics with the types of their messages."""
+        return dict(self._topics)
 
     def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
         """
@@ -255,7 +278,7 @@ class Recording:
 
         known = self._reader.typestore.fielddefs
         if not known.keys() >= set(self._topics.values()):
-            stock = _stock_types().fielddefs
+            stock = stock_types().fielddefs
             self._reader.typestore.register({k: v for k, v in stock.items() if k not in known})
 
         begin, self.end_ns = self._reader.start_time, self._reader.end_time
@@ -389,7 +412,7 @@ def _files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-def _stock_types() -> Typestore:
+def stock_types() -> Typestore:
     """Return the definitions used where a recording has none (before ROS 2 Iron)."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types = {}

@@ -11,8 +11,8 @@ import argparse
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 import hashlib
 from importlib.metadata import version
 import json
@@ -172,9 +172,10 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         if request.options.with_points:
             spool = Spool(folder / SPOOL, round(request.config.tolerance * 1e9))
         provenance = Provenance.of(request.recordings, request.config)
-        writers = {name: writer_for(name, folder, provenance, request.options) for name in names}
+        options = replace(request.options, recording=recording)
+        writers = {name: writer_for(name, folder, provenance, options) for name in names}
         is_early = request.config.estimate == 'early'
-        with closing(_Sink(writers, spool, fixed_frame, sensor_frame, is_early, clock)) as sink:
+        with _Sink(writers, spool, fixed_frame, sensor_frame, is_early, clock) as sink:
             for record in clock.each('read', recording.records(tree)):
                 if progress is not None:
                     done = record.received_ns - recording.start_ns
@@ -193,11 +194,13 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                     T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
                     if spool and T_fixed_sweep is not None:
                         with clock('write'):
-                            spool.add(item, T_fixed_sweep)
+                            spool.add(item, T_fixed_sweep, recording.intensities(record))
                 else:
                     counts['box_arrays'] += 1
                     boxes = item if not isinstance(moved, BoxArray) else moved
-                    sink.expect(boxes, T_fixed_sensor, 'no_transform' if moved is None else '')
+                    T_fixed_given = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
+                    reason = 'no_transform' if moved is None else ''
+                    sink.expect(boxes, T_fixed_sensor, T_fixed_given, reason)
                 with clock('registrar'):
                     ready = _add(registrar, moved)
                 sink.take(ready)
@@ -359,6 +362,7 @@ class _Slot:
 
     stamp_ns: int
     T_fixed_sensor: Floats | None
+    T_fixed_given: Floats | None
     result: RefinedBoxes | None = None
 
 
@@ -387,11 +391,15 @@ class _Sink:
         self.reasons: Counter[str] = Counter()
 
     def expect(
-        self, boxes: BoxArray, T_fixed_sensor: Floats | None = None, reason: str = ''
+        self,
+        boxes: BoxArray,
+        T_fixed_sensor: Floats | None = None,
+        T_fixed_given: Floats | None = None,
+        reason: str = '',
     ) -> None:
         """Keep a place for a box array; with a reason, it is written there as it is."""
         n = len(boxes.track_ids)
-        slot = _Slot(boxes.stamp_ns, T_fixed_sensor)
+        slot = _Slot(boxes.stamp_ns, T_fixed_sensor, T_fixed_given)
         self.boxes_in += n
         if not reason:
             self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
@@ -419,11 +427,16 @@ class _Sink:
             slot.result = slot.result or refined
         self._write()
 
-    def close(self) -> None:
-        """Close the files."""
-        with self._clock('write'):
-            for writer in self._writers.values():
-                writer.close()
+    def __enter__(self) -> _Sink:
+        """Return the sink."""
+        return self
+
+    def __exit__(self, failure: object, *_: object) -> None:
+        """Complete the files, but not after a failure: then nothing of them will be kept."""
+        if failure is None:
+            with self._clock('write'):
+                for writer in self._writers.values():
+                    writer.close()
 
     def left_out(self) -> dict[str, dict[str, int]]:
         """Return the boxes that a format has no place for, by format and reason."""
@@ -447,14 +460,15 @@ class _Sink:
             self.status.update(refined.status)
             self.reasons.update(filter(None, refined.reasons))
             with self._clock('write'):
-                sweep = None
+                sweep = intensities = None
                 if self._spool and slot.T_fixed_sensor is not None:
-                    sweep = self._spool.take(
+                    sweep, intensities = self._spool.take(
                         slot.stamp_ns, self._sensor_frame, slot.T_fixed_sensor
                     )
                 frame = LabelFrame(
-                    refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep
-                )
+                    refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep,
+                    intensities, slot.T_fixed_given,
+                )  # fmt: skip
                 for writer in self._writers.values():
                     writer.write(frame)
 

@@ -122,8 +122,8 @@ class FrameNames:
 
 def write_points(frame: LabelFrame, path: Path) -> None:
     """Write the frame's cloud, an empty one if none belongs to it: the tools need a file."""
-    sweep = frame.sweep
-    write_cloud(path, np.zeros((0, 3)) if sweep is None else sweep.points)
+    points = np.zeros((0, 3)) if frame.sweep is None else frame.sweep.points
+    write_cloud(path, points, frame.intensities)
 
 
 def frames_in(

@@ -65,7 +65,7 @@ class Writer:
         """Add an item."""
         name = self._names.of(frame.refined.boxes.stamp_ns)
         seen: set[str] = set()
-        annotations = []
+        annotations: list[dict[str, Any]] = []
         for c in cuboids_of(frame, self.dropped):
             # A track is in a frame once: what has no name, or a name that is taken, stands alone.
             number = self._tracks.of('' if c.track_id in seen else c.track_id)

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import asdict
 from heapq import merge
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
@@ -40,6 +41,9 @@ FORMAT = Format(
 SUFFIX = '_refined'
 STATIC = 'tf_static'
 """Topics that end so are copied from the whole recording, whatever part is asked for."""
+
+
+_T = TypeVar('_T')
 
 
 class Raw(NamedTuple):
@@ -71,16 +75,16 @@ class Writer:
                 'boxreg relabel'
             )
         self.dropped: Counter[str] = Counter()
-        self._recording = options.recording.again().__enter__()
+        self._recording = copy(options.recording).__enter__()
         self._topic = self._recording.boxes_topic
         part = self._recording.start_ns, self._recording.end_ns
         files = [file for path in self._recording.files for file in _storage_files(path)]
-        sources = [_mcap(file, *part) if file.suffix == '.mcap' else _bag(file, *part) for file in files]
+        sources = [(_mcap if file.suffix == '.mcap' else _bag)(file, *part) for file in files]
         self._messages = merge(*sources, key=lambda raw: raw.log_time)
         self._next = next(self._messages, None)
         self._waiting: dict[int, deque[LabelFrame]] = {}
         self._channels: dict[tuple[object, ...], int] = {}
-        self._schemas: dict[tuple[str, str, bytes] | None, int] = {None: 0}
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._refined_topic = self._topic + SUFFIX
         while self._refined_topic in self._recording.topics:
             self._refined_topic += SUFFIX
@@ -120,8 +124,7 @@ class Writer:
 
     def _refined(self, raw: Raw) -> bytes | None:
         """Return the message with its boxes refined; None if they are not ready."""
-        message = self._recording.box_message(raw.data)
-        given = self._recording.boxes_of(message)
+        message, given = self._recording.box_message(raw.data)
         if not given.track_ids:
             return raw.data
         waiting = self._waiting.get(given.stamp_ns)
@@ -138,12 +141,13 @@ class Writer:
 
     def _add(self, raw: Raw) -> None:
         """Write a message, and its channel where it is the first on it."""
-        if raw.schema not in self._schemas:
-            self._schemas[raw.schema] = self._writer.register_schema(*raw.schema)
         key = (raw.topic, raw.schema, raw.encoding, raw.metadata)
         if key not in self._channels:
+            if raw.schema and raw.schema not in self._schemas:
+                self._schemas[raw.schema] = self._writer.register_schema(*raw.schema)
+            number = self._schemas[raw.schema] if raw.schema else 0  # 0: there is none
             self._channels[key] = self._writer.register_channel(
-                raw.topic, raw.encoding, self._schemas[raw.schema], dict(raw.metadata)
+                raw.topic, raw.encoding, number, dict(raw.metadata)
             )
         self._writer.add_message(
             self._channels[key], raw.log_time, raw.data, raw.publish_time, raw.sequence
@@ -190,11 +194,10 @@ def _mcap(path: Path, start_ns: int, end_ns: int) -> Iterator[Raw]:
         summary = reader.get_summary()
         topics = {c.topic for c in summary.channels.values()} if summary else set()
         static = [topic for topic in topics if topic.endswith(STATIC)]
-        parts = [(None, start_ns, end_ns)]
-        if static:
-            parts = [(static, None, start_ns), *parts, (static, end_ns, None)]
-        for part in parts:
-            for schema, channel, message in reader.iter_messages(*part):
+        for wanted, begin, end in _parts(None, static, start_ns, end_ns):
+            for schema, channel, message in reader.iter_messages(
+                wanted, starting_at=begin, ending_before=end
+            ):
                 yield Raw(
                     channel.topic,
                     (schema.name, schema.encoding, schema.data) if schema else None,
@@ -211,14 +214,19 @@ def _bag(path: Path, start_ns: int, end_ns: int) -> Iterator[Raw]:
     """Yield the same of any other storage, which has one time per message and counts none."""
     with AnyReader([path], default_typestore=stock_types()) as reader:
         static = [c for c in reader.connections if c.topic.endswith(STATIC)]
-        parts = [(reader.connections, start_ns, end_ns)]
-        if static:
-            parts = [(static, None, start_ns), *parts, (static, end_ns, None)]
         channels = {(c.id, id(c.owner)): _channel(c, reader) for c in reader.connections}
-        for part in parts:
+        for part in _parts(reader.connections, static, start_ns, end_ns):
             for connection, time_ns, data in reader.messages(*part):
                 channel = channels[connection.id, id(connection.owner)]
                 yield Raw(*channel, time_ns, time_ns, 0, bytes(data))
+
+
+def _parts(
+    every: _T, static: _T, start_ns: int, end_ns: int
+) -> list[tuple[_T, int | None, int | None]]:
+    """Return what to read from when to when: before and after the part, what is static."""
+    part: tuple[_T, int | None, int | None] = (every, start_ns, end_ns)
+    return [(static, None, start_ns), part, (static, end_ns, None)] if static else [part]
 
 
 def _channel(
@@ -234,7 +242,7 @@ def _channel(
             known = kind in reader.typestore.fielddefs
             text = reader.typestore.generate_msgdef(kind, ros_version=2)[0] if known else ''
         qos = yaml.safe_dump(dump_qos_v9(connection.ext.offered_qos_profiles), sort_keys=False)
-        metadata = {'offered_qos_profiles': qos}
+        metadata = {'offered_qos_profiles': qos, 'topic_type_hash': connection.digest or ''}
     else:
         encoding, language = 'ros1', 'ros1msg'
         kind = kind.replace('/msg/', '/')

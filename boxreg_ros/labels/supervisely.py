@@ -81,8 +81,6 @@ class Writer:
                         'rotation': c.angles,
                         'dimensions': c.extent,
                     },
-                    'nnCreated': True,
-                    'nnUpdated': True,
                     OURS: c.evidence,
                 }
             )

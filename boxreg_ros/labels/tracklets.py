@@ -121,7 +121,7 @@ class Writer:
             self._write(run)
         self._runs = runs
         if frame.sweep is not None:
-            write_cloud(self._clouds / f'{self._frames:010d}.bin', frame.sweep.points)
+            write_cloud(self._clouds / f'{self._frames:010d}.bin', frame.sweep.points, frame.intensities)
         self._timeline.add(frame)
         self._frames += 1
 
