@@ -159,7 +159,7 @@ def pandas(path):
     }
 
 
-def datumaro(folder):
+def datumaro(folder, form='datumaro'):
     """Return every cuboid with its frame, and KITTI raw tracklets that Datumaro makes of them."""
     import tempfile
     from xml.etree import ElementTree
@@ -167,7 +167,7 @@ def datumaro(folder):
     from datumaro import Dataset
     from datumaro.components.annotation import AnnotationType
 
-    data = Dataset.import_from(folder, 'datumaro')
+    data = Dataset.import_from(folder, form)
     labels = data.categories()[AnnotationType.label]
     found = [
         {

@@ -239,7 +239,7 @@ def test_an_overlay_can_be_relabelled_again(tmp_path):
 
 
 def test_labels_alone_make_no_overlay(tmp_path):
-    with pytest.raises(ConfigError, match=r"'mcap' writes a recording again.*boxreg relabel"):
+    with pytest.raises(ConfigError, match=r"'mcap' writes a recording again.*another format"):
         writer_for('mcap', tmp_path, Provenance())
     assert not list(tmp_path.iterdir())
 

@@ -69,10 +69,10 @@ class Writer:
     """
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        if options.recording is None:
+        if options.recording is None or not options.recording.boxes_topic:
             raise ConfigError(
-                "format 'mcap' writes a recording again: expected one, got label files; use "
-                'boxreg relabel'
+                "format 'mcap' writes a recording again, with its boxes refined: expected one "
+                'with boxes, got labels from a file; choose another format'
             )
         self.dropped: Counter[str] = Counter()
         self._recording = copy(options.recording).__enter__()

@@ -48,8 +48,8 @@ FORMAT = Format(
 )
 FILE = 'tracklet_labels.xml'
 POSE = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz')
-EXTENTS = {False: ('l', 'w', 'h'), True: ('w', 'h', 'l')}
-"""Where length, width and height are written, as KITTI has it and with axes swapped."""
+EXTENTS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
+"""Where length, width and height are written, as KITTI has it and as Datumaro reads it."""
 SWAPPED, TRACK = 'axes swapped', 'track '
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
@@ -68,7 +68,7 @@ CLASS_IDS = tuple(
 TAIL = '</tracklets>\n</boost_serialization>\n'
 INTERPOLATED_STATE, LABELLED_STATE = 1, 2
 FLAGS = """\
-<occlusion>-1</occlusion><occlusion_kf>0</occlusion_kf><truncation>99</truncation>\
+<occlusion>-1</occlusion><occlusion_kf>0</occlusion_kf><truncation>-1</truncation>\
 <amt_occlusion>-1</amt_occlusion><amt_occlusion_kf>-1</amt_occlusion_kf>\
 <amt_border_l>-1</amt_border_l><amt_border_r>-1</amt_border_r><amt_border_kf>-1</amt_border_kf>"""
 
@@ -121,7 +121,9 @@ class Writer:
             self._write(run)
         self._runs = runs
         if frame.sweep is not None:
-            write_cloud(self._clouds / f'{self._frames:010d}.bin', frame.sweep.points, frame.intensities)
+            write_cloud(
+                self._clouds / f'{self._frames:010d}.bin', frame.sweep.points, frame.intensities
+            )
         self._timeline.add(frame)
         self._frames += 1
 
