@@ -60,6 +60,7 @@ Tr_velo_cam 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.5
 """
 OURS = (
     'csv', 'parquet', 'openlabel', 'kitti', 'tracklets', 'nuscenes', 't4', 'argoverse2', 'waymo',
+    'sustechpoints', 'datumaro', 'supervisely', 'xtreme1',
 )  # fmt: skip
 LOSE_TILT = {'kitti', 'waymo'}
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, 0.25]], np.float32)

@@ -18,7 +18,7 @@ from typing import Any
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import INPUT, LabelFrame
 from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import frame_names, read_poses, read_stamps, refined_boxes, STAMPS
+from boxreg_ros.labels.files import read_timeline, refined_boxes, STAMPS
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, PITCH, RefinedBoxes, ROLL, X, YAW, Z
 import numpy as np
 from numpy.typing import ArrayLike
@@ -149,24 +149,22 @@ def frames_in(
         If the timeline is missing or is that of other frames.
 
     """
-    stamps = read_stamps(folder / STAMPS)
-    poses = read_poses(folder / 'poses.txt', len(stamps))
-    fixed, sensor = frame_names(folder)
+    timeline = read_timeline(folder, len(names))
     maker = FrameNames()
-    order = [maker.of(stamp) for stamp in stamps]
+    order = [maker.of(stamp_ns) for stamp_ns in timeline.stamps_ns]
     if not set(names) <= set(order):  # not our names: frames sorted by name, a stamp for each
-        if len(names) != len(stamps):
+        if len(names) != len(order):
             raise RecordingError(
-                f'{folder / STAMPS}: expected {len(names)} stamps, one per frame, got '
-                f'{len(stamps)}'
+                f'{folder / STAMPS}: expected one stamp for each of {len(names)} frames, got '
+                f'{len(order)}'
             )
         order = sorted(names)
-    for stamp_ns, name, T_fixed_sensor in zip(stamps, order, poses, strict=True):
+    for index, name in enumerate(order):
         items = items_of(name)
         notes = [note for *_, note in items]
         refined = refined_boxes(
-            stamp_ns,
-            sensor,
+            timeline.stamps_ns[index],
+            timeline.sensor_frame,
             [track_id for track_id, *_ in items],
             [class_name for _, class_name, *_ in items],
             [box for _, _, box, _ in items],
@@ -176,7 +174,7 @@ def frames_in(
             [_covariance(note.get('covariance')) for note in notes],
             [str(note.get('reason', '')) for note in notes],
         )
-        yield LabelFrame(refined, fixed, sensor, T_fixed_sensor).moved('fixed')
+        yield timeline.frame(index, refined).moved('fixed')
 
 
 def _covariance(upper: ArrayLike | None) -> Floats:
