@@ -299,3 +299,14 @@ def test_an_empty_cloud_is_a_file(tmp_path):
 def test_other_clouds_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"'cloud.las': expected a name in .pcd, .ply"):
         write_cloud(tmp_path / 'cloud.las', CLOUD.points)
+
+
+def test_intensities_come_along_in_other_formats(tmp_path):
+    feather = pytest.importorskip('pyarrow.feather')
+    item = frame(STAMP, ['a'], sweep=CLOUD, intensities=np.array([0.5, 900.0]))
+    write('tracklets', tmp_path, [item], with_points=True)
+    (file,) = (tmp_path / 'tracklets').rglob('*.bin')
+    np.testing.assert_array_equal(np.fromfile(file, '<f4')[3::4], [0.5, 900.0])
+    write('argoverse2', tmp_path, [item], with_points=True)
+    (file,) = (tmp_path / 'argoverse2').rglob(f'lidar/{STAMP}.feather')
+    assert feather.read_table(file)['intensity'].to_pylist() == [0, 255]  # whole, in one byte
