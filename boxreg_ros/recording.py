@@ -185,6 +185,11 @@ class Recording:
         return bytes(encode(replaced, kind))
 
     @property
+    def typestore(self) -> Typestore:
+        """Return the definitions of the messages in the recording."""
+        return self._reader.typestore
+
+    @property
     def topics(self) -> dict[str, str]:
         """Return all topics with the types of their messages."""
         return dict(self._topics)

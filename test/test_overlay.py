@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 from ros_messages import Drive, START, typestore, write_recording
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
 
+MARKERS = 'visualization_msgs/msg/MarkerArray'
+ADDED = ('/boxes_refined', '/boxes_refined_markers')
 QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
 
 
@@ -67,9 +70,10 @@ def test_everything_is_copied_and_refined_boxes_are_beside_it(tmp_path, storage,
             for topic, t, data in after
             if topic == '/boxes_refined'
         ]
-    assert sorted(item for item in after if item[0] != '/boxes_refined') == sorted(before)
+    assert sorted(item for item in after if item[0] not in ADDED) == sorted(before)
     assert [t for _, t, _ in after] == sorted(t for _, t, _ in after)
     assert copied.pop('/boxes_refined') == kinds['/boxes']
+    assert copied.pop('/boxes_refined_markers')[0] == MARKERS
     assert copied == kinds
     assert [t for t, *_ in refined] == drive.stamps
     assert summary['status']['refined'] > 0
@@ -85,6 +89,26 @@ def test_everything_is_copied_and_refined_boxes_are_beside_it(tmp_path, storage,
     assert moved > 0.01
 
 
+@pytest.mark.parametrize('storage', ['mcap', 'rosbag1'])
+def test_markers_show_boxes_before_and_after(tmp_path, storage):
+    drive = Drive(sweeps=4, ros1=storage == 'rosbag1')
+    run(drive.write(tmp_path / 'drive', storage), tmp_path / 'out')
+    rows, facts = messages_of(tmp_path / 'out' / 'overlay.mcap')
+    store = get_typestore(Stores.ROS1_NOETIC if drive.messages.ros1 else Stores.ROS2_JAZZY)
+    decode = store.deserialize_ros1 if drive.messages.ros1 else store.deserialize_cdr
+    found = {t: decode(data, MARKERS) for topic, t, *_, data in rows if topic == ADDED[1]}
+    assert list(found) == drive.stamps
+    assert facts[ADDED[1]][0] == MARKERS.replace('/msg/', '/' if drive.messages.ros1 else '/msg/')
+    for stamp_ns, message in found.items():
+        cubes = [m for m in message.markers if m.ns == 'refined' and m.type == 1]
+        boxes = expected_boxes(tmp_path / 'out', drive, stamp_ns)
+        places = [(m.pose.position.x, m.pose.position.y, m.pose.position.z) for m in cubes]
+        np.testing.assert_allclose(places, boxes[:, :3], atol=1e-6)
+        assert {m.header.frame_id for m in cubes} == {'lidar'}
+        texts = [m.text for m in message.markers if m.ns == 'id' and m.action == 0]
+        assert texts == ['1', '2']
+
+
 def test_ros1_stays_ros1(tmp_path):
     drive = Drive(sweeps=4, ros1=True)
     path = drive.write(tmp_path / 'drive', 'rosbag1')
@@ -94,7 +118,7 @@ def test_ros1_stays_ros1(tmp_path):
         store = reader.typestore
     rows, facts = messages_of(tmp_path / 'out' / 'overlay.mcap')
     after = [(topic, t, data) for topic, t, _, _, data in rows]
-    assert sorted(item for item in after if item[0] != '/boxes_refined') == sorted(before)
+    assert sorted(item for item in after if item[0] not in ADDED) == sorted(before)
     name, encoding, definition, message_encoding, metadata = facts['/boxes_refined']
     assert (name, encoding, message_encoding) == (
         'vision_msgs/Detection3DArray', 'ros1msg', 'ros1',
@@ -132,7 +156,7 @@ def test_what_only_mcap_holds_survives(tmp_path):
     writer.finish()
     run(path, tmp_path / 'out')
     rows, facts = messages_of(tmp_path / 'out' / 'overlay.mcap')
-    assert sorted(row for row in rows if row[0] != '/boxes_refined') == messages_sorted(path)
+    assert sorted(row for row in rows if row[0] not in ADDED) == messages_sorted(path)
     assert facts['/boxes_refined'] == facts['/boxes']
     assert {(topic, log - publish, n) for topic, log, publish, n, _ in rows} >= {
         ('/boxes_refined', 5, 42)
@@ -191,7 +215,7 @@ def test_several_recordings_are_one_overlay(tmp_path):
     )
     run(parts, tmp_path / 'out')
     rows, _ = messages_of(tmp_path / 'out' / 'overlay.mcap')
-    assert len([row for row in rows if row[0] != '/boxes_refined']) == len(drive.items)
+    assert len([row for row in rows if row[0] not in ADDED]) == len(drive.items)
     assert [t for topic, t, *_ in rows if topic == '/boxes_refined'] == drive.stamps
     assert [t for _, t, *_ in rows] == sorted(t for _, t, *_ in rows)
 
@@ -224,7 +248,7 @@ def test_boxes_without_transforms_stay_as_they_are(tmp_path):
     first = {
         row[0]: adapter_for(kind).from_msg(typestore().deserialize_cdr(row[4], kind))
         for row in rows
-        if row[1] == drive.stamps[0] and row[0].startswith('/boxes')
+        if row[1] == drive.stamps[0] and row[0] in ('/boxes', '/boxes_refined')
     }
     np.testing.assert_allclose(first['/boxes_refined'].boxes, first['/boxes'].boxes, atol=1e-9)
 

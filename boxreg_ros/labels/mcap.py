@@ -3,7 +3,8 @@ MCAP: the recording again, with the refined boxes on a topic beside it, as ``ove
 
 Everything of the recording is copied as it is, byte by byte: topics of any encoding, and of MCAP
 files also attachments and metadata. Of every message with boxes there is a second one under the
-same times, with the boxes refined, on its topic with ``_refined`` behind.
+same times, with the boxes refined, on its topic with ``_refined`` behind, and for the eyes what
+the node shows as markers, on that topic with ``_markers`` behind.
 
 """
 
@@ -12,21 +13,32 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from heapq import merge
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from types import SimpleNamespace
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.recording import stock_types
 from boxreg_ros.structures import BoxArray, INTERPOLATED, RefinedBoxes
 from boxreg_ros.transforms import boxes_to_frame, inverse
+from boxreg_ros.visual import MarkerBoard
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
+import numpy as np
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinitionFormat,
+    Nodetype,
+)
 from rosbags.rosbag2.metadata import dump_qos_v9
+from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
 import yaml
 
 FORMAT = Format(
@@ -38,7 +50,13 @@ FORMAT = Format(
     rotation='that of the input message',
     files='overlay.mcap, beside boxes.csv',
 )
-SUFFIX = '_refined'
+SUFFIX, MARKERS_SUFFIX = '_refined', '_markers'
+MARKERS = 'visualization_msgs/msg/MarkerArray'
+MESSAGES = (
+    'builtin_interfaces/msg/Time', 'geometry_msgs/msg/Point', 'geometry_msgs/msg/Pose',
+    'geometry_msgs/msg/Quaternion', 'geometry_msgs/msg/Vector3', 'std_msgs/msg/ColorRGBA',
+    'std_msgs/msg/Header', 'visualization_msgs/msg/Marker', MARKERS,
+)  # fmt: skip
 STATIC = 'tf_static'
 """Topics that end so are copied from the whole recording, whatever part is asked for."""
 
@@ -88,6 +106,7 @@ class Writer:
         self._refined_topic = self._topic + SUFFIX
         while self._refined_topic in self._recording.topics:
             self._refined_topic += SUFFIX
+        self._markers = _Markers(self._recording.typestore, is_ros1=files[0].suffix == '.bag')
         self._writer = McapWriter(str(folder / 'overlay.mcap'))
         self._writer.start('ros1' if files[0].suffix == '.bag' else 'ros2')
         origin = asdict(provenance) | {'recordings': ', '.join(provenance.recordings)}
@@ -114,19 +133,19 @@ class Writer:
     def _copy(self, is_end: bool) -> None:
         """Copy messages up to the first whose boxes are not ready yet."""
         while (raw := self._next) is not None:
-            refined = self._refined(raw) if raw.topic == self._topic else b''
+            refined = self._refined(raw) if raw.topic == self._topic else []
             if refined is None and not is_end:
                 return
-            self._add(raw)
-            if refined:
-                self._add(raw._replace(topic=self._refined_topic, data=refined))
+            for item in (raw, *(refined or ())):
+                self._add(item)
             self._next = next(self._messages, None)
 
-    def _refined(self, raw: Raw) -> bytes | None:
-        """Return the message with its boxes refined; None if they are not ready."""
+    def _refined(self, raw: Raw) -> list[Raw] | None:
+        """Return the message with its boxes refined, and markers; None if they are not ready."""
         message, given = self._recording.box_message(raw.data)
+        copied = raw._replace(topic=self._refined_topic)
         if not given.track_ids:
-            return raw.data
+            return [copied]
         waiting = self._waiting.get(given.stamp_ns)
         if not waiting:
             return None
@@ -137,7 +156,9 @@ class Writer:
         boxes, T = refined.boxes, frame.T_fixed_given
         if boxes.frame_id != given.frame_id and T is not None:
             boxes = boxes_to_frame(boxes, inverse(T), given.frame_id)
-        return self._recording.with_boxes(message, boxes, refined.covariances)
+        data = self._recording.with_boxes(message, boxes, refined.covariances)
+        shown = self._markers.of(copied, given, replace(refined, boxes=boxes))
+        return [copied._replace(data=data), shown]
 
     def _add(self, raw: Raw) -> None:
         """Write a message, and its channel where it is the first on it."""
@@ -152,6 +173,48 @@ class Writer:
         self._writer.add_message(
             self._channels[key], raw.log_time, raw.data, raw.publish_time, raw.sequence
         )
+
+
+class _Markers:
+    """Makes markers of rosbags' classes, in the encoding of the recording."""
+
+    def __init__(self, known: Typestore, is_ros1: bool) -> None:
+        stock = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+        self._store = known if MARKERS in known.types else stock
+        self._is_ros1 = is_ros1
+        text = self._store.generate_msgdef(MARKERS, ros_version=1 if is_ros1 else 2)[0]
+        name = MARKERS.replace('/msg/', '/') if is_ros1 else MARKERS
+        self._schema = (name, 'ros1msg' if is_ros1 else 'ros2msg', text.encode())
+        kinds = {kind.rpartition('/')[2]: kind for kind in MESSAGES}
+        makers = {name: partial(_made, self._store, kind) for name, kind in kinds.items()}
+        self._board = MarkerBoard(SimpleNamespace(**makers))
+
+    def of(self, raw: Raw, given: BoxArray, refined: RefinedBoxes) -> Raw:
+        """Return the markers of boxes, received when the message `raw` was."""
+        encode = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
+        return raw._replace(
+            topic=raw.topic + MARKERS_SUFFIX,
+            schema=self._schema,
+            encoding='ros1' if self._is_ros1 else 'cdr',
+            metadata=(),
+            data=bytes(encode(self._board.update(given, refined), MARKERS)),
+        )
+
+
+def _made(store: Typestore, kind: str, **fields: Any) -> Any:
+    """Return a message; fields that are not given are empty or zero."""
+    definition: Any = store.fielddefs[kind][1]
+    for name, (node, inner) in definition:
+        if name in fields:
+            continue
+        if node is Nodetype.NAME:
+            fields[name] = _made(store, inner)
+        elif node is Nodetype.BASE:
+            fields[name] = {'string': str, 'bool': bool}.get(inner[0], int)()
+        else:
+            is_number = inner[0][0] is Nodetype.BASE
+            fields[name] = np.zeros(0, inner[0][1][0]) if is_number else []
+    return store.types[kind](**fields)
 
 
 def _without_interpolated(refined: RefinedBoxes) -> RefinedBoxes:
