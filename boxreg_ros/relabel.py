@@ -16,19 +16,21 @@ from dataclasses import dataclass, field, replace
 import hashlib
 from importlib.metadata import version
 import json
-import os
 from pathlib import Path
 import platform
-import shutil
 import sys
 import time
 from typing import Any, TypeVar
-from uuid import uuid4
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
-from boxreg_ros.labelled import LabelledRecording
+from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.labelled import (
+    add_label_arguments,
+    label_frame_of,
+    LabelledRecording,
+    pose_of,
+)
 from boxreg_ros.labels import (
     LabelFrame,
     LabelWriter,
@@ -39,6 +41,7 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.results import earlier_summary, SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import (
     BoxArray,
@@ -53,8 +56,6 @@ from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame, TransformTree
 import numpy as np
 import yaml
 
-SUMMARY = 'summary.json'
-SPOOL = '.clouds'
 BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
 
 Progress = Callable[[float, float], None]
@@ -170,7 +171,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
         spool = None
         if request.options.with_points:
-            spool = Spool(folder / SPOOL, round(request.config.tolerance * 1e9))
+            spool = Spool(folder, round(request.config.tolerance * 1e9))
         provenance = Provenance.of(request.recordings, request.config)
         options = replace(request.options, recording=recording)
         writers = {name: writer_for(name, folder, provenance, options) for name in names}
@@ -254,78 +255,6 @@ def to_fixed_frame(
     if isinstance(item, Sweep):
         return sweep_to_frame(item, T_fixed_item, fixed_frame)
     return boxes_to_frame(item, T_fixed_item, fixed_frame)
-
-
-def pose_of(tree: TransformTree, fixed_frame: str, frame: str, stamp_ns: int) -> Floats | None:
-    """Return the pose of `frame` in the fixed frame; None if unknown."""
-    try:
-        return tree.lookup(fixed_frame, frame, stamp_ns)
-    except TransformUnavailable:
-        return None
-
-
-def label_frame_of(
-    recording: Recording, tree: TransformTree, fixed_frame: str, wish: str | None
-) -> str:
-    """
-    Return the frame that stands for the sensor's in label files: that of the clouds, or `wish`.
-
-    Raises
-    ------
-    RecordingError
-        If nothing connects it with the fixed frame.
-
-    """
-    frame = (wish or recording.sensor_frame()).lstrip('/')
-    if not tree.connects(fixed_frame, frame):
-        raise RecordingError(
-            f'{recording}: label frame {frame!r}: expected one that is connected with '
-            f'{fixed_frame!r}; TF: {tree}'
-        )
-    return frame
-
-
-def earlier_summary(out: Path) -> dict[str, Any] | None:
-    """Return the summary of an earlier run in `out`; None if there is none."""
-    try:
-        summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
-    except (OSError, ValueError):
-        return None
-    return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
-
-
-@contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
-    """
-    Yield a folder to fill that becomes `out` on success, and vanishes otherwise.
-
-    Raises
-    ------
-    RecordingError
-        If `out` exists and is not the result of an earlier run.
-
-    """
-    if out.exists() and earlier_summary(out) is None and not _is_empty(out):
-        raise RecordingError(
-            f'output {str(out)!r}: expected a new folder or an earlier result, got something '
-            f'else; choose another with -o'
-        )
-    out = out.resolve()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unique = f'.{out.name}.{uuid4().hex[:8]}'
-    partial, earlier = out.with_name(f'{unique}.partial'), out.with_name(f'{unique}.earlier')
-    partial.mkdir()
-    try:
-        yield partial
-        if out.exists():
-            os.replace(out, earlier)
-        os.replace(partial, out)
-    except BaseException:
-        if earlier.exists():
-            os.replace(earlier, out)
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-    shutil.rmtree(earlier, ignore_errors=True)
 
 
 class _Clock:
@@ -479,10 +408,6 @@ def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[Refined
     return registrar.add_sweep(item) if isinstance(item, Sweep) else registrar.add_boxes(item)
 
 
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
-
-
 def _summary(
     request: Request, recording: Recording, fixed_frame: str, counts: Counter[str], sink: _Sink
 ) -> dict[str, Any]:
@@ -576,26 +501,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--workers', type=int, metavar='N', help='cores of the solver (solver.threads)'
     )
-
-
-def add_label_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that label formats need, whoever writes them."""
-    parser.add_argument(
-        '--camera', type=Path, metavar='FILE',
-        help='calibration, for formats that look through a camera',
-    )  # fmt: skip
-    parser.add_argument(
-        '--swap-axes', action='store_true',
-        help='extents where Datumaro and CVAT look for them',
-    )  # fmt: skip
-    parser.add_argument(
-        '--with-points', action='store_true',
-        help='write the clouds that the label formats need beside their labels',
-    )  # fmt: skip
-    parser.add_argument(
-        '--label-frame', metavar='FRAME',
-        help='frame that stands for the sensor in label files (default: that of the clouds)',
-    )  # fmt: skip
 
 
 def _labels_argument(text: str) -> tuple[str, Path]:

@@ -18,18 +18,18 @@ class Spool:
     Parameters
     ----------
     folder : Path
-        Made here, and removed by `remove`.
+        Of results; the clouds are in a folder of their own in it, until `remove`.
     tolerance_ns : int
         A cloud belongs to boxes within this [ns].
 
     """
 
     def __init__(self, folder: Path, tolerance_ns: int) -> None:
-        self._folder = folder
+        self._folder = folder / '.clouds'
         self._tolerance_ns = tolerance_ns
         self._poses: dict[int, tuple[str, Floats]] = {}
         self._stamps: list[int] = []
-        folder.mkdir()
+        self._folder.mkdir()
 
     def add(self, sweep: Sweep, T_fixed_sweep: Floats, intensities: Floats | None = None) -> None:
         """Store a sweep with the pose of its frame; of one stamp, the first."""
