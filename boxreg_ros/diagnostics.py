@@ -19,6 +19,7 @@ REMEDIES = {
     'boxes_queue_full': TOO_SLOW,
     'unreadable': 'the log has the reason',
     'no_transform': 'the log has the frames',
+    'pose_reference': 'boxes do not stand where their points are: the log has the setting',
     'late': 'boxes came after younger ones: publish them in the order of their stamps',
     'no_track_id': 'boxes need an id that stays with the object: put a tracker before this node',
     'duplicate_track_id': 'an id may occur once per message',

@@ -22,6 +22,7 @@ from boxreg_ros.errors import (
 from boxreg_ros.structures import BoxArray, Sweep
 from boxreg_ros.transforms import TransformTree
 from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE
+from msg_adapters.convention import Convention, STANDARD
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -75,6 +76,8 @@ class Recording:
         Topics; found by type where only one fits.
     start, end : float, optional
         Part to read, from the beginning of the recording [s].
+    convention : Convention
+        How the boxes are to be read.
 
     Attributes
     ----------
@@ -98,7 +101,9 @@ class Recording:
         odometry: str | None = None,
         start: float | None = None,
         end: float | None = None,
+        convention: Convention = STANDARD,
     ) -> None:
+        self._convention = convention
         self._paths = [Path(path) for path in paths]
         self._asked = {'points': points, 'boxes': boxes, 'odometry': odometry}
         self._start, self._end = start or 0.0, end
@@ -251,7 +256,7 @@ class Recording:
         if self._asked['odometry']:
             self.odometry_topic = self._topic('odometry', 'odometry', (ODOMETRY_TYPE,))
         if self.has_boxes:
-            self._adapter = adapter_for(self._topics[self.boxes_topic])
+            self._adapter = adapter_for(self._topics[self.boxes_topic], self._convention)
 
         known = self._reader.typestore.fielddefs
         if not known.keys() >= set(self._topics.values()):

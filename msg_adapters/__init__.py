@@ -89,9 +89,7 @@ def canonical(type_name: str) -> str:
     return type_name if middle or not package else f'{package}/msg/{name}'
 
 
-def adapter_for(
-    type_name: str, convention: Convention | None = None, associate: bool = True
-) -> Adapter:
+def adapter_for(type_name: str, convention: Convention | None = None) -> Adapter:
     """
     Return what reads and writes box arrays of this type.
 
@@ -100,9 +98,8 @@ def adapter_for(
     type_name : str
         ``package/msg/Type``.
     convention : Convention, optional
-        What the poses and sizes of this topic mean; without it what the type says.
-    associate : bool
-        Whether boxes are given ids later on; without that, types that have none are refused.
+        What the poses and sizes of this topic mean, and whether its boxes are given ids later
+        on; if not, types that have none are refused. None: what the type says.
 
     Raises
     ------
@@ -116,11 +113,13 @@ def adapter_for(
             f'message type {type_name!r} holds no boxes that can be read; expected one of '
             f'{", ".join(ADAPTERS)}'
         )
-    if canonical(type_name) in WITHOUT_IDS and not associate:
+    if canonical(type_name) in WITHOUT_IDS and convention and not convention.associate:
         raise UnsupportedMessage(
             f'boxes of type {type_name} have no ids to tell objects by over time; put a tracker '
             f'before, or have them associated: associate:=true for the node, --associate for '
             f'boxreg relabel'
         )
     adapter = cast(Adapter, import_module(module))
-    return adapter if convention in (None, Convention()) else _Converting(adapter, convention)
+    if convention is None or convention.is_standard:
+        return adapter
+    return _Converting(adapter, convention)

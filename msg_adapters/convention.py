@@ -40,8 +40,10 @@ class Convention:
         ``'-0.28,0,-0.5'``: from the centre, in parts of length, width and height.
     size_order : str
         What the size's x, y and z are: ``'lwh'`` length, width, height.
-    forward : str
+    forward_axis : str
         The axis of the pose that points forward, one of `FORWARD`.
+    associate : bool
+        Whether the boxes are given ids by association, whatever ids they come with.
 
     Raises
     ------
@@ -52,16 +54,22 @@ class Convention:
 
     pose_reference: str = 'center'
     size_order: str = 'lwh'
-    forward: str = 'x'
+    forward_axis: str = 'x'
+    associate: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name, known in (('size_order', SIZE_ORDERS), ('forward', tuple(FORWARD))):
+        for name, known in (('size_order', SIZE_ORDERS), ('forward_axis', tuple(FORWARD))):
             if getattr(self, name) not in known:
                 raise ConfigError(
                     f'{name}: expected one of {", ".join(known)}, got {getattr(self, name)!r}'
                 )
         _ = self.reference
+
+    @property
+    def is_standard(self) -> bool:
+        """Tell whether pose and size mean what the message type says."""
+        return replace(self, associate=False) == STANDARD
 
     @property
     def reference(self) -> Floats:
@@ -80,14 +88,14 @@ class Convention:
 
     def to_centers(self, boxes: BoxArray) -> BoxArray:
         """Return boxes read from messages of this convention as the core has them."""
-        changed = self._turned(boxes.boxes, FORWARD[self.forward])
+        changed = self._turned(boxes.boxes, FORWARD[self.forward_axis])
         changed[:, LENGTH : HEIGHT + 1] = boxes.boxes[:, self._columns]
         changed[:, X : Z + 1] -= self._offsets(changed)
         return replace(boxes, boxes=changed)
 
     def from_centers(self, boxes: BoxArray) -> BoxArray:
         """Return boxes of the core as messages of this convention have them."""
-        changed = self._turned(boxes.boxes, -FORWARD[self.forward])
+        changed = self._turned(boxes.boxes, -FORWARD[self.forward_axis])
         changed[:, X : Z + 1] += self._offsets(boxes.boxes)
         changed[:, self._columns] = boxes.boxes[:, LENGTH : HEIGHT + 1]
         return replace(boxes, boxes=changed)
@@ -129,3 +137,7 @@ class Convention:
             angles = turns.as_euler('ZYX', suppress_warnings=True)
             changed[known, ROLL : YAW + 1] = angles[:, ::-1]
         return changed
+
+
+STANDARD = Convention()
+"""Pose and size as the message types say."""

@@ -15,7 +15,7 @@ FLOORS = (
     ('sampling', 'objective', 'correspondence', 'lbfgs'),
     ('calibration', 'window', 'registration'),
     ('association', 'registrar'),
-    ('boxtable', 'labels', 'recording', 'transforms'),
+    ('boxtable', 'intake', 'labels', 'pose_check', 'recording', 'tracker', 'transforms'),
 )
 CORE = tuple(module for floor in FLOORS[:5] for module in floor)
 EDGE = len(FLOORS)
