@@ -21,7 +21,11 @@ GAIN = 1.3
 """Another convention has to hold this many times the points ..."""
 AGREEMENT = 0.7
 """... and more points in this part of the boxes, to be believed."""
-WAYS = (('behind', 'before'), ('right of', 'left of'), ('below', 'above'))
+WAYS = (
+    ('length', 'behind', 'before'),
+    ('width', 'right of', 'left of'),
+    ('height', 'below', 'above'),
+)
 
 
 class PoseCheck:
@@ -114,11 +118,10 @@ class PoseCheck:
         if other.pose_reference != self._convention.pose_reference:
             name = 'pose_reference'
             off = other.reference - self._convention.reference  # the boxes from where they are
-            steps = zip(off, ('length', 'width', 'height'), WAYS, strict=True)
             how = ' and '.join(
-                f'{"hover" if way == "above" else "stand"} {abs(part):g} {axis}s {way}'
-                for part, axis, ways in steps
-                for way in [ways[part > 0]]
+                f'{"hover" if axis == "height" and part > 0 else "stand"} {abs(part):g} {axis}s '
+                f'{ways[int(part > 0)]}'
+                for part, (axis, *ways) in zip(off, WAYS, strict=True)
                 if part
             )
         wanted = getattr(other, name)

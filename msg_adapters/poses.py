@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from copy import copy
+from types import SimpleNamespace
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
@@ -107,6 +108,8 @@ def replaced(msg: Any, **fields: Any) -> Any:
         new.MergeFrom(type(msg)(**fields))
         return new
     new = copy(msg)
+    if isinstance(msg, SimpleNamespace):  # mcap's have slots that a copy leaves behind
+        fields = {name: getattr(msg, name) for name in getattr(msg, '__slots__', ())} | fields
     for name, value in fields.items():
         setattr(new, name, value)
     return new
