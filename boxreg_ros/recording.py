@@ -19,11 +19,11 @@ from boxreg_ros.errors import (
     RecordingError,
     UnsupportedMessage,
 )
+from boxreg_ros.foxglove_mcap import Reader
 from boxreg_ros.structures import BoxArray, Sweep
 from boxreg_ros.transforms import TransformTree
-from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE
+from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, WITHOUT_IDS
 from msg_adapters.convention import Convention, STANDARD
-from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -112,7 +112,7 @@ class Recording:
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
         with _readable(self):
-            self._reader = AnyReader(_files(self._paths), default_typestore=_stock_types())
+            self._reader = Reader(_files(self._paths), _stock_types())
             self._reader.open()
         try:
             self._find()
@@ -252,7 +252,9 @@ class Recording:
         }
         self._filled = {c.topic for c in self._reader.connections if c.msgcount}
         self.points_topic = self._topic('points', 'point clouds', (POINTS_TYPE,))
-        self.boxes_topic = self._topic('boxes', 'boxes', tuple(ADAPTERS)) if self.has_boxes else ''
+        self.boxes_topic = ''
+        if self.has_boxes:
+            self.boxes_topic = self._topic('boxes', 'boxes', self._box_types())
         if self._asked['odometry']:
             self.odometry_topic = self._topic('odometry', 'odometry', (ODOMETRY_TYPE,))
         if self.has_boxes:
@@ -299,6 +301,12 @@ class Recording:
                 f'--{role}'
             )
         return candidates[0]
+
+    def _box_types(self) -> tuple[str, ...]:
+        """Return the types of boxes; not those without ids where there are others to choose."""
+        with_ids = tuple(name for name in ADAPTERS if name not in WITHOUT_IDS)
+        is_free = self._convention.associate or self._asked['boxes'] is not None
+        return tuple(ADAPTERS) if is_free or not self._candidates(with_ids) else with_ids
 
     def _candidates(self, types: Collection[str]) -> list[str]:
         """Return the topics of these types that have messages, or the odometry asked for."""
@@ -349,6 +357,8 @@ class Recording:
         connection = record.connection
         try:
             return self._reader.deserialize(record.data, connection.msgtype)
+        except BoxregError:
+            raise
         except Exception as error:  # the bytes are foreign, and so are the errors they cause
             raise RecordingError(
                 f'{self}: a message on {connection.topic!r} is not a {connection.msgtype} as '

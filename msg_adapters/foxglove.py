@@ -32,13 +32,13 @@ def from_msg(msg: Any) -> BoxArray:
         If the entities with cubes disagree about frame or stamp.
 
     """
-    entities = [entity for entity in msg.entities if entity.cubes]
+    entities = [entity for entity in msg.entities if _cubes(entity)]
     origins = ((_time_ns(e.timestamp), e.frame_id) for e in entities or msg.entities[:1])
     origin = poses.one_origin('SceneUpdate', origins)
     track_ids, names, scores, cubes = [], [], [], []
     for entity in entities:
-        for k, cube in enumerate(entity.cubes):
-            track_ids.append(entity.id if len(entity.cubes) == 1 else f'{entity.id}/{k}')
+        for k, cube in enumerate(_cubes(entity)):
+            track_ids.append(entity.id if len(_cubes(entity)) == 1 else f'{entity.id}/{k}')
             names.append(_noted(entity, CLASS_KEYS, ''))
             scores.append(_number(_noted(entity, SCORE_KEYS, '1')))
             cubes.append(cube)
@@ -54,7 +54,7 @@ def to_msg(
     entities, i = [], 0
     for entity in msg.entities:
         cubes = []
-        for cube in entity.cubes:
+        for cube in _cubes(entity):
             pose, size = poses.with_box(cube.pose, cube.size, boxes.boxes[i], quaternions_xyzw[i])
             cubes.append(poses.replaced(cube, pose=pose, size=size))
             i += 1
@@ -70,6 +70,10 @@ def to_msg(
     return poses.replaced(msg, entities=entities)
 
 
+def _cubes(entity: Any) -> Any:
+    return getattr(entity, 'cubes', ())  # JSON may leave out what is empty
+
+
 def _time_ns(time: Any) -> int:
     """Return a time as ROS, JSON or protobuf spell it [ns]."""
     for seconds, rest in (('sec', 'nanosec'), ('sec', 'nsec'), ('seconds', 'nanos')):
@@ -79,7 +83,7 @@ def _time_ns(time: Any) -> int:
 
 
 def _noted(entity: Any, keys: tuple[str, ...], default: str) -> str:
-    noted = {item.key.lower(): str(item.value) for item in entity.metadata}
+    noted = {item.key.lower(): str(item.value) for item in getattr(entity, 'metadata', ())}
     return next((noted[key] for key in keys if key in noted), default)
 
 

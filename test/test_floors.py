@@ -15,7 +15,16 @@ FLOORS = (
     ('sampling', 'objective', 'correspondence', 'lbfgs'),
     ('calibration', 'window', 'registration'),
     ('association', 'registrar'),
-    ('boxtable', 'intake', 'labels', 'pose_check', 'recording', 'tracker', 'transforms'),
+    (
+        'boxtable',
+        'foxglove_mcap',
+        'intake',
+        'labels',
+        'pose_check',
+        'recording',
+        'tracker',
+        'transforms',
+    ),
 )
 CORE = tuple(module for floor in FLOORS[:5] for module in floor)
 EDGE = len(FLOORS)
