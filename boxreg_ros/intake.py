@@ -7,9 +7,10 @@ from typing import cast, TypeVar
 
 from boxreg_ros.config import Config
 from boxreg_ros.pose_check import PoseCheck
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from boxreg_ros.tracker import Tracker
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
+import numpy as np
 
 _T = TypeVar('_T', bound=Sweep | BoxArray)
 
@@ -39,6 +40,17 @@ class Intake:
         if self._tracker is None:
             return {'ids': 'of the input'}
         return {'ids': 'by association', 'associated_tracks': self._tracker.count}
+
+
+def covariances_to_write(refined: RefinedBoxes) -> Floats:
+    """
+    Return covariances (n, 6, 6) for messages, NaN where the box is kept.
+
+    About a box that stays as it was, the detector knows more than we do.
+
+    """
+    is_kept = np.array([status == KEPT for status in refined.status], dtype=bool)
+    return np.where(is_kept[:, None, None], np.nan, refined.covariances)
 
 
 def add_convention_arguments(parser: argparse.ArgumentParser) -> None:

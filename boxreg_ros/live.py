@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 from boxreg_ros import refine
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.intake import Intake
+from boxreg_ros.intake import covariances_to_write, Intake
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep, Track
+from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep, Track
 from boxreg_ros.transforms import boxes_to_frame, inverse, sweep_to_frame, TransformTree
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -234,9 +234,7 @@ class LiveRegistrar:
                 pending.is_early_out = True
             moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
             assert self.adapter is not None  # it has read the message
-            # About boxes that are kept as they were, the detector knows more than we do.
-            is_kept = np.array([status == KEPT for status in moved.status], dtype=bool)
-            covariances = np.where(is_kept[:, None, None], np.nan, moved.covariances)
+            covariances = covariances_to_write(moved)
             message = self.adapter.to_msg(
                 pending.message, moved.boxes, covariances, pending.T_output_item
             )
