@@ -17,6 +17,8 @@ PATIENCE = 300
 MIN_POINTS = 10
 MARGIN = 0.1
 """Points this far outside a box are still its own [m]."""
+NEARLY = 0.85
+"""A convention that holds this part of the most is as good."""
 GAIN = 1.3
 """Another convention has to hold this many times the points ..."""
 AGREEMENT = 0.7
@@ -106,7 +108,9 @@ class PoseCheck:
         counts = np.array(self._counts, dtype=float)
         shares = counts / counts.max(axis=1, keepdims=True)
         own, others = shares[:, 0], shares[:, 1:]
-        best = int(others.sum(axis=0).argmax())
+        totals = others.sum(axis=0)
+        # Of those that hold about as many, the first, which are the common ones.
+        best = int((totals >= NEARLY * totals.max()).argmax())
         is_better = others[:, best] > own
         if others[:, best].sum() < GAIN * own.sum() or is_better.mean() < AGREEMENT:
             return ''

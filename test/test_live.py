@@ -8,7 +8,7 @@ from msg_adapters import adapter_for, pointcloud, vision
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import pytest
-from ros_messages import DETECTIONS, Drive, SECOND, START
+from ros_messages import DETECTIONS, Drive, SECOND, START, TRACKED
 
 
 class Live(LiveRegistrar):
@@ -126,6 +126,31 @@ def test_ids_by_association_are_those_of_the_markers_and_of_the_messages():
         assert item.given.track_ids == item.refined.boxes.track_ids == ('1', '2')
         assert [d.id for d in item.message.detections] == ['1', '2']
     assert live.facts == {'ids': 'by association', 'associated_tracks': 2}
+
+
+def test_headings_of_unknown_sign_become_those_of_their_track_and_stay_unknown():
+    """Of five headings of each object two point backwards, and their twist with them."""
+    drive = Drive(sweeps=5, boxes=TRACKED)
+    for message in items_of(drive, '/boxes')[1:4:2]:
+        for item in message.objects:
+            turn = item.kinematics.pose_with_covariance.pose.orientation
+            turn.z, turn.w = turn.w, -turn.z
+    for message in items_of(drive, '/boxes'):
+        for item in message.objects:
+            item.kinematics.orientation_availability = 1
+    live = Live(window=5)
+    live.adapter = adapter_for(TRACKED)
+    finals = [item for item in live.feed(drive) + live.flush() if item.is_final]
+    assert len(finals) == 5
+    for k, item in enumerate(finals):
+        assert np.abs(item.refined.boxes.boxes[:, 8]).max() < 0.4
+        for given, written in zip(
+            items_of(drive, '/boxes')[k].objects, item.message.objects, strict=True
+        ):
+            assert written.kinematics.orientation_availability == 1
+            sign = -1 if k in (1, 3) else 1
+            speed = given.kinematics.twist_with_covariance.twist.linear.x
+            assert written.kinematics.twist_with_covariance.twist.linear.x == sign * speed
 
 
 def test_arrivals_wait_until_transforms_cover_them_but_not_for_ever():

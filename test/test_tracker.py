@@ -1,11 +1,14 @@
 """Ids by association: the same for the same object, whatever comes between."""
 
+from pathlib import Path
+
 from boxreg_ros.config import Config
 from boxreg_ros.intake import Intake
 from boxreg_ros.structures import BoxArray
 from boxreg_ros.tracker import Tracker
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
+import pytest
 from ros_messages import SECOND, START
 
 CAR, PERSON = (4.5, 1.9, 1.6), (0.6, 0.6, 1.75)
@@ -106,3 +109,27 @@ def test_intake_gives_ids_where_they_are_wanted_and_says_so():
     intake = Intake(Convention(associate=True), Config())
     assert intake.take(boxes).track_ids == ('1',)
     assert intake.facts == {'ids': 'by association', 'associated_tracks': 1}
+
+
+def test_ids_of_a_real_drive():
+    """A drive past parked and moving cars, with the noise of a detector: no id changes."""
+    path = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'kitti_raw_0001.npz'
+    if not path.exists():
+        pytest.skip('the real data is not there')
+    data = np.load(path)
+    order = np.lexsort((data['obs_track'], data['obs_frame']))
+    rng = np.random.default_rng(4)
+    boxes = data['obs_box'] + rng.normal(0, 1, data['obs_box'].shape) * [0.2, 0.1, 0.1, *[0] * 6]
+    boxes[:, 3:6] *= np.exp(rng.normal(0, 0.06, (len(boxes), 3)))
+    tracker, given = Tracker(max_gap=1.0), {}
+    for frame in np.unique(data['obs_frame']):
+        rows = order[data['obs_frame'][order] == frame]
+        stamp_ns = START + round(data['obs_t'][rows[0]] * SECOND)
+        n = len(rows)
+        array = BoxArray(stamp_ns, 'map', ('',) * n, ('',) * n, np.ones(n), boxes[rows])
+        for track, track_id in zip(
+            data['obs_track'][rows], tracker.identify(array).track_ids, strict=True
+        ):
+            given.setdefault(int(track), set()).add(track_id)
+    assert all(len(ids) == 1 for ids in given.values()), given
+    assert len(set.union(*given.values())) == len(given) == 15
