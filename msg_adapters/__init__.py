@@ -43,7 +43,11 @@ class Adapter(Protocol):
         """Return the boxes of a message, in the message's frame."""
 
     def to_msg(
-        self, msg: Any, boxes: BoxArray, covariances: Floats | None = None, T: Floats | None = None
+        self,
+        msg: Any,
+        boxes: BoxArray,
+        covariances: Floats | None = None,
+        T_out_in: Floats | None = None,
     ) -> Any:
         """
         Return a copy of the input message with its boxes replaced.
@@ -58,8 +62,8 @@ class Adapter(Protocol):
         covariances : array, shape (n, 6, 6), optional
             Of x y z roll pitch yaw [m, rad]; written where the type has a place for it. Where
             one is NaN, the message's own stays.
-        T : array, shape (4, 4), optional
-            ``T_output_input`` where `boxes` are in another frame than the message: what is
+        T_out_in : array, shape (4, 4), optional
+            Maps the frame of the message to that of `boxes`, where it is another: what is
             carried over is moved with it.
 
         """
@@ -76,11 +80,15 @@ class _Converting:
         return self.convention.to_centers(self.inner.from_msg(msg))
 
     def to_msg(
-        self, msg: Any, boxes: BoxArray, covariances: Floats | None = None, T: Floats | None = None
+        self,
+        msg: Any,
+        boxes: BoxArray,
+        covariances: Floats | None = None,
+        T_out_in: Floats | None = None,
     ) -> Any:
         if covariances is not None:
             covariances = self.convention.covariances_from_centers(boxes, covariances)
-        return self.inner.to_msg(msg, self.convention.from_centers(boxes), covariances, T)
+        return self.inner.to_msg(msg, self.convention.from_centers(boxes), covariances, T_out_in)
 
 
 def canonical(type_name: str) -> str:

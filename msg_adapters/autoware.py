@@ -46,7 +46,7 @@ def from_msg(msg: Any) -> BoxArray:
 
 
 def to_msg(
-    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T: Floats | None = None
+    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """
     Return a copy with the boxes replaced; see `Adapter.to_msg`.
@@ -56,11 +56,12 @@ def to_msg(
 
     """
     objects, quaternions_xyzw = [], poses.quaternions_of(boxes.boxes)
-    for i, o in enumerate(msg.objects):
+    for i, (o, box) in enumerate(zip(msg.objects, boxes.boxes, strict=True)):
         own = o.kinematics.pose_with_covariance
-        given, spread = poses.moved(own.pose, T), None if covariances is None else covariances[i]
-        pose, size = poses.with_box(given, o.shape.dimensions, boxes.boxes[i], quaternions_xyzw[i])
-        fields = {'pose_with_covariance': poses.with_covariance(own, pose, spread, T)}
+        given = poses.moved(own.pose, T_out_in)
+        spread = None if covariances is None else covariances[i]
+        pose, size = poses.with_box(given, o.shape.dimensions, box, quaternions_xyzw[i])
+        fields = {'pose_with_covariance': poses.with_covariance(own, pose, spread, T_out_in)}
         if hasattr(o.kinematics, 'has_position_covariance'):
             is_ours = spread is not None and bool(np.isfinite(spread).all())
             fields['has_position_covariance'] = is_ours or o.kinematics.has_position_covariance
@@ -68,8 +69,7 @@ def to_msg(
             motion = getattr(o.kinematics, f'{name}_with_covariance', None)
             if motion is not None and poses.forward_of(given) @ poses.forward_of(pose) < 0:
                 fields[f'{name}_with_covariance'] = poses.turned_motion(motion, inner, HALF_TURN)
-        footprint = _stretched(o.shape, boxes.boxes[i])
-        shape = poses.replaced(o.shape, dimensions=size, footprint=footprint)
+        shape = poses.replaced(o.shape, dimensions=size, footprint=_stretched(o.shape, box))
         kinematics = poses.replaced(o.kinematics, **fields)
         objects.append(poses.replaced(o, kinematics=kinematics, shape=shape))
     header = poses.with_frame(msg.header, boxes.frame_id)

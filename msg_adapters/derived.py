@@ -47,24 +47,24 @@ def from_msg(msg: Any) -> BoxArray:
 
 
 def to_msg(
-    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T: Floats | None = None
+    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """Return a copy with the boxes replaced; see `Adapter.to_msg`."""
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
     objects, i = [], 0
     for o in msg.objects:
-        pose, size, spread = poses.moved(_pose(o), T), o.shape.dimensions, None
+        pose, size, spread = poses.moved(_pose(o), T_out_in), o.shape.dimensions, None
         if _is_box(o):
             pose, size = poses.with_box(pose, size, boxes.boxes[i], quaternions_xyzw[i])
             spread = None if covariances is None else covariances[i]
             i += 1
         if hasattr(o.pose, 'covariance'):
-            pose = poses.with_covariance(o.pose, pose, spread, T)
+            pose = poses.with_covariance(o.pose, pose, spread, T_out_in)
         objects.append(
             poses.replaced(
                 o, header=poses.with_frame(o.header, boxes.frame_id), pose=pose,
-                twist=poses.turned_motion(o.twist, 'twist', T),
-                accel=poses.turned_motion(o.accel, 'accel', T),
+                twist=poses.turned_motion(o.twist, 'twist', T_out_in),
+                accel=poses.turned_motion(o.accel, 'accel', T_out_in),
                 shape=poses.replaced(o.shape, dimensions=size),
             )
         )  # fmt: skip

@@ -47,7 +47,7 @@ def from_msg(msg: Any) -> BoxArray:
 
 
 def to_msg(
-    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T: Floats | None = None
+    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """Return a copy with the cubes replaced; it has no place for covariances."""
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
@@ -60,10 +60,10 @@ def to_msg(
             i += 1
         if cubes:
             fields: dict[str, Any] = {'cubes': cubes, 'frame_id': boxes.frame_id}
-            for name in OTHERS if T is not None else ():
+            for name in OTHERS if T_out_in is not None else ():
                 drawn = getattr(entity, name, ())
                 fields[name] = [
-                    poses.replaced(item, pose=poses.moved(item.pose, T)) for item in drawn
+                    poses.replaced(item, pose=poses.moved(item.pose, T_out_in)) for item in drawn
                 ]
             entity = poses.replaced(entity, **fields)
         entities.append(entity)

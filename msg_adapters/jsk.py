@@ -37,7 +37,7 @@ def from_msg(msg: Any) -> BoxArray:
 
 
 def to_msg(
-    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T: Floats | None = None
+    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """Return a copy with the boxes replaced; it has no place for covariances."""
     found = []

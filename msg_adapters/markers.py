@@ -44,7 +44,7 @@ def from_msg(msg: Any) -> BoxArray:
 
 
 def to_msg(
-    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T: Floats | None = None
+    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """Return a copy of a MarkerArray with its boxes replaced; it has no place for covariances."""
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)

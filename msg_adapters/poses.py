@@ -155,7 +155,7 @@ def with_box(pose: Any, size: Any, box: Floats, quaternion_xyzw: Floats) -> tupl
 
 
 def with_covariance(
-    posed: Any, pose: Any, covariance: Floats | None, T_output_input: Floats | None
+    posed: Any, pose: Any, covariance: Floats | None, T_out_in: Floats | None
 ) -> Any:
     """
     Return a copy of a ``PoseWithCovariance`` with another pose and its covariance.
@@ -165,7 +165,7 @@ def with_covariance(
     """
     own = np.array(posed.covariance, dtype=np.float64).reshape(6, 6)
     if covariance is None or np.isnan(covariance).any():
-        covariance = own if T_output_input is None else turned_covariances(own, T_output_input)
+        covariance = own if T_out_in is None else turned_covariances(own, T_out_in)
     return replaced(posed, pose=pose, covariance=np.array(covariance, np.float64).reshape(36))
 
 
@@ -182,27 +182,29 @@ def turned_covariances(covariances: Floats, T_frame_boxes: Floats) -> Floats:
     return J @ covariances @ J.T
 
 
-def turned(vector: Any, T_output_input: Floats | None) -> Any:
+def turned(vector: Any, T_out_in: Floats | None) -> Any:
     """Return a ``Vector3`` of the input frame in the output frame."""
-    if T_output_input is None:
+    if T_out_in is None:
         return vector
-    x, y, z = T_output_input[:3, :3] @ [vector.x, vector.y, vector.z]
+    x, y, z = T_out_in[:3, :3] @ [vector.x, vector.y, vector.z]
     return replaced(vector, x=float(x), y=float(y), z=float(z))
 
 
-def turned_motion(motion: Any, name: str, T: Floats | None) -> Any:
+def turned_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
     """Return a twist or an accel, named so within one with covariance, as `turned` does."""
     if hasattr(motion, 'covariance'):
-        return replaced(motion, **{name: turned_motion(getattr(motion, name), name, T)})
-    return replaced(motion, linear=turned(motion.linear, T), angular=turned(motion.angular, T))
+        return replaced(motion, **{name: turned_motion(getattr(motion, name), name, T_out_in)})
+    return replaced(
+        motion, linear=turned(motion.linear, T_out_in), angular=turned(motion.angular, T_out_in)
+    )
 
 
-def moved(pose: Any, T_output_input: Floats | None) -> Any:
+def moved(pose: Any, T_out_in: Floats | None) -> Any:
     """Return a pose of the input frame in the output frame."""
-    if T_output_input is None:
+    if T_out_in is None:
         return pose
-    p, q, R = pose.position, quaternion_of(pose), T_output_input[:3, :3]
-    pose = with_position(pose, (R @ [p.x, p.y, p.z] + T_output_input[:3, 3]).tolist())
+    p, q, R = pose.position, quaternion_of(pose), T_out_in[:3, :3]
+    pose = with_position(pose, (R @ [p.x, p.y, p.z] + T_out_in[:3, 3]).tolist())
     if not _is_unit(np.array(q)):
         return pose
     return with_orientation(pose, (Rotation.from_matrix(R) * Rotation.from_quat(q)).as_quat())

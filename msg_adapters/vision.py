@@ -52,7 +52,7 @@ def from_msg(msg: Any) -> BoxArray:
 
 
 def to_msg(
-    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T: Floats | None = None
+    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
     """
     Return a copy with the boxes replaced; see `Adapter.to_msg`.
@@ -72,7 +72,7 @@ def to_msg(
         bbox = _replaced(detection.bbox, boxes.boxes[i], quaternions_xyzw[i])
         spread = None if covariances is None else covariances[i]
         results = [
-            poses.replaced(r, pose=poses.with_covariance(r.pose, bbox.center, spread, T))
+            poses.replaced(r, pose=poses.with_covariance(r.pose, bbox.center, spread, T_out_in))
             for r in detection.results
         ]
         own = poses.with_frame(detection.header, boxes.frame_id)
