@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from base64 import b64decode
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import closing, ExitStack
 from heapq import merge
 import json
 from pathlib import Path
@@ -46,7 +46,7 @@ Item = tuple[Connection, int, bytes]
 
 class Reader:
     """
-    Read recordings of all kinds as one, with the interface of `AnyReader`.
+    Read recordings of all kinds as one, as an open `AnyReader` does.
 
     Parameters
     ----------
@@ -60,20 +60,16 @@ class Reader:
     def __init__(self, paths: Sequence[Path], default_typestore: Typestore) -> None:
         foreign = [path for path in paths if _is_foreign(path)]
         ros = [path for path in paths if path not in foreign]
-        self._ros = AnyReader(ros, default_typestore=default_typestore) if ros else None
-        self._foreign = [_Foreign(path) for path in foreign]
-        self.is2 = self._ros is None or self._ros.is2
-
-    def open(self) -> None:
-        """Open all files."""
         with ExitStack() as stack:
-            for reader in self._readers:
-                reader.open()
-                stack.callback(reader.close)
+            self._foreign = [stack.enter_context(closing(_Foreign(path))) for path in foreign]
+            self._ros = None
+            if ros:
+                reader = AnyReader(ros, default_typestore=default_typestore)
+                self._ros = stack.enter_context(reader)
+            self.is2 = self._ros is None or self._ros.is2
             self.typestore = self._ros.typestore if self._ros else get_typestore(Stores.EMPTY)
-            known = self.typestore.fielddefs
-            for reader in self._foreign:
-                types = reader.ros_types()
+            for each in self._foreign:
+                known, types = self.typestore.fielddefs, each.ros_types()
                 self.typestore.register({k: v for k, v in types.items() if k not in known})
             self.connections = [c for reader in self._readers for c in reader.connections]
             self._opened = stack.pop_all()
@@ -127,11 +123,8 @@ class _Foreign:
     """One MCAP file."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
         self.decoders: dict[str, Callable[[bytes], Any]] = {}
-
-    def open(self) -> None:
-        self._file = self._path.open('rb')
+        self._file = path.open('rb')
         self._reader = make_reader(self._file)
         summary = self._reader.get_summary()
         assert summary is not None and summary.statistics is not None
@@ -145,7 +138,7 @@ class _Foreign:
             msgtype = name
             if schema and channel.message_encoding in ('protobuf', 'json'):
                 msgtype = TYPES.get(name, name)
-                self.decoders[msgtype] = _Decoder(self._path, channel.topic, schema)
+                self.decoders[msgtype] = _Decoder(path, channel.topic, schema)
             self.connections.append(
                 Connection(
                     channel.id,

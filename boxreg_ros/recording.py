@@ -113,7 +113,6 @@ class Recording:
         """Open all files and find the topics."""
         with _readable(self):
             self._reader = Reader(_files(self._paths), _stock_types())
-            self._reader.open()
         try:
             self._find()
         except BaseException:

@@ -129,9 +129,7 @@ class Request:
         }
         if self.labels is not None:
             return LabelledRecording(self.labels, self.recordings, **options)
-        return Recording(
-            self.recordings, boxes=self.boxes, convention=self.convention, **options
-        )
+        return Recording(self.recordings, boxes=self.boxes, convention=self.convention, **options)
 
     def fingerprint(self) -> str:
         """Return a digest of the request and of the files it reads, by size and time."""

@@ -18,13 +18,11 @@ import numpy as np
 import pytest
 from ros_messages import Drive, SCENE
 
-pytest.importorskip('mcap_protobuf', reason='mcap-protobuf-support is not installed')
-pytest.importorskip('foxglove_schemas_protobuf', reason='foxglove-schemas-protobuf is missing')
-
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from mcap_protobuf.schema import build_file_descriptor_set
+SCHEMAS = 'foxglove_schemas_protobuf'
+FrameTransforms = pytest.importorskip(f'{SCHEMAS}.FrameTransforms_pb2').FrameTransforms
+PointCloud = pytest.importorskip(f'{SCHEMAS}.PointCloud_pb2').PointCloud
+SceneUpdate = pytest.importorskip(f'{SCHEMAS}.SceneUpdate_pb2').SceneUpdate
+describe = pytest.importorskip('mcap_protobuf.schema').build_file_descriptor_set
 
 FLOAT32 = 7
 
@@ -97,7 +95,7 @@ def write(path, drive, encodings):
             if topic not in channels:
                 name, form, text = kind.DESCRIPTOR.full_name, encoding, b'{}'
                 if encoding == 'protobuf':
-                    text = build_file_descriptor_set(kind).SerializeToString()
+                    text = describe(kind).SerializeToString()
                 elif encoding == 'json':
                     form = 'jsonschema'
                 else:
