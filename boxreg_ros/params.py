@@ -28,7 +28,7 @@ NODE_SETTINGS = (
         '', None, None, SIZE_ORDERS,
     ),
     Setting(
-        'forward_axis', 'x', 'axis of a pose that points forward', '', None, None, tuple(FORWARD)
+        'forward_axis', 'x+', 'axis of a pose that points forward', '', None, None, tuple(FORWARD)
     ),
     Setting(
         'associate', False, 'give boxes ids by association, whatever ids they have',

@@ -24,8 +24,13 @@ REFERENCES = {
 }
 """Points of a box, from its centre in parts of length, width and height; axles are typical."""
 SIZE_ORDERS = tuple(''.join(order) for order in permutations('lwh'))
-FORWARD = {'x': 0.0, 'y': pi / 2, '-x': pi, '-y': -pi / 2}
-"""The axis of a pose that points forward, and how far about z it is from x [rad]."""
+FORWARD = {'x+': 0.0, 'y+': pi / 2, 'x-': pi, 'y-': -pi / 2}
+"""
+The axis of a pose that points forward, and how far about z it is from x [rad].
+
+Spelt so that neither YAML takes one for a boolean nor a command line for an option.
+
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +59,7 @@ class Convention:
 
     pose_reference: str = 'center'
     size_order: str = 'lwh'
-    forward_axis: str = 'x'
+    forward_axis: str = 'x+'
     associate: bool = False
 
     def __post_init__(self) -> None:

@@ -41,9 +41,9 @@ def array_of(*boxes, stamp_ns=STAMP):
         ({'size_order': 'wlh'}, [5, 6, 1, 2, 4, 1.5, 0, 0, 0.3], [5, 6, 1, 4, 2, 1.5, 0, 0, 0.3]),
         ({'size_order': 'hwl'}, [5, 6, 1, 1.5, 2, 4, 0, 0, 0], [5, 6, 1, 4, 2, 1.5, 0, 0, 0]),
         # y points forward: the heading is a quarter turn further than the yaw of the pose.
-        ({'forward_axis': 'y', 'size_order': 'wlh'}, [5, 6, 1, 2, 4, 1.5, 0, 0, 0.3],
+        ({'forward_axis': 'y+', 'size_order': 'wlh'}, [5, 6, 1, 2, 4, 1.5, 0, 0, 0.3],
          [5, 6, 1, 4, 2, 1.5, 0, 0, 0.3 + QUARTER]),
-        ({'forward_axis': '-x'}, [5, 6, 1, 4, 2, 1.5, 0, 0, -3],
+        ({'forward_axis': 'x-'}, [5, 6, 1, 4, 2, 1.5, 0, 0, -3],
          [5, 6, 1, 4, 2, 1.5, 0, 0, np.pi - 3]),
     ],
 )  # fmt: skip
@@ -87,7 +87,7 @@ def test_covariance_is_that_of_the_reference():
         ({'pose_reference': '0,1'}, 'pose_reference.*three numbers'),
         ({'pose_reference': '0,1,nan'}, 'pose_reference'),
         ({'size_order': 'lw'}, 'size_order.*wlh'),
-        ({'forward_axis': 'z'}, 'forward_axis.*-x'),
+        ({'forward_axis': 'z'}, 'forward_axis.*x-'),
     ],
 )
 def test_what_is_refused(settings, expected):
