@@ -42,6 +42,8 @@ setup(
         'bench': ['matplotlib', 'small-gicp'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
         'formats': ['pyarrow'],
+        # MCAP files whose boxes are protobuf.
+        'foxglove': ['mcap-protobuf-support'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -54,7 +56,10 @@ setup(
             'flake8-docstrings',
             'flake8-import-order',
             'flake8-quotes',
+            'foxglove-schemas-protobuf',
             'matplotlib',
+            'mcap-protobuf-support',
+            'mcap-ros2-support',
             'mypy',
             'openlabel-checker',
             'pyarrow',

@@ -54,11 +54,12 @@ class BoxregNode(Node):
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
         config, options = declare(self)
         warm_up(config)
+        self._convention = options.convention
         self._health = Health()
         self._inbox = Inbox(options.backlog)
         self._live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
-            self._trouble,
+            self._trouble, options.convention,
         )  # fmt: skip
         self._board = MarkerBoard()
         self._cloud_frame = self._fixed_frame = ''
@@ -109,13 +110,13 @@ class BoxregNode(Node):
                 self._open_boxes(readable[0])
                 self._search.cancel()
             elif types:
-                adapter_for(types.pop())
+                adapter_for(types.pop(), self._convention)
         except UnsupportedMessage as error:
             if self._health.is_time_to_warn('boxes_type'):
                 self.get_logger().warning(f'{self.resolve_topic_name("boxes")}: {error}')
 
     def _open_boxes(self, type_name: str) -> None:
-        adapter, kind = adapter_for(type_name), import_message(type_name)
+        adapter, kind = adapter_for(type_name, self._convention), import_message(type_name)
         self._live.adapter = adapter
         overrides = QoSOverridingOptions.with_default_policies()
         self._early, self._final = (
@@ -147,6 +148,7 @@ class BoxregNode(Node):
     def _publish_status(self) -> None:
         facts = {
             'fixed_frame': self._fixed_frame or 'not known yet',
+            **self._live.facts,
             **self._inbox.sizes(),
         }
         status = self._health.status(f'{self.get_fully_qualified_name()}: registration', facts)

@@ -19,8 +19,10 @@ REMEDIES = {
     'boxes_queue_full': TOO_SLOW,
     'unreadable': 'the log has the reason',
     'no_transform': 'the log has the frames',
+    'pose_reference': 'boxes do not stand where their points are: the log has the setting',
     'late': 'boxes came after younger ones: publish them in the order of their stamps',
-    'no_track_id': 'boxes need an id that stays with the object: put a tracker before this node',
+    'no_track_id': 'boxes need an id that stays with the object: put a tracker before this node, '
+    'or set associate',
     'duplicate_track_id': 'an id may occur once per message',
     'no_sweep': 'no cloud within tolerance of the stamp of the boxes: copy the stamp of the cloud',
 }

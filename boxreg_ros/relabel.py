@@ -24,7 +24,8 @@ from typing import Any, TypeVar
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
+from boxreg_ros.intake import add_convention_arguments, convention_from, Intake
 from boxreg_ros.labelled import (
     add_label_arguments,
     label_frame_of,
@@ -53,6 +54,7 @@ from boxreg_ros.structures import (
     Sweep,
 )
 from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import yaml
 
@@ -87,6 +89,8 @@ class Request:
         Format and files that the boxes come from instead of a topic.
     label_frame : str or None
         Frame that stands for the sensor's in label formats; None for that of the clouds.
+    convention : Convention
+        How the boxes are to be read.
 
     """
 
@@ -102,11 +106,17 @@ class Request:
     options: Options = field(default_factory=Options)
     labels: tuple[str, Path] | None = None
     label_frame: str | None = None
+    convention: Convention = STANDARD
 
     def __post_init__(self) -> None:
         """Refuse what cannot work before any work is done."""
         if self.labels is not None and self.boxes is not None:
             raise ConfigError('boxes: expected a topic or label files, got both; leave one out')
+        if self.labels is not None and not self.convention.is_standard:
+            raise ConfigError(
+                f'{self.convention}: expected for boxes of a topic, got label files; each format '
+                f'has its own convention, see boxreg formats'
+            )
         for name in (*self.formats, *(self.labels or ())[:1]):
             module_of(str(name))
 
@@ -120,7 +130,7 @@ class Request:
         }
         if self.labels is not None:
             return LabelledRecording(self.labels, self.recordings, **options)
-        return Recording(self.recordings, boxes=self.boxes, **options)
+        return Recording(self.recordings, boxes=self.boxes, convention=self.convention, **options)
 
     def fingerprint(self) -> str:
         """Return a digest of the request and of the files it reads, by size and time."""
@@ -160,6 +170,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     """
     clock = _Clock()
     tree = TransformTree()
+    intake = Intake(request.convention, request.config)
     registrar = BoxRegistrar(request.config)
     counts: Counter[str] = Counter()
     trouble = ''
@@ -185,7 +196,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                     item = recording.decode(record)
                 with clock('transform'):
                     try:
-                        moved = to_fixed_frame(item, tree, fixed_frame)
+                        moved = intake.take(to_fixed_frame(item, tree, fixed_frame))
                     except TransformUnavailable as error:
                         moved, trouble = None, trouble or str(error)
                     T_fixed_sensor = pose_of(tree, fixed_frame, sensor_frame, item.stamp_ns)
@@ -213,6 +224,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         counts.update({k: n for k, n in registrar.counts.items() if '_without_' in k})
         summary = _summary(request, recording, fixed_frame, counts, sink)
         summary['first_missing_transform'] = trouble
+        summary['warning'] = intake.finding
+        summary |= intake.facts
         summary['seconds'] = clock.seconds()
         (folder / 'config.yaml').write_text(
             yaml.safe_dump(request.config.to_dict(), sort_keys=False), encoding='utf-8'
@@ -477,6 +490,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
     )
+    add_convention_arguments(parser)
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as YAML')
     parser.add_argument(
         '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
@@ -537,6 +551,7 @@ def run(args: argparse.Namespace) -> int:
         tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
         args.formats, args.start, args.end, config,
         Options(args.with_points, args.camera, args.swap_axes), args.labels, args.label_frame,
+        convention_from(args),
     )  # fmt: skip
     earlier = earlier_summary(args.out)
     if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():
@@ -553,5 +568,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update(max(0.0, done - bar.n))
 
         summary = relabel(request, args.out, progress)
+    if summary['warning']:
+        print(f'boxreg: {summary["warning"]}', file=sys.stderr)
     print(closing_line(summary, args.out))
     return 0

@@ -21,6 +21,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.intake import covariances_to_write
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.recording import stock_types
 from boxreg_ros.structures import BoxArray, INTERPOLATED, RefinedBoxes
@@ -28,6 +29,7 @@ from boxreg_ros.transforms import boxes_to_frame, inverse
 from boxreg_ros.visual import MarkerBoard
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
+from msg_adapters.poses import turned_covariances
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
@@ -152,12 +154,16 @@ class Writer:
         frame = waiting.popleft()
         if not waiting:
             del self._waiting[given.stamp_ns]
-        refined = _without_interpolated(frame.refined)
-        boxes, T = refined.boxes, frame.T_fixed_given
-        if boxes.frame_id != given.frame_id and T is not None:
-            boxes = boxes_to_frame(boxes, inverse(T), given.frame_id)
-        data = self._recording.with_boxes(message, boxes, refined.covariances)
-        shown = self._markers.of(copied, given, replace(refined, boxes=boxes))
+        refined, T = _without_interpolated(frame.refined), frame.T_fixed_given
+        if refined.boxes.frame_id != given.frame_id and T is not None:
+            refined = replace(
+                refined,
+                boxes=boxes_to_frame(refined.boxes, inverse(T), given.frame_id),
+                covariances=turned_covariances(refined.covariances, inverse(T)),
+            )
+        covariances = covariances_to_write(refined)
+        data = self._recording.with_boxes(message, refined.boxes, covariances)
+        shown = self._markers.of(copied, given, refined)
         return [copied._replace(data=data), shown]
 
     def _add(self, raw: Raw) -> None:
