@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
+from boxreg_ros.errors import ConfigError, TransformUnavailable
 from boxreg_ros.intake import add_convention_arguments, convention_from, Intake
 from boxreg_ros.labelled import (
     add_label_arguments,
