@@ -31,7 +31,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.11',
     install_requires=[
-        'mcap>=1.2,<2',
+        'mcap>=1.6,<2',
         'numpy>=1.26,<3',
         'pyyaml>=6',
         'rosbags>=0.11,<0.12',
@@ -44,6 +44,8 @@ setup(
         'bench': ['matplotlib', 'small-gicp'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
         'formats': ['pyarrow'],
+        # MCAP files whose boxes are protobuf.
+        'foxglove': ['mcap-protobuf-support'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -56,7 +58,10 @@ setup(
             'flake8-docstrings',
             'flake8-import-order',
             'flake8-quotes',
+            'foxglove-schemas-protobuf',
             'matplotlib',
+            'mcap-protobuf-support',
+            'mcap-ros2-support',
             'mypy',
             'openlabel-checker',
             'pyarrow',

@@ -71,12 +71,13 @@ class BoxregNode(Node):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         warm_up(config)
+        self._convention = options.convention
         self._health = Health()
         self._inbox = Inbox(config.queue)
         self._backlog, self._idle_at = options.backlog, 0.0
         self._live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
-            self._trouble,
+            self._trouble, options.convention,
         )  # fmt: skip
         self._board = MarkerBoard()
         self._cloud_frame = self._fixed_frame = ''
@@ -159,13 +160,13 @@ class BoxregNode(Node):
                 self._open_boxes(readable[0])
                 self._search.cancel()
             elif types:
-                adapter_for(types.pop())
+                adapter_for(types.pop(), self._convention)
         except UnsupportedMessage as error:
             if self._health.is_time_to_warn('boxes_type'):
                 self.get_logger().warning(f'{self.resolve_topic_name("boxes")}: {error}')
 
     def _open_boxes(self, type_name: str) -> None:
-        adapter, kind = adapter_for(type_name), import_message(type_name)
+        adapter, kind = adapter_for(type_name, self._convention), import_message(type_name)
         self._live.adapter = adapter
         self._early = self._publisher(kind, 'refined_boxes', 10)
         self._final = self._publisher(kind, 'refined_boxes_final', self._final_depth)
@@ -230,6 +231,7 @@ class BoxregNode(Node):
             'fixed_frame': self._fixed_frame or 'not known yet',
             'newest transform, age [s]': age,
             'tracks': self._tracks,
+            **self._live.facts,
             **self._inbox.sizes(),
         }
         status = self._health.status(f'{self.get_fully_qualified_name()}: registration', facts)

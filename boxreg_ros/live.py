@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from boxreg_ros import refine
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.intake import covariances_to_write, Intake
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep, Track
 from boxreg_ros.transforms import (
@@ -20,6 +21,8 @@ from boxreg_ros.transforms import (
     TransformTree,
 )
 from msg_adapters import Adapter
+from msg_adapters.convention import Convention, STANDARD
+from msg_adapters.poses import turned_covariances
 import numpy as np
 
 SETTLE = 0.3
@@ -58,6 +61,7 @@ class _Pending:
     message: Any
     given: BoxArray
     T_output_fixed: Floats
+    T_output_item: Floats | None
     is_early_out: bool = False
 
 
@@ -81,6 +85,8 @@ class LiveRegistrar:
     trouble : callable
         Told the reason, as counted, the text and the number of everything that is not refined
         here.
+    convention : Convention
+        How the boxes are to be read.
 
     Attributes
     ----------
@@ -102,12 +108,15 @@ class LiveRegistrar:
         output_frame: str,
         transform_timeout: float,
         trouble: Callable[[str, str, int], None],
+        convention: Convention = STANDARD,
     ) -> None:
         self.tree = TransformTree()
         self.fixed_frame = fixed_frame.lstrip('/')
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
         self._trouble = trouble
+        self._convention = convention
+        self._intake = Intake(convention, config)
         self._registrar = BoxRegistrar(config)
         self._pending: dict[int, deque[_Pending]] = {}
         self.cloud_frame = ''
@@ -171,13 +180,17 @@ class LiveRegistrar:
             return self.passed_through(item.message)
         if isinstance(content, Sweep):
             sweep = sweep_to_frame(content, T_fixed_item, self.fixed_frame)
-            return self._outgoing(self._registrar.add_sweep(sweep))
+            return self._outgoing(self._registrar.add_sweep(self._intake.take(sweep)))
         self._last_boxes = item.received
+        boxes = self._intake.take(boxes_to_frame(content, T_fixed_item, self.fixed_frame))
+        if self._intake.finding:
+            self._trouble('pose_reference', self._intake.finding, 1)
         T_output_fixed = others[0] if others else inverse(T_fixed_item)
-        given = boxes_to_frame(content, T_output_fixed @ T_fixed_item, self._output_of(content))
-        pending = _Pending(item.message, given, T_output_fixed)
+        T_output_item = T_output_fixed @ T_fixed_item if others else np.eye(4)
+        given = boxes_to_frame(content, T_output_item, self._output_of(content))
+        given = replace(given, track_ids=boxes.track_ids)
+        pending = _Pending(item.message, given, T_output_fixed, T_output_item if others else None)
         self._pending.setdefault(stamp_ns, deque()).append(pending)
-        boxes = boxes_to_frame(content, T_fixed_item, self.fixed_frame)
         return self._outgoing(self._registrar.add_boxes(boxes))
 
     def lose(self, stamp_ns: int) -> list[Outgoing]:
@@ -198,12 +211,14 @@ class LiveRegistrar:
         """Start afresh but for the transforms; return everything still held."""
         ready = self.flush()
         self._registrar.reset()
+        self._intake = Intake(self._convention, self.config)
         self._rewinds = Rewind(), Rewind()
         return ready
 
     def abandon(self, item: Arrival | None) -> list[Outgoing]:
         """Start afresh after a fault; pass what is held, and the arrival at fault, through."""
         self._registrar.reset()
+        self._intake = Intake(self._convention, self.config)
         held = [p for _, pending in sorted(self._pending.items()) for p in pending]
         self._pending.clear()
         passed = [
@@ -216,6 +231,11 @@ class LiveRegistrar:
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
             passed += self.passed_through(item.message)
         return passed
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Return what there is to tell about the boxes beside the counts."""
+        return self._intake.facts
 
     @staticmethod
     def passed_through(message: Any) -> list[Outgoing]:
@@ -270,25 +290,20 @@ class LiveRegistrar:
                 pending.is_early_out = True
             moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
             assert self.adapter is not None  # it has read the message
-            message = self.adapter.to_msg(pending.message, moved.boxes, moved.covariances)
+            covariances = covariances_to_write(moved)
+            message = self.adapter.to_msg(
+                pending.message, moved.boxes, covariances, pending.T_output_item
+            )
             outgoing.append(Outgoing(message, refined.is_final, pending.given, moved))
         return outgoing
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
-    """
-    Return refined boxes, and their covariances, in another frame.
-
-    Covariances of roll, pitch and yaw stay as they are: that is exact for frames that differ by
-    a turn about z, and the tilt between those in use is small.
-
-    """
-    J = np.eye(6)
-    J[:3, :3] = T_frame_boxes[:3, :3]
+    """Return refined boxes, and their covariances, in another frame."""
     return replace(
         refined,
         boxes=boxes_to_frame(refined.boxes, T_frame_boxes, frame_id),
-        covariances=J @ refined.covariances @ J.T,
+        covariances=turned_covariances(refined.covariances, T_frame_boxes),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.errors import ConfigError
+from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -17,6 +18,23 @@ NODE_SETTINGS = (
     Setting(
         'boxes_type', '',
         'message type of the boxes, as package/msg/Type; empty: that of the first publisher',
+        '', None, None, (),
+    ),
+    Setting(
+        'pose_reference', 'center',
+        f'point of a box that its pose is at: {", ".join(REFERENCES)}, or x,y,z in parts of '
+        f'length, width and height',
+        '', None, None, (),
+    ),
+    Setting(
+        'size_order', 'lwh', 'what x, y and z of a size are: length, width, height',
+        '', None, None, SIZE_ORDERS,
+    ),
+    Setting(
+        'forward_axis', 'x+', 'axis of a pose that points forward', '', None, None, tuple(FORWARD)
+    ),
+    Setting(
+        'associate', False, 'give boxes ids by association, whatever ids they have',
         '', None, None, (),
     ),
     Setting(
@@ -55,11 +73,20 @@ class NodeOptions(NamedTuple):
     """What the node is told beside `Config`; see `NODE_SETTINGS`."""
 
     boxes_type: str
+    pose_reference: str
+    size_order: str
+    forward_axis: str
+    associate: bool
     fixed_frame: str
     output_frame: str
     transform_timeout: float
     backlog: float
     config_file: str
+
+    @property
+    def convention(self) -> Convention:
+        """Return how boxes are to be read."""
+        return Convention(self.pose_reference, self.size_order, self.forward_axis, self.associate)
 
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:

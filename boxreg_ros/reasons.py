@@ -79,13 +79,18 @@ REASONS = {
         'cloud', 'a second one of the same stamp', 'one cloud per stamp: merge those of sensors'
     ),
     'boxes_without_sweep': Reason('message', 'its boxes are those counted as `no_sweep`'),
+    'pose_reference': Reason(
+        'message',
+        'boxes do not stand where their points are; the log has the figures',
+        'set `pose_reference`, `size_order` or `forward_axis` as the log says',
+    ),
     'late': Reason(
         'box', 'younger boxes were there before', 'publish boxes in the order of their stamps'
     ),
     'duplicate_stamp': Reason(
         'box', 'a second message of the same stamp', 'one message per stamp: merge the detectors'
     ),
-    'no_track_id': Reason('box', 'it has no id', 'put a tracker before'),
+    'no_track_id': Reason('box', 'it has no id', 'set `associate`, or put a tracker before'),
     'duplicate_track_id': Reason(
         'box', 'the id occurs twice in one message', 'ids must name objects'
     ),

@@ -75,7 +75,8 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
         given[:, YAW] = one_heading(given[:, YAW])
         boxes[b, :n], boxes[b, n:], valid[b, :n] = given, given[-1], True
         start[b], start[b, :k] = boxes[b], window.start
-        start[b, :k, 6:9] += 2 * np.pi * np.round((given[:k, 6:9] - start[b, :k, 6:9]) / 2 / np.pi)
+        turns = np.pi * np.array([2, 2, 1])  # a box kept may have come turned around
+        start[b, :k, 6:9] += turns * np.round((given[:k, 6:9] - start[b, :k, 6:9]) / turns)
         stamps = np.array([o.stamp_ns for o in window.observations])
         times[b, :n] = (stamps - stamps[0]) * 1e-9
         times[b, n:] = times[b, n - 1] + 0.1 * np.arange(1, N - n + 1)

@@ -4,22 +4,26 @@ from boxreg_ros.config import Config
 from boxreg_ros.live import Arrival, LiveRegistrar, refined_to_frame
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
 from boxreg_ros.transforms import matrix
-from msg_adapters import pointcloud, vision
+from msg_adapters import adapter_for, pointcloud, vision
+from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import pytest
-from ros_messages import Drive, SECOND, START
+from ros_messages import DETECTIONS, Drive, SECOND, START, TRACKED
 
 
 class Live(LiveRegistrar):
     """Fed from a Drive."""
 
-    def __init__(self, fixed_frame='', output_frame='', timeout=1.0, adapter=vision, **settings):
+    def __init__(
+        self, fixed_frame='', output_frame='', timeout=1.0, convention=STANDARD, **settings
+    ):
         self.told = []
         config = Config(estimate='final').updated({'window': 5, 'lag': 2} | settings)
         super().__init__(
-            config, fixed_frame, output_frame, timeout, lambda *words: self.told.append(words)
-        )
-        self.adapter = adapter
+            config, fixed_frame, output_frame, timeout,
+            lambda *words: self.told.append(words), convention,
+        )  # fmt: skip
+        self.adapter = adapter_for(DETECTIONS, convention)
         self.cloud_frame = 'lidar'
 
     def feed(self, drive, now=0.0):
@@ -31,14 +35,14 @@ class Live(LiveRegistrar):
             elif topic == '/odom':
                 self.tree.add_odometry(message)
             else:
-                item = arrival(topic, message, now)
+                item = arrival(topic, message, now, self.adapter)
                 assert self.is_ready(item, now + 0.5) or not self.fixed_frame
                 out += self.process(item)
         return out
 
 
-def arrival(topic, message, now=0.0):
-    reader = pointcloud if topic == '/points' else vision
+def arrival(topic, message, now=0.0, adapter=vision):
+    reader = pointcloud if topic == '/points' else adapter
     return Arrival(message, reader.from_msg(message), now)
 
 
@@ -73,6 +77,79 @@ def test_output_frame_is_the_one_asked_for():
         array = vision.from_msg(item.message)
         assert array.frame_id == item.given.frame_id == item.refined.boxes.frame_id == 'odom'
         assert np.abs(array.boxes[:, :3] - drive.truth[array.stamp_ns][:, :3]).max() < 0.5
+
+
+def test_kept_boxes_keep_their_covariance_and_refined_ones_get_ours():
+    drive = Drive(sweeps=5)
+    for message in items_of(drive, '/boxes'):
+        for detection in message.detections:
+            detection.results[0].pose.covariance = np.diag([9.0, 4, 1, 0, 0, 0]).reshape(36)
+        message.detections[1].bbox.center.position.y += 300  # no points there
+    out = Live(output_frame='turned').feed(Turned(drive))
+    for item in out:
+        assert item.refined.status[1] == KEPT
+        spread = [d.results[0].pose.covariance.reshape(6, 6) for d in item.message.detections]
+        # The output frame is a quarter turn away: the detector's 9 along x is 9 along y.
+        np.testing.assert_allclose(np.diag(spread[1]), [4, 9, 1, 0, 0, 0], atol=1e-9)
+        if item.refined.status[0] == REFINED:
+            np.testing.assert_allclose(spread[0], item.refined.covariances[0])
+    assert any(item.refined.status[0] == REFINED for item in out)
+
+
+class Turned:
+    """A drive with a frame that is a quarter turn away from odom."""
+
+    def __init__(self, drive):
+        m = drive.messages
+        half = np.sqrt(0.5)
+        static = m.transform(START, 'turned', 'odom', (0, 0, 0), (0, 0, half, half))
+        self.items = [('/tf_static', START, m.tf(static)), *drive.items]
+
+
+def test_poses_that_do_not_fit_are_told_with_every_array():
+    drive = Drive(sweeps=10)
+    live = Live(convention=Convention('bottom'))
+    live.feed(drive)
+    reasons = [reason for reason, _ in live.told]
+    assert reasons == ['pose_reference'] * 5  # known after 12 boxes, six arrays
+    assert 'pose_reference:=center' in live.told[0][1]
+
+
+def test_ids_by_association_are_those_of_the_markers_and_of_the_messages():
+    drive = Drive(sweeps=4)
+    for message in items_of(drive, '/boxes'):
+        for detection in message.detections:
+            detection.id = ''
+    live = Live(convention=Convention(associate=True))
+    out = live.feed(drive) + live.flush()
+    for item in out:
+        assert item.given.track_ids == item.refined.boxes.track_ids == ('1', '2')
+        assert [d.id for d in item.message.detections] == ['1', '2']
+    assert live.facts == {'ids': 'by association', 'associated_tracks': 2}
+
+
+def test_headings_of_unknown_sign_become_those_of_their_track_and_stay_unknown():
+    """Of five headings of each object one points backwards, and its twist with it."""
+    drive = Drive(sweeps=5, boxes=TRACKED)
+    for item in items_of(drive, '/boxes')[1].objects:
+        turn = item.kinematics.pose_with_covariance.pose.orientation
+        turn.z, turn.w = turn.w, -turn.z
+    for message in items_of(drive, '/boxes'):
+        for item in message.objects:
+            item.kinematics.orientation_availability = 1
+    live = Live(window=5)
+    live.adapter = adapter_for(TRACKED)
+    finals = [item for item in live.feed(drive) + live.flush() if item.is_final]
+    assert len(finals) == 5
+    for k, item in enumerate(finals):
+        assert np.abs(item.refined.boxes.boxes[:, 8]).max() < 0.4
+        for given, written in zip(
+            items_of(drive, '/boxes')[k].objects, item.message.objects, strict=True
+        ):
+            assert written.kinematics.orientation_availability == 1
+            sign = -1 if k == 1 else 1
+            speed = given.kinematics.twist_with_covariance.twist.linear.x
+            assert written.kinematics.twist_with_covariance.twist.linear.x == sign * speed
 
 
 def test_arrivals_wait_until_transforms_cover_them_but_not_for_ever():
