@@ -110,7 +110,7 @@ def test_poses_that_do_not_fit_are_told_with_every_array():
     drive = Drive(sweeps=10)
     live = Live(convention=Convention('bottom'))
     live.feed(drive)
-    reasons = [reason for reason, _ in live.told]
+    reasons = [reason for reason, *_ in live.told]
     assert reasons == ['pose_reference'] * 5  # known after 12 boxes, six arrays
     assert 'pose_reference:=center' in live.told[0][1]
 
