@@ -1,5 +1,6 @@
 """Package for pip and, as ament_python, for colcon; pins that work together: constraints.txt."""
 
+from glob import glob
 from xml.etree import ElementTree
 
 from setuptools import setup
@@ -16,8 +17,9 @@ setup(
     packages=[NAME, f'{NAME}.labels', 'msg_adapters'],
     data_files=[
         ('share/ament_index/resource_index/packages', [f'{NAME}/resource/{NAME}']),
-        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
     ],
+    package_data={NAME: ['share/*']},  # `boxreg bench node` runs without an installation too
     entry_points={
         'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.node:main']
     },
@@ -29,7 +31,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.11',
     install_requires=[
-        'mcap>=1.2,<2',
+        'mcap>=1.6,<2',
         'numpy>=1.26,<3',
         'pyyaml>=6',
         'rosbags>=0.11,<0.12',
@@ -42,6 +44,8 @@ setup(
         'bench': ['matplotlib', 'small-gicp'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
         'formats': ['pyarrow'],
+        # MCAP files whose boxes are protobuf.
+        'foxglove': ['mcap-protobuf-support'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -54,7 +58,10 @@ setup(
             'flake8-docstrings',
             'flake8-import-order',
             'flake8-quotes',
+            'foxglove-schemas-protobuf',
             'matplotlib',
+            'mcap-protobuf-support',
+            'mcap-ros2-support',
             'mypy',
             'openlabel-checker',
             'pyarrow',

@@ -2,8 +2,10 @@
 
 from bisect import insort
 from collections import Counter
+from math import inf
 from typing import NamedTuple
 
+from boxreg_ros.config import Config
 from boxreg_ros.structures import BoxArray, Sweep
 
 
@@ -18,36 +20,42 @@ class StampMatcher:
     """
     Pair sweeps with box arrays; pairs leave in the order of their boxes' stamps.
 
-    A box array waits for its sweep until a sweep younger than itself has come, a sweep waits
-    until boxes younger than itself have been paired, and neither longer than `capacity` others.
+    A sweep within the tolerance is taken at once, one within reach when a sweep younger than the
+    boxes has come: then none can be closer, in whatever order the two kinds arrive. One sweep
+    may serve several box arrays. The boxes of a sweep that is lost leave alone at once. Neither
+    kind waits longer than for `queue` others.
 
     Parameters
     ----------
-    tolerance_ns : int
-        Stamps further apart do not belong together [ns].
-    capacity : int
-        Sweeps, and box arrays, waited with.
+    config : Config
+        Read are `tolerance`, `reach` and `queue`.
     counts : Counter
         Where what is dropped is counted by reason.
 
     """
 
-    def __init__(self, tolerance_ns: int, capacity: int, counts: Counter[str]) -> None:
-        self._tolerance_ns = tolerance_ns
-        self._capacity = capacity
+    def __init__(self, config: Config, counts: Counter[str]) -> None:
+        self._tolerance_ns = round(config.tolerance * 1e9)
+        self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
+        self._capacity = config.queue
         self._counts = counts
         self._sweeps: list[Sweep] = []
         self._boxes: list[BoxArray] = []
-        self._newest_sweep_ns: int | None = None
+        self._used: set[int] = set()
+        self._newest_ns = self._oldest_ns = -inf  # sweep that came, sweep that is still of use
 
     def add_sweep(self, sweep: Sweep) -> list[Pair]:
         """Take a sweep; return the pairs that are complete now."""
-        insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
-        newest = self._newest_sweep_ns
-        self._newest_sweep_ns = sweep.stamp_ns if newest is None else max(sweep.stamp_ns, newest)
+        if sweep.stamp_ns < self._oldest_ns:
+            self._counts['sweep_late'] += 1
+        elif any(sweep.stamp_ns == other.stamp_ns for other in self._sweeps):
+            self._counts['sweep_duplicate'] += 1
+        else:
+            insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
+        self._newest_ns = max(self._newest_ns, sweep.stamp_ns)
         pairs = self._complete()
-        while len(self._sweeps) > self._capacity:
-            self._forget_sweep(0)
+        if len(self._sweeps) > self._capacity:
+            self._forget_before(self._sweeps[1].stamp_ns)
         return pairs
 
     def add_boxes(self, boxes: BoxArray) -> list[Pair]:
@@ -56,37 +64,33 @@ class StampMatcher:
         return self._complete()
 
     def flush(self) -> list[Pair]:
-        """Return what still waits, paired or not, and forget everything."""
+        """Return what still waits, paired or not, and forget all sweeps."""
         pairs = self._complete(hopeless=True)
-        while self._sweeps:
-            self._forget_sweep(0)
+        self._forget_before(self._newest_ns + 1)
         return pairs
 
     def _complete(self, hopeless: bool = False) -> list[Pair]:
         pairs = []
         while self._boxes:
-            boxes = self._boxes[0]
-            match = self._nearest(boxes.stamp_ns)
-            if match is None and not (
-                hopeless
-                or len(self._boxes) > self._capacity
-                or (
-                    self._newest_sweep_ns is not None
-                    and self._newest_sweep_ns > boxes.stamp_ns + self._tolerance_ns
-                )
-            ):
+            stamp_ns = self._boxes[0].stamp_ns
+            distances = [abs(sweep.stamp_ns - stamp_ns) for sweep in self._sweeps]
+            away = min(distances, default=self._reach_ns + 1)
+            is_open = away > self._tolerance_ns and self._newest_ns < stamp_ns and not hopeless
+            if is_open and len(self._boxes) <= self._capacity:
                 break
-            pairs.append(Pair(self._boxes.pop(0), match))
-            while self._sweeps and self._sweeps[0].stamp_ns < boxes.stamp_ns - self._tolerance_ns:
-                self._forget_sweep(0)
+            near = None
+            if away <= self._reach_ns:
+                sweep = self._sweeps[distances.index(away)]
+                self._used.add(sweep.stamp_ns)
+                near = None if sweep.is_lost else sweep
+            pairs.append(Pair(self._boxes.pop(0), near))
+            self._forget_before(stamp_ns - self._reach_ns)
         return pairs
 
-    def _nearest(self, stamp_ns: int) -> Sweep | None:
-        distance = [abs(sweep.stamp_ns - stamp_ns) for sweep in self._sweeps]
-        if not distance or min(distance) > self._tolerance_ns:
-            return None
-        return self._sweeps.pop(distance.index(min(distance)))
-
-    def _forget_sweep(self, index: int) -> None:
-        self._counts['sweep_without_boxes'] += 1
-        del self._sweeps[index]
+    def _forget_before(self, oldest_ns: float) -> None:
+        self._oldest_ns = max(self._oldest_ns, oldest_ns)
+        while self._sweeps and self._sweeps[0].stamp_ns < oldest_ns:
+            stamp_ns = self._sweeps.pop(0).stamp_ns
+            if stamp_ns not in self._used:
+                self._counts['sweep_without_boxes'] += 1
+            self._used.discard(stamp_ns)

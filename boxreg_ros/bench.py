@@ -352,7 +352,7 @@ def draw_paper(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> No
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads."""
-    kinds = parser.add_subparsers(dest='kind', required=True, metavar='{paper,real,speed}')
+    kinds = parser.add_subparsers(dest='kind', required=True, metavar='{paper,real,speed,node}')
     paper = kinds.add_parser('paper', help="the paper's experiment: its Table I and two figures")
     paper.add_argument(
         '--seeds', type=int, default=3, metavar='N', help='repetitions (default: 3)'
@@ -385,12 +385,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     if find_spec('boxreg_ros.bench_speed'):
         speed = kinds.add_parser('speed', help='time per tick, per box and per window')
         import_module('boxreg_ros.bench_speed').add_arguments(speed)
+    node = kinds.add_parser('node', help='the live node under load, over DDS')
+    import_module('boxreg_ros.bench_node').add_arguments(node)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run one kind of bench and print its table."""
-    if args.kind == 'speed':
-        return int(import_module('boxreg_ros.bench_speed').run(args))
+    if args.kind in ('speed', 'node'):
+        return int(import_module(f'boxreg_ros.bench_{args.kind}').run(args))
     return bench_paper(args) if args.kind == 'paper' else bench_real(args)
 
 

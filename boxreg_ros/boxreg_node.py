@@ -2,28 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
+import os
+from pathlib import Path
 from threading import Event
 import time
 from typing import Any
 
 from boxreg_ros.diagnostics import Health
-from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.inbox import Inbox, Message
 from boxreg_ros.live import Arrival, LiveRegistrar, Outgoing, warm_up
-from boxreg_ros.params import declare
+from boxreg_ros.params import changed, declare, parameters_yaml
+from boxreg_ros.reasons import REASONS
 from boxreg_ros.visual import MarkerBoard
 from diagnostic_msgs.msg import DiagnosticArray
 from msg_adapters import adapter_for, ADAPTERS, canonical, pointcloud
+from msg_adapters.poses import stamp_ns
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    DurabilityPolicy,
+    qos_policy_name_from_kind,
+    QoSProfile,
+    ReliabilityPolicy,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 NAME = 'boxreg_node'
@@ -31,7 +45,7 @@ POLL = 0.02
 """The worker looks this often whether an arrival has waited long enough [s]."""
 GRAPH_PERIOD = 0.2
 STATUS_PERIOD = 1.0
-LAST_WORK, LAST_ACKNOWLEDGEMENT = 1.0, 0.4
+LAST_WORK, LAST_ACKNOWLEDGEMENT = 0.8, 0.4
 """So long may, on shutdown, the worker go on, and subscribers take what it published [s]."""
 
 
@@ -39,9 +53,10 @@ class BoxregNode(Node):
     """
     Subscribes to clouds, boxes, TF and odometry; publishes refined boxes.
 
-    Callbacks run in the executor's thread and only put messages into the inbox, so the executor
-    is never kept waiting. One other thread, in `work` until `stop`, owns the transforms, the
-    registrar and the markers, and publishes boxes. Counters (`Health`) are shared by both.
+    Callbacks run in the executor's thread and only put messages and wishes into the inbox, so
+    the executor is never kept waiting. One other thread, in `work` until `stop`, owns the
+    transforms, the registrar and the markers, and publishes boxes. Counters (`Health`) are
+    shared by both.
 
     Raises
     ------
@@ -52,16 +67,22 @@ class BoxregNode(Node):
 
     def __init__(self) -> None:
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
-        config, options = declare(self)
+        config, options = self._settings = declare(self)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._take_parameters)
         warm_up(config)
+        self._convention = options.convention
         self._health = Health()
-        self._inbox = Inbox(options.backlog)
+        self._inbox = Inbox(config.queue)
+        self._backlog, self._idle_at = options.backlog, 0.0
         self._live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
-            self._trouble,
+            self._trouble, options.convention,
         )  # fmt: skip
         self._board = MarkerBoard()
         self._cloud_frame = self._fixed_frame = ''
+        self._tracks = 0
+        self._newest_motion_ns: int | None = None
         self._stopping = Event()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on when /clock does not
         self._markers = self.create_publisher(MarkerArray, 'refined_markers', 10)
@@ -71,6 +92,8 @@ class BoxregNode(Node):
         self._subscribe(PointCloud2, 'points', self._on_points, best_effort(depth=5))
         self._subscribe(Odometry, 'odom', self._on_odometry, best_effort(depth=50))
         self._subscribe_to_tf()
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.create_service(Trigger, '~/save_config', self._on_save_config)
         self._final_depth = 10 + config.lag  # so many may leave at once, at the end
         self._early: Publisher | None = None
         self._final: Publisher | None = None
@@ -86,9 +109,37 @@ class BoxregNode(Node):
 
     # ------------------------------------------------------------ executor thread: callbacks
 
-    def _subscribe(self, kind: type, topic: str, callback: Any, qos: QoSProfile) -> None:
-        overrides = QoSOverridingOptions.with_default_policies()
-        self.create_subscription(kind, topic, callback, qos, qos_overriding_options=overrides)
+    def _subscribe(
+        self, kind: type, topic: str, callback: Any, qos: QoSProfile, is_open: bool = True
+    ) -> None:
+        """Subscribe; what DDS loses or does not connect is counted. `is_open`: to overrides."""
+        name = self.resolve_topic_name(topic)
+        overrides = QoSOverridingOptions.with_default_policies() if is_open else None
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=partial(self._on_incompatible, name, 'publisher'),
+            message_lost=partial(self._on_lost, topic),
+        )
+        self.create_subscription(
+            kind, topic, callback, qos, event_callbacks=events, qos_overriding_options=overrides
+        )
+
+    def _publisher(self, kind: type, topic: str, depth: int) -> Publisher:
+        name = self.resolve_topic_name(topic)
+        return self.create_publisher(
+            kind, topic, depth,
+            event_callbacks=PublisherEventCallbacks(
+                incompatible_qos=partial(self._on_incompatible, name, 'subscriber')
+            ),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )  # fmt: skip
+
+    def _on_lost(self, topic: str, event: Any) -> None:
+        self._health.count(f'{topic}_lost', event.total_count_change)
+
+    def _on_incompatible(self, topic: str, who: str, event: Any) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        text = f'{topic}: a {who} whose {policy} QoS policy does not go with that of this node'
+        self._trouble('qos_incompatible', f'{text}: {REASONS["qos_incompatible"].remedy}')
 
     def _subscribe_to_tf(self) -> None:
         try:
@@ -98,7 +149,7 @@ class BoxregNode(Node):
             return
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for topic, qos in (('/tf', QoSProfile(depth=100)), ('/tf_static', latched)):
-            self.create_subscription(kind, topic, partial(self._inbox.put_motion, topic), qos)
+            self._subscribe(kind, topic, partial(self._inbox.put_news, topic), qos, is_open=False)
 
     def _find_boxes(self) -> None:
         """Look for publishers of boxes; the first type that can be read is taken."""
@@ -109,25 +160,22 @@ class BoxregNode(Node):
                 self._open_boxes(readable[0])
                 self._search.cancel()
             elif types:
-                adapter_for(types.pop())
+                adapter_for(types.pop(), self._convention)
         except UnsupportedMessage as error:
             if self._health.is_time_to_warn('boxes_type'):
                 self.get_logger().warning(f'{self.resolve_topic_name("boxes")}: {error}')
 
     def _open_boxes(self, type_name: str) -> None:
-        adapter, kind = adapter_for(type_name), import_message(type_name)
+        adapter, kind = adapter_for(type_name, self._convention), import_message(type_name)
         self._live.adapter = adapter
-        overrides = QoSOverridingOptions.with_default_policies()
-        self._early, self._final = (
-            self.create_publisher(kind, topic, depth, qos_overriding_options=overrides)
-            for topic, depth in (('refined_boxes', 10), ('refined_boxes_final', self._final_depth))
-        )
+        self._early = self._publisher(kind, 'refined_boxes', 10)
+        self._final = self._publisher(kind, 'refined_boxes_final', self._final_depth)
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._subscribe(kind, 'boxes', self._on_boxes, qos)
         self.get_logger().info(f'boxes are {type_name}')
 
     def _on_odometry(self, msg: Odometry) -> None:
-        self._inbox.put_motion('odom', msg)
+        self._inbox.put_news('odom', msg)
 
     def _on_points(self, msg: PointCloud2) -> None:
         self._cloud_frame = msg.header.frame_id
@@ -140,18 +188,55 @@ class BoxregNode(Node):
         self._health.count(f'{topic}_received')
         dropped = self._inbox.put(topic, msg)
         if dropped is not None:
-            self._trouble(f'{topic}_queue_full', 'the solver is slower than the data comes')
-            if topic == 'boxes':
-                self._publish(LiveRegistrar.passed_through(dropped.content))
+            self._drop(dropped)
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._inbox.put_news('reset', None)
+        response.success = True
+        response.message = 'tracks and what was learnt are forgotten, transforms are kept'
+        return response
+
+    def _on_save_config(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        config, options = self._settings
+        path = Path(options.config_file).absolute()
+        partial_path = path.with_name(f'.{path.name}.partial')
+        try:
+            text = parameters_yaml(config, options, self.get_fully_qualified_name())
+            partial_path.write_text(text, encoding='utf-8')
+            os.replace(partial_path, path)
+        except OSError as error:
+            response.message = f'{error}; choose another config_file'
+        else:
+            response.success, response.message = True, str(path)
+        return response
+
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            changed(*self._settings, parameters)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take_parameters(self, parameters: list[Parameter]) -> None:
+        self._settings = changed(*self._settings, parameters)
+        self._inbox.put_news('settings', self._settings)
 
     def _publish_status(self) -> None:
+        for complaint in self._health.complaints():
+            self.get_logger().warning(complaint)
+        now, age = self.get_clock().now(), 'none'
+        if self._newest_motion_ns is not None:
+            age = f'{1e-9 * (now.nanoseconds - self._newest_motion_ns):.3f}'
         facts = {
             'fixed_frame': self._fixed_frame or 'not known yet',
+            'newest transform, age [s]': age,
+            'tracks': self._tracks,
+            **self._live.facts,
             **self._inbox.sizes(),
         }
         status = self._health.status(f'{self.get_fully_qualified_name()}: registration', facts)
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = now.to_msg()
         self._diagnostics.publish(message)
 
     # ------------------------------------------------------------ worker thread
@@ -161,19 +246,36 @@ class BoxregNode(Node):
         item: Arrival | None = None
         while not self._stopping.is_set():
             self._inbox.news.clear()
-            self._take_motion()
-            item = item or self._decoded(self._inbox.take())
+            self._take_news()
+            item = item or self._decoded(self._take())
             if item is not None and self._live.is_ready(item, time.monotonic()):
                 self._process(item)
                 item = None
-            elif item is not None or not any(self._inbox.sizes().values()):
-                self._inbox.news.wait(POLL if item is not None else None)
+            elif item is not None:
+                self._inbox.news.wait(POLL)
+                self._idle_at = time.monotonic()
+            elif not any(self._inbox.sizes().values()):
+                if self._live.is_silent(time.monotonic()):
+                    self._publish(self._guarded(self._live.flush))
+                    self._markers.publish(self._board.clear())
+                self._inbox.news.wait(STATUS_PERIOD)
+                self._idle_at = time.monotonic()
         self._finish_work(item)
+
+    def _take(self) -> Message | None:
+        """Return what has waited longest, but for clouds that have waited for the solver."""
+        message = self._inbox.take()
+        if message is None or message.topic != 'points':
+            return message
+        if time.monotonic() <= max(message.received, self._idle_at) + self._backlog:
+            return message
+        self._drop(message)
+        return None
 
     def _finish_work(self, item: Arrival | None) -> None:
         """Process what is left as long as there is time, then publish what is held."""
         end = time.monotonic() + LAST_WORK
-        self._take_motion()
+        self._take_news()
         while time.monotonic() < end:
             item = item or self._decoded(self._inbox.take())
             if item is None and not any(self._inbox.sizes().values()):
@@ -181,18 +283,27 @@ class BoxregNode(Node):
             if item is not None:
                 self._process(item)
                 item = None
-        self._publish(self._live.flush())
+        self._publish(self._guarded(self._live.flush))
         self._markers.publish(self._board.clear())
         for publisher in (self._early, self._final, self._markers):
             if publisher is not None:
                 publisher.wait_for_all_acked(Duration(seconds=LAST_ACKNOWLEDGEMENT / 3))
 
-    def _take_motion(self) -> None:
-        for topic, msg in self._inbox.take_motion():
+    def _take_news(self) -> None:
+        for topic, news in self._inbox.take_news():
             if topic == 'odom':
-                self._live.tree.add_odometry(msg)
+                self._live.tree.add_odometry(news)
+            elif topic == 'lost':
+                self._publish(self._guarded(partial(self._live.lose, news)))
+            elif topic == 'reset':
+                self._publish(self._guarded(self._live.reset))
+            elif topic == 'settings':
+                self._live.config, options = news
+                self._live.output_frame = options.output_frame.lstrip('/')
+                self._live.transform_timeout = options.transform_timeout
             else:
-                self._live.tree.add_transforms(msg.transforms, is_static=topic == '/tf_static')
+                self._live.tree.add_transforms(news.transforms, is_static=topic == '/tf_static')
+        self._newest_motion_ns = self._live.tree.newest_ns()
 
     def _decoded(self, message: Message | None) -> Arrival | None:
         if message is None:
@@ -209,11 +320,7 @@ class BoxregNode(Node):
         return Arrival(message.content, content, message.received)
 
     def _process(self, item: Arrival) -> None:
-        try:
-            ready = self._live.process(item)
-        except Exception as error:  # one bad tick must not end weeks of running
-            self._trouble('failed', f'{type(error).__name__}: {error}')
-            ready = self._live.abandon(item)
+        ready = self._guarded(partial(self._live.process, item), item)
         if self._fixed_frame != self._live.fixed_frame:
             self._fixed_frame = self._live.fixed_frame
             self.get_logger().info(f'fixed frame is {self._fixed_frame!r}')
@@ -222,12 +329,24 @@ class BoxregNode(Node):
         if any(not out.is_final for out in ready):
             self._health.add_latency(time.monotonic() - item.received)
 
+    def _guarded(
+        self, task: Callable[[], list[Outgoing]], item: Arrival | None = None
+    ) -> list[Outgoing]:
+        """Return what a task returns; one bad tick must not end weeks of running."""
+        try:
+            return task()
+        except Exception as error:
+            self._trouble('failed', f'{type(error).__name__}: {error}')
+            return self._live.abandon(item)
+
     def _publish(self, ready: list[Outgoing]) -> None:
         for out in ready:
             publisher = self._final if out.is_final else self._early
             assert publisher is not None  # it was made before boxes were subscribed to
             publisher.publish(out.message)
             self._health.count('final_published' if out.is_final else 'early_published')
+            if not out.is_final and out.given is not None:
+                self._tracks = len(set(out.given.track_ids) - {''})
         if not self._markers.get_subscription_count():
             return  # they take longer than the boxes
         for out in ready:
@@ -236,9 +355,18 @@ class BoxregNode(Node):
 
     # ------------------------------------------------------------ both
 
-    def _trouble(self, reason: str, text: str) -> None:
+    def _drop(self, message: Message) -> None:
+        """Leave out what the solver has no time for; boxes pass through."""
+        reason = f'{message.topic}_queue_full'
+        self._trouble(reason, REASONS[reason].remedy)
+        if message.topic == 'boxes':
+            self._publish(LiveRegistrar.passed_through(message.content))
+        else:
+            self._inbox.put_news('lost', stamp_ns(message.content.header))
+
+    def _trouble(self, reason: str, text: str, number: int = 1) -> None:
         """Count what went wrong, and tell it at a limited rate."""
-        self._health.count(reason)
+        self._health.count(reason, number)
         if self._health.is_time_to_warn(reason):
             self.get_logger().warning(f'{reason}: {" ".join(text.split())}')
 

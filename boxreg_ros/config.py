@@ -154,6 +154,7 @@ class Config:
     min_observations: int = setting(3, 'shorter windows keep their input', '', 2, 1000)
     max_gap: float = setting(1.0, 'a longer silence ends a track', 's', 0.01, 1e4)
     tolerance: float = setting(0.02, 'boxes and sweep belong together within this', 's', 0.0, 10.0)
+    reach: float = setting(0.06, 'a sweep this far off serves, moved along', 's', 0.0, 10.0)
     queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)
     device: str = setting('cpu', "where windows are solved: 'cpu', 'cuda', 'cuda:1', ...")
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -251,7 +252,7 @@ class Config:
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
         """
-        Read a YAML file: plain, or as ROS writes it (``/**: ros__parameters: ...``).
+        Read a YAML file: plain, or as ROS writes it (``/**: ros__parameters: ...``, the first).
 
         Raises
         ------
@@ -264,8 +265,8 @@ class Config:
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             reason = ' '.join(str(error).split())
             raise ConfigError(f'config file {str(path)!r} cannot be read: {reason}') from None
-        if isinstance(values, dict) and len(values) == 1:
-            (inner,) = values.values()
+        if isinstance(values, dict) and values:
+            inner = next(iter(values.values()))
             if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
                 values = inner['ros__parameters']
         if not isinstance(values, dict):

@@ -13,16 +13,14 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.labelled import LabelledRecording
-from boxreg_ros.labels import frames_of, LabelFrame, module_of, Options, Provenance, writer_for
-from boxreg_ros.relabel import (
+from boxreg_ros.labelled import (
     add_label_arguments,
     label_frame_of,
+    LabelledRecording,
     pose_of,
-    SPOOL,
-    SUMMARY,
-    whole_folder,
 )
+from boxreg_ros.labels import frames_of, LabelFrame, module_of, Options, Provenance, writer_for
+from boxreg_ros.results import SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import Sweep
 from boxreg_ros.transforms import boxes_to_frame, TransformTree
@@ -144,7 +142,7 @@ def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
         return
     tree = TransformTree()
     labels = (request.given, request.source)
-    spool = Spool(folder / SPOOL, TOLERANCE_NS) if request.options.with_points else None
+    spool = Spool(folder, TOLERANCE_NS) if request.options.with_points else None
     with LabelledRecording(labels, request.recordings, points=request.points) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
@@ -153,18 +151,20 @@ def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
             if isinstance(item, Sweep):
                 T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
                 if spool is not None and T_fixed_sweep is not None:
-                    spool.add(item, T_fixed_sweep)
+                    spool.add(item, T_fixed_sweep, recording.intensities(record))
                 continue
             T_fixed_boxes = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
             boxes = item
             if T_fixed_boxes is not None:
                 boxes = boxes_to_frame(item, T_fixed_boxes, fixed_frame)
             T_fixed_sensor = pose_of(tree, fixed_frame, sensor_frame, item.stamp_ns)
-            sweep = None
+            sweep = intensities = None
             if spool is not None and T_fixed_sensor is not None:
-                sweep = spool.take(item.stamp_ns, sensor_frame, T_fixed_sensor)
+                sweep, intensities = spool.take(item.stamp_ns, sensor_frame, T_fixed_sensor)
             refined = replace(recording.label.refined, boxes=boxes)
-            yield LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor, sweep)
+            yield LabelFrame(
+                refined, fixed_frame, sensor_frame, T_fixed_sensor, sweep, intensities
+            )
     if spool is not None:
         spool.remove()
 

@@ -3,33 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from threading import Lock
 import time
 
+from boxreg_ros.reasons import FAULTS, REASONS
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-TOO_SLOW = 'the solver is slower than the data: lower window, or fewer boxes'
 LOG_PERIOD = 10.0
 """The same trouble is logged this often at most [s]."""
-
-REMEDIES = {
-    'failed': 'a fault of boxreg_ros: please report it with the log',
-    'points_queue_full': TOO_SLOW,
-    'boxes_queue_full': TOO_SLOW,
-    'unreadable': 'the log has the reason',
-    'no_transform': 'the log has the frames',
-    'late': 'boxes came after younger ones: publish them in the order of their stamps',
-    'no_track_id': 'boxes need an id that stays with the object: put a tracker before this node',
-    'duplicate_track_id': 'an id may occur once per message',
-    'no_sweep': 'no cloud within tolerance of the stamp of the boxes: copy the stamp of the cloud',
-}
-"""
-Reasons someone can do something about, the weightiest first, and what.
-
-The others, such as boxes without points, are in the nature of the data.
-
-"""
+RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')
 
 
 class Health:
@@ -43,7 +26,9 @@ class Health:
     def __init__(self) -> None:
         self._lock = Lock()
         self._counts: Counter[str] = Counter()
+        self._elsewhere: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
+        self._logged: Counter[str] = Counter()
         self._latencies: list[float] = []
         self._warned: dict[str, float] = {}
         self._since = time.monotonic()
@@ -54,10 +39,9 @@ class Health:
             self._counts[name] += number
 
     def set_counts(self, counts: Mapping[str, int]) -> None:
-        """Take over counters that are kept elsewhere."""
+        """Take over counters that are kept elsewhere, to be added to those counted here."""
         with self._lock:
-            for name, number in counts.items():
-                self._counts[name] = number
+            self._elsewhere = Counter(counts)
 
     def add_latency(self, seconds: float) -> None:
         """Note how long after the later of cloud and boxes an early estimate was published."""
@@ -73,21 +57,30 @@ class Health:
                 self._warned[reason] = now
         return is_time
 
+    def complaints(self) -> Iterator[str]:
+        """Yield a line with the remedy for every reason that has one and is due in the log."""
+        with self._lock:
+            counts = self._counts + self._elsewhere
+        for name, reason in REASONS.items():
+            number = counts[name] - self._logged[name]
+            if number and reason.remedy and self.is_time_to_warn(name):
+                self._logged[name] = counts[name]
+                yield f'{name} ({number} more): {reason.meaning}; {reason.remedy}'
+
     def status(self, name: str, facts: Mapping[str, object]) -> DiagnosticStatus:
         """Return the state since the last call; `facts` are added to the values."""
         now = time.monotonic()
         with self._lock:
-            counts, fresh = self._counts.copy(), self._counts - self._reported
-            self._reported = counts.copy()
+            counts = self._counts + self._elsewhere
+            fresh = counts - self._reported
+            self._reported = counts
             latencies, self._latencies = sorted(self._latencies), []
             period, self._since = max(now - self._since, 1e-3), now
-        values = {
-            f'{what} [Hz]': f'{fresh[what] / period:.1f}'
-            for what in ('points_received', 'boxes_received', 'early_published', 'final_published')
-        }
-        if latencies:
-            values['latency median [ms]'] = f'{1e3 * latencies[len(latencies) // 2]:.1f}'
-            values['latency most [ms]'] = f'{1e3 * latencies[-1]:.1f}'
+        values = {f'{what} [Hz]': f'{fresh[what] / period:.1f}' for what in RATES}
+        for what, share in (('median', 0.5), ('p99', 0.99), ('most', 1.0)):
+            if latencies:
+                row = min(int(share * len(latencies)), len(latencies) - 1)
+                values[f'latency {what} [ms]'] = f'{1e3 * latencies[row]:.1f}'
         values |= {key: str(value) for key, value in facts.items()}
         values |= {key: str(number) for key, number in sorted(counts.items())}
         level, message = _verdict(fresh)
@@ -99,10 +92,13 @@ class Health:
 
 def _verdict(fresh: Counter[str]) -> tuple[bytes, str]:
     """Return level and message for what happened since the last time."""
-    fault = next((reason for reason in REMEDIES if fresh[reason]), None)
-    if fault is not None:
-        level = DiagnosticStatus.ERROR if fault == 'failed' else DiagnosticStatus.WARN
-        return level, f'{fault}: {REMEDIES[fault]}'
+    trouble = next((name for name, why in REASONS.items() if fresh[name] and why.remedy), None)
+    if trouble is not None:
+        reason = REASONS[trouble]
+        is_idle = bool(fresh['boxes_received']) and not fresh['refined']
+        level = DiagnosticStatus.ERROR if is_idle or trouble in FAULTS else DiagnosticStatus.WARN
+        text = f'{trouble}: {reason.meaning}; {reason.remedy}'
+        return level, f'no box was refined; {text}' if is_idle else text
     missing = [name for name in ('points', 'boxes') if not fresh[f'{name}_received']]
     if missing:
         return DiagnosticStatus.WARN, f'nothing received on {" and ".join(missing)}'

@@ -28,22 +28,22 @@ class Inbox:
 
     Parameters
     ----------
-    backlog : int
+    capacity : int
         Clouds that may wait.
 
     """
 
-    def __init__(self, backlog: int) -> None:
-        self._capacity = {'points': backlog, 'boxes': 20 * backlog}
+    def __init__(self, capacity: int) -> None:
+        self._capacity = {'points': capacity, 'boxes': 20 * capacity}
         self._lock = Lock()
         self._number = 0
-        self._motion: deque[tuple[str, Any]] = deque()
+        self._news: deque[tuple[str, Any]] = deque()
         self._waiting: dict[str, deque[Message]] = {'points': deque(), 'boxes': deque()}
         self.news = Event()
 
-    def put_motion(self, topic: str, content: Any) -> None:
-        """Take a message with transforms; none is dropped, the worker is quick with them."""
-        self._motion.append((topic, content))
+    def put_news(self, topic: str, content: Any) -> None:
+        """Take transforms or a wish; none is dropped, the worker is quick with them."""
+        self._news.append((topic, content))
         self.news.set()
 
     def put(self, topic: str, content: Any) -> Message | None:
@@ -56,9 +56,9 @@ class Inbox:
         self.news.set()
         return dropped
 
-    def take_motion(self) -> list[tuple[str, Any]]:
-        """Return the transforms that have come since the last call."""
-        return [self._motion.popleft() for _ in range(len(self._motion))]
+    def take_news(self) -> list[tuple[str, Any]]:
+        """Return what has come by `put_news` since the last call."""
+        return [self._news.popleft() for _ in range(len(self._news))]
 
     def take(self) -> Message | None:
         """Return the cloud or boxes that have waited longest."""

@@ -1,15 +1,17 @@
-"""A recording whose boxes come from label files."""
+"""Recordings whose boxes come from label files, and the frames that labels are written in."""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from boxreg_ros.errors import RecordingError, TransformUnavailable
 from boxreg_ros.labels import frames_of, LabelFrame
 from boxreg_ros.recording import Record, Recording
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.structures import BoxArray, Floats, Sweep
 from boxreg_ros.transforms import TransformTree
 
 
@@ -92,3 +94,52 @@ class LabelledRecording(Recording):
 
 def _stamp(frame: LabelFrame) -> int:
     return frame.refined.boxes.stamp_ns
+
+
+def pose_of(tree: TransformTree, fixed_frame: str, frame: str, stamp_ns: int) -> Floats | None:
+    """Return the pose of `frame` in the fixed frame; None if unknown."""
+    try:
+        return tree.lookup(fixed_frame, frame, stamp_ns)
+    except TransformUnavailable:
+        return None
+
+
+def label_frame_of(
+    recording: Recording, tree: TransformTree, fixed_frame: str, wish: str | None
+) -> str:
+    """
+    Return the frame that stands for the sensor's in label files: that of the clouds, or `wish`.
+
+    Raises
+    ------
+    RecordingError
+        If nothing connects it with the fixed frame.
+
+    """
+    frame = (wish or recording.sensor_frame()).lstrip('/')
+    if not tree.connects(fixed_frame, frame):
+        raise RecordingError(
+            f'{recording}: label frame {frame!r}: expected one that is connected with '
+            f'{fixed_frame!r}; TF: {tree}'
+        )
+    return frame
+
+
+def add_label_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that label formats need, whoever writes them."""
+    parser.add_argument(
+        '--camera', type=Path, metavar='FILE',
+        help='calibration, for formats that look through a camera',
+    )  # fmt: skip
+    parser.add_argument(
+        '--swap-axes', action='store_true',
+        help='extents where Datumaro and CVAT look for them',
+    )  # fmt: skip
+    parser.add_argument(
+        '--with-points', action='store_true',
+        help='write the clouds that the label formats need beside their labels',
+    )  # fmt: skip
+    parser.add_argument(
+        '--label-frame', metavar='FRAME',
+        help='frame that stands for the sensor in label files (default: that of the clouds)',
+    )  # fmt: skip

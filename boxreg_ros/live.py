@@ -10,14 +10,25 @@ from typing import Any, NamedTuple
 from boxreg_ros import refine
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.intake import covariances_to_write, Intake
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep, Track
-from boxreg_ros.transforms import boxes_to_frame, inverse, sweep_to_frame, TransformTree
+from boxreg_ros.transforms import (
+    boxes_to_frame,
+    inverse,
+    Rewind,
+    sweep_to_frame,
+    TransformTree,
+)
 from msg_adapters import Adapter
+from msg_adapters.convention import Convention, STANDARD
+from msg_adapters.poses import turned_covariances
 import numpy as np
 
 SETTLE = 0.3
 """Transforms are collected this long before a fixed frame is chosen among them [s]."""
+SILENCE = 3.0
+"""After so long without boxes, final ones are not held back any more [s]."""
 
 
 class Arrival(NamedTuple):
@@ -50,6 +61,7 @@ class _Pending:
     message: Any
     given: BoxArray
     T_output_fixed: Floats
+    T_output_item: Floats | None
     is_early_out: bool = False
 
 
@@ -71,7 +83,10 @@ class LiveRegistrar:
         How long an arrival waits for transforms that cover its stamp [s]. After that it takes
         what a short extrapolation gives.
     trouble : callable
-        Told the reason, as counted, and the text of everything that is not refined here.
+        Told the reason, as counted, the text and the number of everything that is not refined
+        here.
+    convention : Convention
+        How the boxes are to be read.
 
     Attributes
     ----------
@@ -81,6 +96,8 @@ class LiveRegistrar:
         The frame chosen, and the frame of the clouds, to be set; empty while not known.
     adapter : Adapter
         Reads and writes the boxes; to be set before the first.
+    output_frame, transform_timeout
+        As above; may change.
 
     """
 
@@ -90,18 +107,32 @@ class LiveRegistrar:
         fixed_frame: str,
         output_frame: str,
         transform_timeout: float,
-        trouble: Callable[[str, str], None],
+        trouble: Callable[[str, str, int], None],
+        convention: Convention = STANDARD,
     ) -> None:
         self.tree = TransformTree()
         self.fixed_frame = fixed_frame.lstrip('/')
-        self._output_frame = output_frame.lstrip('/')
-        self._timeout = transform_timeout
+        self.output_frame = output_frame.lstrip('/')
+        self.transform_timeout = transform_timeout
         self._trouble = trouble
+        self._convention = convention
+        self._intake = Intake(convention, config)
         self._registrar = BoxRegistrar(config)
         self._pending: dict[int, deque[_Pending]] = {}
         self.cloud_frame = ''
         self._choose_at: float | None = None
         self.adapter: Adapter | None = None
+        self._rewinds = Rewind(), Rewind()
+        self._last_boxes = 0.0
+
+    @property
+    def config(self) -> Config:
+        """Return the settings of the core; see `BoxRegistrar` for what may change."""
+        return self._registrar.config
+
+    @config.setter
+    def config(self, config: Config) -> None:
+        self._registrar.config = config
 
     @property
     def counts(self) -> Counter[str]:
@@ -111,7 +142,7 @@ class LiveRegistrar:
     def is_ready(self, item: Arrival, now: float) -> bool:
         """Tell whether the transforms of an arrival have come, or are no longer waited for."""
         content = item.content
-        if now >= item.received + self._timeout:
+        if now >= item.received + self.transform_timeout:
             return True
         if self._choose_at is None:
             self._choose_at = now + SETTLE
@@ -125,33 +156,69 @@ class LiveRegistrar:
     def process(self, item: Arrival) -> list[Outgoing]:
         """Register an arrival; return what has become ready."""
         content = item.content
-        stamp_ns = content.stamp_ns
         if isinstance(content, BoxArray) and not content.track_ids and not content.frame_id:
             return self.passed_through(item.message)  # an empty MarkerArray has no stamp either
+        ready: list[Outgoing] = []
+        if self._rewinds[isinstance(content, BoxArray)].happened(content.stamp_ns):
+            self._trouble('time_jump', f'stamps went back to {content.stamp_ns} ns', 1)
+            ready = self.reset()
+            self.tree.rewind(content.stamp_ns)
+        return ready + self._register(item)
+
+    def _register(self, item: Arrival) -> list[Outgoing]:
+        content = item.content
+        stamp_ns = content.stamp_ns
         try:
             T_fixed_item, *others = [
                 self.tree.lookup(*frames, stamp_ns) for frames in self._hops(item)
             ]
         except TransformUnavailable as error:
-            self._trouble('no_transform', str(error))
-            return [] if isinstance(content, Sweep) else self.passed_through(item.message)
+            if isinstance(content, Sweep):
+                self._trouble('sweep_without_transform', str(error), 1)
+                return []
+            self._trouble('no_transform', str(error), len(content.track_ids))
+            return self.passed_through(item.message)
         if isinstance(content, Sweep):
             sweep = sweep_to_frame(content, T_fixed_item, self.fixed_frame)
-            return self._outgoing(self._registrar.add_sweep(sweep))
+            return self._outgoing(self._registrar.add_sweep(self._intake.take(sweep)))
+        self._last_boxes = item.received
+        boxes = self._intake.take(boxes_to_frame(content, T_fixed_item, self.fixed_frame))
+        if self._intake.finding:
+            self._trouble('pose_reference', self._intake.finding, 1)
         T_output_fixed = others[0] if others else inverse(T_fixed_item)
-        given = boxes_to_frame(content, T_output_fixed @ T_fixed_item, self._output_of(content))
-        pending = _Pending(item.message, given, T_output_fixed)
+        T_output_item = T_output_fixed @ T_fixed_item if others else np.eye(4)
+        given = boxes_to_frame(content, T_output_item, self._output_of(content))
+        given = replace(given, track_ids=boxes.track_ids)
+        pending = _Pending(item.message, given, T_output_fixed, T_output_item if others else None)
         self._pending.setdefault(stamp_ns, deque()).append(pending)
-        boxes = boxes_to_frame(content, T_fixed_item, self.fixed_frame)
         return self._outgoing(self._registrar.add_boxes(boxes))
+
+    def lose(self, stamp_ns: int) -> list[Outgoing]:
+        """Have the boxes of a cloud that was dropped not wait for it."""
+        sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_lost=True)
+        return self._outgoing(self._registrar.add_sweep(sweep))
+
+    def is_silent(self, now: float) -> bool:
+        """Tell whether boxes are held, but no others have come for long."""
+        silence = max(SILENCE, self.config.max_gap)
+        return bool(self._pending) and now >= self._last_boxes + silence
 
     def flush(self) -> list[Outgoing]:
         """End all tracks and return everything still held."""
         return self._outgoing(self._registrar.flush())
 
-    def abandon(self, item: Arrival) -> list[Outgoing]:
-        """Start afresh after a fault with an arrival; pass it and what is held through."""
+    def reset(self) -> list[Outgoing]:
+        """Start afresh but for the transforms; return everything still held."""
+        ready = self.flush()
         self._registrar.reset()
+        self._intake = Intake(self._convention, self.config)
+        self._rewinds = Rewind(), Rewind()
+        return ready
+
+    def abandon(self, item: Arrival | None) -> list[Outgoing]:
+        """Start afresh after a fault; pass what is held, and the arrival at fault, through."""
+        self._registrar.reset()
+        self._intake = Intake(self._convention, self.config)
         held = [p for _, pending in sorted(self._pending.items()) for p in pending]
         self._pending.clear()
         passed = [
@@ -160,9 +227,15 @@ class LiveRegistrar:
             for out in self.passed_through(p.message)
             if out.is_final or not p.is_early_out
         ]
-        if isinstance(item.content, BoxArray) and all(p.message is not item.message for p in held):
+        is_held = item is None or any(p.message is item.message for p in held)
+        if item is not None and isinstance(item.content, BoxArray) and not is_held:
             passed += self.passed_through(item.message)
         return passed
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Return what there is to tell about the boxes beside the counts."""
+        return self._intake.facts
 
     @staticmethod
     def passed_through(message: Any) -> list[Outgoing]:
@@ -170,7 +243,7 @@ class LiveRegistrar:
         return [Outgoing(message, False), Outgoing(message, True)]
 
     def _output_of(self, boxes: BoxArray) -> str:
-        return self._output_frame or boxes.frame_id
+        return self.output_frame or boxes.frame_id
 
     def _hops(self, item: Arrival) -> list[tuple[str, str]]:
         """
@@ -185,7 +258,7 @@ class LiveRegistrar:
             self._choose_fixed_frame(content)
         hops = [(self.fixed_frame, content.frame_id)]
         if isinstance(content, BoxArray) and self._output_of(content) != content.frame_id:
-            hops.append((self._output_frame, self.fixed_frame))
+            hops.append((self.output_frame, self.fixed_frame))
         return hops
 
     def _choose_fixed_frame(self, content: Sweep | BoxArray) -> None:
@@ -217,25 +290,20 @@ class LiveRegistrar:
                 pending.is_early_out = True
             moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
             assert self.adapter is not None  # it has read the message
-            message = self.adapter.to_msg(pending.message, moved.boxes, moved.covariances)
+            covariances = covariances_to_write(moved)
+            message = self.adapter.to_msg(
+                pending.message, moved.boxes, covariances, pending.T_output_item
+            )
             outgoing.append(Outgoing(message, refined.is_final, pending.given, moved))
         return outgoing
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
-    """
-    Return refined boxes, and their covariances, in another frame.
-
-    Covariances of roll, pitch and yaw stay as they are: that is exact for frames that differ by
-    a turn about z, and the tilt between those in use is small.
-
-    """
-    J = np.eye(6)
-    J[:3, :3] = T_frame_boxes[:3, :3]
+    """Return refined boxes, and their covariances, in another frame."""
     return replace(
         refined,
         boxes=boxes_to_frame(refined.boxes, T_frame_boxes, frame_id),
-        covariances=J @ refined.covariances @ J.T,
+        covariances=turned_covariances(refined.covariances, T_frame_boxes),
     )
 
 

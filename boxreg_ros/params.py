@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+import json
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.errors import ConfigError
+from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 NODE_SETTINGS = (
     Setting(
         'boxes_type', '',
         'message type of the boxes, as package/msg/Type; empty: that of the first publisher',
+        '', None, None, (),
+    ),
+    Setting(
+        'pose_reference', 'center',
+        f'point of a box that its pose is at: {", ".join(REFERENCES)}, or x,y,z in parts of '
+        f'length, width and height',
+        '', None, None, (),
+    ),
+    Setting(
+        'size_order', 'lwh', 'what x, y and z of a size are: length, width, height',
+        '', None, None, SIZE_ORDERS,
+    ),
+    Setting(
+        'forward_axis', 'x+', 'axis of a pose that points forward', '', None, None, tuple(FORWARD)
+    ),
+    Setting(
+        'associate', False, 'give boxes ids by association, whatever ids they have',
         '', None, None, (),
     ),
     Setting(
@@ -30,11 +51,21 @@ NODE_SETTINGS = (
         's', 0.0, 60.0, (),
     ),
     Setting(
-        'backlog', 5, 'clouds waiting for the solver; beyond, the oldest are dropped',
-        '', 1, 10000, (),
+        'backlog', 0.1, 'a cloud that has waited longer for the solver is dropped',
+        's', 0.0, 3600.0, (),
+    ),
+    Setting(
+        'config_file', 'boxreg_node.yaml', 'where ~/save_config writes all parameters',
+        '', None, None, (),
     ),
 )  # fmt: skip
 
+AT_ONCE = (
+    *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
+    *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'config_file'),
+)
+"""Beginnings of the names of what may change while the node runs."""
+READ_ONLY = 'set before the start: windows, threads or subscriptions are built from it'
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 
 
@@ -42,10 +73,20 @@ class NodeOptions(NamedTuple):
     """What the node is told beside `Config`; see `NODE_SETTINGS`."""
 
     boxes_type: str
+    pose_reference: str
+    size_order: str
+    forward_axis: str
+    associate: bool
     fixed_frame: str
     output_frame: str
     transform_timeout: float
-    backlog: int
+    backlog: float
+    config_file: str
+
+    @property
+    def convention(self) -> Convention:
+        """Return how boxes are to be read."""
+        return Convention(self.pose_reference, self.size_order, self.forward_axis, self.associate)
 
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:
@@ -91,6 +132,58 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
     return config, options
 
 
+def changed(
+    config: Config, options: NodeOptions, parameters: Iterable[Parameter]
+) -> tuple[Config, NodeOptions]:
+    """
+    Return the settings with some parameters changed.
+
+    Raises
+    ------
+    ConfigError
+        For a value of the wrong type or out of its bounds, by name.
+
+    """
+    given = {parameter.name: parameter.value for parameter in parameters}
+    config = config.updated({s.name: given[s.name] for s in settings() if s.name in given})
+    own = {s.name: _checked(s, given[s.name]) for s in NODE_SETTINGS if s.name in given}
+    return config, options._replace(**own)
+
+
+def parameters_yaml(
+    config: Config, options: NodeOptions | None = None, node_name: str = '/**/boxreg_node'
+) -> str:
+    """
+    Return all settings as a parameter file of ROS, with what they mean.
+
+    Those of `Config` come first, for every node: this is the part that ``boxreg relabel
+    --config`` reads. `estimate` is left out, the node having no use for it.
+
+    """
+    lines, group = ['/**:', '  ros__parameters:'], ''
+    for item, value in config.items():
+        *groups, name = item.name.split('.')
+        if groups and groups[0] != group:
+            group = groups[0]
+            lines.append(f'    {group}:')
+        if item.name != 'estimate':
+            lines.append(_yaml_line(item, '      ' if groups else '    ', name, value))
+    lines += [f'{node_name}:', '  ros__parameters:']
+    own = options or [item.default for item in NODE_SETTINGS]
+    for item, value in zip(NODE_SETTINGS, own, strict=True):
+        lines.append(_yaml_line(item, '    ', item.name, value))
+    return '\n'.join(lines) + '\n'
+
+
+def _yaml_line(item: Setting, indent: str, name: str, value: Any) -> str:
+    bounds = ', '.join(item.choices)
+    if item.low is not None and item.high is not None:
+        bounds = f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
+    note = f'{item.meaning} ({bounds})' if bounds else item.meaning
+    plain = json.dumps(list(value) if isinstance(value, tuple) else value)
+    return f'{indent}{name}: {plain}  # {note}'
+
+
 def _checked(item: Setting, value: Any) -> Any:
     """Return the value of a setting of the node in its type, or raise ConfigError."""
     kind: Any = type(item.default)
@@ -107,10 +200,12 @@ def _checked(item: Setting, value: Any) -> Any:
 def describe(item: Setting) -> ParameterDescriptor:
     """Return what a setting means, its unit and its bounds, as ROS tools show it."""
     unit = f' [{item.unit}]' if item.unit else ''
+    is_fixed = not item.name.startswith(AT_ONCE)
+    constraints = [f'one of {", ".join(item.choices)}'] if item.choices else []
     descriptor = ParameterDescriptor(
         description=f'{item.meaning}{unit}',
-        additional_constraints=f'one of {", ".join(item.choices)}' if item.choices else '',
-        read_only=True,
+        additional_constraints='; '.join([*constraints, READ_ONLY] if is_fixed else constraints),
+        read_only=is_fixed,
     )
     if item.low is not None and item.high is not None:
         if isinstance(item.default, float):

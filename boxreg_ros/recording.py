@@ -19,10 +19,11 @@ from boxreg_ros.errors import (
     RecordingError,
     UnsupportedMessage,
 )
-from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.foxglove_mcap import encoded, Reader
+from boxreg_ros.structures import BoxArray, Floats, Sweep
 from boxreg_ros.transforms import TransformTree
-from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE
-from rosbags.highlevel import AnyReader
+from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, WITHOUT_IDS
+from msg_adapters.convention import Convention, STANDARD
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -65,7 +66,7 @@ class Recording:
     One or several recordings of one drive, merged by receive time.
 
     Receive time only orders the stream and cuts out the part between `start` and `end`; stamps
-    are those of the messages' headers. Use as a context manager.
+    are those of the messages' headers. Use as a context manager; a copy can be opened once more.
 
     Parameters
     ----------
@@ -75,6 +76,8 @@ class Recording:
         Topics; found by type where only one fits.
     start, end : float, optional
         Part to read, from the beginning of the recording [s].
+    convention : Convention
+        How the boxes are to be read.
 
     Attributes
     ----------
@@ -98,7 +101,9 @@ class Recording:
         odometry: str | None = None,
         start: float | None = None,
         end: float | None = None,
+        convention: Convention = STANDARD,
     ) -> None:
+        self._convention = convention
         self._paths = [Path(path) for path in paths]
         self._asked = {'points': points, 'boxes': boxes, 'odometry': odometry}
         self._start, self._end = start or 0.0, end
@@ -107,8 +112,8 @@ class Recording:
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
         with _readable(self):
-            self._reader = AnyReader(_files(self._paths), default_typestore=_stock_types())
-            self._reader.open()
+            self.files = _files(self._paths)
+            self._reader = Reader(self.files, stock_types())
         try:
             self._find()
         except BaseException:
@@ -132,6 +137,7 @@ class Recording:
         that moves along, so that memory does not grow with the recording.
 
         """
+        tree.rewind(0)  # motions that were read to choose a frame come again
         data = self._connections({self.points_topic, self.boxes_topic})
         motion_topics = self._motion_topics()
         motion = self._connections(motion_topics)
@@ -165,6 +171,35 @@ class Recording:
             return self._adapter.from_msg(self._message(record))
         except (UnsupportedMessage, AttributeError) as error:
             raise UnsupportedMessage(f'topic {topic!r}: {error}') from None
+
+    def intensities(self, record: Record) -> Floats | None:
+        """Return the intensities of a sweep's points; None if the record has none."""
+        return pointcloud.intensities(self._message(record))
+
+    def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
+        """Return a message of the boxes' topic from its bytes, and the boxes in it."""
+        connection = self._connections({self.boxes_topic})[0]
+        message = self._message(Record(connection, 0, data))
+        return message, self._adapter.from_msg(message)
+
+    def with_boxes(self, message: Any, boxes: BoxArray, covariances: Floats) -> bytes:
+        """Return the bytes of a message of the boxes' topic with its boxes replaced."""
+        replaced = self._adapter.to_msg(message, boxes, covariances)
+        if not hasattr(message, '__msgtype__'):
+            return encoded(replaced)
+        store, kind = self._reader.typestore, self._topics[self.boxes_topic]
+        encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
+        return bytes(encode(replaced, kind))
+
+    @property
+    def typestore(self) -> Typestore:
+        """Return the definitions of the messages in the recording."""
+        return self._reader.typestore
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Return all topics with the types of their messages."""
+        return dict(self._topics)
 
     def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
         """
@@ -247,15 +282,17 @@ class Recording:
         }
         self._filled = {c.topic for c in self._reader.connections if c.msgcount}
         self.points_topic = self._topic('points', 'point clouds', (POINTS_TYPE,))
-        self.boxes_topic = self._topic('boxes', 'boxes', tuple(ADAPTERS)) if self.has_boxes else ''
+        self.boxes_topic = ''
+        if self.has_boxes:
+            self.boxes_topic = self._topic('boxes', 'boxes', self._box_types())
         if self._asked['odometry']:
             self.odometry_topic = self._topic('odometry', 'odometry', (ODOMETRY_TYPE,))
         if self.has_boxes:
-            self._adapter = adapter_for(self._topics[self.boxes_topic])
+            self._adapter = adapter_for(self._topics[self.boxes_topic], self._convention)
 
         known = self._reader.typestore.fielddefs
         if not known.keys() >= set(self._topics.values()):
-            stock = _stock_types().fielddefs
+            stock = stock_types().fielddefs
             self._reader.typestore.register({k: v for k, v in stock.items() if k not in known})
 
         begin, self.end_ns = self._reader.start_time, self._reader.end_time
@@ -294,6 +331,12 @@ class Recording:
                 f'--{role}'
             )
         return candidates[0]
+
+    def _box_types(self) -> tuple[str, ...]:
+        """Return the types of boxes; not those without ids where there are others to choose."""
+        with_ids = tuple(name for name in ADAPTERS if name not in WITHOUT_IDS)
+        is_free = self._convention.associate or self._asked['boxes'] is not None
+        return tuple(ADAPTERS) if is_free or not self._candidates(with_ids) else with_ids
 
     def _candidates(self, types: Collection[str]) -> list[str]:
         """Return the topics of these types that have messages, or the odometry asked for."""
@@ -344,6 +387,8 @@ class Recording:
         connection = record.connection
         try:
             return self._reader.deserialize(record.data, connection.msgtype)
+        except BoxregError:
+            raise
         except Exception as error:  # the bytes are foreign, and so are the errors they cause
             raise RecordingError(
                 f'{self}: a message on {connection.topic!r} is not a {connection.msgtype} as '
@@ -389,7 +434,7 @@ def _files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-def _stock_types() -> Typestore:
+def stock_types() -> Typestore:
     """Return the definitions used where a recording has none (before ROS 2 Iron)."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types = {}

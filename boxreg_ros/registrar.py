@@ -2,6 +2,7 @@
 
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
+from math import inf
 
 from boxreg_ros.association import Pair, StampMatcher
 from boxreg_ros.calibration import InputModel
@@ -9,13 +10,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.registration import Estimate, register
 from boxreg_ros.sampling import Observation, observe
-from boxreg_ros.structures import (
-    BoxArray,
-    Floats,
-    KEPT,
-    RefinedBoxes,
-    Sweep,
-)
+from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep, X, Z
 from boxreg_ros.window import Window
 import numpy as np
 import torch
@@ -34,6 +29,9 @@ class BoxRegistrar:
 
     Attributes
     ----------
+    config : Config
+        May be replaced between calls; `sampling`, `solver`, `paper`, `max_gap`,
+        `min_observations` and how classes move have effect at once, the others after `reset`.
     counts : Counter
         Sweeps and boxes taken, boxes by status, and everything dropped or kept by reason.
 
@@ -46,18 +44,17 @@ class BoxRegistrar:
             reason = str(error).splitlines()[0]
             wanted = "device: expected one that torch can use here, such as 'cpu', got "
             raise ConfigError(f'{wanted}{config.device!r}: {reason}') from None
-        self._config = config
+        self.config = config
         self.counts: Counter[str] = Counter()
         self.reset()
 
     def reset(self) -> None:
         """Forget everything but the counts."""
-        config = self._config
-        self._matcher = StampMatcher(round(config.tolerance * 1e9), config.queue, self.counts)
+        self._matcher = StampMatcher(self.config, self.counts)
         self._tracks: dict[str, _TrackBuffer] = {}
         self._ticks: deque[_Tick] = deque()
-        self._newest_ns: int | None = None
-        self._model = InputModel(config.faces)
+        self._newest_ns = -inf
+        self._model = InputModel(self.config.faces)
         self._ended: list[_TrackBuffer] = []
         self._count = 0
 
@@ -85,20 +82,20 @@ class BoxRegistrar:
         for pair in pairs:
             tick = self._open(pair)
             self._count += 1
-            if self._config.estimate != 'track':
-                self._solve([t for t in self._tracks.values() if t.newest_tick is tick])
+            if self.config.estimate != 'track':
+                self._solve([t for t in self._tracks.values() if t.entries[-1].tick is tick])
                 ready.append(tick.result(is_final=False))
                 paired = [t for t in self._ticks if t.is_paired]
-                for old in paired[: max(0, len(paired) - self._config.lag)]:
+                for old in paired[: max(0, len(paired) - self.config.lag)]:
                     old.waiting = 0
-            elif self._count % (self._config.track_window // 2) == 0:
+            elif self._count % (self.config.track_window // 2) == 0:
                 self._solve_tracks()
             ready += self._settled()
         return ready
 
     def _solve_tracks(self) -> None:
         """Solve, all at once, the tracks that have ended and those whose window is full."""
-        full = self._config.track_window // 2
+        full = self.config.track_window // 2
         self._solve(self._ended + [t for t in self._tracks.values() if len(t.entries) > full])
         for track in self._ended:
             track.settle(len(track.entries))
@@ -110,29 +107,34 @@ class BoxRegistrar:
         tick = _Tick.of(boxes)
         self._ticks.append(tick)
         now_ns = boxes.stamp_ns
-        late = self._newest_ns is not None and now_ns <= self._newest_ns
-        self._newest_ns = now_ns if self._newest_ns is None else max(now_ns, self._newest_ns)
+        newest_ns, self._newest_ns = self._newest_ns, max(now_ns, self._newest_ns)
+        late = '' if now_ns > newest_ns else 'late' if now_ns < newest_ns else 'duplicate_stamp'
         tick.is_paired = sweep is not None and not late
         if sweep is None:
             self.counts['boxes_without_sweep'] += 1
-        tick.refuse('late' if late else 'no_sweep' if sweep is None else '')
+        tick.refuse(late or ('no_sweep' if sweep is None else ''))
         admitted = [i for i, reason in enumerate(tick.reasons) if not reason]
-        silent = now_ns - round(self._config.max_gap * 1e9)
+        silent = now_ns - round(self.config.max_gap * 1e9)
         self._end([name for name, track in self._tracks.items() if track.newest_ns < silent])
         if sweep is not None and admitted:
-            observations = observe(sweep, boxes.boxes[admitted], now_ns, self._config)
-            for index, observation in zip(admitted, observations, strict=True):
-                name = boxes.track_ids[index]
-                tick.num_points[index] = observation.num_points
-                track = self._tracks.setdefault(name, _TrackBuffer(name, boxes.class_names[index]))
-                track.entries.append(_Entry(observation, tick, index))
+            fresh = [_TrackBuffer(boxes.track_ids[i], boxes.class_names[i]) for i in admitted]
+            tracks = [self._tracks.setdefault(track.track_id, track) for track in fresh]
+            given, there = boxes.boxes[admitted], boxes.boxes[admitted]
+            if delay := (sweep.stamp_ns - now_ns) * 1e-9:
+                # Seen from the box, points are where they were at the stamp of the box.
+                moves = [t.velocity(box, now_ns) for t, box in zip(tracks, given, strict=True)]
+                there[:, X : Z + 1] += delay * np.array(moves)
+            seen = observe(sweep, there, now_ns, self.config)
+            for i, track, box, observation in zip(admitted, tracks, given, seen, strict=True):
+                tick.num_points[i] = observation.num_points
+                track.entries.append(_Entry(observation._replace(box=box), tick, i))
                 tick.waiting += 1
         return tick
 
     def _end(self, names: list[str]) -> None:
         """Close tracks; in estimate 'track' they are solved with the next batch."""
         ended = [self._tracks.pop(name) for name in names]
-        if self._config.estimate == 'track':
+        if self.config.estimate == 'track':
             self._ended += ended
         else:
             for track in ended:
@@ -141,19 +143,16 @@ class BoxRegistrar:
     def _solve(self, tracks: list['_TrackBuffer']) -> None:
         """Register the window of each track and write the estimates to the ticks they are of."""
         windows = [track.window() for track in tracks]
-        estimates = register(windows, self._config, self._model)
+        estimates = register(windows, self.config, self._model)
         for track, estimate in zip(tracks, estimates, strict=True):
             track.write(estimate)
-            track.slide(self._config)
+            track.slide(self.config)
 
     def _settled(self) -> list[RefinedBoxes]:
         ready = []
         while self._ticks and self._ticks[0].waiting == 0:
             tick = self._ticks.popleft()
-            for status, reason in zip(tick.status, tick.reasons, strict=True):
-                self.counts[status] += 1
-                if reason:
-                    self.counts[reason] += 1
+            self.counts.update([*tick.status, *filter(None, tick.reasons)])
             ready.append(tick.result(is_final=True))
         return ready
 
@@ -193,14 +192,8 @@ class _Tick:
 
     def result(self, is_final: bool) -> RefinedBoxes:
         boxes = replace(self.boxes, boxes=self.refined.copy())
-        return RefinedBoxes(
-            boxes,
-            tuple(self.status),
-            tuple(self.reasons),
-            self.num_points.copy(),
-            self.covariances.copy(),
-            is_final,
-        )
+        outcome = tuple(self.status), tuple(self.reasons), self.num_points.copy()
+        return RefinedBoxes(boxes, *outcome, self.covariances.copy(), is_final)
 
 
 @dataclass(slots=True)
@@ -223,29 +216,31 @@ class _TrackBuffer:
     entries: list[_Entry] = field(default_factory=list)
 
     @property
-    def newest_tick(self) -> _Tick:
-        return self.entries[-1].tick
-
-    @property
     def newest_ns(self) -> int:
         return self.entries[-1].observation.stamp_ns
 
     def window(self) -> Window:
         observations = [entry.observation for entry in self.entries]
         solved = [entry.estimate for entry in self.entries if entry.estimate is not None]
-        fresh = len(observations) - len(solved)
-        return Window(
-            self.track_id, self.class_name, observations, fresh, np.array(solved).reshape(-1, 9)
-        )
+        fresh, start = len(observations) - len(solved), np.array(solved).reshape(-1, 9)
+        return Window(self.track_id, self.class_name, observations, fresh, start)
+
+    def velocity(self, box: Floats, stamp_ns: int) -> Floats:
+        """Return that of the centre over the last stamps and `box`, the newest [m/s]."""
+        known = self.entries[-4:]
+        if not known:
+            return np.zeros(3)
+        boxes = [e.observation.box if e.estimate is None else e.estimate for e in known]
+        seconds = [(e.observation.stamp_ns - stamp_ns) * 1e-9 for e in known]
+        slope: Floats = np.polyfit([*seconds, 0.0], np.array([*boxes, box])[:, X : Z + 1], 1)[0]
+        return slope
 
     def write(self, estimate: Estimate) -> None:
-        for row, entry in enumerate(self.entries):
-            entry.estimate = estimate.boxes[row]
+        for entry, box, status, reason, spread in zip(self.entries, *estimate, strict=True):
+            entry.estimate, tick, i = box, entry.tick, entry.index
             if not entry.is_settled:
-                entry.tick.refined[entry.index] = estimate.boxes[row]
-                entry.tick.covariances[entry.index] = estimate.covariances[row]
-                entry.tick.status[entry.index] = estimate.status[row]
-                entry.tick.reasons[entry.index] = estimate.reasons[row]
+                tick.refined[i], tick.status[i], tick.reasons[i] = box, status, reason
+                tick.covariances[i] = spread
 
     def settle(self, count: int) -> None:
         for entry in self.entries[:count]:

@@ -11,24 +11,27 @@ import argparse
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 import hashlib
 from importlib.metadata import version
 import json
-import os
 from pathlib import Path
 import platform
-import shutil
 import sys
 import time
 from typing import Any, TypeVar
-from uuid import uuid4
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError, RecordingError, TransformUnavailable
-from boxreg_ros.labelled import LabelledRecording
+from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.intake import add_convention_arguments, convention_from, Intake
+from boxreg_ros.labelled import (
+    add_label_arguments,
+    label_frame_of,
+    LabelledRecording,
+    pose_of,
+)
 from boxreg_ros.labels import (
     LabelFrame,
     LabelWriter,
@@ -39,6 +42,7 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.results import earlier_summary, SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import (
     BoxArray,
@@ -50,11 +54,11 @@ from boxreg_ros.structures import (
     Sweep,
 )
 from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import yaml
 
-SUMMARY = 'summary.json'
-SPOOL = '.clouds'
+UNUSED = 'sweep_', 'boxes_'  # reasons of what was not used begin so
 BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
 
 Progress = Callable[[float, float], None]
@@ -86,6 +90,8 @@ class Request:
         Format and files that the boxes come from instead of a topic.
     label_frame : str or None
         Frame that stands for the sensor's in label formats; None for that of the clouds.
+    convention : Convention
+        How the boxes are to be read.
 
     """
 
@@ -101,11 +107,17 @@ class Request:
     options: Options = field(default_factory=Options)
     labels: tuple[str, Path] | None = None
     label_frame: str | None = None
+    convention: Convention = STANDARD
 
     def __post_init__(self) -> None:
         """Refuse what cannot work before any work is done."""
         if self.labels is not None and self.boxes is not None:
             raise ConfigError('boxes: expected a topic or label files, got both; leave one out')
+        if self.labels is not None and not self.convention.is_standard:
+            raise ConfigError(
+                f'{self.convention}: expected for boxes of a topic, got label files; each format '
+                f'has its own convention, see boxreg formats'
+            )
         for name in (*self.formats, *(self.labels or ())[:1]):
             module_of(str(name))
 
@@ -119,7 +131,7 @@ class Request:
         }
         if self.labels is not None:
             return LabelledRecording(self.labels, self.recordings, **options)
-        return Recording(self.recordings, boxes=self.boxes, **options)
+        return Recording(self.recordings, boxes=self.boxes, convention=self.convention, **options)
 
     def fingerprint(self) -> str:
         """Return a digest of the request and of the files it reads, by size and time."""
@@ -159,6 +171,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     """
     clock = _Clock()
     tree = TransformTree()
+    intake = Intake(request.convention, request.config)
     registrar = BoxRegistrar(request.config)
     counts: Counter[str] = Counter()
     trouble = ''
@@ -170,11 +183,12 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
         spool = None
         if request.options.with_points:
-            spool = Spool(folder / SPOOL, round(request.config.tolerance * 1e9))
+            spool = Spool(folder, round(request.config.tolerance * 1e9))
         provenance = Provenance.of(request.recordings, request.config)
-        writers = {name: writer_for(name, folder, provenance, request.options) for name in names}
+        options = replace(request.options, recording=recording)
+        writers = {name: writer_for(name, folder, provenance, options) for name in names}
         is_early = request.config.estimate == 'early'
-        with closing(_Sink(writers, spool, fixed_frame, sensor_frame, is_early, clock)) as sink:
+        with _Sink(writers, spool, fixed_frame, sensor_frame, is_early, clock) as sink:
             for record in clock.each('read', recording.records(tree)):
                 if progress is not None:
                     done = record.received_ns - recording.start_ns
@@ -183,7 +197,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                     item = recording.decode(record)
                 with clock('transform'):
                     try:
-                        moved = to_fixed_frame(item, tree, fixed_frame)
+                        moved = intake.take(to_fixed_frame(item, tree, fixed_frame))
                     except TransformUnavailable as error:
                         moved, trouble = None, trouble or str(error)
                     T_fixed_sensor = pose_of(tree, fixed_frame, sensor_frame, item.stamp_ns)
@@ -193,11 +207,13 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                     T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
                     if spool and T_fixed_sweep is not None:
                         with clock('write'):
-                            spool.add(item, T_fixed_sweep)
+                            spool.add(item, T_fixed_sweep, recording.intensities(record))
                 else:
                     counts['box_arrays'] += 1
                     boxes = item if not isinstance(moved, BoxArray) else moved
-                    sink.expect(boxes, T_fixed_sensor, 'no_transform' if moved is None else '')
+                    T_fixed_given = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
+                    reason = 'no_transform' if moved is None else ''
+                    sink.expect(boxes, T_fixed_sensor, T_fixed_given, reason)
                 with clock('registrar'):
                     ready = _add(registrar, moved)
                 sink.take(ready)
@@ -206,9 +222,11 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             sink.take(ready)
         if spool is not None:
             spool.remove()
-        counts.update({k: n for k, n in registrar.counts.items() if '_without_' in k})
+        counts.update({k: n for k, n in registrar.counts.items() if k.startswith(UNUSED)})
         summary = _summary(request, recording, fixed_frame, counts, sink)
         summary['first_missing_transform'] = trouble
+        summary['warning'] = intake.finding
+        summary |= intake.facts
         summary['seconds'] = clock.seconds()
         (folder / 'config.yaml').write_text(
             yaml.safe_dump(request.config.to_dict(), sort_keys=False), encoding='utf-8'
@@ -253,78 +271,6 @@ def to_fixed_frame(
     return boxes_to_frame(item, T_fixed_item, fixed_frame)
 
 
-def pose_of(tree: TransformTree, fixed_frame: str, frame: str, stamp_ns: int) -> Floats | None:
-    """Return the pose of `frame` in the fixed frame; None if unknown."""
-    try:
-        return tree.lookup(fixed_frame, frame, stamp_ns)
-    except TransformUnavailable:
-        return None
-
-
-def label_frame_of(
-    recording: Recording, tree: TransformTree, fixed_frame: str, wish: str | None
-) -> str:
-    """
-    Return the frame that stands for the sensor's in label files: that of the clouds, or `wish`.
-
-    Raises
-    ------
-    RecordingError
-        If nothing connects it with the fixed frame.
-
-    """
-    frame = (wish or recording.sensor_frame()).lstrip('/')
-    if not tree.connects(fixed_frame, frame):
-        raise RecordingError(
-            f'{recording}: label frame {frame!r}: expected one that is connected with '
-            f'{fixed_frame!r}; TF: {tree}'
-        )
-    return frame
-
-
-def earlier_summary(out: Path) -> dict[str, Any] | None:
-    """Return the summary of an earlier run in `out`; None if there is none."""
-    try:
-        summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
-    except (OSError, ValueError):
-        return None
-    return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
-
-
-@contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
-    """
-    Yield a folder to fill that becomes `out` on success, and vanishes otherwise.
-
-    Raises
-    ------
-    RecordingError
-        If `out` exists and is not the result of an earlier run.
-
-    """
-    if out.exists() and earlier_summary(out) is None and not _is_empty(out):
-        raise RecordingError(
-            f'output {str(out)!r}: expected a new folder or an earlier result, got something '
-            f'else; choose another with -o'
-        )
-    out = out.resolve()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unique = f'.{out.name}.{uuid4().hex[:8]}'
-    partial, earlier = out.with_name(f'{unique}.partial'), out.with_name(f'{unique}.earlier')
-    partial.mkdir()
-    try:
-        yield partial
-        if out.exists():
-            os.replace(out, earlier)
-        os.replace(partial, out)
-    except BaseException:
-        if earlier.exists():
-            os.replace(earlier, out)
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-    shutil.rmtree(earlier, ignore_errors=True)
-
-
 class _Clock:
     """Adds up what each stage takes [s]."""
 
@@ -359,6 +305,7 @@ class _Slot:
 
     stamp_ns: int
     T_fixed_sensor: Floats | None
+    T_fixed_given: Floats | None
     result: RefinedBoxes | None = None
 
 
@@ -387,11 +334,15 @@ class _Sink:
         self.reasons: Counter[str] = Counter()
 
     def expect(
-        self, boxes: BoxArray, T_fixed_sensor: Floats | None = None, reason: str = ''
+        self,
+        boxes: BoxArray,
+        T_fixed_sensor: Floats | None = None,
+        T_fixed_given: Floats | None = None,
+        reason: str = '',
     ) -> None:
         """Keep a place for a box array; with a reason, it is written there as it is."""
         n = len(boxes.track_ids)
-        slot = _Slot(boxes.stamp_ns, T_fixed_sensor)
+        slot = _Slot(boxes.stamp_ns, T_fixed_sensor, T_fixed_given)
         self.boxes_in += n
         if not reason:
             self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
@@ -419,11 +370,16 @@ class _Sink:
             slot.result = slot.result or refined
         self._write()
 
-    def close(self) -> None:
-        """Close the files."""
-        with self._clock('write'):
-            for writer in self._writers.values():
-                writer.close()
+    def __enter__(self) -> _Sink:
+        """Return the sink."""
+        return self
+
+    def __exit__(self, failure: object, *_: object) -> None:
+        """Complete the files, but not after a failure: then nothing of them will be kept."""
+        if failure is None:
+            with self._clock('write'):
+                for writer in self._writers.values():
+                    writer.close()
 
     def left_out(self) -> dict[str, dict[str, int]]:
         """Return the boxes that a format has no place for, by format and reason."""
@@ -447,14 +403,15 @@ class _Sink:
             self.status.update(refined.status)
             self.reasons.update(filter(None, refined.reasons))
             with self._clock('write'):
-                sweep = None
+                sweep = intensities = None
                 if self._spool and slot.T_fixed_sensor is not None:
-                    sweep = self._spool.take(
+                    sweep, intensities = self._spool.take(
                         slot.stamp_ns, self._sensor_frame, slot.T_fixed_sensor
                     )
                 frame = LabelFrame(
-                    refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep
-                )
+                    refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep,
+                    intensities, slot.T_fixed_given,
+                )  # fmt: skip
                 for writer in self._writers.values():
                     writer.write(frame)
 
@@ -465,17 +422,13 @@ def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[Refined
     return registrar.add_sweep(item) if isinstance(item, Sweep) else registrar.add_boxes(item)
 
 
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
-
-
 def _summary(
     request: Request, recording: Recording, fixed_frame: str, counts: Counter[str], sink: _Sink
 ) -> dict[str, Any]:
     """Return all of summary.json but the timings."""
     if sink.missing():
         raise RuntimeError(f'{sink.missing()} of {sink.boxes_in} boxes did not come back')
-    dropped = {name: n for name, n in sorted(counts.items()) if n and '_without_' in name}
+    dropped = {name: n for name, n in sorted(counts.items()) if n and name.startswith(UNUSED)}
     return {
         'recordings': [str(path) for path in request.recordings],
         'topics': {
@@ -538,6 +491,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
     )
+    add_convention_arguments(parser)
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as YAML')
     parser.add_argument(
         '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
@@ -562,26 +516,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--workers', type=int, metavar='N', help='cores of the solver (solver.threads)'
     )
-
-
-def add_label_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that label formats need, whoever writes them."""
-    parser.add_argument(
-        '--camera', type=Path, metavar='FILE',
-        help='calibration, for formats that look through a camera',
-    )  # fmt: skip
-    parser.add_argument(
-        '--swap-axes', action='store_true',
-        help='extents where Datumaro and CVAT look for them',
-    )  # fmt: skip
-    parser.add_argument(
-        '--with-points', action='store_true',
-        help='write the clouds that the label formats need beside their labels',
-    )  # fmt: skip
-    parser.add_argument(
-        '--label-frame', metavar='FRAME',
-        help='frame that stands for the sensor in label files (default: that of the clouds)',
-    )  # fmt: skip
 
 
 def _labels_argument(text: str) -> tuple[str, Path]:
@@ -618,6 +552,7 @@ def run(args: argparse.Namespace) -> int:
         tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
         args.formats, args.start, args.end, config,
         Options(args.with_points, args.camera, args.swap_axes), args.labels, args.label_frame,
+        convention_from(args),
     )  # fmt: skip
     earlier = earlier_summary(args.out)
     if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():
@@ -634,5 +569,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update(max(0.0, done - bar.n))
 
         summary = relabel(request, args.out, progress)
+    if summary['warning']:
+        print(f'boxreg: {summary["warning"]}', file=sys.stderr)
     print(closing_line(summary, args.out))
     return 0

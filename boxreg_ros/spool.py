@@ -18,31 +18,38 @@ class Spool:
     Parameters
     ----------
     folder : Path
-        Made here, and removed by `remove`.
+        Of results; the clouds are in a folder of their own in it, until `remove`.
     tolerance_ns : int
         A cloud belongs to boxes within this [ns].
 
     """
 
     def __init__(self, folder: Path, tolerance_ns: int) -> None:
-        self._folder = folder
+        self._folder = folder / '.clouds'
         self._tolerance_ns = tolerance_ns
         self._poses: dict[int, tuple[str, Floats]] = {}
         self._stamps: list[int] = []
-        folder.mkdir()
+        self._folder.mkdir()
 
-    def add(self, sweep: Sweep, T_fixed_sweep: Floats) -> None:
+    def add(self, sweep: Sweep, T_fixed_sweep: Floats, intensities: Floats | None = None) -> None:
         """Store a sweep with the pose of its frame; of one stamp, the first."""
         if sweep.stamp_ns not in self._poses:
             insort(self._stamps, sweep.stamp_ns)
             self._poses[sweep.stamp_ns] = sweep.frame_id, T_fixed_sweep
-            np.save(self._file(sweep.stamp_ns), sweep.points)
+            columns = [sweep.points]
+            if intensities is not None:
+                columns.append(intensities[:, None])
+            table = np.hstack(columns, dtype=sweep.points.dtype, casting='same_kind')
+            np.save(self._file(sweep.stamp_ns), table)
 
-    def take(self, stamp_ns: int, frame_id: str, T_fixed_frame: Floats) -> Sweep | None:
+    def take(
+        self, stamp_ns: int, frame_id: str, T_fixed_frame: Floats
+    ) -> tuple[Sweep | None, Floats | None]:
         """
         Return the cloud nearest to a stamp, in a frame as that was at the stamp.
 
-        Clouds that are older are removed. None if there is none within the tolerance.
+        Its intensities come with it. Clouds that are older are removed. None if there is none
+        within the tolerance.
 
         """
         first = bisect_left(self._stamps, stamp_ns - self._tolerance_ns)
@@ -52,12 +59,14 @@ class Spool:
         del self._stamps[:first]
         nearest = min(self._stamps, key=lambda stamp: abs(stamp - stamp_ns), default=None)
         if nearest is None or abs(nearest - stamp_ns) > self._tolerance_ns:
-            return None
+            return None, None
         own_frame, T_fixed_sweep = self._poses[nearest]
-        sweep = Sweep(nearest, own_frame, np.load(self._file(nearest)))
-        if (nearest, own_frame) == (stamp_ns, frame_id):
-            return sweep
-        return sweep_to_frame(sweep, inverse(T_fixed_frame) @ T_fixed_sweep, frame_id)
+        table = np.load(self._file(nearest))
+        intensities = table[:, 3] if table.shape[1] > 3 else None
+        sweep = Sweep(nearest, own_frame, table[:, :3])
+        if (nearest, own_frame) != (stamp_ns, frame_id):
+            sweep = sweep_to_frame(sweep, inverse(T_fixed_frame) @ T_fixed_sweep, frame_id)
+        return sweep, intensities
 
     def remove(self) -> None:
         """Remove all that is left."""

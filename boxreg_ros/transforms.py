@@ -22,8 +22,31 @@ MAX_EXTRAPOLATION = 0.2
 """How far beyond the first and the last transform a motion is carried on [s]."""
 MEMORY = 30.0
 """How long transforms are remembered [s]."""
+BACK = 1.0
+"""Stamps that go back further than this mean that time starts again [s]."""
 FLOAT32_RANGE = 4096.0
 """Nearer than this to its origin [m], a frame is resolved to 0.5 mm by float32."""
+
+
+class Rewind:
+    """
+    Tells when the stamps of a stream start again: a recording that loops, a simulation reset.
+
+    One message that is much older than the newest is a stray, two in a row are a new beginning.
+
+    """
+
+    def __init__(self) -> None:
+        self._newest_ns: int | None = None
+        self._was_back = False
+
+    def happened(self, stamp_ns: int) -> bool:
+        """Take the next stamp [ns] and tell whether time has started again before it."""
+        newest_ns = stamp_ns if self._newest_ns is None else self._newest_ns
+        is_back = stamp_ns < newest_ns - round(BACK * 1e9)
+        happened, self._was_back = is_back and self._was_back, is_back and not self._was_back
+        self._newest_ns = stamp_ns if happened else max(newest_ns, stamp_ns)
+        return happened
 
 
 class TransformTree:
@@ -31,7 +54,7 @@ class TransformTree:
     Frames and the transforms between them, looked up by integer stamp.
 
     State: per pair of parent and child the samples of the last `memory` seconds, or one static
-    transform. Not thread-safe.
+    transform. Samples of a pair whose stamps start again replace the old ones. Not thread-safe.
 
     Parameters
     ----------
@@ -67,6 +90,17 @@ class TransformTree:
         """Add a ``nav_msgs/Odometry``: the pose of its child frame in its header's frame."""
         pose = msg.pose.pose
         self._add(self._odometry, msg, pose.position, pose.orientation, False)
+
+    def rewind(self, stamp_ns: int) -> None:
+        """Forget motions that are known beyond a stamp at which time has started again."""
+        for edge in self._edges():
+            edge.rewind(stamp_ns)
+
+    def newest_ns(self) -> int | None:
+        """Return the newest stamp of all motions; None if nothing moves [ns]."""
+        return max(
+            (e.stamps[-1] for e in self._edges() if e.stamps and not e.is_static), default=None
+        )
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Floats:
         """
@@ -171,32 +205,44 @@ class _Edge:
         self.child = child
         self._memory_ns = memory_ns
         self.is_static = False
-        self._stamps: list[int] = []
+        self.stamps: list[int] = []
         self._poses: list[Floats] = []
+        self._rewind = Rewind()
 
     def add(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
         """Add x y z qx qy qz qw; a second one of the same stamp replaces the first."""
         values = np.array(pose, dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[3:]):
             return  # says nothing; a lookup reports the stamps that remain
+        if self._rewind.happened(stamp_ns):
+            self._forget()
         if self.is_static:
-            first, end = 0, len(self._stamps)
+            first, end = 0, len(self.stamps)
         else:
-            first, end = bisect_left(self._stamps, stamp_ns), bisect_right(self._stamps, stamp_ns)
-        self._stamps[first:end], self._poses[first:end] = [stamp_ns], [values]
-        old = bisect_left(self._stamps, self._stamps[-1] - self._memory_ns)
+            first, end = bisect_left(self.stamps, stamp_ns), bisect_right(self.stamps, stamp_ns)
+        self.stamps[first:end], self._poses[first:end] = [stamp_ns], [values]
+        old = bisect_left(self.stamps, self.stamps[-1] - self._memory_ns)
         # Two samples stay, whatever their age: a motion is carried on from two.
-        old = max(min(old, len(self._stamps) - 2), 0)
-        del self._stamps[:old], self._poses[:old]
+        old = max(min(old, len(self.stamps) - 2), 0)
+        del self.stamps[:old], self._poses[:old]
+
+    def rewind(self, stamp_ns: int) -> None:
+        if not self.is_static and self.stamps and self.stamps[-1] > stamp_ns + BACK * 1e9:
+            self._forget()
+            self._rewind = Rewind()
+
+    def _forget(self) -> None:
+        self.stamps.clear()
+        self._poses.clear()
 
     def covers(self, stamp_ns: int) -> bool:
         if self.is_static:
-            return bool(self._stamps)
-        return bool(self._stamps) and self._stamps[0] <= stamp_ns <= self._stamps[-1]
+            return bool(self.stamps)
+        return bool(self.stamps) and self.stamps[0] <= stamp_ns <= self.stamps[-1]
 
     def at(self, stamp_ns: int, max_extrapolation_ns: int) -> Floats:
         """Return ``T_parent_child`` at a stamp."""
-        stamps = self._stamps
+        stamps = self.stamps
         if not stamps:
             raise TransformUnavailable(
                 f'transform {self.parent} -> {self.child}: every pose so far is NaN or has no '

@@ -87,7 +87,8 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     start = boxes.copy()
     for b, window in enumerate(windows):
         start[b, : len(window.start)] = window.start
-    start[..., 6:9] += 2 * np.pi * np.round((boxes[..., 6:9] - start[..., 6:9]) / 2 / np.pi)
+    turns = np.pi * np.array([2, 2, 1])  # a box kept may have come turned around
+    start[..., 6:9] += turns * np.round((boxes[..., 6:9] - start[..., 6:9]) / turns)
     base = boxes[:, 0, :3].copy()
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import BoxArray, Floats
-from msg_adapters.poses import boxes_of, quaternions_of, replaced, stamp_ns, with_box, with_frame
+from msg_adapters import poses
 import numpy as np
 
 CUBE = 1
@@ -33,37 +32,33 @@ def from_msg(msg: Any) -> BoxArray:
 
     """
     cubes = [marker for marker in msg.markers if _is_box(marker)]
-    headers = [marker.header for marker in (cubes or msg.markers)]
-    known = {(stamp_ns(header), header.frame_id) for header in headers[: len(cubes) or 1]}
-    if len(known) > 1:
-        raise UnsupportedMessage(
-            f'MarkerArray: expected one frame and one stamp for all CUBE markers, got '
-            f'{", ".join(f"{frame!r} at {stamp} ns" for stamp, frame in sorted(known))}; '
-            f'publish one array per frame and stamp'
-        )
-    stamp, frame_id = known.pop() if known else (0, '')
+    headers = [marker.header for marker in cubes or msg.markers[:1]]
+    origin = poses.one_origin('MarkerArray', ((poses.stamp_ns(h), h.frame_id) for h in headers))
     return BoxArray(
-        stamp,
-        frame_id,
+        *origin,
         tuple(str(cube.id) for cube in cubes),
         tuple(str(cube.ns) for cube in cubes),
         np.ones(len(cubes)),
-        boxes_of([cube.pose for cube in cubes], [cube.scale for cube in cubes]),
+        poses.boxes_of([cube.pose for cube in cubes], [cube.scale for cube in cubes]),
     )
 
 
-def to_msg(msg: Any, boxes: BoxArray, covariances: Floats | None = None) -> Any:
+def to_msg(
+    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
+) -> Any:
     """Return a copy of a MarkerArray with its boxes replaced; it has no place for covariances."""
-    quaternions_xyzw = quaternions_of(boxes.boxes)
+    quaternions_xyzw = poses.quaternions_of(boxes.boxes)
     markers, i = [], 0
     for marker in msg.markers:
         if _is_box(marker):
-            pose, scale = with_box(marker.pose, marker.scale, boxes.boxes[i], quaternions_xyzw[i])
-            header = with_frame(marker.header, boxes.frame_id)
-            marker = replaced(marker, header=header, pose=pose, scale=scale)
+            pose, scale = poses.with_box(
+                marker.pose, marker.scale, boxes.boxes[i], quaternions_xyzw[i]
+            )
+            header = poses.with_frame(marker.header, boxes.frame_id)
+            marker = poses.replaced(marker, header=header, pose=pose, scale=scale)
             i += 1
         markers.append(marker)
-    return replaced(msg, markers=markers)
+    return poses.replaced(msg, markers=markers)
 
 
 def _is_box(marker: Any) -> bool:

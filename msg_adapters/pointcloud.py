@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
@@ -14,6 +15,7 @@ NUMBERS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8
 """``PointField.datatype`` as numpy spells it."""
 TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time')
 UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
 LONGEST_SWEEP = 1.0
 """No point is measured farther than this from its stamp [s]."""
 
@@ -50,7 +52,7 @@ def from_msg(msg: Any) -> Sweep:
             f'PointCloud2: expected fields x, y, z, got {", ".join(fields) or "none"}; '
             f'publish Cartesian coordinates'
         )
-    time_field = next((name for name in TIME_FIELDS if name in fields), None)
+    time_field = _first(TIME_FIELDS, fields)
     table = _table(msg, [fields[name] for name in (*'xyz', time_field) if name])
 
     wanted = np.result_type(np.float32, *(table.dtype[name] for name in 'xyz'))
@@ -66,6 +68,31 @@ def from_msg(msg: Any) -> Sweep:
     if not good.all():
         points = points[good]
     return Sweep(stamp, msg.header.frame_id, points, times)
+
+
+def intensities(msg: Any) -> Floats | None:
+    """
+    Return what a message says of how bright its points are, in the units of its maker.
+
+    Returns
+    -------
+    intensities : array, shape (M,), or None
+        One for each point of `from_msg`; None if there is none of the fields ``intensity``,
+        ``i``, ``reflectivity``. What is not finite is 0.
+
+    """
+    fields = {field.name: field for field in msg.fields}
+    name = _first(INTENSITY_FIELDS, fields)
+    if name is None or not msg.width * msg.height:
+        return None
+    needed = [n for n in (*'xyz', _first(TIME_FIELDS, fields)) if n]
+    table = _table(msg, [fields[n] for n in (*needed, name)])
+    good = np.logical_and.reduce([np.isfinite(table[n].reshape(-1)) for n in needed])
+    return np.nan_to_num(table[name].reshape(-1)[good].astype(np.float64), posinf=0, neginf=0)
+
+
+def _first(names: Sequence[str], fields: Mapping[str, Any]) -> str | None:
+    return next((name for name in names if name in fields), None)
 
 
 def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:

@@ -1,11 +1,13 @@
-"""Stamps, poses and copies that all box messages share."""
+"""Stamps, poses, covariances and copies that all box messages share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
+from types import SimpleNamespace
 from typing import Any
 
+from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, YAW, Z
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,9 +21,50 @@ def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
+def one_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
+    """
+    Return the header of an array, or that of its items where the array's own is not filled in.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If an item names another frame.
+
+    """
+    header = header if header.frame_id or not items else items[0].header
+    for item in items:
+        frame = item.header.frame_id
+        if frame and frame != header.frame_id:
+            raise UnsupportedMessage(
+                f'{kind}: expected all boxes in the frame of the array {header.frame_id!r}, got '
+                f'one in {frame!r}; publish one array per frame'
+            )
+    return header
+
+
+def one_origin(kind: str, origins: Iterable[tuple[int, str]]) -> tuple[int, str]:
+    """
+    Return stamp [ns] and frame of boxes that each have their own; 0 and '' if there are none.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If they disagree.
+
+    """
+    known = set(origins)
+    if len(known) > 1:
+        raise UnsupportedMessage(
+            f'{kind}: expected one frame and one stamp for all boxes, got '
+            f'{", ".join(f"{frame!r} at {stamp} ns" for stamp, frame in sorted(known))}; '
+            f'publish one array per frame and stamp'
+        )
+    return known.pop() if known else (0, '')
+
+
 def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
     """
-    Return boxes (n, 9) from ``geometry_msgs`` poses and full extents.
+    Return boxes (n, 9) from ``geometry_msgs`` poses and full extents, vectors or sequences.
 
     A quaternion that is not of unit length says nothing about the orientation: such a box gets
     NaN angles, which the core recognises as an invalid box.
@@ -31,15 +74,19 @@ def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
     if not len(poses):
         return boxes
     boxes[:, X : Z + 1] = [(p.position.x, p.position.y, p.position.z) for p in poses]
-    boxes[:, LENGTH : HEIGHT + 1] = [(s.x, s.y, s.z) for s in sizes]
-    quaternions_xyzw = np.array(
-        [(q.x, q.y, q.z, q.w) for q in (pose.orientation for pose in poses)], dtype=np.float64
-    )
-    unit = np.abs(np.square(quaternions_xyzw).sum(axis=1) - 1.0) < UNIT_TOLERANCE
+    boxes[:, LENGTH : HEIGHT + 1] = [(s.x, s.y, s.z) if hasattr(s, 'x') else s for s in sizes]
+    quaternions_xyzw = np.array([quaternion_of(pose) for pose in poses], dtype=np.float64)
+    unit = _is_unit(quaternions_xyzw)
     boxes[unit, ROLL : YAW + 1] = Rotation.from_quat(quaternions_xyzw[unit]).as_euler(
         'ZYX', suppress_warnings=True
     )[:, ::-1]
     return boxes
+
+
+def quaternion_of(pose: Any) -> tuple[float, float, float, float]:
+    """Return the orientation of a pose, x y z w."""
+    q = pose.orientation
+    return q.x, q.y, q.z, q.w
 
 
 def quaternions_of(boxes: Floats) -> Floats:
@@ -52,8 +99,17 @@ def quaternions_of(boxes: Floats) -> Floats:
 
 
 def replaced(msg: Any, **fields: Any) -> Any:
-    """Return a shallow copy of `msg` with some fields set; the rest is shared."""
+    """Return a copy of `msg` with some fields set; the rest is shared, but with protobuf's."""
+    if hasattr(msg, 'CopyFrom'):  # protobuf: messages and lists are filled, not set
+        new = type(msg)()
+        new.CopyFrom(msg)
+        for name in fields:
+            new.ClearField(name)
+        new.MergeFrom(type(msg)(**fields))
+        return new
     new = copy(msg)
+    if isinstance(msg, SimpleNamespace):  # mcap's have slots that a copy leaves behind
+        fields = {name: getattr(msg, name) for name in getattr(msg, '__slots__', ())} | fields
     for name, value in fields.items():
         setattr(new, name, value)
     return new
@@ -64,20 +120,102 @@ def with_frame(header: Any, frame_id: str) -> Any:
     return replaced(header, frame_id=frame_id)
 
 
+def with_position(pose: Any, position: Sequence[float]) -> Any:
+    """Return a pose elsewhere, turned the same."""
+    x, y, z = map(float, position)
+    return replaced(pose, position=replaced(pose.position, x=x, y=y, z=z))
+
+
+def with_orientation(pose: Any, quaternion_xyzw: Sequence[float]) -> Any:
+    """Return a pose at the same place, turned otherwise."""
+    x, y, z, w = map(float, quaternion_xyzw)
+    return replaced(pose, orientation=replaced(pose.orientation, x=x, y=y, z=z, w=w))
+
+
 def with_box(pose: Any, size: Any, box: Floats, quaternion_xyzw: Floats) -> tuple[Any, Any]:
     """
-    Return copies of a pose and a size that hold `box`.
+    Return copies of a pose and a size, a vector or a sequence, that hold `box`.
 
     Parts of the box that are not finite keep what the message says: NaN is not sent out.
 
     """
-    x, y, z, length, width, height, *_ = box.tolist()
     if np.isfinite(box[X : Z + 1]).all():
-        pose = replaced(pose, position=replaced(pose.position, x=x, y=y, z=z))
+        pose = with_position(pose, box[X : Z + 1].tolist())
     if np.isfinite(quaternion_xyzw).all():
-        qx, qy, qz, qw = quaternion_xyzw.tolist()
-        turned = replaced(pose.orientation, x=qx, y=qy, z=qz, w=qw)
-        pose = replaced(pose, orientation=turned)
+        pose = with_orientation(pose, quaternion_xyzw.tolist())
     if np.isfinite(box[LENGTH : HEIGHT + 1]).all():
-        size = replaced(size, x=length, y=width, z=height)
+        extent = box[LENGTH : HEIGHT + 1].tolist()
+        if hasattr(size, 'x'):
+            size = replaced(size, **dict(zip('xyz', extent, strict=True)))
+        else:
+            size = copy(size)
+            for axis, value in enumerate(extent):
+                size[axis] = value
     return pose, size
+
+
+def with_covariance(
+    posed: Any, pose: Any, covariance: Floats | None, T_out_in: Floats | None
+) -> Any:
+    """
+    Return a copy of a ``PoseWithCovariance`` with another pose and its covariance.
+
+    Where `covariance` (6, 6) is NaN, or there is none, the message's own stays.
+
+    """
+    own = np.array(posed.covariance, dtype=np.float64).reshape(6, 6)
+    if covariance is None or np.isnan(covariance).any():
+        covariance = own if T_out_in is None else turned_covariances(own, T_out_in)
+    return replaced(posed, pose=pose, covariance=np.array(covariance, np.float64).reshape(36))
+
+
+def turned_covariances(covariances: Floats, T_frame_boxes: Floats) -> Floats:
+    """
+    Return covariances (..., 6, 6) of x y z roll pitch yaw in another frame.
+
+    The part of roll, pitch and yaw stays as it is: that is exact for frames that differ by a
+    turn about z, and the tilt between those in use is small.
+
+    """
+    J = np.eye(6)
+    J[:3, :3] = T_frame_boxes[:3, :3]
+    return J @ covariances @ J.T
+
+
+def turned(vector: Any, T_out_in: Floats | None) -> Any:
+    """Return a ``Vector3`` of the input frame in the output frame."""
+    if T_out_in is None:
+        return vector
+    x, y, z = T_out_in[:3, :3] @ [vector.x, vector.y, vector.z]
+    return replaced(vector, x=float(x), y=float(y), z=float(z))
+
+
+def turned_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
+    """Return a twist or an accel, named so within one with covariance, as `turned` does."""
+    if hasattr(motion, 'covariance'):
+        return replaced(motion, **{name: turned_motion(getattr(motion, name), name, T_out_in)})
+    return replaced(
+        motion, linear=turned(motion.linear, T_out_in), angular=turned(motion.angular, T_out_in)
+    )
+
+
+def moved(pose: Any, T_out_in: Floats | None) -> Any:
+    """Return a pose of the input frame in the output frame."""
+    if T_out_in is None:
+        return pose
+    p, q, R = pose.position, quaternion_of(pose), T_out_in[:3, :3]
+    pose = with_position(pose, (R @ [p.x, p.y, p.z] + T_out_in[:3, 3]).tolist())
+    if not _is_unit(np.array(q)):
+        return pose
+    return with_orientation(pose, (Rotation.from_matrix(R) * Rotation.from_quat(q)).as_quat())
+
+
+def forward_of(pose: Any) -> Floats:
+    """Return the x axis (3,) of a pose."""
+    x, y, z, w = quaternion_of(pose)
+    return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
+
+
+def _is_unit(quaternions_xyzw: Floats) -> Any:
+    """Tell of quaternions (..., 4) whether they are orientations."""
+    return np.abs(np.square(quaternions_xyzw).sum(axis=-1) - 1.0) < UNIT_TOLERANCE

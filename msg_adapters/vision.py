@@ -1,7 +1,8 @@
 """
-``vision_msgs/Detection3DArray``: `id` is the track, the best hypothesis gives class and score.
+``vision_msgs``: Detection3DArray, and BoundingBox3DArray, which has no ids and no classes.
 
-``bbox.center`` is the box's pose, ``bbox.size`` its extents along its own x, y and z.
+A detection's `id` is its track, its best hypothesis gives class and score. ``center`` is the
+box's pose, ``size`` its extents along its own x, y and z.
 
 """
 
@@ -11,15 +12,13 @@ from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import BoxArray, Floats
-from msg_adapters.poses import boxes_of, quaternions_of, replaced, stamp_ns, with_box, with_frame
+from msg_adapters import poses
 import numpy as np
 
 
 def from_msg(msg: Any) -> BoxArray:
     """
-    Return the boxes of a Detection3DArray.
-
-    A detection without hypotheses has the class ``''`` and the score 1.
+    Return the boxes; a detection without hypotheses has the class ``''`` and the score 1.
 
     Raises
     ------
@@ -28,64 +27,65 @@ def from_msg(msg: Any) -> BoxArray:
         vision_msgs 4.
 
     """
-    detections = list(msg.detections)
-    header = msg.header if msg.header.frame_id or not detections else detections[0].header
-    for detection in detections:
-        frame = detection.header.frame_id
-        if frame and frame != header.frame_id:
+    if not hasattr(msg, 'detections'):
+        n, header, found = len(msg.boxes), msg.header, list(msg.boxes)
+        track_ids, best = ('',) * n, [('', 1.0)] * n
+    else:
+        header = poses.one_header('Detection3DArray', msg.header, msg.detections)
+        found = [detection.bbox for detection in msg.detections]
+        try:
+            best = [_best_hypothesis(detection) for detection in msg.detections]
+            track_ids = tuple(str(detection.id) for detection in msg.detections)
+        except AttributeError as error:
             raise UnsupportedMessage(
-                f'Detection3DArray: expected all detections in the frame of the array '
-                f'{header.frame_id!r}, got one in {frame!r}; publish one array per frame'
-            )
-    try:
-        best = [_best_hypothesis(detection) for detection in detections]
-        track_ids = tuple(str(detection.id) for detection in detections)
-    except AttributeError as error:
-        raise UnsupportedMessage(
-            f'Detection3DArray: expected the fields of vision_msgs 4 (ROS 2 Galactic and later), '
-            f'got a message where {error}; convert the recording'
-        ) from None
+                f'Detection3DArray: expected the fields of vision_msgs 4 (ROS 2 Galactic and '
+                f'later), got a message where {error}; convert the recording'
+            ) from None
     return BoxArray(
-        stamp_ns(header),
+        poses.stamp_ns(header),
         header.frame_id,
         track_ids,
         tuple(class_name for class_name, _ in best),
         np.array([score for _, score in best], dtype=np.float64),
-        boxes_of([d.bbox.center for d in detections], [d.bbox.size for d in detections]),
+        poses.boxes_of([box.center for box in found], [box.size for box in found]),
     )
 
 
-def to_msg(msg: Any, boxes: BoxArray, covariances: Floats | None = None) -> Any:
+def to_msg(
+    msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
+) -> Any:
     """
-    Return a copy of a Detection3DArray with its boxes replaced; see `Adapter.to_msg`.
+    Return a copy with the boxes replaced; see `Adapter.to_msg`.
 
     The pose of every hypothesis becomes the box's centre, which is what the covariance
-    beside it speaks of.
+    beside it speaks of. A detection without an id gets that of `boxes`.
 
     """
-    quaternions_xyzw = quaternions_of(boxes.boxes)
+    header = poses.with_frame(msg.header, boxes.frame_id)
+    quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+    if not hasattr(msg, 'detections'):
+        new = zip(msg.boxes, boxes.boxes, quaternions_xyzw, strict=True)
+        found = [_replaced(*item) for item in new]
+        return poses.replaced(msg, header=header, boxes=found)
     detections = []
     for i, detection in enumerate(msg.detections):
-        center, size = with_box(
-            detection.bbox.center, detection.bbox.size, boxes.boxes[i], quaternions_xyzw[i]
-        )
-        results = list(detection.results)
-        if covariances is not None:
-            spread = np.array(covariances[i], dtype=np.float64).reshape(36)
-            results = [
-                replaced(r, pose=replaced(r.pose, pose=center, covariance=spread)) for r in results
-            ]
-        else:
-            results = [replaced(r, pose=replaced(r.pose, pose=center)) for r in results]
+        bbox = _replaced(detection.bbox, boxes.boxes[i], quaternions_xyzw[i])
+        spread = None if covariances is None else covariances[i]
+        results = [
+            poses.replaced(r, pose=poses.with_covariance(r.pose, bbox.center, spread, T_out_in))
+            for r in detection.results
+        ]
+        own = poses.with_frame(detection.header, boxes.frame_id)
+        track_id = detection.id or boxes.track_ids[i]
         detections.append(
-            replaced(
-                detection,
-                header=with_frame(detection.header, boxes.frame_id),
-                results=results,
-                bbox=replaced(detection.bbox, center=center, size=size),
-            )
+            poses.replaced(detection, header=own, results=results, bbox=bbox, id=track_id)
         )
-    return replaced(msg, header=with_frame(msg.header, boxes.frame_id), detections=detections)
+    return poses.replaced(msg, header=header, detections=detections)
+
+
+def _replaced(bbox: Any, box: Floats, quaternion_xyzw: Floats) -> Any:
+    center, size = poses.with_box(bbox.center, bbox.size, box, quaternion_xyzw)
+    return poses.replaced(bbox, center=center, size=size)
 
 
 def _best_hypothesis(detection: Any) -> tuple[str, float]:

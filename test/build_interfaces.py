@@ -1,15 +1,17 @@
 """
 Build Python type support for the packages in ``test/interfaces`` into the running environment.
 
-The registries have no wheels of vision_msgs and tf2_msgs. Where those cannot be imported, the
-real rosidl generators build them from their field lists: the type hashes equal those of the
-originals, so the tests speak to nodes that use the originals. Does nothing when they are there.
+The registries have no wheels of these message packages. The real rosidl generators build them
+from their field lists: the type hashes equal those of the originals, so the tests speak to nodes
+that use the originals. A package that is built already, in its present state, is left alone.
 
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 import os
 from pathlib import Path
+import re
 import shutil
 import subprocess
 import sys
@@ -17,35 +19,74 @@ from tempfile import TemporaryDirectory
 
 HERE = Path(__file__).resolve().parent / 'interfaces'
 PREFIX = Path(sys.prefix)
+MANIFEST = """<package format="3">
+  <name>{name}</name>
+  <version>0.0.0</version>
+  <description>Field lists, for tests</description>
+  <maintainer email="boxreg@example.com">boxreg_ros developers</maintainer>
+  <license>Apache-2.0</license>
+  <buildtool_depend>ament_cmake</buildtool_depend>
+  <member_of_group>rosidl_interface_packages</member_of_group>
+  <export><build_type>ament_cmake</build_type></export>
+</package>
+"""
+PROJECT = """cmake_minimum_required(VERSION 3.16)
+project({name})
+find_package(ament_cmake REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
+foreach(package {depends})
+  find_package(${{package}} REQUIRED)
+endforeach()
+rosidl_generate_interfaces(${{PROJECT_NAME}} {files} DEPENDENCIES {depends})
+ament_package()
+"""
 
 
 def main() -> None:
     """Build what is not built yet, in the state that it has now."""
-    files = sorted(path for path in HERE.rglob('*') if path.is_file())
-    digest = sha256(b''.join(str(p.relative_to(HERE)).encode() + p.read_bytes() for p in files))
-    stamp = PREFIX / 'share' / 'test_interfaces.sha256'
-    if stamp.exists() and stamp.read_text() == digest.hexdigest():
-        return
+    packages = [p for p in sorted(HERE.iterdir()) if p.is_dir() and not is_built(p)]
     compiler = os.environ.get('CXX', 'c++')
-    if shutil.which(compiler) is None:
+    if packages and shutil.which(compiler) is None:
         sys.exit(f'no C++ compiler {compiler!r} to build message types with: apt install g++')
-    for package in sorted(path.parent for path in HERE.glob('*/package.xml')):
-        print(f'building message types of {package.name} ...', flush=True)
-        build(package)
-    stamp.write_text(digest.hexdigest())
+    if packages:
+        print(f'building message types of {", ".join(p.name for p in packages)} ...', flush=True)
+    with ThreadPoolExecutor(2) as pool:  # one compiles while the next one generates
+        for package, trouble in zip(packages, pool.map(build, packages), strict=True):
+            if trouble:
+                sys.exit(f'{package.name}: {trouble}')
+            stamp(package).write_text(digest(package))
 
 
-def build(package: Path) -> None:
-    """Configure, build and install one package; show the log if that fails."""
+def stamp(package: Path) -> Path:
+    """Return the file that says what a package was built from."""
+    return PREFIX / 'share' / package.name / 'test_interfaces.sha256'
+
+
+def digest(package: Path) -> str:
+    """Return a digest of all that a package is built from."""
+    files = [*sorted(package.glob('msg/*.msg')), HERE / 'fix_wheel_paths.cmake', Path(__file__)]
+    return sha256(b''.join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
+
+
+def is_built(package: Path) -> bool:
+    """Tell whether a package is there in its present state."""
+    return stamp(package).exists() and stamp(package).read_text() == digest(package)
+
+
+def build(package: Path) -> str:
+    """Configure, build and install one package; return what went wrong, if anything."""
     # What python's own start has set for the ROS wheels is not for cmake or the generators.
     foreign = {'LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'PYTHONPATH'}
     environment = {key: value for key, value in os.environ.items() if key not in foreign}
     environment['PATH'] = f'{PREFIX / "bin"}{os.pathsep}{environment["PATH"]}'
     environment['CMAKE_PREFIX_PATH'] = environment['AMENT_PREFIX_PATH'] = str(PREFIX)
     with TemporaryDirectory() as folder:
-        configure = ['cmake', '-S', package, '-B', folder, '-G', 'Ninja', '-Wno-dev']
+        source = Path(folder, 'source')
+        shutil.copytree(package, source)
+        write_project(source, package.name)
+        configure = ['cmake', '-S', source, '-B', f'{folder}/build', '-G', 'Ninja', '-Wno-dev']
         settings = {
-            'CMAKE_BUILD_TYPE': 'MinSizeRel',  # the quickest to compile
+            'CMAKE_BUILD_TYPE': 'None',  # no optimisation: the quickest to compile
             'CMAKE_INSTALL_PREFIX': PREFIX,
             'CMAKE_PROJECT_INCLUDE': HERE / 'fix_wheel_paths.cmake',
             'Python3_EXECUTABLE': PREFIX / 'bin' / 'python',
@@ -53,12 +94,27 @@ def build(package: Path) -> None:
             'BUILD_TESTING': 'OFF',
         }
         configure += [f'-D{name}={value}' for name, value in settings.items()]
-        for command in (configure, ['cmake', '--build', folder, '--target', 'install']):
+        install = ['cmake', '--build', f'{folder}/build', '--target', 'install']
+        for command in (configure, install):
             done = subprocess.run(
                 command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
             )
             if done.returncode:
-                sys.exit(f'{package.name}: {command[:2]} failed:\n{done.stdout.decode()[-5000:]}')
+                return f'{command[:2]} failed:\n{done.stdout.decode()[-5000:]}'
+    return ''
+
+
+def write_project(source: Path, name: str) -> None:
+    """Write what the generators want to see beside the field lists in ``source/msg``."""
+    files = sorted(source.glob('msg/*.msg'))
+    used = {u for f in files for u in re.findall(r'^(\w+)/', f.read_text(), re.MULTILINE)}
+    fields = {
+        'name': name,
+        'depends': ' '.join(sorted(used - {name})),
+        'files': ' '.join(f'msg/{path.name}' for path in files),
+    }
+    (source / 'package.xml').write_text(MANIFEST.format(**fields))
+    (source / 'CMakeLists.txt').write_text(PROJECT.format(**fields))
 
 
 if __name__ == '__main__':

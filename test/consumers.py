@@ -159,5 +159,83 @@ def pandas(path):
     }
 
 
+def datumaro(folder, form='datumaro'):
+    """Return every cuboid with its frame, and KITTI raw tracklets that Datumaro makes of them."""
+    import tempfile
+    from xml.etree import ElementTree
+
+    from datumaro import Dataset
+    from datumaro.components.annotation import AnnotationType
+
+    data = Dataset.import_from(folder, form)
+    labels = data.categories()[AnnotationType.label]
+    found = [
+        {
+            'item': item.id, 'frame': item.attributes['frame'],
+            'bytes': len(item.media.data or b'') if item.media else 0,
+            'label': labels[annotation.label].name, 'position': annotation.position,
+            'rotation': annotation.rotation, 'scale': annotation.scale,
+            'attributes': annotation.attributes,
+        }
+        for item in data
+        for annotation in item.annotations
+    ]  # fmt: skip
+    with tempfile.TemporaryDirectory() as out:
+        data.export(out, 'kitti_raw')
+        tree = ElementTree.parse(Path(out) / 'tracklet_labels.xml')
+    tracklets = [
+        {key: float(track.find(key).text) for key in 'hwl'}
+        for track in tree.getroot().iter('item')
+        if track.find('objectType') is not None
+    ]
+    return {'found': found, 'infos': data.infos(), 'tracklets': tracklets}
+
+
+def supervisely(folder):
+    """Return every figure of every frame of a project of point cloud episodes."""
+    from importlib import import_module
+
+    without_door('supervisely')  # imports all of the platform
+    package = sys.modules['supervisely']
+    package.logger = import_module('supervisely.sly_logger').logger
+    package.env = import_module('supervisely.io.env')
+    episodes = import_module('supervisely.project.pointcloud_episode_project')
+
+    project = episodes.PointcloudEpisodeProject(folder, episodes.OpenMode.READ)
+    (data,) = project.datasets
+    label = data.get_ann(project.meta)
+    figures = []
+    for name in data:
+        for figure in label.get_figures_on_frame(data.get_frame_idx(name)):
+            geometry = figure.geometry.to_json()
+            figures.append({
+                'cloud': name, 'frame': figure.frame_index, 'geometry': geometry,
+                'class': figure.parent_object.obj_class.name,
+                'tags': [
+                    (tag.name, tag.value, tag.frame_range) for tag in figure.parent_object.tags
+                ],
+            })  # fmt: skip
+    return {
+        'type': project.type, 'frames': label.frames_count, 'description': label.description,
+        'items': sorted(data), 'figures': figures,
+    }  # fmt: skip
+
+
+def cloud(path):
+    """Return the names and the rows of the points in a PCD or PLY file."""
+    if path.endswith('.pcd'):
+        from pypcd4 import PointCloud
+
+        points = PointCloud.from_path(path)
+        return {'fields': list(points.fields), 'rows': points.numpy().tolist()}
+    from plyfile import PlyData
+
+    vertex = PlyData.read(path)['vertex']
+    return {
+        'fields': [item.name for item in vertex.properties],
+        'rows': [[float(value) for value in row] for row in vertex.data.tolist()],
+    }
+
+
 if __name__ == '__main__':
     json.dump(globals()[sys.argv[1]](*sys.argv[2:]), sys.stdout)

@@ -29,9 +29,9 @@ _domains = itertools.count(os.getpid())
 class Graph:
     """One node in this process, and the processes started beside it, in a domain of their own."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, domain=None):
         self.folder = folder
-        self.domain = 1 + next(_domains) % 100
+        self.domain = domain or 1 + next(_domains) % 100
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=self.domain)
         self.node = rclpy.create_node('neighbour', context=self.context)
@@ -43,6 +43,14 @@ class Graph:
     def start(self, *ros_args, command=('-m', 'boxreg_ros.node')):
         """Start the node; its arguments are those after --ros-args."""
         process = NodeProcess(self, [sys.executable, *command, '--ros-args', *ros_args])
+        self.processes.append(process)
+        return process
+
+    def start_player(self, path, boxes_topic='/boxes'):
+        """Start a process that plays a recording once it is told to on its standard input."""
+        command = [sys.executable, __file__, str(path), boxes_topic, str(self.domain)]
+        process = NodeProcess(self, command)
+        process.is_ending = True
         self.processes.append(process)
         return process
 
@@ -106,8 +114,9 @@ class NodeProcess:
         }
         with self._log.open('w') as log:
             self.popen = subprocess.Popen(
-                command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT
-            )
+                command, cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=log,
+                stderr=subprocess.STDOUT,
+            )  # fmt: skip
 
     def output(self):
         return self._log.read_text()
@@ -142,8 +151,13 @@ def graph_in(folder):
 
 def stamp_of(message):
     """Return the stamp of boxes [ns]."""
-    header = message.header if hasattr(message, 'header') else message.markers[0].header
-    return header.stamp.sec * 10**9 + header.stamp.nanosec
+    if hasattr(message, 'header'):
+        stamp = message.header.stamp
+    elif hasattr(message, 'entities'):
+        stamp = message.entities[0].timestamp
+    else:
+        stamp = message.markers[0].header.stamp
+    return stamp.sec * 10**9 + stamp.nanosec
 
 
 class Record(NamedTuple):
@@ -188,3 +202,18 @@ def play(graph, records, early=None):
             graph.wait(
                 lambda s=stamp_ns: any(stamp_of(m) == s for m in early), f'boxes of {stamp_ns} ns'
             )
+
+
+if __name__ == '__main__':
+    recording, topic, domain = sys.argv[1:]
+    everything = records_of(Path(recording), topic)
+    player = Graph(Path(recording).parent, int(domain))
+    publishers_for(player, everything)
+    player.wait_until_connected()
+    sys.stdin.readline()
+    for one in everything:
+        play(player, [one])
+        time.sleep(0.02)
+    for publisher in player.publishers.values():
+        publisher.wait_for_all_acked()
+    player.close()

@@ -3,41 +3,36 @@
 from pathlib import Path
 
 import numpy as np
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-VISION = {
-    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score\n',
-    'vision_msgs/msg/ObjectHypothesisWithPose': (
-        'vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
-    ),
-    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n',
-    'vision_msgs/msg/Detection3D': (
-        'std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n'
-        'vision_msgs/BoundingBox3D bbox\nstring id\n'
-    ),
-    'vision_msgs/msg/Detection3DArray': (
-        'std_msgs/Header header\nvision_msgs/Detection3D[] detections\n'
-    ),
-}
-TF_MESSAGE = {'tf2_msgs/msg/TFMessage': 'geometry_msgs/TransformStamped[] transforms\n'}
+INTERFACES = Path(__file__).resolve().parent / 'interfaces'
 
 POINTS = 'sensor_msgs/msg/PointCloud2'
 DETECTIONS = 'vision_msgs/msg/Detection3DArray'
 MARKERS = 'visualization_msgs/msg/MarkerArray'
 TF = 'tf2_msgs/msg/TFMessage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
+TRACKED = 'autoware_perception_msgs/msg/TrackedObjects'
+DETECTED = 'autoware_perception_msgs/msg/DetectedObjects'
+OBJECTS = 'derived_object_msgs/msg/ObjectArray'
+OBJECTS_WITH_COVARIANCE = 'derived_object_msgs/msg/ObjectWithCovarianceArray'
+SCENE = 'foxglove_msgs/msg/SceneUpdate'
+JSK = 'jsk_recognition_msgs/msg/BoundingBoxArray'
+BOXES = 'vision_msgs/msg/BoundingBox3DArray'
 NUMBERS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 8}
 
 
 def typestore(stock=Stores.ROS2_JAZZY):
-    """Return a typestore that knows vision_msgs and tf2_msgs beside the stock types."""
+    """Return a typestore that knows the packages in ``interfaces`` beside the stock types."""
     store = get_typestore(stock)
     extra = {}
-    for name, text in (VISION | TF_MESSAGE).items():
+    for file in INTERFACES.glob('*/msg/*.msg'):
+        name = f'{file.parts[-3]}/msg/{file.stem}'
         if name not in store.types:
-            extra.update(get_types_from_msg(text, name))
+            extra.update(get_types_from_msg(file.read_text(), name))
     store.register(extra)
     return store
 
@@ -51,6 +46,54 @@ class Messages:
 
     def make(self, type_name, /, **fields):
         return self.store.types[type_name](**fields)
+
+    def build(self, type_name, /, **values):
+        """Return a message of these values, messages as dicts; what is not given is zero."""
+        fields = {
+            name: self._value(node, values.pop(name, None))
+            for name, node in self.store.fielddefs[type_name][1]
+        }
+        assert not values, f'{type_name} has no {", ".join(values)}'
+        return self.make(type_name, **fields)
+
+    def _value(self, node, given):
+        kind, args = node
+        if kind == Nodetype.NAME:
+            if given is not None and not isinstance(given, dict):
+                return given
+            return self.build(args, **(given or {}))
+        if kind == Nodetype.BASE:
+            zero = {'string': '', 'bool': False}.get(args[0], 0)
+            return zero if given is None else given
+        element, count = args
+        if given is None:
+            given = [None] * (count if kind == Nodetype.ARRAY else 0)
+        if element[0] == Nodetype.BASE and element[1][0] != 'string':
+            return np.array([item or 0 for item in given], element[1][0])
+        return [self._value(element, item) for item in given]
+
+    def boxes(self, type_name, stamp_ns, frame_id, found):
+        """
+        Return an array of any type that the adapters read, with all there is beside the boxes.
+
+        `found` are (number of the track, (position, quaternion), size).
+
+        """
+        header = self.header(stamp_ns, frame_id)
+        numbers = [number for number, _, _ in found]
+        poses = [self.pose(*pose) for _, pose, _ in found]
+        sizes = [self.vector(*size) for _, _, size in found]
+        if type_name == DETECTIONS:
+            items = [(str(n), 'car', 0.9, *pose, size) for n, pose, size in found]
+            return self.detections(stamp_ns, frame_id, items)
+        if type_name == MARKERS:
+            items = [self.marker(stamp_ns, frame_id, n, 'car', p, s) for n, p, s in found]
+            return self.markers(items)
+        make, kind = ITEMS[type_name]
+        items = [make(header, *item) for item in zip(numbers, poses, sizes, strict=True)]
+        return self.build(
+            type_name, **({} if type_name == SCENE else {'header': header}), **{kind: items}
+        )
 
     def header(self, stamp_ns, frame_id):
         stamp = self.make(
@@ -199,6 +242,75 @@ class Messages:
         )  # fmt: skip
 
 
+def _autoware(header, number, pose, size):
+    motion = {'linear': {'x': 3.0, 'y': 0.5}, 'angular': {'z': 0.1}}
+    corners = [{'x': 0.5 * size.x, 'y': 0.5 * size.y}, {'x': -0.5 * size.x, 'y': 0.5 * size.y}]
+    return {
+        'existence_probability': 0.75,
+        'classification': [{'label': 7, 'probability': 0.25}, {'label': 1, 'probability': 0.75}],
+        'kinematics': {
+            'pose_with_covariance': {'pose': pose, 'covariance': 0.5 * np.eye(6).reshape(36)},
+            'twist_with_covariance': {'twist': motion},
+            'orientation_availability': 2,
+        },
+        'shape': {'dimensions': size, 'footprint': {'points': corners}},
+    }
+
+
+def _tracked(header, number, pose, size):
+    item = _autoware(header, number, pose, size)
+    accel = {'accel': {'linear': {'x': 0.25}}}
+    item['kinematics'] |= {'acceleration_with_covariance': accel, 'is_stationary': True}
+    return item | {'object_id': {'uuid': [0] * 15 + [number]}}
+
+
+def _object(header, number, pose, size):
+    return {
+        'header': header, 'id': number, 'detection_level': 1, 'object_classified': True,
+        'pose': pose, 'twist': {'linear': {'x': 3.0}}, 'accel': {'linear': {'y': 0.25}},
+        'polygon': {'points': [{'x': 1.0}]},
+        'shape': {'type': 1, 'dimensions': [size.x, size.y, size.z]},
+        'classification': 6, 'classification_certainty': 204, 'classification_age': 9,
+    }  # fmt: skip
+
+
+def _object_with_covariance(header, number, pose, size):
+    item = _object(header, number, pose, size)
+    item['pose'] = {'pose': pose, 'covariance': 0.5 * np.eye(6).reshape(36)}
+    item['twist'], item['accel'] = {'twist': item['twist']}, {'accel': item['accel']}
+    item['shape']['covariance'] = [0.25] * 9
+    return item
+
+
+def _entity(header, number, pose, size):
+    notes = {'class': 'car', 'score': '0.75', 'user': 'kept'}
+    return {
+        'timestamp': header.stamp, 'frame_id': header.frame_id, 'id': str(number),
+        'metadata': [{'key': key, 'value': value} for key, value in notes.items()],
+        'cubes': [{'pose': pose, 'size': size, 'color': {'g': 1.0, 'a': 0.5}}],
+        'texts': [{'pose': pose, 'text': 'a car'}],
+    }  # fmt: skip
+
+
+def _jsk(header, number, pose, size):
+    return {'header': header, 'pose': pose, 'dimensions': size, 'value': 0.75, 'label': 3}
+
+
+def _bare(header, number, pose, size):
+    return {'center': pose, 'size': size}
+
+
+ITEMS = {
+    TRACKED: (_tracked, 'objects'),
+    DETECTED: (_autoware, 'objects'),
+    OBJECTS: (_object, 'objects'),
+    OBJECTS_WITH_COVARIANCE: (_object_with_covariance, 'objects'),
+    SCENE: (_entity, 'entities'),
+    JSK: (_jsk, 'boxes'),
+    BOXES: (_bare, 'boxes'),
+}
+
+
 def write_recording(path, items, storage='mcap', messages=None):
     """
     Write (topic, received_ns, message) as a recording and return its path.
@@ -271,16 +383,13 @@ class Drive:
             self.items.append(('/boxes', stamp, self._boxes(boxes, stamp, noisy, sensor)))
 
     def _boxes(self, kind, stamp, boxes, sensor):
-        m = self.messages
         found = []
         for track, box in enumerate(boxes, start=1):
             half = box[8] / 2
             pose = (box[:3] - sensor, (0, 0, np.sin(half), np.cos(half)))
             found.append((track, pose, box[3:6]))
-        if kind == 'vision':
-            detections = [(str(t), 'car', 0.9, *pose, size) for t, pose, size in found]
-            return m.detections(stamp, 'lidar', detections)
-        return m.markers([m.marker(stamp, 'lidar', t, 'car', p, s) for t, p, s in found])
+        type_name = {'vision': DETECTIONS, 'markers': MARKERS}.get(kind, kind)
+        return self.messages.boxes(type_name, stamp, 'lidar', found)
 
     def replace(self, topic, index, change):
         """Apply `change` to the message number `index` on a topic."""

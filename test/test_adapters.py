@@ -89,6 +89,22 @@ def test_absolute_times_of_a_simulated_clock():
     np.testing.assert_allclose(pointcloud.from_msg(message).times, SECONDS, atol=1e-12)
 
 
+def test_intensities_go_with_their_points():
+    xyz, seconds = XYZ.copy(), np.array([0.0, 0.1, np.nan, 0.3])
+    xyz[1, 2] = np.inf
+    extra = [('t', 'f4', seconds), ('intensity', 'u2', np.array([5, 6, 7, 800]))]
+    message = M.cloud(STAMP, 'lidar', [*columns(xyz=xyz), *extra], height=2, row_padding=3)
+    np.testing.assert_array_equal(pointcloud.from_msg(message).points, XYZ[[0, 3]])
+    np.testing.assert_array_equal(pointcloud.intensities(message), [5, 800])
+
+
+def test_intensities_that_are_missing():
+    assert pointcloud.intensities(M.cloud(STAMP, 'lidar', columns())) is None
+    strange = [*columns(), ('i', 'f4', np.array([np.nan, np.inf, 2.0, -np.inf]))]
+    message = M.cloud(STAMP, 'lidar', strange)
+    np.testing.assert_array_equal(pointcloud.intensities(message), [0, 0, 2, 0])
+
+
 def test_times_that_fit_nothing_are_left_out():
     values = SECONDS - 2e9
     message = M.cloud(STAMP, 'lidar', [*columns(), ('timestamp', 'f8', values)])

@@ -4,15 +4,16 @@ from collections import Counter
 from itertools import permutations
 
 from boxreg_ros.association import StampMatcher
+from boxreg_ros.config import Config
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
 
-TOLERANCE_NS = 20
+TOLERANCE_NS, REACH_NS = 20, 60
 
 
-def sweep(stamp_ns):
-    return Sweep(stamp_ns, 'odom', np.zeros((0, 3)))
+def sweep(stamp_ns, is_lost=False):
+    return Sweep(stamp_ns, 'odom', np.zeros((0, 3)), is_lost=is_lost)
 
 
 def boxes(stamp_ns):
@@ -20,18 +21,24 @@ def boxes(stamp_ns):
 
 
 class Feed:
-    """A matcher that takes ``'s100'`` or ``'b105'`` and tells pairs as stamps."""
+    """
+    A matcher that takes ``'s100'`` or ``'b105'`` and tells pairs as stamps.
 
-    def __init__(self, capacity=10):
+    ``'l100'`` is a sweep that is lost.
+
+    """
+
+    def __init__(self, capacity=10, reach=TOLERANCE_NS):
         self.counts = Counter()
-        self.matcher = StampMatcher(TOLERANCE_NS, capacity, self.counts)
+        config = Config(tolerance=TOLERANCE_NS * 1e-9, reach=reach * 1e-9, queue=capacity)
+        self.matcher = StampMatcher(config, self.counts)
 
     def add(self, *items):
         pairs = []
         for item in items:
             stamp_ns = int(item[1:])
-            if item[0] == 's':
-                pairs += self.matcher.add_sweep(sweep(stamp_ns))
+            if item[0] in 'sl':
+                pairs += self.matcher.add_sweep(sweep(stamp_ns, is_lost=item[0] == 'l'))
             else:
                 pairs += self.matcher.add_boxes(boxes(stamp_ns))
         return told(pairs)
@@ -73,10 +80,46 @@ def test_the_nearest_sweep_is_taken():
     assert feed.counts == {'sweep_without_boxes': 2}
 
 
-def test_a_sweep_is_taken_once():
+def test_a_sweep_serves_all_boxes_near_it():
     feed = Feed()
-    assert feed.add('s100', 'b95', 'b105') == [(95, 100)]
-    assert feed.flush() == [(105, None)]
+    assert feed.add('s100', 'b95', 'b105') == [(95, 100), (105, 100)]
+    assert feed.flush() == []
+    assert feed.counts == {}
+
+
+@pytest.mark.parametrize('late', range(3))
+def test_between_sweeps_the_nearest_is_known_when_a_younger_one_has_come(late):
+    # 150 is 45 from 105, 55 from 205: within reach of both, the tolerance of neither.
+    items = ['s105', 's205']
+    items.insert(late, 'b150')
+    feed = Feed(reach=REACH_NS)
+    assert feed.add(*items) == [(150, 105)]
+    assert feed.add('b210') == [(210, 205)]
+    assert feed.add('b266') == []
+    assert feed.add('s305') == [(266, 305)]
+    assert feed.add('b366', 's466') == [(366, None)]  # 61 from 305
+    assert feed.flush() == []
+    assert feed.counts == {'sweep_without_boxes': 1}
+
+
+def test_boxes_at_twice_the_rate_share_sweeps():
+    feed = Feed(reach=REACH_NS)
+    pairs = feed.add('s100', 'b100', 'b150', 's200', 'b200', 'b250', 's300', 'b300')
+    assert pairs == [(100, 100), (150, 100), (200, 200), (250, 200), (300, 300)]
+    assert feed.counts == {}
+
+
+def test_the_boxes_of_a_lost_sweep_leave_alone():
+    feed = Feed(reach=REACH_NS)
+    assert feed.add('s100', 'l150', 'b150') == [(150, None)]  # at once, and not with 100
+    assert feed.add('b200', 'l200') == [(200, None)]
+
+
+def test_sweeps_that_come_twice_or_too_late_are_counted():
+    feed = Feed()
+    assert feed.add('s100', 's100', 's200', 'b200', 's100', 's179') == [(200, 200)]
+    assert feed.add('s180', 'b180') == [(180, 180)]
+    assert feed.counts == {'sweep_duplicate': 1, 'sweep_without_boxes': 1, 'sweep_late': 2}
 
 
 def test_any_order_loses_nothing():
@@ -88,7 +131,7 @@ def test_any_order_loses_nothing():
         assert sorted(stamp for stamp, _ in pairs) == [100, 200, 300], order
         assert all(sweep in (stamp, None) for stamp, sweep in pairs), order
         alone = sum(sweep is None for _, sweep in pairs)
-        assert feed.counts['sweep_without_boxes'] == alone, order
+        assert feed.counts['sweep_without_boxes'] + feed.counts['sweep_late'] == alone, order
         if [i for i in order if i[0] == 's'] == ['s100', 's200', 's300'] and (
             [i for i in order if i[0] == 'b'] == ['b100', 'b200', 'b300']
         ):

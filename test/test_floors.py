@@ -15,7 +15,17 @@ FLOORS = (
     ('chain', 'sampling', 'objective', 'shape', 'correspondence', 'lbfgs'),
     ('calibration', 'window', 'registration'),
     ('association', 'registrar'),
-    ('boxtable', 'labels', 'recording', 'transforms'),
+    (
+        'boxtable',
+        'foxglove_mcap',
+        'intake',
+        'labels',
+        'pose_check',
+        'recording',
+        'tracker',
+        'transforms',
+        'visual',
+    ),
 )
 CORE = tuple(module for floor in FLOORS[:5] for module in floor)
 EDGE = len(FLOORS)

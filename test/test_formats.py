@@ -60,6 +60,7 @@ Tr_velo_cam 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.5
 """
 OURS = (
     'csv', 'parquet', 'openlabel', 'kitti', 'tracklets', 'nuscenes', 't4', 'argoverse2', 'waymo',
+    'sustechpoints', 'datumaro', 'supervisely', 'xtreme1',
 )  # fmt: skip
 LOSE_TILT = {'kitti', 'waymo'}
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, 0.25]], np.float32)
@@ -199,10 +200,12 @@ def test_tracklets(tmp_path):
 def test_tracklets_as_datumaro_and_cvat_read_them(tmp_path):
     _, folder = written('tracklets', tmp_path, swap_axes=True)
     (item,) = ElementTree.parse(folder / 'tracklet_labels.xml').findall('tracklets/item')
-    # Their scale x, y, z is w, h, l; their position is the centre.
-    assert [float(item.findtext(name)) for name in 'whl'] == EXTENT
+    # Their scale x, y, z is h, w, l; their position is the centre.
+    assert [float(item.findtext(name)) for name in 'hwl'] == EXTENT
     place = [float(item.find('poses/item').findtext(name)) for name in ('tx', 'ty', 'tz')]
     np.testing.assert_allclose(place, [6, -3, 1], atol=1e-9)
+    (seen,) = consumer('datumaro', folder, 'kitti_raw')['found']
+    assert (seen['position'], seen['scale']) == ([6, -3, 1], EXTENT)
     (frame,) = frames_of('tracklets', folder)
     np.testing.assert_allclose(frame.refined.boxes.boxes, [IN_SENSOR], atol=1e-9)
 

@@ -4,22 +4,26 @@ from boxreg_ros.config import Config
 from boxreg_ros.live import Arrival, LiveRegistrar, refined_to_frame
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
 from boxreg_ros.transforms import matrix
-from msg_adapters import pointcloud, vision
+from msg_adapters import adapter_for, pointcloud, vision
+from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import pytest
-from ros_messages import Drive, SECOND, START
+from ros_messages import DETECTIONS, Drive, SECOND, START, TRACKED
 
 
 class Live(LiveRegistrar):
     """Fed from a Drive."""
 
-    def __init__(self, fixed_frame='', output_frame='', timeout=1.0, adapter=vision, **settings):
+    def __init__(
+        self, fixed_frame='', output_frame='', timeout=1.0, convention=STANDARD, **settings
+    ):
         self.told = []
         config = Config(estimate='final').updated({'window': 5, 'lag': 2} | settings)
         super().__init__(
-            config, fixed_frame, output_frame, timeout, lambda *words: self.told.append(words)
-        )
-        self.adapter = adapter
+            config, fixed_frame, output_frame, timeout,
+            lambda *words: self.told.append(words), convention,
+        )  # fmt: skip
+        self.adapter = adapter_for(DETECTIONS, convention)
         self.cloud_frame = 'lidar'
 
     def feed(self, drive, now=0.0):
@@ -31,14 +35,14 @@ class Live(LiveRegistrar):
             elif topic == '/odom':
                 self.tree.add_odometry(message)
             else:
-                item = arrival(topic, message, now)
+                item = arrival(topic, message, now, self.adapter)
                 assert self.is_ready(item, now + 0.5) or not self.fixed_frame
                 out += self.process(item)
         return out
 
 
-def arrival(topic, message, now=0.0):
-    reader = pointcloud if topic == '/points' else vision
+def arrival(topic, message, now=0.0, adapter=vision):
+    reader = pointcloud if topic == '/points' else adapter
     return Arrival(message, reader.from_msg(message), now)
 
 
@@ -75,6 +79,79 @@ def test_output_frame_is_the_one_asked_for():
         assert np.abs(array.boxes[:, :3] - drive.truth[array.stamp_ns][:, :3]).max() < 0.5
 
 
+def test_kept_boxes_keep_their_covariance_and_refined_ones_get_ours():
+    drive = Drive(sweeps=5)
+    for message in items_of(drive, '/boxes'):
+        for detection in message.detections:
+            detection.results[0].pose.covariance = np.diag([9.0, 4, 1, 0, 0, 0]).reshape(36)
+        message.detections[1].bbox.center.position.y += 300  # no points there
+    out = Live(output_frame='turned').feed(Turned(drive))
+    for item in out:
+        assert item.refined.status[1] == KEPT
+        spread = [d.results[0].pose.covariance.reshape(6, 6) for d in item.message.detections]
+        # The output frame is a quarter turn away: the detector's 9 along x is 9 along y.
+        np.testing.assert_allclose(np.diag(spread[1]), [4, 9, 1, 0, 0, 0], atol=1e-9)
+        if item.refined.status[0] == REFINED:
+            np.testing.assert_allclose(spread[0], item.refined.covariances[0])
+    assert any(item.refined.status[0] == REFINED for item in out)
+
+
+class Turned:
+    """A drive with a frame that is a quarter turn away from odom."""
+
+    def __init__(self, drive):
+        m = drive.messages
+        half = np.sqrt(0.5)
+        static = m.transform(START, 'turned', 'odom', (0, 0, 0), (0, 0, half, half))
+        self.items = [('/tf_static', START, m.tf(static)), *drive.items]
+
+
+def test_poses_that_do_not_fit_are_told_with_every_array():
+    drive = Drive(sweeps=10)
+    live = Live(convention=Convention('bottom'))
+    live.feed(drive)
+    reasons = [reason for reason, *_ in live.told]
+    assert reasons == ['pose_reference'] * 5  # known after 12 boxes, six arrays
+    assert 'pose_reference:=center' in live.told[0][1]
+
+
+def test_ids_by_association_are_those_of_the_markers_and_of_the_messages():
+    drive = Drive(sweeps=4)
+    for message in items_of(drive, '/boxes'):
+        for detection in message.detections:
+            detection.id = ''
+    live = Live(convention=Convention(associate=True))
+    out = live.feed(drive) + live.flush()
+    for item in out:
+        assert item.given.track_ids == item.refined.boxes.track_ids == ('1', '2')
+        assert [d.id for d in item.message.detections] == ['1', '2']
+    assert live.facts == {'ids': 'by association', 'associated_tracks': 2}
+
+
+def test_headings_of_unknown_sign_become_those_of_their_track_and_stay_unknown():
+    """Of five headings of each object one points backwards, and its twist with it."""
+    drive = Drive(sweeps=5, boxes=TRACKED)
+    for item in items_of(drive, '/boxes')[1].objects:
+        turn = item.kinematics.pose_with_covariance.pose.orientation
+        turn.z, turn.w = turn.w, -turn.z
+    for message in items_of(drive, '/boxes'):
+        for item in message.objects:
+            item.kinematics.orientation_availability = 1
+    live = Live(window=5)
+    live.adapter = adapter_for(TRACKED)
+    finals = [item for item in live.feed(drive) + live.flush() if item.is_final]
+    assert len(finals) == 5
+    for k, item in enumerate(finals):
+        assert np.abs(item.refined.boxes.boxes[:, 8]).max() < 0.4
+        for given, written in zip(
+            items_of(drive, '/boxes')[k].objects, item.message.objects, strict=True
+        ):
+            assert written.kinematics.orientation_availability == 1
+            sign = -1 if k == 1 else 1
+            speed = given.kinematics.twist_with_covariance.twist.linear.x
+            assert written.kinematics.twist_with_covariance.twist.linear.x == sign * speed
+
+
 def test_arrivals_wait_until_transforms_cover_them_but_not_for_ever():
     drive = Drive(sweeps=3)
     live = Live(timeout=1.0)
@@ -103,9 +180,10 @@ def test_boxes_without_transform_pass_through_with_the_remedy():
     out = live.process(arrival('/boxes', boxes))
     assert [item.is_final for item in out] == [False, True]
     assert all(item.message is boxes for item in out)
-    (reason, text), _ = live.told
-    assert reason == 'no_transform'
-    assert 'fixed_frame:=lidar' in text
+    assert [(reason, number) for reason, _, number in live.told] == [
+        ('sweep_without_transform', 1), ('no_transform', 2),
+    ]  # fmt: skip
+    assert all('fixed_frame:=lidar' in text for _, text, _ in live.told)
 
 
 def test_a_sensor_that_does_not_move_needs_no_transform():
@@ -144,6 +222,103 @@ def test_after_a_fault_all_that_is_held_passes_through_once():
     assert len(live.feed(again) + live.flush()) == 12
 
 
+def moved(drive, seconds, south=0.0):
+    """Return a drive, its stamps later, all poses and boxes to the south."""
+    for _, _, message in drive.items:
+        for item in getattr(message, 'transforms', [message]):
+            item.header.stamp.sec += seconds
+    for message in items_of(drive, '/tf'):
+        message.transforms[0].transform.translation.y -= south
+    return drive
+
+
+@pytest.mark.parametrize('back', [1, 30])
+def test_a_recording_that_loops_starts_afresh(back):
+    # The same street again, 30 m to the south by its transforms: what was known of these stamps
+    # before must not count. One cloud and one box array are spent on finding out.
+    live = Live(timeout=0.4)
+    before = live.feed(moved(Drive(sweeps=20), 60 + back))
+    drive = moved(Drive(sweeps=20), 60, south=30.0)
+    after = live.feed(drive) + live.flush()
+    finals = [item for item in before + after if item.is_final]
+    assert len(finals) == 40
+    told = [reason for reason, _, _ in live.told]
+    assert told.count('time_jump') == 1
+    assert len(told) == {1: 1, 30: 3}[back]  # of 30 s ago, there was no transform left
+    for item in finals[-19:]:
+        array = vision.from_msg(item.message)
+        stamp_ns = array.stamp_ns - 60 * SECOND
+        sensor = np.array([0.5 * drive.stamps.index(stamp_ns), 0, 2.0])
+        assert item.refined.status == (REFINED,) * 2
+        assert np.abs(array.boxes[:, :3] + sensor - drive.truth[stamp_ns][:, :3]).max() < 0.3
+
+
+def test_after_a_gap_tracks_begin_anew():
+    live = Live()
+    live.feed(Drive(sweeps=6))
+    out = live.feed(moved(Drive(sweeps=6), 20)) + live.flush()
+    assert sum(item.is_final for item in out) == 8  # two were held back by the lag
+    assert not live.told
+    assert live.counts['short_track'] == 0
+
+
+def test_silence_ends_what_is_held():
+    live = Live()
+    out = live.feed(Drive(sweeps=6), now=10.0)
+    assert not live.is_silent(12.9)
+    assert live.is_silent(13.1)
+    out += live.flush()
+    assert not live.is_silent(99.0)
+    assert sum(item.is_final for item in out) == 6
+    assert sum(item.is_final for item in live.feed(moved(Drive(sweeps=6), 1)) + live.flush()) == 6
+
+
+def test_boxes_of_a_cloud_that_was_dropped_do_not_wait_for_it():
+    drive = Drive(sweeps=6)
+    drive.items = [i for i in drive.items if (i[0], i[1]) != ('/points', drive.stamps[3])]
+    live = Live()
+    out = live.lose(drive.stamps[3]) + live.feed(drive) + live.flush()
+    kept = [item.refined.reasons for item in out if item.is_final]
+    assert kept[3] == ('no_sweep',) * 2
+    assert kept[4:] == [('', '')] * 2
+    early = [vision.from_msg(item.message).stamp_ns for item in out if not item.is_final]
+    assert early == drive.stamps
+
+
+def test_reset_returns_what_is_held_and_keeps_the_transforms():
+    drive = Drive(sweeps=6)
+    live = Live()
+    out = live.feed(drive) + live.reset()
+    assert sum(item.is_final for item in out) == 6
+    again = [item for item in drive.items if item[0] in ('/points', '/boxes')]
+    drive.items = again
+    out = live.feed(drive) + live.reset()
+    assert sum(item.is_final for item in out) == 6
+    assert not live.told
+
+
+@pytest.mark.parametrize('delay, shuffle', [(0.05, 0), (0.5, 0), (0.5, 3)])
+def test_boxes_may_come_late_and_out_of_order(delay, shuffle):
+    # 50 to 500 ms behind their clouds; out of order by up to `shuffle` stamps: as long as their
+    # clouds are kept, only those that come after younger ones pass unrefined, and are counted.
+    drive = Drive(sweeps=20)
+    order = np.random.default_rng(0).permutation
+    boxes = [i for i in drive.items if i[0] == '/boxes']
+    if shuffle:
+        boxes = [boxes[k] for a in range(0, 20, 4) for k in a + order(4)]
+    rank = {id(i[2]): START + round((0.1 * k + delay) * SECOND) for k, i in enumerate(boxes)}
+    drive.items.sort(key=lambda i: rank.get(id(i[2]), i[1]))
+    live = Live()
+    out = live.feed(drive) + live.flush()
+    finals = [item for item in out if item.is_final]
+    assert sorted(vision.from_msg(item.message).stamp_ns for item in finals) == drive.stamps
+    late = live.counts['late']
+    assert (late > 0) == bool(shuffle)
+    assert live.counts['refined'] + live.counts['kept'] == 40
+    assert live.counts['kept'] == late + live.counts['short_track']
+    assert live.counts['no_sweep'] == 0
+
+
 def test_boxes_of_one_stamp_come_back_each_in_its_own_message():
     drive = Drive(sweeps=4)
     boxes = items_of(drive, '/boxes')
@@ -152,6 +327,7 @@ def test_boxes_of_one_stamp_come_back_each_in_its_own_message():
     out = live.feed(drive) + live.flush()
     for is_final in (False, True):
         assert sum(item.is_final == is_final for item in out) == 4
+    assert live.counts['duplicate_stamp'] == 2
 
 
 @pytest.mark.parametrize('yaw', [0.0, 0.7, 2.5])

@@ -7,7 +7,7 @@ import time
 
 from boxreg_ros.diagnostics import Health
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
-from boxreg_ros.visual import MarkerBoard
+from boxreg_ros.visual import MarkerBoard, NAMESPACES
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import markers, vision
 import numpy as np
@@ -16,7 +16,7 @@ from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
-QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=50')
+QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=60.0')
 WITHOUT_TF2_MSGS = (
     'import sys; sys.modules["tf2_msgs"] = None\n'
     'from boxreg_ros.node import main\n'
@@ -79,7 +79,7 @@ def test_odometry_alone_is_enough(graph, tmp_path):
     array = markers.from_msg(early[-1])
     assert array.frame_id == 'lidar' and array.track_ids == ('1',)
     added = [{m.ns for m in message.markers if m.action == 0} for message in shown[:6]]
-    assert added == [{'input', 'refined', 'heading', 'id'}] * 6
+    assert added == [set(NAMESPACES)] * 6
     colours = {(m.ns, m.color.g) for m in shown[3].markers if m.ns in ('input', 'refined')}
     assert len({green for _, green in colours}) == 2
     numbers = {m.text: m.id for m in shown[3].markers if m.ns == 'id'}
@@ -164,7 +164,7 @@ def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
     reliable = [*RELIABLE, '-p', 'qos_overrides./points.subscription.depth:=100']
     reliable += ['-p', 'qos_overrides./boxes.subscription.depth:=100']
     slow = ('-p', 'solver.rounds:=40', '-p', 'solver.iterations:=400')
-    node = graph.start(*reliable, *slow, '-p', 'backlog:=2')
+    node = graph.start(*reliable, *slow, '-p', 'backlog:=0.2')
     graph.wait_until_connected()
     play(graph, records)
     graph.wait(lambda: len(early) == 30, 'early boxes')
@@ -181,7 +181,16 @@ def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
     early = graph.collect(DETECTIONS, '/refined_boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     endless = ('-p', 'solver.rounds:=100', '-p', 'solver.iterations:=10000', '-p', 'window:=30')
-    node = graph.start(*RELIABLE, *endless, '-p', 'solver.tolerance:=0.0', '-p', 'backlog:=100')
+    node = graph.start(
+        *RELIABLE,
+        *endless,
+        '-p',
+        'solver.tolerance:=0.0',
+        '-p',
+        'backlog:=60.0',
+        '-p',
+        'queue:=100',
+    )
     graph.wait_until_connected()
     play(graph, records)
     graph.wait(lambda: len(early) >= 4, 'some boxes')
@@ -245,7 +254,8 @@ def test_markers_stay_with_their_track():
     board = MarkerBoard()
     given = boxes_of('a', 'b', '', '')
     first = board.update(given, refined_of(given, REFINED, KEPT, KEPT, KEPT)).markers
-    assert len({(m.ns, m.id) for m in first}) == len(first) == 16
+    assert first.pop(0).action == 3  # what an earlier node may have left
+    assert len({(m.ns, m.id) for m in first}) == len(first) == 20
     cubes = {m.id: m.color.r for m in first if m.ns == 'refined'}
     assert cubes[0] != cubes[1]
     given = boxes_of('c', 'b')
@@ -253,9 +263,9 @@ def test_markers_stay_with_their_track():
     second = board.update(given, refined_of(given, KEPT, KEPT)).markers
     assert {m.id for m in second if m.action == 0} == {1}
     assert {(m.ns, m.id) for m in second if m.action == 2} == {
-        (ns, number) for ns in ('input', 'refined', 'heading', 'id') for number in (0, 2, 3)
+        (ns, number) for ns in NAMESPACES for number in (0, 2, 3)
     }
-    assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 4
+    assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
 
 
 def test_health_tells_the_worst_of_the_last_period():
@@ -275,8 +285,16 @@ def test_health_tells_the_worst_of_the_last_period():
     assert status.message.startswith('no_sweep') and 'stamp' in status.message
     health.count('failed')
     assert health.status('node', {}).level == DiagnosticStatus.ERROR
-    assert health.is_time_to_warn('late') and not health.is_time_to_warn('late')
-    assert health.is_time_to_warn('no_sweep')
+    for name, level in (('refined', DiagnosticStatus.WARN), ('kept', DiagnosticStatus.ERROR)):
+        health.count('boxes_received')
+        health.count('late')
+        health.count(name)
+        assert health.status('node', {}).level == level
+    assert [line.split()[0] for line in health.complaints()] == ['failed', 'no_sweep', 'late']
+    health.count('late')
+    assert not list(health.complaints())  # at a limited rate
+    assert health.is_time_to_warn('unreadable') and not health.is_time_to_warn('unreadable')
+    assert health.is_time_to_warn('invalid_box')
 
 
 def test_without_ros_the_remedy_is_told():

@@ -67,6 +67,8 @@ def test_colcon_installs_where_ros2_run_looks(prefix):
         assert not (prefix / 'bin' / executable).exists()
     assert (prefix / 'share/ament_index/resource_index/packages/boxreg_ros').is_file()
     assert (prefix / 'share/boxreg_ros/package.xml').is_file()
+    for file in ROOT.glob('boxreg_ros/share/*'):
+        assert (prefix / 'share/boxreg_ros' / file.name).read_bytes() == file.read_bytes()
 
 
 def test_every_module_is_installed_and_imported_from_there(prefix):

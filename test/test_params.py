@@ -2,7 +2,14 @@
 
 from boxreg_ros.config import Config, settings
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.params import declare, NODE_SETTINGS
+from boxreg_ros.params import (
+    AT_ONCE,
+    changed,
+    declare,
+    NODE_SETTINGS,
+    parameters_yaml,
+    READ_ONLY,
+)
 import pytest
 import rclpy
 from rclpy.parameter import Parameter
@@ -44,7 +51,8 @@ def test_every_setting_is_a_parameter(make_node):
         descriptor = node.describe_parameter(item.name)
         assert descriptor.description.startswith(item.meaning)
         assert not item.unit or f'[{item.unit}]' in descriptor.description
-        assert descriptor.read_only
+        assert descriptor.read_only == (not item.name.startswith(AT_ONCE))
+        assert (READ_ONLY in descriptor.additional_constraints) == descriptor.read_only
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
         assert [(r.from_value, r.to_value) for r in ranges] == (
             [] if item.low is None else [(item.low, item.high)]
@@ -86,7 +94,7 @@ def test_one_yaml_file_serves_node_and_recordings(make_node, tmp_path):
         ('lag', 10, ('lag', 'window')),
         ('mode', '4d', ('mode', 'bev', '4d')),
         ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
-        ('backlog', 2.5, ('backlog', 'int', '2.5')),
+        ('backlog', 'x', ('backlog', 'float', 'x')),
         ('boxes_type', 3, ('boxes_type', 'str', '3')),
         ('faces.learn', 1, ('faces.learn', 'bool', '1')),
     ],
@@ -105,3 +113,33 @@ def test_parameters_cannot_be_changed_behind_the_node(make_node):
     assert not result.successful
     assert 'read-only' in result.reason
     assert node.get_parameter('window').value == Config().window
+
+
+def test_what_may_change_changes(make_node):
+    node = make_node()
+    settings_before = declare(node)
+    changes = [Parameter('solver.rounds', value=2), Parameter('transform_timeout', value=1.5)]
+    assert all(result.successful for result in node.set_parameters(changes))
+    config, options = changed(*settings_before, [*changes, Parameter('use_sim_time', value=True)])
+    assert config == settings_before[0].updated({'solver.rounds': 2})
+    assert options == settings_before[1]._replace(transform_timeout=1.5)
+    (result,) = node.set_parameters([Parameter('solver.rounds', value=0)])
+    assert not result.successful
+    for bad in (Parameter('solver.rounds', value=0), Parameter('transform_timeout', value='a')):
+        with pytest.raises(ConfigError, match=bad.name):
+            changed(*settings_before, [bad])
+
+
+def test_a_parameter_file_says_it_all_and_serves_both(make_node, tmp_path):
+    path = tmp_path / 'params.yaml'
+    config = Config(estimate='final').updated(
+        {'window': 7, 'vehicle.names': ['ute', 'car'], 'solver.tolerance': 1e-5, 'mode': 'bev'}
+    )
+    _, options = declare(make_node())
+    options = options._replace(fixed_frame='map', backlog=9.0)
+    path.write_text(parameters_yaml(config, options, '/**/params'))
+    again = declare(make_node(cli_args=['--ros-args', '--params-file', str(path)]))
+    assert again == (config, options)
+    assert Config.from_yaml(path) == config.updated({'estimate': 'track'})
+    for item in settings():
+        assert item.name == 'estimate' or item.meaning in path.read_text()

@@ -1,23 +1,24 @@
 """One core, two drivers: the node's final boxes are those of `boxreg relabel`."""
 
 import csv
+import json
 
 from boxreg_ros.cli import main
-from msg_adapters import adapter_for
+from msg_adapters import adapter_for, ADAPTERS, WITHOUT_IDS
 from msg_adapters.poses import quaternions_of
 import numpy as np
 import pytest
 from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
-from ros_messages import Drive
+from ros_messages import DETECTIONS, Drive, JSK, MARKERS
 
 SETTINGS = {'window': 5, 'lag': 3}
 
 
-def relabelled(path, out):
+def relabelled(path, out, *more):
     """Return (stamp, track) -> x y z qx qy qz qw length width height of `boxreg relabel`."""
     options = [f'--set={key}={value}' for key, value in SETTINGS.items()]
     command = ['relabel', str(path), '-o', str(out), '--set=estimate=final', '--formats=csv']
-    assert main([*command, *options]) == 0
+    assert main([*command, *options, *more]) == 0
     columns = ['x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height']
     with (out / 'boxes.csv').open() as file:
         rows = list(csv.DictReader(file))
@@ -33,13 +34,18 @@ def as_published(messages, type_name):
     found = {}
     for message in messages:
         array = adapter_for(type_name).from_msg(message)
-        assert array.frame_id == 'odom'
-        quaternions_xyzw = quaternions_of(array.boxes)
-        for i, track_id in enumerate(array.track_ids):
-            box = array.boxes[i]
+        for track_id, row in zip(array.track_ids, as_rows([message], type_name), strict=True):
             assert (array.stamp_ns, track_id) not in found
-            found[array.stamp_ns, track_id] = [*box[:3], *quaternions_xyzw[i], *box[3:6]]
+            found[array.stamp_ns, track_id] = row
     return found
+
+
+def as_rows(messages, type_name):
+    """Return x y z qx qy qz qw length width height of all boxes in messages."""
+    arrays = [adapter_for(type_name).from_msg(message) for message in messages]
+    assert {array.frame_id for array in arrays} == {'odom'}
+    boxes = np.concatenate([array.boxes for array in arrays])
+    return np.hstack([boxes[:, :3], quaternions_of(boxes), boxes[:, 3:6]])
 
 
 @pytest.mark.parametrize('recording', ['vision-tf', 'markers-odometry', 'street'])
@@ -55,7 +61,7 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
     (type_name,) = {record.type_name for record in records if record.topic == boxes_topic}
     with graph_in(tmp_path) as graph:
         # Patient, so that no transform is extrapolated because a machine is busy.
-        options = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=100']
+        options = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=60.0']
         options += [f'{key}:={value}' for key, value in SETTINGS.items()]
         publishers_for(graph, records)
         early = graph.collect(type_name, '/refined_boxes')
@@ -73,3 +79,49 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
     difference = np.abs(np.array([found[k] for k in keys]) - [expected[k] for k in keys])
     assert difference.max() < 1e-6
     assert [stamp_of(message) for message in final] == sorted({stamp for stamp, _ in expected})
+
+
+@pytest.mark.parametrize('type_name', [t for t in ADAPTERS if t not in (DETECTIONS, MARKERS)])
+def test_publisher_node_and_subscriber_of_every_family(tmp_path, type_name):
+    """Three processes; what is not in the messages, an id, is the same in node and `relabel`."""
+    drive = Drive(sweeps=8, boxes=type_name)
+    path = drive.write(tmp_path / 'drive')
+    associate = type_name in WITHOUT_IDS
+    options = ['--associate'] if associate else []
+    expected = relabelled(path, tmp_path / 'out', *options)
+    if associate:
+        summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+        assert (summary['ids'], summary['associated_tracks']) == ('by association', 2)
+    with graph_in(tmp_path) as graph:
+        final = graph.collect(type_name, '/refined_boxes_final')
+        diagnostics = graph.collect('diagnostic_msgs/msg/DiagnosticArray', '/diagnostics')
+        settings = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=100']
+        settings += [f'{key}:={value}' for key, value in SETTINGS.items()]
+        settings += [f'boxes_type:={type_name}'] + ['associate:=true'] * associate
+        node = graph.start(*RELIABLE, *[part for item in settings for part in ('-p', item)])
+        player = graph.start_player(path)
+        graph.wait_until_connected()
+        player.popen.communicate(b'go')
+        assert player.popen.returncode == 0, player.output()
+        graph.wait(lambda: len(final) >= 8 - SETTINGS['lag'], 'final boxes')
+        if associate:
+            graph.wait(lambda: 'by association' in str(diagnostics), 'diagnostics')
+        node.stop()
+        assert node.popen.returncode == 0, node.output()
+    assert [stamp_of(message) for message in final] == drive.stamps
+    rows = as_rows(final, type_name)
+    assert np.abs(rows - list(expected.values())).max() < 1e-6
+    ids = [track_id for _, track_id in expected]
+    assert ids == ids[:2] * 8  # stable
+
+
+def test_boxes_without_ids_are_refused_by_node_and_relabel(tmp_path, capsys):
+    path = Drive(sweeps=2, boxes=JSK).write(tmp_path / 'drive')
+    assert main(['relabel', str(path), '-o', str(tmp_path / 'out')]) == 1
+    assert '--associate' in capsys.readouterr().err
+    with graph_in(tmp_path) as graph:
+        node = graph.start('-p', f'boxes_type:={JSK}')
+        node.is_ending = True
+        graph.wait(lambda: node.popen.poll() is not None, 'the node to give up')
+        assert node.popen.returncode == 1
+        assert 'associate:=true' in node.output()

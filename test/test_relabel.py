@@ -5,12 +5,14 @@ import subprocess
 import sys
 
 from boxreg_ros.boxtable import BoxTable
+from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.relabel import input_boxes, relabel, Request
+from msg_adapters.convention import Convention
 import numpy as np
 import pytest
-from ros_messages import Drive, Messages, SECOND, write_recording
+from ros_messages import Drive, JSK, Messages, SECOND, write_recording
 
 QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
 M = Messages()
@@ -303,6 +305,42 @@ def test_fingerprint_tells_requests_apart(tmp_path):
     assert Request((path,), config=QUICK).fingerprint() != first
     path.write_bytes(path.read_bytes() + b'x')
     assert Request((path,)).fingerprint() != first
+
+
+def test_boxes_are_read_as_they_are_meant(tmp_path, capsys):
+    """Bottoms and w, l, h in the messages: the same results once that is said."""
+    drive = Drive(sweeps=8)
+    command = ['relabel', '--formats=csv', '-o']
+    path = str(drive.write(tmp_path / 'drive'))
+    assert main([*command, str(tmp_path / 'expected'), path]) == 0
+    for topic, _, message in drive.items:
+        for detection in message.detections if topic == '/boxes' else ():
+            size, at = detection.bbox.size, detection.bbox.center.position
+            size.x, size.y, at.z = size.y, size.x, at.z - size.z / 2
+    path = str(drive.write(tmp_path / 'bottoms'))
+    meant = ['--pose-reference', 'bottom', '--size-order', 'wlh']
+    assert not capsys.readouterr().err
+    assert main([*command, str(tmp_path / 'half'), path, *meant[2:]]) == 0
+    assert 'pose_reference:=bottom' in capsys.readouterr().err
+    assert main([*command, str(tmp_path / 'meant'), path, *meant]) == 0
+    assert not capsys.readouterr().err
+    expected = rows_of(tmp_path / 'expected')
+    for row, other in zip(rows_of(tmp_path / 'meant'), expected, strict=True):
+        assert float(row['z']) == pytest.approx(float(other['z']), abs=1e-6)
+        assert float(row['length']) == pytest.approx(float(other['length']), abs=1e-6)
+    assert main([*command, str(tmp_path / 'x'), path, '--pose-reference', 'floor']) == 2
+    assert 'pose_reference' in capsys.readouterr().err
+
+
+def test_topics_with_ids_go_before_those_without(tmp_path):
+    drive, other = Drive(sweeps=4), Drive(sweeps=4, boxes=JSK)
+    more = [('/clusters', *item[1:]) for item in other.items if item[0] == '/boxes']
+    drive.items += more
+    path = drive.write(tmp_path / 'drive')
+    summary, _ = run(path, tmp_path / 'out')
+    assert summary['topics']['boxes'] == '/boxes'
+    with pytest.raises(RecordingError, match='/boxes, /clusters'):
+        run(path, tmp_path / 'out', convention=Convention(associate=True))
 
 
 # The input as it is ----------------------------------------------------------------------------

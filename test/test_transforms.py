@@ -1,6 +1,6 @@
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.structures import BoxArray, Sweep
-from boxreg_ros.transforms import boxes_to_frame, inverse, sweep_to_frame, TransformTree
+from boxreg_ros.transforms import boxes_to_frame, inverse, Rewind, sweep_to_frame, TransformTree
 import numpy as np
 import pytest
 from ros_messages import Messages
@@ -223,3 +223,34 @@ def test_boxes_turn_about_all_axes():
     assert np.isnan(moved.boxes[4, :3]).any()
     assert np.isnan(moved.boxes[5, 6:]).any()
     assert np.isfinite(moved.boxes[good]).all()
+
+
+def test_stamps_that_start_again_replace_what_was_known():
+    static = [(0, 'base', 'lidar', (0, 0, 2))]
+    moves = [(100 * S + k * S // 10, 'odom', 'base', (k, 0, 0)) for k in range(50)]
+    tree = tree_of(*moves, static=static)
+    one = (90 * S, 'odom', 'base', (-1, 0, 0))  # a stray, 14.9 s old
+    tree.add_transforms(M.tf(M.transform(*one)).transforms)
+    np.testing.assert_allclose(tree.lookup('odom', 'lidar', 102 * S)[0, 3], 20)
+    assert tree.newest_ns() == 104_900_000_000
+    again = [(100 * S + k * S // 10, 'odom', 'base', (0, k, 0)) for k in range(4)]
+    for item in again:
+        tree.add_transforms(M.tf(M.transform(*item)).transforms)
+    T = tree.lookup('odom', 'lidar', 100 * S + 250_000_000)
+    np.testing.assert_allclose(T[:3, 3], [0, 2.5, 2])  # the second time, the mount still known
+    assert not tree.covers('odom', 'lidar', 102 * S)
+    assert not tree.covers('odom', 'lidar', 95 * S)
+    tree.rewind(98 * S)
+    with pytest.raises(TransformUnavailable):
+        tree.lookup('odom', 'lidar', 100 * S)
+    assert tree.connects('odom', 'lidar')
+
+
+def test_a_jump_is_told_by_two_stamps_that_are_far_back():
+    rewind = Rewind()
+    told = [
+        rewind.happened(t * S // 10) for t in (100, 110, 105, 101, 99, 111, 99, 98, 99, 85, 112)
+    ]
+    # 0.1 s more than a second back: 99 once after 110; then 99 and 98 after 111 are two. After
+    # that 98 is the newest: 85 is one again.
+    assert told == [False] * 7 + [True] + [False] * 3

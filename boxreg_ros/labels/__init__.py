@@ -17,7 +17,7 @@ from importlib import import_module
 import json
 from pathlib import Path
 from types import ModuleType
-from typing import Protocol
+from typing import Protocol, TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
@@ -25,6 +25,9 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.structures import Floats, HEIGHT, Ints, LENGTH, RefinedBoxes, Sweep
 from boxreg_ros.transforms import boxes_to_frame, inverse
 import numpy as np
+
+if TYPE_CHECKING:
+    from boxreg_ros.recording import Recording
 
 FORMATS = {
     'csv': 'boxreg_ros.labels.csv',
@@ -36,7 +39,14 @@ FORMATS = {
     't4': 'boxreg_ros.labels.t4',
     'argoverse2': 'boxreg_ros.labels.argoverse2',
     'waymo': 'boxreg_ros.labels.waymo',
+    'sustechpoints': 'boxreg_ros.labels.sustechpoints',
+    'datumaro': 'boxreg_ros.labels.datumaro',
+    'supervisely': 'boxreg_ros.labels.supervisely',
+    'xtreme1': 'boxreg_ros.labels.xtreme1',
+    'mcap': 'boxreg_ros.labels.mcap',
 }
+BESIDE_RESULTS = ('csv', 'mcap')
+"""Formats whose one file is in the folder of results itself."""
 INPUT = 'input'
 """Status of boxes whose file does not say where they come from."""
 
@@ -91,6 +101,10 @@ class LabelFrame:
         Pose of the sensor at the boxes' stamp; None if unknown.
     sweep : Sweep or None
         The cloud of that stamp in the sensor's frame, where points are asked for.
+    intensities : array, shape (M,), or None
+        Of its points, in the units of the sensor; None if it has none.
+    T_fixed_given : array, shape (4, 4), or None
+        Pose of the frame that the boxes came in; None if unknown.
 
     """
 
@@ -99,6 +113,8 @@ class LabelFrame:
     sensor_frame: str
     T_fixed_sensor: Floats | None = None
     sweep: Sweep | None = None
+    intensities: Floats | None = None
+    T_fixed_given: Floats | None = None
 
     def placed(self, frame: str, dropped: Counter[str]) -> tuple[Ints, Floats]:
         """
@@ -188,19 +204,23 @@ class Options:
         Calibration file, for the formats that look through a camera.
     swap_axes : bool
         Write extents where Datumaro and CVAT look for them, not where the format says.
+    recording : Recording or None
+        What the boxes are of, for the formats that write it again.
 
     """
 
     with_points: bool = False
     camera: Path | None = None
     swap_axes: bool = False
+    recording: Recording | None = None
 
 
 class LabelWriter(Protocol):
     """
     What ``Writer(folder, provenance, options)`` of every module in `FORMATS` offers.
 
-    `folder` exists, is empty and the writer's own (that of ``csv`` is the folder of results).
+    `folder` exists, is empty and the writer's own (that of `BESIDE_RESULTS` is the folder of
+    results).
 
     Attributes
     ----------
@@ -254,7 +274,7 @@ def writer_for(
 
     """
     module = module_of(name)
-    folder = out if name == 'csv' else out / name
+    folder = out if name in BESIDE_RESULTS else out / name
     folder.mkdir(exist_ok=True)
     writer: LabelWriter = module.Writer(folder, provenance, options or Options())
     return writer

@@ -89,7 +89,9 @@ class Writer:
         if frame.T_fixed_sensor is not None:
             self._poses.add(given.stamp_ns, *_pose(frame.T_fixed_sensor))
         if frame.sweep is not None:
-            _write_cloud(self._clouds / f'{given.stamp_ns}.feather', frame.sweep.points)
+            _write_cloud(
+                self._clouds / f'{given.stamp_ns}.feather', frame.sweep.points, frame.intensities
+            )
         self._origin |= {'fixed_frame': frame.fixed_frame, 'sensor_frame': frame.sensor_frame}
 
     def close(self) -> None:
@@ -142,7 +144,7 @@ def _xyz_xyzw(row: dict[str, float]) -> Floats:
     return np.array([row[name] for name in names])
 
 
-def _write_cloud(path: Path, points: np.ndarray) -> None:
+def _write_cloud(path: Path, points: np.ndarray, intensities: Floats | None) -> None:
     """Write a sweep as the data set has it; what a cloud does not tell is 0."""
     import pyarrow
     from pyarrow import feather
@@ -150,4 +152,6 @@ def _write_cloud(path: Path, points: np.ndarray) -> None:
     n = len(points)
     columns = dict(zip('xyz', points.T.astype(np.float32), strict=True))
     zeros = {name: np.zeros(n, kind) for name, kind in POINT.items()}
+    if intensities is not None:
+        zeros['intensity'] = intensities.clip(0, 255).astype(np.uint8)
     feather.write_feather(pyarrow.table(columns | zeros), path)

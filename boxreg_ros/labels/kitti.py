@@ -94,7 +94,9 @@ class Writer:
             )
             self._file.write(' '.join(f'{value:.6f}' for value in numbers) + '\n')
         if frame.sweep is not None:
-            write_cloud(self._clouds / f'{self._frames:06d}.bin', frame.sweep.points)
+            write_cloud(
+                self._clouds / f'{self._frames:06d}.bin', frame.sweep.points, frame.intensities
+            )
         self._timeline.add(frame)
         self._frames += 1
 

@@ -107,7 +107,7 @@ class Writer:
             'translation': T[:3, 3].tolist(),
         })  # fmt: skip
         if frame.sweep is not None:
-            write_cloud(self._folder / file, frame.sweep.points)
+            write_cloud(self._folder / file, frame.sweep.points, frame.intensities)
         self._annotate(frame, sample, rows.tolist(), boxes)
 
     def close(self) -> None:

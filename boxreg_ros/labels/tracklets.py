@@ -48,8 +48,8 @@ FORMAT = Format(
 )
 FILE = 'tracklet_labels.xml'
 POSE = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz')
-EXTENTS = {False: ('l', 'w', 'h'), True: ('w', 'h', 'l')}
-"""Where length, width and height are written, as KITTI has it and with axes swapped."""
+EXTENTS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
+"""Where length, width and height are written, as KITTI has it and as Datumaro reads it."""
 SWAPPED, TRACK = 'axes swapped', 'track '
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
@@ -67,8 +67,10 @@ CLASS_IDS = tuple(
 """What boost wants to read at the first of each kind: tracklet, poses, pose."""
 TAIL = '</tracklets>\n</boost_serialization>\n'
 INTERPOLATED_STATE, LABELLED_STATE = 1, 2
+UNKNOWN_TRUNCATION = {False: '99', True: '-1'}
+"""What stands for unknown in files of KITTI, and what Datumaro takes for it."""
 FLAGS = """\
-<occlusion>-1</occlusion><occlusion_kf>0</occlusion_kf><truncation>99</truncation>\
+<occlusion>-1</occlusion><occlusion_kf>0</occlusion_kf><truncation>{unknown}</truncation>\
 <amt_occlusion>-1</amt_occlusion><amt_occlusion_kf>-1</amt_occlusion_kf>\
 <amt_border_l>-1</amt_border_l><amt_border_r>-1</amt_border_r><amt_border_kf>-1</amt_border_kf>"""
 
@@ -121,7 +123,9 @@ class Writer:
             self._write(run)
         self._runs = runs
         if frame.sweep is not None:
-            write_cloud(self._clouds / f'{self._frames:010d}.bin', frame.sweep.points)
+            write_cloud(
+                self._clouds / f'{self._frames:010d}.bin', frame.sweep.points, frame.intensities
+            )
         self._timeline.add(frame)
         self._frames += 1
 
@@ -144,6 +148,7 @@ class Writer:
         down = 0.0 if self._swap else -extent[2] / 2
         poses = np.hstack([_shifted(boxes, down), boxes[:, ROLL : YAW + 1]])
         names = ' '.join(run.class_name.split()) or 'Misc'
+        flags = FLAGS.format(unknown=UNKNOWN_TRUNCATION[self._swap])
         item, poses_item, pose_item = CLASS_IDS if self._count == 0 else ('', '', '')
         lines = [
             f'<item{item}>',
@@ -156,7 +161,7 @@ class Writer:
         ]
         for pose, state in zip(poses.tolist(), run.states, strict=True):
             values = ''.join(f'<{k}>{v!r}</{k}>' for k, v in zip(POSE, pose, strict=True))
-            lines.append(f'<item{pose_item}>{values}<state>{state}</state>{FLAGS}</item>')
+            lines.append(f'<item{pose_item}>{values}<state>{state}</state>{flags}</item>')
             pose_item = ''
         self._body.write('\n'.join([*lines, '</poses>\n<finished>1</finished>\n</item>\n']))
         self._count += 1

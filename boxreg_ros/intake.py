@@ -1,0 +1,79 @@
+"""What sweeps and boxes pass on their way to the registrar, live and offline alike."""
+
+from __future__ import annotations
+
+import argparse
+from typing import cast, TypeVar
+
+from boxreg_ros.config import Config
+from boxreg_ros.pose_check import PoseCheck
+from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
+from boxreg_ros.tracker import Tracker
+from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
+import numpy as np
+
+_T = TypeVar('_T', bound=Sweep | BoxArray)
+
+
+class Intake:
+    """Give boxes ids where wanted, and look whether boxes stand where their points are."""
+
+    def __init__(self, convention: Convention, config: Config) -> None:
+        self._check = PoseCheck(convention, config.tolerance)
+        self._tracker = Tracker(config.max_gap) if convention.associate else None
+
+    def take(self, item: _T) -> _T:
+        """Return a sweep or boxes, in the fixed frame, as the registrar is to have them."""
+        self._check.add(item)
+        if self._tracker is None or not isinstance(item, BoxArray):
+            return item
+        return cast(_T, self._tracker.identify(item))
+
+    @property
+    def finding(self) -> str:
+        """Return what is wrong with the poses and sizes; empty while nothing is known to be."""
+        return self._check.finding
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Return what a report says about the ids."""
+        if self._tracker is None:
+            return {'ids': 'of the input'}
+        return {'ids': 'by association', 'associated_tracks': self._tracker.count}
+
+
+def covariances_to_write(refined: RefinedBoxes) -> Floats:
+    """
+    Return covariances (n, 6, 6) for messages, NaN where the box is kept.
+
+    About a box that stays as it was, the detector knows more than we do.
+
+    """
+    is_kept = np.array([status == KEPT for status in refined.status], dtype=bool)
+    return np.where(is_kept[:, None, None], np.nan, refined.covariances)
+
+
+def add_convention_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how boxes are to be read; the node's parameters of these names."""
+    parser.add_argument(
+        '--pose-reference', metavar='POINT', default=STANDARD.pose_reference,
+        help=f'point of a box that its pose is at: {", ".join(REFERENCES)}, or X,Y,Z in parts of '
+        f'length, width and height (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--size-order', choices=SIZE_ORDERS, default=STANDARD.size_order,
+        help='what x, y and z of a size are (default: %(default)s, length, width, height)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--forward-axis', choices=FORWARD, default=STANDARD.forward_axis,
+        help='axis of a pose that points forward (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--associate', action='store_true',
+        help='give boxes ids by association, whatever ids they have',
+    )  # fmt: skip
+
+
+def convention_from(args: argparse.Namespace) -> Convention:
+    """Return what `add_convention_arguments` has read."""
+    return Convention(args.pose_reference, args.size_order, args.forward_axis, args.associate)

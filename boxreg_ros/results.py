@@ -1,0 +1,63 @@
+"""Folders of results: whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import shutil
+from typing import Any
+from uuid import uuid4
+
+from boxreg_ros.errors import RecordingError
+
+SUMMARY = 'summary.json'
+
+
+def earlier_summary(out: Path) -> dict[str, Any] | None:
+    """Return the summary of an earlier run in `out`; None if there is none."""
+    try:
+        summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return None
+    return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """
+    Yield a folder to fill that becomes `out` on success, and vanishes otherwise.
+
+    Raises
+    ------
+    RecordingError
+        If `out` exists and is not the result of an earlier run.
+
+    """
+    if out.exists() and earlier_summary(out) is None and not _is_empty(out):
+        raise RecordingError(
+            f'output {str(out)!r}: expected a new folder or an earlier result, got something '
+            f'else; choose another with -o'
+        )
+    out = out.resolve()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    unique = f'.{out.name}.{uuid4().hex[:8]}'
+    partial, earlier = out.with_name(f'{unique}.partial'), out.with_name(f'{unique}.earlier')
+    partial.mkdir()
+    try:
+        yield partial
+        if out.exists():
+            os.replace(out, earlier)
+        os.replace(partial, out)
+    except BaseException:
+        if earlier.exists():
+            os.replace(earlier, out)
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    shutil.rmtree(earlier, ignore_errors=True)
+
+
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and not any(folder.iterdir())

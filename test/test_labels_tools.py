@@ -1,0 +1,312 @@
+"""Labels for SUSTechPOINTS, Datumaro and CVAT, Supervisely and Xtreme1, and clouds beside them."""
+
+import json
+
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.labels import frames_of, LabelFrame, Options, Provenance, writer_for
+from boxreg_ros.labels.clouds import write_cloud
+from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
+from consumers import consumer
+import numpy as np
+import pytest
+
+TOOLS = ('sustechpoints', 'datumaro', 'supervisely', 'xtreme1')
+STAMP = 1_700_000_000_100_000_000
+NAME = '1700000000100000000'
+
+# A tilted box, off the origin, in a fixed frame that the sensor stands in at (10, 20, 1.5),
+# turned by a quarter turn to the left.
+TILTED = [1.5, -2.25, 0.1, 4.5, 1.8, 1.6, 0.1, -0.2, 2.5]
+T_ODOM_LIDAR = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 1.5], [0, 0, 0, 1]])
+# From the sensor, the centre less (10, 20, 1.5) is (-8.5, -22.25, -1.4), turned back by a quarter
+# turn, (x, y) to (y, -x):
+CENTER = [-22.25, 8.5, -1.4]
+# The turn about z leaves roll and pitch, and takes pi/2 from yaw: R = Rz(0.929204) Ry(-0.2)
+# Rx(0.1), of which by multiplying out
+#   R[0, 0] = cos y cos p                       = 0.598472 * 0.980067    =  0.586543
+#   R[0, 1] = cos y sin p sin r - sin y cos r   = -0.011870 - 0.797141   = -0.809012
+#   R[0, 2] = cos y sin p cos r + sin y sin r   = -0.118304 + 0.079981   = -0.038323
+#   R[1, 2] = sin y sin p cos r - cos y sin r   = -0.158367 - 0.059748   = -0.218115
+#   R[2, 2] = cos p cos r                       = 0.980067 * 0.995004    =  0.975170
+# and of R = Rx(a) Ry(b) Rz(c): sin b = R[0, 2], tan a = -R[1, 2] / R[2, 2],
+# tan c = -R[0, 1] / R[0, 0].
+ANGLES = [np.arctan2(0.218115, 0.975170), np.arcsin(-0.038323), np.arctan2(0.809012, 0.586543)]
+EXTENT = [4.5, 1.8, 1.6]
+
+
+def refined(stamp_ns, tracks, boxes=None, status=None, classes=None, frame_id='odom'):
+    n = len(tracks)
+    values = np.array([TILTED] * n if boxes is None else boxes, dtype=float).reshape(n, 9)
+    # A full symmetric matrix, all of its numbers different.
+    covariance = np.diag(np.arange(1.0, 7.0))
+    covariance[np.triu_indices(6, 1)] = np.arange(15) * 0.01
+    covariance = np.maximum(covariance, covariance.T)
+    status = status or ('refined',) * n
+    classes = classes or ('car',) * n
+    return RefinedBoxes(
+        BoxArray(stamp_ns, frame_id, tuple(tracks), classes, np.full(n, 0.75), values),
+        status,
+        tuple('no_points' if s == 'kept' else '' for s in status),
+        np.arange(n) + 7,
+        np.broadcast_to(covariance, (n, 6, 6)),
+    )
+
+
+def frame(*arguments, T=T_ODOM_LIDAR, sweep=None, intensities=None, **options):
+    boxes = refined(*arguments, **options)
+    return LabelFrame(boxes, 'odom', 'lidar', T, sweep, intensities)
+
+
+def write(name, folder, frames, **options):
+    provenance = Provenance(('drive.mcap',), 'cafe')
+    writer = writer_for(name, folder, provenance, Options(**options))
+    for item in frames:
+        writer.write(item)
+    writer.close()
+    return writer
+
+
+def content(path):
+    return json.loads(path.read_text())
+
+
+def vector(values):
+    return pytest.approx(dict(zip('xyz', values, strict=True)), abs=2e-6)
+
+
+CLOUD = Sweep(STAMP, 'lidar', np.array([[1.5, -2.0, 0.25], [3.0, 4.0, -1.0]], np.float32))
+BRIGHT = np.array([0.5, 200.0])
+
+
+# Golden values --------------------------------------------------------------------------------
+
+
+def test_sustechpoints_golden_values(tmp_path):
+    write('sustechpoints', tmp_path, [frame(STAMP, ['x7'], status=('kept',))])
+    (item,) = content(tmp_path / 'sustechpoints' / 'label' / f'{NAME}.json')
+    assert item['psr']['position'] == vector(CENTER)
+    assert item['psr']['rotation'] == vector(ANGLES)
+    assert item['psr']['scale'] == vector(EXTENT)
+    assert (item['obj_type'], item['obj_id'], item['annotator']) == ('car', 'x7', 'boxreg')
+    evidence = item['boxreg']
+    assert (evidence['status'], evidence['reason']) == ('kept', 'no_points')
+    assert (evidence['num_points'], evidence['score']) == (7, 0.75)
+    # The upper triangle, row by row: 1, then the five numbers right of it, then 2 ...
+    assert evidence['covariance'][:7] == [1.0, 0.0, 0.01, 0.02, 0.03, 0.04, 2.0]
+    about = content(tmp_path / 'sustechpoints' / 'desc.json')
+    assert (about['tool'], about['config_hash']) == ('boxreg_ros', 'cafe')
+
+
+def test_xtreme1_golden_values(tmp_path):
+    write('xtreme1', tmp_path, [frame(STAMP, ['x7'])])
+    (item,) = content(tmp_path / 'xtreme1' / 'scene_1' / 'result' / f'{NAME}.json')['objects']
+    contour = item['contour']
+    assert contour['center3D'] == vector(CENTER)
+    assert contour['rotation3D'] == vector(ANGLES)
+    assert contour['size3D'] == vector(EXTENT)
+    assert (item['type'], item['trackId'], item['trackName']) == ('3D_BOX', 'x7', 'x7')
+    assert (item['className'], item['modelConfidence'], contour['pointN']) == ('car', 0.75, 7)
+
+
+@pytest.mark.parametrize('swapped', [False, True])
+def test_datumaro_golden_values_in_datumaro(tmp_path, swapped):
+    frames = [frame(STAMP, ['x7'], sweep=CLOUD)]
+    write('datumaro', tmp_path, frames, with_points=True, swap_axes=swapped)
+    seen = consumer('datumaro', tmp_path / 'datumaro')
+    (item,) = seen['found']
+    # Datumaro itself rounds to two digits.
+    assert item['position'] == pytest.approx(CENTER, abs=0.0051)
+    assert item['rotation'] == pytest.approx(ANGLES, abs=0.0051)
+    assert item['scale'] == (EXTENT[::-1] if swapped else EXTENT)
+    assert (item['item'], item['frame'], item['label']) == (NAME, 0, 'car')
+    assert item['bytes'] > 24  # two points of three numbers, behind their header
+    attributes = item['attributes']
+    assert (attributes['track'], attributes['status']) == ('x7', 'refined')
+    assert attributes['track_id'] == 10**6
+    assert seen['infos']['config_hash'] == 'cafe'
+    (tracklet,) = seen['tracklets']
+    length, width, height = EXTENT
+    if swapped:  # what the option is for: KITTI's own meaning of the three
+        assert tracklet == {'h': height, 'w': width, 'l': length}
+    else:
+        assert tracklet == {'h': length, 'w': width, 'l': height}
+
+
+def test_supervisely_golden_values_in_supervisely(tmp_path):
+    frames = [
+        frame(STAMP + k * 10**8, ['x7', 'y'][:n], status=(status, 'kept')[:n], sweep=CLOUD)
+        for k, (n, status) in enumerate([(2, 'refined'), (1, 'refined'), (2, 'kept')])
+    ]
+    write('supervisely', tmp_path, frames, with_points=True)
+    seen = consumer('supervisely', tmp_path / 'supervisely')
+    assert (seen['type'], seen['frames'], len(seen['items'])) == ('point_cloud_episodes', 3, 3)
+    assert json.loads(seen['description'])['config_hash'] == 'cafe'
+    assert [figure['frame'] for figure in seen['figures']] == [0, 0, 1, 2, 2]
+    figure = seen['figures'][0]
+    assert (figure['cloud'], figure['class']) == (f'{NAME}.pcd', 'car')
+    assert figure['geometry']['position'] == vector(CENTER)
+    assert figure['geometry']['rotation'] == vector(ANGLES)
+    assert figure['geometry']['dimensions'] == vector(EXTENT)
+    assert figure['tags'] == [
+        ['track_id', 'x7', None], ['status', 'refined', [0, 1]], ['status', 'kept', [2, 2]],
+    ]  # fmt: skip
+    assert seen['figures'][1]['tags'] == [
+        ['track_id', 'y', None], ['status', 'kept', [0, 0]], ['status', 'kept', [2, 2]],
+    ]  # fmt: skip
+
+
+# What the tools without a library ask for ------------------------------------------------------
+
+
+def test_sustechpoints_scene_is_complete(tmp_path):
+    frames = [frame(STAMP, ['a']), frame(STAMP + 1, []), frame(STAMP + 1, ['a'])]
+    write('sustechpoints', tmp_path, frames, with_points=True)
+    scene = tmp_path / 'sustechpoints'
+    # Its server lists lidar/ as the frames, sorted, and pairs labels by name.
+    names = sorted(path.stem for path in (scene / 'lidar').iterdir())
+    assert names == [NAME, '1700000000100000001', '1700000000100000001_1']
+    assert sorted(path.stem for path in (scene / 'label').iterdir()) == names
+    assert content(scene / 'label' / f'{names[1]}.json') == []
+
+
+def test_xtreme1_upload_is_complete(tmp_path):
+    frames = [frame(STAMP, ['a', '', '']), frame(STAMP + 1, [])]
+    write('xtreme1', tmp_path, frames, with_points=True)
+    scene = tmp_path / 'xtreme1' / 'scene_1'
+    # Data are the files in folders lidar_point_cloud_<digit>; a result has a name of theirs, and
+    # at least one object, each with a type and a contour; the scene's name begins with 'scene'.
+    clouds = {path.stem for path in (scene / 'lidar_point_cloud_0').iterdir()}
+    results = {path.stem for path in (scene / 'result').iterdir()}
+    assert len(clouds) == 2
+    assert results == {NAME}
+    objects = content(scene / 'result' / f'{NAME}.json')['objects']
+    assert all(item['type'] == '3D_BOX' and item['contour'] for item in objects)
+    assert len({item['trackId'] for item in objects}) == 3  # nameless boxes are not one object
+
+
+# Round trips ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('name', TOOLS)
+@pytest.mark.parametrize('with_points', [False, True])
+def test_read_back_as_it_was(tmp_path, name, with_points):
+    boxes = [TILTED, [100.0, 50, 2, 12, 2.5, 3.5, 0, 0, -3], [0, 0, 0, 1, 1, 1, -0.3, 0.4, 1]]
+    given = [
+        frame(STAMP, ['7', 'b', ''], boxes=boxes, status=('refined', 'kept', 'interpolated')),
+        frame(STAMP + 10**8, []),
+        frame(STAMP + 2 * 10**8, ['b'], classes=('truck',)),
+    ]
+    write(name, tmp_path, given, with_points=with_points)
+    back = list(frames_of(name, tmp_path / name))
+    assert len(back) == 3
+    for before, after in zip(given, back, strict=True):
+        one, two = before.refined, after.refined
+        assert two.boxes.stamp_ns == one.boxes.stamp_ns
+        assert (after.fixed_frame, after.sensor_frame) == ('odom', 'lidar')
+        assert two.boxes.frame_id == 'odom'
+        np.testing.assert_array_equal(after.T_fixed_sensor, T_ODOM_LIDAR)
+        np.testing.assert_allclose(two.boxes.boxes, one.boxes.boxes, atol=1e-9)
+        assert two.boxes.track_ids == one.boxes.track_ids
+        assert two.boxes.class_names == one.boxes.class_names
+        assert (two.status, two.reasons) == (one.status, one.reasons)
+        np.testing.assert_array_equal(two.num_points, one.num_points)
+        np.testing.assert_array_equal(two.boxes.scores, one.boxes.scores)
+        np.testing.assert_array_equal(two.covariances, one.covariances)
+
+
+def test_swapped_axes_are_swapped_back(tmp_path):
+    write('datumaro', tmp_path, [frame(STAMP, ['a'])], swap_axes=True)
+    (back,) = frames_of('datumaro', tmp_path / 'datumaro')
+    np.testing.assert_allclose(back.refined.boxes.boxes, [TILTED], atol=1e-9)
+
+
+@pytest.mark.parametrize('name', TOOLS)
+def test_scores_that_are_no_numbers(tmp_path, name):
+    given = frame(STAMP, ['a'])
+    given.refined.boxes.scores[0] = np.nan
+    write(name, tmp_path, [given])
+    (back,) = frames_of(name, tmp_path / name)
+    assert np.isnan(back.refined.boxes.scores[0])
+
+
+def test_a_scene_of_the_tool_itself(tmp_path):
+    (tmp_path / 'label').mkdir()
+    psr = {'position': {'x': 1, 'y': 2, 'z': 3}, 'scale': {'x': 4, 'y': 2, 'z': 1.5}}
+    psr['rotation'] = {'x': 0, 'y': 0, 'z': 0.5}
+    items = [{'psr': psr, 'obj_type': 'Car', 'obj_id': '3', 'obj_attr': ''}]
+    for number in (950, 965):
+        (tmp_path / 'label' / f'{number:06d}.json').write_text(json.dumps(items))
+    with pytest.raises(RecordingError, match=r'timestamps.txt.*one stamp per frame'):
+        list(frames_of('sustechpoints', tmp_path))
+    (tmp_path / 'timestamps.txt').write_text('100\n200\n')
+    first, second = frames_of('sustechpoints', tmp_path)
+    assert (first.refined.boxes.stamp_ns, second.refined.boxes.stamp_ns) == (100, 200)
+    np.testing.assert_allclose(first.refined.boxes.boxes, [[1, 2, 3, 4, 2, 1.5, 0, 0, 0.5]])
+    assert first.refined.status == ('input',)
+    (tmp_path / 'timestamps.txt').write_text('100\n200\n300\n')
+    with pytest.raises(RecordingError, match=r'one stamp for each of 2 frames, got 3'):
+        list(frames_of('sustechpoints', tmp_path))
+    (tmp_path / 'timestamps.txt').write_text('100\n')
+    with pytest.raises(RecordingError, match=r'expected a stamp for 2 frames, got 1'):
+        list(frames_of('sustechpoints', tmp_path))
+
+
+@pytest.mark.parametrize(
+    ('name', 'file'),
+    [
+        ('sustechpoints', f'label/{NAME}.json'),
+        ('datumaro', 'annotations/default.json'),
+        ('supervisely', 'episode/annotation.json'),
+        ('xtreme1', f'scene_1/result/{NAME}.json'),
+    ],
+)
+def test_foreign_json_is_refused(tmp_path, name, file):
+    write(name, tmp_path, [frame(STAMP, ['a'])])
+    (tmp_path / name / file).write_text('[{"a": 1}]')
+    with pytest.raises(RecordingError, match='expected'):
+        list(frames_of(name, tmp_path / name))
+
+
+# Clouds ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('ending', ['.pcd', '.ply'])
+@pytest.mark.parametrize('intensities', [None, BRIGHT])
+def test_clouds_in_the_libraries_of_others(tmp_path, ending, intensities):
+    path = tmp_path / f'cloud{ending}'
+    write_cloud(path, CLOUD.points, intensities)
+    seen = consumer('cloud', path)
+    rows = CLOUD.points.tolist()
+    if intensities is not None:
+        rows = [[*row, value] for row, value in zip(rows, intensities, strict=True)]
+    assert seen == {'fields': ['x', 'y', 'z', 'intensity'][: len(rows[0])], 'rows': rows}
+
+
+def test_bin_files_have_four_numbers_or_five(tmp_path):
+    write_cloud(tmp_path / 'kitti.bin', CLOUD.points, BRIGHT)
+    write_cloud(tmp_path / 'nuscenes.pcd.bin', CLOUD.points)
+    kitti = np.fromfile(tmp_path / 'kitti.bin', '<f4').reshape(-1, 4)
+    np.testing.assert_array_equal(kitti, np.column_stack([CLOUD.points, BRIGHT]))
+    nuscenes = np.fromfile(tmp_path / 'nuscenes.pcd.bin', '<f4').reshape(-1, 5)
+    np.testing.assert_array_equal(nuscenes, np.pad(CLOUD.points, ((0, 0), (0, 2))))
+
+
+def test_an_empty_cloud_is_a_file(tmp_path):
+    write_cloud(tmp_path / 'cloud.pcd', np.zeros((0, 3)))
+    assert consumer('cloud', tmp_path / 'cloud.pcd')['rows'] == []
+
+
+def test_other_clouds_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"'cloud.las': expected a name in .pcd, .ply"):
+        write_cloud(tmp_path / 'cloud.las', CLOUD.points)
+
+
+def test_intensities_come_along_in_other_formats(tmp_path):
+    feather = pytest.importorskip('pyarrow.feather')
+    item = frame(STAMP, ['a'], sweep=CLOUD, intensities=np.array([0.5, 900.0]))
+    write('tracklets', tmp_path, [item], with_points=True)
+    (file,) = (tmp_path / 'tracklets').rglob('*.bin')
+    np.testing.assert_array_equal(np.fromfile(file, '<f4')[3::4], [0.5, 900.0])
+    write('argoverse2', tmp_path, [item], with_points=True)
+    (file,) = (tmp_path / 'argoverse2').rglob(f'lidar/{STAMP}.feather')
+    assert feather.read_table(file)['intensity'].to_pylist() == [0, 255]  # whole, in one byte
