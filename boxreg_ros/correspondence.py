@@ -1,6 +1,6 @@
 """Which points tell where a face is: the outermost ones on each, as their moments."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
 from boxreg_ros.objective import EXTENT, GAP, Problem, State
@@ -14,6 +14,7 @@ BESIDE = 0.2  # outside the edges of a face, points still count for it [m]
 INSIDE = 0.3  # more room on the inner side of a face than on its outer side [m]
 VEILED = 0.25  # say of a face that is hidden behind its edge
 TURN = 0.25  # how fast a face is lost when it turns away; its edges are rounder at the ends
+FAR = 1e9
 LEAD = (0.0, 0.0, 0.2, 0.2, 0.0, 0.0)
 
 
@@ -54,8 +55,8 @@ def aspect(problem: Problem) -> Tensor:
 
     """
     R = rotation_from_rpy(problem.pose[..., 3:])
-    weight = problem.mask.to(problem.points)[..., None]
-    mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
+    weight = problem.mask.to(problem.points)[..., None, :]
+    mean = (weight @ problem.points)[..., 0, :] / weight.sum(-1).clamp(min=1)
     known = problem.origins.isfinite().all(-1, keepdim=True)
     toward = (torch.where(known, problem.origins, 1e6 * mean)[..., None, :] @ R)[..., 0, :]
     outward = toward[..., [0, 0, 1, 1]] * FACE_SIGN[:4].to(R)
@@ -108,39 +109,53 @@ def support(
     What moves is measured at its own time: points are carried along to the stamp of the box.
 
     """
-    shift = state.pose[..., :3] - problem.pose[..., :3]
-    points = problem.points
+    points, openness = problem.points, aspect(problem)
     if bool(problem.delays.any()):
-        points = (
-            points - _velocity(problem, state)[..., None, :].to(points) * problem.delays[..., None]
-        )
-    R = rotation_from_rpy(state.pose[..., 3:]).to(points)
-    local = ((points - shift[..., None, :].to(points)) @ R).mT  # (B, N, 3, M)
+        carried = _velocity(problem, state)[..., None, :].to(points) * problem.delays[..., None]
+        points = points - carried
     half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]
-    beyond = torch.where(problem.mask[..., None, :], local.abs() - half, torch.inf)
-    count = (beyond.amax(-2) < margin).sum(-1)
-    far = beyond[..., [1, 0, 0], :].maximum(beyond[..., [2, 2, 1], :]) >= BESIDE
-    inset = retreat(aspect(problem), depths)
+    inset = retreat(openness, depths)
     offset = (state.shared[:, None, GAP] + inset).to(points)[..., None] - half[..., FACE_AXIS, :]
-    out = local[..., FACE_AXIS, :] * FACE_SIGN.to(points)[:, None] + offset
-    out.masked_fill_(
-        far[..., FACE_AXIS, :] | (out > margin) | (out < -margin - INSIDE), -torch.inf
-    )
-    most = min(out.shape[-1], max(LEAST, int(outermost * out.shape[-1]) + 1))
-    height, index = out.topk(most)  # (B, N, 6, K)
+    # Masks cost five times as much as sums: what does not count is made to lie very far inside.
+    local = in_box_axes(points, problem, state.pose)
+    beyond = local.abs() - half + FAR * (~problem.mask[..., None, :]).to(points)
+    x, y, z = beyond.unbind(-2)
+    count = (x.maximum(y).maximum(z) < margin).sum(-1)
+    aside = torch.stack([y.maximum(z), x.maximum(z), x.maximum(y)], -2) - BESIDE
+    depth = torch.empty_like(points.mT).repeat(1, 1, 2, 1)[..., :BOTTOM, :]
+    for k, sign in enumerate((-1.0, 1.0)):  # front left top, back right
+        far = aside[..., : 3 - k, :]
+        inside = sign * local[..., : 3 - k, :] - offset[..., k:BOTTOM:2, :]
+        depth[..., k::2, :] = inside.maximum(far.maximum(-margin - inside) * FAR)
+    most = min(depth.shape[-1], max(LEAST, int(outermost * depth.shape[-1]) + 1))
+    depth, index = depth.topk(most, largest=False)  # (B, N, 5, K)
     wanted = (outermost * count).clamp(min=LEAST)[..., None, None]
-    chosen = height.isfinite() & (torch.arange(most, device=out.device) < wanted)
+    chosen = (depth <= margin + INSIDE) & (torch.arange(most, device=depth.device) < wanted)
     number = chosen.sum(-1)
     share = chosen / number.clamp(min=1)[..., None].to(points)
-    flat = torch.arange(count.numel(), device=out.device).view_as(count)[..., None, None]
-    best = points.flatten(0, 2)[index + flat * out.shape[-1]]
+    best = torch.take_along_dim(points[:, :, None], index[..., None], 3)
     best = torch.cat([best, torch.ones_like(best[..., :1])], -1)
     moments = (best * share[..., None]).mT @ best
-    outwardness = (torch.where(chosen, height, 0.0) * share).sum(-1)
-    trust = (number >= LEAST) * torch.where(aspect(problem) > 0, 1.0, VEILED)
-    moments, outwardness, trust = moments.to(shift), outwardness.to(shift), trust.to(shift)
-    sights = Support(moments, outwardness, trust, inset, count.to(shift))
-    return _with_road(problem, state, sights)
+    out = -(torch.where(chosen, depth, 0.0) * share).sum(-1)
+    trust = (number >= LEAST) * torch.where(openness[..., :BOTTOM] > 0, 1.0, VEILED)
+    # The bottom is where a point of the road is, under the centre of the box.
+    shift = state.pose[..., :3] - problem.pose[..., :3]
+    known, road = problem.ground.isfinite() & problem.valid, torch.nan_to_num(problem.ground)
+    point = torch.stack([shift[..., 0], shift[..., 1], road, torch.ones_like(road)], -1)
+    height, gap = state.shared[:, None, 2], state.shared[:, None, GAP][..., BOTTOM]
+    bottom = point[..., None] * point[..., None, :], shift[..., 2] - road - height / 2 + gap, known
+    found: Any = (
+        torch.cat([five.to(road), one[:, :, None].to(road)], 2)
+        for five, one in zip((moments, out, trust), bottom, strict=True)
+    )
+    inset[..., BOTTOM] = 0.0
+    return Support(*[*found, inset, count.to(road)])
+
+
+def in_box_axes(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:
+    """Return `points` (B, N, M, 3) of `problem` in boxes at `pose` (B, N, 6), (B, N, 3, M)."""
+    shift = (pose[..., :3] - problem.pose[..., :3]).to(points)
+    return rotation_from_rpy(pose[..., 3:]).to(points).mT @ (points - shift[..., None, :]).mT
 
 
 def _velocity(problem: Problem, state: State) -> Tensor:
@@ -149,17 +164,3 @@ def _velocity(problem: Problem, state: State) -> Tensor:
     steps = where.diff(dim=1) * problem.valid[:, 1:, None]
     change = pad(steps, (0, 0, 1, 0)) + pad(steps, (0, 0, 0, 1))
     return change[..., :3] / change[..., 3:].clamp(min=1e-9)  # a single observation rests
-
-
-def _with_road(problem: Problem, state: State, support: Support) -> Support:
-    """Let a point of the road under the centre of the box stand for its bottom face."""
-    known = problem.ground.isfinite() & problem.valid
-    road = torch.nan_to_num(problem.ground)
-    shift = state.pose[..., :3] - problem.pose[..., :3]
-    point = torch.stack([shift[..., 0], shift[..., 1], road, torch.ones_like(road)], -1)
-    support.moments[..., BOTTOM, :, :] = point[..., :, None] * point[..., None, :]
-    height, gap = state.shared[:, None, 2], state.shared[:, None, GAP][..., BOTTOM]
-    support.outwardness[..., BOTTOM] = shift[..., 2] - road - height / 2 + gap
-    support.trust[..., BOTTOM] = known.to(road)
-    support.retreat[..., BOTTOM] = 0.0
-    return support

@@ -8,7 +8,7 @@ behaves as if it were alone: a hard or broken one neither slows nor spoils its n
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,9 +16,11 @@ from torch import Tensor
 SUFFICIENT = 1e-4  # part of the promised decrease that a step must bring (Armijo)
 CURVATURE = 1e-10  # a pair with s.y below this part of |s||y| is not remembered
 BACKTRACKS = 12
+PATIENCE = 4  # turns between questions to a device that must be waited for
 
 Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Metric = Callable[[Tensor, Tensor], Tensor]
+Pair = tuple[Tensor, Tensor, Tensor]  # step, change of the gradient, 1 / their product
 
 
 class Status(IntEnum):
@@ -82,62 +84,64 @@ def minimize(
     Notes
     -----
     Two-loop recursion, then backtracking from a full step by quadratic interpolation until the
-    Armijo condition holds. Ended rows leave the batch as soon as they are half of it.
+    Armijo condition holds. Every turn asks for one point per row: a row that accepts it goes on
+    from there while its neighbour still shortens its step. Ended rows leave the batch as soon as
+    they are half of it. A device that must be waited for is asked only every few turns.
 
     """
     rows = torch.arange(len(start), device=start.device)
     value, gradient = function(start, rows)
     finite = value.isfinite() & gradient.isfinite().all(1)
-    best = Minimum(
-        start.clone(), value.clone(), torch.where(finite, 0, Status.FAILED), torch.zeros_like(rows)
-    )
-    x, gradient = start.clone(), torch.where(finite[:, None], gradient, 0.0)
-    pairs: list[tuple[Tensor, Tensor, Tensor]] = []
-    for iteration in range(iterations):
-        running = best.status[rows] == Status.RUNNING
-        count = int(running.sum())
-        if count == 0:
-            break
-        if count <= len(rows) // 2:
-            rows, x, value, gradient = (t[running] for t in (rows, x, value, gradient))
-            pairs = [(s[running], y[running], r[running]) for s, y, r in pairs]
-            running = running[running]
-        direction = -_two_loop(gradient, pairs, rows, metric)
-        slope = (gradient * direction).sum(1)
-        uphill = ~(slope < 0)
-        direction = torch.where(uphill[:, None], -gradient, direction)
-        slope = torch.where(uphill, -gradient.square().sum(1), slope)
+    status = torch.where(finite, 0, int(Status.FAILED))
+    best = Minimum(start.clone(), value.clone(), status, torch.zeros_like(rows))
+    moved, tries, step, slope = finite, torch.zeros_like(rows), value, value
+    x, direction, gradient = start, start, torch.where(finite[:, None], gradient, 0.0)
+    pairs: list[Pair] = []
+    for turn in range(iterations * BACKTRACKS):
+        taken = best.iterations[rows]
+        running = (best.status[rows] == Status.RUNNING) & ((taken < iterations) | ~moved)
+        if turn % (1 if rows.is_cpu else PATIENCE) == 0:
+            if not (count := int(running.sum())):
+                break
+            if count <= len(rows) // 2:
+                state = (rows, x, value, gradient, direction, slope, step, moved, tries, pairs)
+                state = select(state, running.nonzero()[:, 0])
+                rows, x, value, gradient, direction, slope, step, moved, tries, pairs = state
+                running = running[running]
+        # Rows that have moved need a new direction.
+        fresh, along = running & moved, -_two_loop(gradient, pairs, rows, metric)
+        promise = (gradient * along).sum(1)
+        uphill = ~(promise < 0)
+        along = torch.where(uphill[:, None], -gradient, along)
+        promise = torch.where(uphill, -gradient.square().sum(1), promise)
         if metric is None and not pairs:  # nothing known of the scale yet
             size = gradient.abs().sum(1).clamp(min=1.0)
-            direction, slope = direction / size[:, None], slope / size
-        converged = running & (-slope <= tolerance * (1 + value.abs()))
-        best.status[rows[converged]] = int(Status.CONVERGED)
-        running &= ~converged
-        step, fresh_value, fresh_gradient = _search(
-            function, x, value, direction, slope, gradient, rows, running
-        )
-        moved = running & (step > 0)
-        best.status[rows[running & ~moved]] = int(Status.STUCK)
-        best.iterations[rows[running]] = iteration + 1
-        change = torch.where(moved, step, 0.0)[:, None] * direction
-        x = x + change
-        bend = torch.where(moved[:, None], fresh_gradient - gradient, 0.0)
+            along, promise = along / size[:, None], promise / size
+        converged = fresh & (-promise <= tolerance * (1 + value.abs()))
+        best.status[rows] += int(Status.CONVERGED) * converged
+        running, fresh = running & ~converged, fresh & ~converged
+        best.iterations[rows] += fresh
+        direction = torch.where(fresh[:, None], along, direction)
+        slope, step = torch.where(fresh, promise, slope), torch.where(fresh, 1.0, step)
+        tries = torch.where(fresh, 0, tries) + 1
+        # One trial.
+        trial, bent = function(x + step[:, None] * direction, rows)
+        good = running & bent.isfinite().all(1) & (trial <= value + SUFFICIENT * step * slope)
+        best.status[rows] += int(Status.STUCK) * (running & ~good & (tries == BACKTRACKS))
+        change = torch.where(good, step, 0.0)[:, None] * direction
+        bend = torch.where(good[:, None], bent - gradient, 0.0)
         product = (change * bend).sum(1)
         useful = product > CURVATURE * change.norm(dim=1) * bend.norm(dim=1)
-        pairs.append((change, bend, torch.where(useful, 1 / product, 0.0)))
-        pairs = pairs[-history:]
-        value = torch.where(moved, fresh_value, value)
-        gradient = torch.where(moved[:, None], fresh_gradient, gradient)
+        pairs = [*pairs, (change, bend, torch.where(useful, 1 / product, 0.0))][-history:]
+        parabola = -slope * step.square() / (2 * (trial - value - slope * step))
+        step = torch.where(parabola.isfinite(), parabola, 0.1 * step).clamp(0.1 * step, 0.5 * step)
+        x, gradient, value = x + change, gradient + bend, torch.where(good, trial, value)
+        moved = good | (moved & ~running)
         best.x[rows], best.value[rows] = x, value  # Armijo: never above the one before
     return best
 
 
-def _two_loop(
-    gradient: Tensor,
-    pairs: list[tuple[Tensor, Tensor, Tensor]],
-    rows: Tensor,
-    metric: Metric | None,
-) -> Tensor:
+def _two_loop(gradient: Tensor, pairs: list[Pair], rows: Tensor, metric: Metric | None) -> Tensor:
     """Return the inverse Hessian approximated by `pairs`, times `gradient`."""
     q = gradient
     alphas = []
@@ -156,34 +160,13 @@ def _two_loop(
     return q
 
 
-def _search(
-    function: Function,
-    x: Tensor,
-    value: Tensor,
-    direction: Tensor,
-    slope: Tensor,
-    gradient: Tensor,
-    rows: Tensor,
-    running: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the step accepted by each row (0: none), and value and gradient there."""
-    step = torch.ones_like(value)
-    accepted = ~running
-    taken, new_value, new_gradient = torch.zeros_like(value), value, gradient
-    for _ in range(BACKTRACKS):
-        trial, trial_gradient = function(x + step[:, None] * direction, rows)
-        good = (
-            ~accepted
-            & (trial <= value + SUFFICIENT * step * slope)
-            & trial_gradient.isfinite().all(1)
-        )
-        taken = torch.where(good, step, taken)
-        new_value = torch.where(good, trial, new_value)
-        new_gradient = torch.where(good[:, None], trial_gradient, new_gradient)
-        accepted = accepted | good
-        if bool(accepted.all()):
-            break
-        parabola = -slope * step.square() / (2 * (trial - value - slope * step))
-        shorter = torch.where(parabola.isfinite(), parabola, 0.1 * step)
-        step = torch.where(accepted, step, shorter.clamp(0.1 * step, 0.5 * step))
-    return taken, new_value, new_gradient
+def select(part: Any, rows: Tensor) -> Any:
+    """Return `rows`, ascending, of tensors (B, ...) in tuples, lists and dicts; all: no copy."""
+    if isinstance(part, Tensor):
+        return part[rows] if len(rows) < len(part) else part
+    if isinstance(part, dict):
+        return {name: select(inner, rows) for name, inner in part.items()}
+    if isinstance(part, tuple | list):
+        parts = [select(inner, rows) for inner in part]
+        return type(part)(*parts) if hasattr(part, '_fields') else type(part)(parts)
+    return part

@@ -7,19 +7,20 @@ W, adding r' W r / 2; W holds the expected deviations and the robust weights of 
 
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
+from boxreg_ros.chain import Chain, Factor
 from boxreg_ros.config import PaperConfig
 from boxreg_ros.geometry import (
     FACE_AXIS,
     face_distances,
-    FACE_SIGN,
     rotation_derivatives,
     rotation_from_rpy,
     wrap_angle,
 )
+from boxreg_ros.lbfgs import select
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor
@@ -73,9 +74,7 @@ class Problem:
 
     def select(self, rows: Tensor) -> 'Problem':
         """Return the windows `rows` alone."""
-        parts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'deviations'}
-        chosen = {name: value[rows] for name, value in parts.items()}
-        return Problem(**chosen, deviations={k: v[rows] for k, v in self.deviations.items()})
+        return Problem(*(select(getattr(self, f.name), rows) for f in fields(self)))
 
 
 # --- the paper ----------------------------------------------------------------------------------
@@ -236,172 +235,182 @@ class Linearised(NamedTuple):
     """
     A term at one state: n stencils of k observations in a row, F groups of R residuals each.
 
-    `residual` is (B, n, F, R), its derivative `by_pose` (B, n, F, R, k, 6) and `by_shared`
-    (B, n, F, R, 16) or None.
+    `residual` is (B, n, F, R), its derivative `by_pose` (B, n, F, R, 6 k) and `by_shared`
+    (B, n, F, R, 16), or (F, R, 16) where that is the same for all.
 
     """
 
     residual: Tensor
     by_pose: Tensor
-    by_shared: Tensor | None
+    by_shared: Tensor
 
 
 class Term(NamedTuple):
-    """A residual function of problem, state and data (B, ...), and its weight (B, n, F, R, R)."""
+    """A residual function of state and data (B, ...), and its weight (B, n, F, R, R)."""
 
     function: Callable[..., Linearised]
-    problem: Problem
     weight: Tensor
-    data: Tensor | None = None
+    data: tuple[Tensor, ...] = ()
 
     def linearise(self, state: State) -> Linearised:
         """Return residual and derivatives at `state`."""
-        return self.function(self.problem, state, self.data)
-
-    def select(self, rows: Tensor) -> 'Term':
-        """Return the term of the windows `rows` alone."""
-        data = None if self.data is None else self.data[rows]
-        return Term(self.function, self.problem.select(rows), self.weight[rows], data)
+        return self.function(state, *self.data)
 
 
-def value_and_gradient(terms: list[Term], x: Tensor, length: int) -> tuple[Tensor, Tensor]:
-    """Return the sum of r' W r / 2 over all terms, shape (B,), and its gradient (B, D)."""
+def value_and_gradient(
+    terms: Sequence[Term], x: Tensor, length: int, curvature: Chain | None = None
+) -> tuple[Tensor, Tensor]:
+    """
+    Return the sum of r' W r / 2 over all terms, shape (B,), and its gradient (B, D).
+
+    Their Gauss-Newton matrices J' W J are added to `curvature`.
+
+    """
     state = State.unpack(x, length)
-    value = x.new_zeros(len(x))
-    gradient = torch.zeros_like(x)
+    value, gradient = x.new_zeros(len(x)), torch.zeros_like(x)
     by_pose, by_shared = State.unpack(gradient, length)  # views
     for term in terms:
         r, J, J_shared = term.linearise(state)
         pull = (term.weight @ r[..., None])[..., 0]
         value += 0.5 * (r * pull).flatten(1).sum(1)
-        moved = torch.einsum('bnfr,bnfrkp->bnkp', pull, J)
-        for k in range(J.shape[-2]):
-            by_pose[:, k : k + J.shape[1]] += moved[:, :, k]
-        if J_shared is not None:
-            by_shared += torch.einsum('bnfr,bnfrs->bs', pull, J_shared)
+        n, flat = r.shape[1], pull.flatten(2)[:, :, None]
+        moved = (flat @ J.flatten(2, 3))[:, :, 0].unflatten(2, (-1, 6))
+        for k in range(moved.shape[2]):
+            by_pose[:, k : k + n] += moved[:, :, k]
+        by_shared += (flat @ J_shared.flatten(-3, -2)).sum((1, 2))
+        if curvature is not None:
+            W = r.new_zeros(*r.shape, *r.shape[2:])  # one product of full size beats F small ones
+            W.diagonal(dim1=2, dim2=4).copy_(term.weight.permute(0, 1, 3, 4, 2))
+            J = torch.cat([J, J_shared.expand(*r.shape, SHARED)], -1).flatten(2, 3)
+            curvature.add(J.mT @ (W.flatten(4, 5).flatten(2, 3) @ J), moved.shape[2])
     return value, gradient
 
 
-def curvature(terms: list[Term], x: Tensor, length: int) -> Tensor:
-    """Return the Gauss-Newton matrix, the sum of J' W J over all terms, shape (B, D, D)."""
-    state = State.unpack(x, length)
-    H = x.new_zeros((len(x), x.shape[1], x.shape[1]))
-    pose = 6 * length
-    blocks = H[:, :pose, :pose].unflatten(1, (length, 6)).unflatten(3, (length, 6))
-    border = H[:, :pose, pose:].unflatten(1, (length, 6))
-    for term in terms:
-        _, J, J_shared = term.linearise(state)
-        n, span = J.shape[1], J.shape[-2]
-        flat = J.flatten(-2)
-        WJ = term.weight @ flat
-        local = torch.einsum('bnfra,bnfrc->nbac', flat, WJ)
-        rows = torch.arange(n)
-        for a in range(span):
-            for c in range(span):
-                part = local[:, :, 6 * a : 6 * a + 6, 6 * c : 6 * c + 6]
-                blocks[:, rows + a, :, rows + c, :] += part
-        if J_shared is not None:
-            across = torch.einsum('bnfra,bnfrs->bnas', WJ, J_shared)
-            for a in range(span):
-                border[:, a : a + n] += across[:, :, 6 * a : 6 * a + 6]
-            H[:, pose:, pose:] += torch.einsum(
-                'bnfrs,bnfrt->bst', J_shared, term.weight @ J_shared
-            )
-    H[:, pose:, :pose] = H[:, :pose, pose:].mT
-    return H
+class Sum:
+    """
+    The sum of terms, for a search in one round.
+
+    Parameters
+    ----------
+    terms : sequence of Term
+        Those that are linear in the variables are summed up to one quadratic form.
+    start, free : Tensor, shape (B, D)
+        Where the search starts, and 1 for the variables it may change.
+    length : int
+        N.
+
+    Attributes
+    ----------
+    factor : Factor
+        Of the curvature where the search starts.
+
+    """
+
+    def __init__(self, terms: Sequence[Term], start: Tensor, length: int, free: Tensor) -> None:
+        linear = [term for term in terms if term.function in LINEAR]
+        self._terms = [term for term in terms if term.function not in LINEAR]
+        self._length, self._form = length, Chain.zeros(start, length)
+        value, gradient = value_and_gradient(linear, start, length, self._form)
+        self._start = start, value, gradient, free
+        whole = Chain(*(part.clone() for part in self._form))
+        bent = value_and_gradient(self._terms, start, length, whole)
+        self._first = value + bent[0], (gradient + bent[1]) * free
+        self.factor = whole.factorised(free)
+
+    def __call__(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`."""
+        if x is self._start[0]:
+            return self._first
+        parts = self._form, self._terms, *self._start
+        form, terms, start, value, gradient, free = select(parts, rows)
+        step = x - start
+        bend = form.times(step)
+        bent_value, bent_gradient = value_and_gradient(terms, x, self._length)
+        value = value + (step * (gradient + bend / 2)).sum(1) + bent_value
+        return value, (gradient + bend + bent_gradient) * free
+
+    def newton(self, vector: Tensor, rows: Tensor) -> Tensor:
+        """Return the inverse of the curvature where the search started times `vector` (b, D)."""
+        factor: Factor = select(self.factor, rows)
+        return factor.solve(vector)
 
 
-def faces(problem: Problem, state: State, inset: Tensor) -> Linearised:
+def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:
     """
     Planes of the six faces as 4-vectors v: v . (p, 1) is how far p stands out of the face [m].
 
-    With p relative to the centre of the input box, and the gap added: zero for points that
+    With p relative to the centre of the `given` pose, and the gap added: zero for points that
     stand the expected gap inside. The weight of this term is the points' second moment, so its
     cost does not grow with their number.
 
     """
     R, dR = rotation_derivatives(state.pose[..., 3:])
-    shift = state.pose[..., :3] - problem.pose[..., :3]
-    sign = FACE_SIGN.to(R)
-    normal = R.mT[..., FACE_AXIS, :] * sign[:, None]
-    turned = dR.mT[..., FACE_AXIS, :] * sign[:, None]  # (B, N, 3, 6, 3)
+    shift = state.pose[..., :3] - given[..., :3]
+    # The planes through the centre, then those before and behind it.
+    by_pose = R.new_zeros(*shift.shape[:2], 3, 4, 6)
+    by_pose[..., 3, :3] = -R.mT
+    by_pose[..., :3, 3:] = dR.permute(0, 1, 4, 3, 2)
+    by_pose[..., 3, 3:] = -(shift[:, :, None, None] @ dR)[..., 0, :].mT
+    planes = torch.cat([R.mT, by_pose[..., 3, :3] @ shift[..., None]], -1)
+    residual, by_pose = (torch.stack([x, -x], 3).flatten(2, 3) for x in (planes, by_pose))
     extent, gap = state.shared[:, EXTENT], state.shared[:, GAP]
-    constant = (gap - extent[:, FACE_AXIS] / 2)[:, None] + inset
-    offset = constant - (normal * shift[..., None, :]).sum(-1)
-    residual = torch.cat([normal, offset[..., None]], -1)
-    B, N = shift.shape[:2]
-    by_pose = R.new_zeros((B, N, 6, 4, 1, 6))
-    by_pose[..., 3, 0, :3] = -normal
-    by_pose[..., :3, 0, 3:] = turned.permute(0, 1, 3, 4, 2)
-    by_pose[..., 3, 0, 3:] = -(turned * shift[..., None, None, :]).sum(-1).mT
-    by_shared = R.new_zeros((B, N, 6, 4, SHARED))
-    face = torch.arange(6)
-    by_shared[..., face, 3, FACE_AXIS] = -0.5
-    by_shared[..., face, 3, 9 + face] = 1.0
+    residual[..., 3] += inset + (gap - extent[:, FACE_AXIS] / 2)[:, None]
+    by_shared, one = R.new_zeros(6, 4, SHARED), torch.eye(SHARED).to(R)
+    by_shared[:, 3] = one[GAP] - one[EXTENT].repeat_interleave(2, 0) / 2
     return Linearised(residual, by_pose, by_shared)
 
 
-def prior(problem: Problem, state: State, _: None = None) -> Linearised:
-    """Deviation of the poses from the input, along its axes, less the bias [m, rad]."""
-    given = problem.pose
-    R = rotation_from_rpy(given[..., 3:])
-    difference = state.pose - given
-    along = (R.mT @ difference[..., :3, None])[..., 0]
-    residual = torch.cat([along, difference[..., 3:]], -1) - state.shared[:, None, BIAS]
-    by_pose = residual.new_zeros((*residual.shape[:2], 1, 6, 1, 6))
-    by_pose[:, :, 0, :3, 0, :3] = R.mT
-    by_pose[:, :, 0, 3:, 0, 3:] = torch.eye(3).to(R)
-    by_shared = residual.new_zeros((*residual.shape[:2], 1, 6, SHARED))
-    by_shared[..., BIAS] = -torch.eye(6).to(R)
-    return Linearised(residual[:, :, None], by_pose, by_shared)
+def prior(state: State, given: Tensor) -> Linearised:
+    """Deviation of the poses from the `given` ones, along its axes, less the bias [m, rad]."""
+    along = torch.eye(6).to(given).repeat(*given.shape[:2], 1, 1, 1)
+    along[..., :3, :3] = rotation_from_rpy(given[..., None, 3:]).mT
+    residual = (along @ (state.pose - given)[..., None, :, None])[..., 0]
+    by_shared = -torch.eye(SHARED).to(given)[None, BIAS]
+    return Linearised(residual - state.shared[:, None, None, BIAS], along, by_shared)
 
 
-def acceleration(problem: Problem, state: State, _: None = None) -> Linearised:
+def acceleration(state: State, times: Tensor) -> Linearised:
     """Second differences of the pose over true time steps [m/s^2, rad/s^2]."""
-    dt = problem.times.diff(dim=1)
-    first, second = dt[:, :-1, None], dt[:, 1:, None]
-    mean = (first + second) / 2
-    p = state.pose
+    dt, p, eye = times.diff(dim=1)[..., None], state.pose, torch.eye(6).to(times)
+    first, second, mean = dt[:, :-1], dt[:, 1:], (dt[:, :-1] + dt[:, 1:]) / 2
     residual = ((p[:, 2:] - p[:, 1:-1]) / second - (p[:, 1:-1] - p[:, :-2]) / first) / mean
     weights = torch.stack([1 / first, -1 / first - 1 / second, 1 / second], -1) / mean[..., None]
-    eye = torch.eye(6).to(p)
-    by_pose = weights[:, :, 0, None, :, None] * eye[:, None, :]
-    return Linearised(residual[:, :, None], by_pose[:, :, None], None)
+    by_pose = (weights[..., None] * eye[:, None, :]).flatten(-2)[:, :, None]
+    return Linearised(residual[:, :, None], by_pose, p.new_zeros(1, 6, SHARED))
 
 
-def rest(problem: Problem, state: State, _: None = None) -> Linearised:
+def rest(state: State) -> Linearised:
     """First differences of the pose of what is parked [m, rad]."""
     p = state.pose
     eye = torch.eye(6).to(p)
-    by_pose = torch.stack([-eye, eye], -2).expand(*p[:, 1:].shape[:2], 6, 2, 6)
-    return Linearised((p[:, 1:] - p[:, :-1])[:, :, None], by_pose[:, :, None], None)
+    by_pose = torch.cat([-eye, eye], -1).expand(*p[:, 1:].shape[:2], 1, 6, 12)
+    return Linearised((p[:, 1:] - p[:, :-1])[:, :, None], by_pose, p.new_zeros(1, 6, SHARED))
 
 
-def slip(problem: Problem, state: State, _: None = None) -> Linearised:
+def slip(state: State, times: Tensor) -> Linearised:
     """Velocity of the pivot, to the left and upward in the body frame [m/s] [for Eq. 7]."""
-    dt = problem.times.diff(dim=1)[..., None]
-    p, length, ratio = state.pose, state.shared[:, :1, None], state.shared[:, PIVOT, None, None]
-    across, by_angle = rotation_derivatives((p[:, 1:, 3:] + p[:, :-1, 3:]) / 2)
-    across, by_angle = across[..., 1:].mT, by_angle[..., 1:].mT
-    R, dR = rotation_derivatives(p[..., 3:])
-    rear = p[..., :3] - length * ratio * R[..., 0]
-    step = rear.diff(dim=1) / dt
-    residual = (across @ step[..., None])[..., 0]
-    by_pose = p.new_zeros((*residual.shape[:2], 1, 2, 2, 6))
-    tilt = 0.5 * (by_angle @ step[..., None, :, None])[..., 0].mT
-    for k, (sign, end) in enumerate(((-1.0, slice(None, -1)), (1.0, slice(1, None)))):
-        swing = -(length * ratio)[..., None] * dR[:, end, :, :, 0] * sign / dt[..., None]
-        by_pose[:, :, 0, :, k, :3] = sign * across / dt[..., None]
-        by_pose[:, :, 0, :, k, 3:] = across @ swing.mT + tilt
-    turned = -(across @ (R[..., 0].diff(dim=1) / dt)[..., None])[..., 0]
-    by_shared = p.new_zeros((*residual.shape[:2], 1, 2, SHARED))
-    by_shared[:, :, 0, :, 0], by_shared[:, :, 0, :, PIVOT] = ratio * turned, length * turned
-    return Linearised(residual[:, :, None], by_pose, by_shared)
+    dt, N = times.diff(dim=1)[..., None, None], state.pose.shape[1]
+    p, shared = state.pose, state.shared[..., None, None, None]
+    length, ratio = shared[:, 0], shared[:, PIVOT]
+    R, dR = rotation_derivatives(torch.cat([p[..., 3:], (p[:, 1:, 3:] + p[:, :-1, 3:]) / 2], 1))
+    heading, swing = R[:, :N, :, 0], length * ratio * dR[:, :N, ..., 0].mT
+    across, by_angle = R[:, N:, :, 1:].mT / dt, dR[:, N:, ..., 1:] / dt[..., None]
+    step = (p[..., :3] - (length * ratio)[..., 0] * heading).diff(dim=1)
+    residual = (across @ step[..., None]).mT
+    tilt = (step[:, :, None, None] @ by_angle)[..., 0, :].mT / 2
+    before, after = tilt + across @ swing[:, :-1], tilt - across @ swing[:, 1:]
+    by_pose = torch.cat([-across, before, across, after], -1)[:, :, None]
+    turned = -(across @ heading.diff(dim=1)[..., None]).mT
+    by_shared = p.new_zeros(*residual.shape, SHARED)
+    by_shared[..., 0], by_shared[..., PIVOT] = ratio * turned, length * turned
+    return Linearised(residual, by_pose, by_shared)
 
 
-def shared_prior(problem: Problem, state: State, expected: Tensor) -> Linearised:
+def shared_prior(state: State, expected: Tensor) -> Linearised:
     """Deviation of what is shared from what is expected of it, (B, 16)."""
     residual = (state.shared - expected)[:, None, None]
-    by_shared = torch.eye(SHARED).to(residual).expand(len(expected), 1, 1, SHARED, SHARED)
-    by_pose = residual.new_zeros((len(expected), 1, 1, SHARED, 1, 6))
-    return Linearised(residual, by_pose, by_shared)
+    by_pose = residual.new_zeros((len(expected), 1, 1, SHARED, 6))
+    return Linearised(residual, by_pose, torch.eye(SHARED).to(residual)[None])
+
+
+LINEAR = (prior, acceleration, rest, shared_prior)  # in pose and shared

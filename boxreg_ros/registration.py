@@ -6,10 +6,10 @@ from typing import NamedTuple
 from boxreg_ros import objective
 from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
 from boxreg_ros.config import Config
-from boxreg_ros.correspondence import Support, support
+from boxreg_ros.correspondence import in_box_axes, Support, support
 from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.lbfgs import minimize
-from boxreg_ros.objective import EXTENT, Problem, SHARED, State, Term
+from boxreg_ros.objective import EXTENT, Problem, SHARED, State, Sum, Term
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED
 from boxreg_ros.window import batches, stack, Window
 import numpy as np
@@ -126,7 +126,8 @@ def solve(
     the curvature, which is also the metric L-BFGS starts from in every round.
 
     """
-    length, settings = problem.boxes.shape[1], config.solver
+    length, solver = problem.boxes.shape[1], config.solver
+    limits = solver.iterations, solver.history, solver.tolerance
     rule, noise = model.rule(), model.noise()
     expected = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), expected.clone())
@@ -135,63 +136,13 @@ def solve(
         margin = MARGINS[0] if turn == 0 and rounds > 1 else MARGINS[1]
         sights = support(problem, state, margin, config.faces.outermost, rule.depths)
         terms = weigh(problem, state, sights, expected, noise, config, is_first=turn == 0)
-        metric = _Metric(objective.curvature(terms, state.pack(), length), free)
-        found = minimize(
-            _Sum(terms, length, free),
-            state.pack(),
-            settings.iterations,
-            settings.history,
-            settings.tolerance,
-            metric,
-        )
-        state = State.unpack(found.x, length)
+        x = state.pack()
+        total = Sum(terms, x, length, free)
+        best = minimize(total, x, *limits, total.newton)
+        state = State.unpack(best.x, length)
         if config.estimate == 'track':
             noise = InputNoise.measure(scatter(problem, state), problem.valid)
-    return state, metric.blocks(length)
-
-
-class _Sum:
-    """The sum of terms as a function of the free variables of some rows."""
-
-    def __init__(self, terms: list[Term], length: int, free: Tensor) -> None:
-        self._terms, self._length, self._free = terms, length, free
-        self._part: tuple[Tensor, list[Term]] | None = None
-
-    def __call__(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        terms = self._terms
-        if len(rows) < len(self._free):
-            if self._part is None or self._part[0] is not rows:
-                self._part = rows, [term.select(rows) for term in terms]
-            terms = self._part[1]
-        value, gradient = objective.value_and_gradient(terms, x, self._length)
-        return value, gradient * (self._free if terms is self._terms else self._free[rows])
-
-
-class _Metric:
-    """The inverse of the curvature in the free variables, factorised once."""
-
-    def __init__(self, curvature: Tensor, free: Tensor) -> None:
-        curvature *= free[:, :, None]
-        curvature *= free[:, None, :]
-        curvature.diagonal(dim1=1, dim2=2).add_(1.0 - free + 1e-9)
-        self._factor, failed = torch.linalg.cholesky_ex(curvature)
-        if bool(failed.any()):
-            # A window out of all proportion (stamps a microsecond apart, a box at the moon) is
-            # left to the line search with its diagonal alone; the others must not notice.
-            diagonal = curvature.diagonal(dim1=1, dim2=2)[failed > 0].nan_to_num().clamp(min=1e-9)
-            self._factor[failed > 0] = torch.diag_embed(diagonal.sqrt())
-        self._rough = self._factor.float()  # good enough for a direction, half the memory
-
-    def __call__(self, vector: Tensor, rows: Tensor) -> Tensor:
-        factor = self._rough if len(rows) == len(self._rough) else self._rough[rows]
-        return torch.cholesky_solve(vector[..., None].float(), factor)[..., 0].to(vector)
-
-    def blocks(self, length: int) -> Tensor:
-        """Return the covariances of the poses (B, N, 6, 6)."""
-        inverse = torch.cholesky_inverse(self._factor)[:, : 6 * length, : 6 * length]
-        inverse = inverse.unflatten(1, (length, 6)).unflatten(3, (length, 6))
-        blocks: Tensor = inverse.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
-        return blocks
+    return state, total.factor.inverse_of_links(length)
 
 
 def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
@@ -252,6 +203,7 @@ def weigh(
 
     """
     kind, valid, faces = problem.deviations, problem.valid.to(state.pose), config.faces
+    given = problem.pose
 
     def of(*names: str) -> Tensor:
         return torch.stack([kind[name] for name in names], -1)
@@ -273,7 +225,7 @@ def weigh(
         inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
         bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
         extent = extent * slow[6:]
-    off = objective.prior(problem, state).residual[:, :, 0]
+    off = objective.prior(state, given).residual[:, :, 0]
     off = (off.abs() + surprise(problem) * is_first) / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     hidden = (sights.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
@@ -286,7 +238,7 @@ def weigh(
     change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2
     turn = torch.eye(6).to(state.pose).expand(*state.pose.shape[:2], 6, 6).clone()
     turn[..., :3, :3] = rotation_from_rpy(state.pose[..., 3:])
-    change = (turn * change[:, None, None]) @ turn.mT
+    change = ((turn * change[:, None, None]) @ turn.mT)[:, 1:-1] * valid[:, 2:, None, None]
     slip = of('slip', 'climb') ** -2
     still = (of('drift') * error.new_tensor([1, 1, 0.5, 0.15, 0.15, 0.15])) ** -2
 
@@ -294,16 +246,12 @@ def weigh(
         return torch.diag_embed(weight)[:, :, None]
 
     return [
-        Term(objective.faces, problem, sights.moments * trust[..., None, None], sights.retreat),
-        Term(objective.prior, problem, diagonal(hold)),
-        Term(
-            objective.acceleration,
-            problem,
-            (change[:, 1:-1] * valid[:, 2:, None, None])[:, :, None],
-        ),
-        Term(objective.slip, problem, diagonal(slip[:, None] * valid[:, 1:, None])),
-        Term(objective.rest, problem, diagonal(still[:, None] * _parked(problem)[..., None])),
-        Term(objective.shared_prior, problem, diagonal(shared[:, None]), expected),
+        Term(objective.faces, sights.moments * trust[..., None, None], (given, sights.retreat)),
+        Term(objective.prior, diagonal(hold), (given,)),
+        Term(objective.acceleration, change[:, :, None], (problem.times,)),
+        Term(objective.slip, diagonal(slip[:, None] * valid[:, 1:, None]), (problem.times,)),
+        Term(objective.rest, diagonal(still[:, None] * _parked(problem)[..., None])),
+        Term(objective.shared_prior, diagonal(shared[:, None]), (expected,)),
     ]
 
 
@@ -407,11 +355,9 @@ def _judge(
 
 def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     """Return how many points lie in boxes of `pose` (B, N, 6) and `extent` (B, N, 3), (B, N)."""
-    shift = (pose[..., :3] - problem.pose[..., :3]).to(problem.points)
-    R = rotation_from_rpy(pose[..., 3:]).to(problem.points)
-    local = ((problem.points - shift[..., None, :]) @ R).abs()
-    inside = (local < extent[..., None, :].to(local) / 2 + 0.05).all(-1)
-    return (inside & problem.mask).sum(-1)
+    local = in_box_axes(problem.points, problem, pose).abs()
+    x, y, z = (local < extent[..., None].to(local) / 2 + 0.05).unbind(-2)
+    return (x & y & z & problem.mask).sum(-1)
 
 
 def _kept(window: Window, reason: str) -> Estimate:

@@ -55,41 +55,30 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     clearance are left out, and the road's height is kept instead.
 
     """
-    points, source = _near_any(sweep.points, boxes, RING + config.sampling.margin)
+    around = _around(sweep.points, boxes, max(RING, config.sampling.margin))
     R = rotation_from_rpy(torch.from_numpy(boxes[:, 6:9])).numpy()
     crops = []
-    nearest = np.full(len(points), np.inf)
-    for box, axes in zip(boxes, R, strict=True):
-        reach = float(np.hypot(*box[3:5])) / 2 + RING
-        first, last = np.searchsorted(points[:, 0], (box[0] - reach, box[0] + reach))
-        index = first + np.flatnonzero(np.abs(points[first:last, 1] - box[1]) < reach)
-        offset = points[index] - box[:3]
+    nearest = np.full(len(sweep.points), np.inf)
+    for box, axes, index in zip(boxes, R, around, strict=True):
+        offset = sweep.points[index].astype(np.float64) - box[:3]
         x, y, z = (np.abs(offset @ axes) - box[3:6] / 2).T
         aside = np.maximum(x, y)
         depth = np.maximum(aside, z)
         beside = (aside > 0.05) & (aside < RING) & (np.abs(offset[:, 2] + box[5] / 2) < 0.6)
         near = np.flatnonzero(depth < config.sampling.margin)
+        near = near[np.argsort(offset[near, 0], kind='stable')]
         crops.append((index[near], offset[near], depth[near], _road(offset[beside, 2])))
-        np.minimum.at(nearest, index[near], depth[near])
+        nearest[index[near]] = np.minimum(nearest[index[near]], depth[near])
     observations = []
     for box, (index, offset, depth, ground) in zip(boxes, crops, strict=True):
         floor = (-box[5] / 2 if np.isnan(ground) else ground) + CLEARANCE
         own = np.flatnonzero((depth <= nearest[index]) & (offset[:, 2] > floor))
         kept = own[_thinned(offset[own], config)]
-        delays = np.zeros(len(kept))
+        near, late = offset[kept].astype(np.float32), np.zeros(len(kept), dtype=np.float32)
         if config.sampling.deskew and sweep.times is not None:
-            delays = sweep.times[source[index[kept]]]
-        observations.append(
-            Observation(
-                stamp_ns,
-                box,
-                offset[kept].astype(np.float32),
-                delays.astype(np.float32),
-                sweep.origin - box[:3],
-                ground,
-                int((depth <= 0).sum()),
-            )
-        )
+            late = sweep.times[index[kept]].astype(np.float32)
+        inside, origin = int((depth <= 0).sum()), sweep.origin - box[:3]
+        observations.append(Observation(stamp_ns, box, near, late, origin, ground, inside))
     return observations
 
 
@@ -110,27 +99,27 @@ def _thinned(points: Floats, config: Config) -> Ints:
     return farthest_point_sample(torch.from_numpy(points), mask, count).numpy()
 
 
-def _near_any(points: NDArray[np.floating], boxes: Floats, margin: float) -> tuple[Floats, Ints]:
-    """
-    Return the points near any box, ascending in x, and their rows in the sweep.
-
-    One pass over the sweep with a look-up table of coarse cells, so that the exact tests that
-    follow see the few points that matter.
-
-    """
-    reach = np.linalg.norm(boxes[:, 3:5], axis=1) / 2 + margin
-    low = (boxes[:, :2] - reach[:, None]).min(0)
-    span = (boxes[:, :2] + reach[:, None]).max(0) - low
-    cell = max(1.0, float(span.max()) / 1000)
-    table = np.zeros((span / cell).astype(int) + 3, dtype=bool)
-    for (x, y), r in zip(boxes[:, :2] - low, reach, strict=True):
-        a, b, c, d = (np.array([x - r, x + r, y - r, y + r]) / cell).astype(int) + 1
-        table[a : b + 1, c : d + 1] = True
-    scaled = (points[:, :2] - low.astype(points.dtype)) * np.asarray(1 / cell, points.dtype) + 1
-    x, y = (scaled[:, i].clip(0, table.shape[i] - 1).astype(np.int32) for i in (0, 1))
-    near = np.flatnonzero(table[x, y])
-    near = near[np.argsort(points[near, 0], kind='stable')]
-    return points[near].astype(np.float64), near
+def _around(points: NDArray[np.floating], boxes: Floats, margin: float) -> list[Ints]:
+    """Return the points in the upright square `margin` around the footprint of each box."""
+    reach = np.hypot(boxes[:, 3], boxes[:, 4])[:, None] / 2 + margin
+    low, high = boxes[:, :2] - reach, boxes[:, :2] + reach
+    least, cell = low.min(0), max(1.0, (high.max(0) - low.min(0)).max() / 250)
+    nx, ny = ((high.max(0) - least) / cell).astype(int) + 3  # with a rim for what is outside
+    x, y = (
+        ((points[:, i] - float(least[i])) * float(1 / cell) + 1).clip(0, n - 1).astype(np.uint16)
+        for i, n in enumerate((nx, ny))
+    )
+    cells = x * np.uint16(ny) + y  # numbers of 16 bits are sorted by counting
+    order = np.argsort(cells, kind='stable')
+    ends = np.cumsum(np.bincount(cells, minlength=nx * ny))
+    first, last = (((edge - least) / cell).astype(int) + 1 for edge in (low, high))
+    found = []
+    for box, r, (a, b), (c, d) in zip(boxes, reach, first, last, strict=True):
+        rows = np.arange(a, c + 1) * ny
+        parts = zip(ends[rows + b - 1], ends[rows + d], strict=True)
+        near = np.sort(np.concatenate([order[i:j] for i, j in parts]))
+        found.append(near[(np.abs(points[near, :2] - box[:2]) < r).all(1)])
+    return found
 
 
 def farthest_point_sample(points: Tensor, mask: Tensor, count: int) -> Tensor:

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.objective import Problem, SHARED
 from boxreg_ros.sampling import Observation
 from boxreg_ros.structures import Floats, YAW
 import numpy as np
+from numpy.typing import NDArray
 import torch
 
 BATCH_VALUES = 3e7  # most point coordinates, or entries of the curvature, solved at once
@@ -63,48 +64,48 @@ def batches(windows: Sequence[Window], config: Config) -> list[list[int]]:
 
 def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     """Return padded tensors of `windows`, and the points (B, 3) their centres are relative to."""
-    B, N = len(windows), max(len(w.observations) for w in windows)
-    M = max(1, *(len(o.points) for w in windows for o in w.observations))
-    boxes, valid, times = np.zeros((B, N, 9)), np.zeros((B, N), dtype=bool), np.zeros((B, N))
-    start, delays = np.zeros((B, N, 9)), np.zeros((B, N, M), dtype=np.float32)
-    points, mask = np.zeros((B, N, M, 3), dtype=np.float32), np.zeros((B, N, M), dtype=bool)
-    origins, ground = np.zeros((B, N, 3)), np.full((B, N), np.nan)
+    lengths = np.array([len(w.observations) for w in windows])
+    B, N, device = len(windows), lengths.max(), config.device
+    every = [o for w in windows for o in w.observations]
+    counts = np.array([len(o.points) for o in every])
+    valid = np.arange(N) < lengths[:, None]
+    mask = np.zeros((B, N, max(1, counts.max())), dtype=bool)
+    mask[valid] = np.arange(mask.shape[2]) < counts[:, None]
+    boxes, times, ground = np.zeros((B, N, 9)), np.zeros((B, N)), np.full((B, N), np.nan)
+    points, origins = np.zeros((*mask.shape, 3), dtype=np.float32), np.zeros((B, N, 3))
+    delays = np.zeros(mask.shape, dtype=np.float32)
+    boxes[valid], origins[valid] = [o.box for o in every], [o.origin for o in every]
+    ground[valid] = [o.ground for o in every]
+    begin = np.repeat([w.observations[0].stamp_ns for w in windows], lengths)
+    times[valid] = (np.array([o.stamp_ns for o in every]) - begin) * 1e-9
+    for b, i, o in zip(*np.nonzero(valid), every, strict=True):
+        points[b, i, : len(o.points)], delays[b, i, : len(o.points)] = o.points, o.delays
+    row, step, last = np.arange(B)[:, None], np.arange(N), lengths[:, None] - 1
+    boxes, times = (part[row, np.minimum(step, last)] for part in (boxes, times))
+    times += 0.1 * np.maximum(step - last, 0)
+    boxes[..., YAW] = one_heading(boxes[..., YAW], valid)
+    start = boxes.copy()
     for b, window in enumerate(windows):
-        n, k = len(window.observations), len(window.start)
-        given = np.array([o.box for o in window.observations])
-        given[:, YAW] = one_heading(given[:, YAW])
-        boxes[b, :n], boxes[b, n:], valid[b, :n] = given, given[-1], True
-        start[b], start[b, :k] = boxes[b], window.start
-        turns = np.pi * np.array([2, 2, 1])  # a box kept may have come turned around
-        start[b, :k, 6:9] += turns * np.round((given[:k, 6:9] - start[b, :k, 6:9]) / turns)
-        stamps = np.array([o.stamp_ns for o in window.observations])
-        times[b, :n] = (stamps - stamps[0]) * 1e-9
-        times[b, n:] = times[b, n - 1] + 0.1 * np.arange(1, N - n + 1)
-        for i, o in enumerate(window.observations):
-            m = len(o.points)
-            points[b, i, :m], delays[b, i, :m], mask[b, i, :m] = o.points, o.delays, True
-            origins[b, i], ground[b, i] = o.origin, o.ground
+        start[b, : len(window.start)] = window.start
+    turns = np.pi * np.array([2, 2, 1])  # a box kept may have come turned around
+    start[..., 6:9] += turns * np.round((boxes[..., 6:9] - start[..., 6:9]) / turns)
     base = boxes[:, 0, :3].copy()
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]
     kinds = [config.class_config(window.class_name) for window in windows]
     deviations = {
-        f.name: torch.tensor([getattr(kind, f.name) for kind in kinds], dtype=torch.float64)
+        f.name: torch.tensor([getattr(k, f.name) for k in kinds], dtype=torch.float64).to(device)
         for f in fields(ClassConfig)
         if f.name != 'names'
     }
     arrays = (boxes, start, valid, times, points, mask, delays, origins, ground)
-    names = (f.name for f in fields(Problem) if f.name != 'deviations')
-    tensors = {
-        name: torch.from_numpy(array).to(config.device)
-        for name, array in zip(names, arrays, strict=True)
-    }
-    deviations = {name: value.to(config.device) for name, value in deviations.items()}
-    return Problem(**tensors, deviations=deviations), base
+    parts: list[Any] = [torch.from_numpy(array).to(device) for array in arrays]
+    return Problem(*[*parts, deviations]), base
 
 
-def one_heading(yaw: Floats) -> Floats:
-    """Return `yaw` (N,) unwrapped [rad], with the half turns undone that are in the minority."""
+def one_heading(yaw: Floats, valid: NDArray[np.bool_]) -> Floats:
+    """Return `yaw` (B, N) unwrapped [rad], with the half turns undone that are in the minority."""
     chain = np.unwrap(yaw, period=np.pi)
-    turned = np.cos(yaw - chain) < 0
-    return chain + np.pi if turned.mean() > 0.5 else chain
+    turned = (np.cos(yaw - chain) < 0) & valid
+    is_most = turned.sum(1, keepdims=True) > valid.sum(1, keepdims=True) / 2
+    return np.where(is_most, chain + np.pi, chain)

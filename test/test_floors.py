@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     ('structures', 'config', 'errors'),
     ('geometry', 'metrics'),
-    ('sampling', 'objective', 'correspondence', 'lbfgs'),
+    ('chain', 'sampling', 'objective', 'correspondence', 'lbfgs'),
     ('calibration', 'window', 'registration'),
     ('association', 'registrar'),
     (

@@ -6,7 +6,6 @@ from boxreg_ros.geometry import (
     FACE_SIGN,
     rotation_derivatives,
     rotation_from_rpy,
-    to_box_frame,
     wrap_angle,
 )
 import numpy as np
@@ -67,21 +66,14 @@ def test_wrap_angle_turns_by_whole_turns_into_half_a_turn():
     np.testing.assert_allclose(turns, turns.round(), atol=1e-13)
 
 
-def test_box_frame_by_hand():
-    # (1, 5, 4) is 3 m ahead of the centre along +y, which is its forward, and 1 m above it;
-    # (0, 2, 3) is 1 m beside it along -x, which is its left.
-    points = torch.tensor([[1.0, 5.0, 4.0], [0.0, 2.0, 3.0]], dtype=torch.float64)
-    known = [[3, 0, 1], [0, 1, 0]]
-    np.testing.assert_allclose(to_box_frame(points, TURNED), known, atol=1e-15)
-
-
-def test_box_frame_undoes_scipy():
+def test_face_distances_undo_scipy():
     rng = np.random.default_rng(2)
     local, boxes = rng.normal(size=(20, 30, 3)), rng.normal(size=(20, 9))
     turned = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()
     points = local @ turned.swapaxes(1, 2) + boxes[:, None, :3]
-    back = to_box_frame(torch.from_numpy(points), torch.from_numpy(boxes))
-    np.testing.assert_allclose(back, local, atol=1e-13)
+    found = face_distances(torch.from_numpy(points), torch.from_numpy(boxes))
+    known = local[..., FACE_AXIS] * FACE_SIGN.numpy() - boxes[:, None, 3:6][..., FACE_AXIS] / 2
+    np.testing.assert_allclose(found, known, atol=1e-13)
 
 
 def test_face_distances_by_hand():

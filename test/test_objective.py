@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from boxreg_ros import objective
+from boxreg_ros.chain import Chain
 from boxreg_ros.config import PaperConfig
 from boxreg_ros.geometry import face_distances
 from boxreg_ros.objective import SHARED, State, Term
@@ -295,12 +296,12 @@ def terms_of(problem, seed=1):
     inset = torch.from_numpy(rng.random((B, N, 6)))
     expected = torch.from_numpy(rng.normal(size=(B, SHARED)))
     return {
-        'faces': Term(objective.faces, problem, spd(rng, B, N, 6, 4), inset),
-        'prior': Term(objective.prior, problem, spd(rng, B, N, 1, 6)),
-        'acceleration': Term(objective.acceleration, problem, spd(rng, B, N - 2, 1, 6)),
-        'rest': Term(objective.rest, problem, spd(rng, B, N - 1, 1, 6)),
-        'slip': Term(objective.slip, problem, spd(rng, B, N - 1, 1, 2)),
-        'shared_prior': Term(objective.shared_prior, problem, spd(rng, B, 1, 1, SHARED), expected),
+        'faces': Term(objective.faces, spd(rng, B, N, 6, 4), (problem.pose, inset)),
+        'prior': Term(objective.prior, spd(rng, B, N, 1, 6), (problem.pose,)),
+        'acceleration': Term(objective.acceleration, spd(rng, B, N - 2, 1, 6), (problem.times,)),
+        'rest': Term(objective.rest, spd(rng, B, N - 1, 1, 6)),
+        'slip': Term(objective.slip, spd(rng, B, N - 1, 1, 2), (problem.times,)),
+        'shared_prior': Term(objective.shared_prior, spd(rng, B, 1, 1, SHARED), (expected,)),
     }
 
 
@@ -340,9 +341,9 @@ def test_jacobians_equal_automatic_differentiation(name):
         pose, shared = State.unpack(found[b, ..., b, :].flatten(0, -2), N)
         pose = pose.unflatten(0, r.shape[1:])
         for i in range(r.shape[1]):
-            pose[i, :, :, i : i + by_pose.shape[-2]] = by_pose[b, i]
-        if by_shared is not None:
-            shared = by_shared[b].flatten(0, -2)
+            span = by_pose.shape[-1] // 6
+            pose[i, :, :, i : i + span] = by_pose[b, i].unflatten(-1, (span, 6))
+        shared = by_shared.expand(*r.shape, SHARED)[b].flatten(0, -2)
         found[b, ..., b, :] = State(pose.flatten(0, 2), shared).pack().unflatten(0, r.shape[1:])
     np.testing.assert_allclose(found, known, atol=1e-9)
 
@@ -364,7 +365,8 @@ def test_value_gradient_and_curvature(names):
 
     given = x.clone().requires_grad_()
     (known,) = torch.autograd.grad(loss(given).sum(), given)
-    value, gradient = objective.value_and_gradient(terms, x, N)
+    form = Chain.zeros(x, N)
+    value, gradient = objective.value_and_gradient(terms, x, N, form)
     np.testing.assert_allclose(value, loss(x), rtol=1e-12)
     np.testing.assert_allclose(gradient, known, atol=1e-9 * known.abs().max())
 
@@ -376,20 +378,45 @@ def test_value_gradient_and_curvature(names):
         for b in range(B):
             own = J[b, ..., b, :]
             curvature[b] += torch.einsum('nfrd,nfrs,nfse->de', own, term.weight[b], own)
-    found = objective.curvature(terms, x, N)
-    np.testing.assert_allclose(found, curvature, atol=1e-9 * curvature.abs().max())
-    np.testing.assert_allclose(found, found.mT, atol=1e-9 * curvature.abs().max())
+    scale = float(curvature.abs().max())
+    for i, column in enumerate(torch.eye(x.shape[1], dtype=D)):
+        found = form.times(column.expand(B, -1))
+        np.testing.assert_allclose(found, curvature[:, :, i], atol=1e-9 * scale)
 
 
-def test_windows_selected_stand_alone():
+def test_terms_that_are_linear_are_summed_up_beforehand():
+    # Away from where the sum was made, and for some windows alone, it is still that of its terms.
     problem = random_problem()
-    terms, x, rows = list(terms_of(problem).values()), variables(problem), torch.tensor([2, 0])
+    terms, x = list(terms_of(problem).values()), variables(problem)
+    free = (torch.rand(x.shape, generator=torch.Generator().manual_seed(5)) < 0.9).to(x)
+    start = variables(problem, seed=7)
+    found = objective.Sum(terms, start, 6, free)
+    known, _ = objective.value_and_gradient(terms, start, 6)
+    np.testing.assert_allclose(found(start, torch.arange(3))[0], known, rtol=1e-12)
     value, gradient = objective.value_and_gradient(terms, x, 6)
-    part = [term.select(rows) for term in terms]
-    for found, known in zip(
-        objective.value_and_gradient(part, x[rows], 6), (value[rows], gradient[rows]), strict=True
-    ):
-        np.testing.assert_allclose(found, known, rtol=1e-12)
+    for rows in (torch.arange(3), torch.tensor([2, 0])):
+        found_value, found_gradient = found(x[rows], rows)
+        np.testing.assert_allclose(found_value, value[rows], rtol=1e-9)
+        known = (gradient * free)[rows]
+        np.testing.assert_allclose(found_gradient, known, atol=1e-9 * float(known.abs().max()))
+
+
+def test_newton_takes_the_inverse_of_the_curvature():
+    problem = random_problem()
+    terms, x = list(terms_of(problem).values()), variables(problem)
+    found = objective.Sum(terms, x, 6, torch.ones_like(x))
+    vector, form = variables(problem, seed=8), Chain.zeros(x, 6)
+    objective.value_and_gradient(terms, x, 6, form)
+    solved = found.newton(vector, torch.arange(3))
+    np.testing.assert_allclose(form.times(solved), vector, atol=1e-6)
+    rows = torch.tensor([2, 0])
+    np.testing.assert_allclose(found.newton(vector[rows], rows), solved[rows], rtol=1e-9)
+    identity = torch.eye(x.shape[1], dtype=D)
+    columns = [found.newton(column.expand(3, -1), torch.arange(3)) for column in identity[:12]]
+    inverse = torch.stack(columns, -1)
+    np.testing.assert_allclose(
+        found.factor.inverse_of_links(6)[:, 1], inverse[:, 6:12, 6:12], rtol=1e-6
+    )
 
 
 # --- ours: values -------------------------------------------------------------------------------
@@ -404,7 +431,9 @@ def test_faces_by_moments_equal_the_sum_over_points():
     inset = torch.from_numpy(rng.random((3, 6, 6)))
     homogeneous = torch.cat([problem.points, torch.ones_like(problem.points[..., :1])], -1)
     moment = torch.einsum('bnmi,bnmj->bnij', homogeneous, homogeneous) / 20
-    term = Term(objective.faces, problem, moment[:, :, None].expand(-1, -1, 6, -1, -1), inset)
+    term = Term(
+        objective.faces, moment[:, :, None].expand(-1, -1, 6, -1, -1), (problem.pose, inset)
+    )
     r = term.linearise(state).residual
     found = torch.einsum('bnfr,bnfrs,bnfs->bnf', r, term.weight, r)
     extent = state.shared[:, None, :3].expand(-1, 6, -1)
@@ -425,7 +454,7 @@ def test_acceleration_by_hand():
     t = np.array([0.0, 0.1, 0.3, 0.35])
     pose = np.c_[1.5 * t**2, 7 * t, 0 * t, 0 * t, 0 * t, 0.4 * t]
     problem = problem_at(pose, t.tolist())
-    found = objective.acceleration(problem, State(problem.pose, shared_of())).residual
+    found = objective.acceleration(State(problem.pose, shared_of()), problem.times).residual
     known = np.tile([3.0, 0, 0, 0, 0, 0], (1, 2, 1, 1))
     np.testing.assert_allclose(found, known, atol=1e-12)
 
@@ -433,7 +462,7 @@ def test_acceleration_by_hand():
 def test_rest_by_hand():
     pose = [[0, 0, 0, 0, 0, 0], [1, 2, 3, 0.1, 0.2, 0.3], [1, 2, 3, 0.1, 0.2, 0.4]]
     problem = problem_at(pose, [0, 0.1, 0.2])
-    found = objective.rest(problem, State(problem.pose, shared_of())).residual
+    found = objective.rest(State(problem.pose, shared_of())).residual
     known = [[[[1, 2, 3, 0.1, 0.2, 0.3]], [[0, 0, 0, 0, 0, 0.1]]]]
     np.testing.assert_allclose(found, known, atol=1e-15)
 
@@ -443,7 +472,7 @@ def test_prior_by_hand():
     # along x is 0.2 m to its right. Less the bias, 0.1 m ahead and 0.05 rad of yaw.
     problem = problem_at([[0, 0, 0, 0, 0, np.pi / 2]], [0.0])
     pose = problem.pose + tensor([0.2, 0.3, 0.5, 0.01, 0.02, 0.06])
-    found = objective.prior(problem, State(pose, shared_of(BIAS=[0.1, 0, 0, 0, 0, 0.05])))
+    found = objective.prior(State(pose, shared_of(BIAS=[0.1, 0, 0, 0, 0, 0.05])), problem.pose)
     known = [[[[0.2, -0.2, 0.5, 0.01, 0.02, 0.01]]]]
     np.testing.assert_allclose(found.residual, known, atol=1e-15)
 
@@ -452,7 +481,7 @@ def test_shared_prior_by_hand():
     problem = problem_at([[0.0] * 6], [0.0])
     state = State(problem.pose, shared_of(BIAS=[0.1, 0, 0, 0, 0, 0]))
     expected = shared_of(EXTENT=[3.5, 2, 2])
-    found = objective.shared_prior(problem, state, expected).residual
+    found = objective.shared_prior(state, expected).residual
     known = np.zeros((1, 1, 1, SHARED))
     known[..., 0], known[..., 3] = 0.5, 0.1
     np.testing.assert_allclose(found, known, atol=1e-15)
@@ -467,12 +496,12 @@ def test_a_vehicle_on_a_circle_does_not_slip():
     pose = np.c_[center, np.zeros((4, 3)), yaw]
     problem = problem_at(pose, [0, 0.1, 0.3, 0.4])
     state = State(problem.pose, shared_of(PIVOT=0.25))
-    np.testing.assert_allclose(objective.slip(problem, state).residual, 0, atol=1e-12)
+    np.testing.assert_allclose(objective.slip(state, problem.times).residual, 0, atol=1e-12)
     # Its centre does: 1 m before the axle, it swings out to the left by twice the sine of half
     # the turn.
     state = State(problem.pose, shared_of(PIVOT=0.0))
     known = 2 * np.sin(np.diff(yaw) / 2) / [0.1, 0.2, 0.1]
-    np.testing.assert_allclose(objective.slip(problem, state).residual[0, :, 0, 0], known)
+    np.testing.assert_allclose(objective.slip(state, problem.times).residual[0, :, 0, 0], known)
 
 
 @pytest.mark.parametrize('yaw', [0.0, np.pi / 2, 3.0])
@@ -483,5 +512,5 @@ def test_slip_by_hand(yaw):
     for way in (1.0, -1.0):
         x, y = way * ahead + 0.1 * left
         problem = problem_at([[0, 0, 0, 0, 0, yaw], [x, y, 0.02, 0, 0, yaw]], [0.0, 0.1])
-        found = objective.slip(problem, State(problem.pose, shared_of(PIVOT=0.25))).residual
+        found = objective.slip(State(problem.pose, shared_of(PIVOT=0.25)), problem.times).residual
         np.testing.assert_allclose(found, [[[[1.0, 0.2]]]], atol=1e-12)

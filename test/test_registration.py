@@ -3,7 +3,7 @@
 from boxreg_ros import objective
 from boxreg_ros.calibration import InputModel
 from boxreg_ros.config import Config
-from boxreg_ros.lbfgs import minimize
+from boxreg_ros.lbfgs import minimize, select
 from boxreg_ros.metrics import iou_3d
 from boxreg_ros.objective import State
 from boxreg_ros.registration import register, solve_paper
@@ -173,19 +173,12 @@ def test_the_robust_objective_against_torch():
     length = problem.valid.shape[1]
     shared = torch.cat([problem.boxes[:, 0, 3:6], torch.zeros(4, objective.SHARED - 3)], 1)
     x = State(problem.pose, shared.to(D)).pack()
-    L = torch.linalg.cholesky(objective.curvature(terms, x, length) + 1e-6 * torch.eye(x.shape[1]))
-
-    def function(x, rows):
-        return objective.value_and_gradient([term.select(rows) for term in terms], x, length)
-
-    def metric(vector, rows):
-        return torch.cholesky_solve(vector[..., None], L[rows])[..., 0]
-
-    found = minimize(function, x, 12, 6, 1e-6, metric)
+    function = objective.Sum(terms, x, length, torch.ones_like(x))
+    found = minimize(function, x, 12, 6, 1e-6, function.newton)
     assert (found.value < 0.9 * function(x, torch.arange(4))[0]).all()
     for row in range(4):
         index = torch.tensor([row])
-        own = [term.select(index) for term in terms]
+        own = select(terms, index)
 
         def loss(x, own=own):
             state = State.unpack(x[None], length)
@@ -216,15 +209,16 @@ def robust_terms(problem):
     expected[:, :3], expected[:, objective.PIVOT] = problem.boxes[:, 0, 3:6], 0.25
     one = torch.ones(B, 1, dtype=D)
     return [
-        objective.Term(objective.faces, problem, moments, torch.zeros(B, N, 6, dtype=D)),
-        objective.Term(objective.prior, problem, diagonal(weight, valid)),
-        objective.Term(objective.acceleration, problem, diagonal(motion, valid[:, 2:])),
+        objective.Term(objective.faces, moments, (problem.pose, torch.zeros(B, N, 6, dtype=D))),
+        objective.Term(objective.prior, diagonal(weight, valid), (problem.pose,)),
+        objective.Term(objective.acceleration, diagonal(motion, valid[:, 2:]), (problem.times,)),
         objective.Term(
-            objective.slip, problem, diagonal(torch.tensor([40.0, 20.0]).to(D), valid[:, 1:])
+            objective.slip, diagonal(torch.tensor([40.0, 20.0]).to(D), valid[:, 1:]),
+            (problem.times,),
         ),
         objective.Term(
-            objective.shared_prior, problem,
-            diagonal(torch.full((objective.SHARED,), 400.0, dtype=D), one), expected,
+            objective.shared_prior,
+            diagonal(torch.full((objective.SHARED,), 400.0, dtype=D), one), (expected,),
         ),
     ]  # fmt: skip
 

@@ -1,0 +1,157 @@
+"""
+Symmetric matrices of a chain of links that share a border, B at once; knows no boxes.
+
+Every link has six variables and is coupled to two links on either side and to the border: what
+is not zero looks like an arrow. All that is done here costs in proportion to the links.
+
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.linalg import cholesky_ex, solve_triangular
+from torch.nn.functional import pad
+
+LINK = 6
+NEXT = 2 * LINK  # variables ahead of a link that it is coupled to
+SPAN = NEXT + LINK + NEXT
+BLOCK = 10  # most links eliminated at once
+
+
+class Chain(NamedTuple):
+    """
+    B matrices of N links and a border of S variables.
+
+    Attributes
+    ----------
+    links : Tensor, shape (B, N, 6, 30 + S)
+        Rows of each link: columns of two links before, itself, two links after, and the border.
+    corner : Tensor, shape (B, S, S)
+        The border with itself.
+
+    """
+
+    links: Tensor
+    corner: Tensor
+
+    @classmethod
+    def zeros(cls, like: Tensor, length: int) -> 'Chain':
+        """Return zeros for `length` links and vectors as `like` (B, 6 N + S)."""
+        B, S = len(like), like.shape[1] - LINK * length
+        return cls(like.new_zeros(B, length, LINK, SPAN + S), like.new_zeros(B, S, S))
+
+    def add(self, part: Tensor, span: int) -> None:
+        """Add symmetric `part` (B, n, d, d), for `span` links from each of n on and the border."""
+        n, own = part.shape[1], LINK * span
+        for k in range(span):
+            rows, first = part[:, :, LINK * k : LINK * (k + 1)], NEXT - LINK * k
+            self.links[:, k : k + n, :, first : first + own] += rows[..., :own]
+            self.links[:, k : k + n, :, SPAN:] += rows[..., own:]
+        self.corner.add_(part[:, :, own:, own:].sum(1))
+
+    def times(self, x: Tensor) -> Tensor:
+        """Return the products with vectors (B, 6 N + S)."""
+        S = self.corner.shape[1]
+        along = (self.links @ _around(x, S)[..., None])[..., 0]
+        down = (self.links[..., SPAN:] * x[:, :-S].unflatten(1, (-1, LINK, 1))).sum((1, 2))
+        return torch.cat([along.flatten(1), down + (self.corner @ x[:, -S:, None])[..., 0]], 1)
+
+    def factorised(self, free: Tensor) -> 'Factor':
+        """
+        Return the factors of the matrices in the variables where `free` (B, 6 N + S) is 1.
+
+        Where 0 the rows and columns are those of the identity. Factors of a matrix that is not
+        positive definite are not finite.
+
+        """
+        S, N = self.corner.shape[1], self.links.shape[1]
+        chain, border = free[:, :-S].unflatten(1, (-1, LINK)), free[:, -S:]
+        links = self.links * chain[..., None] * _around(free, S)[:, :, None]
+        links[..., NEXT : NEXT + LINK].diagonal(dim1=2, dim2=3).add_(1.0 - chain + 1e-9)
+        corner = self.corner * border[..., None] * border[:, None]
+        corner.diagonal(dim1=1, dim2=2).add_(1.0 - border + 1e-9)
+        count = -(-N // BLOCK)
+        size = -(-N // count)  # links of a block; the last ones are filled up with identities
+        links = pad(links, (0, 0, 0, 0, 0, count * size - N))
+        links[:, N:, :, NEXT : NEXT + LINK] = torch.eye(LINK).to(links)
+        wide = links.new_zeros(len(links), count, size, LINK, LINK * size + 2 * NEXT)
+        for j in range(size):
+            wide[:, :, j, :, LINK * j : LINK * j + SPAN] = links[:, j::size, :, :SPAN]
+        every = torch.cat([wide[..., NEXT:], links[..., SPAN:].unflatten(1, (count, size))], -1)
+        blocks, carry = [], links.new_zeros(1, NEXT + S, NEXT + S)
+        for block in every.flatten(2, 3).unbind(
+            1
+        ):  # own columns, those of the next two links, the border
+            block[:, :NEXT, :NEXT] -= carry[:, :NEXT, :NEXT]
+            block[:, :NEXT, -S:] -= carry[:, :NEXT, NEXT:]
+            L = _cholesky(block[..., : LINK * size])
+            V = solve_triangular(L, block[..., LINK * size :], upper=False)
+            carry = V.mT @ V
+            corner = corner - carry[:, NEXT:, NEXT:]
+            blocks.append((L, V))
+        return Factor(blocks, _cholesky(corner))
+
+
+class Factor(NamedTuple):
+    """
+    Cholesky factors by blocks of links.
+
+    Attributes
+    ----------
+    blocks : list of pairs of Tensor, shapes (B, b, b) and (B, b, 12 + S)
+        Lower factor of each block, and its rows for the next two links and the border.
+    corner : Tensor, shape (B, S, S)
+        Lower factor of the border.
+
+    """
+
+    blocks: list[tuple[Tensor, Tensor]]
+    corner: Tensor
+
+    def solve(self, b: Tensor) -> Tensor:
+        """Return the solutions (B, 6 N + S) for right sides `b`."""
+        S, size, D = self.corner.shape[1], self.blocks[0][0].shape[1], b.shape[1]
+        chain, border = pad(b[:, :-S], (0, len(self.blocks) * size - D + S)), b[:, -S:, None]
+        parts = list(chain.unflatten(1, (-1, size, 1)).unbind(1))
+        for i, (L, V) in enumerate(self.blocks):
+            parts[i] = solve_triangular(L, parts[i], upper=False)
+            carry = V.mT @ parts[i]
+            border = border - carry[:, NEXT:]
+            if i + 1 < len(parts):
+                parts[i + 1][:, :NEXT] -= carry[:, :NEXT]
+        border = torch.cholesky_solve(border, self.corner)
+        ahead = torch.zeros_like(border[:, :1]).expand(-1, NEXT, -1)
+        for i, (L, V) in reversed(list(enumerate(self.blocks))):
+            rest = parts[i] - V @ torch.cat([ahead, border], 1)
+            parts[i] = solve_triangular(L.mT, rest, upper=True)
+            ahead = parts[i][:, :NEXT]
+        return torch.cat([torch.cat(parts, 1)[:, : D - S], border], 1)[..., 0]
+
+    def inverse_of_links(self, length: int) -> Tensor:
+        """Return the blocks of the first `length` links in the inverse, (B, N, 6, 6)."""
+        # What has been found of the inverse: the two links after the present ones, the border.
+        ahead = pad(torch.cholesky_inverse(self.corner), (NEXT, 0, NEXT, 0))
+        found: list[Tensor] = []
+        for L, V in reversed(self.blocks):
+            K = solve_triangular(L.mT, V, upper=True)
+            across = -(K @ ahead)
+            own = torch.cholesky_inverse(L) - across @ K.mT
+            blocks = own.unflatten(1, (-1, LINK)).unflatten(3, (-1, LINK)).diagonal(dim1=1, dim2=3)
+            found.insert(0, blocks.permute(0, 3, 1, 2))
+            ahead[:, :NEXT, :NEXT] = own[:, :NEXT, :NEXT]
+            ahead[:, :NEXT, NEXT:] = across[:, :NEXT, NEXT:]
+            ahead[:, NEXT:, :NEXT] = across[:, :NEXT, NEXT:].mT
+        return torch.cat(found, 1)[:, :length]
+
+
+def _around(x: Tensor, S: int) -> Tensor:
+    """Return the variables (B, N, 30 + S) that each link of `x` (B, 6 N + S) is coupled to."""
+    near = pad(x[:, :-S], (NEXT, NEXT)).unfold(1, SPAN, LINK)
+    return torch.cat([near, x[:, None, -S:].expand(-1, near.shape[1], -1)], -1)
+
+
+def _cholesky(matrix: Tensor) -> Tensor:
+    """Return the lower factors of `matrix` (B, b, b); not finite where there is none."""
+    L, failed = cholesky_ex(matrix)
+    return torch.div(L, (failed == 0)[:, None, None])
