@@ -42,13 +42,13 @@ class Chain(NamedTuple):
         return cls(like.new_zeros(B, length, LINK, SPAN + S), like.new_zeros(B, S, S))
 
     def add(self, part: Tensor, span: int) -> None:
-        """Add symmetric `part` (B, n, d, d), for `span` links from each of n on and the border."""
-        n, own = part.shape[1], LINK * span
+        """Add symmetric `part` (B, n, d, d): `span` links from each of n on, then some border."""
+        n, own, more = part.shape[1], LINK * span, part.shape[2] - LINK * span
         for k in range(span):
             rows, first = part[:, :, LINK * k : LINK * (k + 1)], NEXT - LINK * k
             self.links[:, k : k + n, :, first : first + own] += rows[..., :own]
-            self.links[:, k : k + n, :, SPAN:] += rows[..., own:]
-        self.corner.add_(part[:, :, own:, own:].sum(1))
+            self.links[:, k : k + n, :, SPAN : SPAN + more] += rows[..., own:]
+        self.corner[:, :more, :more] += part[:, :, own:, own:].sum(1)
 
     def times(self, x: Tensor) -> Tensor:
         """Return the products with vectors (B, 6 N + S)."""

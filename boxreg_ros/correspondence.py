@@ -115,7 +115,7 @@ def support(
     offset = (state.shared[:, None, GAP] + inset).to(points)[..., None] - half[..., FACE_AXIS, :]
     # Masks cost five times as much as sums: what does not count is made to lie very far inside.
     local = in_box_axes(points, problem, state.pose)
-    beyond = local.abs() - half + FAR * (~problem.mask[..., None, :]).to(points)
+    beyond = local.abs().sub_(half).add_((~problem.mask[..., None, :]).to(points), alpha=FAR)
     x, y, z = beyond.unbind(-2)
     count = (x.maximum(y).maximum(z) < margin).sum(-1)
     aside = torch.stack([y.maximum(z), x.maximum(z), x.maximum(y)], -2) - BESIDE
@@ -130,8 +130,7 @@ def support(
     chosen = (depth <= margin + INSIDE) & (torch.arange(most, device=depth.device) < wanted)
     number = chosen.sum(-1)
     share = chosen / number.clamp(min=1)[..., None].to(points)
-    best = torch.take_along_dim(points[:, :, None], index[..., None], 3)
-    best = torch.cat([best, torch.ones_like(best[..., :1])], -1)
+    best = pad(torch.take_along_dim(points[:, :, None], index[..., None], 3), (0, 1), value=1.0)
     moments = (best * share[..., None]).mT @ best
     out = -(torch.where(chosen, depth, 0.0) * share).sum(-1)
     trust = (number >= LEAST) * torch.where(openness[..., :BOTTOM] > 0, 1.0, VEILED)
@@ -152,7 +151,8 @@ def support(
 def in_box_axes(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:
     """Return `points` (B, N, M, 3) of `problem` in boxes at `pose` (B, N, 6), (B, N, 3, M)."""
     shift = (pose[..., :3] - problem.pose[..., :3]).to(points)
-    return rotation_from_rpy(pose[..., 3:]).to(points).mT @ (points - shift[..., None, :]).mT
+    R = rotation_from_rpy(pose[..., 3:]).to(points).mT
+    return (R @ points.mT).sub_(R @ shift[..., None])
 
 
 def carried(problem: Problem, state: State) -> Tensor:

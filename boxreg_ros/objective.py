@@ -245,8 +245,8 @@ class Linearised(NamedTuple):
     """
     A term at one state: n stencils of k observations in a row, F groups of R residuals each.
 
-    `residual` is (B, n, F, R), its derivative `by_pose` (B, n, F, R, 6 k) and `by_shared`
-    (B, n, F, R, 22), or (F, R, 22) where that is the same for all.
+    `residual` is (B, n, F, R), its derivative `by_pose` (B, n, F, R, 6 k) and, by the first s
+    shared variables, `by_shared` (B, n, F, R, s), or (F, R, s) where that is the same for all.
 
     """
 
@@ -287,11 +287,11 @@ def value_and_gradient(
         moved = (flat @ J.flatten(2, 3))[:, :, 0].unflatten(2, (-1, 6))
         for k in range(moved.shape[2]):
             by_pose[:, k : k + n] += moved[:, :, k]
-        by_shared += (flat @ J_shared.flatten(-3, -2)).sum((1, 2))
+        by_shared[:, : J_shared.shape[-1]] += (flat @ J_shared.flatten(-3, -2)).sum((1, 2))
         if curvature is not None:
             W = r.new_zeros(*r.shape, *r.shape[2:])  # one product of full size beats F small ones
             W.diagonal(dim1=2, dim2=4).copy_(term.weight.permute(0, 1, 3, 4, 2))
-            J = torch.cat([J, J_shared.expand(*r.shape, SHARED)], -1).flatten(2, 3)
+            J = torch.cat([J, J_shared.expand(*r.shape, -1)], -1).flatten(2, 3)
             curvature.add(J.mT @ (W.flatten(4, 5).flatten(2, 3) @ J), moved.shape[2])
     return value, gradient
 
@@ -363,9 +363,8 @@ def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:
     by_pose[..., 3, 3:] = -(shift[:, :, None, None] @ dR)[..., 0, :].mT
     planes = torch.cat([R.mT, by_pose[..., 3, :3] @ shift[..., None]], -1)
     residual, by_pose = (torch.stack([x, -x], 3).flatten(2, 3) for x in (planes, by_pose))
-    extent, gap = state.shared[:, EXTENT], state.shared[:, GAP]
-    residual[..., 3] += inset + (gap - extent[:, FACE_AXIS] / 2)[:, None]
-    by_shared, one = R.new_zeros(6, 4, SHARED), torch.eye(SHARED).to(R)
+    residual[..., 3] += inset + (state.shared[:, GAP] - state.shared[:, FACE_AXIS] / 2)[:, None]
+    by_shared, one = R.new_zeros(6, 4, GAP.stop), torch.eye(GAP.stop).to(R)
     by_shared[:, 3] = one[GAP] - one[EXTENT].repeat_interleave(2, 0) / 2
     return Linearised(residual, by_pose, by_shared)
 
@@ -375,7 +374,7 @@ def prior(state: State, given: Tensor, axes: Tensor) -> Linearised:
     along = torch.eye(6).to(given).repeat(*given.shape[:2], 1, 1, 1)
     along[..., :3, :3] = axes.mT[..., None, :, :]
     residual = (along @ (state.pose - given)[..., None, :, None])[..., 0]
-    by_shared = -torch.eye(SHARED).to(given)[None, BIAS]
+    by_shared = -torch.eye(BIAS.stop).to(given)[None, BIAS]
     return Linearised(residual - state.shared[:, None, None, BIAS], along, by_shared)
 
 
@@ -404,7 +403,7 @@ def acceleration(state: State, times: Tensor) -> Linearised:
     residual = ((p[:, 2:] - p[:, 1:-1]) / second - (p[:, 1:-1] - p[:, :-2]) / first) / mean
     weights = torch.stack([1 / first, -1 / first - 1 / second, 1 / second], -1) / mean[..., None]
     by_pose = (weights[..., None] * eye[:, None, :]).flatten(-2)[:, :, None]
-    return Linearised(residual[:, :, None], by_pose, p.new_zeros(1, 6, SHARED))
+    return Linearised(residual[:, :, None], by_pose, p.new_zeros(1, 6, 0))
 
 
 def rest(state: State) -> Linearised:
@@ -412,7 +411,7 @@ def rest(state: State) -> Linearised:
     p = state.pose
     eye = torch.eye(6).to(p)
     by_pose = torch.cat([-eye, eye], -1).expand(*p[:, 1:].shape[:2], 1, 6, 12)
-    return Linearised((p[:, 1:] - p[:, :-1])[:, :, None], by_pose, p.new_zeros(1, 6, SHARED))
+    return Linearised((p[:, 1:] - p[:, :-1])[:, :, None], by_pose, p.new_zeros(1, 6, 0))
 
 
 def slip(state: State, times: Tensor) -> Linearised:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -21,10 +21,10 @@ TF_DEFINITION = {'tf2_msgs/msg/TFMessage': 'geometry_msgs/TransformStamped[] tra
 
 def write_recording(
     path: Path,
-    sweeps: Sequence[Sweep],
-    intensities: Sequence[NDArray[Any]],
-    detections: Sequence[BoxArray],
-    T_fixed_sensor: Floats,
+    sweeps: Iterable[Sweep],
+    intensities: Iterable[NDArray[Any]],
+    detections: Iterable[BoxArray],
+    T_fixed_sensor: Iterable[Floats],
     fixed_frame: str,
 ) -> None:
     """
@@ -36,7 +36,7 @@ def write_recording(
         Ends in ``.mcap``.
     sweeps, intensities, detections
         One each per stamp, all in the sensor's frame.
-    T_fixed_sensor : array, shape (n, 4, 4)
+    T_fixed_sensor : n arrays, shape (4, 4)
         Where the sensor was at each stamp, in `fixed_frame`.
     fixed_frame : str
         Parent frame of the odometry.

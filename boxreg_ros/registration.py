@@ -393,9 +393,9 @@ def _judge(
 
 def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     """Return how many points lie in boxes of `pose` (B, N, 6) and `extent` (B, N, 3), (B, N)."""
-    local = in_box_axes(problem.points, problem, pose).abs()
-    x, y, z = (local < extent[..., None].to(local) / 2 + 0.05).unbind(-2)
-    return (x & y & z & problem.mask).sum(-1)
+    local = in_box_axes(problem.points, problem, pose).abs_()
+    x, y, z = local.sub_(extent[..., None].to(local) / 2).unbind(-2)
+    return ((x.maximum(y).maximum(z) < 0.05) & problem.mask).sum(-1)
 
 
 def _kept(window: Window, reason: str) -> Estimate:

@@ -10,20 +10,20 @@ LENGTHS = [2, 3, 10, 11, 27]  # one block, and several that are not all full
 
 
 def chain(length, seed=0):
-    """Return matrices summed over all spans, and the same dense."""
+    """Return matrices summed over all spans, with some of the border, and the same dense."""
     rng = np.random.default_rng(seed)
     D = LINK * length + S
     found = Chain.zeros(torch.zeros(B, D, dtype=torch.float64), length)
     known = np.zeros((B, D, D))
-    for span in (1, 2, 3):
-        n, d = length - span + 1, LINK * span + S
+    for span, border in ((1, S), (1, 2), (2, 3), (3, 0)):
+        n, d = length - span + 1, LINK * span + border
         if n < 1:
             continue
         root = rng.normal(size=(B, n, d, d))
         part = root @ root.swapaxes(-1, -2)
         found.add(torch.from_numpy(part), span)
         for i in range(n):
-            index = np.r_[LINK * i : LINK * (i + span), D - S : D]
+            index = np.r_[LINK * i : LINK * (i + span), D - S : D - S + border]
             known[:, index[:, None], index] += part[:, i]
     return found, known
 

@@ -346,7 +346,7 @@ def test_jacobians_equal_automatic_differentiation(name):
         for i in range(r.shape[1]):
             span = by_pose.shape[-1] // 6
             pose[i, :, :, i : i + span] = by_pose[b, i].unflatten(-1, (span, 6))
-        shared = by_shared.expand(*r.shape, SHARED)[b].flatten(0, -2)
+        shared[:, : by_shared.shape[-1]] = by_shared.expand(*r.shape, -1)[b].flatten(0, -2)
         found[b, ..., b, :] = State(pose.flatten(0, 2), shared).pack().unflatten(0, r.shape[1:])
     np.testing.assert_allclose(found, known, atol=1e-9)
 
