@@ -15,7 +15,7 @@ from torch import Tensor
 
 KINDS = ([0, 1], [2, 3], [4], [5])  # ends, sides, top, bottom
 RULE_ERROR = (0.05, 0.05, 0.05, 0.15)  # how far a rule may be from the expected one [m]
-TRACKS, SCATTERS = 500, 100  # remembered: tracks, and observations of each
+TRACKS, SCATTERS = 100, 100  # remembered: tracks, and observations of each
 LEAST = 20  # observations of a track, that it tells how its input errs
 
 
@@ -80,6 +80,8 @@ class InputModel:
         self._config = config
         self._sights: OrderedDict[str, Floats] = OrderedDict()
         self._scatter: OrderedDict[str, deque[Floats]] = OrderedDict()
+        self._noise: InputNoise | None = None
+        self._fresh = self._measured = 0
 
     def learn_rule(
         self, names: Sequence[str], support: Support, fresh: Tensor, rule: Rule
@@ -108,7 +110,8 @@ class InputModel:
     def learn_noise(self, names: Sequence[str], scatters: Floats) -> None:
         """Take what one more observation of each track `names` scatters, (B, 9)."""
         for name, row in zip(names, scatters, strict=True):
-            self._scatter.setdefault(name, deque(maxlen=SCATTERS)).append(row)
+            self._scatter.setdefault(name, deque(maxlen=SCATTERS)).append(row.copy())
+        self._fresh += len(names)
         _forget(self._scatter, names)
 
     def rule(self) -> Rule:
@@ -133,13 +136,22 @@ class InputModel:
         return values
 
     def noise(self) -> InputNoise | None:
-        """Return the noise of what `learn_noise` took; None as long as that is too little."""
+        """
+        Return the noise of what `learn_noise` took; None as long as that is too little.
+
+        Measured anew when that has grown by a twentieth: it costs as much as there is.
+
+        """
+        if self._fresh < 0.05 * self._measured:
+            return self._noise
         rows = [np.array(row) for row in self._scatter.values() if len(row) >= LEAST]
         if not rows:
             return None
         valid = np.arange(SCATTERS) < np.array([len(row) for row in rows])[:, None]
         padded = np.stack([np.pad(row, ((0, SCATTERS - len(row)), (0, 0))) for row in rows])
-        return InputNoise.measure(torch.from_numpy(padded), torch.from_numpy(valid))
+        self._noise = InputNoise.measure(torch.from_numpy(padded), torch.from_numpy(valid))
+        self._fresh, self._measured = 0, int(valid.sum())
+        return self._noise
 
 
 def _forget(
