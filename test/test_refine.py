@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from boxreg_ros import Config, refine, Track
 from boxreg_ros.errors import ShapeError
-from boxreg_ros.metrics import iou_3d, pose_errors
+from boxreg_ros.metrics import iou_3d, pose_errors, wrap
 from boxreg_ros.simulate import simulate
 import numpy as np
 import pytest
@@ -393,3 +393,28 @@ def test_garbage_does_not_touch_its_neighbours():
         # What is learnt of the input is shared by all: a little may change.
         assert np.abs(found.boxes - known.boxes)[:, :3].max() < 0.1
         assert iou_3d(found.boxes, truth).mean() > iou_3d(good.boxes, truth).mean()
+
+
+def normalised_errors(scenario, seeds):
+    """Return the mean of e' C^-1 e / 6 over all refined boxes, e the error and C its covariance."""
+    values = []
+    for seed in seeds:
+        scene = simulate(scenario, seed)
+        table = scene.truth
+        keys = zip(table.stamps_ns.tolist(), table.track_ids, strict=True)
+        truth = dict(zip(keys, table.boxes, strict=True))
+        tracks = scene.tracks()
+        for track, refined in zip(tracks, refine(tracks), strict=True):
+            for i, stamp_ns in enumerate(track.stamps_ns.tolist()):
+                true = truth[stamp_ns, track.track_id]
+                error = (refined.boxes[i] - true)[[0, 1, 2, 6, 7, 8]]
+                error[3:] = wrap(error[3:])
+                if refined.status[i] == 'refined' and abs(error[5]) < np.pi / 2:
+                    values.append(error @ np.linalg.solve(refined.covariances[i], error) / 6)
+    return np.mean(values)
+
+
+@pytest.mark.parametrize(('scenario', 'seeds'), [('street', range(2)), ('paper', range(5))])
+def test_errors_are_as_large_as_the_covariance_says(scenario, seeds):
+    # 1 where the covariance is right; 0.7 to 1.5 is asked of it.
+    assert 0.7 <= normalised_errors(scenario, seeds) <= 1.5
