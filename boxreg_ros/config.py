@@ -96,7 +96,7 @@ class PaperConfig:
     """Weights of the paper's objective (Eq. 8); read with ``objective: paper`` only."""
 
     closeness: float = setting(0.1, 'weight of Eq. 4', '1/m^2', 0.0, 1e6)
-    enclosure: float = setting(1.0, 'weight of Eq. 5', '1/m', 0.0, 1e6)
+    enclosure: float = setting(3.0, 'weight of Eq. 5', '1/m', 0.0, 1e6)
     smoothness: float = setting(0.1, 'weight of Eq. 6 and of its constraint', '', 0.0, 1e6)
     alignment: float = setting(0.3, 'weight of Eq. 7 and of its constraint', '', 0.0, 1e6)
     nearest: int = setting(8, 'K, the closest points per visible face in Eq. 4', '', 1, 10000)
