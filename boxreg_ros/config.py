@@ -194,11 +194,7 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, as `from_dict` and YAML take them."""
-
-        def plain(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-            return {k: list(v) if isinstance(v, tuple) else v for k, v in pairs}
-
-        return asdict(self, dict_factory=plain)
+        return asdict(self)
 
     def updated(self, changes: Mapping[str, Any]) -> Config:
         """

@@ -29,20 +29,16 @@ REFINED, KEPT, INTERPOLATED = 'refined', 'kept', 'interpolated'
 
 def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
     """Return `value` as float64 of `shape` (None: any length), or raise ShapeError."""
+    wanted = str(shape).replace('None', 'N')
     try:
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ShapeError(f'{name}: expected numbers of shape {_text(shape)}: {error}') from None
+        raise ShapeError(f'{name}: expected numbers of shape {wanted}: {error}') from None
     if array.ndim != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, array.shape, strict=False)
+        want not in (None, got) for want, got in zip(shape, array.shape, strict=True)
     ):
-        raise ShapeError(f'{name}: expected shape {_text(shape)}, got {array.shape}')
+        raise ShapeError(f'{name}: expected shape {wanted}, got {array.shape}')
     return array
-
-
-def _text(shape: tuple[int | None, ...]) -> str:
-    inner = ', '.join('N' if n is None else str(n) for n in shape)
-    return f'({inner},)' if len(shape) == 1 else f'({inner})'
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,12 +189,9 @@ class Track:
             raise ShapeError(
                 f'points of track {self.track_id!r}: expected {n}, got {len(self.points)}'
             )
-        points = tuple(np.asarray(p).reshape(-1, 3) if np.size(p) == 0 else p for p in self.points)
-        object.__setattr__(
-            self,
-            'points',
-            tuple(checked(f'points[{i}]', p, (None, 3)) for i, p in enumerate(points)),
-        )
+        rows = [p if np.size(p) else np.zeros((0, 3)) for p in self.points]
+        points = tuple(checked(f'points[{i}]', p, (None, 3)) for i, p in enumerate(rows))
+        object.__setattr__(self, 'points', points)
         for name, shape in (('sensor_origins', (n, 3)), ('scores', (n,))):
             value = getattr(self, name)
             if value is not None:
