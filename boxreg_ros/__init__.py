@@ -4,10 +4,9 @@ from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.structures import RefinedTrack, Track
 
 if TYPE_CHECKING:
-    from boxreg_ros.tracks import refine
+    from boxreg_ros.tracks import refine, RefinedTrack, Track
 
 __version__ = '0.1.0'
 
@@ -16,8 +15,8 @@ __all__ = ['BoxregError', 'Config', 'RefinedTrack', 'Track', 'refine']
 
 def __getattr__(name: str) -> Any:
     """Import what needs torch when it is first asked for: it takes seconds."""
-    if name == 'refine':
-        from boxreg_ros.tracks import refine
+    if name in __all__:
+        from boxreg_ros import tracks
 
-        return refine
+        return getattr(tracks, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -11,7 +11,8 @@ from __future__ import annotations
 from typing import Any
 
 from boxreg_ros.metrics import EXTENT, wrap
-from boxreg_ros.structures import Floats, LENGTH, PITCH, ROLL, Track, WIDTH, YAW
+from boxreg_ros.structures import Floats, LENGTH, PITCH, ROLL, WIDTH, YAW
+from boxreg_ros.tracks import Track
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

@@ -93,13 +93,11 @@ class InputModel:
 
         """
         out, retreat = support.outwardness.cpu().numpy(), support.retreat.cpu().numpy()
-        share = retreat / np.maximum(rule.depths.cpu().numpy(), 1e-6)
+        gaps, depths = rule.gaps.cpu().numpy(), rule.depths.cpu().numpy()
+        share = retreat / np.maximum(depths, 1e-6)
         usable = ((support.trust > 0) & (fresh & (support.points >= 30))[..., None]).cpu().numpy()
         usable &= np.abs(out) < 0.5
-        sights = (
-            rule.gaps.cpu().numpy() - out,
-            rule.depths.cpu().numpy() - out / np.maximum(share, 0.5),
-        )
+        sights = gaps - out, depths - out / np.maximum(share, 0.5)
         for b, name in enumerate(names):
             known = self._sights.setdefault(name, np.zeros((2, 2, 6)))
             for k, which in enumerate((share < 0.25, share > 0.5)):

@@ -10,25 +10,14 @@ so doubling one halves the pull of that term.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, MISSING
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError
 import yaml
-
-
-def setting(
-    default: Any,
-    meaning: str,
-    unit: str = '',
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-) -> Any:
-    """Return a dataclass field that knows its meaning, unit and bounds."""
-    facts = {'meaning': meaning, 'unit': unit, 'low': low, 'high': high, 'choices': choices}
-    return field(default=default, metadata=facts)
 
 
 class Setting(NamedTuple):
@@ -37,10 +26,15 @@ class Setting(NamedTuple):
     name: str
     default: bool | int | float | str | tuple[str, ...]
     meaning: str
-    unit: str
-    low: float | None
-    high: float | None
-    choices: tuple[str, ...]
+    unit: str = ''
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+def setting(default: Any, *facts: Any, **more: Any) -> Any:
+    """Return a dataclass field that knows what a `Setting` is made of, its name excepted."""
+    return field(default=default, metadata={'of': Setting('', default, *facts, **more)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,28 +151,22 @@ class Config:
     reach: float = setting(0.06, 'a sweep this far off serves, moved along', 's', 0.0, 10.0)
     queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)
     device: str = setting('cpu', "where windows are solved: 'cpu', 'cuda', 'cuda:1', ...")
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    faces: FaceConfig = field(default_factory=FaceConfig)
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    paper: PaperConfig = field(default_factory=PaperConfig)
-    vehicle: ClassConfig = field(
-        default_factory=lambda: ClassConfig(
-            names=('car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram')
-        )
+    sampling: SamplingConfig = SamplingConfig()
+    faces: FaceConfig = FaceConfig()
+    solver: SolverConfig = SolverConfig()
+    paper: PaperConfig = PaperConfig()
+    vehicle: ClassConfig = ClassConfig(
+        names=('car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram')
     )
-    cyclist: ClassConfig = field(
-        default_factory=lambda: ClassConfig(
-            names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
-            acceleration=2.0,
-            cornering=2.0, turning=1.5, slip=0.4, pivot=0.2, shape=0.06, heading=0.15, extent=0.1,
-        )
+    cyclist: ClassConfig = ClassConfig(
+        names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
+        acceleration=2.0,
+        cornering=2.0, turning=1.5, slip=0.4, pivot=0.2, shape=0.06, heading=0.15, extent=0.1,
     )  # fmt: skip
-    pedestrian: ClassConfig = field(
-        default_factory=lambda: ClassConfig(
-            names=('pedestrian', 'person', 'walker', 'people', 'child'),
-            acceleration=2.0,
-            cornering=2.0, turning=4.0, slip=1.5, pivot=0.0, shape=0.15, heading=0.5, extent=0.1,
-        )
+    pedestrian: ClassConfig = ClassConfig(
+        names=('pedestrian', 'person', 'walker', 'people', 'child'),
+        acceleration=2.0,
+        cornering=2.0, turning=4.0, slip=1.5, pivot=0.0, shape=0.15, heading=0.5, extent=0.1,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -194,10 +182,7 @@ class Config:
     def items(self) -> Iterator[tuple[Setting, Any]]:
         """Yield every setting with its present value, groups flattened to dotted names."""
         for item in settings():
-            value: Any = self
-            for part in item.name.split('.'):
-                value = getattr(value, part)
-            yield item, value
+            yield item, attrgetter(item.name)(self)
 
     def class_config(self, class_name: str) -> ClassConfig:
         """Return how objects of `class_name` move; unknown classes move like vehicles."""
@@ -209,11 +194,7 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, as `from_dict` and YAML take them."""
-
-        def plain(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-            return {k: list(v) if isinstance(v, tuple) else v for k, v in pairs}
-
-        return asdict(self, dict_factory=plain)
+        return asdict(self)
 
     def updated(self, changes: Mapping[str, Any]) -> Config:
         """
@@ -247,7 +228,8 @@ class Config:
             For an unknown key, by name, or a value of the wrong type or out of bounds.
 
         """
-        return cls(**_arguments(cls(), values, ''))
+        config: Config = _filled(cls(), values, '')
+        return config
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
@@ -262,70 +244,51 @@ class Config:
         """
         try:
             values = yaml.safe_load(Path(path).read_text(encoding='utf-8')) or {}
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            reason = ' '.join(str(error).split())
-            raise ConfigError(f'config file {str(path)!r} cannot be read: {reason}') from None
-        if isinstance(values, dict) and values:
-            inner = next(iter(values.values()))
-            if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
-                values = inner['ros__parameters']
-        if not isinstance(values, dict):
-            raise ConfigError(
-                f'config file {str(path)!r}: expected settings by name, got {values!r}'
-            )
-        try:
+            if isinstance(values, dict):
+                inner = next(iter(values.values()), None)
+                if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
+                    values = inner['ros__parameters']
             return cls.from_dict(values)
-        except ConfigError as error:
-            raise ConfigError(f'config file {str(path)!r}: {error}') from None
+        except (OSError, UnicodeDecodeError, yaml.YAMLError, ConfigError) as error:
+            reason = ' '.join(str(error).split())
+            raise ConfigError(f'config file {str(path)!r}: {reason}') from None
 
 
 def settings() -> Iterator[Setting]:
     """Yield every setting of `Config` with its default, groups flattened to dotted names."""
     for item in fields(Config):
-        if item.default is not MISSING:
-            yield Setting(item.name, item.default, **item.metadata)
-        elif item.default_factory is not MISSING:
-            group = item.default_factory()
-            for part in fields(group):
-                yield Setting(
-                    f'{item.name}.{part.name}', getattr(group, part.name), **part.metadata
-                )
+        if not is_dataclass(item.default):
+            yield item.metadata['of']._replace(name=item.name)
+            continue
+        for part in fields(item.default):
+            name, default = f'{item.name}.{part.name}', getattr(item.default, part.name)
+            yield part.metadata['of']._replace(name=name, default=default)
 
 
-def _arguments(default: Any, values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    known = {item.name for item in fields(default)}
-    for key in values:
+def _filled(default: Any, value: Any, name: str) -> Any:
+    """Return `value` as a setting, or a group of them where what is absent is `default`."""
+    if not is_dataclass(default):
+        return _cast(name, value, default)
+    if not isinstance(value, Mapping):
+        raise ConfigError(f'{name or "all"}: expected a group of settings, got {value!r}')
+    known = {item.name: getattr(default, item.name) for item in fields(default)}
+    prefix = f'{name}.' if name else ''
+    for key in value:
         if key not in known:
             raise ConfigError(
                 f'{prefix}{key}: no such setting; expected one of {", ".join(sorted(known))}'
             )
-    arguments: dict[str, Any] = {}
-    for name in known:
-        was = getattr(default, name)
-        value = values.get(name, was)
-        if is_dataclass(was) and value is not was:
-            if not isinstance(value, Mapping):
-                raise ConfigError(f'{prefix}{name}: expected a group of settings, got {value!r}')
-            group: Any = type(was)
-            value = group(**_arguments(was, value, f'{prefix}{name}.'))
-        elif not is_dataclass(was):
-            value = _cast(f'{prefix}{name}', value, was)
-        arguments[name] = value
-    return arguments
+    changes = {key: _filled(known[key], inner, prefix + key) for key, inner in value.items()}
+    return replace(default, **changes)  # type: ignore[type-var]
 
 
 def _cast(name: str, value: Any, default: Any) -> Any:
-    if isinstance(default, tuple):
-        if isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value):
+    if isinstance(default, float) and not isinstance(value, bool):
+        with suppress(TypeError, ValueError):
+            return float(value)  # YAML reads 1e-4, without a point, as text
+    elif isinstance(default, tuple):
+        if isinstance(value, list | tuple) and all(isinstance(v, str) for v in value):
             return tuple(value)
-    elif isinstance(default, float):
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            return float(value)
-        if isinstance(value, str):  # YAML reads 1e-4, without a point, as text
-            try:
-                return float(value)
-            except ValueError:
-                pass
     elif type(value) is type(default):
         return value
     kind = 'list of text' if isinstance(default, tuple) else type(default).__name__
@@ -335,9 +298,6 @@ def _cast(name: str, value: Any, default: Any) -> Any:
 def _check(item: Setting, value: Any) -> None:
     if item.choices and value not in item.choices:
         raise ConfigError(f'{item.name}: expected one of {", ".join(item.choices)}, got {value!r}')
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        low = -float('inf') if item.low is None else item.low
-        high = float('inf') if item.high is None else item.high
-        unit = f' {item.unit}' if item.unit else ''
-        if not low <= value <= high:
-            raise ConfigError(f'{item.name}: expected {low:g} to {high:g}{unit}, got {value!r}')
+    if item.low is not None and item.high is not None and not item.low <= value <= item.high:
+        bounds = f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
+        raise ConfigError(f'{item.name}: expected {bounds}, got {value!r}')

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from boxreg_ros import refine
+from boxreg_ros import refine, Track
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.intake import covariances_to_write, Intake
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep, Track
+from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 from boxreg_ros.transforms import (
     boxes_to_frame,
     inverse,

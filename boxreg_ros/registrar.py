@@ -104,7 +104,7 @@ class BoxRegistrar:
     def _open(self, pair: Pair) -> '_Tick':
         """Start a tick: sort its boxes out and add an observation to the track of each."""
         boxes, sweep = pair
-        tick = _Tick.of(boxes)
+        tick = _Tick(boxes)
         self._ticks.append(tick)
         now_ns = boxes.stamp_ns
         newest_ns, self._newest_ns = self._newest_ns, max(now_ns, self._newest_ns)
@@ -157,24 +157,18 @@ class BoxRegistrar:
         return ready
 
 
-@dataclass(eq=False, slots=True)
 class _Tick:
     """One box array on its way: the best known about each box, and how many still wait."""
 
-    boxes: BoxArray
-    refined: np.ndarray
-    status: list[str]
-    reasons: list[str]
-    num_points: np.ndarray
-    covariances: np.ndarray
-    waiting: int = 0
-    is_paired: bool = False
-
-    @classmethod
-    def of(cls, boxes: BoxArray) -> '_Tick':
+    def __init__(self, boxes: BoxArray) -> None:
         n = len(boxes.track_ids)
-        unknown = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()
-        return cls(boxes, boxes.boxes.copy(), [KEPT] * n, [''] * n, np.zeros(n, int), unknown)
+        self.boxes = boxes
+        self.refined = boxes.boxes.copy()
+        self.status, self.reasons = [KEPT] * n, [''] * n
+        self.num_points = np.zeros(n, int)
+        self.covariances = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()
+        self.waiting = 0
+        self.is_paired = False
 
     def refuse(self, reason: str) -> None:
         """Give a reason to each box the core cannot take; `reason` holds for all if not empty."""

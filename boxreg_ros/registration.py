@@ -7,7 +7,7 @@ from boxreg_ros import objective
 from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
 from boxreg_ros.config import Config
 from boxreg_ros.correspondence import in_box_axes, Support, support
-from boxreg_ros.geometry import rotation_from_rpy
+from boxreg_ros.geometry import rotation_from_rpy, wrap_angle
 from boxreg_ros.lbfgs import minimize
 from boxreg_ros.objective import ANCHOR, EXTENT, Problem, SHARED, State, Sum, Term
 from boxreg_ros.shape import agreement
@@ -81,34 +81,48 @@ def _register(windows: Sequence[Window], config: Config, model: InputModel) -> l
             state, covariances = solve(problem, config, model, rounds)
         if config.estimate != 'track':
             _learn_noise(model, part, problem, state, config.lag)
-        found = _estimates(part, problem, base, state, covariances, config)
+        kept = [estimates[i] for i in rows]
+        found = _judged(kept, problem, base, state, covariances, config)
         for i, estimate in zip(rows, found, strict=True):
             estimates[i] = estimate
     return estimates
 
 
-def _estimates(
-    windows: Sequence[Window],
+def _judged(
+    kept: Sequence[Estimate],
     problem: Problem,
     base: Floats,
     state: State,
     covariances: Tensor,
     config: Config,
 ) -> list[Estimate]:
-    """Return what a solved batch says of each window, in the fixed frame."""
+    """
+    Return what a solved batch says of each window, in the fixed frame.
+
+    Where that does not deserve trust it is the input, `kept`. Beside points at all and finite
+    numbers, a refined box must hold nearly as many of the points as the input box does: a test
+    the objective does not make.
+
+    """
     given = problem.boxes[..., 3:6]
     extent = given if config.extent == 'fixed' else state.shared[:, None, EXTENT].expand_as(given)
-    pairs = ((problem.pose, given), (state.pose, extent))
-    held = torch.stack([_held(problem, *pair) for pair in pairs], 1)
-    angles = torch.atan2(state.pose[..., 3:].sin(), state.pose[..., 3:].cos())
-    boxes = torch.cat([state.pose[..., :3], extent, angles], -1).cpu().numpy()
-    boxes[..., :3] += base[:, None]
-    spread, counts = covariances.cpu().numpy(), held.cpu().numpy()
+    boxes = torch.cat([state.pose[..., :3], extent, wrap_angle(state.pose[..., 3:])], -1)
+    finite = boxes.isfinite().all(-1) & (extent > 0).all(-1) & covariances.isfinite().all((2, 3))
+    before, after = _held(problem, problem.pose, given), _held(problem, state.pose, extent)
+    failed = torch.stack([~problem.mask.any(-1), ~finite, after < before / 2 - 3])
+    good = (~failed.any(0)).cpu().numpy()
+    status = np.where(good, REFINED, KEPT)
+    reasons = np.select(list(failed.cpu().numpy()), ['no_points', 'not_finite', 'no_gain'], '')
+    found, spread = boxes.cpu().numpy(), covariances.cpu().numpy()
+    found[..., :3] += base[:, None]
     estimates = []
-    for b, window in enumerate(windows):
-        n = len(window.observations)
-        before = np.array([o.box for o in window.observations])
-        estimates.append(_judge(window, before, boxes[b, :n], counts[b, :, :n], spread[b, :n]))
+    for b, known in enumerate(kept):
+        n = len(known.boxes)
+        is_own = good[b, :n, None]
+        own = np.where(is_own, found[b, :n], known.boxes)
+        error = np.where(is_own[..., None], spread[b, :n], known.covariances)
+        words = tuple(status[b, :n].tolist()), tuple(reasons[b, :n].tolist())
+        estimates.append(Estimate(own, *words, error))
     return estimates
 
 
@@ -191,10 +205,10 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
         return torch.cat([pose[..., :3], extent[rows], pose[..., 3:]], -1)
 
     def function(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        part = problem if len(rows) == len(extent) else problem.select(rows)
         with torch.enable_grad():
             x = x.detach().requires_grad_()
-            loss, _ = objective.total(boxes(x, rows), part, settings, multipliers[rows], rounding)
+            part, factors = problem.select(rows), multipliers[rows]
+            loss, _ = objective.total(boxes(x, rows), part, settings, factors, rounding)
             (gradient,) = torch.autograd.grad(loss.sum(), x)
         return loss.detach(), gradient * free[rows]
 
@@ -258,19 +272,8 @@ def weigh(
     gap = (faces.spread**2 + (RETREAT_SPREAD * hidden) ** 2).sqrt()
     unusual = (state.shared[:, objective.GAP] - expected[:, objective.GAP]) / gap
     gap = gap * (1 + (unusual / GAP_OUTLIER) ** 2).sqrt()
-    shared = (
-        torch.cat(
-            [
-                expected[:, :3] * extent,
-                bias,
-                gap,
-                torch.full_like(gap[:, :1], 0.25),
-                torch.full_like(gap, 1.0),
-            ],
-            1,
-        )
-        ** -2
-    )
+    pivot, anchor = torch.full_like(gap[:, :1], 0.25), torch.ones_like(gap)
+    shared = torch.cat([expected[:, :3] * extent, bias, gap, pivot, anchor], 1) ** -2
     # Motion: smoothness, alignment, rest.
     change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2
     turn = torch.eye(6).to(state.pose).expand(*state.pose.shape[:2], 6, 6).clone()
@@ -328,8 +331,7 @@ def _parked(problem: Problem) -> Tensor:
     change = middle((index >= count - third) & problem.valid) - middle(index < third)
     moved: Tensor = change[:, :2].norm(dim=1)
     is_parked = (moved < PARKED[0] * change[:, 2]) & (moved < PARKED[1])
-    still: Tensor = (is_parked[:, None] & problem.valid[:, 1:]).to(where)
-    return still
+    return (is_parked[:, None] & problem.valid[:, 1:]).to(where)
 
 
 def expected_shared(problem: Problem, rule: Rule) -> Tensor:
@@ -367,28 +369,6 @@ def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None
     state = State(problem.pose, expected_shared(problem, rule))
     sights = support(problem, state, MARGINS[0], config.faces.outermost, rule.depths)
     model.learn_rule([w.track_id for w in windows], sights, problem.valid, rule)
-
-
-def _judge(
-    window: Window, given: Floats, boxes: Floats, held: Floats, covariances: Floats
-) -> Estimate:
-    """
-    Return the refined boxes, or the input where they do not deserve trust.
-
-    Beside points at all and finite numbers, a refined box must hold nearly as many of the points
-    as the input box does: a test the objective does not make. `held` (2, N) counts them.
-
-    """
-    finite = np.isfinite(boxes).all(1) & (boxes[:, 3:6] > 0).all(1)
-    finite &= np.isfinite(covariances).all((1, 2))
-    empty = np.array([len(o.points) == 0 for o in window.observations], dtype=bool)
-    lost = held[1] < held[0] / 2 - 3
-    names = ['no_points', 'not_finite', 'no_gain']
-    reasons: list[str] = np.select([empty, ~finite, lost], names, '').tolist()
-    good = np.array([not reason for reason in reasons])
-    status = tuple(REFINED if ok else KEPT for ok in good)
-    covariances = np.where(good[:, None, None], covariances, np.eye(6))
-    return Estimate(np.where(good[:, None], boxes, given), status, tuple(reasons), covariances)
 
 
 def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:

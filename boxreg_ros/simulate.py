@@ -28,9 +28,9 @@ from boxreg_ros.structures import (
     PITCH,
     ROLL,
     Sweep,
-    Track,
     YAW,
 )
+from boxreg_ros.tracks import Track
 from boxreg_ros.transforms import boxes_to_frame, inverse
 import numpy as np
 from numpy.typing import NDArray

@@ -1,20 +1,102 @@
 """Whole tracks in, refined tracks out: the core without topics and files."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.structures import (
     BoxArray,
+    checked,
+    Floats,
     INTERPOLATED,
+    Ints,
     RefinedBoxes,
-    RefinedTrack,
     Sweep,
-    Track,
 )
 import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """
+    One object over time, as arrays in the fixed frame.
+
+    Attributes
+    ----------
+    track_id, class_name : str
+        Identity and category.
+    stamps_ns : array, shape (N,)
+        Strictly increasing [ns].
+    boxes : array, shape (N, 9)
+        Input boxes.
+    points : sequence of N arrays, shape (M_i, 3)
+        Returns on and around the object [m]; M_i may be 0.
+    sensor_origins : array, shape (N, 3), or None
+        Where the sensor was [m]; without it visible faces are told by the points' centre of mass.
+    scores : array, shape (N,), or None
+        Detector confidence.
+
+    """
+
+    track_id: str
+    class_name: str
+    stamps_ns: Ints
+    boxes: Floats
+    points: Sequence[NDArray[np.floating]]
+    sensor_origins: Floats | None = None
+    scores: Floats | None = None
+
+    def __post_init__(self) -> None:
+        """Check shapes and order; convert lists to arrays."""
+        stamps = np.asarray(self.stamps_ns, dtype=np.int64)
+        if stamps.ndim != 1 or (np.diff(stamps) <= 0).any():
+            raise ShapeError(
+                f'stamps_ns of track {self.track_id!r}: expected (N,) strictly increasing [ns]'
+            )
+        n = len(stamps)
+        object.__setattr__(self, 'stamps_ns', stamps)
+        object.__setattr__(self, 'boxes', checked('boxes', self.boxes, (n, 9)))
+        if len(self.points) != n:
+            raise ShapeError(
+                f'points of track {self.track_id!r}: expected {n}, got {len(self.points)}'
+            )
+        rows = [p if np.size(p) else np.zeros((0, 3)) for p in self.points]
+        points = tuple(checked(f'points[{i}]', p, (None, 3)) for i, p in enumerate(rows))
+        object.__setattr__(self, 'points', points)
+        for name, shape in (('sensor_origins', (n, 3)), ('scores', (n,))):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, checked(name, value, shape))
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedTrack:
+    """
+    What `refine` returns for one track, row by row with its input.
+
+    Attributes
+    ----------
+    track_id : str
+        That of the input.
+    boxes : array, shape (N, 9)
+        Refined boxes, fixed frame.
+    status : tuple of N str
+        ``refined``, ``kept`` or ``interpolated``.
+    reasons : tuple of N str
+        Why a box was kept; empty for the others.
+    covariances : array, shape (N, 6, 6)
+        Of x y z roll pitch yaw [m, rad].
+
+    """
+
+    track_id: str
+    boxes: Floats
+    status: tuple[str, ...]
+    reasons: tuple[str, ...]
+    covariances: Floats
 
 
 def refine(tracks: Sequence[Track], config: Config | None = None) -> list[RefinedTrack]:

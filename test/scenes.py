@@ -3,7 +3,8 @@
 from boxreg_ros import objective
 from boxreg_ros.objective import Problem, SHARED
 from boxreg_ros.sampling import observe
-from boxreg_ros.structures import BoxArray, Sweep, Track
+from boxreg_ros.structures import BoxArray, Sweep
+from boxreg_ros.tracks import Track
 from boxreg_ros.window import Window
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -11,7 +11,7 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.evaluate import evaluate
 from boxreg_ros.recorder import write_recording
 from boxreg_ros.simulate import simulate
-from boxreg_ros.structures import Track
+from boxreg_ros.tracks import Track
 import numpy as np
 import pytest
 import torch
