@@ -55,8 +55,8 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     lever = p.new_zeros(*near.shape, 7)  # of all points of an observation, and how far off it is
     found = torch.cat([normal, torch.linalg.cross(p, normal), off[:, None]], 1)
     lever[near] = found * weight.sqrt()
-    count = (lever[..., :3] != 0).any(-1).sum(-1)
-    total = (lever.mT @ lever * (SAY / count.clamp(min=SAY))[..., None, None]).to(state.pose)
+    seen = (lever[..., :3] != 0).any(-1).sum(-1)
+    total = (lever.mT @ lever * (SAY / seen.clamp(min=SAY))[..., None, None]).to(state.pose)
     information, pull = total[..., :6, :6], total[..., :6, 6]
     return information, torch.linalg.solve(information + 1e-3 * torch.eye(6).to(pull), pull)
 
