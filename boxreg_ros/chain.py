@@ -41,14 +41,20 @@ class Chain(NamedTuple):
         B, S = len(like), like.shape[1] - LINK * length
         return cls(like.new_zeros(B, length, LINK, SPAN + S), like.new_zeros(B, S, S))
 
-    def add(self, part: Tensor, span: int) -> None:
-        """Add symmetric `part` (B, n, d, d): `span` links from each of n on, then some border."""
-        n, own, more = part.shape[1], LINK * span, part.shape[2] - LINK * span
-        for k in range(span):
-            rows, first = part[:, :, LINK * k : LINK * (k + 1)], NEXT - LINK * k
-            self.links[:, k : k + n, :, first : first + own] += rows[..., :own]
-            self.links[:, k : k + n, :, SPAN : SPAN + more] += rows[..., own:]
-        self.corner[:, :more, :more] += part[:, :, own:, own:].sum(1)
+    def add(self, own: Tensor, across: Tensor, corner: Tensor) -> None:
+        """
+        Add n stretches of k links each, that begin one link after another.
+
+        `own` (B, n, 6 k, 6 k) of the links, `across` (B, n, 6 k, s) of these and the first s
+        variables of the border, `corner` (B, s, s) of these alone.
+
+        """
+        n, span, s = *own.shape[1:3], across.shape[3]
+        for k, first in enumerate(range(NEXT, NEXT - span, -LINK)):
+            rows = self.links[:, k : k + n]
+            rows[..., first : first + span] += own[:, :, LINK * k : LINK * (k + 1)]
+            rows[..., SPAN : SPAN + s] += across[:, :, LINK * k : LINK * (k + 1)]
+        self.corner[:, :s, :s] += corner
 
     def times(self, x: Tensor) -> Tensor:
         """Return the products with vectors (B, 6 N + S)."""

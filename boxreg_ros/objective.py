@@ -280,19 +280,20 @@ def value_and_gradient(
     value, gradient = x.new_zeros(len(x)), torch.zeros_like(x)
     by_pose, by_shared = State.unpack(gradient, length)  # views
     for term in terms:
-        r, J, J_shared = term.linearise(state)
+        r, J, S = term.linearise(state)
+        J, S = J.flatten(2, 3), S.flatten(-3, -2)
         pull = (term.weight @ r[..., None])[..., 0]
         value += 0.5 * (r * pull).flatten(1).sum(1)
         n, flat = r.shape[1], pull.flatten(2)[:, :, None]
-        moved = (flat @ J.flatten(2, 3))[:, :, 0].unflatten(2, (-1, 6))
+        moved = (flat @ J)[:, :, 0].unflatten(2, (-1, 6))
         for k in range(moved.shape[2]):
             by_pose[:, k : k + n] += moved[:, :, k]
-        by_shared[:, : J_shared.shape[-1]] += (flat @ J_shared.flatten(-3, -2)).sum((1, 2))
+        by_shared[:, : S.shape[-1]] += (flat @ S).sum((1, 2))
         if curvature is not None:
-            W = r.new_zeros(*r.shape, *r.shape[2:])  # one product of full size beats F small ones
-            W.diagonal(dim1=2, dim2=4).copy_(term.weight.permute(0, 1, 3, 4, 2))
-            J = torch.cat([J, J_shared.expand(*r.shape, -1)], -1).flatten(2, 3)
-            curvature.add(J.mT @ (W.flatten(4, 5).flatten(2, 3) @ J), moved.shape[2])
+            W = torch.diag_embed(term.weight.permute(0, 1, 3, 4, 2), dim1=2, dim2=4)
+            W = W.flatten(4, 5).flatten(2, 3)  # one product of full size beats F small ones
+            WJ, corner = W @ J, S.mT @ (W if S.dim() > 2 else W.sum(1, keepdim=True)) @ S
+            curvature.add(J.mT @ WJ, WJ.mT @ S, corner.sum(1))
     return value, gradient
 
 

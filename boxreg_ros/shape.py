@@ -30,11 +30,11 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     planes are linear in a small step of the pose: their sums of squares are all that is kept.
 
     """
-    B, N = problem.valid.shape
+    B = len(problem.valid)
     local = in_box_axes(carried(problem, state), problem, state.pose).mT
     half = (state.shared[:, None, None, EXTENT] / 2).to(local)
     near = ((local.abs() - half).amax(-1) < MARGIN) & problem.mask
-    window, step, _ = near.nonzero(as_tuple=True)
+    window, _, _ = near.nonzero(as_tuple=True)
     p = local[near]
     counts = torch.tensor(CELLS, device=p.device)
     place = ((p / half[window, 0, 0] + 1) / 2 * counts).long().clamp(counts * 0, counts - 1)
@@ -52,12 +52,12 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     normal, thickness = axes[cell, :, 0], thickness[cell]
     off = (normal * (p - mean[cell])).sum(1)
     weight = torch.where(is_surface[cell], 1 / (thickness + off**2), 0.0)[:, None]
-    lever = torch.cat([normal, torch.linalg.cross(p, normal)], 1)
-    parts = torch.cat([_squares(lever), lever * off[:, None]], 1) * weight
-    total = p.new_zeros(B * N, 43)
-    total.index_add_(0, window * N + step, torch.cat([parts, (weight > 0).to(p)], 1))
-    total = (total * (SAY / total[:, 42:].clamp(min=SAY))).to(state.pose).unflatten(0, (B, N))
-    information, pull = total[..., :36].unflatten(2, (6, 6)), total[..., 36:42]
+    lever = p.new_zeros(*near.shape, 7)  # of all points of an observation, and how far off it is
+    found = torch.cat([normal, torch.linalg.cross(p, normal), off[:, None]], 1)
+    lever[near] = found * weight.sqrt()
+    seen = (lever[..., :3] != 0).any(-1).sum(-1)
+    total = (lever.mT @ lever * (SAY / seen.clamp(min=SAY))[..., None, None]).to(state.pose)
+    information, pull = total[..., :6, :6], total[..., :6, 6]
     return information, torch.linalg.solve(information + 1e-3 * torch.eye(6).to(pull), pull)
 
 

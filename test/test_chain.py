@@ -21,7 +21,9 @@ def chain(length, seed=0):
             continue
         root = rng.normal(size=(B, n, d, d))
         part = root @ root.swapaxes(-1, -2)
-        found.add(torch.from_numpy(part), span)
+        whole, own = torch.from_numpy(part), LINK * span
+        corner = whole[:, :, own:, own:].sum(1)
+        found.add(whole[:, :, :own, :own], whole[:, :, :own, own:], corner)
         for i in range(n):
             index = np.r_[LINK * i : LINK * (i + span), D - S : D - S + border]
             known[:, index[:, None], index] += part[:, i]

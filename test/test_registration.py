@@ -93,6 +93,18 @@ def test_a_batch_equals_its_windows_alone(config):
         assert (found.status, found.reasons) == (known.status, known.reasons)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device here')
+@pytest.mark.parametrize('estimate', ['final', 'track'])
+def test_a_gpu_gives_the_same(estimate):
+    config = ALONE.updated({'estimate': estimate})
+    there = config.updated({'device': 'cuda'})
+    known = register(windows(), config, InputModel(config.faces))
+    found = register(windows(), there, InputModel(config.faces))
+    for a, b in zip(found, known, strict=True):
+        assert a.status == b.status
+        np.testing.assert_allclose(a.boxes, b.boxes, atol=1e-4)
+
+
 @pytest.mark.parametrize('config', [ALONE, BRIEF], ids=['robust', 'paper'])
 def test_the_order_of_windows_does_not_matter(config):
     many = windows(config)
