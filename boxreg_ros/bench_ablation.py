@@ -150,6 +150,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--without', nargs='+', choices=list(INGREDIENTS)[1:], default=list(INGREDIENTS)[1:],
         metavar='INGREDIENT', help=f'only some of {", ".join(list(INGREDIENTS)[1:])}',
     )  # fmt: skip
+    parser.add_argument(
+        '--estimate', choices=('early', 'final', 'track'), default='track',
+        help='which boxes: newest, `lag` later, or of whole tracks (default: track)',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
 
@@ -163,7 +167,7 @@ def run(args: argparse.Namespace) -> int:
             drive = Drive.read(folder)
             report[str(folder)] = {}
             for name in wanted:
-                found = without(INGREDIENTS[name], drive, Config())
+                found = without(INGREDIENTS[name], drive, args.estimate)
                 scores = summarise(in_scope(found, drive.truth, args))
                 report[str(folder)][name] = scores
                 bar.update()
@@ -184,19 +188,20 @@ def run(args: argparse.Namespace) -> int:
         }
         print(f'mean of {len(report)} recordings')
         print('\n'.join(table(means)) + '\n')
-    print('Whole tracks; in brackets what it costs. Without')
+    print(f'Estimate {args.estimate}; in brackets what it costs. Without')
     for name in args.without:
         print(f'  {name}: {INGREDIENTS[name].meaning}')
     return 0
 
 
-def without(ingredient: Ingredient, drive: Drive, config: Config) -> BoxTable:
-    """Return the boxes of whole tracks with an ingredient off."""
-    config = config.updated(ingredient.settings)
+def without(ingredient: Ingredient, drive: Drive, estimate: str = 'track') -> BoxTable:
+    """Return the boxes of an estimate with an ingredient off."""
+    run = 'track' if estimate == 'track' else 'final'  # which has the early ones too
+    config = Config(estimate=run).updated(ingredient.settings)
     with ExitStack() as stack:
         for place, name, value in ingredient.replaced:
             stack.enter_context(_replaced(place, name, value))
-        return drive.registered(config)['track']
+        return drive.registered(config)[estimate]
 
 
 def figures(scores: Scores) -> list[float]:

@@ -4,7 +4,6 @@ import json
 
 from boxreg_ros import bench, bench_ablation, cli
 from boxreg_ros.bench_ablation import INGREDIENTS, WHOLE, without
-from boxreg_ros.config import Config
 from boxreg_ros.recorder import write_recording
 from boxreg_ros.simulate import simulate
 import numpy as np
@@ -26,12 +25,12 @@ def drive(scene):
 
 @pytest.fixture(scope='module')
 def whole(drive):
-    return without(INGREDIENTS[WHOLE], drive, Config())
+    return without(INGREDIENTS[WHOLE], drive)
 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_an_ingredient_that_is_off_makes_a_difference(drive, whole, name):
-    found = without(INGREDIENTS[name], drive, Config())
+    found = without(INGREDIENTS[name], drive)
     assert found.track_ids == whole.track_ids
     assert np.isfinite(found.boxes).all()
     assert np.abs(found.boxes - whole.boxes).max() > 1e-3
@@ -41,9 +40,9 @@ def test_all_is_on_again_afterwards(drive, whole):
     places = {(place, name) for item in INGREDIENTS.values() for place, name, _ in item.replaced}
     before = {key: vars(key[0])[key[1]] for key in places}
     with pytest.raises(AttributeError):  # also where a run fails
-        without(INGREDIENTS['ownership'], None, Config())
+        without(INGREDIENTS['ownership'], None)
     assert all(vars(place)[name] is value for (place, name), value in before.items())
-    again = without(INGREDIENTS[WHOLE], drive, Config())
+    again = without(INGREDIENTS[WHOLE], drive)
     np.testing.assert_array_equal(again.boxes, whole.boxes)
 
 
@@ -66,6 +65,13 @@ def test_what_it_costs_is_printed(tmp_path, scene, capsys):
     (rows,) = json.loads(capsys.readouterr().out).values()
     assert set(rows) == {WHOLE, 'one extent'}
     assert 0.5 < rows[WHOLE]['iou_3d'] < 1
+
+
+def test_any_estimate(drive, whole):
+    newest, final = (without(INGREDIENTS[WHOLE], drive, name) for name in ('early', 'final'))
+    for one, other in ((newest, final), (final, whole), (newest, whole)):
+        assert len(one.boxes) == len(other.boxes)
+        assert np.abs(one.boxes - other.boxes).max() > 1e-3
 
 
 def test_costs_by_hand():
