@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import pairwise
@@ -22,33 +22,32 @@ from typing import Any
 from boxreg_ros.baselines import icp, l_shaped, smoothed
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.config import Config
-from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
+from boxreg_ros.drive import Drive
+from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.evaluate import finite, match, Matches, RECALLS, summarise
-from boxreg_ros.metrics import EXTENT
-from boxreg_ros.recording import Recording
-from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.relabel import to_fixed_frame
-from boxreg_ros.simulate import Scene, simulate
+from boxreg_ros.simulate import simulate
 from boxreg_ros.structures import (
-    BoxArray,
     Floats,
-    Ints,
     LENGTH,
     PITCH,
-    RefinedBoxes,
     ROLL,
+<<<<<<< HEAD
     Sweep,
     WIDTH,
     YAW,
 )
 from boxreg_ros.tracks import Track
 from boxreg_ros.transforms import sweep_to_frame, TransformTree
+=======
+    Track,
+    WIDTH,
+    YAW,
+)
+>>>>>>> edges
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-MARGIN = 1.0  # [m], points this far outside a box are handed to the baselines
 RANGE_BINS = (0, 20, 40, 80, math.inf)  # [m]
 POINT_BINS = (0, 30, 100, 300, 1000, math.inf)
 VARIABLES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
@@ -75,90 +74,6 @@ METHODS = (*BASELINES, 'paper', 'ours')
 
 Methods = dict[str, BoxTable | str]
 """Boxes by the name of their method, or why there are none."""
-
-
-@dataclass(frozen=True, slots=True)
-class Drive:
-    """Sweeps and noisy boxes of one drive, in time order, in the frame of its true boxes."""
-
-    sweeps: tuple[Sweep, ...]
-    boxes: tuple[BoxArray, ...]
-    truth: BoxTable
-
-    @classmethod
-    def from_scene(cls, scene: Scene) -> Drive:
-        """Return what was simulated."""
-        sweeps = zip(scene.sweeps, scene.T_fixed_sensor, strict=True)
-        moved = tuple(sweep_to_frame(sweep, T, 'odom') for sweep, T in sweeps)
-        return cls(moved, tuple(scene.fixed_detections()), scene.truth)
-
-    @classmethod
-    def read(cls, folder: Path) -> Drive:
-        """
-        Read the one recording in a folder and the ``truth.csv`` beside it.
-
-        Raises
-        ------
-        RecordingError
-            If they are not there, or cannot be read.
-
-        """
-        if not folder.is_dir():
-            raise RecordingError(f'{folder}: expected a folder with a recording and truth.csv')
-        truth = BoxTable.read(folder / 'truth.csv')
-        found = [p for p in sorted(folder.iterdir()) if p.suffix in ('.mcap', '.bag', '.db3')]
-        found = found or [p.parent for p in sorted(folder.glob('*/metadata.yaml'))]
-        if len(found) != 1:
-            raise RecordingError(f'{folder}: expected one recording in it, got {len(found)}')
-        tree = TransformTree()
-        sweeps, boxes = [], []
-        with Recording(found) as recording:
-            fixed_frame = recording.choose_fixed_frame(tree, truth.frame_id)
-            for record in recording.records(tree):
-                item = to_fixed_frame(recording.decode(record), tree, fixed_frame)
-                if isinstance(item, Sweep):
-                    sweeps.append(item)
-                else:
-                    boxes.append(item)
-        if not sweeps:
-            raise RecordingError(f'{found[0]}: expected sweeps, got none')
-        return cls(
-            tuple(sorted(sweeps, key=lambda sweep: sweep.stamp_ns)),
-            tuple(sorted(boxes, key=lambda array: array.stamp_ns)),
-            truth,
-        )
-
-    def tracks(self) -> list[Track]:
-        """Return the boxes as tracks, with the points around each."""
-        rows: dict[str, list[tuple[BoxArray, int]]] = {}
-        for array in self.boxes:
-            for i, track_id in enumerate(array.track_ids):
-                rows.setdefault(track_id, []).append((array, i))
-        tracks = []
-        for track_id, places in rows.items():
-            boxes = np.array([array.boxes[i] for array, i in places])
-            stamps = np.array([array.stamp_ns for array, _ in places])
-            near = self._sweeps_at(stamps)
-            points = [_crop(sweep.points, box) for sweep, box in zip(near, boxes, strict=True)]
-            origins = np.array([sweep.origin for sweep in near])
-            array, i = places[0]
-            tracks.append(Track(track_id, array.class_names[i], stamps, boxes, points, origins))
-        return tracks
-
-    def ranges(self, rows: Ints) -> Floats:
-        """Return how far the true boxes in `rows` are from the sensor, in the plane [m]."""
-        near = self._sweeps_at(self.truth.stamps_ns[rows])
-        origins = np.array([sweep.origin for sweep in near]).reshape(-1, 3)
-        apart: Floats = np.linalg.norm((self.truth.boxes[rows, :3] - origins)[:, :2], axis=1)
-        return apart
-
-    def _sweeps_at(self, stamps_ns: Ints) -> list[Sweep]:
-        """Return the sweep nearest in time to each stamp."""
-        own = np.array([sweep.stamp_ns for sweep in self.sweeps])
-        after = np.searchsorted(own, stamps_ns).clip(0, len(own) - 1)
-        before = (after - 1).clip(0)
-        rows = np.where(stamps_ns - own[before] < own[after] - stamps_ns, before, after)
-        return [self.sweeps[row] for row in rows]
 
 
 def run_methods(
@@ -198,7 +113,7 @@ def run_methods(
             estimates = ('track',) if method == 'paper' else ('final', 'track')
             for estimate in estimates:
                 config = Config(objective=objective, estimate=estimate, mode=mode)
-                found = _registered(drive, config)
+                found = drive.registered(config)
                 methods |= {f'{method}, {name}': boxes for name, boxes in found.items()}
         done()
     return methods
@@ -237,9 +152,9 @@ def bench_paper(args: argparse.Namespace) -> int:
         return 0
     for mode, rows in means.items():
         iou = 'IoU 3D' if mode == '3d' else 'IoU BEV'
-        print(_line(f'Table I, {mode}', (*VARIABLES, iou, 'first', 'last')))
+        print(line(f'Table I, {mode}', (*VARIABLES, iou, 'first', 'last')))
         for name, row in (PUBLISHED[mode] | rows).items():
-            print(_line(name, row))
+            print(line(name, row))
         print()
     print(
         f'{args.seeds} seeds. Mean absolute errors [m, rad], x and y along and across the '
@@ -263,11 +178,8 @@ def bench_real(args: argparse.Namespace) -> int:
         for folder in args.data:
             drive = Drive.read(folder)
             methods = run_methods(drive, '3d', args.methods, bar.update)
-            classes = [word for part in args.classes for word in part.split(',') if word]
             found = {
-                name: boxes
-                if isinstance(boxes, str)
-                else match(boxes, drive.truth, args.min_points, classes)
+                name: boxes if isinstance(boxes, str) else in_scope(boxes, drive.truth, args)
                 for name, boxes in methods.items()
             }
             if not args.json:
@@ -287,14 +199,14 @@ def print_real(folder: Path, drive: Drive, found: Mapping[str, Matches | str]) -
     whole = next(m for m in found.values() if not isinstance(m, str))
     print(f'{folder}: {len(whole.rows)} true boxes')
     names = ['BEV', '3D', *(f'R@{level}' for level in RECALLS), 'ATE', 'ASE', 'AOE', 'flips']
-    print(_line('', (*names, 'jitter')))
+    print(line('', (*names, 'jitter')))
     for name, matches in found.items():
         if isinstance(matches, str):
-            print(_line(name, matches))
+            print(line(name, matches))
             continue
         s = summarise(matches)
         numbers = (s.iou_bev, s.iou_3d, *s.recall_3d, s.ate, s.ase, s.aoe, s.flips, s.jitter)
-        print(_line(name, numbers))
+        print(line(name, numbers))
     for what, values, edges in (
         ('3D by range [m]', drive.ranges(whole.rows), RANGE_BINS),
         ('3D by points', whole.num_points, POINT_BINS),
@@ -304,10 +216,10 @@ def print_real(folder: Path, drive: Drive, found: Mapping[str, Matches | str]) -
             label = f'{low:g}-{high:g}' if math.isfinite(high) else f'{low:g}+'
             bins.append((label, (values >= low) & (values < high)))
         bins = [(label, mask) for label, mask in bins if mask.any()]
-        print(_line(what, [label for label, _ in bins]))
+        print(line(what, [label for label, _ in bins]))
         for name, matches in found.items():
             if not isinstance(matches, str):
-                print(_line(name, [summarise(matches, mask).iou_3d for _, mask in bins]))
+                print(line(name, [summarise(matches, mask).iou_3d for _, mask in bins]))
     print()
 
 
@@ -352,7 +264,9 @@ def draw_paper(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> No
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads."""
-    kinds = parser.add_subparsers(dest='kind', required=True, metavar='{paper,real,speed,node}')
+    kinds = parser.add_subparsers(
+        dest='kind', required=True, metavar='{paper,real,ablation,speed,node}'
+    )
     paper = kinds.add_parser('paper', help="the paper's experiment: its Table I and two figures")
     paper.add_argument(
         '--seeds', type=int, default=3, metavar='N', help='repetitions (default: 3)'
@@ -365,17 +279,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='where the figures go (default: out/bench)',
     )  # fmt: skip
     real = kinds.add_parser('real', help='recordings with known truth')
-    real.add_argument(
-        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
-    )
-    real.add_argument(
-        '--min-points', type=int, default=100, metavar='N',
-        help='leave out true boxes with fewer points (default: 100)',
-    )  # fmt: skip
-    real.add_argument(
-        '--classes', nargs='+', default=['car', 'van', 'truck'], metavar='WORD',
-        help='only true boxes whose class name holds one of these words (default: car van truck)',
-    )  # fmt: skip
+    add_scope_arguments(real)
     for kind in (paper, real):
         kind.add_argument(
             '--methods', nargs='+', choices=METHODS, default=METHODS, metavar='METHOD',
@@ -385,32 +289,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     if find_spec('boxreg_ros.bench_speed'):
         speed = kinds.add_parser('speed', help='time per tick, per box and per window')
         import_module('boxreg_ros.bench_speed').add_arguments(speed)
+    ablation = kinds.add_parser('ablation', help='what each ingredient is worth')
+    import_module('boxreg_ros.bench_ablation').add_arguments(ablation)
     node = kinds.add_parser('node', help='the live node under load, over DDS')
     import_module('boxreg_ros.bench_node').add_arguments(node)
 
 
+def add_scope_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what to measure on, and which of its true boxes count."""
+    parser.add_argument(
+        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
+    )
+    parser.add_argument(
+        '--min-points', type=int, default=100, metavar='N',
+        help='leave out true boxes with fewer points (default: 100)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--classes', nargs='+', default=['car', 'van', 'truck'], metavar='WORD',
+        help='only true boxes whose class name holds one of these words (default: car van truck)',
+    )  # fmt: skip
+
+
+def in_scope(boxes: BoxTable, truth: BoxTable, args: argparse.Namespace) -> Matches:
+    """Compare boxes with those true boxes that `add_scope_arguments` leaves in."""
+    classes = [word for part in args.classes for word in part.split(',') if word]
+    return match(boxes, truth, args.min_points, classes)
+
+
 def run(args: argparse.Namespace) -> int:
     """Run one kind of bench and print its table."""
-    if args.kind in ('speed', 'node'):
+    if args.kind in ('ablation', 'speed', 'node'):
         return int(import_module(f'boxreg_ros.bench_{args.kind}').run(args))
     return bench_paper(args) if args.kind == 'paper' else bench_real(args)
-
-
-def _registered(drive: Drive, config: Config) -> dict[str, BoxTable]:
-    """Return boxes by estimate: 'early' and 'final' come from one run, 'track' from another."""
-    registrar = BoxRegistrar(config)
-    results: list[RefinedBoxes] = []
-    items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
-    for item in sorted(items, key=lambda item: item.stamp_ns):
-        if isinstance(item, Sweep):
-            results += registrar.add_sweep(item)
-        else:
-            results += registrar.add_boxes(item)
-    results += registrar.flush()
-    arrays: dict[str, list[BoxArray]] = {}
-    for result in results:
-        arrays.setdefault(config.estimate if result.is_final else 'early', []).append(result.boxes)
-    return {name: BoxTable.from_arrays(found) for name, found in sorted(arrays.items())}
 
 
 def _table(tracks: Sequence[Track], boxes: Sequence[Floats], drive: Drive) -> BoxTable:
@@ -427,16 +337,6 @@ def _table(tracks: Sequence[Track], boxes: Sequence[Floats], drive: Drive) -> Bo
     )
 
 
-def _crop(points: NDArray[Any], box: Floats) -> NDArray[Any]:
-    """Return the points within `MARGIN` of a box."""
-    reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + 2 * MARGIN
-    near = points[(np.abs(points[:, :2] - box[:2]) < reach).all(axis=1)]
-    R = Rotation.from_euler('ZYX', box[[YAW, PITCH, ROLL]]).as_matrix()
-    inside = (np.abs((near - box[:3]) @ R) < box[EXTENT] / 2 + MARGIN).all(axis=1)
-    cropped: NDArray[Any] = near[inside]
-    return cropped
-
-
 def _footprint(box: Floats) -> Floats:
     """Return the outline (6, 2) of a box from above, with a stroke forward."""
     corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [1.4, 0]])
@@ -450,7 +350,8 @@ def _mean_row(found: Sequence[tuple[float, ...] | str]) -> tuple[float, ...] | s
     return tuple(np.mean(rows, axis=0).tolist()) if rows else str(found[0])
 
 
-def _line(name: str, row: Sequence[float | str] | str) -> str:
+def line(name: str, row: Sequence[float | str] | str) -> str:
+    """Return one line of a table."""
     if isinstance(row, str):
         return f'{name:20} {row}'
     cells = (

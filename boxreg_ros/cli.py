@@ -16,6 +16,7 @@ COMMANDS = {
     'convert': 'write labels of one format in others',
     'formats': 'list the label formats and their conventions',
     'evaluate': 'compare boxes with true boxes',
+    'calibrate': 'learn the annotation rule from labelled tracks',
     'simulate': 'make a recording with known truth',
     'bench': 'measure accuracy and speed',
     'node': 'run the live node (where there is no ros2 run)',

@@ -1,7 +1,8 @@
 """
 `boxreg relabel`: recordings in, refined boxes as label files out.
 
-Every box of the recording is written exactly once: refined, or as it was with the reason.
+Every box of the recording is written exactly once: refined, or as it was with the reason. Boxes
+that are missing are put in where that is asked for.
 
 """
 
@@ -23,6 +24,7 @@ import time
 from typing import Any, TypeVar
 
 from boxreg_ros import __version__
+from boxreg_ros.bridge import Bridge
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, TransformUnavailable
 from boxreg_ros.intake import add_convention_arguments, convention_from, Intake
@@ -52,6 +54,7 @@ from boxreg_ros.structures import (
     REFINED,
     RefinedBoxes,
     Sweep,
+    YAW,
 )
 from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame, TransformTree
 from msg_adapters.convention import Convention, STANDARD
@@ -92,6 +95,9 @@ class Request:
         Frame that stands for the sensor's in label formats; None for that of the clouds.
     convention : Convention
         How the boxes are to be read.
+    bridge : float
+        Where a track is missing between two of its boxes that are no further apart than this,
+        a box is put in [s]; 0 for nowhere.
 
     """
 
@@ -108,6 +114,7 @@ class Request:
     labels: tuple[str, Path] | None = None
     label_frame: str | None = None
     convention: Convention = STANDARD
+    bridge: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what cannot work before any work is done."""
@@ -117,6 +124,11 @@ class Request:
             raise ConfigError(
                 f'{self.convention}: expected for boxes of a topic, got label files; each format '
                 f'has its own convention, see boxreg formats'
+            )
+        if not 0 <= self.bridge <= self.config.max_gap:
+            raise ConfigError(
+                f'bridge: expected 0 to max_gap ({self.config.max_gap:g} s), after which an id is '
+                f'that of another track, got {self.bridge:g}'
             )
         for name in (*self.formats, *(self.labels or ())[:1]):
             module_of(str(name))
@@ -188,7 +200,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         options = replace(request.options, recording=recording)
         writers = {name: writer_for(name, folder, provenance, options) for name in names}
         is_early = request.config.estimate == 'early'
-        with _Sink(writers, spool, fixed_frame, sensor_frame, is_early, clock) as sink:
+        bridge: Bridge[_Slot] = Bridge(request.bridge, fixed_frame, request.config)
+        with _Sink(writers, spool, bridge, fixed_frame, sensor_frame, is_early, clock) as sink:
             for record in clock.each('read', recording.records(tree)):
                 if progress is not None:
                     done = record.received_ns - recording.start_ns
@@ -303,10 +316,21 @@ class _Clock:
 class _Slot:
     """The place of one box array in the order of the output."""
 
-    stamp_ns: int
+    boxes: BoxArray
     T_fixed_sensor: Floats | None
     T_fixed_given: Floats | None
     result: RefinedBoxes | None = None
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.boxes.stamp_ns
+
+    def flips(self, refined: RefinedBoxes) -> int:
+        """Return how many headings are off the given ones by more than a right angle."""
+        n = len(self.boxes.track_ids)  # what is put in comes behind
+        turn = refined.boxes.boxes[:n, YAW] - self.boxes.boxes[:, YAW]
+        is_refined = np.array([status == REFINED for status in refined.status[:n]], bool)
+        return int((is_refined & (np.cos(turn) < 0)).sum())
 
 
 class _Sink:
@@ -316,6 +340,7 @@ class _Sink:
         self,
         writers: dict[str, LabelWriter],
         spool: Spool | None,
+        bridge: Bridge[_Slot],
         fixed_frame: str,
         sensor_frame: str,
         is_early: bool,
@@ -323,6 +348,7 @@ class _Sink:
     ) -> None:
         self._writers = writers
         self._spool = spool
+        self._bridge = bridge
         self._fixed_frame, self._sensor_frame = fixed_frame, sensor_frame
         self._is_early = is_early
         self._clock = clock
@@ -332,6 +358,7 @@ class _Sink:
         self.boxes_out = 0
         self.status: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
+        self.heading_flips = 0
 
     def expect(
         self,
@@ -342,7 +369,7 @@ class _Sink:
     ) -> None:
         """Keep a place for a box array; with a reason, it is written there as it is."""
         n = len(boxes.track_ids)
-        slot = _Slot(boxes.stamp_ns, T_fixed_sensor, T_fixed_given)
+        slot = _Slot(boxes, T_fixed_sensor, T_fixed_given)
         self.boxes_in += n
         if not reason:
             self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
@@ -377,6 +404,8 @@ class _Sink:
     def __exit__(self, failure: object, *_: object) -> None:
         """Complete the files, but not after a failure: then nothing of them will be kept."""
         if failure is None:
+            for refined, slot in self._bridge.flush():
+                self._put(refined, slot)
             with self._clock('write'):
                 for writer in self._writers.values():
                     writer.close()
@@ -397,23 +426,28 @@ class _Sink:
 
     def _write(self) -> None:
         """Write what nothing earlier is missing for."""
-        while self._slots and (refined := self._slots[0].result) is not None:
-            slot = self._slots.pop(0)
-            self.boxes_out += len(refined.status)
-            self.status.update(refined.status)
-            self.reasons.update(filter(None, refined.reasons))
-            with self._clock('write'):
-                sweep = intensities = None
-                if self._spool and slot.T_fixed_sensor is not None:
-                    sweep, intensities = self._spool.take(
-                        slot.stamp_ns, self._sensor_frame, slot.T_fixed_sensor
-                    )
-                frame = LabelFrame(
-                    refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep,
-                    intensities, slot.T_fixed_given,
-                )  # fmt: skip
-                for writer in self._writers.values():
-                    writer.write(frame)
+        while self._slots and (result := self._slots[0].result) is not None:
+            for refined, slot in self._bridge.add(result, self._slots.pop(0)):
+                self._put(refined, slot)
+
+    def _put(self, refined: RefinedBoxes, slot: _Slot) -> None:
+        """Count the boxes of a slot, and have them written."""
+        self.boxes_out += len(refined.status)
+        self.status.update(refined.status)
+        self.reasons.update(filter(None, refined.reasons))
+        self.heading_flips += slot.flips(refined)
+        with self._clock('write'):
+            sweep = intensities = None
+            if self._spool and slot.T_fixed_sensor is not None:
+                sweep, intensities = self._spool.take(
+                    slot.stamp_ns, self._sensor_frame, slot.T_fixed_sensor
+                )
+            frame = LabelFrame(
+                refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep,
+                intensities, slot.T_fixed_given,
+            )  # fmt: skip
+            for writer in self._writers.values():
+                writer.write(frame)
 
 
 def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[RefinedBoxes]:
@@ -445,6 +479,7 @@ def _summary(
         'boxes_out': sink.boxes_out,
         'status': dict(sink.status),
         'reasons': dict(sink.reasons.most_common()),
+        'heading_flips': sink.heading_flips,
         'dropped': dropped,
         'left_out_of_labels': sink.left_out(),
         'versions': {'boxreg_ros': __version__, 'python': platform.python_version()}
@@ -466,6 +501,10 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
     reasons = ', '.join(f'{name} {count:,}' for name, count in summary['reasons'].items())
     status = summary['status']
     kept = f'{status.get(KEPT, 0):,} kept' + (f' ({reasons})' if reasons else '')
+    if flips := summary['heading_flips']:
+        kept += f', {flips:,} headings turned around'
+    if put_in := status.get(INTERPOLATED):
+        kept += f', {put_in:,} interpolated'
     return (
         f'{out}: {summary["boxes_in"]:,} boxes in, {status.get(REFINED, 0):,} refined, {kept} '
         f'from {summary["sweeps"]:,} sweeps in {summary["seconds"]["total"]:.1f} s, '
@@ -510,6 +549,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--start', type=float, metavar='S', help='from here [s]')
     parser.add_argument('--end', type=float, metavar='S', help='to here [s]')
     parser.add_argument(
+        '--bridge', type=float, default=0.0, metavar='S',
+        help='put boxes in where a track is missing between two that are no further apart [s]',
+    )  # fmt: skip
+    parser.add_argument(
         '--resume', action='store_true',
         help='do nothing if OUT holds the results of the same request, files and settings',
     )  # fmt: skip
@@ -552,7 +595,7 @@ def run(args: argparse.Namespace) -> int:
         tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
         args.formats, args.start, args.end, config,
         Options(args.with_points, args.camera, args.swap_axes), args.labels, args.label_frame,
-        convention_from(args),
+        convention_from(args), args.bridge,
     )  # fmt: skip
     earlier = earlier_summary(args.out)
     if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():

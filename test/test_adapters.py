@@ -65,22 +65,36 @@ def test_points_that_are_not_finite_go_with_their_times():
 SECONDS = np.array([-0.01, 0.0, 0.05, 0.09])
 
 
+@pytest.mark.parametrize('name', ['t', 'time', 'timestamp', 'offset_time'])
 @pytest.mark.parametrize(
-    ('name', 'kind', 'values', 'accuracy'),
+    ('kind', 'values', 'accuracy'),
     [
-        ('t', 'f4', SECONDS, 1e-8),
-        ('time', 'f8', SECONDS, 1e-12),
-        ('time', 'f4', SECONDS * 1e3, 1e-8),
-        ('t', 'i4', SECONDS * 1e6, 1e-12),
-        ('offset_time', 'i4', SECONDS * 1e9, 1e-12),
-        ('timestamp', 'f8', SECONDS + STAMP * 1e-9, 1e-6),
-        ('timestamp', 'f8', SECONDS * 1e6 + STAMP * 1e-3, 1e-6),
-        ('timestamp', 'f8', SECONDS * 1e9 + STAMP, 1e-6),
+        ('f4', SECONDS, 1e-8),
+        ('f8', SECONDS, 1e-12),
+        ('f4', SECONDS * 1e3, 1e-8),
+        ('f4', SECONDS * 1e6, 1e-8),
+        ('f8', SECONDS * 1e9, 1e-12),
+        ('i4', SECONDS * 1e6, 1e-12),
+        ('i4', SECONDS * 1e9, 1e-12),
+        ('f8', SECONDS + STAMP * 1e-9, 1e-6),
+        ('f8', SECONDS * 1e6 + STAMP * 1e-3, 1e-6),
+        ('f8', SECONDS * 1e9 + STAMP, 1e-6),
     ],
+    ids=['s', 's f8', 'ms', 'us f4', 'ns f8', 'us', 'ns', 'clock s', 'clock us', 'clock ns'],
 )
 def test_point_times_in_any_unit(name, kind, values, accuracy):
     sweep = pointcloud.from_msg(M.cloud(STAMP, 'lidar', [*columns(), (name, kind, values)]))
     np.testing.assert_allclose(sweep.times, SECONDS, rtol=0, atol=accuracy)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'unit'), [('u4', 1e-9), ('u4', 1e-6), ('u2', 1e-3), ('u1', 1e-3)]
+)
+def test_point_times_counted_from_the_start_of_the_sweep(kind, unit):
+    seconds = np.array([0.0, 0.025, 0.05, 0.099])
+    column = ('t', kind, np.round(seconds / unit).astype(kind))
+    sweep = pointcloud.from_msg(M.cloud(STAMP, 'lidar', [*columns(), column]))
+    np.testing.assert_allclose(sweep.times, seconds, rtol=0, atol=1e-12)
 
 
 def test_absolute_times_of_a_simulated_clock():

@@ -119,7 +119,7 @@ class Writer:
 
     def write(self, frame: LabelFrame) -> None:
         """Take the boxes of a message, and copy what comes before those that are missing."""
-        if frame.refined.status:
+        if _without_interpolated(frame.refined).status:
             stamp_ns = frame.refined.boxes.stamp_ns
             self._waiting.setdefault(stamp_ns, deque()).append(frame)
         self._copy(is_end=False)

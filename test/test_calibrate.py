@@ -1,0 +1,213 @@
+"""`boxreg calibrate`: rules and errors that are known are found again."""
+
+from dataclasses import replace
+
+from boxreg_ros import cli
+from boxreg_ros.boxtable import BoxTable
+from boxreg_ros.calibrate import annotation_rule, calibrated, GAPS, input_errors, Measured
+from boxreg_ros.config import Config
+from boxreg_ros.drive import Drive
+from boxreg_ros.recorder import write_recording
+from boxreg_ros.simulate import simulate
+from boxreg_ros.structures import BoxArray
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+import yaml
+
+RULE = {'gap_ends': 0.12, 'gap_sides': 0.07, 'gap_top': 0.09, 'gap_bottom': 0.05}
+"""How far outside of the bodies' own boxes an annotator draws [m]."""
+
+
+def drawn(truth, rule=RULE):
+    """Return true boxes drawn by a rule."""
+    boxes = truth.boxes.copy()
+    up, down = rule['gap_top'], rule['gap_bottom']
+    boxes[:, 3:6] += 2 * rule['gap_ends'], 2 * rule['gap_sides'], up + down
+    axes = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()
+    boxes[:, :3] += axes[:, :, 2] * (up - down) / 2
+    return replace(truth, boxes=boxes)
+
+
+@pytest.fixture(scope='module')
+def scene():
+    return simulate('street', seed=6, sweeps=24)
+
+
+@pytest.fixture(scope='module')
+def plain(scene):
+    return annotation_rule(Drive.from_scene(scene), Config())
+
+
+def test_the_rule_of_a_simulated_recording_is_found(scene, plain):
+    # Bodies stand on the road, which is the bottom of their boxes. Elsewhere they reach these
+    # here and there, and of the noise of 0.02 m the outermost twentieth is 2 deviations out.
+    assert plain['gap_bottom'].value == pytest.approx(0.0, abs=0.01)
+    assert all(-0.05 < plain[name].value < 0.15 for name in GAPS)
+    drive = Drive.from_scene(scene)
+    found = annotation_rule(replace(drive, truth=drawn(drive.truth)), Config())
+    for name, gap in RULE.items():
+        assert found[name].value - plain[name].value == pytest.approx(gap, abs=0.012), name
+        assert 10 < found[name].tracks <= 22
+        assert found[name].spread < 0.1
+    # How round a body is does not change with how its box is drawn.
+    for name in ('depth_ends', 'depth_sides'):
+        assert found[name].value == pytest.approx(plain[name].value, abs=0.06)
+
+
+def test_the_rule_does_not_hang_on_where_it_begins(scene, plain):
+    begin = Config().updated({'faces.gap_ends': 0.3, 'faces.gap_top': -0.1, 'faces.learn': False})
+    found = annotation_rule(Drive.from_scene(scene), begin)
+    for name in GAPS:
+        assert found[name].value == pytest.approx(plain[name].value, abs=0.01), name
+
+
+def test_few_tracks_tell_their_part(scene, plain):
+    drive = Drive.from_scene(scene)
+    keep = [i for i, name in enumerate(drive.truth.track_ids) if name in ('9', '10', '11', '12')]
+    few = replace(
+        drive.truth,
+        stamps_ns=drive.truth.stamps_ns[keep], boxes=drive.truth.boxes[keep],
+        scores=drive.truth.scores[keep], num_points=drive.truth.num_points[keep],
+        **{name: tuple(getattr(drive.truth, name)[i] for i in keep)
+           for name in ('track_ids', 'class_names', 'status')},
+    )  # fmt: skip
+    found = annotation_rule(replace(drive, truth=few), Config())
+    assert {found[name].tracks for name in GAPS} <= {3, 4}
+    assert found['gap_bottom'].value == pytest.approx(plain['gap_bottom'].value, abs=0.02)
+
+
+def noisy_drive(deviation, count=25, n=40, bias=0.0, class_name='car', turned=0.0):
+    """Return tracks with known errors: lon lat z [m], roll pitch yaw [rad], part of extents."""
+    rng = np.random.default_rng(7)
+    arrays, true = [], []
+    scale = rng.normal(0, deviation[6], (count, 3)) + 1  # of a whole track
+    for k in range(n):
+        boxes = np.zeros((count, 9))
+        boxes[:, :2] = np.arange(count)[:, None] * [9.0, 4.0] + 0.5 * k
+        boxes[:, 3:6] = 4.4, 1.8, 1.5
+        boxes[:, 8] = np.linspace(-3, 3, count) + 0.05 * k
+        axes = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()
+        noisy = boxes.copy()
+        shift = rng.normal(0, deviation[:3], (count, 3)) + bias
+        noisy[:, :3] += (axes @ shift[..., None])[..., 0]
+        noisy[:, 6:] += rng.normal(0, deviation[3:6], (count, 3))
+        noisy[:, 8] += np.pi * (rng.random(count) < turned)
+        noisy[:, 3:6] *= scale
+        ids, names = tuple(map(str, range(count))), (class_name,) * count
+        for rows, out in ((noisy, arrays), (boxes, true)):
+            out.append(BoxArray(k * 10**8, 'odom', ids, names, np.ones(count), rows))
+    return Drive((), tuple(arrays), BoxTable.from_arrays(true, 'truth'))
+
+
+DEVIATION = np.array([0.2, 0.1, 0.05, 0.03, 0.03, 0.06, 0.08])
+
+
+@pytest.mark.parametrize(('bias', 'turned'), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.1), (0.0, 1.0)])
+def test_errors_of_the_input_are_found(bias, turned):
+    found = input_errors(noisy_drive(DEVIATION, bias=bias, turned=turned), Config())
+    expected = {
+        'position': 0.2, 'lateral': 0.1, 'height': 0.05, 'tilt': 0.03, 'heading': 0.06,
+        'extent': 0.08,
+    }  # fmt: skip
+    assert set(found) == {f'vehicle.{name}' for name in expected}
+    for name, value in expected.items():
+        measured = found[f'vehicle.{name}']
+        # 1000 errors tell a deviation to 4 %; 75 extents to 15 %.
+        assert measured.value == pytest.approx(value, rel=0.25 if name == 'extent' else 0.1), name
+        assert measured.tracks == 25
+        assert 0 < measured.spread < value
+
+
+def test_kinds_have_errors_of_their_own():
+    drives = [noisy_drive(DEVIATION * k, class_name=c) for k, c in ((1, 'bus'), (2, 'person'))]
+    walkers = [replace(a, track_ids=tuple(f'p{n}' for n in a.track_ids)) for a in drives[1].boxes]
+    truth = [d.truth for d in drives]
+    both = Drive((), (*drives[0].boxes, *walkers), BoxTable(
+        np.concatenate([t.stamps_ns for t in truth]), 'odom',
+        truth[0].track_ids + tuple(f'p{n}' for n in truth[1].track_ids),
+        truth[0].class_names + truth[1].class_names, np.concatenate([t.scores for t in truth]),
+        np.concatenate([t.boxes for t in truth]), truth[0].status + truth[1].status,
+        np.concatenate([t.num_points for t in truth]),
+    ))  # fmt: skip
+    found = input_errors(both, Config())
+    assert found['vehicle.position'].value == pytest.approx(0.2, rel=0.1)
+    assert found['pedestrian.position'].value == pytest.approx(0.4, rel=0.1)
+    assert not any(name.startswith('cyclist') for name in found)
+
+
+def test_short_tracks_tell_no_errors():
+    found = input_errors(noisy_drive(DEVIATION, n=19), Config())
+    assert found['vehicle.position'].tracks == 0
+    assert calibrated(Config(), found) == {}
+
+
+def test_settings_that_come_out():
+    rule = {f'faces.{name}': Measured(gap, 0.01, 3) for name, gap in RULE.items()}
+    found = calibrated(Config(lag=4), rule)
+    assert found == {f'faces.{k}': v for k, v in RULE.items()} | {'lag': 4, 'faces.learn': False}
+    # Of two tracks nothing is believed, and then the rule is not stated.
+    rule['faces.gap_top'] = Measured(0.4, 0.01, 2)
+    found = calibrated(Config(), rule)
+    assert 'faces.gap_top' not in found
+    assert 'faces.learn' not in found
+    # Values beyond what a setting may have; tilt that neither labels nor input have.
+    edges = {
+        'faces.depth_ends': Measured(-0.1, 0.01, 9), 'vehicle.tilt': Measured(0.0, 0.0, 9),
+        'vehicle.heading': Measured(0.0, 0.0, 9),
+    }  # fmt: skip
+    assert calibrated(Config(), edges) == {'faces.depth_ends': 0.0, 'vehicle.heading': 0.001}
+
+
+@pytest.fixture(scope='module')
+def street(tmp_path_factory, scene):
+    folder = tmp_path_factory.mktemp('street')
+    intensities = [np.zeros(len(owner)) for owner in scene.owners]
+    path = folder / 'street.mcap'
+    write_recording(
+        path, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, 'odom'
+    )
+    drawn(scene.truth).write(folder / 'truth.csv')
+    return path
+
+
+def test_what_is_written_is_what_relabel_reads(street, scene, tmp_path, capsys):
+    rule, out = tmp_path / 'rule.yaml', tmp_path / 'out'
+    truth = street.with_name('truth.csv')
+    arguments = ['calibrate', street, '--truth', truth, '-o', rule, '--set', 'solver.rounds=2']
+    assert cli.main([str(a) for a in arguments]) == 0
+    text = capsys.readouterr().out
+    assert 'faces.gap_bottom' in text
+    assert 'vehicle.position' in text
+    assert 'the rule is stated' in text
+    assert f'{len(set(scene.truth.track_ids))} labelled tracks' in text
+    config = Config.from_yaml(rule)
+    assert config.faces.gap_bottom == pytest.approx(RULE['gap_bottom'], abs=0.01)
+    assert not config.faces.learn
+    assert config.solver.rounds == 2
+    # The form of ROS, which the node's --params-file needs: numbers are floats, but for counts.
+    group = yaml.safe_load(rule.read_text())['/**']['ros__parameters']
+    assert all(isinstance(v, float) for k, v in group['faces'].items() if k != 'learn')
+    assert cli.main(['relabel', str(street), '-o', str(out), '--config', str(rule)]) == 0
+    assert Config.from_yaml(out / 'config.yaml') == config
+
+
+def test_a_recording_without_boxes_has_a_rule(street, scene, tmp_path, capsys):
+    path = tmp_path / 'clouds.mcap'
+    nobody = [replace(a, track_ids=(), class_names=(), scores=a.scores[:0], boxes=a.boxes[:0])
+              for a in scene.detections]  # fmt: skip
+    intensities = [np.zeros(len(owner)) for owner in scene.owners]
+    write_recording(path, scene.sweeps, intensities, nobody, scene.T_fixed_sensor, 'odom')
+    truth = str(street.with_name('truth.csv'))
+    assert cli.main(['calibrate', str(path), '--truth', truth, '--no-boxes']) == 0
+    text = capsys.readouterr().out
+    assert 'faces.gap_ends' in text
+    assert 'vehicle' not in text
+
+
+def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
+    truth = replace(scene.truth, stamps_ns=scene.truth.stamps_ns + 10**12)
+    truth.write(tmp_path / 'truth.csv')
+    arguments = ['calibrate', str(street), '--truth', str(tmp_path / 'truth.csv')]
+    assert cli.main(arguments) == 1
+    assert 'are stamps and frame those of the recording?' in capsys.readouterr().err
