@@ -31,19 +31,10 @@ from boxreg_ros.structures import (
     LENGTH,
     PITCH,
     ROLL,
-<<<<<<< HEAD
-    Sweep,
     WIDTH,
     YAW,
 )
 from boxreg_ros.tracks import Track
-from boxreg_ros.transforms import sweep_to_frame, TransformTree
-=======
-    Track,
-    WIDTH,
-    YAW,
-)
->>>>>>> edges
 import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm

@@ -23,10 +23,10 @@ from boxreg_ros.structures import (
     RefinedBoxes,
     ROLL,
     Sweep,
-    Track,
     WIDTH,
     YAW,
 )
+from boxreg_ros.tracks import Track
 from boxreg_ros.transforms import sweep_to_frame, TransformTree
 import numpy as np
 from numpy.typing import NDArray

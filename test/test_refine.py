@@ -396,7 +396,7 @@ def test_garbage_does_not_touch_its_neighbours():
 
 
 def normalised_errors(scenario, seeds):
-    """Return the mean of e' C^-1 e / 6 over all refined boxes, e the error and C its covariance."""
+    """Return the mean of e' C^-1 e / 6 over refined boxes, e the error and C its covariance."""
     values = []
     for seed in seeds:
         scene = simulate(scenario, seed)
