@@ -8,7 +8,7 @@ from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
 from boxreg_ros.config import Config
 from boxreg_ros.correspondence import in_box_axes, Support, support
 from boxreg_ros.geometry import rotation_from_rpy, wrap_angle
-from boxreg_ros.lbfgs import minimize
+from boxreg_ros.lbfgs import minimize, select
 from boxreg_ros.objective import ANCHOR, EXTENT, Problem, SHARED, State, Sum, Term
 from boxreg_ros.shape import agreement
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED
@@ -167,14 +167,13 @@ def solve(
         total = Sum(terms, x, length, free[rows])
         found = State.unpack(minimize(total, x, *limits, total.newton).x, length)
         state.pose[rows], state.shared[rows] = found
-        covariances[rows] = total.factor.inverse_of_links(length)
         if config.estimate == 'track':
             noise = InputNoise.measure(scatter(everything, state), everything.valid)
-        if turn > 1:
-            errors = problem.errors[:, None]
-            moved = ((found.pose - part.pose) / errors).square().mean(2).amax(1).sqrt()
-            moving = (moved > SETTLED).nonzero()[:, 0]
-            rows, problem = rows[moving], problem.select(moving)
+        step = ((found.pose - part.pose) / problem.errors[:, None]).square().mean(2).amax(1).sqrt()
+        is_done = (step <= SETTLED) & (turn > 1) | (turn + 1 == rounds)
+        done, rest = is_done.nonzero()[:, 0], (~is_done).nonzero()[:, 0]
+        covariances[rows[done]] = select(total.factor, done).inverse_of_links(length)
+        rows, problem = rows[rest], problem.select(rest)
         if not len(rows):
             break
     return state, covariances
