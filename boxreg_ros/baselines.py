@@ -11,10 +11,11 @@ from __future__ import annotations
 from typing import Any
 
 from boxreg_ros.metrics import EXTENT, wrap
-from boxreg_ros.structures import Floats, LENGTH, PITCH, ROLL, WIDTH, YAW
+from boxreg_ros.structures import Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
 from boxreg_ros.tracks import Track
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
 POSITION, HEADING = 0.3, 0.2  # expected errors of an input box [m, rad]
@@ -33,10 +34,25 @@ def smoothed(track: Track) -> Floats:
     pose.
 
     """
-    boxes = track.boxes.copy()
+    return _smooth(track.stamps_ns, track.boxes)
+
+
+def smoothed_live(track: Track, lag: int) -> tuple[Floats, Floats]:
+    """Return each box as `smoothed` has it when it is the newest, and `lag` boxes later."""
+    newest, lagged = track.boxes.copy(), track.boxes.copy()
+    for count in range(1, len(newest) + 1):
+        found = _smooth(track.stamps_ns[:count], track.boxes[:count])
+        newest[count - 1] = found[-1]
+        lagged[max(0, count - 1 - lag) : count] = found[-1 - lag :]
+    return newest, lagged
+
+
+def _smooth(stamps_ns: Ints, given: Floats) -> Floats:
+    """Do what `smoothed` says."""
+    boxes = given.copy()
     boxes[:, EXTENT] = np.median(boxes[:, EXTENT], axis=0)
     boxes[:, YAW] = _without_flips(boxes[:, YAW])
-    times = (track.stamps_ns - track.stamps_ns[0]) / 1e9
+    times = (stamps_ns - stamps_ns[0]) / 1e9
     expected = [POSITION] * 3 + [HEADING] * 3
     changes = [ACCELERATION] * 2 + [ACCELERATION / 2, TURNING / 2, TURNING / 2, TURNING]
     columns = [0, 1, 2, ROLL, PITCH, YAW]
@@ -45,11 +61,11 @@ def smoothed(track: Track) -> Floats:
         boxes[:, column] = _map_estimate(times, values, error, change)
     third = -(-len(times) // 3)
     first, last = (
-        np.median(track.boxes[part, :2], axis=0) for part in (slice(third), slice(-third, None))
+        np.median(given[part, :2], axis=0) for part in (slice(third), slice(-third, None))
     )
     if np.linalg.norm(last - first) < PARKED:
-        boxes[:, :2] = np.median(track.boxes[:, :2], axis=0)
-        boxes[:, YAW] = np.median(np.unwrap(_without_flips(track.boxes[:, YAW])))
+        boxes[:, :2] = np.median(given[:, :2], axis=0)
+        boxes[:, YAW] = np.median(np.unwrap(_without_flips(given[:, YAW])))
     return boxes
 
 
@@ -67,18 +83,18 @@ def _map_estimate(times: Floats, values: Floats, error: float, change: float) ->
     if n < 3:
         return values
     steps = np.diff(times)
-    rows = np.arange(n - 2)
-    second = np.zeros((n - 2, n))
-    second[rows, rows] = 1 / steps[:-1]
-    second[rows, rows + 1] = -1 / steps[:-1] - 1 / steps[1:]
-    second[rows, rows + 2] = 1 / steps[1:]
-    second /= change * np.sqrt((steps[:-1] + steps[1:]) / 2)[:, None]
-    stiffness = second.T @ second
+    before, after = 1 / steps[:-1], 1 / steps[1:]
+    second = np.array([before, -before - after, after])  # differences, a row of three for each
+    second /= change * np.sqrt((steps[:-1] + steps[1:]) / 2)
+    stiffness = np.zeros((3, n))  # their squares: diagonals, upper form
+    for i in range(3):
+        for j in range(i, 3):
+            stiffness[2 + i - j, j : n - 2 + j] += second[i] * second[j]
     result: NDArray[Any] = values
     weights = np.ones(n)
     for _ in range(5):
         pull = weights / error**2
-        result = np.linalg.solve(np.diag(pull) + stiffness, pull * values)
+        result = solveh_banded(stiffness + [[0.0], [0.0], [1.0]] * pull, pull * values)
         weights = 1 / (1 + ((values - result) / (2 * error)) ** 2)  # Cauchy
     return result
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from boxreg_ros.baselines import icp, l_shaped, smoothed
+from boxreg_ros.baselines import icp, l_shaped, smoothed, smoothed_live
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.config import Config
 from boxreg_ros.drive import Drive
@@ -41,6 +41,7 @@ from tqdm import tqdm
 
 RANGE_BINS = (0, 20, 40, 80, math.inf)  # [m]
 POINT_BINS = (0, 30, 100, 300, 1000, math.inf)
+PARTS = {'by_range': 'by range [m]', 'by_points': 'by points'}
 VARIABLES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
 
 # Table I: mean absolute errors [m, rad] and IoU, as published.
@@ -93,6 +94,10 @@ def run_methods(
     for method in METHODS:
         if method not in wanted:
             continue
+        if method == 'smoothing':
+            live = [smoothed_live(track, Config().lag) for track in tracks]
+            for k, estimate in enumerate(('early', 'final')):
+                methods[f'smoothing, {estimate}'] = _table(tracks, [b[k] for b in live], drive)
         if method in BASELINES:
             name, baseline = BASELINES[method]
             try:
@@ -115,6 +120,7 @@ def bench_paper(args: argparse.Namespace) -> int:
     if args.seeds < 1:
         raise ConfigError(f'--seeds: expected 1 or more, got {args.seeds}')
     results: dict[str, dict[str, list[tuple[float, ...] | str]]] = {}
+    sights: dict[str, dict[str, list[Floats]]] = {}
     with _progress(args, 2 * args.seeds) as bar:
         for mode, scenario in SCENARIOS.items():
             found = results.setdefault(mode, {})
@@ -122,9 +128,13 @@ def bench_paper(args: argparse.Namespace) -> int:
                 drive = Drive.from_scene(simulate(scenario, seed, args.steps))
                 methods = run_methods(drive, mode, args.methods, bar.update)
                 for name, boxes in methods.items():
-                    found.setdefault(name, []).append(
-                        boxes if isinstance(boxes, str) else paper_row(boxes, drive.truth, mode)
-                    )
+                    if isinstance(boxes, str):
+                        found.setdefault(name, []).append(boxes)
+                        continue
+                    matches = match(boxes, drive.truth)
+                    found.setdefault(name, []).append(paper_row(matches, mode))
+                    seen = sights.setdefault(mode, {}).setdefault(name, [])
+                    seen.append(sighted(drive, matches, mode))
                 if seed == 0:
                     draw_paper(args.output, mode, methods, drive.truth)
     names = (*VARIABLES, 'iou', 'iou_first', 'iou_last')
@@ -132,20 +142,25 @@ def bench_paper(args: argparse.Namespace) -> int:
         mode: {name: _mean_row(rows) for name, rows in found.items()}
         for mode, found in results.items()
     }
+    parts = {
+        mode: {name: by_part(np.concatenate(rows)) for name, rows in found.items()}
+        for mode, found in sights.items()
+    }
     if args.json:
-        print(json.dumps(finite({
-            mode: {
-                name: row if isinstance(row, str) else dict(zip(names, row, strict=False))
-                for name, row in (PUBLISHED[mode] | rows).items()
-            }
-            for mode, rows in means.items()
-        })))  # fmt: skip
+        report: dict[str, Any] = {m: {**PUBLISHED[m], **rows} for m, rows in means.items()}
+        for mode, rows in report.items():
+            for name, row in rows.items():
+                if not isinstance(row, str):
+                    named = dict(zip(names, row, strict=False))
+                    rows[name] = named | parts[mode].get(name, {})
+        print(json.dumps(finite(report)))
         return 0
     for mode, rows in means.items():
         iou = 'IoU 3D' if mode == '3d' else 'IoU BEV'
         print(line(f'Table I, {mode}', (*VARIABLES, iou, 'first', 'last')))
         for name, row in (PUBLISHED[mode] | rows).items():
             print(line(name, row))
+        print_parts(parts[mode], iou)
         print()
     print(
         f'{args.seeds} seeds. Mean absolute errors [m, rad], x and y along and across the '
@@ -154,9 +169,8 @@ def bench_paper(args: argparse.Namespace) -> int:
     return 0
 
 
-def paper_row(boxes: BoxTable, truth: BoxTable, mode: str) -> tuple[float, ...]:
+def paper_row(matches: Matches, mode: str) -> tuple[float, ...]:
     """Return six mean absolute errors [m, rad], and the IoU of all, the first and the last box."""
-    matches = match(boxes, truth)
     errors = np.abs(np.concatenate([matches.translation, matches.rotation], axis=1)).mean(axis=0)
     iou = matches.iou_3d if mode == '3d' else matches.iou_bev
     return (*map(float, errors), float(iou.mean()), float(iou[0]), float(iou[-1]))
@@ -177,9 +191,10 @@ def bench_real(args: argparse.Namespace) -> int:
                 bar.clear()
                 print_real(folder, drive, found)
             report[str(folder)] = {
-                name: m if isinstance(m, str) else asdict(summarise(m))
+                name: m if isinstance(m, str)
+                else asdict(summarise(m)) | by_part(sighted(drive, m, '3d'))
                 for name, m in found.items()
-            }
+            }  # fmt: skip
     if args.json:
         print(json.dumps(finite(report)))
     return 0
@@ -198,20 +213,40 @@ def print_real(folder: Path, drive: Drive, found: Mapping[str, Matches | str]) -
         s = summarise(matches)
         numbers = (s.iou_bev, s.iou_3d, *s.recall_3d, s.ate, s.ase, s.aoe, s.flips, s.jitter)
         print(line(name, numbers))
-    for what, values, edges in (
-        ('3D by range [m]', drive.ranges(whole.rows), RANGE_BINS),
-        ('3D by points', whole.num_points, POINT_BINS),
-    ):
-        bins = []
+    print_parts(
+        {n: by_part(sighted(drive, m, '3d')) for n, m in found.items() if not isinstance(m, str)},
+        '3D',
+    )
+    print()
+
+
+def sighted(drive: Drive, matches: Matches, mode: str) -> Floats:
+    """Return IoU of the mode (NaN without a prediction), range [m] and points of true boxes."""
+    iou = np.where(matches.is_matched, matches.iou_3d if mode == '3d' else matches.iou_bev, np.nan)
+    return np.stack([iou, drive.ranges(matches.rows), matches.num_points], axis=1)
+
+
+def by_part(rows: Floats) -> dict[str, dict[str, float]]:
+    """Return mean IoU by range and by number of points, of rows (n, 3) as `sighted` has them."""
+    iou, *by = rows[np.isfinite(rows).all(axis=1)].T
+    found: dict[str, dict[str, float]] = {}
+    for what, values, edges in zip(PARTS, by, (RANGE_BINS, POINT_BINS), strict=True):
+        found[what] = {}
         for low, high in pairwise(edges):
             label = f'{low:g}-{high:g}' if math.isfinite(high) else f'{low:g}+'
-            bins.append((label, (values >= low) & (values < high)))
-        bins = [(label, mask) for label, mask in bins if mask.any()]
-        print(line(what, [label for label, _ in bins]))
-        for name, matches in found.items():
-            if not isinstance(matches, str):
-                print(line(name, [summarise(matches, mask).iou_3d for _, mask in bins]))
-    print()
+            mask = (values >= low) & (values < high)
+            if mask.any():
+                found[what][label] = float(iou[mask].mean())
+    return found
+
+
+def print_parts(found: Mapping[str, Mapping[str, Mapping[str, float]]], iou: str) -> None:
+    """Print what `by_part` found of each method."""
+    for what, title in PARTS.items():
+        labels = list(dict.fromkeys(label for parts in found.values() for label in parts[what]))
+        print(line(f'{iou} {title}', labels))
+        for name, parts in found.items():
+            print(line(name, [parts[what].get(label, math.nan) for label in labels]))
 
 
 def draw_paper(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> None:
@@ -344,12 +379,12 @@ def _mean_row(found: Sequence[tuple[float, ...] | str]) -> tuple[float, ...] | s
 def line(name: str, row: Sequence[float | str] | str) -> str:
     """Return one line of a table."""
     if isinstance(row, str):
-        return f'{name:20} {row}'
+        return f'{name:22} {row}'
     cells = (
         value if isinstance(value, str) else '-' if math.isnan(value) else f'{value:.3f}'
         for value in row
     )
-    return f'{name:20}' + ''.join(f'{cell:>9}' for cell in cells)
+    return f'{name:22}' + ''.join(f'{cell:>9}' for cell in cells)
 
 
 def _progress(args: argparse.Namespace, total: int) -> Any:

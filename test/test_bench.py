@@ -6,9 +6,9 @@ import json
 import sys
 
 from boxreg_ros import bench
-from boxreg_ros.baselines import icp, l_shaped, smoothed
+from boxreg_ros.baselines import icp, l_shaped, smoothed, smoothed_live
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.evaluate import evaluate
+from boxreg_ros.evaluate import evaluate, match
 from boxreg_ros.recorder import write_recording
 from boxreg_ros.simulate import simulate
 from boxreg_ros.tracks import Track
@@ -18,6 +18,8 @@ import torch
 
 METHODS = {
     'input',
+    'smoothing, early',
+    'smoothing, final',
     'smoothing only',
     'L-shape per sweep',
     'ICP on box points',
@@ -85,6 +87,22 @@ def test_smoother_over_the_wrap():
     truth[:, 8] = (truth[:, 8] + np.pi) % (2 * np.pi) - np.pi
     found = smoothed(make_track(truth))[:, 8]
     assert np.abs(np.cos(found) + 1).max() < 1e-2
+
+
+def test_smoother_live_knows_no_future():
+    truth = car(30, 8.0)
+    noisy = truth.copy()
+    noisy[:, :2] += np.random.default_rng(3).normal(0, 0.2, (30, 2))
+    newest, lagged = smoothed_live(make_track(noisy), lag=5)
+    np.testing.assert_allclose(newest[12], smoothed(make_track(noisy[:13]))[-1])
+    np.testing.assert_allclose(lagged[12], smoothed(make_track(noisy[:18]))[12])
+    np.testing.assert_allclose(lagged[24:], smoothed(make_track(noisy))[24:])
+    # Later is better: errors of the inner boxes, where all three have had time to settle.
+    errors = [
+        np.abs(found - truth)[10:25, :2].mean()
+        for found in (newest, lagged, smoothed(make_track(noisy)))
+    ]
+    assert errors[0] > 1.2 * errors[1] > 1.2 * errors[2]
 
 
 def corner_points(box, rng):
@@ -190,6 +208,10 @@ def test_real(folder, capsys):
     assert 0.6 < report['input']['iou_3d'] < 0.95
     assert report['smoothing only']['flips'] == 0
     assert len(report['ours, track']['recall_3d']) == 3
+    # Means by range and by points are of the same boxes as the mean of all: on either side of it.
+    for part in ('by_range', 'by_points'):
+        values = report['input'][part].values()
+        assert min(values) <= report['input']['iou_3d'] <= max(values)
     assert run('real', folder, '--classes', 'van', '--min-points', 10) == 0
     text = capsys.readouterr().out
     assert all(method in text for method in METHODS)
@@ -197,7 +219,8 @@ def test_real(folder, capsys):
     assert '3D by points' in text
     assert run('real', folder, '--methods', 'l-shape', 'smoothing', '--json') == 0
     report = json.loads(capsys.readouterr().out)[str(folder)]
-    assert set(report) == {'input', 'smoothing only', 'L-shape per sweep'}
+    smoothed = {'smoothing, early', 'smoothing, final', 'smoothing only'}
+    assert set(report) == {'input', 'L-shape per sweep'} | smoothed
 
 
 def test_real_refuses(tmp_path, folder):
@@ -213,17 +236,27 @@ def test_paper(tmp_path, capsys):
     assert run('paper', '--seeds', 1, '--steps', 8, '-o', tmp_path / 'figures') == 0
     text = capsys.readouterr().out
     for method in METHODS | {'initial, published', 'refined, published'}:
-        assert text.count(method) == 2, method
+        # Once per mode in Table I and, but for what is published, by range and by points.
+        assert text.count(method) == (2 if 'published' in method else 6), method
     figures = sorted(path.name for path in (tmp_path / 'figures').iterdir())
     assert figures == [
         f'paper_{mode}_{what}.png' for mode in ('3d', 'bev') for what in ('errors', 'trajectory')
     ]
     assert all(p.read_bytes()[:4] == b'\x89PNG' for p in (tmp_path / 'figures').iterdir())
+    quick = ('--seeds', 2, '--steps', 4, '--methods', 'smoothing', '-o', tmp_path / 'again')
+    assert run('paper', *quick, '--json') == 0
+    report = json.loads(capsys.readouterr().out)
+    assert set(report) == {'3d', 'bev'}
+    for rows in report.values():
+        row = rows['smoothing only']
+        assert set(row) == {*bench.VARIABLES, 'iou', 'iou_first', 'iou_last', *bench.PARTS}
+        assert row['x'] > 0
+        assert rows['refined, published']['x'] in (0.121, 0.054)
     with pytest.raises(ConfigError, match='--seeds: expected 1 or more, got 0'):
         run('paper', '--seeds', 0)
 
 
 def test_paper_row_by_hand():
     truth = simulate('paper', seed=0, sweeps=6).truth
-    row = bench.paper_row(truth, truth, '3d')
+    row = bench.paper_row(match(truth, truth), '3d')
     np.testing.assert_allclose(row, [0] * 6 + [1] * 3, atol=1e-8)
