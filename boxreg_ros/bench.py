@@ -244,6 +244,9 @@ def print_parts(found: Mapping[str, Mapping[str, Mapping[str, float]]], iou: str
     """Print what `by_part` found of each method."""
     for what, title in PARTS.items():
         labels = list(dict.fromkeys(label for parts in found.values() for label in parts[what]))
+        if len(labels) == 1:  # the mean once more
+            print(f'{iou} {title}: all {labels[0]}')
+            continue
         print(line(f'{iou} {title}', labels))
         for name, parts in found.items():
             print(line(name, [parts[what].get(label, math.nan) for label in labels]))

@@ -236,8 +236,10 @@ def test_paper(tmp_path, capsys):
     assert run('paper', '--seeds', 1, '--steps', 8, '-o', tmp_path / 'figures') == 0
     text = capsys.readouterr().out
     for method in METHODS | {'initial, published', 'refined, published'}:
-        # Once per mode in Table I and, but for what is published, by range and by points.
-        assert text.count(method) == (2 if 'published' in method else 6), method
+        assert text.count(method) == 2, method
+    # The sensor rides along, 7 m beside the only object.
+    assert all(f'IoU {kind} by range [m]: all 0-20' in text for kind in ('3D', 'BEV'))
+    assert all(f'IoU {kind} by points: all 1000+' in text for kind in ('3D', 'BEV'))
     figures = sorted(path.name for path in (tmp_path / 'figures').iterdir())
     assert figures == [
         f'paper_{mode}_{what}.png' for mode in ('3d', 'bev') for what in ('errors', 'trajectory')
