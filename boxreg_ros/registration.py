@@ -142,7 +142,8 @@ def solve(
     Minimise the robust objective: rounds of correspondence, weighting and L-BFGS.
 
     Returns the state and the covariances of the poses, (B, N, 6, 6): blocks of the inverse of
-    the curvature, which is also the metric L-BFGS starts from in every round.
+    the curvature, which is also the metric L-BFGS starts from in every round. A window whose
+    boxes moved by less than `SETTLED` errors of its input takes no part in further rounds.
 
     """
     length, solver = problem.boxes.shape[1], config.solver

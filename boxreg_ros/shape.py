@@ -16,6 +16,13 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     """
     Compare each observation with the shape that all of its track make together.
 
+    Parameters
+    ----------
+    problem : Problem
+        B windows of N observations.
+    state : State
+        Where their boxes are in this round.
+
     Returns
     -------
     information : Tensor, shape (B, N, 6, 6)
