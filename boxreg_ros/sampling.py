@@ -1,15 +1,15 @@
 """From a sweep to what each box sees of it: crop, ownership, road, farthest point sampling."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.structures import Floats, Ints, Sweep
 import numpy as np
 from numpy.typing import NDArray
-import torch
-from torch import Tensor
+from scipy.spatial.transform import Rotation
 
+Pairs = tuple[Ints, Ints, Floats, Floats]
 RING = 1.0  # how far beside a box the road is looked for [m]
 CLEARANCE = 0.2  # what is lower above the road may be road [m]
 
@@ -54,103 +54,134 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     that a neighbour's bumper is no evidence. Points lower than the road beside the box plus a
     clearance are left out, and the road's height is kept instead.
 
+    All boxes are seen at once, as pairs of a point and a box.
+
     """
-    around = _around(sweep.points, boxes, max(RING, config.sampling.margin))
-    R = rotation_from_rpy(torch.from_numpy(boxes[:, 6:9])).numpy()
-    crops = []
+    centers, half, n = boxes[:, :3], boxes[:, 3:6] / 2, len(boxes)
+    index, owner, offset, outside = crop(sweep.points, boxes, max(RING, config.sampling.margin))
+    aside, depth = outside[:2].max(0), outside.max(0)
+    height = offset[2] + half[:, 2].take(owner)  # above the bottom of the box
+    beside = np.flatnonzero((aside > 0.05) & (depth < RING) & (np.abs(height) < 0.6))
+    corner = np.hypot(half[:, 0], half[:, 1]) + RING  # the ring ends at an upright square
+    beside = beside[np.abs(offset[:2, beside]).max(0) < corner.take(owner.take(beside))]
+    road = _road(height.take(beside), owner.take(beside), n)
     nearest = np.full(len(sweep.points), np.inf)
-    for box, axes, index in zip(boxes, R, around, strict=True):
-        offset = sweep.points[index].astype(np.float64) - box[:3]
-        x, y, z = (np.abs(offset @ axes) - box[3:6] / 2).T
-        aside = np.maximum(x, y)
-        depth = np.maximum(aside, z)
-        beside = (aside > 0.05) & (aside < RING) & (np.abs(offset[:, 2] + box[5] / 2) < 0.6)
-        near = np.flatnonzero(depth < config.sampling.margin)
-        near = near[np.argsort(offset[near, 0], kind='stable')]
-        crops.append((index[near], offset[near], depth[near], _road(offset[beside, 2])))
-        nearest[index[near]] = np.minimum(nearest[index[near]], depth[near])
-    observations = []
-    for box, (index, offset, depth, ground) in zip(boxes, crops, strict=True):
-        floor = (-box[5] / 2 if np.isnan(ground) else ground) + CLEARANCE
-        own = np.flatnonzero((depth <= nearest[index]) & (offset[:, 2] > floor))
-        kept = own[_thinned(offset[own], config)]
-        near, late = offset[kept].astype(np.float32), np.zeros(len(kept), dtype=np.float32)
-        if config.sampling.deskew and sweep.times is not None:
-            late = sweep.times[index[kept]].astype(np.float32)
-        inside, origin = int((depth <= 0).sum()), sweep.origin - box[:3]
-        observations.append(Observation(stamp_ns, box, near, late, origin, ground, inside))
-    return observations
+    np.minimum.at(nearest, index, depth)
+    is_own = (depth < config.sampling.margin) & (depth <= nearest.take(index))
+    own = np.flatnonzero(is_own & (height > (np.nan_to_num(road) + CLEARANCE).take(owner)))
+    inside = np.bincount(owner.take(np.flatnonzero(depth <= 0)), minlength=n).tolist()
+    owner, x = owner.take(own), offset[0].take(own)
+    rows = _by_x(index.take(own), owner, x / np.abs(x).max(initial=1.0), n)
+    kept = [_thinned(rows[part], sweep.points, config) for part in _parts(owner, n)]
+    rows, owner = np.concatenate(kept), np.repeat(np.arange(n), [len(part) for part in kept])
+    near = (sweep.points.take(rows, 0) - centers.take(owner, 0)).astype(np.float32)
+    times = sweep.times if config.sampling.deskew else None
+    late = (np.zeros(len(rows)) if times is None else times[rows]).astype(np.float32)
+    origin, ground, parts = sweep.origin - centers, (road - half[:, 2]).tolist(), _parts(owner, n)
+    columns = boxes, [near[p] for p in parts], [late[p] for p in parts], origin, ground, inside
+    return [Observation(stamp_ns, *row) for row in zip(*columns, strict=True)]
 
 
-def _road(heights: Floats) -> float:
-    """Return the height of the road among what is beside a box; NaN if that is not flat [m]."""
-    if len(heights) < 5:
-        return np.nan
-    low, road, high = np.sort(heights)[(len(heights) * np.array([0.1, 0.3, 0.6])).astype(int)]
-    return float(road) if high - low < 0.15 else np.nan  # no wall, kerb or vehicle
-
-
-def _thinned(points: Floats, config: Config) -> Ints:
-    """Return which of `points` (M, 3) to keep: farthest ones for the paper, else every n-th."""
-    count = config.sampling.points
-    if config.objective != 'paper' or len(points) <= count:
-        return np.arange(0, len(points), max(1, -(-len(points) // count)))
-    mask = torch.ones(len(points), dtype=torch.bool)
-    return farthest_point_sample(torch.from_numpy(points), mask, count).numpy()
-
-
-def _around(points: NDArray[np.floating], boxes: Floats, margin: float) -> list[Ints]:
-    """Return the points in the upright square `margin` around the footprint of each box."""
-    reach = np.hypot(boxes[:, 3], boxes[:, 4])[:, None] / 2 + margin
-    low, high = boxes[:, :2] - reach, boxes[:, :2] + reach
-    least, cell = low.min(0), max(1.0, (high.max(0) - low.min(0)).max() / 250)
-    nx, ny = ((high.max(0) - least) / cell).astype(int) + 3  # with a rim for what is outside
-    x, y = (
-        ((points[:, i] - float(least[i])) * float(1 / cell) + 1).clip(0, n - 1).astype(np.uint16)
-        for i, n in enumerate((nx, ny))
-    )
-    cells = x * np.uint16(ny) + y  # numbers of 16 bits are sorted by counting
-    order = np.argsort(cells, kind='stable')
-    ends = np.cumsum(np.bincount(cells, minlength=nx * ny))
-    first, last = (((edge - least) / cell).astype(int) + 1 for edge in (low, high))
-    found = []
-    for box, r, (a, b), (c, d) in zip(boxes, reach, first, last, strict=True):
-        rows = np.arange(a, c + 1) * ny
-        parts = zip(ends[rows + b - 1], ends[rows + d], strict=True)
-        near = np.sort(np.concatenate([order[i:j] for i, j in parts]))
-        found.append(near[(np.abs(points[near, :2] - box[:2]) < r).all(1)])
-    return found
-
-
-def farthest_point_sample(points: Tensor, mask: Tensor, count: int) -> Tensor:
+def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Pairs:
     """
-    Choose `count` points that cover the cloud, for all clouds of a batch at once.
+    Return all pairs of a point and a box (n, 9) within `margin` of each other, and some more [m].
 
-    Parameters
-    ----------
-    points : Tensor, shape (..., M, 3)
-        Clouds [m]; padding may hold any finite value.
-    mask : Tensor, shape (..., M)
-        True where a point is real.
-    count : int
-        Points to choose, at most M.
-
-    Returns
-    -------
-    index : Tensor, shape (..., count)
-        The first is the one farthest from the mean, each next one farthest from all before;
-        padding comes last, where a cloud has fewer points than that.
+    The row of the point (P,) and that of the box (P,), ascending; the point minus the centre of
+    the box (3, P), and how far outside of its faces it is, along its axes (3, P).
 
     """
-    weight = mask.to(points.dtype)
-    mean = (points * weight[..., None]).sum(-2) / weight.sum(-1, keepdim=True).clamp(min=1)
-    distance = torch.where(mask, (points - mean[..., None, :]).square().sum(-1), -2.0)
-    picks = []
+    R, half = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix(), boxes[:, 3:6] / 2
+    reach = (np.abs(R) @ (half + margin)[..., None])[..., 0]
+    index, owner = _pairs(points, boxes[:, :2], reach[:, :2])
+    offset = points.take(index, 0).T.astype(np.float64, order='C')
+    offset -= boxes[:, :3].T.take(owner, 1)
+    outside = np.empty_like(offset)
+    for axes, part in zip(R, _parts(owner, len(boxes)), strict=True):
+        np.matmul(axes.T, offset[:, part], out=outside[:, part])
+    np.subtract(np.abs(outside, out=outside), half.T.take(owner, 1), out=outside)
+    return index, owner, offset, outside
+
+
+def _pairs(points: NDArray[np.floating], centers: Floats, reach: Floats) -> tuple[Ints, Ints]:
+    """
+    Return point and box of all pairs that are within `reach` (n, 2) of each other, and of more.
+
+    The ground plane is a raster of 1 m whose 16-bit numbers run on from one row of cells to the
+    next, and start again after the last: no scene is too wide for it. What is as far off as to
+    share a number with a box is left for the caller to tell, like what is in the rim of a cell.
+    Points and edges are both cut to whole metres, which changes no order: none gets lost.
+
+    """
+    low = (centers - reach).astype(int)
+    nx, ny = ((centers + reach).astype(int) - low + 1).T
+    nx, ny = np.clip(nx + (ny - 1) // 256, 1, 256), np.clip(ny, 1, 256)  # long rows: as several
+    owner = np.repeat(np.arange(len(centers)), nx)  # of each row of cells of a box
+    start, length = (_runs(low[:, 0], nx) * 256 + low[owner, 1]) % 2**16, ny[owner]
+    is_touched = np.bincount(_runs(start, length) % 2**16, minlength=2**16) > 0
+    x, y = (points[:, i].clip(-1e9, 1e9).astype(np.int32).astype(np.uint16) for i in (0, 1))
+    cells = x * np.uint16(256) + y
+    near = np.flatnonzero(is_touched.take(cells))
+    near = near.take(np.argsort(cells.take(near), kind='stable'))  # of 16 bits: by counting
+    cells = np.add.outer([0, 2**16], cells.take(near)).ravel()  # for rows that start again
+    first, last = np.searchsorted(cells, [start, start + length])
+    return near.take(_runs(first, last - first), mode='wrap'), np.repeat(owner, last - first)
+
+
+def _runs(first: Ints, counts: Ints) -> Ints:
+    """Return `counts[0]` numbers from `first[0]` on, then `counts[1]` from `first[1]` on ..."""
+    return np.repeat(first - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+
+
+def _parts(owner: Ints, n: int) -> list[slice]:
+    """Return where in `owner`, ascending, each of `n` boxes is."""
+    return [slice(a, b) for a, b in pairwise(np.searchsorted(owner, np.arange(n + 1)).tolist())]
+
+
+def _road(heights: Floats, owner: Ints, n: int) -> Floats:
+    """
+    Return the height of the road beside each of `n` boxes; NaN where that is not flat [m].
+
+    `heights` (P,) are between -1 and 1, above the bottoms of the boxes `owner` (P,).
+
+    """
+    levels = np.append(np.sort(2.0 * owner + heights), np.nan)  # box after box
+    counts = np.bincount(owner, minlength=n)
+    first = np.cumsum(counts) - counts
+    low, road, high = (levels[first + (part * counts).astype(int)] for part in (0.1, 0.3, 0.6))
+    # A wall, a kerb or a vehicle is not flat.
+    return np.where((counts >= 5) & (high - low < 0.15), road - 2.0 * np.arange(n), np.nan)
+
+
+def _by_x(rows: Ints, owner: Ints, x: Floats, n: int) -> Ints:
+    """
+    Return `rows` of the sweep by `owner` (one of `n`), then `x` (-1 to 1), then row.
+
+    All three make one number: sorting numbers is several times faster than finding their order,
+    and no two are equal, so that every machine sorts them alike.
+
+    """
+    bits = int(rows.max(initial=0)).bit_length()
+    place = (owner + 0.5 + x / 4) * 2.0 ** (62 - bits - n.bit_length())
+    return np.sort(place.astype(np.int64) << bits | rows) & ((1 << bits) - 1)
+
+
+def _thinned(rows: Ints, points: NDArray[np.floating], config: Config) -> Ints:
+    """Return the `rows` of `points` to keep: farthest ones for the paper, else every n-th."""
+    if config.objective != 'paper' or len(rows) <= config.sampling.points:
+        return rows[:: max(1, -(-len(rows) // config.sampling.points))]
+    return rows[farthest_point_sample(points[rows].astype(np.float64), config.sampling.points)]
+
+
+def farthest_point_sample(points: Floats, count: int) -> Ints:
+    """
+    Choose `count` of `points` (M, 3), at most M, that cover the cloud; return their rows.
+
+    The first is the one farthest from the mean, each next one farthest from all before.
+
+    """
+    gaps, picks = np.square(points - points.mean(0)).sum(1), np.empty(count, dtype=int)
     for step in range(count):
-        pick = distance.argmax(-1, keepdim=True)
-        center = points.gather(-2, pick[..., None].expand(*pick.shape, 3))
-        fresh = (points - center).square().sum(-1)
-        distance = torch.where(mask, fresh if step == 0 else distance.minimum(fresh), -2.0)
-        picks.append(pick)
-        distance = distance.scatter(-1, pick, -3.0)  # once is enough: minima stay below
-    return torch.cat(picks, -1)
+        picks[step] = gaps.argmax()
+        gaps = np.minimum(gaps if step else np.inf, np.square(points - points[picks[step]]).sum(1))
+        gaps[picks[step]] = -1.0  # once is enough: minima stay below
+    return picks

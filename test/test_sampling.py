@@ -6,7 +6,6 @@ from boxreg_ros.structures import Sweep
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-import torch
 
 STAMP_NS = 5 * 10**8
 CAR = np.array([10.0, 20.0, 1.0, 4.0, 2.0, 2.0, 0.0, 0.0, 0.0])  # stands on z = 0
@@ -90,6 +89,77 @@ def test_a_box_without_points(points):
     assert np.isnan(seen.ground)
 
 
+@pytest.mark.parametrize('kind', [np.float32, np.float64])
+@pytest.mark.parametrize(
+    'x, y',
+    [
+        (0.0, 0.0),  # around the cells that lie on both sides of zero
+        (-0.4, -300.7),
+        (255.5, 256.0),  # cell 255 * 256 + 255 is the last of the raster, the next is its first
+        (-256.0, 0.3),
+        (4000.2, -7000.9),
+    ],
+)
+def test_a_box_sees_the_same_wherever_it_is(x, y, kind):
+    # Offsets in eighths of a metre are exact; the box reaches 0.6 m beyond 2 m and 1 m, and above
+    # its bottom by 0.2 m. Turned by a right angle, length and width change places.
+    offsets = np.array(np.meshgrid(*[np.arange(-4, 4.1, 0.125)] * 2, [0.25])).reshape(3, -1).T
+    center = np.array([np.float32(x), np.float32(y), 1.0], dtype=float)
+    for yaw, (a, b) in ((0.0, (2.6, 1.6)), (np.pi / 2, (1.6, 2.6))):
+        box = np.r_[center, CAR[3:6], 0, 0, yaw]
+        scan = Sweep(STAMP_NS, 'odom', (center + offsets).astype(kind))
+        config = Config().updated({'sampling.points': 10000})
+        (seen,) = observe(scan, box[None], STAMP_NS, config)
+        known = offsets[(np.abs(offsets[:, 0]) < a) & (np.abs(offsets[:, 1]) < b)]
+        # At (4000, -7000) numbers of 32 bits are 0.0005 m apart.
+        np.testing.assert_allclose(rows(seen.points), rows(known), atol=5e-4)
+
+
+def test_places_far_apart_are_told_apart():
+    # 256 m to the side or 1 m across and 256 m along, numbers of cells are the same.
+    apart = [[256, 0], [0, 65536], [-256, 0], [1, -256], [0, 0], [512, 0]]
+    boxes = CAR + np.pad(apart, [(0, 0), (0, 7)])
+    heights = np.linspace(0.0, 0.5, 6)  # of one point in each, to know them by
+    seen = see(boxes[:, :3] + np.c_[np.zeros((6, 2)), heights], *boxes)
+    assert [observation.points[:, 2].tolist() for observation in seen] == [
+        [pytest.approx(height, abs=1e-6)] for height in heights
+    ]
+
+
+@pytest.mark.parametrize('length, width', [(2000.0, 3.0), (3.0, 2000.0), (600.0, 600.0)])
+def test_a_box_larger_than_the_raster_sees_each_point_once(length, width):
+    rng = np.random.default_rng(11)
+    box = np.array([40.5, -80.5, 1.0, length, width, 2.0, 0, 0, 0])
+    points = box[:3] + rng.uniform(-0.5, 0.5, (5000, 3)) * [length, width, 0.5]
+    changes = {'sampling.points': 100000, 'sampling.deskew': True}
+    seen, other = see(points, box, CAR + 5000.0, changes=changes, times=np.arange(5000.0))
+    assert seen.num_points == 5000
+    assert sorted(seen.delays) == list(range(5000))
+    assert len(other.points) == 0
+
+
+def test_points_come_along_x_and_then_as_in_the_sweep():
+    # Two boxes that share points: every third of each is kept, of equal x those named first.
+    rng = np.random.default_rng(12)
+    x = 10.0 + rng.integers(-4, 5, 600) * 0.25
+    points = np.c_[x, 20 + rng.uniform(-0.9, 0.9, 600), np.full(600, 1.0)]
+    changes = {'sampling.points': 200, 'sampling.deskew': True}
+    far = CAR + np.eye(9)[1] * 100
+    more = points + np.array([0, 100, 0])
+    first, second = see(
+        np.r_[more[:5], points, more[5:]], CAR, far, changes=changes, times=np.arange(1200.0)
+    )
+    order = np.argsort(x, kind='stable')[::3]
+    assert first.delays.tolist() == (5 + order).tolist()
+    assert second.delays.tolist() == np.where(order < 5, order, 600 + order).tolist()
+
+
+def test_points_beyond_all_sense_are_nowhere():
+    with np.errstate(all='raise'):
+        (seen,) = see([[3e38, -3e38, 0.0], [3e9, 20.0, 1.0], [10.0, 20.0, 1.0]], CAR)
+    np.testing.assert_array_equal(seen.points, [[0.0, 0.0, 0.0]])
+
+
 # --- ownership ----------------------------------------------------------------------------------
 
 # Two cars that overlap: the first reaches to x = 12, the second begins at x = 11.5.
@@ -110,7 +180,7 @@ def test_num_points_counts_what_is_inside_whoever_owns_it():
 
 
 def test_many_boxes_equal_brute_force():
-    # The look-up table and the sorting are for speed: every box must see what a plain loop sees.
+    # The raster and the sorting are for speed: every box must see what a plain loop sees.
     rng = np.random.default_rng(5)
     n = 25
     boxes = np.c_[
@@ -176,6 +246,45 @@ def test_a_sloping_road_is_taken_at_its_lower_part():
     assert seen.ground == pytest.approx(-1 + 0.03, abs=1e-6)
 
 
+def test_every_box_has_its_own_road():
+    # The roads of 40 points lie 0.1 m above the bottom, 0.2 m below it, and 0.3 m above it;
+    # the first, third and last box see none or too little of one.
+    shifts = 50.0 * np.arange(6)[:, None] * [1.0, 0, 0]
+    heights = [None, 0.1, None, -0.2, 0.3, None]
+    scene = [road(h) + s for h, s in zip(heights, shifts, strict=True) if h is not None]
+    scene.append(road(0.0, count=4) + shifts[5])
+    seen = see(np.concatenate(scene), *(CAR + np.pad(shifts, [(0, 0), (0, 6)])))
+    known = [np.nan if height is None else -1 + height for height in heights]
+    np.testing.assert_allclose([observation.ground for observation in seen], known, atol=1e-6)
+
+
+@pytest.mark.parametrize('roll', [0.0, 0.3])
+def test_the_road_is_looked_for_up_to_a_metre_beside_the_box(roll):
+    # 20 points lie 0.95 m beside the left face on the road, 80 points 0.05 m higher 1.05 m beside
+    # it: only the first count. The box stands rolled on its lower left edge: along y, a metre
+    # beside that face is 1 / cos(roll) metres from the edge.
+    corner = [10.0, 21.3, 0.0]
+    box = np.r_[corner, CAR[3:6], roll, 0, 0]
+    box[:3] -= Rotation.from_euler('x', roll).apply([0, 1.0, -1.0])
+    near, far = road(0.0, count=20), road(0.05, count=80)
+    near[:, 1], far[:, 1] = (
+        21.3 + 0.95 / np.cos(roll),
+        21.3 + (1.05 + 0.05 * np.sin(roll)) / np.cos(roll),
+    )
+    (seen,) = see(np.r_[near, far], box)
+    assert seen.ground + box[2] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize('distance, is_seen', [(3.2, True), (3.27, False)])
+def test_the_ring_ends_at_an_upright_square(distance, is_seen):
+    # Half the diagonal is 5 ** 0.5 = 2.236 m, so the square reaches 3.236 m. The box is turned so
+    # that a corner of the ring, (3, 2) in its own axes and 3.6 m from its centre, lies ahead.
+    box = CAR - np.eye(9)[8] * np.arctan2(2, 3)
+    spot = [distance, 0, -1.0] + np.linspace(-0.01, 0.01, 20)[:, None] * [0, 1, 0]
+    (seen,) = see(CAR[:3] + spot, box)
+    assert seen.ground == pytest.approx(-1.0 if is_seen else np.nan, abs=1e-6, nan_ok=True)
+
+
 # --- thinning -----------------------------------------------------------------------------------
 
 
@@ -213,39 +322,16 @@ def brute_force(points, count):
 
 
 def test_farthest_points_equal_brute_force():
-    rng = np.random.default_rng(8)
-    points = rng.normal(size=(50, 3))
-    mask = torch.ones(50, dtype=torch.bool)
-    found = farthest_point_sample(torch.from_numpy(points), mask, 20)
-    assert found.tolist() == brute_force(points, 20)
+    points = np.random.default_rng(8).normal(size=(50, 3))
+    assert farthest_point_sample(points, 20).tolist() == brute_force(points, 20)
 
 
 def test_farthest_points_by_hand():
-    # Mean 2.875 without the padding: farthest from it is 10, from that 0, then 1 is 1 m from 0
-    # where 0.5 is 0.5 m from it.
-    x = torch.tensor([0.0, 0.5, 1.0, 10.0, -0.5], dtype=torch.float64)
-    points = torch.stack([x, 0 * x, 0 * x], -1)
-    mask = torch.tensor([True, True, True, True, False])
-    assert farthest_point_sample(points, mask, 4).tolist() == [3, 0, 2, 1]
+    # Mean 2.875: farthest from it is 10, from that 0, then 1 is 1 m from 0 where 0.5 is 0.5 m
+    # from it.
+    points = np.array([0.0, 0.5, 1.0, 10.0])[:, None] * [1.0, 0, 0]
+    assert farthest_point_sample(points, 4).tolist() == [3, 0, 2, 1]
 
 
-def test_farthest_points_of_a_batch_equal_a_loop():
-    rng = np.random.default_rng(9)
-    points = torch.from_numpy(rng.normal(size=(3, 4, 30, 3)))
-    mask = torch.from_numpy(rng.random((3, 4, 30)) < 0.8)
-    many = farthest_point_sample(points, mask, 12)
-    for index in np.ndindex(3, 4):
-        alone = farthest_point_sample(points[index], mask[index], 12)
-        assert many[index].tolist() == alone.tolist()
-
-
-@pytest.mark.parametrize('real', [0, 1, 5, 12])
-def test_padding_is_chosen_last(real):
-    # Padding far away and equal real points are no reason to take padding early.
-    rng = np.random.default_rng(10)
-    mask = torch.zeros(12, dtype=torch.bool)
-    mask[torch.from_numpy(rng.permutation(12)[:real])] = True
-    points = torch.where(mask[:, None], 1.0, 1e6 * torch.from_numpy(rng.normal(size=(12, 3))))
-    found = farthest_point_sample(points, mask, 12)
-    assert mask[found[:real]].all()
-    assert sorted(found[:real].tolist()) == mask.nonzero()[:, 0].tolist()
+def test_equal_points_are_each_chosen_once():
+    assert sorted(farthest_point_sample(np.ones((12, 3)), 12)) == list(range(12))
