@@ -25,7 +25,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.drive import Drive
 from boxreg_ros.evaluate import finite, Scores, summarise
 from boxreg_ros.objective import BIAS, Problem, SHARED
-from boxreg_ros.structures import Floats, Sweep
+from boxreg_ros.structures import Floats, Ints, Sweep
 import numpy as np
 from numpy.typing import NDArray
 import torch
@@ -77,7 +77,12 @@ def _each_alone(
     return [seen for box in boxes for seen in sampling.observe(sweep, box[None], stamp_ns, config)]
 
 
-def _as_given(yaw: Floats, valid: NDArray[np.bool_]) -> Floats:
+def _no_road(heights: Floats, owner: Ints, n: int) -> Floats:
+    """Stand in for `_road`: none is seen."""
+    return np.full(n, np.nan)
+
+
+def _as_given(yaw: Floats, valid: NDArray[np.bool_], known: Floats) -> Floats:
     """Stand in for `one_heading`: headings keep their signs."""
     return np.unwrap(yaw)
 
@@ -111,13 +116,14 @@ INGREDIENTS = {
         'errors of the input have no constant part',
         replaced=((registration, 'free_variables', _without_bias),),
     ),
+    'memory': Ingredient(
+        'live, what has left the window is forgotten', replaced=((window, 'FADING', 0.0),)
+    ),
     'one extent': Ingredient('each box keeps the extent of its input', {'extent': 'fixed'}),
     'ownership': Ingredient(
         "a neighbour's points count too", replaced=((registrar, 'observe', _each_alone),)
     ),
-    'road': Ingredient(
-        'the bottom is seen nowhere', replaced=((sampling, '_road', lambda heights: np.nan),)
-    ),
+    'road': Ingredient('the bottom is seen nowhere', replaced=((sampling, '_road', _no_road),)),
     'smoothness': Ingredient(
         'any acceleration is as likely',
         _every_kind(

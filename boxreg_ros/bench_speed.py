@@ -22,7 +22,7 @@ from time import perf_counter
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from boxreg_ros import objective
+from boxreg_ros import objective, sampling
 from boxreg_ros.calibration import InputModel
 from boxreg_ros.config import Config
 from boxreg_ros.correspondence import support
@@ -31,7 +31,7 @@ from boxreg_ros.metrics import iou_3d
 from boxreg_ros.objective import EXTENT, State, Sum, Term
 from boxreg_ros.recorder import write_recording
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.registration import expected_shared, free_variables, MARGINS, solve, weigh
+from boxreg_ros.registration import expected_shared, free_variables, Solution, solve, weigh
 from boxreg_ros.sampling import observe
 from boxreg_ros.simulate import simulate
 from boxreg_ros.structures import BoxArray, Floats, POSE, Sweep
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         'scaling': scaling(config, args.quick),
     }
     seconds = 3.0 if args.quick else 20.0
-    report['relabel'] = relabel(tracks, points, seconds, report['crop']['ours'])
+    report['relabel'] = relabel(tracks, points, seconds, report['tick']['crop and sample'])
     if args.out:
         args.out.mkdir(parents=True, exist_ok=True)
         report['plot'] = str(_plot(report['scaling'], config, args.out / 'speed.png'))
@@ -99,17 +99,17 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
     problem, base = stack(windows, config)
     rounds = config.solver.rounds
 
-    def cold() -> tuple[State, Tensor]:
+    def cold() -> Solution:
         return solve(problem, config, InputModel(config.faces), rounds)
 
-    state, _ = cold()
+    state = cold().state
     pose, extent = state.pose, state.shared[:, None, EXTENT].expand(-1, config.window, -1)
     solved = torch.cat([pose[..., :3], extent, pose[..., 3:]], -1)
     # As in a stream: all but the newest box start from what was found before.
     warm_start = torch.cat([solved[:, :-1], problem.boxes[:, -1:]], 1)
-    warm_problem = replace(problem, start=warm_start)
+    warm_problem = problem._replace(start=warm_start)
 
-    def warm() -> tuple[State, Tensor]:
+    def warm() -> Solution:
         return solve(warm_problem, config, InputModel(config.faces), 1)
 
     result = {'cold': 1e3 * _time(cold, config) / count, 'warm': 1e3 * _time(warm, config) / count}
@@ -117,7 +117,7 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
     begin = perf_counter()
     ends = [reference(one, config) for one in part]
     result['reference'] = 1e3 * (perf_counter() - begin) / references
-    ours = [solve(one, config, InputModel(config.faces), rounds)[0] for one in part]
+    ours = [solve(one, config, InputModel(config.faces), rounds).state for one in part]
     for name, states in (('input', None), ('reference', ends), ('ours', ours)):
         boxes = [p.boxes[0].cpu().numpy().copy() for p in part]
         for i, box in enumerate(boxes):
@@ -143,7 +143,7 @@ def fixed(problem: objective.Problem, config: Config, references: int) -> dict[s
         State(problem.pose, expected_shared(problem, rule)),
         free_variables(problem, config),
     )
-    terms, x = _terms(problem, start, MARGINS[0], config), start.pack()
+    terms, x = _terms(problem, start, config), start.pack()
 
     def ours() -> Minimum:
         total = Sum(terms, x, length, free)
@@ -261,11 +261,11 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
     """
     Return what cropping all boxes of a sweep costs [ms]: ours, and box by box.
 
-    Ours does more than the others: the road, whose point is whose, sampling, offsets.
+    Ours is the crop alone, as the others; what `observe` does with it is a stage of the tick.
 
     """
-    ((stamp, _, cloud, boxes),) = traffic(tracks, points, 1)
-    sweep, margin = Sweep(stamp, 'lidar', cloud), config.sampling.margin
+    ((_, _, cloud, boxes),) = traffic(tracks, points, 1)
+    margin = config.sampling.margin
     rotations = Rotation.from_euler('ZYX', boxes.boxes[:, [8, 7, 6]]).as_matrix()
 
     def one_by_one() -> None:
@@ -274,7 +274,7 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
             cloud[(local < box[3:6] / 2 + margin).all(1)]
 
     def ours() -> None:
-        observe(sweep, boxes.boxes, stamp, config)
+        sampling.crop(cloud, boxes.boxes, margin)
 
     result: dict[str, Any] = {
         'ours': 1e3 * _time(ours, config),
@@ -297,10 +297,11 @@ def relabel(tracks: int, points: int, seconds: float, crop_ms: float) -> dict[st
     """
     Return how `boxreg relabel` does on a recording of `seconds` at 10 Hz, in its own process.
 
-    ``faster`` is how much less it takes than the recording lasts, ``rest`` the part of its time
-    that is not the solver's; the registrar's, less `crop_ms` for each sweep, is. ``memory`` is
-    its peak [MB], ``short`` and ``long`` those on recordings of this length and of ten times
-    that, with sweeps of a fifth of the points.
+    ``total`` is what all of it takes [s], the stages are what each is busy; as reading goes on
+    while the registrar works, they add up to more. ``faster`` is how much less than the recording
+    lasts the total is, ``rest`` the part of it in which nothing is solved: the registrar solves,
+    but for `crop_ms` of each sweep. ``memory`` is its peak [MB], ``short`` and ``long`` those on
+    recordings of this length and of ten times that, with sweeps of a fifth of the points.
 
     """
     result: dict[str, float] = {}
@@ -339,8 +340,8 @@ def reference(problem: objective.Problem, config: Config) -> State:
     length, rule = problem.boxes.shape[1], InputModel(config.faces).rule()
     free = free_variables(problem, config)
     state = State(problem.pose.clone(), expected_shared(problem, rule))
-    for turn in range(config.solver.rounds):
-        terms = _terms(problem, state, MARGINS[min(turn, 1)], config)
+    for _ in range(config.solver.rounds):
+        terms = _terms(problem, state, config)
         x = _torch_minimum(terms, state.pack(), length, free, config)
         state = State.unpack(x, length)
     return state
@@ -368,9 +369,9 @@ def _torch_minimum(
     return x.detach()
 
 
-def _terms(problem: objective.Problem, state: State, margin: float, config: Config) -> list[Term]:
+def _terms(problem: objective.Problem, state: State, config: Config) -> list[Term]:
     rule = InputModel(config.faces).rule()
-    sights = support(problem, state, margin, config.faces.outermost, rule.depths)
+    sights = support(problem, state, config.faces.outermost, rule.depths)
     return weigh(problem, state, sights, expected_shared(problem, rule), None, config)
 
 
@@ -430,7 +431,7 @@ def _message(points: NDArray[np.floating]) -> SimpleNamespace:
 def _time(function: Callable[[], object], config: Config, repeats: int = 3) -> float:
     """Return the shortest of several times, after one for warming up [s]."""
     before = torch.get_num_threads()
-    torch.set_num_threads(config.solver.threads)
+    torch.set_num_threads(1)
     function()
     best = np.inf
     for _ in range(repeats):
@@ -507,7 +508,8 @@ def _text(report: dict[str, Any]) -> str:
     )
     stages = ('read', 'decode', 'transform', 'registrar', 'write')
     lines.append(
-        f'relabel: {r["faster"]:.1f} times faster than the recording lasts ({r["total"]:.1f} s: '
+        f'relabel: {r["faster"]:.1f} times faster than the recording lasts ({r["total"]:.1f} s; '
+        'busy, partly at once: '
         + ', '.join(f'{k} {r[k]:.1f}' for k in stages)
         + f'), all but the solve {r["rest"]:.0%}; peak {r["memory"]:.0f} MB; of a smaller one '
         f'{r["short"]:.0f} MB, ten times as long {r["long"]:.0f} MB'

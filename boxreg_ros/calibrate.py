@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.intake import add_convention_arguments, convention_from
 from boxreg_ros.objective import EXTENT, State
 from boxreg_ros.recording import Recording
-from boxreg_ros.registration import expected_shared, MARGINS
+from boxreg_ros.registration import expected_shared
 from boxreg_ros.relabel import config_from, setting
 from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import Floats, LENGTH, ROLL
@@ -81,7 +81,7 @@ class _Sights(InputModel):
     """What the core learns of a rule, track by track."""
 
     def of(self, which: int, faces: Sequence[int]) -> list[Floats]:
-        """Return the gaps (0) or depths (1) of these faces, per track that tells some [m]."""
+        """Return shifts of gaps (0) or depths (1) of faces, per track that tells some [m]."""
         means = []
         for known in self._sights.values():
             total, count = known[which][:, faces]
@@ -104,25 +104,31 @@ def annotation_rule(drive: Drive, config: Config) -> dict[str, Measured]:
     Returns
     -------
     rule : dict of Measured
-        By name of the setting [m]; what was not seen on enough tracks is NaN.
+        By name of the setting [m]: gaps of the kinds of objects there are, depths of all
+        together. What was seen on no track is NaN.
 
     """
-    windows = _true_windows(drive, config)
-    faces = config.faces
+    kinds: dict[str, list[Window]] = {}
+    for window in _true_windows(drive, config):
+        kinds.setdefault(_kind(window.class_name, config), []).append(window)
     rule: dict[str, Measured] = {}
     for _ in range(PASSES):
-        seen: dict[str, list[Floats]] = {name: [] for name in (*GAPS, *DEPTHS)}
-        for first in range(0, len(windows), TRACKS):
-            model = _Sights(faces)
-            _show(model, windows[first : first + TRACKS], config, model.rule())
-            for which, names in enumerate((GAPS, DEPTHS)):
-                for name, kind in zip(names, FACE_KINDS, strict=False):
-                    seen[name] += model.of(which, kind)
+        gaps: dict[str, list[Floats]] = {f'{k}.{n}': [] for k in kinds for n in GAPS}
+        depths: dict[str, list[Floats]] = {f'faces.{n}': [] for n in DEPTHS}
+        for kind, windows in kinds.items():
+            expected = [getattr(getattr(config, kind), name) for name in GAPS]
+            for first in range(0, len(windows), TRACKS):
+                model = _Sights(config.faces)
+                _show(model, windows[first : first + TRACKS], config, model.rule())
+                for name, gap, faces in zip(GAPS, expected, FACE_KINDS, strict=True):
+                    gaps[f'{kind}.{name}'] += [gap + shift for shift in model.of(0, faces)]
+                for name, faces in zip(DEPTHS, FACE_KINDS, strict=False):
+                    depths[f'faces.{name}'] += model.of(1, faces)
         rule = {
             name: Measured.median(np.concatenate([np.zeros(0), *means]), len(means))
-            for name, means in seen.items()
+            for name, means in (gaps | depths).items()
         }
-        faces = replace(faces, **_valid(rule, 'faces.'))
+        config = config.updated(_valid(rule))
     return rule
 
 
@@ -139,10 +145,9 @@ def input_errors(drive: Drive, config: Config) -> dict[str, Measured]:
     for i in np.argsort(truth.stamps_ns, kind='stable'):
         stamp_ns, name = int(truth.stamps_ns[i]), truth.track_ids[i]
         if (stamp_ns, name) in given and _is_box(truth.boxes[i]):
-            kind = config.class_config(truth.class_names[i])
-            group = next(k for k in KINDS if getattr(config, k) is kind)
+            kind = _kind(truth.class_names[i], config)
             pair = stamp_ns, given[stamp_ns, name], truth.boxes[i]
-            pairs.setdefault(group, {}).setdefault(name, []).append(pair)
+            pairs.setdefault(kind, {}).setdefault(name, []).append(pair)
     return {
         f'{kind}.{name}': measured
         for kind, tracks in pairs.items()
@@ -193,7 +198,8 @@ def calibrated(config: Config, measured: Mapping[str, Measured]) -> dict[str, An
     """
     Return the settings that were measured, and those in `config` that are not the defaults.
 
-    The rule is stated, and not learnt from the input any more, where all its gaps are known.
+    The rule is stated, and not learnt from the input any more, where of each kind of objects
+    all gaps are known or none is: such a kind keeps what is expected of it.
 
     """
     values: dict[str, Any] = {
@@ -202,18 +208,19 @@ def calibrated(config: Config, measured: Mapping[str, Measured]) -> dict[str, An
         if value != item.default
     }
     values |= {name: round(value, 4) for name, value in _valid(measured).items()}
-    if all(f'faces.{name}' in values for name in GAPS):
+    known = {sum(f'{kind}.{name}' in values for name in GAPS) for kind in KINDS}
+    if max(known) > 0 and known <= {0, len(GAPS)}:
         values['faces.learn'] = False
     return values
 
 
-def _valid(measured: Mapping[str, Measured], prefix: str = '') -> dict[str, Any]:
+def _valid(measured: Mapping[str, Measured]) -> dict[str, Any]:
     """Return values by name that enough tracks told, as near as the bounds of settings allow."""
     bounds = {item.name: item for item in settings()}
     values = {}
     for name, found in measured.items():
         if found.tracks >= FEWEST:
-            item = bounds[prefix + name]
+            item = bounds[name]
             # Angles that neither labels nor input have tell nothing of an error.
             if not (name.endswith('tilt') and found.value < (item.low or 0)):
                 values[name] = float(np.clip(found.value, item.low, item.high))
@@ -284,8 +291,8 @@ def run(args: argparse.Namespace) -> int:
     )
     recording.has_boxes = not args.no_boxes
     drive = Drive.of(recording, truth)
-    measured = {f'faces.{k}': found for k, found in annotation_rule(drive, config).items()}
-    if not any(measured[f'faces.{name}'].tracks for name in GAPS):
+    measured = annotation_rule(drive, config)
+    if not any(found.tracks for found in measured.values()):
         raise RecordingError(
             f'{args.truth}: expected true boxes with points in {recording}, got no face of '
             f'{len(truth.boxes)} boxes that is seen; are stamps and frame those of the recording?'
@@ -297,7 +304,11 @@ def run(args: argparse.Namespace) -> int:
     learns = values.get('faces.learn', config.faces.learn)
     print(
         f'{len(set(truth.track_ids))} labelled tracks; spread between them; the rule '
-        + ('is still corrected by the input: too few faces seen' if learns else 'is stated')
+        + (
+            'is still corrected by the input: not all gaps of a kind told'
+            if learns
+            else 'is stated (faces.learn: false), where nothing told as before'
+        )
     )
     if args.output:
         write_settings(args.output, values, f'{args.truth.name} of {recording}')
@@ -330,7 +341,7 @@ def _show(model: InputModel, windows: Sequence[Window], config: Config, rule: Ru
         part = [windows[i] for i in rows]
         problem, _ = stack(part, config)
         state = State(problem.pose, expected_shared(problem, rule))
-        sights = support(problem, state, MARGINS[0], config.faces.outermost, rule.depths)
+        sights = support(problem, state, config.faces.outermost, rule.depths)
         model.learn_rule([w.track_id for w in part], sights, problem.valid, rule)
 
 
@@ -342,6 +353,12 @@ def _bare(rows: Iterable[Sequence[Any]]) -> Window:
         for stamp_ns, box in rows
     ]
     return Window('', '', observations, len(observations), np.zeros((0, 9)))
+
+
+def _kind(class_name: str, config: Config) -> str:
+    """Return the name of the settings for objects of a class."""
+    found = config.class_config(class_name)
+    return next(kind for kind in KINDS if getattr(config, kind) is found)
 
 
 def _is_box(box: Floats) -> bool:

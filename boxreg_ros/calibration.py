@@ -1,6 +1,6 @@
 """What the input tells about itself: its annotation rule, and how it errs."""
 
-from collections import deque, OrderedDict
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -44,14 +44,25 @@ class InputNoise(NamedTuple):
         scatter = scatter - (scatter * valid[..., None]).sum(1, keepdim=True) / count
         deviation = 1.48 * scatter[valid].abs().median(0).values
         bounded = scatter.clamp(-3 * deviation, 3 * deviation)
-        first, second = bounded[:, :-1][valid[:, 1:]], bounded[:, 1:][valid[:, 1:]]
+        both = valid[:, 1:] & valid[:, :-1]
+        first, second = bounded[:, :-1][both], bounded[:, 1:][both]
         power = (first.square() + second.square()).sum(0) / 2
         correlation = (first * second).sum(0) / power.clamp(min=1e-12)
         return cls(deviation, correlation.clamp(0.0, 0.9))
 
 
 class Rule(NamedTuple):
-    """Gap of each face (6,) [m], and how much further in its points stand if it is hidden."""
+    """
+    How faces stand to the points on them.
+
+    Attributes
+    ----------
+    gaps : Tensor, shape (6,)
+        Gap of each face less the one expected of its class [m].
+    depths : Tensor, shape (6,)
+        How much further in points stand on a face that is hidden [m].
+
+    """
 
     gaps: Tensor
     depths: Tensor
@@ -70,24 +81,22 @@ class InputModel:
     The annotation rule and the noise of the input, learnt as it comes.
 
     The rule is the gap between a label's faces and the outermost points on them. Each track
-    gives one sight per face, the mean over its observations, and the median over tracks is
-    weighed against the expected gap: boxes that err by more than the gap still tell it if their
-    error has no preferred direction.
+    gives one sight per face, the mean over its observations of the gap less the one expected of
+    its class, and the median over tracks of all classes is weighed against no difference: boxes
+    that err by more than the gap still tell it if their error has no preferred direction.
 
     """
 
     def __init__(self, config: FaceConfig) -> None:
         self._config = config
         self._sights: OrderedDict[str, Floats] = OrderedDict()
-        self._scatter: OrderedDict[str, deque[Floats]] = OrderedDict()
+        self._scatter: OrderedDict[str, Floats] = OrderedDict()
         self._noise: InputNoise | None = None
         self._fresh = self._measured = 0
 
-    def learn_rule(
-        self, names: Sequence[str], support: Support, fresh: Tensor, rule: Rule
-    ) -> None:
+    def learn_rule(self, names: Sequence[str], support: Support, new: Tensor, rule: Rule) -> None:
         """
-        Take the observations `fresh` (B, N) of tracks `names`, sighted at their input boxes.
+        Take the observations `new` (B, N) of tracks `names`, sighted at their input boxes.
 
         `rule` is what `support` was made with.
 
@@ -95,28 +104,26 @@ class InputModel:
         out, retreat = support.outwardness.cpu().numpy(), support.retreat.cpu().numpy()
         gaps, depths = rule.gaps.cpu().numpy(), rule.depths.cpu().numpy()
         share = retreat / np.maximum(depths, 1e-6)
-        usable = ((support.trust > 0) & (fresh & (support.points >= 30))[..., None]).cpu().numpy()
+        usable = ((support.trust > 0) & (new & (support.points >= 30))[..., None]).cpu().numpy()
         usable &= np.abs(out) < 0.5
         sights = gaps - out, depths - out / np.maximum(share, 0.5)
+        weights = usable & (share < 0.25), usable & (share > 0.5)
+        sums = [[(s * w).sum(1), w.sum(1)] for s, w in zip(sights, weights, strict=True)]
         for b, name in enumerate(names):
-            known = self._sights.setdefault(name, np.zeros((2, 2, 6)))
-            for k, which in enumerate((share < 0.25, share > 0.5)):
-                weight = (usable & which)[b]
-                known[k] += np.stack([(sights[k][b] * weight).sum(0), weight.sum(0)])
-        _forget(self._sights, names)
+            known = _of(self._sights, name, np.zeros((2, 2, 6)))
+            known += [[part[b] for part in pair] for pair in sums]
 
     def learn_noise(self, names: Sequence[str], scatters: Floats) -> None:
         """Take what one more observation of each track `names` scatters, (B, 9)."""
         for name, row in zip(names, scatters, strict=True):
-            self._scatter.setdefault(name, deque(maxlen=SCATTERS)).append(row.copy())
+            known = _of(self._scatter, name, np.full((SCATTERS, 9), np.nan))
+            known[:-1], known[-1] = known[1:].copy(), row
         self._fresh += len(names)
-        _forget(self._scatter, names)
 
     def rule(self) -> Rule:
         """Return the annotation rule to expect."""
-        c = self._config
-        gaps = self._median(0, (c.gap_ends, c.gap_sides, c.gap_top, c.gap_bottom))
-        return Rule(gaps, self._median(1, (c.depth_ends, c.depth_sides, 0.0, 0.0)))
+        depths = self._config.depth_ends, self._config.depth_sides, 0.0, 0.0
+        return Rule(self._median(0, (0.0,) * 4), self._median(1, depths))
 
     def _median(self, which: int, expected: Sequence[float]) -> Tensor:
         """Weigh what is `expected` of each kind of face against the median over tracks."""
@@ -142,21 +149,18 @@ class InputModel:
         """
         if self._fresh < 0.05 * self._measured:
             return self._noise
-        rows = [np.array(row) for row in self._scatter.values() if len(row) >= LEAST]
-        if not rows:
-            return None
-        valid = np.arange(SCATTERS) < np.array([len(row) for row in rows])[:, None]
-        padded = np.stack([np.pad(row, ((0, SCATTERS - len(row)), (0, 0))) for row in rows])
-        self._noise = InputNoise.measure(torch.from_numpy(padded), torch.from_numpy(valid))
-        self._fresh, self._measured = 0, int(valid.sum())
+        if self._scatter:
+            known = torch.from_numpy(np.array(list(self._scatter.values())))
+            valid = known.isfinite().all(2)
+            self._noise = InputNoise.measure(known.nan_to_num(), valid)
+            self._fresh, self._measured = 0, int(valid.sum())
         return self._noise
 
 
-def _forget(
-    known: OrderedDict[str, Floats] | OrderedDict[str, deque[Floats]], names: Sequence[str]
-) -> None:
-    """Drop the tracks that were seen longest ago."""
-    for name in names:
-        known.move_to_end(name)
-    while len(known) > TRACKS:
+def _of(known: OrderedDict[str, Floats], name: str, fresh: Floats) -> Floats:
+    """Return the array of a track, `fresh` for a new one; forget the one seen longest ago."""
+    found = known.setdefault(name, fresh)
+    known.move_to_end(name)
+    if len(known) > TRACKS:
         known.popitem(last=False)
+    return found

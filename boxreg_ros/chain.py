@@ -56,13 +56,6 @@ class Chain(NamedTuple):
             rows[..., SPAN : SPAN + s] += across[:, :, LINK * k : LINK * (k + 1)]
         self.corner[:, :s, :s] += corner
 
-    def times(self, x: Tensor) -> Tensor:
-        """Return the products with vectors (B, 6 N + S)."""
-        S = self.corner.shape[1]
-        along = (self.links @ _around(x, S)[..., None])[..., 0]
-        down = (self.links[..., SPAN:] * x[:, :-S].unflatten(1, (-1, LINK, 1))).sum((1, 2))
-        return torch.cat([along.flatten(1), down + (self.corner @ x[:, -S:, None])[..., 0]], 1)
-
     def factorised(self, free: Tensor) -> 'Factor':
         """
         Return the factors of the matrices in the variables where `free` (B, 6 N + S) is 1.
@@ -73,7 +66,9 @@ class Chain(NamedTuple):
         """
         S, N = self.corner.shape[1], self.links.shape[1]
         chain, border = free[:, :-S].unflatten(1, (-1, LINK)), free[:, -S:]
-        links = self.links * chain[..., None] * _around(free, S)[:, :, None]
+        near = pad(free[:, :-S], (NEXT, NEXT)).unfold(1, SPAN, LINK)
+        around = torch.cat([near, border[:, None].expand(-1, N, -1)], -1)
+        links = self.links * chain[..., None] * around[:, :, None]
         links[..., NEXT : NEXT + LINK].diagonal(dim1=2, dim2=3).add_(1.0 - chain + 1e-9)
         corner = self.corner * border[..., None] * border[:, None]
         corner.diagonal(dim1=1, dim2=2).add_(1.0 - border + 1e-9)
@@ -86,17 +81,15 @@ class Chain(NamedTuple):
             wide[:, :, j, :, LINK * j : LINK * j + SPAN] = links[:, j::size, :, :SPAN]
         every = torch.cat([wide[..., NEXT:], links[..., SPAN:].unflatten(1, (count, size))], -1)
         blocks, carry = [], links.new_zeros(1, NEXT + S, NEXT + S)
-        for block in every.flatten(2, 3).unbind(
-            1
-        ):  # own columns, those of the next two links, the border
+        for block in every.flatten(2, 3).unbind(1):  # columns: own, the next two links, the border
             block[:, :NEXT, :NEXT] -= carry[:, :NEXT, :NEXT]
             block[:, :NEXT, -S:] -= carry[:, :NEXT, NEXT:]
-            L = _cholesky(block[..., : LINK * size])
+            L = cholesky(block[..., : LINK * size])
             V = solve_triangular(L, block[..., LINK * size :], upper=False)
             carry = V.mT @ V
             corner = corner - carry[:, NEXT:, NEXT:]
             blocks.append((L, V))
-        return Factor(blocks, _cholesky(corner))
+        return Factor(blocks, cholesky(corner))
 
 
 class Factor(NamedTuple):
@@ -151,13 +144,7 @@ class Factor(NamedTuple):
         return torch.cat(found, 1)[:, :length]
 
 
-def _around(x: Tensor, S: int) -> Tensor:
-    """Return the variables (B, N, 30 + S) that each link of `x` (B, 6 N + S) is coupled to."""
-    near = pad(x[:, :-S], (NEXT, NEXT)).unfold(1, SPAN, LINK)
-    return torch.cat([near, x[:, None, -S:].expand(-1, near.shape[1], -1)], -1)
-
-
-def _cholesky(matrix: Tensor) -> Tensor:
+def cholesky(matrix: Tensor) -> Tensor:
     """Return the lower factors of `matrix` (B, b, b); not finite where there is none."""
     L, failed = cholesky_ex(matrix)
     return torch.div(L, (failed == 0)[:, None, None])

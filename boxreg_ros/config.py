@@ -43,18 +43,12 @@ class SamplingConfig:
 
     deskew: bool = setting(False, 'carry points by their times to where a moving object is')
     margin: float = setting(0.6, 'points this far outside a box count', 'm', 0.05, 5.0)
-    points: int = setting(256, 'points kept per box', '', 8, 100000)
+    points: int = setting(128, 'points kept per box', '', 8, 100000)
 
 
 @dataclass(frozen=True, slots=True)
 class FaceConfig:
-    """
-    How the outermost points of a face tell where it is.
-
-    The gaps are the annotation rule: how far outside of its outermost points a label's face
-    stands. With `learn` they are the expectation that the input's own boxes correct.
-
-    """
+    """How the outermost points of a face tell where it is."""
 
     outermost: float = setting(0.05, 'part of the points that stands for a face', '', 1e-3, 1.0)
     ends: float = setting(0.12, 'error of one sight of front or back', 'm', 1e-3, 10.0)
@@ -62,10 +56,6 @@ class FaceConfig:
     top: float = setting(0.08, 'error of one sight of the roof', 'm', 1e-3, 10.0)
     bottom: float = setting(0.05, 'error of one sight of the road', 'm', 1e-3, 10.0)
     outlier: float = setting(0.15, 'a face this far off its points loses its say', 'm', 1e-3, 10.0)
-    gap_ends: float = setting(0.05, 'label outside the points, front and back', 'm', -2.0, 2.0)
-    gap_sides: float = setting(0.03, 'label outside the points, left and right', 'm', -2.0, 2.0)
-    gap_top: float = setting(0.05, 'label above the roof points', 'm', -2.0, 2.0)
-    gap_bottom: float = setting(0.0, 'label below the road', 'm', -2.0, 2.0)
     depth_ends: float = setting(0.36, 'points further in, ends seen from behind', 'm', 0.0, 2.0)
     depth_sides: float = setting(0.18, 'points further in, sides seen from behind', 'm', 0.0, 2.0)
     spread: float = setting(0.06, 'difference of gaps between objects', 'm', 1e-4, 1.0)
@@ -76,12 +66,10 @@ class FaceConfig:
 class SolverConfig:
     """L-BFGS and the rounds around it."""
 
-    rounds: int = setting(
-        15, 'most outer rounds: outermost points and weights renewed', '', 1, 100
-    )
-    iterations: int = setting(2, 'most L-BFGS iterations per round', '', 1, 10000)
+    rounds: int = setting(15, 'most rounds: outermost points and weights renewed', '', 1, 100)
+    iterations: int = setting(1, 'most L-BFGS iterations per round', '', 1, 10000)
     history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
-    threads: int = setting(1, 'cores of the solver; more pay only where all are idle', '', 1, 256)
+    threads: int = setting(0, 'parts of a batch solved at once; 0: as many as cores', '', 0, 256)
     tolerance: float = setting(1e-4, 'a step that promises less ends a window', '', 0.0, 1.0)
 
 
@@ -100,7 +88,13 @@ class PaperConfig:
 
 @dataclass(frozen=True, slots=True)
 class ClassConfig:
-    """How objects of one kind move and how their boxes err."""
+    """
+    How objects of one kind move, how their boxes err and how these are drawn.
+
+    The gaps are the annotation rule: how far outside of its outermost points a label's face
+    stands. With ``faces.learn`` the input's own boxes shift them, those of all kinds together.
+
+    """
 
     names: tuple[str, ...] = setting((), 'class names of this kind: any of these words, any case')
     acceleration: float = setting(1.5, 'expected change of speed', 'm/s^2', 1e-3, 1e3)
@@ -119,6 +113,10 @@ class ClassConfig:
     heading: float = setting(0.04, 'error of an input yaw', 'rad', 1e-3, 3.2)
     tilt: float = setting(0.02, 'error of an input roll and pitch', 'rad', 1e-4, 3.2)
     extent: float = setting(0.05, 'error of the input extents, as part of each', '', 1e-3, 1.0)
+    gap_ends: float = setting(0.05, 'label outside the points, front and back', 'm', -2.0, 2.0)
+    gap_sides: float = setting(0.03, 'label outside the points, left and right', 'm', -2.0, 2.0)
+    gap_top: float = setting(0.05, 'label above the roof points', 'm', -2.0, 2.0)
+    gap_bottom: float = setting(0.0, 'label below the road', 'm', -2.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,18 +131,15 @@ class Config:
     )
     estimate: str = setting(
         'track',
-        "which estimate of a box: 'early' as newest of its window, 'final' `lag` observations "
-        "later, 'track' from all of its track",
+        "what tells a box: 'early' what came before, 'final' `lag` boxes more, 'track' all",
         choices=('early', 'final', 'track'),
     )
     extent: str = setting(
-        'track',
-        "'track' estimates one extent per track, 'fixed' keeps the input's",
-        choices=('track', 'fixed'),
+        'track', "'track' estimates one, 'fixed' keeps the input's", choices=('track', 'fixed')
     )
     window: int = setting(10, 'observations per sliding window', '', 3, 1000)
     lag: int = setting(5, 'observations a final box waits for', '', 0, 999)
-    track_window: int = setting(100, "observations solved at once for 'track'", '', 10, 10000)
+    track_window: int = setting(130, "observations solved at once for 'track'", '', 10, 10000)
     min_observations: int = setting(3, 'shorter windows keep their input', '', 2, 1000)
     max_gap: float = setting(1.0, 'a longer silence ends a track', 's', 0.01, 1e4)
     tolerance: float = setting(0.02, 'boxes and sweep belong together within this', 's', 0.0, 10.0)
@@ -164,8 +159,7 @@ class Config:
         cornering=2.0, turning=1.5, slip=0.4, pivot=0.2, shape=0.06, heading=0.15, extent=0.1,
     )  # fmt: skip
     pedestrian: ClassConfig = ClassConfig(
-        names=('pedestrian', 'person', 'walker', 'people', 'child'),
-        acceleration=2.0,
+        names=('pedestrian', 'person', 'walker', 'people', 'child'), acceleration=2.0,
         cornering=2.0, turning=4.0, slip=1.5, pivot=0.0, shape=0.15, heading=0.5, extent=0.1,
     )  # fmt: skip
 
@@ -175,8 +169,7 @@ class Config:
             _check(item, value)
         if self.lag >= self.window:
             raise ConfigError(
-                f'lag: expected less than window ({self.window}), got {self.lag}; '
-                'lower lag or raise window'
+                f'lag: expected less than window ({self.window}), got {self.lag}; lower the lag'
             )
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
@@ -275,9 +268,8 @@ def _filled(default: Any, value: Any, name: str) -> Any:
     prefix = f'{name}.' if name else ''
     for key in value:
         if key not in known:
-            raise ConfigError(
-                f'{prefix}{key}: no such setting; expected one of {", ".join(sorted(known))}'
-            )
+            names = ', '.join(sorted(known))
+            raise ConfigError(f'{prefix}{key}: no such setting; expected one of {names}')
     changes = {key: _filled(known[key], inner, prefix + key) for key, inner in value.items()}
     return replace(default, **changes)  # type: ignore[type-var]
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 BOTTOM = 5
+MARGIN = 0.4  # outside a face, points still count for it [m]
 LEAST = 3  # points without which a face is not seen
 BESIDE = 0.2  # outside the edges of a face, points still count for it [m]
 INSIDE = 0.3  # more room on the inner side of a face than on its outer side [m]
@@ -78,9 +79,7 @@ def retreat(aspect: Tensor, depths: Tensor) -> Tensor:
     return depths.to(aspect) * (0.5 - 0.5 * shifted / (shifted.square() + TURN).sqrt())
 
 
-def support(
-    problem: Problem, state: State, margin: float, outermost: float, depths: Tensor
-) -> Support:
+def support(problem: Problem, state: State, outermost: float, depths: Tensor) -> Support:
     """
     Find the outermost points of each face, the part `outermost` of all [for Eq. 4].
 
@@ -90,8 +89,6 @@ def support(
         Windows.
     state : State
         Where their boxes are in this round.
-    margin : float
-        Only points this close to the outer side of a face count for it [m].
     outermost : float
         Part of the points in and near the box that stands for a face.
     depths : Tensor, shape (6,)
@@ -109,7 +106,7 @@ def support(
     What moves is measured at its own time: points are carried along to the stamp of the box.
 
     """
-    points, openness = carried(problem, state), aspect(problem)
+    points, openness = carried(problem, state), problem.openness
     half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]
     inset = retreat(openness, depths)
     offset = (state.shared[:, None, GAP] + inset).to(points)[..., None] - half[..., FACE_AXIS, :]
@@ -117,17 +114,17 @@ def support(
     local = in_box_axes(points, problem, state.pose)
     beyond = local.abs().sub_(half).add_((~problem.mask[..., None, :]).to(points), alpha=FAR)
     x, y, z = beyond.unbind(-2)
-    count = (x.maximum(y).maximum(z) < margin).sum(-1)
+    count = (x.maximum(y).maximum(z) < MARGIN).sum(-1)
     aside = torch.stack([y.maximum(z), x.maximum(z), x.maximum(y)], -2).sub_(BESIDE)
     depth = points.new_empty(*count.shape, BOTTOM, points.shape[-2])
     for k, sign in enumerate((-1.0, 1.0)):  # front left top, back right
         far = aside[..., : 3 - k, :]
         inside = (sign * local[..., : 3 - k, :]).sub_(offset[..., k:BOTTOM:2, :])
-        depth[..., k::2, :] = inside.maximum(far.maximum(-margin - inside).mul_(FAR))
+        depth[..., k::2, :] = inside.maximum(far.maximum(-MARGIN - inside).mul_(FAR))
     most = min(depth.shape[-1], max(LEAST, int(outermost * depth.shape[-1]) + 1))
     depth, index = depth.topk(most, largest=False)  # (B, N, 5, K)
     wanted = (outermost * count).clamp(min=LEAST)[..., None, None]
-    chosen = (depth <= margin + INSIDE) & (torch.arange(most, device=depth.device) < wanted)
+    chosen = (depth <= MARGIN + INSIDE) & (torch.arange(most, device=depth.device) < wanted)
     number = chosen.sum(-1)
     share = chosen / number.clamp(min=1)[..., None].to(points)
     best = pad(torch.take_along_dim(points[:, :, None], index[..., None], 3), (0, 1), value=1.0)
@@ -140,10 +137,8 @@ def support(
     point = torch.stack([shift[..., 0], shift[..., 1], road, torch.ones_like(road)], -1)
     height, gap = state.shared[:, None, 2], state.shared[:, None, GAP][..., BOTTOM]
     bottom = point[..., None] * point[..., None, :], shift[..., 2] - road - height / 2 + gap, known
-    found: Any = (
-        torch.cat([five.to(road), one[:, :, None].to(road)], 2)
-        for five, one in zip((moments, out, trust), bottom, strict=True)
-    )
+    pairs = zip((moments, out, trust), bottom, strict=True)
+    found: Any = (torch.cat([five.to(road), one[:, :, None].to(road)], 2) for five, one in pairs)
     inset[..., BOTTOM] = 0.0
     return Support(*[*found, inset, count.to(road)])
 

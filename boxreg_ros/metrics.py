@@ -79,8 +79,7 @@ def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
 
 def wrap(angles: Floats) -> Floats:
     """Return `angles` in [-pi, pi) [rad]."""
-    wrapped: Floats = (angles + np.pi) % (2 * np.pi) - np.pi
-    return wrapped
+    return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _rows(boxes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:

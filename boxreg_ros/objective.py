@@ -8,10 +8,9 @@ W, adding r' W r / 2; W holds the expected deviations and the robust weights of 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
 from typing import NamedTuple
 
-from boxreg_ros.chain import Chain, Factor
+from boxreg_ros.chain import Chain, cholesky, Factor, LINK
 from boxreg_ros.config import PaperConfig
 from boxreg_ros.geometry import (
     FACE_AXIS,
@@ -24,12 +23,13 @@ from boxreg_ros.lbfgs import select
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor
+from torch.linalg import solve_triangular
+from torch.nn.functional import pad
 
 EPSILON = 1e-9  # inside roots, so that the paper's norms have a gradient at zero
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     """
     A batch of padded windows; centres are relative to one point per window.
 
@@ -51,6 +51,13 @@ class Problem:
         Sensor minus the centre of the input box [m]; NaN where unknown.
     ground : Tensor, shape (B, N)
         Height of the road minus that of the input centre [m]; NaN where unknown.
+    recalled, information : Tensor, shapes (B, 34) and (B, 34, 34)
+        Where the quadratic form is least that stands for what has left the window, in its two
+        oldest poses and what is shared, and its curvature.
+    seen : Tensor, shape (B, 4)
+        Sum of the input extents that have left, and their number.
+    openness : Tensor, shape (B, N, 6)
+        How openly the sensor sees each face of the input, see `aspect`.
     deviations : dict of Tensors, shape (B,)
         The numbers of each window's `ClassConfig`.
 
@@ -65,6 +72,10 @@ class Problem:
     delays: Tensor
     origins: Tensor
     ground: Tensor
+    recalled: Tensor
+    information: Tensor
+    seen: Tensor
+    openness: Tensor
     deviations: dict[str, Tensor]
 
     @property
@@ -72,15 +83,9 @@ class Problem:
         """Input poses x y z roll pitch yaw, shape (B, N, 6)."""
         return self.boxes[..., POSE]
 
-    @property
-    def errors(self) -> Tensor:
-        """Return the expected errors of the input, along its axes and of angles, (B, 6)."""
-        names = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
+    def of(self, *names: str) -> Tensor:
+        """Return deviations by name, (B, n)."""
         return torch.stack([self.deviations[name] for name in names], -1)
-
-    def select(self, rows: Tensor) -> 'Problem':
-        """Return the windows `rows` alone."""
-        return Problem(*(select(getattr(self, f.name), rows) for f in fields(self)))
 
 
 # --- the paper ----------------------------------------------------------------------------------
@@ -210,7 +215,9 @@ def _mean(values: Tensor, real: Tensor) -> Tensor:
 SHARED = 22  # extent (3), bias of the input (6), gap of the faces (6), pivot, anchor (6)
 EXTENT, BIAS, GAP = slice(0, 3), slice(3, 9), slice(9, 15)
 PIVOT = 15
+ERRORS = 'position', 'lateral', 'height', 'tilt', 'tilt', 'heading'  # of a pose, by deviation
 ANCHOR = slice(16, 22)
+MEMORY = 12 + SHARED
 
 
 class State(NamedTuple):
@@ -223,8 +230,8 @@ class State(NamedTuple):
         x y z roll pitch yaw [m, rad].
     shared : Tensor, shape (B, 22)
         Extent [m]; bias of the input poses, along their axes [m, rad]; gap from the outermost
-        points of each face out to the face [m]; the point that does not slip sideways, behind the
-        centre, as part of the length.
+        points of each face out to the face [m]; how far behind the centre the point is that
+        does not slip sideways [m].
 
     """
 
@@ -263,8 +270,10 @@ class Term(NamedTuple):
     data: tuple[Tensor, ...] = ()
 
     def linearise(self, state: State) -> Linearised:
-        """Return residual and derivatives at `state`."""
-        return self.function(state, *self.data)
+        """Return residual and derivatives at `state`, of as many stencils as have a weight."""
+        r, J, S = self.function(state, *self.data)
+        n = self.weight.shape[1]
+        return Linearised(r[:, :n], J[:, :n], S[:, :n] if S.dim() > 3 else S)
 
 
 def value_and_gradient(
@@ -290,11 +299,41 @@ def value_and_gradient(
             by_pose[:, k : k + n] += moved[:, :, k]
         by_shared[:, : S.shape[-1]] += (flat @ S).sum((1, 2))
         if curvature is not None:
-            W = torch.diag_embed(term.weight.permute(0, 1, 3, 4, 2), dim1=2, dim2=4)
-            W = W.flatten(4, 5).flatten(2, 3)  # one product of full size beats F small ones
+            W = term.weight[:, :, 0]
+            if term.weight.shape[2] > 1:  # one product of full size beats F small ones
+                W = torch.diag_embed(term.weight.permute(0, 1, 3, 4, 2), dim1=2, dim2=4)
+                W = W.flatten(4, 5).flatten(2, 3)
             WJ, corner = W @ J, S.mT @ (W if S.dim() > 2 else W.sum(1, keepdim=True)) @ S
             curvature.add(J.mT @ WJ, WJ.mT @ S, corner.sum(1))
     return value, gradient
+
+
+def remembered(terms: Sequence[Term], state: State) -> tuple[Tensor, Tensor, Tensor]:
+    """
+    Return what the oldest observation leaves behind when it is eliminated from the window.
+
+    A quadratic form in the next two poses and what is shared: where they are (B, 34), the step
+    from there to its minimum (B, 34), and its curvature (B, 34, 34). It stands for all terms of
+    that observation, what these remember included, so nothing is counted twice.
+
+    """
+    head = State(state.pose[:, :3], state.shared)
+    form = state.pose.new_zeros(len(state.pose), 3 * LINK + SHARED + 1, 3 * LINK + SHARED + 1)
+    for term in terms:
+        if term.function is not shared_prior:
+            data = tuple(part[:, :3] for part in term.data)
+            r, J, S = Term(term.function, term.weight[:, :1], data).linearise(head)
+            J, S = pad(J, (0, 3 * LINK - J.shape[-1])), pad(S, (0, SHARED - S.shape[-1]))
+            # With the residual as a last column, one product gives curvature and gradient.
+            A = torch.cat([J, S.expand(*J.shape[:-1], -1), r[..., None]], -1)[:, 0]
+            form += A.flatten(1, 2).mT @ (term.weight[:, 0] @ A).flatten(1, 2)
+    root = cholesky(form[:, :LINK, :LINK] + 1e-9 * torch.eye(LINK).to(form))
+    across = solve_triangular(root, form[:, :LINK, LINK:], upper=False)
+    form = form[:, LINK:, LINK:] - across.mT @ across
+    information, gradient = form[:, :-1, :-1], form[:, :-1, -1]
+    # The ridge is for what is not known at all.
+    step = torch.linalg.solve(information + 1e-6 * torch.eye(MEMORY).to(form), -gradient)
+    return head.pack()[:, LINK:], step, information
 
 
 class Sum:
@@ -304,7 +343,7 @@ class Sum:
     Parameters
     ----------
     terms : sequence of Term
-        Those that are linear in the variables are summed up to one quadratic form.
+        What to sum up.
     start, free : Tensor, shape (B, D)
         Where the search starts, and 1 for the variables it may change.
     length : int
@@ -318,27 +357,19 @@ class Sum:
     """
 
     def __init__(self, terms: Sequence[Term], start: Tensor, length: int, free: Tensor) -> None:
-        linear = [term for term in terms if term.function in LINEAR]
-        self._terms = [term for term in terms if term.function not in LINEAR]
-        self._length, self._form = length, Chain.zeros(start, length)
-        value, gradient = value_and_gradient(linear, start, length, self._form)
-        self._start = start, value, gradient, free
-        whole = Chain(*(part.clone() for part in self._form))
-        bent = value_and_gradient(self._terms, start, length, whole)
-        self._first = value + bent[0], (gradient + bent[1]) * free
-        self.factor = whole.factorised(free)
+        self._terms, self._start, self._length, self._free = terms, start, length, free
+        curvature = Chain.zeros(start, length)
+        value, gradient = value_and_gradient(terms, start, length, curvature)
+        self._first = value, gradient * free
+        self.factor = curvature.factorised(free)
 
     def __call__(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`."""
-        if x is self._start[0]:
+        if x is self._start:
             return self._first
-        parts = self._form, self._terms, *self._start
-        form, terms, start, value, gradient, free = select(parts, rows)
-        step = x - start
-        bend = form.times(step)
-        bent_value, bent_gradient = value_and_gradient(terms, x, self._length)
-        value = value + (step * (gradient + bend / 2)).sum(1) + bent_value
-        return value, (gradient + bend + bent_gradient) * free
+        terms, free = select((self._terms, self._free), rows)
+        value, gradient = value_and_gradient(terms, x, self._length)
+        return value, gradient * free
 
     def newton(self, vector: Tensor, rows: Tensor) -> Tensor:
         """Return the inverse of the curvature where the search started times `vector` (b, D)."""
@@ -418,19 +449,17 @@ def rest(state: State) -> Linearised:
 def slip(state: State, times: Tensor) -> Linearised:
     """Velocity of the pivot, to the left and upward in the body frame [m/s] [for Eq. 7]."""
     dt, N = times.diff(dim=1)[..., None, None], state.pose.shape[1]
-    p, shared = state.pose, state.shared[..., None, None, None]
-    length, ratio = shared[:, 0], shared[:, PIVOT]
+    p, arm = state.pose, state.shared[:, PIVOT, None, None, None]
     R, dR = rotation_derivatives(torch.cat([p[..., 3:], (p[:, 1:, 3:] + p[:, :-1, 3:]) / 2], 1))
-    heading, swing = R[:, :N, :, 0], length * ratio * dR[:, :N, ..., 0].mT
+    heading, swing = R[:, :N, :, 0], arm * dR[:, :N, ..., 0].mT
     across, by_angle = R[:, N:, :, 1:].mT / dt, dR[:, N:, ..., 1:] / dt[..., None]
-    step = (p[..., :3] - (length * ratio)[..., 0] * heading).diff(dim=1)
+    step = (p[..., :3] - arm[..., 0] * heading).diff(dim=1)
     residual = (across @ step[..., None]).mT
     tilt = (step[:, :, None, None] @ by_angle)[..., 0, :].mT / 2
     before, after = tilt + across @ swing[:, :-1], tilt - across @ swing[:, 1:]
     by_pose = torch.cat([-across, before, across, after], -1)[:, :, None]
     turned = -(across @ heading.diff(dim=1)[..., None]).mT
-    by_shared = p.new_zeros(*residual.shape, SHARED)
-    by_shared[..., 0], by_shared[..., PIVOT] = ratio * turned, length * turned
+    by_shared = pad(turned[..., None], (PIVOT, SHARED - PIVOT - 1))
     return Linearised(residual, by_pose, by_shared)
 
 
@@ -441,4 +470,9 @@ def shared_prior(state: State, expected: Tensor) -> Linearised:
     return Linearised(residual, by_pose, torch.eye(SHARED).to(residual)[None])
 
 
-LINEAR = (prior, shape, acceleration, rest, shared_prior)  # in pose and shared
+def memory(state: State, recalled: Tensor) -> Linearised:
+    """Deviation of the two oldest poses and of what is shared from what is `recalled`."""
+    residual = torch.cat([state.pose[:, :2].flatten(1), state.shared], 1) - recalled[:, 0]
+    by_pose, by_shared = torch.eye(MEMORY).to(residual).split([MEMORY - SHARED, SHARED], 1)
+    by_pose = by_pose.expand(len(residual), 1, 1, -1, -1)
+    return Linearised(residual[:, None, None], by_pose, by_shared[None])

@@ -11,7 +11,7 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.registration import Estimate, register
 from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep, X, Z
-from boxreg_ros.window import Window
+from boxreg_ros.window import Memory, Window
 import numpy as np
 import torch
 
@@ -115,7 +115,8 @@ class BoxRegistrar:
         tick.refuse(late or ('no_sweep' if sweep is None else ''))
         admitted = [i for i, reason in enumerate(tick.reasons) if not reason]
         silent = now_ns - round(self.config.max_gap * 1e9)
-        self._end([name for name, track in self._tracks.items() if track.newest_ns < silent])
+        newest = {name: t.entries[-1].observation.stamp_ns for name, t in self._tracks.items()}
+        self._end([name for name, stamp_ns in newest.items() if stamp_ns < silent])
         if sweep is not None and admitted:
             fresh = [_TrackBuffer(boxes.track_ids[i], boxes.class_names[i]) for i in admitted]
             tracks = [self._tracks.setdefault(track.track_id, track) for track in fresh]
@@ -208,16 +209,13 @@ class _TrackBuffer:
     track_id: str
     class_name: str
     entries: list[_Entry] = field(default_factory=list)
-
-    @property
-    def newest_ns(self) -> int:
-        return self.entries[-1].observation.stamp_ns
+    memory: Memory | None = None
 
     def window(self) -> Window:
         observations = [entry.observation for entry in self.entries]
         solved = [entry.estimate for entry in self.entries if entry.estimate is not None]
         fresh, start = len(observations) - len(solved), np.array(solved).reshape(-1, 9)
-        return Window(self.track_id, self.class_name, observations, fresh, start)
+        return Window(self.track_id, self.class_name, observations, fresh, start, self.memory)
 
     def velocity(self, box: Floats, stamp_ns: int) -> Floats:
         """Return that of the centre over the last stamps and `box`, the newest [m/s]."""
@@ -230,7 +228,8 @@ class _TrackBuffer:
         return slope
 
     def write(self, estimate: Estimate) -> None:
-        for entry, box, status, reason, spread in zip(self.entries, *estimate, strict=True):
+        self.memory = estimate.memory
+        for entry, box, status, reason, spread in zip(self.entries, *estimate[:4], strict=True):
             entry.estimate, tick, i = box, entry.tick, entry.index
             if not entry.is_settled:
                 tick.refined[i], tick.status[i], tick.reasons[i] = box, status, reason
@@ -247,8 +246,8 @@ class _TrackBuffer:
         if config.estimate != 'track':
             del self.entries[: max(0, len(self.entries) - config.window + 1)]
         else:
-            # The ends of a window are its weakest part: a quarter waits for the next window,
-            # which sees another quarter of settled ones before it.
-            overlap = config.track_window // 4
+            # The ends of a window are its weakest part: an eighth waits for the next window,
+            # which sees another eighth of settled ones before it.
+            overlap = config.track_window // 8
             self.settle(max(0, len(self.entries) - overlap))
             del self.entries[: max(0, len(self.entries) - 2 * overlap)]

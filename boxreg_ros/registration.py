@@ -1,6 +1,9 @@
 """Windows in, refined boxes out: the method in one readable function."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from multiprocessing import cpu_count
 from typing import NamedTuple
 
 from boxreg_ros import objective
@@ -9,33 +12,59 @@ from boxreg_ros.config import Config
 from boxreg_ros.correspondence import in_box_axes, Support, support
 from boxreg_ros.geometry import rotation_from_rpy, wrap_angle
 from boxreg_ros.lbfgs import minimize, select
-from boxreg_ros.objective import ANCHOR, EXTENT, Problem, SHARED, State, Sum, Term
+from boxreg_ros.objective import ERRORS, EXTENT, Problem, remembered, SHARED, State, Sum, Term
 from boxreg_ros.shape import agreement
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED
-from boxreg_ros.window import batches, stack, Window
+from boxreg_ros.window import batches, Memory, stack, Window
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-# Around the box, where a face's points are looked for: first round, later [m].
-MARGINS = 0.4, 0.3
 RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
 
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
-SETTLED = 0.1  # a window whose boxes move less, in errors of the input, is done
+SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
+PART = 2**18  # points that a thread works on at once: what its cache holds
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 
 class Estimate(NamedTuple):
-    """Boxes (N, 9) of a window with their status, reasons and covariances (N, 6, 6)."""
+    """
+    Boxes (N, 9) of a window with their status, reasons and covariances (N, 6, 6).
+
+    Of a full window, what the next one is to remember of it too.
+
+    """
 
     boxes: Floats
     status: tuple[str, ...]
     reasons: tuple[str, ...]
     covariances: Floats
+    memory: Memory | None = None
+
+
+class Solution(NamedTuple):
+    """
+    A solved batch.
+
+    Attributes
+    ----------
+    state : State
+        Poses, and what is shared.
+    covariances : Tensor, shape (B, N, 6, 6)
+        Of the poses: blocks of the inverse of the curvature.
+    left : tuple of Tensor
+        What full windows leave to `Memory`, its base excepted; NaN where they are not full.
+
+    """
+
+    state: State
+    covariances: Tensor
+    left: tuple[Tensor, ...] = ()
 
 
 def register(windows: Sequence[Window], config: Config, model: InputModel) -> list[Estimate]:
@@ -57,12 +86,12 @@ def register(windows: Sequence[Window], config: Config, model: InputModel) -> li
         In the order of `windows`.
 
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(config.solver.threads)  # tensors are small: threads wait, not work
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)  # tensors are small: threads of torch would wait, not work
     try:
         return _register(windows, config, model)
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(before)
 
 
 def _register(windows: Sequence[Window], config: Config, model: InputModel) -> list[Estimate]:
@@ -75,26 +104,23 @@ def _register(windows: Sequence[Window], config: Config, model: InputModel) -> l
         part = [windows[i] for i in rows]
         problem, base = stack(part, config)
         if config.objective == 'paper':
-            state, covariances = solve_paper(problem, config)
+            solved = solve_paper(problem, config)
         else:
             rounds = 1 if part[0].is_warm else config.solver.rounds
-            state, covariances = solve(problem, config, model, rounds)
+            solved = solve(problem, config, model, rounds)
         if config.estimate != 'track':
-            _learn_noise(model, part, problem, state, config.lag)
-        kept = [estimates[i] for i in rows]
-        found = _judged(kept, problem, base, state, covariances, config)
+            # The input scatters about what a window knows best, `lag` from its end.
+            best = [max(0, len(window.observations) - 1 - config.lag) for window in part]
+            known = scatter(problem, solved.state)[range(len(part)), best].cpu().numpy()
+            model.learn_noise([window.track_id for window in part], known)
+        found = _judged([estimates[i] for i in rows], problem, base, solved, config)
         for i, estimate in zip(rows, found, strict=True):
             estimates[i] = estimate
     return estimates
 
 
 def _judged(
-    kept: Sequence[Estimate],
-    problem: Problem,
-    base: Floats,
-    state: State,
-    covariances: Tensor,
-    config: Config,
+    kept: Sequence[Estimate], problem: Problem, base: Floats, solved: Solution, config: Config
 ) -> list[Estimate]:
     """
     Return what a solved batch says of each window, in the fixed frame.
@@ -104,6 +130,7 @@ def _judged(
     the objective does not make.
 
     """
+    state, covariances, left = solved
     given = problem.boxes[..., 3:6]
     extent = given if config.extent == 'fixed' else state.shared[:, None, EXTENT].expand_as(given)
     boxes = torch.cat([state.pose[..., :3], extent, wrap_angle(state.pose[..., 3:])], -1)
@@ -115,72 +142,81 @@ def _judged(
     reasons = np.select(list(failed.cpu().numpy()), ['no_points', 'not_finite', 'no_gain'], '')
     found, spread = boxes.cpu().numpy(), covariances.cpu().numpy()
     found[..., :3] += base[:, None]
-    estimates = []
+    arrays, estimates = [part.cpu().numpy() for part in left], []
     for b, known in enumerate(kept):
-        n = len(known.boxes)
+        memory = Memory(base[b], *(a[b] for a in arrays)) if left and finite[b].all() else None
+        n, is_lasting = len(known.boxes), memory is not None and np.isfinite(memory.step).all()
         is_own = good[b, :n, None]
         own = np.where(is_own, found[b, :n], known.boxes)
         error = np.where(is_own[..., None], spread[b, :n], known.covariances)
         words = tuple(status[b, :n].tolist()), tuple(reasons[b, :n].tolist())
-        estimates.append(Estimate(own, *words, error))
+        estimates.append(Estimate(own, *words, error, memory if is_lasting else None))
     return estimates
 
 
-def _learn_noise(
-    model: InputModel, windows: Sequence[Window], problem: Problem, state: State, lag: int
-) -> None:
-    """Show the model how the input scatters where a window knows it best, `lag` from its end."""
-    best = torch.tensor([max(0, len(w.observations) - 1 - lag) for w in windows])
-    rows = scatter(problem, state)[torch.arange(len(windows)), best]
-    model.learn_noise([w.track_id for w in windows], rows.cpu().numpy())
-
-
-def solve(
-    problem: Problem, config: Config, model: InputModel, rounds: int
-) -> tuple[State, Tensor]:
+@torch.inference_mode()
+def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> Solution:
     """
     Minimise the robust objective: rounds of correspondence, weighting and L-BFGS.
 
-    Returns the state and the covariances of the poses, (B, N, 6, 6): blocks of the inverse of
-    the curvature, which is also the metric L-BFGS starts from in every round. A window whose
-    boxes moved by less than `SETTLED` errors of its input takes no part in further rounds.
+    The curvature is also the metric L-BFGS starts from in every round. A window whose boxes moved
+    by less than `SETTLED` errors of its input takes no part in further rounds. Within a round
+    windows do not depend on each other: threads share them.
 
     """
     length, solver = problem.boxes.shape[1], config.solver
     limits = solver.iterations, solver.history, solver.tolerance
+    is_track = config.estimate == 'track'
     rule, noise = model.rule(), model.noise()
-    expected = expected_shared(problem, rule)
-    state = State(problem.start[..., POSE].clone(), expected.clone())
+    everyone = expected_shared(problem, rule)
+    state = State(problem.start[..., POSE].clone(), everyone.clone())
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
+    unknown = torch.full_like(problem.recalled, torch.nan)
+    seen = problem.seen + pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
+    left = unknown, unknown.clone(), problem.information.clone(), seen
     free = free_variables(problem, config)
-    rows = torch.arange(len(expected), device=expected.device)
-    everything = problem
-    for turn in range(rounds):
-        margin = MARGINS[0] if turn == 0 and rounds > 1 else MARGINS[1]
-        part = State(state.pose[rows], state.shared[rows])
-        part.shared[:, ANCHOR] = 0.0
-        sights = support(problem, part, margin, config.faces.outermost, rule.depths)
-        terms = weigh(problem, part, sights, expected[rows], noise, config, is_first=turn == 0)
-        if turn > 0 and config.estimate == 'track':
-            information, wanted = agreement(problem, part)
-            terms.append(Term(objective.shape, information[:, :, None], (part.pose, wanted)))
-        x = part.pack()
+
+    @torch.inference_mode()
+    def improve(rows: Tensor, turn: int, noise: InputNoise | None) -> Tensor:
+        """Take one round with some windows; return those that need another."""
+        part, here, expected = select(problem, rows), select(state, rows), everyone[rows]
+        here.shared[:, objective.ANCHOR] = 0.0
+        sights = support(part, here, config.faces.outermost, rule.depths)
+        terms = weigh(part, here, sights, expected, noise, config)
+        if turn > 0 and is_track:
+            information, wanted = agreement(part, here)
+            terms.append(Term(objective.shape, information[:, :, None], (here.pose, wanted)))
+        x = here.pack()
         total = Sum(terms, x, length, free[rows])
-        found = State.unpack(minimize(total, x, *limits, total.newton).x, length)
-        state.pose[rows], state.shared[rows] = found
-        if config.estimate == 'track':
-            noise = InputNoise.measure(scatter(everything, state), everything.valid)
-        step = ((found.pose - part.pose) / problem.errors[:, None]).square().mean(2).amax(1).sqrt()
-        is_done = (step <= SETTLED) & (turn > 1) | (turn + 1 == rounds)
-        done, rest = is_done.nonzero()[:, 0], (~is_done).nonzero()[:, 0]
+        best = State.unpack(minimize(total, x, *limits, total.newton).x, length)
+        step = (
+            ((best.pose - here.pose) / part.of(*ERRORS)[:, None]).square().mean(2).amax(1).sqrt()
+        )
+        state.pose[rows], state.shared[rows] = best  # `here` may be a view of it
+        is_done = (step <= SETTLED) & (turn > 0) | (turn + 1 == rounds)
+        done, leaves = is_done.nonzero()[:, 0], is_done & part.valid.all(1)
         covariances[rows[done]] = select(total.factor, done).inverse_of_links(length)
-        rows, problem = rows[rest], problem.select(rest)
-        if not len(rows):
-            break
-    return state, covariances
+        if not is_track and length == config.window:
+            for whole, new in zip(left, remembered(terms, best), strict=False):
+                whole[rows[leaves]] = new[leaves]
+        return rows[~is_done]
+
+    workers = solver.threads or cpu_count()
+    with ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool:
+        rows = torch.arange(len(state.pose), device=free.device)
+        size = (PART if rows.is_cpu else 2**62) / problem.mask[0].numel()
+        for turn in range(rounds):
+            parts = rows.tensor_split(min(len(rows), 1 + int(len(rows) / size)))
+            run = pool.map if len(parts) > 1 else map
+            rows = torch.cat(list(run(partial(improve, turn=turn, noise=noise), parts)))
+            if is_track:
+                noise = InputNoise.measure(scatter(problem, state), problem.valid)
+            if not len(rows):
+                break
+    return Solution(state, covariances, left)
 
 
-def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
+def solve_paper(problem: Problem, config: Config) -> Solution:
     """
     Minimise the paper's objective (Eq. 8) by L-BFGS, multipliers updated in between.
 
@@ -207,7 +243,7 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
     def function(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         with torch.enable_grad():
             x = x.detach().requires_grad_()
-            part, factors = problem.select(rows), multipliers[rows]
+            part, factors = select(problem, rows), multipliers[rows]
             loss, _ = objective.total(boxes(x, rows), part, settings, factors, rounding)
             (gradient,) = torch.autograd.grad(loss.sum(), x)
         return loss.detach(), gradient * free[rows]
@@ -218,8 +254,8 @@ def solve_paper(problem: Problem, config: Config) -> tuple[State, Tensor]:
         rows = torch.arange(len(x), device=x.device)
         _, violation = objective.total(boxes(x, rows), problem, settings, multipliers, rounding)
         multipliers += violation * x.new_tensor([settings.smoothness, settings.alignment])
-    spread = torch.diag_embed(problem.errors**2)[:, None].expand(-1, length, -1, -1)
-    return State(x.unflatten(1, (length, 6)), expected), spread
+    spread = torch.diag_embed(problem.of(*ERRORS) ** 2)[:, None].expand(-1, length, -1, -1)
+    return Solution(State(x.unflatten(1, (length, 6)), expected), spread)
 
 
 def weigh(
@@ -229,7 +265,6 @@ def weigh(
     expected: Tensor,
     noise: InputNoise | None,
     config: Config,
-    is_first: bool = False,
 ) -> list[Term]:
     """
     Return the terms of one round, weighted by expected deviations and by how far off they are.
@@ -241,11 +276,7 @@ def weigh(
     correlation measured widens its deviation, and without correlation there is no bias either.
 
     """
-    kind, valid, faces = problem.deviations, problem.valid.to(state.pose), config.faces
-    given = problem.pose
-
-    def of(*names: str) -> Tensor:
-        return torch.stack([kind[name] for name in names], -1)
+    of, valid, faces, given = problem.of, problem.valid.to(state.pose), config.faces, problem.pose
 
     # Closeness and enclosure: outermost points on their faces.
     errors = [faces.ends] * 2 + [faces.sides] * 2 + [faces.top, faces.bottom]
@@ -253,9 +284,9 @@ def weigh(
     trust = trust / (1 + (sights.outwardness / faces.outlier) ** 2) ** 2
     trust = trust * valid[..., None] / torch.tensor(errors).to(trust) ** 2
     # The input, its bias and its extents.
-    error = problem.errors
+    error = problem.of(*ERRORS)
     inflation = torch.tensor(INFLATION).to(error)
-    bias, extent = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]), kind['extent'][:, None]
+    bias, extent = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]), of('extent')
     if noise is not None:
         deviation, correlation = noise.deviation.to(error), noise.correlation.to(error)
         ratio = (deviation[:6] / error).clamp(0.05, 4.0)
@@ -265,14 +296,14 @@ def weigh(
         bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
         extent = extent * slow[6:]
     axes = rotation_from_rpy(state.pose[..., 3:])
-    off = objective.prior(state, given, axes).residual[:, :, 0]
-    off = (off.abs() + surprise(problem) * is_first) / error[:, None]
+    off = objective.prior(state, given, axes).residual[:, :, 0].abs() + surprise(problem, axes)
+    off = off / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     hidden = (sights.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
     gap = (faces.spread**2 + (RETREAT_SPREAD * hidden) ** 2).sqrt()
     unusual = (state.shared[:, objective.GAP] - expected[:, objective.GAP]) / gap
     gap = gap * (1 + (unusual / GAP_OUTLIER) ** 2).sqrt()
-    pivot, anchor = torch.full_like(gap[:, :1], 0.25), torch.ones_like(gap)
+    pivot, anchor = expected[:, :1] / 4, torch.ones_like(gap)
     shared = torch.cat([expected[:, :3] * extent, bias, gap, pivot, anchor], 1) ** -2
     # Motion: smoothness, alignment, rest.
     change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2
@@ -292,60 +323,49 @@ def weigh(
         Term(objective.slip, diagonal(slip[:, None] * valid[:, 1:, None]), (problem.times,)),
         Term(objective.rest, diagonal(still[:, None] * _parked(problem)[..., None])),
         Term(objective.shared_prior, diagonal(shared[:, None]), (expected,)),
+        Term(objective.memory, problem.information[:, None, None], (problem.recalled[:, None],)),
     ]
 
 
-def surprise(problem: Problem) -> Tensor:
+def surprise(problem: Problem, axes: Tensor) -> Tensor:
     """
-    Return how far each input pose is off what its neighbours make expect, shape (B, N, 6).
+    Return how far off each input pose is from what its neighbours make expect, (B, N, 6).
 
-    The least of what two before, two after and one on each side say, along the axes of the box:
-    before anything is solved, an outlier is told by all of them, its neighbours by two at most.
-    A third of it counts: noise alone makes so much more of it than of the noise itself.
+    The least of what two before, two after and one on each side say, along `axes`: an outlier is
+    told by all of them, its neighbours by two at most. A third of it counts: noise alone makes
+    so much more of it than of the noise itself.
 
     """
-    pose, t = problem.pose, problem.times[..., None]
-    axes = rotation_from_rpy(pose[..., 3:])
-    least = torch.full_like(pose, torch.inf)
-    for first, second in ((-2, -1), (-1, 1), (1, 2)):
-        low, high = max(0, -first), max(0, -first, pose.shape[1] - max(0, second))
-        a, b, here = (slice(low + k, high + k) for k in (first, second, 0))
-        share = (t[:, here] - t[:, a]) / (t[:, b] - t[:, a])
-        off = pose[:, here] - pose[:, a] - share * (pose[:, b] - pose[:, a])
-        off = torch.cat([(axes[:, here].mT @ off[..., :3, None])[..., 0], off[..., 3:]], -1).abs()
-        real = (problem.valid[:, a] & problem.valid[:, b])[..., None]
-        least[:, here] = least[:, here].minimum(torch.where(real, off, torch.inf))
+    own = given, t, _ = problem.pose, problem.times[..., None], problem.valid[..., None]
+    least = torch.full_like(given, torch.inf)
+    for i, j in ((-2, -1), (-1, 1), (1, 2)):
+        a, ta, va, b, tb, vb = (x.roll(-k, 1) for k in (i, j) for x in own)
+        off = given - a - (t - ta) / (tb - ta) * (b - a)
+        off = torch.cat([(axes.mT @ off[..., :3, None])[..., 0], off[..., 3:]], -1).abs()
+        real = va & vb & ((ta - t) * i > 0) & ((tb - t) * j > 0)  # not from the other end
+        least = torch.where(real, off, torch.inf).minimum(least)
     return torch.where(least.isfinite(), least, 0.0) / 3
 
 
 def _parked(problem: Problem) -> Tensor:
     """Return 1 for the steps (B, N - 1) of windows whose input hardly moves, else 0."""
-    count = problem.valid.sum(1, keepdim=True)
-    index = torch.arange(problem.valid.shape[1], device=count.device)
-    third = (count + 2) // 3
-    where = torch.cat([problem.boxes[..., :2], problem.times[..., None]], -1)
-
-    def middle(part: Tensor) -> Tensor:
-        return torch.where(part[..., None], where, torch.nan).nanmedian(1).values
-
-    change = middle((index >= count - third) & problem.valid) - middle(index < third)
-    moved: Tensor = change[:, :2].norm(dim=1)
-    is_parked = (moved < PARKED[0] * change[:, 2]) & (moved < PARKED[1])
-    return (is_parked[:, None] & problem.valid[:, 1:]).to(where)
+    valid, t = problem.valid.to(problem.times), problem.times
+    late = (t - (t * valid).sum(1, keepdim=True) / valid.sum(1, keepdim=True)) * valid
+    slope = (late[..., None] * problem.boxes[..., :2]).sum(1) / (late * t).sum(1)[:, None]
+    speed, seconds = slope.square().sum(1).sqrt(), (t * valid).amax(1)
+    is_parked = (speed < PARKED[0]) & (speed * seconds < PARKED[1])
+    return is_parked[:, None].to(valid) * valid[:, 1:]
 
 
 def expected_shared(problem: Problem, rule: Rule) -> Tensor:
     """Return the expectation of what is shared (B, 22): mean extent, no bias, rule, pivot."""
-    extents = problem.boxes[..., 3:6]
-    count = problem.valid.sum(1)
-    ranked = torch.where(problem.valid[..., None], extents, torch.inf).sort(1).values
-    cut = (0.15 * count).long()[:, None]
-    index = torch.arange(extents.shape[1], device=count.device)
-    kept = ((index >= cut) & (index < count[:, None] - cut))[..., None]
-    mean = torch.where(kept, ranked, 0.0).sum(1) / kept.sum(1)
-    gaps = rule.gaps.to(mean).expand(len(mean), 6)
+    n = problem.valid.sum(1, keepdim=True)
+    total = (problem.boxes[..., 3:6] * problem.valid[..., None]).sum(1) + problem.seen[:, :3]
+    mean = total / (n + problem.seen[:, 3:])
+    gaps = problem.of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
     none = torch.zeros_like(gaps)
-    return torch.cat([mean, none, gaps, problem.deviations['pivot'][:, None], none], 1)
+    pivot = mean[:, :1] * problem.deviations['pivot'][:, None]
+    return torch.cat([mean, none, gaps + rule.gaps.to(mean), pivot, none], 1)
 
 
 def free_variables(problem: Problem, config: Config) -> Tensor:
@@ -361,14 +381,12 @@ def free_variables(problem: Problem, config: Config) -> Tensor:
 
 def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None:
     """Show the model the fresh observations at their input boxes."""
-    windows = [window for window in windows if window.fresh > 0]
-    if not windows:
-        return
-    problem, _ = stack([window.fresh_part() for window in windows], config)
-    rule = model.rule()
-    state = State(problem.pose, expected_shared(problem, rule))
-    sights = support(problem, state, MARGINS[0], config.faces.outermost, rule.depths)
-    model.learn_rule([w.track_id for w in windows], sights, problem.valid, rule)
+    fresh = [window.fresh_part() for window in windows if window.fresh > 0]
+    if fresh:
+        (problem, _), rule = stack(fresh, config), model.rule()
+        state = State(problem.pose, expected_shared(problem, rule))
+        sights = support(problem, state, config.faces.outermost, rule.depths)
+        model.learn_rule([window.track_id for window in fresh], sights, problem.valid, rule)
 
 
 def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:

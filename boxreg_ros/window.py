@@ -5,14 +5,43 @@ from dataclasses import fields
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
-from boxreg_ros.objective import Problem, SHARED
+from boxreg_ros.correspondence import aspect
+from boxreg_ros.objective import MEMORY, Problem, SHARED
 from boxreg_ros.sampling import Observation
 from boxreg_ros.structures import Floats, YAW
 import numpy as np
 from numpy.typing import NDArray
 import torch
 
+FADING = 0.97  # of what is remembered, from stamp to stamp: no model holds forever
+NOTHING = np.full(MEMORY, np.nan), np.zeros(MEMORY), np.zeros((MEMORY, MEMORY)), np.zeros(4)
+ANGLES = [3, 4, 5, 9, 10, 11]  # of the two poses that are remembered
 BATCH_VALUES = 3e7  # most point coordinates, or entries of the curvature, solved at once
+
+
+class Memory(NamedTuple):
+    """
+    What observations that have left a window still tell about those in it: a quadratic form.
+
+    Attributes
+    ----------
+    base : array, shape (3,)
+        What all positions of the track are relative to from now on [m].
+    state, step : array, shape (34,)
+        Poses of the two oldest observations and what is shared, when the last one left, and how
+        far from there the form is least.
+    information : array, shape (34, 34)
+        Its curvature.
+    seen : array, shape (4,)
+        Sum of the input extents that have left, and their number.
+
+    """
+
+    base: Floats
+    state: Floats
+    step: Floats
+    information: Floats
+    seen: Floats
 
 
 class Window(NamedTuple):
@@ -29,6 +58,8 @@ class Window(NamedTuple):
         How many of them, the last ones, no window has had before.
     start : array, shape (N - fresh, 9)
         What the window before made of the others; empty where there was none.
+    memory : Memory or None
+        What has left.
 
     """
 
@@ -37,6 +68,7 @@ class Window(NamedTuple):
     observations: Sequence[Observation]
     fresh: int
     start: Floats
+    memory: Memory | None = None
 
     @property
     def is_warm(self) -> bool:
@@ -45,7 +77,8 @@ class Window(NamedTuple):
 
     def fresh_part(self) -> 'Window':
         """Return the window of the fresh observations alone."""
-        return self._replace(observations=self.observations[-self.fresh :], start=np.zeros((0, 9)))
+        observations, start = self.observations[-self.fresh :], np.zeros((0, 9))
+        return self._replace(observations=observations, start=start, memory=None)
 
 
 def batches(windows: Sequence[Window], config: Config) -> list[list[int]]:
@@ -78,34 +111,51 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     ground[valid] = [o.ground for o in every]
     begin = np.repeat([w.observations[0].stamp_ns for w in windows], lengths)
     times[valid] = (np.array([o.stamp_ns for o in every]) - begin) * 1e-9
-    for b, i, o in zip(*np.nonzero(valid), every, strict=True):
-        points[b, i, : len(o.points)], delays[b, i, : len(o.points)] = o.points, o.delays
+    place = np.flatnonzero(mask)
+    points.reshape(-1, 3)[place] = np.concatenate([o.points for o in every])
+    delays.reshape(-1)[place] = np.concatenate([o.delays for o in every])
     row, step, last = np.arange(B)[:, None], np.arange(N), lengths[:, None] - 1
     boxes, times = (part[row, np.minimum(step, last)] for part in (boxes, times))
     times += 0.1 * np.maximum(step - last, 0)
-    boxes[..., YAW] = one_heading(boxes[..., YAW], valid)
+    known = zip(*(w.memory or nothing_known(w) for w in windows), strict=True)
+    base, state, move, information, seen = (np.array(part) for part in known)
+    boxes[..., YAW] = one_heading(boxes[..., YAW], valid, state[:, 5])
     start = boxes.copy()
     for b, window in enumerate(windows):
         start[b, : len(window.start)] = window.start
     turns = np.pi * np.array([2, 2, 1])  # a box kept may have come turned around
     start[..., 6:9] += turns * np.round((boxes[..., 6:9] - start[..., 6:9]) / turns)
-    base = boxes[:, 0, :3].copy()
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]
+    turns = (start[:, [0, min(1, N - 1)], 6:9].reshape(B, 6) - state[:, ANGLES]) / np.pi
+    turns = np.nan_to_num(np.round(turns))
+    recalled = np.nan_to_num(state + move)
+    recalled[:, ANGLES] += np.pi * turns
+    information *= FADING * (turns % 2 == 0).all(1)[:, None, None]
     kinds = [config.class_config(window.class_name) for window in windows]
-    deviations = {
-        f.name: torch.tensor([getattr(k, f.name) for k in kinds], dtype=torch.float64).to(device)
-        for f in fields(ClassConfig)
-        if f.name != 'names'
-    }
-    arrays = (boxes, start, valid, times, points, mask, delays, origins, ground)
+    names = [item.name for item in fields(ClassConfig)[1:]]
+    numbers = np.array([[getattr(k, name) for name in names] for k in kinds], dtype=np.float64)
+    deviations = dict(zip(names, torch.from_numpy(numbers).to(device).unbind(1), strict=True))
+    arrays: list[Any] = [boxes, start, valid, times, points, mask, delays, origins, ground]
+    arrays += [recalled, information, seen]
     parts: list[Any] = [torch.from_numpy(array).to(device) for array in arrays]
-    return Problem(*[*parts, deviations]), base
+    problem = Problem(*[*parts, torch.empty(0), deviations])
+    return problem._replace(openness=aspect(problem)), base
 
 
-def one_heading(yaw: Floats, valid: NDArray[np.bool_]) -> Floats:
-    """Return `yaw` (B, N) unwrapped [rad], with the half turns undone that are in the minority."""
+def nothing_known(window: Window) -> Memory:
+    """Return the memory of a window that nothing has left yet."""
+    return Memory(window.observations[0].box[:3], *NOTHING)
+
+
+def one_heading(yaw: Floats, valid: NDArray[np.bool_], known: Floats) -> Floats:
+    """
+    Return `yaw` (B, N) unwrapped [rad], with the half turns undone that are in the minority.
+
+    Where the heading of the first is `known` (B,), not NaN, three quarters must say otherwise.
+
+    """
     chain = np.unwrap(yaw, period=np.pi)
-    turned = (np.cos(yaw - chain) < 0) & valid
-    is_most = turned.sum(1, keepdims=True) > valid.sum(1, keepdims=True) / 2
-    return np.where(is_most, chain + np.pi, chain)
+    turned = ((np.cos(yaw - chain) < 0) & valid).sum(1) / valid.sum(1)
+    limit = np.where(np.cos(known - chain[:, 0]) < 0, 0.25, np.where(np.isnan(known), 0.5, 0.75))
+    return np.where((turned > limit)[:, None], chain + np.pi, chain)

@@ -1,7 +1,9 @@
 """A car and what a sensor that stands still sees of it, known exactly; and problems by hand."""
 
 from boxreg_ros import objective
-from boxreg_ros.objective import Problem, SHARED
+from boxreg_ros.chain import LINK
+from boxreg_ros.correspondence import aspect
+from boxreg_ros.objective import MEMORY, Problem, SHARED
 from boxreg_ros.sampling import observe
 from boxreg_ros.structures import BoxArray, Sweep
 from boxreg_ros.tracks import Track
@@ -14,7 +16,7 @@ EXTENT = np.array([4.4, 1.8, 1.5])
 PERIOD_NS = 10**8
 START_NS = 1_700_000_000 * 10**9
 # How far inside of the box its outermost points stand, as the annotation rule expects by default:
-# front, back, left, right, top; see `FaceConfig`.
+# front, back, left, right, top; see `ClassConfig`.
 GAPS = np.array([0.05, 0.05, 0.03, 0.03, 0.05])
 
 
@@ -101,7 +103,12 @@ def window_of(track, config):
 
 
 def problem_of(boxes, **changes):
-    """Return the problem of `boxes` (B, N, 9), one every 0.1 s, without points, but `changes`."""
+    """
+    Return the problem of `boxes` (B, N, 9), but for `changes`.
+
+    One every 0.1 s, without points or memory, faces as open as the origins say.
+
+    """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
     B, N = boxes.shape[:2]
     points = torch.as_tensor(changes.get('points', np.zeros((B, N, 1, 3))))
@@ -115,19 +122,40 @@ def problem_of(boxes, **changes):
         'delays': torch.zeros(points.shape[:3], dtype=torch.float64),
         'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
         'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
+        'recalled': torch.zeros(B, MEMORY, dtype=torch.float64),
+        'information': torch.zeros(B, MEMORY, MEMORY, dtype=torch.float64),
+        'seen': torch.zeros(B, 4, dtype=torch.float64),
+        'openness': torch.empty(0),
         'deviations': {},
     }
     more = {
         name: value if name == 'deviations' else torch.as_tensor(np.asarray(value))
         for name, value in changes.items()
     }
-    return Problem(**{**given, **more})
+    problem = Problem(**{**given, **more})
+    return problem if 'openness' in changes else problem._replace(openness=aspect(problem))
 
 
 def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
-    """Return what a window shares (B, 16): `extent`, and parts by the names of their slices."""
+    """Return what a window shares (B, 22): `extent`, and parts by the names of their slices."""
     shared = torch.zeros(B, SHARED, dtype=torch.float64)
     shared[:, :3] = torch.tensor(extent)
     for name, value in parts.items():
         shared[:, getattr(objective, name)] = torch.as_tensor(value, dtype=torch.float64)
     return shared
+
+
+def dense(chain):
+    """Return the matrices (B, D, D) of a `Chain` as they are, zeros and all."""
+    B, N = chain.links.shape[:2]
+    D = LINK * N + chain.corner.shape[1]
+    whole = chain.links.new_zeros(B, D, D)
+    whole[:, LINK * N :, LINK * N :] = chain.corner
+    for i in range(N):
+        own, rows = slice(LINK * i, LINK * (i + 1)), chain.links[:, i]
+        whole[:, own, LINK * N :] = rows[..., 5 * LINK :]
+        whole[:, LINK * N :, own] = rows[..., 5 * LINK :].mT
+        for k in range(max(0, 2 - i), min(5, 2 + N - i)):
+            first = LINK * (i + k - 2)
+            whole[:, own, first : first + LINK] = rows[..., LINK * k : LINK * (k + 1)]
+    return whole

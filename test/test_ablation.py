@@ -30,7 +30,10 @@ def whole(drive):
 
 @pytest.mark.parametrize('name', NAMES)
 def test_an_ingredient_that_is_off_makes_a_difference(drive, whole, name):
-    found = without(INGREDIENTS[name], drive)
+    if name == 'memory':  # nothing leaves the window of a whole track
+        whole, found = (without(INGREDIENTS[key], drive, 'early') for key in (WHOLE, name))
+    else:
+        found = without(INGREDIENTS[name], drive)
     assert found.track_ids == whole.track_ids
     assert np.isfinite(found.boxes).all()
     assert np.abs(found.boxes - whole.boxes).max() > 1e-3

@@ -96,7 +96,7 @@ def test_resume_does_what_is_left_to_do(tmp_path, capsys):
         (['--set', 'names=[a'], 2, 'not a YAML value'),
         (['--config', 'no_such.yaml'], 2, 'no_such.yaml'),
         (['--formats', 'csv,kiti'], 2, "format 'kiti'"),
-        (['--workers', '0'], 2, 'solver.threads'),
+        (['--workers', '-1'], 2, 'solver.threads'),
         (['--frobnicate'], 2, '--frobnicate'),
     ],
 )

@@ -1,7 +1,5 @@
 """Which points tell where a face is, against boxes whose points are placed by hand."""
 
-from dataclasses import replace
-
 from boxreg_ros.correspondence import aspect, retreat, support
 from boxreg_ros.objective import State
 import numpy as np
@@ -64,7 +62,7 @@ def on_faces(inside, n=40, faces=(0, 2, 4)):
 def supported(problem, gap=0.0, outermost=0.05, depths=0.0):
     state = State(problem.pose, shared_of(GAP=[gap] * 6))
     depths = torch.full((6,), depths, dtype=D)
-    return support(problem, state, 0.4, outermost, depths)
+    return support(problem, state, outermost, depths)
 
 
 @pytest.mark.parametrize('gap', [0.0, 0.04])
@@ -127,7 +125,7 @@ def test_order_and_padding_of_points_do_not_matter():
     boxes = [[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 2]
     order = rng.permutation(120)
     known, found = (
-        support(problem, State(problem.pose, shared_of()), 0.4, 0.2, torch.ones(6, dtype=D))
+        support(problem, State(problem.pose, shared_of()), 0.2, torch.ones(6, dtype=D))
         for problem in (
             problem_of(boxes, points=points, mask=mask, origins=[[[9.0, 9.0, 9.0]] * 2]),
             problem_of(
@@ -151,7 +149,7 @@ def test_points_are_carried_to_the_stamp():
     late = problem_of(boxes, points=points, origins=origins, delays=np.full((1, 4, 40), -0.05))
     found = supported(late)
     np.testing.assert_allclose(found.outwardness[..., 0], 0, atol=1e-6)
-    assert (supported(replace(late, delays=0 * late.delays)).outwardness[..., 0] < -0.4).all()
+    assert (supported(late._replace(delays=0 * late.delays)).outwardness[..., 0] < -0.4).all()
 
 
 def test_what_is_carried_does_not_hang_on_padding():

@@ -1,15 +1,13 @@
 """The terms: the paper's equations by hand, ours against automatic differentiation."""
 
-from dataclasses import replace
-
 from boxreg_ros import objective
 from boxreg_ros.chain import Chain
 from boxreg_ros.config import PaperConfig
 from boxreg_ros.geometry import face_distances, rotation_from_rpy
-from boxreg_ros.objective import SHARED, State, Term
+from boxreg_ros.objective import MEMORY, SHARED, State, Term
 import numpy as np
 import pytest
-from scenes import problem_of, shared_of
+from scenes import dense, problem_of, shared_of
 import torch
 
 D = torch.float64
@@ -229,8 +227,8 @@ def test_the_gradient_is_finite_where_the_paper_has_none(term, moving):
 @each_term
 def test_nothing_real_gives_zero_and_no_gradient(term):
     problem = random_problem()
-    nothing = replace(
-        problem, mask=torch.zeros_like(problem.mask), valid=torch.zeros_like(problem.valid)
+    nothing = problem._replace(
+        mask=torch.zeros_like(problem.mask), valid=torch.zeros_like(problem.valid)
     )
     pose = poses_of(problem.boxes)
     value = term(with_poses(problem.boxes, pose), nothing)
@@ -246,7 +244,7 @@ def test_padding_order_and_batch_do_not_matter(term):
     # Other order of points, and padding filled with other numbers.
     order = torch.from_numpy(np.random.default_rng(1).permutation(problem.points.shape[2]))
     points = torch.where(problem.mask[..., None], problem.points, -1e4)[:, :, order]
-    other = replace(problem, points=points, mask=problem.mask[:, :, order])
+    other = problem._replace(points=points, mask=problem.mask[:, :, order])
     boxes = torch.where(problem.valid[..., None], problem.boxes, 77.0)
     np.testing.assert_allclose(term(problem.boxes, other), known, rtol=1e-12)
     if term is not PAPER['total']:  # whose points are relative to the boxes
@@ -297,6 +295,7 @@ def terms_of(problem, seed=1):
     expected = torch.from_numpy(rng.normal(size=(B, SHARED)))
     axes = rotation_from_rpy(problem.pose[..., 3:] + 0.1)
     wanted = torch.from_numpy(rng.normal(size=(B, N, 6)))
+    recalled = torch.from_numpy(rng.normal(size=(B, 1, MEMORY)))
     return {
         'faces': Term(objective.faces, spd(rng, B, N, 6, 4), (problem.pose, inset)),
         'prior': Term(objective.prior, spd(rng, B, N, 1, 6), (problem.pose, axes)),
@@ -305,6 +304,7 @@ def terms_of(problem, seed=1):
         'rest': Term(objective.rest, spd(rng, B, N - 1, 1, 6)),
         'slip': Term(objective.slip, spd(rng, B, N - 1, 1, 2), (problem.times,)),
         'shared_prior': Term(objective.shared_prior, spd(rng, B, 1, 1, SHARED), (expected,)),
+        'memory': Term(objective.memory, spd(rng, B, 1, 1, MEMORY), (recalled,)),
     }
 
 
@@ -316,7 +316,7 @@ def variables(problem, seed=2):
     return State(pose, shared).pack()
 
 
-NAMES = ['faces', 'prior', 'shape', 'acceleration', 'rest', 'slip', 'shared_prior']
+NAMES = ['faces', 'prior', 'shape', 'acceleration', 'rest', 'slip', 'shared_prior', 'memory']
 
 
 def test_state_packs_and_unpacks():
@@ -381,14 +381,11 @@ def test_value_gradient_and_curvature(names):
         for b in range(B):
             own = J[b, ..., b, :]
             curvature[b] += torch.einsum('nfrd,nfrs,nfse->de', own, term.weight[b], own)
-    scale = float(curvature.abs().max())
-    for i, column in enumerate(torch.eye(x.shape[1], dtype=D)):
-        found = form.times(column.expand(B, -1))
-        np.testing.assert_allclose(found, curvature[:, :, i], atol=1e-9 * scale)
+    np.testing.assert_allclose(dense(form), curvature, atol=1e-9 * float(curvature.abs().max()))
 
 
-def test_terms_that_are_linear_are_summed_up_beforehand():
-    # Away from where the sum was made, and for some windows alone, it is still that of its terms.
+def test_a_sum_is_that_of_its_terms_anywhere():
+    # Where it was made, away from there, and for some windows alone.
     problem = random_problem()
     terms, x = list(terms_of(problem).values()), variables(problem)
     free = (torch.rand(x.shape, generator=torch.Generator().manual_seed(5)) < 0.9).to(x)
@@ -411,7 +408,8 @@ def test_newton_takes_the_inverse_of_the_curvature():
     vector, form = variables(problem, seed=8), Chain.zeros(x, 6)
     objective.value_and_gradient(terms, x, 6, form)
     solved = found.newton(vector, torch.arange(3))
-    np.testing.assert_allclose(form.times(solved), vector, atol=1e-6)
+    product = (dense(form) @ solved[..., None])[..., 0]
+    np.testing.assert_allclose(product, vector, atol=1e-6)
     rows = torch.tensor([2, 0])
     np.testing.assert_allclose(found.newton(vector[rows], rows), solved[rows], rtol=1e-9)
     identity = torch.eye(x.shape[1], dtype=D)
@@ -420,6 +418,119 @@ def test_newton_takes_the_inverse_of_the_curvature():
     np.testing.assert_allclose(
         found.factor.inverse_of_links(6)[:, 1], inverse[:, 6:12, 6:12], rtol=1e-6
     )
+
+
+# --- ours: what is remembered -------------------------------------------------------------------
+
+
+def linear_terms(problem, seed=1):
+    """Return terms that are linear, of the usual size: 0.1 m and rad, 1 m/s^2."""
+    rng = np.random.default_rng(seed)
+    B, N = problem.valid.shape
+    axes = rotation_from_rpy(problem.pose[..., 3:])
+    expected = torch.from_numpy(rng.normal(size=(B, SHARED)))
+    recalled = State(problem.pose[:, :2] + 0.1, expected + 0.1).pack()
+
+    def weight(n, size):
+        return spd(rng, B, n, 1, size) + torch.eye(size, dtype=D)
+
+    return [
+        Term(objective.prior, 100 * weight(N, 6), (problem.pose, axes)),
+        Term(objective.acceleration, weight(N - 2, 6), (problem.times,)),
+        Term(objective.rest, 100 * weight(N - 1, 6)),
+        Term(objective.shared_prior, 100 * weight(1, SHARED), (expected,)),
+        Term(objective.memory, 100 * weight(1, MEMORY), (recalled[:, None],)),
+    ]
+
+
+def without_oldest(terms, state):
+    """Return the terms of the window without its oldest observation, which is remembered."""
+    where, step, information = objective.remembered(terms, state)
+    kept = [
+        term
+        if term.function is objective.shared_prior
+        else Term(term.function, term.weight[:, 1:], tuple(part[:, 1:] for part in term.data))
+        for term in terms
+        if term.function is not objective.memory
+    ]
+    left = Term(objective.memory, information[:, None, None], ((where + step)[:, None],))
+    return [*kept, left]
+
+
+def least(terms, N):
+    """Return where the sum of linear terms is least, (B, D)."""
+    x = torch.zeros(len(terms[0].weight), 6 * N + SHARED, dtype=D)
+    form = Chain.zeros(x, N)
+    _, gradient = objective.value_and_gradient(terms, x, N, form)
+    return torch.linalg.solve(dense(form), -gradient)
+
+
+@pytest.mark.parametrize('N', [4, 7])
+@pytest.mark.parametrize('is_first', [True, False], ids=['nothing before', 'remembering'])
+def test_what_has_left_is_remembered_exactly(N, is_first):
+    # Where terms are linear nothing is lost: once an observation has left, and then another, the
+    # window is least where all observations together are, wherever it was when these left. The
+    # ridge on what is not known at all, 1e-6 of curvatures of 100, is seen in 1e-8 of the step.
+    problem = random_problem(N=N)
+    terms = linear_terms(problem)[: 4 if is_first else 5]
+    known = least(terms, N)
+    rng = np.random.default_rng(9)
+    for n in (N - 1, N - 2):
+        whole = State.unpack(known[:, -6 * (n + 1) - SHARED :], n + 1)
+        away = State(
+            *(part + 0.1 * torch.from_numpy(rng.normal(size=part.shape)) for part in whole)
+        )
+        terms = without_oldest(terms, away)
+        np.testing.assert_allclose(least(terms, n), known[:, -6 * n - SHARED :], atol=1e-8)
+
+
+def test_the_memory_is_a_quadratic_form_of_all_terms_of_the_oldest():
+    # To first order of the residuals: the dense Schur complement of all terms that the oldest
+    # observation takes part in, but for what is expected of the shared, which stays.
+    problem, N = random_problem(), 6
+    terms, x = terms_of(problem), variables(problem)
+    state = State.unpack(x, N)
+    where, step, information = objective.remembered(list(terms.values()), state)
+    np.testing.assert_array_equal(where, State(state.pose[:, 1:3], state.shared).pack())
+    form, gradient = Chain.zeros(x, N), torch.zeros_like(x)
+    for name, term in terms.items():
+        if name != 'shared_prior':
+            weight = torch.zeros_like(term.weight)
+            weight[:, 0] = term.weight[:, 0]
+            gradient += objective.value_and_gradient([term._replace(weight=weight)], x, N, form)[1]
+    H = dense(form)
+    first, others = slice(0, 6), [*range(6, 18), *range(6 * N, 6 * N + SHARED)]
+    across = torch.linalg.solve(H[:, first, first], H[:, first])
+    known = (H - H[:, :, first] @ across)[:, others][:, :, others]
+    scale = float(known.abs().max())
+    np.testing.assert_allclose(information, known, atol=1e-8 * scale)
+    pull = gradient - (across.mT @ gradient[:, first, None])[..., 0]
+    found = -(information @ step[..., None])[..., 0]
+    np.testing.assert_allclose(found, pull[:, others], atol=1e-4 * float(pull.abs().max()))
+
+
+def test_a_hard_window_does_not_touch_what_others_remember():
+    problem = random_problem()
+    terms, state = list(terms_of(problem).values()), State.unpack(variables(problem), 6)
+    known = objective.remembered(terms, state)
+    state.pose[1, 0] = torch.nan
+    for found, right in zip(objective.remembered(terms, state), known, strict=True):
+        np.testing.assert_allclose(found[[0, 2]], right[[0, 2]], rtol=1e-9)
+    assert not objective.remembered(terms, state)[1][1].isfinite().all()
+
+
+def test_memory_by_hand():
+    # Two poses, 0.1 m and 0.2 rad off what is recalled of them, and what is shared, 0.3 off; the
+    # third pose has no part in it.
+    problem = problem_at(
+        [[0.1, 0, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0.2], [9, 9, 9, 0, 0, 0]], [0, 1, 2]
+    )
+    recalled = torch.zeros(1, 1, MEMORY, dtype=D)
+    recalled[..., 6], recalled[..., 12:15] = 1.0, tensor([4.0, 2.0, 1.7])
+    found = objective.memory(State(problem.pose, shared_of()), recalled).residual
+    known = np.zeros((1, 1, 1, MEMORY))
+    known[..., 0], known[..., 11], known[..., 14] = 0.1, 0.2, 0.3
+    np.testing.assert_allclose(found, known, atol=1e-15)
 
 
 # --- ours: values -------------------------------------------------------------------------------
@@ -516,14 +627,14 @@ def test_shared_prior_by_hand():
 
 
 def test_a_vehicle_on_a_circle_does_not_slip():
-    # Its rear axle, a quarter of 4 m behind the centre, moves on a circle of 8 m: every chord
+    # Its rear axle, 1 m behind the centre, moves on a circle of 8 m: every chord
     # of a circle lies along the mean of the headings at its ends.
     yaw = np.array([0.0, 0.2, 0.5, 0.6])
     axle = 8 * np.c_[np.sin(yaw), -np.cos(yaw)]
-    center = axle + 0.25 * 4 * np.c_[np.cos(yaw), np.sin(yaw)]
+    center = axle + 1.0 * np.c_[np.cos(yaw), np.sin(yaw)]
     pose = np.c_[center, np.zeros((4, 3)), yaw]
     problem = problem_at(pose, [0, 0.1, 0.3, 0.4])
-    state = State(problem.pose, shared_of(PIVOT=0.25))
+    state = State(problem.pose, shared_of(PIVOT=1.0))
     np.testing.assert_allclose(objective.slip(state, problem.times).residual, 0, atol=1e-12)
     # Its centre does: 1 m before the axle, it swings out to the left by twice the sine of half
     # the turn.
@@ -540,5 +651,5 @@ def test_slip_by_hand(yaw):
     for way in (1.0, -1.0):
         x, y = way * ahead + 0.1 * left
         problem = problem_at([[0, 0, 0, 0, 0, yaw], [x, y, 0.02, 0, 0, yaw]], [0.0, 0.1])
-        found = objective.slip(State(problem.pose, shared_of(PIVOT=0.25)), problem.times).residual
+        found = objective.slip(State(problem.pose, shared_of(PIVOT=1.0)), problem.times).residual
         np.testing.assert_allclose(found, [[[[1.0, 0.2]]]], atol=1e-12)

@@ -414,6 +414,46 @@ def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate):
         assert (difference < 1e-6) == is_new
 
 
+@pytest.mark.parametrize('estimate', ['early', 'final'])
+def test_a_new_track_of_a_known_id_remembers_nothing(estimate):
+    # Eleven boxes, a silence, then eleven under the same id, in windows of six; too few for the
+    # noise of the input to be measured. All that follow are as if nothing had been before.
+    config = setup(estimate, **{'faces.learn': False})
+    whole = stream_of([track_of(drive(33), np.random.default_rng(0), 'a')])
+    registrar = BoxRegistrar(config)
+    fed(registrar, whole[:11])
+    assert registrar._tracks['a'].memory.seen[3] == 6  # of 11, five are still in the window
+    results = fed(registrar, whole[22:23])
+    assert registrar._tracks['a'].memory is None
+    results += fed(registrar, whole[23:]) + registrar.flush()
+    first = whole[22][1].stamp_ns
+    known, _ = run(whole[22:], config)
+    assert_equal([r for r in results if r.boxes.stamp_ns >= first], known)
+
+
+@pytest.mark.parametrize('estimate', ['early', 'final'])
+def test_a_window_that_fails_is_forgotten(estimate):
+    # Stamps a nanosecond apart leave no curvature: their windows are kept. The track goes on
+    # without what they knew, and is refined again.
+    whole = stream_of([track_of(drive(24), np.random.default_rng(0), 'a')])
+    hasty = []
+    for i, (sweep, boxes) in enumerate(whole):
+        now_ns = boxes.stamp_ns if i < 8 else whole[8][1].stamp_ns + i
+        now_ns = boxes.stamp_ns if i >= 16 else now_ns
+        hasty.append((replace(sweep, stamp_ns=now_ns), replace(boxes, stamp_ns=now_ns)))
+    registrar, lasting, status = BoxRegistrar(setup(estimate, tolerance=0.0, reach=0.0)), [], []
+    for pair in hasty:
+        early = [r for r in fed(registrar, [pair]) if not r.is_final]
+        lasting.append(registrar._tracks['a'].memory is not None)
+        status += [(r.status[0], r.reasons[0]) for r in early]
+    registrar.flush()
+    failed = [i for i, (_, reason) in enumerate(status) if reason == 'not_finite']
+    assert failed
+    assert not any(lasting[i] for i in failed)
+    assert status[-1][0] == 'refined'
+    assert lasting[-1]
+
+
 def test_a_track_that_ends_comes_back_before_the_end():
     # With estimate 'track' a track that has been silent for long must not hold up all others.
     rng = np.random.default_rng(0)

@@ -1,19 +1,20 @@
 """Windows solved together, alone, and by torch's own L-BFGS; and how they are stacked."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
-from boxreg_ros import objective
-from boxreg_ros.calibration import InputModel
+from boxreg_ros import objective, registration
+from boxreg_ros.calibration import InputModel, InputNoise, Rule
 from boxreg_ros.config import Config
+from boxreg_ros.correspondence import support
 from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.lbfgs import minimize, Minimum, select
 from boxreg_ros.metrics import iou_3d
 from boxreg_ros.objective import State
-from boxreg_ros.registration import register, solve_paper
+from boxreg_ros.registration import expected_shared, register, solve_paper, weigh
 from boxreg_ros.window import stack
 import numpy as np
 import pytest
-from scenes import drive, track_of, window_of
+from scenes import drive, problem_of, track_of, window_of
 import torch
 
 D = torch.float64
@@ -158,6 +159,196 @@ def test_nothing_to_solve(many):
     assert [set(estimate.status) for estimate in found] == [{'kept'}] * len(many)
 
 
+# --- what is shared and what rests --------------------------------------------------------------
+
+
+def test_what_is_expected_of_the_shared_by_hand():
+    # Lengths of 4.0, 4.4 and 4.5 m are in the window, two of 4.3 m have left: 21.5 / 5 = 4.3 m;
+    # what is padded, 9 m, does not count. The pivot is a quarter of that behind the centre.
+    boxes = np.zeros((2, 4, 9))
+    boxes[:, :, 3] = [4.0, 4.4, 4.5, 9.0]
+    boxes[..., 4:6] = [2.0, 1.5]
+    valid, seen = [[True, True, True, False]] * 2, [[8.6, 4.0, 3.0, 2.0], [0, 0, 0, 0]]
+    kinds = {'pivot': [0.25, 0.2], 'gap_ends': [1, 2], 'gap_sides': [3, 4], 'gap_top': [5, 6]}
+    kinds = {**kinds, 'gap_bottom': [7, 8]}
+    kinds = {name: torch.tensor(values, dtype=D) for name, values in kinds.items()}
+    problem = problem_of(boxes, valid=valid, seen=seen, deviations=kinds)
+    gaps = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], dtype=D)  # beyond those of the classes
+    found = expected_shared(problem, Rule(gaps, torch.zeros(6, dtype=D)))
+    known = np.zeros((2, objective.SHARED))
+    known[:, objective.EXTENT] = [[4.3, 2.0, 1.5], [4.3, 2.0, 1.5]]
+    known[:, objective.GAP] = [[1.1, 1.2, 3.3, 3.4, 5.5, 7.6], [2.1, 2.2, 4.3, 4.4, 6.5, 8.6]]
+    known[:, objective.PIVOT] = [4.3 / 4, 4.3 / 5]
+    np.testing.assert_allclose(found, known, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('speed', 'length', 'rests'),
+    [
+        (0.0, 10, True),
+        (0.28, 10, True),  # 0.25 m in 0.9 s
+        (0.32, 10, False),
+        (0.28, 30, False),  # 0.81 m in 2.9 s
+        (0.2, 30, True),  # 0.58 m
+    ],
+)
+def test_what_hardly_moves_is_parked(speed, length, rests):
+    # Slower than 0.3 m/s and moved less than 0.7 m. Of two windows the second is padded with
+    # boxes far away, and errors that take turns do not make it move.
+    boxes = drive(length, speed, 0.0)
+    boxes[:, 1] += 0.2 * np.cos(
+        np.pi * np.minimum(np.arange(length), length - 1 - np.arange(length))
+    )
+    padded = np.concatenate([boxes, 1e3 + boxes[:2]])
+    many = np.stack([np.concatenate([boxes, boxes[-1:], boxes[-1:]]), padded])
+    valid = np.arange(length + 2) < length
+    kinds = {name: torch.full((2,), value) for name, value in numbers(ALONE.vehicle)}
+    problem = problem_of(many, valid=np.stack([valid] * 2), deviations=kinds)
+    expected = expected_shared(problem, InputModel(ALONE.faces).rule())
+    state = State(problem.pose, expected)
+    sights = support(problem, state, 0.05, torch.zeros(6, dtype=D))
+    (rest,) = (
+        term.weight
+        for term in weigh(problem, state, sights, expected, None, ALONE)
+        if term.function is objective.rest
+    )
+    held = (rest.diagonal(dim1=-2, dim2=-1) > 0)[:, :, 0].all(-1)
+    np.testing.assert_array_equal(held, np.stack([valid[1:] & rests] * 2))
+
+
+def numbers(kind):
+    return ((f.name, getattr(kind, f.name)) for f in fields(kind) if f.name != 'names')
+
+
+# --- threads ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('estimate', ['final', 'track'])
+@pytest.mark.parametrize('part', [1, 4000, 2**18])
+def test_the_number_of_threads_makes_no_difference(monkeypatch, estimate, part):
+    # One window at a time, a few, and all at once.
+    config = ALONE.updated({'estimate': estimate})
+    known = register(windows(), config, InputModel(config.faces))
+    monkeypatch.setattr(registration, 'PART', part)
+    for threads in (0, 1, 3):
+        more = config.updated({'solver.threads': threads})
+        for a, b in zip(register(windows(), more, InputModel(more.faces)), known, strict=True):
+            assert (a.status, a.reasons) == (b.status, b.reasons)
+            np.testing.assert_allclose(a.boxes, b.boxes, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(a.covariances, b.covariances, rtol=0, atol=1e-9)
+            assert (a.memory is None) == (b.memory is None)
+            for one, other in zip(a.memory or (), b.memory or (), strict=True):
+                np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
+
+
+class WrongNoise(InputModel):
+    """Says of five numbers what there are nine of, which a round stumbles over."""
+
+    def noise(self):
+        return InputNoise(torch.ones(5), torch.zeros(5))
+
+
+@pytest.mark.parametrize('part', [1, 2**18])
+def test_an_error_in_a_thread_comes_out(monkeypatch, part):
+    monkeypatch.setattr(registration, 'PART', part)
+    threads = torch.get_num_threads()
+    with pytest.raises(RuntimeError, match='must match'):
+        register(windows(), ALONE, WrongNoise(ALONE.faces))
+    assert torch.get_num_threads() == threads
+
+
+class Watching(InputModel):
+    """Notes the threads of torch while its rule is asked for."""
+
+    def rule(self):
+        self.threads = torch.get_num_threads()
+        return super().rule()
+
+
+def test_torch_has_one_thread_meanwhile():
+    before, model = torch.get_num_threads(), Watching(ALONE.faces)
+    torch.set_num_threads(2)
+    try:
+        register(windows(), ALONE, model)
+        assert (model.threads, torch.get_num_threads()) == (1, 2)
+    finally:
+        torch.set_num_threads(before)
+
+
+# --- what is remembered -------------------------------------------------------------------------
+
+
+def test_full_windows_leave_what_they_know():
+    # Of ten, the length of a window, the first is to leave; shorter ones are to grow.
+    many = windows()
+    found = register(many, ALONE, InputModel(ALONE.faces))
+    assert [estimate.memory is not None for estimate in found] == [True, False, False, False]
+    memory, boxes = found[0].memory, found[0].boxes
+    first = given(many[0])[0]
+    np.testing.assert_array_equal(memory.base, first[:3])
+    np.testing.assert_array_equal(memory.seen, [*first[3:6], 1])
+    left = boxes[1:3] - [*first[:3], *np.zeros(6)]
+    np.testing.assert_allclose(memory.state[:12], left[:, objective.POSE].ravel(), atol=1e-9)
+    np.testing.assert_allclose(memory.state[12:15], boxes[0, 3:6], atol=1e-9)
+    np.testing.assert_allclose(memory.information, memory.information.T, atol=1e-6)
+    assert np.linalg.eigvalsh(memory.information).min() > -1e-6 * memory.information.max()
+    for config in (ALONE.updated({'estimate': 'track'}), BRIEF):
+        found = register(windows(config), config, InputModel(config.faces))
+        assert {estimate.memory for estimate in found} == {None}
+
+
+def slid(whole, count, turns=0.0, config=ALONE):
+    """Return the estimates of windows of ten of `whole`, one after the other; memory + `turns`."""
+    estimates, memory, start = [], None, np.zeros((0, 9))
+    for first in range(count):
+        observations = whole.observations[first : first + 10]
+        one = whole._replace(
+            observations=observations, fresh=10 - len(start), start=start, memory=memory
+        )
+        estimates += register([one], config, InputModel(config.faces))
+        memory, start = estimates[-1].memory, estimates[-1].boxes[1:]
+        state = memory.state.copy()
+        state[[5, 11]] += turns
+        memory = memory._replace(state=state)
+    return estimates
+
+
+def test_memory_goes_on_and_on():
+    whole = window(drive(14))
+    estimates = slid(whole, 5)
+    boxes = given(whole)
+    for i, estimate in enumerate(estimates):
+        np.testing.assert_array_equal(estimate.memory.base, boxes[0, :3])
+        known = [*boxes[: i + 1, 3:6].sum(0), i + 1]
+        np.testing.assert_allclose(estimate.memory.seen, known)
+    # What has left tells of the bias and the extent: without it, the same window knows less.
+    last = whole._replace(
+        observations=whole.observations[4:], fresh=1, start=estimates[3].boxes[1:]
+    )
+    (forgetful,) = register([last], ALONE, InputModel(ALONE.faces))
+    spread = [np.trace(e.covariances[-1][:2, :2]) for e in (estimates[4], forgetful)]
+    assert spread[0] < spread[1]
+
+
+@pytest.mark.parametrize('turns', [2 * np.pi, -4 * np.pi])
+def test_whole_turns_between_windows_do_not_matter(turns):
+    whole = window(drive(13, turn=0.4, start=(5.0, 6.0, 2.9)))  # across half a turn
+    for found, known in zip(slid(whole, 4, turns), slid(whole, 4), strict=True):
+        np.testing.assert_allclose(found.boxes, known.boxes, atol=1e-9)
+
+
+def test_a_window_that_fails_leaves_nothing():
+    # Stamps a nanosecond apart: its curvature is lost in rounding. Its neighbour remembers.
+    many = [window(drive(10), 0), window(drive(10, start=(-9.0, 3.0, -1.0)), 1)]
+    bad = [o._replace(stamp_ns=i) for i, o in enumerate(many[0].observations)]
+    many[0] = many[0]._replace(observations=bad)
+    failed, found = register(many, ALONE, InputModel(ALONE.faces))
+    assert set(failed.reasons) == {'not_finite'}
+    assert failed.memory is None
+    assert set(found.status) == {'refined'}
+    assert found.memory is not None
+
+
 # --- solver against torch's ---------------------------------------------------------------------
 
 
@@ -222,7 +413,8 @@ def robust_terms(problem):
     moments = torch.einsum('bnmi,bnmj->bnij', homogeneous, homogeneous)
     moments = moments[:, :, None] * torch.tensor([1.0, 0, 1.0, 0, 1.0, 0])[:, None, None]
     expected = torch.zeros(B, objective.SHARED, dtype=D)
-    expected[:, :3], expected[:, objective.PIVOT] = problem.boxes[:, 0, 3:6], 0.25
+    expected[:, :3] = problem.boxes[:, 0, 3:6]
+    expected[:, objective.PIVOT] = problem.boxes[:, 0, 3] / 4
     one = torch.ones(B, 1, dtype=D)
     axes = rotation_from_rpy(problem.pose[..., 3:])
     return [
@@ -248,7 +440,7 @@ def paper_problem():
     def total(x, rows, multipliers, rounding=objective.EPSILON):
         pose = x.unflatten(1, (extent.shape[1], 6))
         boxes = torch.cat([pose[..., :3], extent[rows], pose[..., 3:]], -1)
-        return objective.total(boxes, problem.select(rows), WEIGHTS, multipliers, rounding)
+        return objective.total(boxes, select(problem, rows), WEIGHTS, multipliers, rounding)
 
     return problem, x, total
 
@@ -284,13 +476,14 @@ def test_multipliers_lower_the_violation_of_the_constraints():
     # Smoothness and alignment are constraints: after the rounds they are violated less than at
     # the input, and the objective at the multipliers of the first round is lower.
     problem, x, total = paper_problem()
-    state, covariances = solve_paper(problem, PAPER)
+    state, covariances, left = solve_paper(problem, PAPER)
+    assert left == ()
     assert covariances.shape == (*problem.valid.shape, 6, 6)
     rows, none = torch.arange(4), torch.zeros(4, 2, dtype=D)
     before, violation = total(x, rows, none)
-    after, left = total(state.pose.flatten(1), rows, none)
+    after, rest = total(state.pose.flatten(1), rows, none)
     assert (after < before).all()
-    assert (left < violation).all()
+    assert (rest < violation).all()
 
 
 # --- what is free -------------------------------------------------------------------------------

@@ -1,7 +1,9 @@
 """Windows of observations, and their batches as padded tensors."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.window import batches, one_heading, stack
+from boxreg_ros.objective import MEMORY
+from boxreg_ros.structures import POSE
+from boxreg_ros.window import batches, FADING, Memory, one_heading, stack
 import numpy as np
 import pytest
 from scenes import drive, track_of, window_of
@@ -16,6 +18,27 @@ def windows(lengths):
 
 def given(window):
     return np.array([observation.box for observation in window.observations])
+
+
+def remembering(window, yaw=0.0):
+    """Return a window of which one box has left, given 1 m before the first; headings + `yaw`."""
+    boxes = given(window)
+    base = boxes[0, :3] - [1.0, 0, 0]
+    pose = boxes[:2, POSE] - [*base, 0, 0, 0]
+    pose[:, 5] += yaw
+    shared = [*boxes[0, 3:6], *np.zeros(MEMORY - 15)]
+    step = np.random.default_rng(3).normal(size=MEMORY)
+    information = np.diag(1.0 + np.arange(MEMORY))
+    memory = Memory(base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1]))
+    start = boxes[:-1] + 0.01 * np.eye(9)[8]
+    return window._replace(fresh=1, start=start, memory=memory)
+
+
+def turned(window):
+    """Return `window` with all its input boxes turned around."""
+    boxes = [o.box + np.pi * np.eye(9)[8] for o in window.observations]
+    pairs = zip(window.observations, boxes, strict=True)
+    return window._replace(observations=[o._replace(box=box) for o, box in pairs])
 
 
 def test_stack_pads():
@@ -52,9 +75,73 @@ def test_one_heading(yaw, known):
     # Up to whole turns; steps are small whatever the input.
     # What is padded, here by half turns, has no say.
     padded = np.array([yaw + [yaw[-1] + np.pi] * 9])
-    (found,) = one_heading(padded, np.arange(padded.size)[None] < len(yaw))[:, : len(yaw)]
+    valid, unknown = np.arange(padded.size)[None] < len(yaw), np.array([np.nan])
+    (found,) = one_heading(padded, valid, unknown)[:, : len(yaw)]
     np.testing.assert_allclose(np.cos(found - known), 1, atol=1e-12)
     assert (np.abs(np.diff(found)) < np.pi / 2).all()
+
+
+@pytest.mark.parametrize('turns', [0.0, 2 * np.pi, -6 * np.pi])
+@pytest.mark.parametrize('is_first_turned', [False, True])
+@pytest.mark.parametrize(
+    ('contrary', 'unknown', 'known'),
+    [
+        (1, 0, 0),
+        (3, 0, 0),
+        (5, np.pi, 0),  # more than half, less than three quarters of eight
+        (7, np.pi, np.pi),  # more than three quarters
+        (8, np.pi, np.pi),
+    ],
+)
+def test_a_known_heading_is_kept_until_three_quarters_say_otherwise(
+    turns, is_first_turned, contrary, unknown, known
+):
+    # Eight boxes that turn slowly from 0, of which `contrary` are turned around, the first of
+    # them or not; what has left headed to 0, give or take whole turns.
+    steps = 0.01 * np.arange(8)
+    is_contrary = np.arange(8) < contrary if is_first_turned else np.arange(8) >= 8 - contrary
+    yaw, valid = (steps + np.pi * is_contrary)[None], np.ones((1, 8), dtype=bool)
+    for heading, base in ((np.nan, unknown), (0.02 + turns, known)):
+        (found,) = one_heading(yaw, valid, np.array([heading]))
+        np.testing.assert_allclose(np.cos(found - steps - base), 1, atol=1e-12)
+        assert (np.abs(np.diff(found)) < np.pi / 2).all()
+
+
+def test_what_has_left_is_stacked():
+    one, other = windows([5, 4])
+    problem, base = stack([remembering(one), other], CONFIG)
+    memory = remembering(one).memory
+    np.testing.assert_array_equal(base, [memory.base, given(other)[0, :3]])
+    np.testing.assert_allclose(problem.boxes[:, 0, :3], [[1, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(problem.recalled[0], memory.state + memory.step, atol=1e-12)
+    np.testing.assert_allclose(problem.information[0], FADING * memory.information)
+    np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1], [0, 0, 0, 0]])
+    np.testing.assert_array_equal(problem.recalled[1], 0)
+    np.testing.assert_array_equal(problem.information[1], 0)
+    assert memory.information[3, 3] == 4  # nor is it written to
+    assert remembering(one).fresh_part().memory is None
+
+
+@pytest.mark.parametrize('turns', [2 * np.pi, -2 * np.pi, 6 * np.pi])
+def test_whole_turns_are_no_difference(turns):
+    # What is remembered comes to where the search starts, however often it has turned since.
+    (window,) = windows([5])
+    known, _ = stack([remembering(window)], CONFIG)
+    found, _ = stack([remembering(window, turns)], CONFIG)
+    for a, b in zip(found[:-1], known[:-1], strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_a_window_turned_against_its_memory_drops_it():
+    # All boxes say otherwise: the form is of boxes that head elsewhere, and tells nothing now.
+    (window,) = windows([5])
+    for one in (turned(remembering(window)), remembering(window, np.pi)):
+        problem, _ = stack([one], CONFIG)
+        np.testing.assert_array_equal(problem.information, 0)
+        assert problem.recalled.isfinite().all()
+        np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1]])
+    kept, _ = stack([turned(remembering(window, np.pi))], CONFIG)
+    assert (kept.information[0].diagonal() > 0).all()
 
 
 def test_a_solved_window_starts_where_it_was():
@@ -81,5 +168,5 @@ def test_batches_hold_every_window_that_is_long_enough_once():
 def test_batches_are_bounded_and_equally_warm(monkeypatch):
     many = windows([5, 6, 7, 8])
     many[1] = many[1]._replace(fresh=1, start=given(many[1])[:5])
-    monkeypatch.setattr('boxreg_ros.window.BATCH_VALUES', 2 * 8 * 256 * 18)
+    monkeypatch.setattr('boxreg_ros.window.BATCH_VALUES', 2 * 8 * CONFIG.sampling.points * 18)
     assert batches(many, CONFIG) == [[0, 2], [3], [1]]
