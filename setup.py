@@ -34,7 +34,7 @@ setup(
         'mcap>=1.6,<2',
         'numpy>=1.26,<3',
         'pyyaml>=6',
-        'rosbags>=0.11,<0.12',
+        'rosbags>=0.11.5,<0.12',  # whose .db3 files may be read in a thread of their own
         'scipy>=1.11',
         'torch>=2.3',
         'tqdm>=4.60',

@@ -57,6 +57,9 @@ class Bridge(Generic[_T]):
 
     def add(self, refined: RefinedBoxes, item: _T) -> Iterator[tuple[RefinedBoxes, _T]]:
         """Take a result with whatever belongs to it; yield those that are complete."""
+        if not self._longest_ns:
+            yield refined, item
+            return
         boxes, now_ns = refined.boxes, refined.boxes.stamp_ns
         is_late = self._newest_ns is not None and now_ns < self._newest_ns
         self._newest_ns = now_ns if self._newest_ns is None else max(now_ns, self._newest_ns)

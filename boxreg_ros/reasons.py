@@ -43,8 +43,8 @@ REASONS = {
     'unreadable': Reason(
         'message',
         'cloud or boxes that contradict themselves, or in a layout that is not known; boxes pass '
-        'through',
-        'the log has the reason: mend the publisher',
+        'through, offline only in `overlay.mcap`',
+        'the log, or `summary.json`, has the reason: mend the publisher',
     ),
     'points_queue_full': Reason('cloud', 'dropped: the solver is slower than the data', FASTER),
     'boxes_queue_full': Reason(

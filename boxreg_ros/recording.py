@@ -159,28 +159,23 @@ class Recording:
         Raises
         ------
         UnsupportedMessage
-            If its layout is none that can be read.
+            If this message cannot be read: its bytes do not follow the definition in the
+            recording, or it contradicts itself, or its layout is none that is known.
         RecordingError
-            If its bytes do not follow the definition in the recording.
+            If no message of its kind can be read here.
 
         """
-        topic = record.connection.topic
-        try:
-            if topic == self.points_topic:
-                return pointcloud.from_msg(self._message(record))
-            return self._adapter.from_msg(self._message(record))
-        except (UnsupportedMessage, AttributeError) as error:
-            raise UnsupportedMessage(f'topic {topic!r}: {error}') from None
+        return self._content(record.connection.topic, self._message(record))
 
     def intensities(self, record: Record) -> Floats | None:
         """Return the intensities of a sweep's points; None if the record has none."""
         return pointcloud.intensities(self._message(record))
 
     def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
-        """Return a message of the boxes' topic from its bytes, and the boxes in it."""
+        """Return a message of the boxes' topic from its bytes, and its boxes; see `decode`."""
         connection = self._connections({self.boxes_topic})[0]
         message = self._message(Record(connection, 0, data))
-        return message, self._adapter.from_msg(message)
+        return message, self._content(self.boxes_topic, message)
 
     def with_boxes(self, message: Any, boxes: BoxArray, covariances: Floats) -> bytes:
         """Return the bytes of a message of the boxes' topic with its boxes replaced."""
@@ -270,10 +265,16 @@ class Recording:
         return str(cloud.header.frame_id).lstrip('/')
 
     def _first(self, topic: str) -> Any:
-        """Return the first message on a topic in the part that is read, or None."""
-        connections = self._connections({topic})
-        records = self._read(connections, self.start_ns, self.end_ns)
-        return next((self._message(record) for record in records), None)
+        """Return the first message on a topic, in the part that is read, that can be; or None."""
+        trouble: UnsupportedMessage | None = None
+        for record in self._read(self._connections({topic}), self.start_ns, self.end_ns):
+            try:
+                return self._message(record)
+            except UnsupportedMessage as error:
+                trouble = trouble or error
+        if trouble is not None:
+            raise trouble
+        return None
 
     def _find(self) -> None:
         """Settle topics and times, and complete the message definitions."""
@@ -390,10 +391,18 @@ class Recording:
         except BoxregError:
             raise
         except Exception as error:  # the bytes are foreign, and so are the errors they cause
-            raise RecordingError(
+            raise UnsupportedMessage(
                 f'{self}: a message on {connection.topic!r} is not a {connection.msgtype} as '
                 f'defined there: {_text(error)}'
             ) from None
+
+    def _content(self, topic: str, message: Any) -> Any:
+        """Return the sweep or the boxes in a message."""
+        reader: Any = pointcloud if topic == self.points_topic else self._adapter
+        try:
+            return reader.from_msg(message)
+        except Exception as error:  # whatever a malformed message leads to
+            raise UnsupportedMessage(f'topic {topic!r}: {_text(error)}') from None
 
     def _add_motion(self, tree: TransformTree, record: Record) -> None:
         message = self._message(record)

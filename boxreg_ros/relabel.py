@@ -21,12 +21,13 @@ from pathlib import Path
 import platform
 import sys
 import time
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros import __version__
+from boxreg_ros.ahead import ahead
 from boxreg_ros.bridge import Bridge
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.intake import add_convention_arguments, convention_from, Intake
 from boxreg_ros.labelled import (
     add_label_arguments,
@@ -64,6 +65,8 @@ import yaml
 UNUSED = 'sweep_', 'boxes_'  # reasons of what was not used begin so
 BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
 
+AHEAD = 20
+"""So many clouds and box arrays, mostly half of each, are made ready while the registrar works."""
 Progress = Callable[[float, float], None]
 _T = TypeVar('_T')
 
@@ -179,20 +182,18 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     ------
     RecordingError
         If the recording lacks something, or `out` is not ours to replace.
+    UnsupportedMessage
+        If none of its clouds, or none of its messages of boxes, can be read.
 
     """
     clock = _Clock()
-    tree = TransformTree()
-    intake = Intake(request.convention, request.config)
     registrar = BoxRegistrar(request.config)
-    counts: Counter[str] = Counter()
-    trouble = ''
     names = dict.fromkeys(('csv', *request.formats))
     recording = request.recording()
     with recording, whole_folder(out) as folder:
         with clock('read'):
-            fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
-        sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
+            arrivals = _Arrivals(recording, request, clock)
+        fixed_frame, sensor_frame = arrivals.fixed_frame, arrivals.sensor_frame
         spool = None
         if request.options.with_points:
             spool = Spool(folder, round(request.config.tolerance * 1e9))
@@ -201,45 +202,23 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         writers = {name: writer_for(name, folder, provenance, options) for name in names}
         is_early = request.config.estimate == 'early'
         bridge: Bridge[_Slot] = Bridge(request.bridge, fixed_frame, request.config)
-        with _Sink(writers, spool, bridge, fixed_frame, sensor_frame, is_early, clock) as sink:
-            for record in clock.each('read', recording.records(tree)):
+        with (
+            _Sink(writers, spool, bridge, fixed_frame, sensor_frame, is_early, clock) as sink,
+            ahead(iter(arrivals), AHEAD) as coming,
+        ):
+            for arrival in coming:
                 if progress is not None:
-                    done = record.received_ns - recording.start_ns
-                    progress(done * 1e-9, (recording.end_ns - recording.start_ns) * 1e-9)
-                with clock('decode'):
-                    item = recording.decode(record)
-                with clock('transform'):
-                    try:
-                        moved = intake.take(to_fixed_frame(item, tree, fixed_frame))
-                    except TransformUnavailable as error:
-                        moved, trouble = None, trouble or str(error)
-                    T_fixed_sensor = pose_of(tree, fixed_frame, sensor_frame, item.stamp_ns)
-                if isinstance(item, Sweep):
-                    counts['sweeps'] += 1
-                    counts['sweep_without_transform'] += moved is None
-                    T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
-                    if spool and T_fixed_sweep is not None:
-                        with clock('write'):
-                            spool.add(item, T_fixed_sweep, recording.intensities(record))
-                else:
-                    counts['box_arrays'] += 1
-                    boxes = item if not isinstance(moved, BoxArray) else moved
-                    T_fixed_given = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
-                    reason = 'no_transform' if moved is None else ''
-                    sink.expect(boxes, T_fixed_sensor, T_fixed_given, reason)
+                    progress(arrival.seconds, arrivals.seconds)
+                sink.expect(arrival)
                 with clock('registrar'):
-                    ready = _add(registrar, moved)
+                    ready = _add(registrar, arrival.moved)
                 sink.take(ready)
             with clock('registrar'):
                 ready = registrar.flush()
             sink.take(ready)
         if spool is not None:
             spool.remove()
-        counts.update({k: n for k, n in registrar.counts.items() if k.startswith(UNUSED)})
-        summary = _summary(request, recording, fixed_frame, counts, sink)
-        summary['first_missing_transform'] = trouble
-        summary['warning'] = intake.finding
-        summary |= intake.facts
+        summary = _summary(request, recording, arrivals, registrar.counts, sink)
         summary['seconds'] = clock.seconds()
         (folder / 'config.yaml').write_text(
             yaml.safe_dump(request.config.to_dict(), sort_keys=False), encoding='utf-8'
@@ -285,7 +264,13 @@ def to_fixed_frame(
 
 
 class _Clock:
-    """Adds up what each stage takes [s]."""
+    """
+    Adds up what each stage takes [s].
+
+    Two threads use it, for different stages; as their work overlaps, stages may add up to more
+    than the total.
+
+    """
 
     def __init__(self) -> None:
         self._begun = time.perf_counter()
@@ -333,6 +318,117 @@ class _Slot:
         return int((is_refined & (np.cos(turn) < 0)).sum())
 
 
+class _Arrival(NamedTuple):
+    """
+    A cloud or boxes on the way to the registrar, and what files need to know with them.
+
+    Attributes
+    ----------
+    seconds : float
+        Part of the recording that lies behind [s].
+    given, moved : Sweep or BoxArray, or None
+        In its own and in the fixed frame: `given` is None for a cloud that is not written,
+        `moved` where nothing connects the frames.
+    T_fixed_given, T_fixed_sensor : array, shape (4, 4), or None
+        Poses of its own frame, and of that which stands for the sensor's in label files.
+    intensities : array, shape (M,), or None
+        Those of a cloud, if they are written.
+
+    """
+
+    seconds: float
+    given: Sweep | BoxArray | None
+    moved: Sweep | BoxArray | None
+    T_fixed_given: Floats | None
+    T_fixed_sensor: Floats | None
+    intensities: Floats | None
+
+
+class _Arrivals:
+    """
+    All that happens to messages before the registrar: reading, decoding, the fixed frame.
+
+    Iterating may happen in another thread: nothing here is used by others until that is over,
+    but for the frames and `seconds`, which stay what they are.
+
+    Attributes
+    ----------
+    counts : Counter
+        Sweeps and box arrays, and what was not used by reason.
+    unreadable : dict
+        Of each topic with messages that cannot be read, the first error.
+    first_missing_transform : str
+        What is not known of the first item without a transform; else empty.
+
+    """
+
+    def __init__(self, recording: Recording, request: Request, clock: _Clock) -> None:
+        self._recording = recording
+        self._clock = clock
+        self._tree = TransformTree()
+        self._with_points = request.options.with_points
+        self.fixed_frame = recording.choose_fixed_frame(self._tree, request.fixed_frame)
+        self.sensor_frame = label_frame_of(
+            recording, self._tree, self.fixed_frame, request.label_frame
+        )
+        self.seconds = (recording.end_ns - recording.start_ns) * 1e-9
+        self.intake = Intake(request.convention, request.config)
+        self.counts: Counter[str] = Counter()
+        self.unreadable: dict[str, UnsupportedMessage] = {}
+        self.first_missing_transform = ''
+
+    def __iter__(self) -> Iterator[_Arrival]:
+        """
+        Yield clouds and boxes in the order they were received, but for those unreadable.
+
+        Raises
+        ------
+        UnsupportedMessage
+            At the end, if no cloud, or no message of boxes, was readable.
+
+        """
+        read: set[str] = set()
+        for record in self._clock.each('read', self._recording.records(self._tree)):
+            topic = record.connection.topic
+            with self._clock('decode'):
+                try:
+                    given = self._recording.decode(record)
+                except UnsupportedMessage as error:
+                    self.counts['unreadable'] += 1
+                    self.unreadable.setdefault(topic, error)
+                    continue
+                is_cloud = isinstance(given, Sweep)
+                is_written = is_cloud and self._with_points
+                intensities = self._recording.intensities(record) if is_written else None
+            read.add(topic)
+            self.counts['sweeps' if is_cloud else 'box_arrays'] += 1
+            with self._clock('transform'):
+                arrival = _Arrival(
+                    (record.received_ns - self._recording.start_ns) * 1e-9,
+                    given if is_written or not is_cloud else None,
+                    self._moved(given),
+                    self._pose_of(given.frame_id, given.stamp_ns),
+                    self._pose_of(self.sensor_frame, given.stamp_ns),
+                    intensities,
+                )
+            yield arrival
+        for topic, first in self.unreadable.items():
+            if topic not in read:
+                raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
+
+    def _moved(self, given: Sweep | BoxArray) -> Sweep | BoxArray | None:
+        """Return a cloud or boxes in the fixed frame; None, and counted, where it is unknown."""
+        try:
+            return self.intake.take(to_fixed_frame(given, self._tree, self.fixed_frame))
+        except TransformUnavailable as error:
+            self.counts['sweep_without_transform'] += isinstance(given, Sweep)
+            self.first_missing_transform = self.first_missing_transform or str(error)
+            return None
+
+    def _pose_of(self, frame: str, stamp_ns: int) -> Floats | None:
+        return pose_of(self._tree, self.fixed_frame, frame, stamp_ns)
+
+
 class _Sink:
     """Brings results into the order of stamps, each box array once, and has them written."""
 
@@ -360,26 +456,25 @@ class _Sink:
         self.reasons: Counter[str] = Counter()
         self.heading_flips = 0
 
-    def expect(
-        self,
-        boxes: BoxArray,
-        T_fixed_sensor: Floats | None = None,
-        T_fixed_given: Floats | None = None,
-        reason: str = '',
-    ) -> None:
-        """Keep a place for a box array; with a reason, it is written there as it is."""
+    def expect(self, arrival: _Arrival) -> None:
+        """Keep a cloud that files need, or a place for boxes: those not moved stay as they are."""
+        given = arrival.given
+        if not isinstance(given, BoxArray):
+            if self._spool and given is not None and arrival.T_fixed_given is not None:
+                with self._clock('write'):
+                    self._spool.add(given, arrival.T_fixed_given, arrival.intensities)
+            return
+        boxes = arrival.moved if isinstance(arrival.moved, BoxArray) else given
         n = len(boxes.track_ids)
-        slot = _Slot(boxes, T_fixed_sensor, T_fixed_given)
+        slot = _Slot(boxes, arrival.T_fixed_sensor, arrival.T_fixed_given)
         self.boxes_in += n
-        if not reason:
+        if arrival.moved is not None:
             self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
         elif not n:
             return
         else:
-            unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
-            slot.result = RefinedBoxes(
-                boxes, (KEPT,) * n, (reason,) * n, np.zeros(n, np.int64), unknown
-            )
+            reasons, unknown = ('no_transform',) * n, np.broadcast_to(np.eye(6), (n, 6, 6))
+            slot.result = RefinedBoxes(boxes, (KEPT,) * n, reasons, np.zeros(n, np.int64), unknown)
         insort(self._slots, slot, key=lambda slot: slot.stamp_ns)
 
     def take(self, ready: Sequence[RefinedBoxes]) -> None:
@@ -457,12 +552,18 @@ def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[Refined
 
 
 def _summary(
-    request: Request, recording: Recording, fixed_frame: str, counts: Counter[str], sink: _Sink
+    request: Request,
+    recording: Recording,
+    arrivals: _Arrivals,
+    registered: Counter[str],
+    sink: _Sink,
 ) -> dict[str, Any]:
     """Return all of summary.json but the timings."""
     if sink.missing():
         raise RuntimeError(f'{sink.missing()} of {sink.boxes_in} boxes did not come back')
-    dropped = {name: n for name, n in sorted(counts.items()) if n and name.startswith(UNUSED)}
+    counts = arrivals.counts
+    unused = {name: n for name, n in registered.items() if name.startswith(UNUSED)}
+    unused |= {name: counts[name] for name in ('unreadable', 'sweep_without_transform')}
     return {
         'recordings': [str(path) for path in request.recordings],
         'topics': {
@@ -471,7 +572,7 @@ def _summary(
             'odometry': recording.odometry_topic,
         },
         'labels': _labels(request, recording),
-        'fixed_frame': fixed_frame,
+        'fixed_frame': arrivals.fixed_frame,
         'estimate': request.config.estimate,
         'sweeps': counts['sweeps'],
         'box_arrays': counts['box_arrays'],
@@ -480,7 +581,11 @@ def _summary(
         'status': dict(sink.status),
         'reasons': dict(sink.reasons.most_common()),
         'heading_flips': sink.heading_flips,
-        'dropped': dropped,
+        'dropped': {name: n for name, n in sorted(unused.items()) if n},
+        'first_missing_transform': arrivals.first_missing_transform,
+        'first_unreadable': '; '.join(map(str, arrivals.unreadable.values())),
+        'warning': arrivals.intake.finding,
+        **arrivals.intake.facts,
         'left_out_of_labels': sink.left_out(),
         'versions': {'boxreg_ros': __version__, 'python': platform.python_version()}
         | {name: version(name) for name in ('torch', 'numpy', 'scipy', 'rosbags')},
@@ -505,10 +610,12 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
         kept += f', {flips:,} headings turned around'
     if put_in := status.get(INTERPOLATED):
         kept += f', {put_in:,} interpolated'
+    unreadable = summary['dropped'].get('unreadable')
     return (
         f'{out}: {summary["boxes_in"]:,} boxes in, {status.get(REFINED, 0):,} refined, {kept} '
         f'from {summary["sweeps"]:,} sweeps in {summary["seconds"]["total"]:.1f} s, '
         f'fixed frame {summary["fixed_frame"]}'
+        + (f'; {unreadable:,} messages could not be read' if unreadable else '')
     )
 
 

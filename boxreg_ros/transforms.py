@@ -304,8 +304,9 @@ def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     is_near = np.abs(T_frame_sweep[:3, 3]).max() < FLOAT32_RANGE
     kind = points.dtype if is_near else np.dtype(np.float64)
     R, t = T_frame_sweep[:3, :3], T_frame_sweep[:3, 3]
-    moved = points.astype(kind, copy=False) @ R.T.astype(kind)
-    moved += t.astype(kind)
+    moved, (x, y, z) = np.empty(points.shape, kind), points.astype(kind, copy=False).T
+    for i, (a, b, c) in enumerate(R.astype(kind)):  # BLAS would start threads beside the solver's
+        moved[:, i] = a * x + b * y + c * z + t[i].astype(kind)
     return replace(sweep, frame_id=frame_id, points=moved, origin=R @ sweep.origin + t)
 
 

@@ -8,7 +8,7 @@ import sys
 
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.cli import main
-from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.foxglove_mcap import encoded
 from boxreg_ros.recording import Recording
 from boxreg_ros.transforms import TransformTree
@@ -218,7 +218,7 @@ def test_bytes_that_are_no_message_are_told(tmp_path):
     path = write(tmp_path / 'a.mcap', drive, {'/boxes': 'json', '/points': 'cdr', '/tf': 'cdr'})
     with Recording([path]) as recording:
         records = {r.connection.topic: r for r in recording.records(TransformTree())}
-        with pytest.raises(RecordingError, match="'/boxes'"):
+        with pytest.raises(UnsupportedMessage, match="'/boxes'"):
             recording.decode(records['/boxes']._replace(data=b'{"entities": ['))
 
 

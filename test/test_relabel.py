@@ -1,3 +1,4 @@
+from collections import Counter
 import csv
 import json
 from pathlib import Path
@@ -8,11 +9,13 @@ from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
-from boxreg_ros.relabel import input_boxes, relabel, Request
+from boxreg_ros.relabel import closing_line, input_boxes, relabel, Request
 from msg_adapters.convention import Convention
 import numpy as np
 import pytest
 from ros_messages import Drive, JSK, Messages, SECOND, write_recording
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
 M = Messages()
@@ -256,10 +259,66 @@ def test_boxes_that_never_have_points_and_lone_boxes(tmp_path):
     assert all(np.isfinite(float(row['x'])) for row in empty)
 
 
+def truncated(path, out, sizes):
+    """Copy a recording; `sizes` has the bytes that are left of message k on a topic."""
+    count = Counter()
+    with (
+        AnyReader([path]) as reader,
+        Writer(out, version=9, storage_plugin=StoragePlugin.MCAP) as writer,
+    ):
+        types = reader.typestore
+        known = {
+            c.topic: writer.add_connection(c.topic, c.msgtype, typestore=types)
+            for c in reader.connections
+        }
+        for connection, received_ns, data in reader.messages():
+            key = connection.topic, count[connection.topic]
+            count[connection.topic] += 1
+            writer.write(known[connection.topic], received_ns, data[: sizes.get(key, len(data))])
+    return next(out.glob('*.mcap'))
+
+
+def test_unreadable_messages_are_passed_over_and_counted(tmp_path):
+    drive = Drive(sweeps=8)
+    drive.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
+    path = drive.write(tmp_path / 'whole')
+    # A cloud of which nothing is left but its stamp, the first that tells the frame; one of which
+    # half is left; boxes that end amid the first.
+    sizes = {('/points', 0): 12, ('/points', 6): 1500, ('/boxes', 5): 60}
+    path = truncated(path, tmp_path / 'drive', sizes)
+    summary, rows = run(path, tmp_path / 'out', formats=('csv', 'mcap'))
+    dropped = {'boxes_without_sweep': 3, 'sweep_without_boxes': 1, 'unreadable': 4}
+    assert summary['dropped'] == dropped
+    assert (summary['sweeps'], summary['box_arrays'], summary['boxes_in']) == (5, 7, 14)
+    left = [stamp for k, stamp in enumerate(drive.stamps) if k != 5]
+    assert keys(rows) == [(stamp, track) for stamp in left for track in ('1', '2')]
+    lost = [drive.stamps[k] for k in (0, 3, 6)]
+    status = {int(row['stamp_ns']): row['status'] for row in rows}
+    assert status == {stamp: 'kept' if stamp in lost else 'refined' for stamp in left}
+    assert summary['reasons'] == {'no_sweep': 6}
+    assert "'/points' is not a sensor_msgs/msg/PointCloud2" in summary['first_unreadable']
+    assert "'/boxes' is not a vision_msgs/msg/Detection3DArray" in summary['first_unreadable']
+    assert '4 messages could not be read' in closing_line(summary, tmp_path / 'out')
+    # The overlay has them as they were; the refined topic has the others.
+    with AnyReader([tmp_path / 'out' / 'overlay.mcap']) as reader:
+        copied = Counter(c.topic for c, _, _ in reader.messages())
+    assert (copied['/points'], copied['/boxes'], copied['/boxes_refined']) == (8, 8, 7)
+
+
+@pytest.mark.parametrize('topic', ['/points', '/boxes'])
+def test_a_recording_of_which_nothing_is_readable_is_an_error(tmp_path, topic):
+    path = Drive(sweeps=3).write(tmp_path / 'whole')
+    path = truncated(path, tmp_path / 'drive', {(topic, k): 12 for k in range(3)})
+    with pytest.raises(UnsupportedMessage, match=f"on '{topic}' is not a "):
+        run(path, tmp_path / 'results' / 'out')
+    assert not (tmp_path / 'results').exists() or not list((tmp_path / 'results').iterdir())
+
+
 def test_failures_leave_nothing_behind(tmp_path):
     drive = Drive(sweeps=6)
-    drive.replace('/points', 5, lambda message: setattr(message, 'point_step', 2))
-    with pytest.raises(UnsupportedMessage, match="topic '/points'"):
+    for k in range(6):
+        drive.replace('/points', k, lambda message: setattr(message, 'point_step', 2))
+    with pytest.raises(UnsupportedMessage, match=r"no message on '/points' can be read.*got 2"):
         run(drive.write(tmp_path / 'drive'), tmp_path / 'results' / 'out')
     assert list((tmp_path / 'results').iterdir()) == []
 
@@ -268,8 +327,8 @@ def test_earlier_results_survive_a_failure_and_are_replaced_by_success(tmp_path)
     good = Drive(sweeps=3).write(tmp_path / 'good')
     run(good, tmp_path / 'out')
     before = (tmp_path / 'out' / 'boxes.csv').read_bytes()
-    broken = Drive(sweeps=3)
-    broken.replace('/points', 2, lambda message: setattr(message, 'point_step', 2))
+    broken = Drive(sweeps=1)
+    broken.replace('/points', 0, lambda message: setattr(message, 'point_step', 2))
     with pytest.raises(UnsupportedMessage):
         run(broken.write(tmp_path / 'broken'), tmp_path / 'out')
     assert (tmp_path / 'out' / 'boxes.csv').read_bytes() == before

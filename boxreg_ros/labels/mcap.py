@@ -20,7 +20,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar
 
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.intake import covariances_to_write
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.recording import stock_types
@@ -144,7 +144,10 @@ class Writer:
 
     def _refined(self, raw: Raw) -> list[Raw] | None:
         """Return the message with its boxes refined, and markers; None if they are not ready."""
-        message, given = self._recording.box_message(raw.data)
+        try:
+            message, given = self._recording.box_message(raw.data)
+        except UnsupportedMessage:
+            return []  # `relabel` passes it over too, and counts it
         copied = raw._replace(topic=self._refined_topic)
         if not given.track_ids:
             return [copied]
