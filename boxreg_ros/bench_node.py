@@ -28,8 +28,8 @@ from boxreg_ros.errors import BoxregError
 import numpy as np
 
 PROFILE = Path(__file__).parent / 'share' / 'fastdds.xml'
-CIRCLE = 50
-"""Sweeps until the cars are where they began."""
+CIRCLE = 5.0
+"""Until the cars are where they began [s]."""
 LIFE = 200
 """Sweeps until a track gets a new id."""
 SETTLING = 5.0
@@ -81,7 +81,7 @@ def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tupl
     """Return the points (M, 3) and boxes (n, 9) of a sweep, in the frame of the sensor."""
     side = int(np.ceil(np.sqrt(args.tracks)))
     index = np.arange(args.tracks)
-    phase = 2 * np.pi * (turn / CIRCLE + index / args.tracks)
+    phase = 2 * np.pi * (turn / (CIRCLE * args.rate) + index / args.tracks)
     boxes = np.zeros((args.tracks, 9))
     boxes[:, 0] = 14.0 * (index % side - side / 2) + 4.0 * np.sin(phase) + 5.0
     boxes[:, 1] = 14.0 * (index // side - side / 2) - 4.0 * np.cos(phase) + 5.0
@@ -116,7 +116,7 @@ def publish(args: argparse.Namespace) -> None:
 
     rng = np.random.default_rng(0)
     clouds, arrays = [], []
-    for turn in range(CIRCLE):
+    for turn in range(round(CIRCLE * args.rate)):
         points, boxes = scene(args, turn, rng)
         table = np.zeros((len(points), 4), np.float32)
         table[:, :3] = points
@@ -156,10 +156,10 @@ def publish(args: argparse.Namespace) -> None:
             stamp = divmod(stamp_ns, 10**9)
             odometry.header.stamp.sec, odometry.header.stamp.nanosec = stamp
             to_odom.publish(odometry)
-            cloud_bytes = clouds[turn % CIRCLE]
+            cloud_bytes = clouds[turn % len(clouds)]
             struct.pack_into('<iI', cloud_bytes, 4, *stamp)  # behind the encapsulation of CDR
             to_points.publish(bytes(cloud_bytes))
-            array = arrays[turn % CIRCLE]
+            array = arrays[turn % len(arrays)]
             for i, marker in enumerate(array.markers):
                 marker.id = i + args.tracks * ((turn + i * LIFE // args.tracks) // LIFE)
                 marker.header.stamp.sec, marker.header.stamp.nanosec = stamp
@@ -201,10 +201,12 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         while publisher.poll() is None:
             if node.poll() is not None:
                 raise BoxregError(f'the node ended: {(folder / "node.log").read_text()}')
-            samples.append(vitals(node.pid))
+            if seen['early']:
+                samples.append(vitals(node.pid))
             time.sleep(1.0)
         if publisher.returncode:
             raise BoxregError(f'the publisher failed: {(folder / "sent.log").read_text()}')
+        samples = samples or [vitals(node.pid)]
         sent = np.loadtxt(folder / 'sent', dtype=np.int64, ndmin=2)
         begun = time.monotonic()
         node.send_signal(signal.SIGINT)
@@ -250,16 +252,21 @@ def results(sent: Any, seen: dict[str, Any], rate: float) -> dict[str, float]:
 
 
 def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
-    """Return memory, handles, threads and cores used by the node, from one sample a second."""
-    settled = samples[min(len(samples) // 5 + 1, len(samples) - 1)]
-    last = samples[-1]
+    """
+    Return memory, handles, threads and cores used by the node, from one sample a second.
+
+    The first is of when boxes came back. What grows from the start to the middle and on to the
+    end is a leak, what stays is a plateau.
+
+    """
+    end = len(samples) - 1
+    begin = min(round(SETTLING), end // 3)
+    rows = {'at the start': begin, 'in the middle': (begin + end) // 2, 'at the end': end}
     return {
-        'memory after a fifth [MB]': settled[0],
-        'memory at the end [MB]': last[0],
-        'handles after a fifth': float(settled[1]),
-        'handles at the end': float(last[1]),
-        'threads': float(last[2]),
-        'cores used': (last[3] - settled[3]) / max(1.0, len(samples) * 0.8),
+        **{f'memory {when} [MB]': samples[row][0] for when, row in rows.items()},
+        **{f'handles {when}': float(samples[row][1]) for when, row in rows.items()},
+        'threads': float(samples[end][2]),
+        'cores used': (samples[end][3] - samples[begin][3]) / max(1, end - begin),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+import gc
 from importlib import import_module
 import os
 from pathlib import Path
@@ -45,7 +46,7 @@ POLL = 0.02
 """The worker looks this often whether an arrival has waited long enough [s]."""
 GRAPH_PERIOD = 0.2
 STATUS_PERIOD = 1.0
-LAST_WORK, LAST_ACKNOWLEDGEMENT = 0.8, 0.4
+LAST_WORK, LAST_ACKNOWLEDGEMENT = 0.5, 0.4
 """So long may, on shutdown, the worker go on, and subscribers take what it published [s]."""
 
 
@@ -71,6 +72,8 @@ class BoxregNode(Node):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         warm_up(config)
+        gc.collect()
+        gc.freeze()  # what stays for good: to look it over for garbage costs a tick 50 ms
         self._convention = options.convention
         self._health = Health()
         self._inbox = Inbox(config.queue)
@@ -142,6 +145,16 @@ class BoxregNode(Node):
         self._trouble('qos_incompatible', f'{text}: {REASONS["qos_incompatible"].remedy}')
 
     def _subscribe_to_tf(self) -> None:
+        """Have `tf2_ros` listen where it is installed, else listen the way it does."""
+        try:
+            from tf2_ros import TransformListener
+        except ImportError:
+            self._subscribe_without_tf2_ros()
+        else:
+            self._listener = TransformListener(_TransformsToInbox(self._inbox), self)
+            self.get_logger().debug('transforms come by tf2_ros')
+
+    def _subscribe_without_tf2_ros(self) -> None:
         try:
             kind = import_message('tf2_msgs/msg/TFMessage')
         except UnsupportedMessage as error:
@@ -149,7 +162,8 @@ class BoxregNode(Node):
             return
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for topic, qos in (('/tf', QoSProfile(depth=100)), ('/tf_static', latched)):
-            self._subscribe(kind, topic, partial(self._inbox.put_news, topic), qos, is_open=False)
+            callback = partial(self._on_transforms, topic)
+            self._subscribe(kind, topic, callback, qos, is_open=False)
 
     def _find_boxes(self) -> None:
         """Look for publishers of boxes; the first type that can be read is taken."""
@@ -173,6 +187,9 @@ class BoxregNode(Node):
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._subscribe(kind, 'boxes', self._on_boxes, qos)
         self.get_logger().info(f'boxes are {type_name}')
+
+    def _on_transforms(self, topic: str, msg: Any) -> None:
+        self._inbox.put_news(topic, msg.transforms)
 
     def _on_odometry(self, msg: Odometry) -> None:
         self._inbox.put_news('odom', msg)
@@ -302,7 +319,7 @@ class BoxregNode(Node):
                 self._live.output_frame = options.output_frame.lstrip('/')
                 self._live.transform_timeout = options.transform_timeout
             else:
-                self._live.tree.add_transforms(news.transforms, is_static=topic == '/tf_static')
+                self._live.tree.add_transforms(news, is_static=topic == '/tf_static')
         self._newest_motion_ns = self._live.tree.newest_ns()
 
     def _decoded(self, message: Message | None) -> Arrival | None:
@@ -369,6 +386,19 @@ class BoxregNode(Node):
         self._health.count(reason, number)
         if self._health.is_time_to_warn(reason):
             self.get_logger().warning(f'{reason}: {" ".join(text.split())}')
+
+
+class _TransformsToInbox:
+    """What a `TransformListener` of `tf2_ros` needs of a buffer: `TransformTree` is the buffer."""
+
+    def __init__(self, inbox: Inbox) -> None:
+        self._inbox = inbox
+
+    def set_transform(self, transform: Any, authority: str) -> None:
+        self._inbox.put_news('/tf', [transform])
+
+    def set_transform_static(self, transform: Any, authority: str) -> None:
+        self._inbox.put_news('/tf_static', [transform])
 
 
 def import_message(type_name: str) -> type:

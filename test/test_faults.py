@@ -266,6 +266,9 @@ def test_bench_of_the_node_measures(domain):
     assert 0.0 < report['latency p50 [ms]'] < 1000.0
     assert report['exit status'] == 0
     assert report['ending [s]'] < 2.0
+    for when in ('at the start', 'in the middle', 'at the end'):
+        assert 50.0 < report[f'memory {when} [MB]'] < 5000.0
+        assert 5 < report[f'handles {when}'] < 100
     counters = report['counters']
     assert counters['boxes_received'] >= 85
     assert counters['refined'] > 100

@@ -5,6 +5,8 @@ import subprocess
 import sys
 import time
 
+from boxreg_ros.calibrate import calibrated, GAPS, Measured, write_settings
+from boxreg_ros.config import Config, settings
 from boxreg_ros.diagnostics import Health
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
 from boxreg_ros.visual import MarkerBoard, NAMESPACES
@@ -12,15 +14,18 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import markers, vision
 import numpy as np
 import pytest
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
 from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=60.0')
-WITHOUT_TF2_MSGS = (
-    'import sys; sys.modules["tf2_msgs"] = None\n'
+WITHOUT_TF2_MSGS, WITHOUT_TF2_ROS = (
+    f'import sys; sys.modules["{package}"] = None\n'
     'from boxreg_ros.node import main\n'
     'sys.exit(main())'
+    for package in ('tf2_msgs', 'tf2_ros')
 )
 
 
@@ -124,6 +129,28 @@ def test_transforms_may_come_late_and_bad_messages_do_no_harm(graph, tmp_path):
         assert np.nanmax(np.abs(error)) < 0.4
 
 
+@pytest.mark.parametrize('package', ['tf2_ros', 'none'])
+def test_transforms_come_by_tf2_ros_where_it_is_installed(graph, tmp_path, package):
+    """With it and without it: the same transforms, the same boxes."""
+    if package == 'tf2_ros':
+        pytest.importorskip('tf2_ros', reason='tf2_ros is not installed', exc_type=ImportError)
+    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    command = ('-m', 'boxreg_ros.node') if package == 'tf2_ros' else ('-c', WITHOUT_TF2_ROS)
+    options = ('-p', 'transform_timeout:=20.0', '--log-level', 'boxreg_node:=debug')
+    node = graph.start(*RELIABLE, *QUICK, *options, command=command)
+    graph.wait_until_connected()
+    play(graph, records, early)
+    graph.wait(lambda: values_of(diagnostics).get('early_published') == '6', 'diagnostics')
+    values = values_of(diagnostics)
+    assert (values['fixed_frame'], values.get('no_transform')) == ('odom', None)
+    assert int(values['refined']) > 0
+    assert ended_cleanly(node)
+    assert ('transforms come by tf2_ros' in node.output()) == (package == 'tf2_ros')
+
+
 def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path):
     drive = Drive(sweeps=4, boxes='vision', motion='none')
     path = drive.write(tmp_path / 'drive')
@@ -197,6 +224,35 @@ def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
     graph.wait(lambda: len(diagnostics) >= 2, 'diagnostics beside the solver')
     assert len(early) < 25
     assert ended_cleanly(node)
+
+
+def test_a_calibrated_rule_is_taken_as_parameters(graph, tmp_path):
+    """What `boxreg calibrate` writes, of every type there is, reaches the running node."""
+    changes = {
+        'max_gap': 2, 'window': 8, 'solver.tolerance': 1e-5, 'sampling.deskew': True,
+        'mode': 'bev', 'vehicle.names': ['ute'],
+    }  # fmt: skip
+    gap = Measured(value=0.25, spread=0.01, tracks=9)
+    measured = {f'cyclist.{name}': gap for name in GAPS} | {'cyclist.position': gap}
+    values = calibrated(Config().updated(changes), measured)
+    rule = tmp_path / 'rule.yaml'
+    write_settings(rule, values, 'a test')
+    node = graph.start('--params-file', str(rule))
+    client = graph.node.create_client(GetParameters, '/boxreg_node/get_parameters')
+    graph.wait(client.service_is_ready, 'its parameters')
+    names = [item.name for item in settings()]
+    future = client.call_async(GetParameters.Request(names=names))
+    graph.wait(future.done, 'an answer')
+    answer = map(parameter_value_to_python, future.result().values)
+    defaults = {item.name: value for item, value in Config().items()}
+    expected = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in (defaults | values | {'estimate': 'final'}).items()
+    }
+    assert expected['cyclist.gap_ends'] == 0.25 and not expected['faces.learn']
+    assert dict(zip(names, answer, strict=True)) == expected
+    assert ended_cleanly(node)
+    assert 'WARN' not in node.output()
 
 
 @pytest.fixture(scope='module')
