@@ -138,6 +138,8 @@ def test_a_node_that_is_killed_is_replaced(graph, tmp_path):
     node = graph.start(*RELIABLE, *QUICK)
     graph.wait_until_connected()
     play(graph, records[:half], early)
+    for _ in range(10):  # markers follow their boxes
+        graph.executor.spin_once(timeout_sec=0.05)
     node.kill()
     count = len(shown)
     second = graph.start(*RELIABLE, *QUICK)
