@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.calibration import (
     InputModel,
@@ -30,11 +31,9 @@ from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.correspondence import support
 from boxreg_ros.drive import Drive
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.intake import add_convention_arguments, convention_from
 from boxreg_ros.objective import EXTENT, State
 from boxreg_ros.recording import Recording
 from boxreg_ros.registration import expected_shared
-from boxreg_ros.relabel import config_from, setting
 from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import Floats, LENGTH, ROLL
 from boxreg_ros.window import batches, stack, Window
@@ -256,9 +255,7 @@ def table(measured: Mapping[str, Measured], config: Config) -> list[str]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads."""
-    parser.add_argument(
-        'recordings', nargs='+', type=Path, metavar='RECORDING', help='as for boxreg relabel'
-    )
+    add_recording_arguments(parser)
     parser.add_argument(
         '--truth', type=Path, required=True, metavar='TRUTH.csv',
         help='true boxes of some tracks, in the columns of boxes.csv',
@@ -266,20 +263,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '-o', '--output', type=Path, metavar='RULE.yaml', help='where the settings go'
     )
-    parser.add_argument('--points', metavar='TOPIC', help='point clouds (default: found by type)')
-    parser.add_argument('--boxes', metavar='TOPIC', help='boxes (default: found by type)')
     parser.add_argument(
         '--no-boxes', action='store_true', help='measure the rule alone, no errors of the input'
     )
-    parser.add_argument(
-        '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
-    )
-    add_convention_arguments(parser)
-    parser.add_argument('--config', type=Path, metavar='FILE', help='settings to begin with')
-    parser.add_argument(
-        '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
-        help='one setting; wins over --config',
-    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 from typing import cast, TypeVar
 
 from boxreg_ros.config import Config
 from boxreg_ros.pose_check import PoseCheck
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from boxreg_ros.tracker import Tracker
-from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
+from msg_adapters.convention import Convention
 import numpy as np
 
 _T = TypeVar('_T', bound=Sweep | BoxArray)
@@ -51,29 +50,3 @@ def covariances_to_write(refined: RefinedBoxes) -> Floats:
     """
     is_kept = np.array([status == KEPT for status in refined.status], dtype=bool)
     return np.where(is_kept[:, None, None], np.nan, refined.covariances)
-
-
-def add_convention_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how boxes are to be read; the node's parameters of these names."""
-    parser.add_argument(
-        '--pose-reference', metavar='POINT', default=STANDARD.pose_reference,
-        help=f'point of a box that its pose is at: {", ".join(REFERENCES)}, or X,Y,Z in parts of '
-        f'length, width and height (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--size-order', choices=SIZE_ORDERS, default=STANDARD.size_order,
-        help='what x, y and z of a size are (default: %(default)s, length, width, height)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--forward-axis', choices=FORWARD, default=STANDARD.forward_axis,
-        help='axis of a pose that points forward (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--associate', action='store_true',
-        help='give boxes ids by association, whatever ids they have',
-    )  # fmt: skip
-
-
-def convention_from(args: argparse.Namespace) -> Convention:
-    """Return what `add_convention_arguments` has read."""
-    return Convention(args.pose_reference, args.size_order, args.forward_axis, args.associate)

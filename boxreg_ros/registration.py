@@ -24,7 +24,6 @@ from torch.nn.functional import pad
 RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
-
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
 SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]

@@ -25,10 +25,11 @@ from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros import __version__
 from boxreg_ros.ahead import ahead
+from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
 from boxreg_ros.bridge import Bridge
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
-from boxreg_ros.intake import add_convention_arguments, convention_from, Intake
+from boxreg_ros.intake import Intake
 from boxreg_ros.labelled import (
     add_label_arguments,
     label_frame_of,
@@ -621,27 +622,13 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg relabel`."""
-    parser.add_argument(
-        'recordings', nargs='+', type=Path, metavar='RECORDING',
-        help='MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; several are merged by time',
-    )  # fmt: skip
+    add_recording_arguments(parser)
     parser.add_argument(
         '-o', '--out', type=Path, required=True, help='folder of results; appears whole or not'
     )
-    parser.add_argument('--points', metavar='TOPIC', help='point clouds (default: found by type)')
-    parser.add_argument('--boxes', metavar='TOPIC', help='boxes (default: found by type)')
     parser.add_argument(
         '--fixed-frame', metavar='FRAME',
         help='frame to refine in (default: the topmost the frame of the clouds moves in)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
-    )
-    add_convention_arguments(parser)
-    parser.add_argument('--config', type=Path, metavar='FILE', help='settings as YAML')
-    parser.add_argument(
-        '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
-        help='one setting, as in solver.rounds=2; wins over --config',
     )  # fmt: skip
     parser.add_argument(
         '--formats', default='csv,openlabel', metavar='NAME,...',
@@ -674,23 +661,6 @@ def _labels_argument(text: str) -> tuple[str, Path]:
     if not name or not colon or not path:
         raise argparse.ArgumentTypeError(f'expected FORMAT:PATH, got {text!r}')
     return name, Path(path)
-
-
-def setting(text: str) -> tuple[str, Any]:
-    """Return name and value of ``KEY=VALUE``, the value read as YAML."""
-    name, equals, value = text.partition('=')
-    if not name or not equals:
-        raise argparse.ArgumentTypeError(f'expected KEY=VALUE, got {text!r}')
-    try:
-        return name, yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise argparse.ArgumentTypeError(f'{name}: not a YAML value: {value!r}') from None
-
-
-def config_from(args: argparse.Namespace) -> Config:
-    """Return the settings of ``--config`` and ``--set``."""
-    config = Config() if args.config is None else Config.from_yaml(args.config)
-    return config.updated(dict(args.set))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -45,18 +45,17 @@ def whole_folder(out: Path) -> Iterator[Path]:
     out.parent.mkdir(parents=True, exist_ok=True)
     unique = f'.{out.name}.{uuid4().hex[:8]}'
     partial, earlier = out.with_name(f'{unique}.partial'), out.with_name(f'{unique}.earlier')
-    partial.mkdir()
     try:
+        partial.mkdir()
         yield partial
         if out.exists():
             os.replace(out, earlier)
         os.replace(partial, out)
-    except BaseException:
-        if earlier.exists():
+    finally:
+        if earlier.exists() and not out.exists():
             os.replace(earlier, out)
         shutil.rmtree(partial, ignore_errors=True)
-        raise
-    shutil.rmtree(earlier, ignore_errors=True)
+        shutil.rmtree(earlier, ignore_errors=True)
 
 
 def _is_empty(folder: Path) -> bool:
