@@ -46,9 +46,8 @@ class InputNoise(NamedTuple):
         bounded = scatter.clamp(-3 * deviation, 3 * deviation)
         both = valid[:, 1:] & valid[:, :-1]
         first, second = bounded[:, :-1][both], bounded[:, 1:][both]
-        power = (first.square() + second.square()).sum(0) / 2
-        correlation = (first * second).sum(0) / power.clamp(min=1e-12)
-        return cls(deviation, correlation.clamp(0.0, 0.9))
+        power = (first.square() + second.square()).sum(0).clamp(min=1e-12) / 2
+        return cls(deviation, ((first * second).sum(0) / power).clamp(0.0, 0.9))
 
 
 class Rule(NamedTuple):

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
 from boxreg_ros.objective import EXTENT, GAP, Problem, State
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -110,19 +111,19 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]
     inset = retreat(openness, depths)
     offset = (state.shared[:, None, GAP] + inset).to(points)[..., None] - half[..., FACE_AXIS, :]
-    # Masks cost five times as much as sums: what does not count is made to lie very far inside.
     local = in_box_axes(points, problem, state.pose)
-    beyond = local.abs().sub_(half).add_((~problem.mask[..., None, :]).to(points), alpha=FAR)
+    beyond = local.abs().sub_(half)
     x, y, z = beyond.unbind(-2)
     count = (x.maximum(y).maximum(z) < MARGIN).sum(-1)
+    # Masks cost five times as much as sums: what does not count is made to lie very far inside.
     aside = torch.stack([y.maximum(z), x.maximum(z), x.maximum(y)], -2).sub_(BESIDE)
     depth = points.new_empty(*count.shape, BOTTOM, points.shape[-2])
-    for k, sign in enumerate((-1.0, 1.0)):  # front left top, back right
-        far = aside[..., : 3 - k, :]
-        inside = (sign * local[..., : 3 - k, :]).sub_(offset[..., k:BOTTOM:2, :])
-        depth[..., k::2, :] = inside.maximum(far.maximum(-MARGIN - inside).mul_(FAR))
+    for k, part in enumerate((slice(3), slice(2))):  # front left top, back right
+        inside = (local if k else -local)[..., part, :] - offset[..., k:BOTTOM:2, :]
+        far = (-MARGIN - inside).maximum(aside[..., part, :]).mul_(FAR)
+        torch.maximum(inside, far, out=depth[..., k::2, :])
     most = min(depth.shape[-1], max(LEAST, int(outermost * depth.shape[-1]) + 1))
-    depth, index = depth.topk(most, largest=False)  # (B, N, 5, K)
+    depth, index = smallest(depth, most)  # (B, N, 5, K)
     wanted = (outermost * count).clamp(min=LEAST)[..., None, None]
     chosen = (depth <= MARGIN + INSIDE) & (torch.arange(most, device=depth.device) < wanted)
     number = chosen.sum(-1)
@@ -141,6 +142,15 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     found: Any = (torch.cat([five.to(road), one[:, :, None].to(road)], 2) for five, one in pairs)
     inset[..., BOTTOM] = 0.0
     return Support(*[*found, inset, count.to(road)])
+
+
+def smallest(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the `count` smallest of the last axis, ascending, and where they are."""
+    if not values.is_cpu:
+        return values.topk(count, largest=False)
+    place = torch.from_numpy(np.argpartition(values.numpy(), count - 1))  # topk takes three times
+    found, order = values.gather(-1, place[..., :count]).sort()
+    return found, place.gather(-1, order)
 
 
 def in_box_axes(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:

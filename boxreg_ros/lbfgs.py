@@ -143,8 +143,7 @@ def minimize(
 
 def _two_loop(gradient: Tensor, pairs: list[Pair], rows: Tensor, metric: Metric | None) -> Tensor:
     """Return the inverse Hessian approximated by `pairs`, times `gradient`."""
-    q = gradient
-    alphas = []
+    q, alphas = gradient, []
     for s, y, rho in reversed(pairs):
         alpha = rho * (s * q).sum(1)
         q = q - alpha[:, None] * y

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.geometry import rotation_from_rpy
@@ -16,8 +16,7 @@ EXTENT = slice(LENGTH, HEIGHT + 1)
 SHIFT = 1e-9  # [m], so much the second box is grown: no two faces are ever in one plane
 
 
-@dataclass(frozen=True, slots=True)
-class PoseErrors:
+class PoseErrors(NamedTuple):
     """
     Predicted minus true, one row per pair.
 
@@ -64,8 +63,7 @@ def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
         overlap[part] = _intersection(a[part], b[part])
     union = a[:, EXTENT].prod(axis=1) + b[:, EXTENT].prod(axis=1) - overlap
     valid = np.isfinite(overlap) & (overlap > 0)
-    iou: Floats = np.divide(overlap, union, out=np.zeros(len(a)), where=valid)
-    return iou.clip(0.0, 1.0)
+    return np.asarray(np.divide(overlap, union, out=np.zeros(len(a)), where=valid)).clip(0.0, 1.0)
 
 
 def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
@@ -91,8 +89,7 @@ def _rows(boxes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:
 
 def _rotation(boxes: Floats) -> Floats:
     """Return R (n, 3, 3), box axes as columns."""
-    R: Floats = rotation_from_rpy(torch.from_numpy(boxes[:, ROLL:])).numpy()
-    return R
+    return np.asarray(rotation_from_rpy(torch.from_numpy(boxes[:, ROLL:])))
 
 
 def _intersection(a: Floats, b: Floats) -> Floats:
@@ -129,5 +126,4 @@ def _intersection(a: Floats, b: Floats) -> Floats:
         end = np.where(slope >= 0, crossing, np.inf).min(axis=2)
         start = np.where(slope < 0, crossing, -np.inf).max(axis=2)
         length = np.where((end > start) & ~parallel, end - start, 0.0)
-    volume: Floats = (length * (2 * d_i * d_j - cosine * (d_i**2 + d_j**2)) / (6 * sine)).sum(1)
-    return volume
+    return np.asarray((length * (2 * d_i * d_j - cosine * (d_i**2 + d_j**2)) / (6 * sine)).sum(1))

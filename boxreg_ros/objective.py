@@ -44,7 +44,8 @@ class Problem(NamedTuple):
     times : Tensor, shape (B, N)
         Since the first observation, growing over the padding too [s].
     points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
-        Returns minus the centre of their input box [m]; True where real.
+        Returns minus the centre of their input box [m], very far away where not real; True where
+        real.
     delays : Tensor, shape (B, N, M)
         When each return was measured, relative to the stamp of its box [s].
     origins : Tensor, shape (B, N, 3)

@@ -7,7 +7,7 @@ Message definitions come from the recording, so nothing of ROS need be installed
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,6 +83,8 @@ class Recording:
     ----------
     has_boxes : bool
         Whether there have to be boxes; without them `boxes_topic` is ''.
+    unreadable, first_errors : Counter and dict
+        How many messages of each topic were passed over, and the error of the first.
 
     Raises
     ------
@@ -108,6 +110,8 @@ class Recording:
         self._asked = {'points': points, 'boxes': boxes, 'odometry': odometry}
         self._start, self._end = start or 0.0, end
         self.odometry_topic: str | None = None
+        self.unreadable: Counter[str] = Counter()
+        self.first_errors: dict[str, UnsupportedMessage] = {}
 
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
@@ -138,7 +142,8 @@ class Recording:
 
         """
         tree.rewind(0)  # motions that were read to choose a frame come again
-        data = self._connections({self.points_topic, self.boxes_topic})
+        self.unreadable.clear()
+        data = self._connections(self.data_topics)
         motion_topics = self._motion_topics()
         motion = self._connections(motion_topics)
         held: deque[Record] = deque()
@@ -167,6 +172,11 @@ class Recording:
         """
         return self._content(record.connection.topic, self._message(record))
 
+    def pass_over(self, record: Record, error: UnsupportedMessage) -> None:
+        """Note a record that cannot be read."""
+        self.unreadable[record.connection.topic] += 1
+        self.first_errors.setdefault(record.connection.topic, error)
+
     def intensities(self, record: Record) -> Floats | None:
         """Return the intensities of a sweep's points; None if the record has none."""
         return pointcloud.intensities(self._message(record))
@@ -190,6 +200,11 @@ class Recording:
     def typestore(self) -> Typestore:
         """Return the definitions of the messages in the recording."""
         return self._reader.typestore
+
+    @property
+    def data_topics(self) -> set[str]:
+        """Return the topics of clouds and boxes."""
+        return {self.points_topic, self.boxes_topic}
 
     @property
     def topics(self) -> dict[str, str]:
@@ -405,7 +420,10 @@ class Recording:
             raise UnsupportedMessage(f'topic {topic!r}: {_text(error)}') from None
 
     def _add_motion(self, tree: TransformTree, record: Record) -> None:
-        message = self._message(record)
+        try:
+            message = self._message(record)
+        except UnsupportedMessage as error:
+            return self.pass_over(record, error)
         if record.connection.msgtype == ODOMETRY_TYPE:
             tree.add_odometry(message)
         else:

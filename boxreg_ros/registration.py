@@ -102,11 +102,11 @@ def _register(windows: Sequence[Window], config: Config, model: InputModel) -> l
     for rows in groups:
         part = [windows[i] for i in rows]
         problem, base = stack(part, config)
-        if config.objective == 'paper':
-            solved = solve_paper(problem, config)
-        else:
-            rounds = 1 if part[0].is_warm else config.solver.rounds
-            solved = solve(problem, config, model, rounds)
+        rounds = 1 if part[0].is_warm else config.solver.rounds
+        is_paper = config.objective == 'paper'
+        solved = (
+            solve_paper(problem, config) if is_paper else solve(problem, config, model, rounds)
+        )
         if config.estimate != 'track':
             # The input scatters about what a window knows best, `lag` from its end.
             best = [max(0, len(window.observations) - 1 - config.lag) for window in part]
@@ -181,16 +181,15 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         part, here, expected = select(problem, rows), select(state, rows), everyone[rows]
         here.shared[:, objective.ANCHOR] = 0.0
         sights = support(part, here, config.faces.outermost, rule.depths)
-        terms = weigh(part, here, sights, expected, noise, config)
+        terms = [t for t in weigh(part, here, sights, expected, noise, config) if t.weight.any()]
         if turn > 0 and is_track:
             information, wanted = agreement(part, here)
             terms.append(Term(objective.shape, information[:, :, None], (here.pose, wanted)))
         x = here.pack()
         total = Sum(terms, x, length, free[rows])
         best = State.unpack(minimize(total, x, *limits, total.newton).x, length)
-        step = (
-            ((best.pose - here.pose) / part.of(*ERRORS)[:, None]).square().mean(2).amax(1).sqrt()
-        )
+        moved = (best.pose - here.pose) / part.of(*ERRORS)[:, None]
+        step = moved.square().mean(2).amax(1).sqrt()
         state.pose[rows], state.shared[rows] = best  # `here` may be a view of it
         is_done = (step <= SETTLED) & (turn > 0) | (turn + 1 == rounds)
         done, leaves = is_done.nonzero()[:, 0], is_done & part.valid.all(1)
@@ -392,7 +391,7 @@ def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     """Return how many points lie in boxes of `pose` (B, N, 6) and `extent` (B, N, 3), (B, N)."""
     local = in_box_axes(problem.points, problem, pose).abs_()
     x, y, z = local.sub_(extent[..., None].to(local) / 2).unbind(-2)
-    return ((x.maximum(y).maximum(z) < 0.05) & problem.mask).sum(-1)
+    return (x.maximum(y).maximum(z) < 0.05).sum(-1)
 
 
 def _kept(window: Window, reason: str) -> Estimate:

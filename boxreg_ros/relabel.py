@@ -232,7 +232,7 @@ def input_boxes(path: Path) -> list[BoxArray]:
     """
     Return the boxes of a recording as they are, in the fixed frame `relabel` would choose.
 
-    Box arrays without a transform to that frame are left out.
+    Box arrays without a transform to that frame are left out, and what cannot be read.
 
     """
     tree = TransformTree()
@@ -241,7 +241,7 @@ def input_boxes(path: Path) -> list[BoxArray]:
         arrays = []
         for record in recording.records(tree):
             if record.connection.topic == recording.boxes_topic:
-                with suppress(TransformUnavailable):
+                with suppress(TransformUnavailable, UnsupportedMessage):
                     arrays.append(to_fixed_frame(recording.decode(record), tree, fixed_frame))
     return [array for array in arrays if isinstance(array, BoxArray)]
 
@@ -356,8 +356,6 @@ class _Arrivals:
     ----------
     counts : Counter
         Sweeps and box arrays, and what was not used by reason.
-    unreadable : dict
-        Of each topic with messages that cannot be read, the first error.
     first_missing_transform : str
         What is not known of the first item without a transform; else empty.
 
@@ -375,7 +373,6 @@ class _Arrivals:
         self.seconds = (recording.end_ns - recording.start_ns) * 1e-9
         self.intake = Intake(request.convention, request.config)
         self.counts: Counter[str] = Counter()
-        self.unreadable: dict[str, UnsupportedMessage] = {}
         self.first_missing_transform = ''
 
     def __iter__(self) -> Iterator[_Arrival]:
@@ -395,8 +392,7 @@ class _Arrivals:
                 try:
                     given = self._recording.decode(record)
                 except UnsupportedMessage as error:
-                    self.counts['unreadable'] += 1
-                    self.unreadable.setdefault(topic, error)
+                    self._recording.pass_over(record, error)
                     continue
                 is_cloud = isinstance(given, Sweep)
                 is_written = is_cloud and self._with_points
@@ -413,8 +409,8 @@ class _Arrivals:
                     intensities,
                 )
             yield arrival
-        for topic, first in self.unreadable.items():
-            if topic not in read:
+        for topic, first in self._recording.first_errors.items():
+            if topic not in read and topic in self._recording.data_topics:
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
     def _moved(self, given: Sweep | BoxArray) -> Sweep | BoxArray | None:
@@ -564,7 +560,8 @@ def _summary(
         raise RuntimeError(f'{sink.missing()} of {sink.boxes_in} boxes did not come back')
     counts = arrivals.counts
     unused = {name: n for name, n in registered.items() if name.startswith(UNUSED)}
-    unused |= {name: counts[name] for name in ('unreadable', 'sweep_without_transform')}
+    unused['sweep_without_transform'] = counts['sweep_without_transform']
+    unused['unreadable'] = recording.unreadable.total()
     return {
         'recordings': [str(path) for path in request.recordings],
         'topics': {
@@ -584,7 +581,7 @@ def _summary(
         'heading_flips': sink.heading_flips,
         'dropped': {name: n for name, n in sorted(unused.items()) if n},
         'first_missing_transform': arrivals.first_missing_transform,
-        'first_unreadable': '; '.join(map(str, arrivals.unreadable.values())),
+        'first_unreadable': '; '.join(map(str, recording.first_errors.values())),
         'warning': arrivals.intake.finding,
         **arrivals.intake.facts,
         'left_out_of_labels': sink.left_out(),

@@ -74,7 +74,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     rows = _by_x(index.take(own), owner, x / np.abs(x).max(initial=1.0), n)
     kept = [_thinned(rows[part], sweep.points, config) for part in _parts(owner, n)]
     rows, owner = np.concatenate(kept), np.repeat(np.arange(n), [len(part) for part in kept])
-    near = (sweep.points.take(rows, 0) - centers.take(owner, 0)).astype(np.float32)
+    near = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
     times = sweep.times if config.sampling.deskew else None
     late = (np.zeros(len(rows)) if times is None else times[rows]).astype(np.float32)
     origin, ground, parts = sweep.origin - centers, (road - half[:, 2]).tolist(), _parts(owner, n)
@@ -93,8 +93,7 @@ def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Pairs:
     R, half = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix(), boxes[:, 3:6] / 2
     reach = (np.abs(R) @ (half + margin)[..., None])[..., 0]
     index, owner = _pairs(points, boxes[:, :2], reach[:, :2])
-    offset = points.take(index, 0).T.astype(np.float64, order='C')
-    offset -= boxes[:, :3].T.take(owner, 1)
+    offset = points.T.take(index, 1).astype(np.float64) - boxes[:, :3].T.take(owner, 1)
     outside = np.empty_like(offset)
     for axes, part in zip(R, _parts(owner, len(boxes)), strict=True):
         np.matmul(axes.T, offset[:, part], out=outside[:, part])

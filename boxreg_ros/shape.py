@@ -40,7 +40,7 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     B = len(problem.valid)
     local = in_box_axes(carried(problem, state), problem, state.pose).mT
     half = (state.shared[:, None, None, EXTENT] / 2).to(local)
-    near = ((local.abs() - half).amax(-1) < MARGIN) & problem.mask
+    near = (local.abs() - half).amax(-1) < MARGIN
     window, _, _ = near.nonzero(as_tuple=True)
     p = local[near]
     counts = torch.tensor(CELLS, device=p.device)

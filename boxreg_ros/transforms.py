@@ -304,10 +304,10 @@ def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     is_near = np.abs(T_frame_sweep[:3, 3]).max() < FLOAT32_RANGE
     kind = points.dtype if is_near else np.dtype(np.float64)
     R, t = T_frame_sweep[:3, :3], T_frame_sweep[:3, 3]
-    moved, (x, y, z) = np.empty(points.shape, kind), points.astype(kind, copy=False).T
+    moved, (x, y, z) = np.empty(points.T.shape, kind), points.astype(kind, copy=False).T
     for i, (a, b, c) in enumerate(R.astype(kind)):  # BLAS would start threads beside the solver's
-        moved[:, i] = a * x + b * y + c * z + t[i].astype(kind)
-    return replace(sweep, frame_id=frame_id, points=moved, origin=R @ sweep.origin + t)
+        moved[i] = a * x + b * y + c * z + t[i].astype(kind)
+    return replace(sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t)
 
 
 def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> BoxArray:

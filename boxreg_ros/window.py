@@ -16,6 +16,7 @@ import torch
 FADING = 0.97  # of what is remembered, from stamp to stamp: no model holds forever
 NOTHING = np.full(MEMORY, np.nan), np.zeros(MEMORY), np.zeros((MEMORY, MEMORY)), np.zeros(4)
 ANGLES = [3, 4, 5, 9, 10, 11]  # of the two poses that are remembered
+AWAY = 1e6  # where points are that are not real: near no box [m]
 BATCH_VALUES = 3e7  # most point coordinates, or entries of the curvature, solved at once
 
 
@@ -105,7 +106,7 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     mask = np.zeros((B, N, max(1, counts.max())), dtype=bool)
     mask[valid] = np.arange(mask.shape[2]) < counts[:, None]
     boxes, times, ground = np.zeros((B, N, 9)), np.zeros((B, N)), np.full((B, N), np.nan)
-    points, origins = np.zeros((*mask.shape, 3), dtype=np.float32), np.zeros((B, N, 3))
+    points, origins = np.full((*mask.shape, 3), AWAY, dtype=np.float32), np.zeros((B, N, 3))
     delays = np.zeros(mask.shape, dtype=np.float32)
     boxes[valid], origins[valid] = [o.box for o in every], [o.origin for o in every]
     ground[valid] = [o.ground for o in every]

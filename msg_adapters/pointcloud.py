@@ -56,18 +56,18 @@ def from_msg(msg: Any) -> Sweep:
     table = _table(msg, [fields[name] for name in (*'xyz', time_field) if name])
 
     wanted = np.result_type(np.float32, *(table.dtype[name] for name in 'xyz'))
-    points = np.empty((table.size, 3), wanted.newbyteorder('='))
-    for column, name in enumerate('xyz'):
-        points[:, column] = table[name].reshape(-1)
-    good = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
+    columns = np.empty((3, table.size), wanted.newbyteorder('='))  # what follows goes by columns
+    for column, name in zip(columns, 'xyz', strict=True):
+        column[:] = table[name].reshape(-1)
+    good = np.isfinite(columns).all(0)
     times = None
     if time_field is not None:
         raw = table[time_field].reshape(-1)
         good &= np.isfinite(raw)
         times = _seconds(raw if good.all() else raw[good], stamp)
     if not good.all():
-        points = points[good]
-    return Sweep(stamp, msg.header.frame_id, points, times)
+        columns = columns[:, good]
+    return Sweep(stamp, msg.header.frame_id, columns.T, times)
 
 
 def intensities(msg: Any) -> Floats | None:

@@ -7,7 +7,7 @@ from boxreg_ros.objective import MEMORY, Problem, SHARED
 from boxreg_ros.sampling import observe
 from boxreg_ros.structures import BoxArray, Sweep
 from boxreg_ros.tracks import Track
-from boxreg_ros.window import Window
+from boxreg_ros.window import AWAY, Window
 import numpy as np
 from scipy.spatial.transform import Rotation
 import torch
@@ -111,14 +111,14 @@ def problem_of(boxes, **changes):
     """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
     B, N = boxes.shape[:2]
-    points = torch.as_tensor(changes.get('points', np.zeros((B, N, 1, 3))))
+    points = torch.as_tensor(np.array(changes.pop('points', np.full((B, N, 1, 3), AWAY))))
     given = {
         'boxes': boxes,
         'start': boxes,
         'valid': torch.ones(B, N, dtype=torch.bool),
         'times': 0.1 * torch.arange(N, dtype=torch.float64).expand(B, N),
         'points': points,
-        'mask': torch.full(points.shape[:3], 'points' in changes),
+        'mask': points[..., 0] != AWAY,
         'delays': torch.zeros(points.shape[:3], dtype=torch.float64),
         'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
         'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
@@ -133,6 +133,7 @@ def problem_of(boxes, **changes):
         for name, value in changes.items()
     }
     problem = Problem(**{**given, **more})
+    problem.points[~problem.mask] = AWAY
     return problem if 'openness' in changes else problem._replace(openness=aspect(problem))
 
 

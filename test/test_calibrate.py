@@ -49,7 +49,9 @@ def test_the_rule_of_a_simulated_recording_is_found(scene, plain):
     for gap_name, gap in RULE.items():
         name = f'vehicle.{gap_name}'
         assert found[name].value - plain[name].value == pytest.approx(gap, abs=0.012), name
-        assert 10 <= found[name].tracks <= 19  # vehicles of 22 tracks: half at least tell each face
+        assert (
+            10 <= found[name].tracks <= 19
+        )  # vehicles of 22 tracks: half at least tell each face
         assert found[name].spread < 0.1
     # How round a body is does not change with how its box is drawn.
     for name in ('faces.depth_ends', 'faces.depth_sides'):

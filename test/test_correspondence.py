@@ -130,8 +130,8 @@ def test_order_and_padding_of_points_do_not_matter():
             problem_of(boxes, points=points, mask=mask, origins=[[[9.0, 9.0, 9.0]] * 2]),
             problem_of(
                 boxes,
-                points=np.where(mask[..., None], points, 0.0)[:, :, order],
-                mask=mask[:, :, order],
+                points=np.pad(points[:, :, order], [(0, 0), (0, 0), (0, 7), (0, 0)]),
+                mask=np.pad(mask[:, :, order], [(0, 0), (0, 0), (0, 7)]),
                 origins=[[[9.0, 9.0, 9.0]] * 2],
             ),
         )

@@ -283,11 +283,11 @@ def test_unreadable_messages_are_passed_over_and_counted(tmp_path):
     drive.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
     path = drive.write(tmp_path / 'whole')
     # A cloud of which nothing is left but its stamp, the first that tells the frame; one of which
-    # half is left; boxes that end amid the first.
-    sizes = {('/points', 0): 12, ('/points', 6): 1500, ('/boxes', 5): 60}
+    # half is left; boxes that end amid the first; a transform between two others.
+    sizes = {('/points', 0): 12, ('/points', 6): 1500, ('/boxes', 5): 60, ('/tf', 4): 30}
     path = truncated(path, tmp_path / 'drive', sizes)
     summary, rows = run(path, tmp_path / 'out', formats=('csv', 'mcap'))
-    dropped = {'boxes_without_sweep': 3, 'sweep_without_boxes': 1, 'unreadable': 4}
+    dropped = {'boxes_without_sweep': 3, 'sweep_without_boxes': 1, 'unreadable': 5}
     assert summary['dropped'] == dropped
     assert (summary['sweeps'], summary['box_arrays'], summary['boxes_in']) == (5, 7, 14)
     left = [stamp for k, stamp in enumerate(drive.stamps) if k != 5]
@@ -298,7 +298,8 @@ def test_unreadable_messages_are_passed_over_and_counted(tmp_path):
     assert summary['reasons'] == {'no_sweep': 6}
     assert "'/points' is not a sensor_msgs/msg/PointCloud2" in summary['first_unreadable']
     assert "'/boxes' is not a vision_msgs/msg/Detection3DArray" in summary['first_unreadable']
-    assert '4 messages could not be read' in closing_line(summary, tmp_path / 'out')
+    assert "'/tf' is not a tf2_msgs/msg/TFMessage" in summary['first_unreadable']
+    assert '5 messages could not be read' in closing_line(summary, tmp_path / 'out')
     # The overlay has them as they were; the refined topic has the others.
     with AnyReader([tmp_path / 'out' / 'overlay.mcap']) as reader:
         copied = Counter(c.topic for c, _, _ in reader.messages())
