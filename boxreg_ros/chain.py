@@ -8,6 +8,7 @@ is not zero looks like an arrow. All that is done here costs in proportion to th
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.linalg import cholesky_ex, solve_triangular
@@ -142,6 +143,12 @@ class Factor(NamedTuple):
             ahead[:, :NEXT, NEXT:] = across[:, :NEXT, NEXT:]
             ahead[:, NEXT:, :NEXT] = across[:, :NEXT, NEXT:].mT
         return torch.cat(found, 1)[:, :length]
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Return a @ b; on a CPU, many small ones take numpy a fifth of the time."""
+    is_numpys = torch.is_inference_mode_enabled() and a.is_cpu
+    return torch.from_numpy(np.matmul(a.numpy(), b.numpy())) if is_numpys else a @ b
 
 
 def cholesky(matrix: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+from boxreg_ros.chain import product
 from boxreg_ros.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
 from boxreg_ros.objective import EXTENT, GAP, Problem, State
 import numpy as np
@@ -112,8 +113,7 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     inset = retreat(openness, depths)
     offset = (state.shared[:, None, GAP] + inset).to(points)[..., None] - half[..., FACE_AXIS, :]
     local = in_box_axes(points, problem, state.pose)
-    beyond = local.abs().sub_(half)
-    x, y, z = beyond.unbind(-2)
+    x, y, z = local.abs().sub_(half).unbind(-2)
     count = (x.maximum(y).maximum(z) < MARGIN).sum(-1)
     # Masks cost five times as much as sums: what does not count is made to lie very far inside.
     aside = torch.stack([y.maximum(z), x.maximum(z), x.maximum(y)], -2).sub_(BESIDE)
@@ -129,7 +129,7 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     number = chosen.sum(-1)
     share = chosen / number.clamp(min=1)[..., None].to(points)
     best = pad(torch.take_along_dim(points[:, :, None], index[..., None], 3), (0, 1), value=1.0)
-    moments = (best * share[..., None]).mT @ best
+    moments = product((best * share[..., None]).mT, best)
     out = -(torch.where(chosen, depth, 0.0) * share).sum(-1)
     trust = (number >= LEAST) * torch.where(openness[..., :BOTTOM] > 0, 1.0, VEILED)
     # The bottom is where a point of the road is, under the centre of the box.

@@ -10,7 +10,7 @@ W, adding r' W r / 2; W holds the expected deviations and the robust weights of 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from boxreg_ros.chain import Chain, cholesky, Factor, LINK
+from boxreg_ros.chain import Chain, cholesky, Factor, LINK, product
 from boxreg_ros.config import PaperConfig
 from boxreg_ros.geometry import (
     FACE_AXIS,
@@ -291,21 +291,18 @@ def value_and_gradient(
     by_pose, by_shared = State.unpack(gradient, length)  # views
     for term in terms:
         r, J, S = term.linearise(state)
-        J, S = J.flatten(2, 3), S.flatten(-3, -2)
         pull = (term.weight @ r[..., None])[..., 0]
         value += 0.5 * (r * pull).flatten(1).sum(1)
         n, flat = r.shape[1], pull.flatten(2)[:, :, None]
-        moved = (flat @ J)[:, :, 0].unflatten(2, (-1, 6))
+        moved = product(flat, J.flatten(2, 3))[:, :, 0].unflatten(2, (-1, 6))
         for k in range(moved.shape[2]):
             by_pose[:, k : k + n] += moved[:, :, k]
-        by_shared[:, : S.shape[-1]] += (flat @ S).sum((1, 2))
+        by_shared[:, : S.shape[-1]] += (flat @ S.flatten(-3, -2)).sum((1, 2))
         if curvature is not None:
-            W = term.weight[:, :, 0]
-            if term.weight.shape[2] > 1:  # one product of full size beats F small ones
-                W = torch.diag_embed(term.weight.permute(0, 1, 3, 4, 2), dim1=2, dim2=4)
-                W = W.flatten(4, 5).flatten(2, 3)
-            WJ, corner = W @ J, S.mT @ (W if S.dim() > 2 else W.sum(1, keepdim=True)) @ S
-            curvature.add(J.mT @ WJ, WJ.mT @ S, corner.sum(1))
+            W = term.weight if S.dim() > 3 else term.weight.sum(1, keepdim=True)
+            corner = product(S.mT, product(W, S)).sum((1, 2))
+            J, WJ = J.flatten(2, 3), product(term.weight, J).flatten(2, 3)
+            curvature.add(product(J.mT, WJ), product(WJ.mT, S.flatten(-3, -2)), corner)
     return value, gradient
 
 

@@ -188,10 +188,9 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         x = here.pack()
         total = Sum(terms, x, length, free[rows])
         best = State.unpack(minimize(total, x, *limits, total.newton).x, length)
-        moved = (best.pose - here.pose) / part.of(*ERRORS)[:, None]
-        step = moved.square().mean(2).amax(1).sqrt()
+        moved = ((best.pose - here.pose) / part.of(*ERRORS)[:, None]).square().mean(2).amax(1)
         state.pose[rows], state.shared[rows] = best  # `here` may be a view of it
-        is_done = (step <= SETTLED) & (turn > 0) | (turn + 1 == rounds)
+        is_done = (moved <= SETTLED**2) & (turn > 0) | (turn + 1 == rounds)
         done, leaves = is_done.nonzero()[:, 0], is_done & part.valid.all(1)
         covariances[rows[done]] = select(total.factor, done).inverse_of_links(length)
         if not is_track and length == config.window:
@@ -398,5 +397,4 @@ def _kept(window: Window, reason: str) -> Estimate:
     """Return the input boxes of a window."""
     n = len(window.observations)
     boxes = np.array([o.box for o in window.observations]).reshape(n, 9)
-    unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
-    return Estimate(boxes, (KEPT,) * n, (reason,) * n, unknown)
+    return Estimate(boxes, (KEPT,) * n, (reason,) * n, np.broadcast_to(np.eye(6), (n, 6, 6)))

@@ -37,12 +37,12 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     planes are linear in a small step of the pose: their sums of squares are all that is kept.
 
     """
-    B = len(problem.valid)
+    B, N, M = problem.mask.shape
     local = in_box_axes(carried(problem, state), problem, state.pose).mT
     half = (state.shared[:, None, None, EXTENT] / 2).to(local)
     near = (local.abs() - half).amax(-1) < MARGIN
-    window, _, _ = near.nonzero(as_tuple=True)
-    p = local[near]
+    rows = near.flatten().nonzero()[:, 0]
+    window, p = rows // (N * M), local.flatten(0, 2)[rows]
     counts = torch.tensor(CELLS, device=p.device)
     place = ((p / half[window, 0, 0] + 1) / 2 * counts).long().clamp(counts * 0, counts - 1)
     cell = (place * place.new_tensor([CELLS[1] * CELLS[2], CELLS[2], 1])).sum(1)
@@ -59,10 +59,10 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     normal, thickness = axes[cell, :, 0], thickness[cell]
     off = (normal * (p - mean[cell])).sum(1)
     weight = torch.where(is_surface[cell], 1 / (thickness + off**2), 0.0)[:, None]
-    lever = p.new_zeros(*near.shape, 7)  # of all points of an observation, and how far off it is
+    lever = p.new_zeros(B * N * M, 7)  # of all points of an observation, and how far off it is
     found = torch.cat([normal, torch.linalg.cross(p, normal), off[:, None]], 1)
-    lever[near] = found * weight.sqrt()
-    seen = (lever[..., :3] != 0).any(-1).sum(-1)
+    lever[rows], lever = found * weight.sqrt(), lever.view(B, N, M, 7)
+    seen = torch.bincount(rows // M, weight[:, 0] > 0, B * N).view(B, N)
     total = (lever.mT @ lever * (SAY / seen.clamp(min=SAY))[..., None, None]).to(state.pose)
     information, pull = total[..., :6, :6], total[..., :6, 6]
     return information, torch.linalg.solve(information + 1e-3 * torch.eye(6).to(pull), pull)

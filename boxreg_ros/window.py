@@ -17,6 +17,7 @@ FADING = 0.97  # of what is remembered, from stamp to stamp: no model holds fore
 NOTHING = np.full(MEMORY, np.nan), np.zeros(MEMORY), np.zeros((MEMORY, MEMORY)), np.zeros(4)
 ANGLES = [3, 4, 5, 9, 10, 11]  # of the two poses that are remembered
 AWAY = 1e6  # where points are that are not real: near no box [m]
+TELLING = 30  # observations of a track tell as much of its labels as many more
 BATCH_VALUES = 3e7  # most point coordinates, or entries of the curvature, solved at once
 
 
@@ -77,9 +78,9 @@ class Window(NamedTuple):
         return self.fresh == 1 and len(self.start) == len(self.observations) - 1 > 1
 
     def fresh_part(self) -> 'Window':
-        """Return the window of the fresh observations alone."""
-        observations, start = self.observations[-self.fresh :], np.zeros((0, 9))
-        return self._replace(observations=observations, start=start, memory=None)
+        """Return the window of the fresh observations alone, of very many an even part."""
+        observations = self.observations[-self.fresh :: 1 + self.fresh // TELLING]
+        return self._replace(observations=observations, start=np.zeros((0, 9)), memory=None)
 
 
 def batches(windows: Sequence[Window], config: Config) -> list[list[int]]:
