@@ -46,6 +46,8 @@ POLL = 0.02
 """The worker looks this often whether an arrival has waited long enough [s]."""
 GRAPH_PERIOD = 0.2
 STATUS_PERIOD = 1.0
+BOXES_BACKLOG = 1.0
+"""Boxes that wait longer pass through as they are: even making messages takes too long [s]."""
 LAST_WORK, LAST_ACKNOWLEDGEMENT = 0.5, 0.4
 """So long may, on shutdown, the worker go on, and subscribers take what it published [s]."""
 
@@ -280,11 +282,12 @@ class BoxregNode(Node):
         self._finish_work(item)
 
     def _take(self) -> Message | None:
-        """Return what has waited longest, but for clouds that have waited for the solver."""
+        """Return what has waited longest, but for what has waited for the solver too long."""
         message = self._inbox.take()
-        if message is None or message.topic != 'points':
-            return message
-        if time.monotonic() <= max(message.received, self._idle_at) + self._backlog:
+        if message is None:
+            return None
+        patience = self._backlog if message.topic == 'points' else BOXES_BACKLOG
+        if time.monotonic() <= max(message.received, self._idle_at) + patience:
             return message
         self._drop(message)
         return None

@@ -19,10 +19,11 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 def main(args: Sequence[str] | None = None) -> int:
     """
-    Run the node until SIGINT or SIGTERM and return the exit status.
+    Run the node until SIGINT or SIGTERM, then end the process.
 
-    0 ended by a signal, 1 it failed, 2 an argument or a parameter is wrong; failures are told
-    in one line on stderr.
+    Its exit status is 0 when ended by a signal, 1 if the node failed while it ran. What is
+    returned is that of a node that could not begin: 1, or 2 if an argument or a parameter is
+    wrong. Failures are told in one line on stderr.
 
     """
     for number in SIGNALS:
@@ -74,13 +75,15 @@ def main(args: Sequence[str] | None = None) -> int:
         thread.join(max(0.0, end - time.monotonic()))
     status = _fail(failures[0], 1) if failures else 0
     if any(thread.is_alive() for thread in threads):
-        # Torch cannot be interrupted, and python would not wait for it quietly.
         node.get_logger().warning('ended while the solver was busy: the last boxes are missing')
-        sys.stderr.flush()
-        os._exit(status)
-    node.destroy_node()
-    rclpy.try_shutdown()
-    return status
+    else:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    # Torch cannot be interrupted, and python would free what still waits, millions of objects, one
+    # by one: seconds.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def _fail(error: Exception, status: int) -> int:
