@@ -46,8 +46,8 @@ POLL = 0.02
 """The worker looks this often whether an arrival has waited long enough [s]."""
 GRAPH_PERIOD = 0.2
 STATUS_PERIOD = 1.0
-BOXES_BACKLOG = 1.0
-"""Boxes that wait longer pass through as they are: even making messages takes too long [s]."""
+BOXES_PATIENCE = 10.0
+"""Boxes that wait this many times as long as clouds may pass through, not even decoded."""
 LAST_WORK, LAST_ACKNOWLEDGEMENT = 0.5, 0.4
 """So long may, on shutdown, the worker go on, and subscribers take what it published [s]."""
 
@@ -286,7 +286,7 @@ class BoxregNode(Node):
         message = self._inbox.take()
         if message is None:
             return None
-        patience = self._backlog if message.topic == 'points' else BOXES_BACKLOG
+        patience = self._backlog * (1.0 if message.topic == 'points' else BOXES_PATIENCE)
         if time.monotonic() <= max(message.received, self._idle_at) + patience:
             return message
         self._drop(message)

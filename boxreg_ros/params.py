@@ -51,7 +51,7 @@ NODE_SETTINGS = (
         's', 0.0, 60.0, (),
     ),
     Setting(
-        'backlog', 0.1, 'a cloud that has waited longer for the solver is dropped',
+        'backlog', 0.1, 'clouds that wait longer are dropped, boxes pass after ten times that',
         's', 0.0, 3600.0, (),
     ),
     Setting(
