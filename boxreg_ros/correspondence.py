@@ -145,12 +145,22 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
 
 
 def smallest(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the `count` smallest of the last axis, ascending, and where they are."""
+    """
+    Return the `count` smallest of the last axis, ascending but for rounding, and their places.
+
+    The last bits of a value make room for its place: numpy parts numbers four times as fast as
+    torch tells which are smallest.
+
+    """
     if not values.is_cpu:
         return values.topk(count, largest=False)
-    place = torch.from_numpy(np.argpartition(values.numpy(), count - 1))  # topk takes three times
-    found, order = values.gather(-1, place[..., :count]).sort()
-    return found, place.gather(-1, order)
+    size, low = values.shape[-1], (1 << (values.shape[-1] - 1).bit_length()) - 1
+    keys = values.float().view(torch.int32) & ~low
+    keys |= torch.arange(size, dtype=torch.int32)
+    keys.numpy().view(np.float32).partition(count - 1)
+    first = np.sort(keys.numpy().view(np.float32)[..., :count]).view(np.int32) & low
+    places = torch.from_numpy(first).long()
+    return values.gather(-1, places), places
 
 
 def in_box_axes(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:

@@ -180,11 +180,7 @@ def alignment(boxes: Tensor, valid: Tensor, rounding: float = EPSILON) -> Tensor
 
 
 def total(
-    boxes: Tensor,
-    problem: Problem,
-    weights: PaperConfig,
-    multipliers: Tensor,
-    rounding: float = EPSILON,
+    boxes: Tensor, problem: Problem, weights: PaperConfig, multipliers: Tensor, rounding: float
 ) -> tuple[Tensor, Tensor]:
     """
     Return the objective (B,) [Eq. 8] and the violation (B, 2) of its two constraints.

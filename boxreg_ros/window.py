@@ -113,9 +113,9 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     ground[valid] = [o.ground for o in every]
     begin = np.repeat([w.observations[0].stamp_ns for w in windows], lengths)
     times[valid] = (np.array([o.stamp_ns for o in every]) - begin) * 1e-9
-    place = np.flatnonzero(mask)
-    points.reshape(-1, 3)[place] = np.concatenate([o.points for o in every])
-    delays.reshape(-1)[place] = np.concatenate([o.delays for o in every])
+    for (b, n), o in zip(np.argwhere(valid).tolist(), every, strict=True):
+        points[b, n, : len(o.points)] = o.points
+    delays[mask] = np.concatenate([o.delays for o in every])
     row, step, last = np.arange(B)[:, None], np.arange(N), lengths[:, None] - 1
     boxes, times = (part[row, np.minimum(step, last)] for part in (boxes, times))
     times += 0.1 * np.maximum(step - last, 0)

@@ -4,7 +4,7 @@ from boxreg_ros import objective
 from boxreg_ros.chain import Chain
 from boxreg_ros.config import PaperConfig
 from boxreg_ros.geometry import face_distances, rotation_from_rpy
-from boxreg_ros.objective import MEMORY, SHARED, State, Term
+from boxreg_ros.objective import EPSILON, MEMORY, SHARED, State, Term
 import numpy as np
 import pytest
 from scenes import dense, problem_of, shared_of
@@ -194,7 +194,7 @@ PAPER = {
     'enclosure': lambda b, p: objective.enclosure(b, p.points, p.mask),
     'smoothness': lambda b, p: objective.smoothness(b, p.valid),
     'alignment': lambda b, p: objective.alignment(b, p.valid),
-    'total': lambda b, p: objective.total(b, p, PaperConfig(nearest=5), MULTIPLIERS)[0],
+    'total': lambda b, p: objective.total(b, p, PaperConfig(nearest=5), MULTIPLIERS, EPSILON)[0],
 }
 MULTIPLIERS = tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
 each_term = pytest.mark.parametrize('term', PAPER.values(), ids=PAPER)
@@ -269,7 +269,7 @@ def test_total_is_the_weighted_sum_with_multipliers():
     weights = PaperConfig(closeness=2.0, enclosure=3.0, smoothness=0.5, alignment=0.7, nearest=5)
     boxes = problem.boxes + 0.1
     points = problem.points + problem.boxes[..., None, :3]
-    loss, violation = objective.total(boxes, problem, weights, MULTIPLIERS)
+    loss, violation = objective.total(boxes, problem, weights, MULTIPLIERS, EPSILON)
     c = [objective.smoothness(boxes, problem.valid), objective.alignment(boxes, problem.valid)]
     known = 2 * objective.closeness(boxes, points, problem.mask, 5)
     known += 3 * objective.enclosure(boxes, points, problem.mask)
