@@ -157,9 +157,8 @@ def smallest(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
     size, low = values.shape[-1], (1 << (values.shape[-1] - 1).bit_length()) - 1
     keys = values.float().view(torch.int32) & ~low
     keys |= torch.arange(size, dtype=torch.int32)
-    keys.numpy().view(np.float32).partition(count - 1)
-    first = np.sort(keys.numpy().view(np.float32)[..., :count]).view(np.int32) & low
-    places = torch.from_numpy(first).long()
+    (numbers := keys.numpy().view(np.float32)).partition(count - 1)
+    places = torch.from_numpy(np.sort(numbers[..., :count]).view(np.int32) & low).long()
     return values.gather(-1, places), places
 
 

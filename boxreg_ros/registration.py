@@ -27,7 +27,7 @@ INFLATION = 1.5  # of the deviation of an input whose error is correlated over t
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
 SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
-PART = 2**18  # points that a thread works on at once: what its cache holds
+PART = 1000  # observations that a thread works on at once: what its cache holds
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 
@@ -201,9 +201,10 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     workers = solver.threads or cpu_count()
     with ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool:
         rows = torch.arange(len(state.pose), device=free.device)
-        size = (PART if rows.is_cpu else 2**62) / problem.mask[0].numel()
+        size = (PART if rows.is_cpu else 2**62) / length
         for turn in range(rounds):
-            parts = rows.tensor_split(min(len(rows), 1 + int(len(rows) / size)))
+            count = workers * int(1 + len(rows) / size / workers) if len(rows) > size else 1
+            parts = rows.tensor_split(min(len(rows), count))
             run = pool.map if len(parts) > 1 else map
             rows = torch.cat(list(run(partial(improve, turn=turn, noise=noise), parts)))
             if is_track:
