@@ -111,7 +111,7 @@ def problem_of(boxes, **changes):
     """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
     B, N = boxes.shape[:2]
-    points = torch.as_tensor(np.array(changes.pop('points', np.full((B, N, 1, 3), AWAY))))
+    points = torch.as_tensor(changes.pop('points', np.full((B, N, 1, 3), AWAY))).clone()
     given = {
         'boxes': boxes,
         'start': boxes,
