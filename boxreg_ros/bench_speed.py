@@ -471,6 +471,8 @@ def _plot(table: dict[str, list[tuple[int, float]]], config: Config, path: Path)
         panel.set_xlabel(
             {'length': 'boxes per window', 'points': 'points per box'}.get(name, name)
         )
+        panel.set_xticks(x, [f'{value:g}' for value in x])
+        panel.set_xticks([], minor=True)
         panel.grid(which='both', alpha=0.3)
     panels[0].legend()
     panels[0].set_ylabel('ms per window')

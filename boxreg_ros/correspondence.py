@@ -146,10 +146,10 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
 
 def smallest(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """
-    Return the `count` smallest of the last axis, ascending but for rounding, and their places.
+    Return the `count` smallest of `values` (..., M), ascending but for rounding, and their places.
 
-    The last bits of a value make room for its place: numpy parts numbers four times as fast as
-    torch tells which are smallest.
+    Both are (..., count). The last bits of a value make room for its place: numpy parts numbers
+    four times as fast as torch tells which are smallest.
 
     """
     if not values.is_cpu:

@@ -61,7 +61,7 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     weight = torch.where(is_surface[cell], 1 / (thickness + off**2), 0.0)[:, None]
     lever = p.new_zeros(B * N * M, 7)  # of all points of an observation, and how far off it is
     found = torch.cat([normal, torch.linalg.cross(p, normal), off[:, None]], 1)
-    lever[rows], lever = found * weight.sqrt(), lever.view(B, N, M, 7)
+    lever = lever.index_copy_(0, rows, found * weight.sqrt()).view(B, N, M, 7)
     seen = torch.bincount(rows // M, weight[:, 0] > 0, B * N).view(B, N)
     total = (lever.mT @ lever * (SAY / seen.clamp(min=SAY))[..., None, None]).to(state.pose)
     information, pull = total[..., :6, :6], total[..., :6, 6]

@@ -181,6 +181,29 @@ def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path)
     assert np.abs(refined - [vision.from_msg(message).boxes for message in given]).max() > 1e-4
 
 
+def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
+    # Ten times the backlog is 0.05 s, which a single window of this solver exceeds.
+    drive = Drive(sweeps=30)
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    deep = [f'qos_overrides./{name}.subscription.depth:=100' for name in ('points', 'boxes')]
+    slow = ['solver.rounds:=40', 'solver.iterations:=400', 'solver.tolerance:=0.0']
+    options = [part for text in (*deep, *slow, 'backlog:=0.005') for part in ('-p', text)]
+    node = graph.start(*RELIABLE, *options)
+    graph.wait_until_connected()
+    play(graph, records)
+    graph.wait(lambda: len(early) == 30, 'early boxes')
+    graph.wait(lambda: int(values_of(diagnostics).get('early_published', 0)) == 30, 'counters')
+    passed = int(values_of(diagnostics)['boxes_queue_full'])
+    assert 0 < passed < 30
+    assert 'boxes_queue_full' in node.output()
+    assert ended_cleanly(node)
+    assert sorted(map(stamp_of, early)) == sorted(map(stamp_of, final)) == drive.stamps
+
+
 def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
     drive = Drive(sweeps=30)
     records = records_of(drive.write(tmp_path / 'drive'))
