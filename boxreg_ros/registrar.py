@@ -88,15 +88,25 @@ class BoxRegistrar:
                 paired = [t for t in self._ticks if t.is_paired]
                 for old in paired[: max(0, len(paired) - self.config.lag)]:
                     old.waiting = 0
-            elif self._count % (self.config.track_window // 2) == 0:
+            elif self._is_time_for_tracks():
                 self._solve_tracks()
             ready += self._settled()
         return ready
 
+    def _is_time_for_tracks(self) -> bool:
+        """Tell whether, half a window after the last time, a track may have filled its window."""
+        window = self.config.track_window
+        return self._count >= window // 2 and len(self._ticks) >= window - window // 8
+
     def _solve_tracks(self) -> None:
-        """Solve, all at once, the tracks that have ended and those whose window is full."""
-        full = self.config.track_window // 2
-        self._solve(self._ended + [t for t in self._tracks.values() if len(t.entries) > full])
+        """
+        Solve, all at once, the tracks that have ended and those whose window is half full.
+
+        The more at once, the better they tell the errors of the input.
+
+        """
+        half, self._count = self.config.track_window // 2, 0
+        self._solve(self._ended + [t for t in self._tracks.values() if len(t.entries) > half])
         for track in self._ended:
             track.settle(len(track.entries))
         self._ended.clear()
