@@ -138,7 +138,7 @@ class Config:
         'track', "'track' estimates one, 'fixed' keeps the input's", choices=('track', 'fixed')
     )
     window: int = setting(10, 'observations per sliding window', '', 3, 1000)
-    lag: int = setting(5, 'observations a final box waits for', '', 0, 999)
+    lag: int = setting(9, 'observations a final box waits for, within its window', '', 0, 999)
     track_window: int = setting(130, "observations solved at once for 'track'", '', 10, 10000)
     min_observations: int = setting(3, 'shorter windows keep their input', '', 2, 1000)
     max_gap: float = setting(1.0, 'a longer silence ends a track', 's', 0.01, 1e4)
@@ -164,13 +164,9 @@ class Config:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        """Check every value against its bounds, and those that depend on each other."""
+        """Check every value against its bounds."""
         for item, value in self.items():
             _check(item, value)
-        if self.lag >= self.window:
-            raise ConfigError(
-                f'lag: expected less than window ({self.window}), got {self.lag}; lower the lag'
-            )
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
         """Yield every setting with its present value, groups flattened to dotted names."""

@@ -21,7 +21,7 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Schema
-from rosbags.highlevel import AnyReader
+from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -52,20 +52,24 @@ class Reader:
     ----------
     paths : sequence of Path
         Recordings; MCAP files with other encodings than ROS's are told by looking into them.
-    default_typestore : Typestore
-        Definitions for recordings that bring none.
+    default_typestore : callable
+        Returns definitions for recordings that bring none; few do, and loading them takes a
+        tenth of a second.
 
     """
 
-    def __init__(self, paths: Sequence[Path], default_typestore: Typestore) -> None:
+    def __init__(self, paths: Sequence[Path], default_typestore: Callable[[], Typestore]) -> None:
         foreign = [path for path in paths if _is_foreign(path)]
         ros = [path for path in paths if path not in foreign]
         with ExitStack() as stack:
             self._foreign = [stack.enter_context(closing(_Foreign(path))) for path in foreign]
             self._ros = None
             if ros:
-                reader = AnyReader(ros, default_typestore=default_typestore)
-                self._ros = stack.enter_context(reader)
+                try:
+                    self._ros = stack.enter_context(AnyReader(ros))
+                except AnyReaderError:  # whatever else is wrong comes again
+                    reader = AnyReader(ros, default_typestore=default_typestore())
+                    self._ros = stack.enter_context(reader)
             self.is2 = self._ros is None or self._ros.is2
             self.typestore = self._ros.typestore if self._ros else get_typestore(Stores.EMPTY)
             for each in self._foreign:

@@ -88,6 +88,11 @@ class Problem(NamedTuple):
         """Return deviations by name, (B, n)."""
         return torch.stack([self.deviations[name] for name in names], -1)
 
+    def thinned(self, step: int) -> 'Problem':
+        """Return the same with every `step`-th point."""
+        names = 'points', 'mask', 'delays'
+        return self._replace(**{name: getattr(self, name)[:, :, ::step] for name in names})
+
 
 # --- the paper ----------------------------------------------------------------------------------
 
@@ -453,7 +458,7 @@ def slip(state: State, times: Tensor) -> Linearised:
     before, after = tilt + across @ swing[:, :-1], tilt - across @ swing[:, 1:]
     by_pose = torch.cat([-across, before, across, after], -1)[:, :, None]
     turned = -(across @ heading.diff(dim=1)[..., None]).mT
-    by_shared = pad(turned[..., None], (PIVOT, SHARED - PIVOT - 1))
+    by_shared = pad(turned[..., None], (PIVOT, 0))
     return Linearised(residual, by_pose, by_shared)
 
 

@@ -117,7 +117,7 @@ class Recording:
         """Open all files and find the topics."""
         with _readable(self):
             self.files = _files(self._paths)
-            self._reader = Reader(self.files, stock_types())
+            self._reader = Reader(self.files, stock_types)
         try:
             self._find()
         except BaseException:

@@ -78,25 +78,20 @@ class BoxRegistrar:
         return ready + self._settled()
 
     def _advance(self, pairs: list[Pair]) -> list[RefinedBoxes]:
-        ready = []
+        ready, full = [], self.config.track_window
         for pair in pairs:
             tick = self._open(pair)
             self._count += 1
             if self.config.estimate != 'track':
                 self._solve([t for t in self._tracks.values() if t.entries[-1].tick is tick])
                 ready.append(tick.result(is_final=False))
-                paired = [t for t in self._ticks if t.is_paired]
-                for old in paired[: max(0, len(paired) - self.config.lag)]:
+                lag = min(self.config.lag, self.config.window - 1)
+                for old in [t for t in self._ticks if t.is_paired][::-1][lag:]:
                     old.waiting = 0
-            elif self._is_time_for_tracks():
-                self._solve_tracks()
+            elif self._count >= full // 2 and len(self._ticks) >= full - full // 8:
+                self._solve_tracks()  # a track may have filled its window
             ready += self._settled()
         return ready
-
-    def _is_time_for_tracks(self) -> bool:
-        """Tell whether, half a window after the last time, a track may have filled its window."""
-        window = self.config.track_window
-        return self._count >= window // 2 and len(self._ticks) >= window - window // 8
 
     def _solve_tracks(self) -> None:
         """

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from multiprocessing import cpu_count
 from typing import NamedTuple
 
@@ -28,6 +27,7 @@ GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
 SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 1000  # observations that a thread works on at once: what its cache holds
+COARSE = 256  # points of a box that tell where it is but for the last round
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 
@@ -102,11 +102,10 @@ def _register(windows: Sequence[Window], config: Config, model: InputModel) -> l
     for rows in groups:
         part = [windows[i] for i in rows]
         problem, base = stack(part, config)
-        rounds = 1 if part[0].is_warm else config.solver.rounds
-        is_paper = config.objective == 'paper'
-        solved = (
-            solve_paper(problem, config) if is_paper else solve(problem, config, model, rounds)
-        )
+        if config.objective == 'paper':
+            solved = solve_paper(problem, config)
+        else:
+            solved = solve(problem, config, model, 1 if part[0].is_warm else config.solver.rounds)
         if config.estimate != 'track':
             # The input scatters about what a window knows best, `lag` from its end.
             best = [max(0, len(window.observations) - 1 - config.lag) for window in part]
@@ -166,7 +165,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     length, solver = problem.boxes.shape[1], config.solver
     limits = solver.iterations, solver.history, solver.tolerance
     is_track = config.estimate == 'track'
-    rule, noise = model.rule(), model.noise()
+    rule, noise, turn = model.rule(), model.noise(), 0
+    step = max(1, problem.points.shape[2] // COARSE if rounds > 1 else 1)
     everyone = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), everyone.clone())
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
@@ -176,9 +176,10 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     free = free_variables(problem, config)
 
     @torch.inference_mode()
-    def improve(rows: Tensor, turn: int, noise: InputNoise | None) -> Tensor:
-        """Take one round with some windows; return those that need another."""
-        part, here, expected = select(problem, rows), select(state, rows), everyone[rows]
+    def improve(rows: Tensor) -> Tensor:
+        """Take round `turn` with some windows, every `step`-th point; return those not done."""
+        part, here = select(problem, rows).thinned(step), select(state, rows)
+        expected = everyone[rows]
         here.shared[:, objective.ANCHOR] = 0.0
         sights = support(part, here, config.faces.outermost, rule.depths)
         terms = [t for t in weigh(part, here, sights, expected, noise, config) if t.weight.any()]
@@ -190,7 +191,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         best = State.unpack(minimize(total, x, *limits, total.newton).x, length)
         moved = ((best.pose - here.pose) / part.of(*ERRORS)[:, None]).square().mean(2).amax(1)
         state.pose[rows], state.shared[rows] = best  # `here` may be a view of it
-        is_done = (moved <= SETTLED**2) & (turn > 0) | (turn + 1 == rounds)
+        is_done = (moved <= SETTLED**2) & (turn > 0) | (turn + 1 >= rounds)
         done, leaves = is_done.nonzero()[:, 0], is_done & part.valid.all(1)
         covariances[rows[done]] = select(total.factor, done).inverse_of_links(length)
         if not is_track and length == config.window:
@@ -200,17 +201,17 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
 
     workers = solver.threads or cpu_count()
     with ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool:
-        rows = torch.arange(len(state.pose), device=free.device)
+        rows = every = torch.arange(len(state.pose), device=free.device)
         size = (PART if rows.is_cpu else 2**62) / length
-        for turn in range(rounds):
+        while len(rows):
             count = workers * int(1 + len(rows) / size / workers) if len(rows) > size else 1
             parts = rows.tensor_split(min(len(rows), count))
             run = pool.map if len(parts) > 1 else map
-            rows = torch.cat(list(run(partial(improve, turn=turn, noise=noise), parts)))
+            rows, turn = torch.cat(list(run(improve, parts))), turn + 1
             if is_track:
                 noise = InputNoise.measure(scatter(problem, state), problem.valid)
-            if not len(rows):
-                break
+            if not len(rows) and step > 1:
+                rows, step = every, 1  # where few points lead to, all of them tell
     return Solution(state, covariances, left)
 
 

@@ -331,7 +331,8 @@ class _Arrival(NamedTuple):
         In its own and in the fixed frame: `given` is None for a cloud that is not written,
         `moved` where nothing connects the frames.
     T_fixed_given, T_fixed_sensor : array, shape (4, 4), or None
-        Poses of its own frame, and of that which stands for the sensor's in label files.
+        Poses of its own frame, and of that which stands for the sensor's in label files; None
+        where unknown, and for a cloud that is not written.
     intensities : array, shape (M,), or None
         Those of a cloud, if they are written.
 
@@ -399,13 +400,14 @@ class _Arrivals:
                 intensities = self._recording.intensities(record) if is_written else None
             read.add(topic)
             self.counts['sweeps' if is_cloud else 'box_arrays'] += 1
+            is_kept = is_written or not is_cloud
             with self._clock('transform'):
                 arrival = _Arrival(
                     (record.received_ns - self._recording.start_ns) * 1e-9,
-                    given if is_written or not is_cloud else None,
+                    given if is_kept else None,
                     self._moved(given),
-                    self._pose_of(given.frame_id, given.stamp_ns),
-                    self._pose_of(self.sensor_frame, given.stamp_ns),
+                    self._pose_of(given.frame_id, given.stamp_ns) if is_kept else None,
+                    self._pose_of(self.sensor_frame, given.stamp_ns) if is_kept else None,
                     intensities,
                 )
             yield arrival

@@ -1,9 +1,12 @@
 """One rigid shape per track: what all its observations say of it in the frame of its box."""
 
+import math
+
 from boxreg_ros.correspondence import carried, in_box_axes
 from boxreg_ros.objective import EXTENT, Problem, State
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 CELLS = 8, 3, 3  # into which a box is cut, each a piece of surface
 LEAST = 8  # points that make a surface
@@ -39,35 +42,32 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     """
     B, N, M = problem.mask.shape
     local = in_box_axes(carried(problem, state), problem, state.pose).mT
-    half = (state.shared[:, None, None, EXTENT] / 2).to(local)
-    near = (local.abs() - half).amax(-1) < MARGIN
+    half, counts = (state.shared[:, EXTENT] / 2).to(local), local.new_tensor(CELLS)
+    near = (local.abs() - half[:, None, None]).amax(-1) < MARGIN
     rows = near.flatten().nonzero()[:, 0]
     window, p = rows // (N * M), local.flatten(0, 2)[rows]
-    counts = torch.tensor(CELLS, device=p.device)
-    place = ((p / half[window, 0, 0] + 1) / 2 * counts).long().clamp(counts * 0, counts - 1)
-    cell = (place * place.new_tensor([CELLS[1] * CELLS[2], CELLS[2], 1])).sum(1)
-    cell += window * (count := int(counts.prod()))
-    # Number, sum and sum of squares of the points in each cell; a plane through them.
-    sums = p.new_zeros(B * count, 13)
-    sums.index_add_(0, cell, torch.cat([torch.ones_like(p[:, :1]), p, _squares(p)], 1))
-    number = sums[:, :1].clamp(min=1)
-    mean, squares = sums[:, 1:4] / number, sums[:, 4:] / number
-    power, axes = torch.linalg.eigh((squares - _squares(mean)).unflatten(1, (3, 3)))
+    scaled = (p / half.index_select(0, window) + 1) * (counts / 2)
+    place = scaled.floor().clamp(counts * 0, counts - 1)
+    cell = (place * counts.new_tensor([CELLS[1] * CELLS[2], CELLS[2], 1])).sum(1).long()
+    cell += window * (count := math.prod(CELLS))
+    # Moments of the points in each cell, their number last; a plane through them.
+    p = pad(p, (0, 1), value=1.0)
+    moments = p.new_zeros(B * count, 16)
+    moments.index_add_(0, cell, (p[:, :, None] * p[:, None]).flatten(1))
+    number = moments[:, -1].clamp(min=1)
+    mean = (moments / number[:, None]).unflatten(1, (4, 4))
+    power, axes = torch.linalg.eigh(mean[:, :3, :3] - mean[:, :3, 3:] * mean[:, 3:, :3])
+    plane = torch.cat([axes[..., 0], -(axes[..., :1].mT @ mean[:, :3, 3:])[..., 0]], 1)
     rough = problem.deviations['shape'].to(p).repeat_interleave(count) ** 2
     thickness = power[:, 0].clamp(min=0) + rough
-    is_surface = (power[:, 1] > FLATNESS * thickness) & (number[:, 0] >= LEAST)
-    normal, thickness = axes[cell, :, 0], thickness[cell]
-    off = (normal * (p - mean[cell])).sum(1)
-    weight = torch.where(is_surface[cell], 1 / (thickness + off**2), 0.0)[:, None]
+    is_surface = (power[:, 1] > FLATNESS * thickness) & (number >= LEAST)
+    plane = plane.index_select(0, cell)
+    off = (plane * p).sum(1)
+    weight = torch.where(is_surface[cell], 1 / (thickness[cell] + off**2), 0.0)[:, None]
     lever = p.new_zeros(B * N * M, 7)  # of all points of an observation, and how far off it is
-    found = torch.cat([normal, torch.linalg.cross(p, normal), off[:, None]], 1)
+    found = torch.cat([plane[:, :3], torch.linalg.cross(p[:, :3], plane[:, :3]), off[:, None]], 1)
     lever = lever.index_copy_(0, rows, found * weight.sqrt()).view(B, N, M, 7)
     seen = torch.bincount(rows // M, weight[:, 0] > 0, B * N).view(B, N)
     total = (lever.mT @ lever * (SAY / seen.clamp(min=SAY))[..., None, None]).to(state.pose)
     information, pull = total[..., :6, :6], total[..., :6, 6]
     return information, torch.linalg.solve(information + 1e-3 * torch.eye(6).to(pull), pull)
-
-
-def _squares(rows: Tensor) -> Tensor:
-    """Return the products (n, d d) of all pairs within rows (n, d)."""
-    return (rows[:, :, None] * rows[:, None]).flatten(1)

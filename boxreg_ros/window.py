@@ -119,7 +119,7 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     row, step, last = np.arange(B)[:, None], np.arange(N), lengths[:, None] - 1
     boxes, times = (part[row, np.minimum(step, last)] for part in (boxes, times))
     times += 0.1 * np.maximum(step - last, 0)
-    known = zip(*(w.memory or nothing_known(w) for w in windows), strict=True)
+    known = zip(*(w.memory or (w.observations[0].box[:3], *NOTHING) for w in windows), strict=True)
     base, state, move, information, seen = (np.array(part) for part in known)
     boxes[..., YAW] = one_heading(boxes[..., YAW], valid, state[:, 5])
     start = boxes.copy()
@@ -143,11 +143,6 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     parts: list[Any] = [torch.from_numpy(array).to(device) for array in arrays]
     problem = Problem(*[*parts, torch.empty(0), deviations])
     return problem._replace(openness=aspect(problem)), base
-
-
-def nothing_known(window: Window) -> Memory:
-    """Return the memory of a window that nothing has left yet."""
-    return Memory(window.observations[0].box[:3], *NOTHING)
 
 
 def one_heading(yaw: Floats, valid: NDArray[np.bool_], known: Floats) -> Floats:

@@ -62,7 +62,7 @@ def from_msg(msg: Any) -> Sweep:
     good = np.isfinite(columns).all(0)
     times = None
     if time_field is not None:
-        raw = table[time_field].reshape(-1)
+        raw = table[time_field].ravel()  # a copy without gaps: it is gone through several times
         good &= np.isfinite(raw)
         times = _seconds(raw if good.all() else raw[good], stamp)
     if not good.all():
@@ -149,5 +149,5 @@ def _seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
                 return (raw.astype(np.float64) - origin) * unit
     for unit in UNITS if floating else UNITS[1:]:
         if max(abs(low), abs(high)) * unit <= LONGEST_SWEEP:
-            return raw.astype(np.float64) * unit
+            return np.multiply(raw, unit, dtype=np.float64)
     return None

@@ -126,12 +126,6 @@ def test_wrong_types_are_refused_by_name(name, value):
         Config().updated({name: value})
 
 
-def test_settings_that_depend_on_each_other():
-    with pytest.raises(ConfigError, match='lag'):
-        Config(window=5, lag=5)
-    assert Config(window=5, lag=4).lag == 4
-
-
 @pytest.mark.parametrize(
     'text', ['- 1\n- 2\n', 'word\n', 'a: [\n', '/**:\n  ros__parameters: 3\n', 'window: 2\n']
 )

@@ -91,7 +91,7 @@ def test_one_yaml_file_serves_node_and_recordings(make_node, tmp_path):
     [
         ('window', 2, ('window', '3', '2')),
         ('window', 'abc', ('window', 'int', 'abc')),
-        ('lag', 10, ('lag', 'window')),
+        ('lag', 1000, ('lag', '999', '1000')),
         ('mode', '4d', ('mode', 'bev', '4d')),
         ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
         ('backlog', 'x', ('backlog', 'float', 'x')),

@@ -5,6 +5,7 @@ from dataclasses import replace
 from boxreg_ros import Config, refine
 from boxreg_ros.geometry import face_distances
 from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.registration import register
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
@@ -15,20 +16,20 @@ ESTIMATES = ['early', 'final', 'track']
 each_estimate = pytest.mark.parametrize('estimate', ESTIMATES)
 
 
+def cut(track, part):
+    """Return the observations `part` of a track."""
+    return replace(
+        track, stamps_ns=track.stamps_ns[part], boxes=track.boxes[part], points=track.points[part],
+        sensor_origins=track.sensor_origins[part],
+    )  # fmt: skip
+
+
 @pytest.fixture(scope='module')
 def tracks():
     """Return two cars that never meet, the second there from the third to the tenth stamp only."""
     rng = np.random.default_rng(0)
     first = track_of(drive(14), rng, 'a')
-    second = track_of(drive(14, start=(-12.0, -6.0, 3.0)), rng, 'b')
-    part = slice(2, 10)
-    return [
-        first,
-        replace(
-            second, stamps_ns=second.stamps_ns[part], boxes=second.boxes[part],
-            points=second.points[part], sensor_origins=second.sensor_origins[part],
-        ),
-    ]  # fmt: skip
+    return [first, cut(track_of(drive(14, start=(-12.0, -6.0, 3.0)), rng, 'b'), slice(2, 10))]
 
 
 @pytest.fixture(scope='module')
@@ -102,10 +103,11 @@ def test_early_estimates_come_at_once(stream, estimate):
     assert all(r.is_final for r in registrar.flush())
 
 
-@pytest.mark.parametrize('lag', [0, 1, 3])
+@pytest.mark.parametrize('lag', [0, 1, 3, 5, 9])
 @pytest.mark.parametrize('estimate', ['early', 'final'])
 def test_finals_come_lag_ticks_later(stream, estimate, lag):
     registrar = BoxRegistrar(setup(estimate, lag=lag))
+    lag = min(lag, 5)  # by then it is the oldest of its window of 6, which says no more of it
     order = [boxes.stamp_ns for _, boxes in stream]
     for tick, (sweep, boxes) in enumerate(stream):
         ready = finals(registrar.add_sweep(sweep) + registrar.add_boxes(boxes))
@@ -132,7 +134,7 @@ def test_finals_are_better_than_early_estimates():
 
 
 def test_a_window_of_the_whole_track_comes_back_in_parts():
-    # With windows of 12, tracks are solved every 6 ticks, and a quarter of the window waits.
+    # With windows of 12, a track is solved when 11 boxes wait; the last one then waits on.
     stream = stream_of([track_of(drive(40), np.random.default_rng(0))])
     registrar = BoxRegistrar(setup('track', track_window=12))
     held = []
@@ -454,6 +456,36 @@ def test_a_window_that_fails_is_forgotten(estimate):
     assert lasting[-1]
 
 
+def test_tracks_are_solved_together_when_a_window_is_full(monkeypatch):
+    # A window of 12 is full when 11 boxes wait: an eighth, one, is its overlap with the last.
+    # Tick 11: the track of 11 and the one that has ended; with 6, half a window, one may wait.
+    # Tick 17, half a window later, 12 boxes wait: 6 more and the overlap on either side, 8.
+    # Tick 27: 11 boxes wait, and 12 with the settled half of the overlap. The rest at the end.
+    rng = np.random.default_rng(0)
+    long, short, late = (
+        cut(track_of(drive(30, start=(5.0, y, 0.2)), rng, name), part)
+        for y, name, part in (
+            (6.0, 'long', slice(30)), (-6.0, 'short', slice(4)), (20.0, 'late', slice(5, 30))
+        )
+    )  # fmt: skip
+    calls = []
+
+    def noted(windows, config, model):
+        calls.append({w.track_id: len(w.observations) for w in windows})
+        return register(windows, config, model)
+
+    monkeypatch.setattr('boxreg_ros.registrar.register', noted)
+    registrar = BoxRegistrar(setup('track', track_window=12, max_gap=0.3))
+    results = fed(registrar, stream_of([long, short, late])) + registrar.flush()
+    assert calls == [
+        {'long': 11, 'short': 4},
+        {'long': 8, 'late': 12},
+        {'long': 12, 'late': 12},
+        {'long': 5, 'late': 5},
+    ]
+    assert len(results) == 30
+
+
 def test_a_track_that_ends_comes_back_before_the_end():
     # With estimate 'track' a track that has been silent for long must not hold up all others.
     rng = np.random.default_rng(0)
@@ -483,6 +515,6 @@ def test_memory_is_bounded(estimate):
         entries += sum(len(t.entries) for t in registrar._ended)
         assert entries <= 2 * 10 + 3 * 5
         assert len(registrar._tracks) <= 4
-    # Ticks wait for the lag, or for a window of 10 that is solved every 5 ticks.
+    # Ticks wait for the lag, or for the window of 10.
     assert max(held) <= 15
     assert max(held[40:]) <= max(held[:40])

@@ -14,7 +14,7 @@ from boxreg_ros.registration import expected_shared, register, solve_paper, weig
 from boxreg_ros.window import stack
 import numpy as np
 import pytest
-from scenes import drive, problem_of, track_of, window_of
+from scenes import drive, problem_of, returns, track_of, window_of
 import torch
 
 D = torch.float64
@@ -246,6 +246,36 @@ class WrongNoise(InputModel):
 
     def noise(self):
         return InputNoise(torch.ones(5), torch.zeros(5))
+
+
+@pytest.mark.parametrize('estimate', ['final', 'track'])
+def test_many_points_wait_for_the_last_round(monkeypatch, estimate):
+    # Of some 1,000 points about 256 until the boxes rest, then all; nothing is lost by that.
+    config = ALONE.updated({'estimate': estimate, 'sampling.points': 2000})
+    rng, truth = np.random.default_rng(0), drive(10)
+    points = [returns(box, rng, 1800) for box in truth]
+    one = window_of(replace(track_of(truth, rng), points=points), config)
+    most = max(len(observation.points) for observation in one.observations)
+    few = -(-most // (most // registration.COARSE))
+    seen = []
+
+    def noted(problem, *rest):
+        seen.append(problem.points.shape[2])
+        return support(problem, *rest)
+
+    monkeypatch.setattr(registration, 'support', noted)
+    (found,) = register([one], config, InputModel(config.faces))
+    assert most > 900 and few < 350
+    assert seen.pop(0) == most  # the rule is learnt from all
+    assert seen == sorted(seen) and set(seen) == {few, most}
+    assert seen.count(few) >= 2 and seen.count(most) <= 2
+    monkeypatch.setattr(registration, 'COARSE', most)
+    seen.clear()
+    (known,) = register([one], config, InputModel(config.faces))
+    assert set(seen) == {most}
+    iou = [iou_3d(boxes, truth).mean() for boxes in (given(one), found.boxes, known.boxes)]
+    assert iou[1] > iou[0] + 0.05
+    assert abs(iou[1] - iou[2]) < 0.01
 
 
 @pytest.mark.parametrize('part', [1, 2**18])
