@@ -109,7 +109,7 @@ INGREDIENTS = {
     'measured noise': Ingredient(
         'the input errs as the settings say',
         replaced=(
-            (calibration.InputNoise, 'measure', classmethod(lambda cls, scatter, valid: None)),
+            (calibration.InputNoise, 'measure', classmethod(lambda cls, scatter, valid: cls())),
         ),
     ),
     'bias': Ingredient(

@@ -23,7 +23,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from boxreg_ros import objective, sampling
-from boxreg_ros.calibration import InputModel
+from boxreg_ros.calibration import InputModel, InputNoise
 from boxreg_ros.config import Config
 from boxreg_ros.correspondence import support
 from boxreg_ros.lbfgs import minimize, Minimum, select
@@ -382,7 +382,7 @@ def _torch_minimum(
 def _terms(problem: objective.Problem, state: State, config: Config) -> list[Term]:
     rule = InputModel(config.faces).rule()
     sights = support(problem, state, config.faces.outermost, rule.depths)
-    return weigh(problem, state, sights, expected_shared(problem, rule), None, config)
+    return weigh(problem, state, sights, expected_shared(problem, rule), InputNoise(), config)
 
 
 def _total(terms: Sequence[Term], state: State) -> Tensor:

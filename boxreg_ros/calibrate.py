@@ -173,7 +173,6 @@ def _errors_of_kind(
 
     def deviations(rows: slice) -> Floats:
         noise = InputNoise.measure(off[rows], problem.valid[rows])
-        assert noise is not None  # all are long enough
         lon, lat, z, roll, pitch, yaw = noise.deviation[:6].tolist()
         return np.array([lon, lat, z, np.hypot(roll, pitch) / np.sqrt(2), yaw])
 

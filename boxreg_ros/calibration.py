@@ -28,18 +28,21 @@ class InputNoise(NamedTuple):
     deviation, correlation : Tensor, shape (9,)
         Robust standard deviation along the box axes (lon lat z roll pitch yaw [m, rad], extents
         as part of each), and correlation from one observation to the next, 0 to 0.9.
+    trust : float
+        0 where nothing is known, a half after `LEAST` observations, near 1 after many.
 
     """
 
-    deviation: Tensor
-    correlation: Tensor
+    deviation: Tensor = torch.zeros(9, dtype=torch.float64)
+    correlation: Tensor = torch.zeros(9, dtype=torch.float64)
+    trust: float = 0.0
 
     @classmethod
-    def measure(cls, scatter: Tensor, valid: Tensor) -> 'InputNoise | None':
-        """Pool tracks (B, N, 9) that are long enough to tell, `valid` (B, N); None without any."""
+    def measure(cls, scatter: Tensor, valid: Tensor) -> 'InputNoise':
+        """Pool the tracks (B, N, 9) that are long enough to tell, `valid` (B, N)."""
         valid = valid & (valid.sum(1, keepdim=True) >= LEAST)
-        if not bool(valid.any()):
-            return None
+        if not (total := int(valid.sum())):
+            return cls()
         count = valid.sum(1)[:, None, None].clamp(min=1)
         scatter = scatter - (scatter * valid[..., None]).sum(1, keepdim=True) / count
         deviation = 1.48 * scatter[valid].abs().median(0).values
@@ -47,7 +50,8 @@ class InputNoise(NamedTuple):
         both = valid[:, 1:] & valid[:, :-1]
         first, second = bounded[:, :-1][both], bounded[:, 1:][both]
         power = (first.square() + second.square()).sum(0).clamp(min=1e-12) / 2
-        return cls(deviation, ((first * second).sum(0) / power).clamp(0.0, 0.9))
+        correlation = ((first * second).sum(0) / power).clamp(0.0, 0.9)
+        return cls(deviation, correlation, total / (total + LEAST))
 
 
 class Rule(NamedTuple):
@@ -90,7 +94,7 @@ class InputModel:
         self._config = config
         self._sights: OrderedDict[str, Floats] = OrderedDict()
         self._scatter: OrderedDict[str, Floats] = OrderedDict()
-        self._noise: InputNoise | None = None
+        self._noise = InputNoise()
         self._fresh = self._measured = 0
 
     def learn_rule(self, names: Sequence[str], support: Support, new: Tensor, rule: Rule) -> None:
@@ -139,9 +143,9 @@ class InputModel:
             values[faces] = float(value)
         return values
 
-    def noise(self) -> InputNoise | None:
+    def noise(self) -> InputNoise:
         """
-        Return the noise of what `learn_noise` took; None as long as that is too little.
+        Return the noise of what `learn_noise` took.
 
         Measured anew when that has grown by a twentieth: it costs as much as there is.
 

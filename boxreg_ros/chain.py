@@ -69,7 +69,7 @@ class Chain(NamedTuple):
         chain, border = free[:, :-S].unflatten(1, (-1, LINK)), free[:, -S:]
         near = pad(free[:, :-S], (NEXT, NEXT)).unfold(1, SPAN, LINK)
         around = torch.cat([near, border[:, None].expand(-1, N, -1)], -1)
-        links = self.links * chain[..., None] * around[:, :, None]
+        links = (self.links * chain[..., None]).mul_(around[:, :, None])
         links[..., NEXT : NEXT + LINK].diagonal(dim1=2, dim2=3).add_(1.0 - chain + 1e-9)
         corner = self.corner * border[..., None] * border[:, None]
         corner.diagonal(dim1=1, dim2=2).add_(1.0 - border + 1e-9)
@@ -77,12 +77,13 @@ class Chain(NamedTuple):
         size = -(-N // count)  # links of a block; the last ones are filled up with identities
         links = pad(links, (0, 0, 0, 0, 0, count * size - N))
         links[:, N:, :, NEXT : NEXT + LINK] = torch.eye(LINK).to(links)
-        wide = links.new_zeros(len(links), count, size, LINK, LINK * size + 2 * NEXT)
+        wide = links.new_zeros(len(links), count, size, LINK, LINK * size + 2 * NEXT + S)
+        wide[..., -S:] = links[..., SPAN:].unflatten(1, (count, size))
         for j in range(size):
             wide[:, :, j, :, LINK * j : LINK * j + SPAN] = links[:, j::size, :, :SPAN]
-        every = torch.cat([wide[..., NEXT:], links[..., SPAN:].unflatten(1, (count, size))], -1)
         blocks, carry = [], links.new_zeros(1, NEXT + S, NEXT + S)
-        for block in every.flatten(2, 3).unbind(1):  # columns: own, the next two links, the border
+        # Columns: own, the next two links, the border.
+        for block in wide[..., NEXT:].flatten(2, 3).unbind(1):
             block[:, :NEXT, :NEXT] -= carry[:, :NEXT, :NEXT]
             block[:, :NEXT, -S:] -= carry[:, :NEXT, NEXT:]
             L = cholesky(block[..., : LINK * size])

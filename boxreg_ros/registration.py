@@ -22,8 +22,9 @@ from torch.nn.functional import pad
 
 RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
-INFLATION = 1.5  # of the deviation of an input whose error is correlated over time
+USUAL = 0.385  # correlation of the errors of an input from one observation to the next
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
+TENTH = 0.1  # of a second, over which errors that are biased are correlated
 SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 1000  # observations that a thread works on at once: what its cache holds
@@ -262,7 +263,7 @@ def weigh(
     state: State,
     sights: Support,
     expected: Tensor,
-    noise: InputNoise | None,
+    noise: InputNoise,
     config: Config,
 ) -> list[Term]:
     """
@@ -272,7 +273,8 @@ def weigh(
     -----
     A face loses its say as the square of Cauchy's weight, the input as Cauchy's. The error of an
     input is a part that is constant over its track, the bias, and one that changes slowly: the
-    correlation measured widens its deviation, and without correlation there is no bias either.
+    correlation measured widens its deviation, and without correlation over a tenth of a second
+    there is no bias either.
 
     """
     of, valid, faces, given = problem.of, problem.valid.to(state.pose), config.faces, problem.pose
@@ -284,16 +286,14 @@ def weigh(
     trust = trust * valid[..., None] / torch.tensor(errors).to(trust) ** 2
     # The input, its bias and its extents.
     error = problem.of(*ERRORS)
-    inflation = torch.tensor(INFLATION).to(error)
-    bias, extent = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]), of('extent')
-    if noise is not None:
-        deviation, correlation = noise.deviation.to(error), noise.correlation.to(error)
-        ratio = (deviation[:6] / error).clamp(0.05, 4.0)
-        slow = ((correlation - 0.15) / 0.3).clamp(0.1, 1.0)
-        error = error * ratio
-        inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
-        bias = bias * slow[:6] * ratio.clamp(0.1, 2.0)
-        extent = extent * slow[6:]
+    correlation = USUAL + noise.trust * (noise.correlation.to(error) - USUAL)
+    ratio = (noise.deviation[:6].to(error) / error).clamp(0.05, 4.0)
+    ratio = (1 + noise.trust * (ratio**2 - 1)).sqrt()
+    step = (problem.times * valid).amax(1, keepdim=True) / (valid.sum(1, keepdim=True) - 1)
+    slow = ((correlation ** (TENTH / step) - 0.15) / 0.3).clamp(0.1, 1.0)
+    bias = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]) * slow[:, :6] * ratio.clamp(0.1, 2.0)
+    error, extent = error * ratio, of('extent') * slow[:, 6:]
+    inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
     axes = rotation_from_rpy(state.pose[..., 3:])
     off = objective.prior(state, given, axes).residual[:, :, 0].abs() + surprise(problem, axes)
     off = off / error[:, None]

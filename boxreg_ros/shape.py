@@ -52,10 +52,9 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     cell += window * (count := math.prod(CELLS))
     # Moments of the points in each cell, their number last; a plane through them.
     p = pad(p, (0, 1), value=1.0)
-    moments = p.new_zeros(B * count, 16)
-    moments.index_add_(0, cell, (p[:, :, None] * p[:, None]).flatten(1))
-    number = moments[:, -1].clamp(min=1)
-    mean = (moments / number[:, None]).unflatten(1, (4, 4))
+    sums = p.new_zeros(B * count, 16).index_add_(0, cell, (p[:, :, None] * p[:, None]).flatten(1))
+    number = sums[:, -1].clamp(min=1)
+    mean = (sums / number[:, None]).unflatten(1, (4, 4))
     power, axes = torch.linalg.eigh(mean[:, :3, :3] - mean[:, :3, 3:] * mean[:, 3:, :3])
     plane = torch.cat([axes[..., 0], -(axes[..., :1].mT @ mean[:, :3, 3:])[..., 0]], 1)
     rough = problem.deviations['shape'].to(p).repeat_interleave(count) ** 2
@@ -64,9 +63,9 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     plane = plane.index_select(0, cell)
     off = (plane * p).sum(1)
     weight = torch.where(is_surface[cell], 1 / (thickness[cell] + off**2), 0.0)[:, None]
-    lever = p.new_zeros(B * N * M, 7)  # of all points of an observation, and how far off it is
+    # The levers of all points of an observation, and how far off each is.
     found = torch.cat([plane[:, :3], torch.linalg.cross(p[:, :3], plane[:, :3]), off[:, None]], 1)
-    lever = lever.index_copy_(0, rows, found * weight.sqrt()).view(B, N, M, 7)
+    lever = p.new_zeros(B * N * M, 7).index_copy_(0, rows, found * weight.sqrt()).view(B, N, M, 7)
     seen = torch.bincount(rows // M, weight[:, 0] > 0, B * N).view(B, N)
     total = (lever.mT @ lever * (SAY / seen.clamp(min=SAY))[..., None, None]).to(state.pose)
     information, pull = total[..., :6, :6], total[..., :6, 6]

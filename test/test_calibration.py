@@ -79,7 +79,7 @@ def test_correlation_stays_in_its_bounds():
 def test_short_tracks_do_not_tell_and_padding_does_not_count():
     values = autoregressive(3, 40, np.ones(9), 0.3)
     valid = real(values)
-    assert InputNoise.measure(values[:, : LEAST - 1], valid[:, : LEAST - 1]) is None
+    assert InputNoise.measure(values[:, : LEAST - 1], valid[:, : LEAST - 1]).trust == 0
     known = InputNoise.measure(values[:2, :30], valid[:2, :30])
     valid[:2, 30:] = False
     valid[2, LEAST - 1 :] = False
@@ -88,6 +88,7 @@ def test_short_tracks_do_not_tell_and_padding_does_not_count():
     found = InputNoise.measure(values, valid)
     np.testing.assert_allclose(found.deviation, known.deviation)
     np.testing.assert_allclose(found.correlation, known.correlation)
+    assert found.trust == known.trust == 60 / 80
 
 
 def test_scatter_by_hand():
@@ -107,12 +108,12 @@ def test_noise_of_a_stream():
     values = autoregressive(4, 40, np.ones(9), 0.5, seed=2)
     lengths = [40, 30, LEAST, LEAST - 1]
     model = InputModel(FACES)
-    assert model.noise() is None
+    assert model.noise().trust == 0
     for i in range(40):
         alive = [b for b in range(4) if i < lengths[b]]
         model.learn_noise([str(b) for b in alive], values[alive, i].numpy())
         if i == LEAST - 2:
-            assert model.noise() is None
+            assert model.noise().trust == 0
     valid = torch.arange(40) < torch.tensor(lengths)[:, None]
     known = InputNoise.measure(values, valid)
     np.testing.assert_allclose(model.noise().deviation, known.deviation)

@@ -209,11 +209,44 @@ def test_what_hardly_moves_is_parked(speed, length, rests):
     sights = support(problem, state, 0.05, torch.zeros(6, dtype=D))
     (rest,) = (
         term.weight
-        for term in weigh(problem, state, sights, expected, None, ALONE)
+        for term in weigh(problem, state, sights, expected, InputNoise(), ALONE)
         if term.function is objective.rest
     )
     held = (rest.diagonal(dim1=-2, dim2=-1) > 0)[:, :, 0].all(-1)
     np.testing.assert_array_equal(held, np.stack([valid[1:] & rests] * 2))
+
+
+@pytest.mark.parametrize(
+    ('trust', 'fast', 'slow'),
+    [
+        (0.0, 0.235 / 0.3, 1.0),
+        (0.5, 2.5**0.5 * 0.1425 / 0.3, 2.5**0.5),
+        (1.0, 2 * 0.05 / 0.3, 2.0),
+    ],
+)
+def test_the_bias_to_expect_by_hand(trust, fast, slow):
+    # Twice as wide as expected, correlated by 0.2 where 0.385 is usual: half of the trust lies
+    # between, at 0.2925, and at (1 + 4) / 2 times the power. A bias is in proportion to that
+    # deviation and to what the correlation is above 0.15, up to 0.45, over a tenth of a second:
+    # at 2 Hz the fifth root of all three is.
+    kinds = {name: torch.full((2,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
+    times = torch.arange(6, dtype=D) * torch.tensor([[0.1], [0.5]], dtype=D)
+    boxes = np.broadcast_to(drive(6), (2, 6, 9)).copy()
+    problem = problem_of(boxes, times=times, deviations=kinds)
+    expected = expected_shared(problem, InputModel(ALONE.faces).rule())
+    state = State(problem.pose, expected)
+    sights = support(problem, state, 0.05, torch.zeros(6, dtype=D))
+    error = problem.of(*objective.ERRORS)
+    deviation = torch.cat([2 * error[0], torch.ones(3, dtype=D)])
+    noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), trust)
+    (weight,) = (
+        term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
+        for term in weigh(problem, state, sights, expected, noise, ALONE)
+        if term.function is objective.shared_prior
+    )
+    bias = weight[:, objective.BIAS] ** -0.5 / error
+    known = torch.tensor([[fast], [slow]], dtype=D) * torch.tensor([1, 1, 1, 1, 1, 0.5])
+    np.testing.assert_allclose(bias, known, rtol=1e-9)
 
 
 def numbers(kind):
