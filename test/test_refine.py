@@ -455,3 +455,29 @@ def normalised_errors(scenario, seeds):
 def test_errors_are_as_large_as_the_covariance_says(scenario, seeds):
     # 1 where the covariance is right; 0.7 to 1.5 is asked of it.
     assert 0.7 <= normalised_errors(scenario, seeds) <= 1.5
+
+
+def test_whole_tracks_tell_more_than_windows_at_half_the_rate_too():
+    # At 5 Hz few tracks are long enough to tell how the input errs, and what its errors share
+    # over a tenth of a second has half faded at the next stamp.
+    overlaps = []
+    for seed in range(4):
+        scene = simulate('street', seed)
+        table = scene.truth
+        keys = zip(table.stamps_ns.tolist(), table.track_ids, strict=True)
+        truth = dict(zip(keys, table.boxes, strict=True))
+        tracks = [
+            Track(
+                track.track_id, track.class_name, track.stamps_ns[::2], track.boxes[::2],
+                track.points[::2], None if origins is None else origins[::2],
+            )
+            for track in scene.tracks()
+            for origins in [track.sensor_origins]
+        ]  # fmt: skip
+        lagged, whole = (refine(tracks, Config(estimate=e)) for e in ('final', 'track'))
+        for track, *found in zip(tracks, lagged, whole, strict=True):
+            true = [truth[stamp_ns, track.track_id] for stamp_ns in track.stamps_ns.tolist()]
+            is_seen = [len(points) >= 100 for points in track.points]
+            overlaps += list(zip(*(iou_3d(r.boxes, true)[is_seen] for r in found), strict=True))
+    lagged, whole = np.mean(overlaps, axis=0)
+    assert whole > lagged
