@@ -96,7 +96,7 @@ def register(windows: Sequence[Window], config: Config, model: InputModel) -> li
 
 def _register(windows: Sequence[Window], config: Config, model: InputModel) -> list[Estimate]:
     """Do what `register` says."""
-    estimates = [_kept(window, 'short_track') for window in windows]
+    estimates: dict[int, Estimate] = {}
     groups = batches(windows, config)
     for rows in groups:
         _learn(model, [windows[i] for i in rows], config)
@@ -112,20 +112,18 @@ def _register(windows: Sequence[Window], config: Config, model: InputModel) -> l
             best = [max(0, len(window.observations) - 1 - config.lag) for window in part]
             known = scatter(problem, solved.state)[range(len(part)), best].cpu().numpy()
             model.learn_noise([window.track_id for window in part], known)
-        found = _judged([estimates[i] for i in rows], problem, base, solved, config)
-        for i, estimate in zip(rows, found, strict=True):
-            estimates[i] = estimate
-    return estimates
+        estimates.update(zip(rows, _judged(part, problem, base, solved, config), strict=True))
+    return [estimates.get(i) or _kept(window) for i, window in enumerate(windows)]
 
 
 def _judged(
-    kept: Sequence[Estimate], problem: Problem, base: Floats, solved: Solution, config: Config
+    windows: Sequence[Window], problem: Problem, base: Floats, solved: Solution, config: Config
 ) -> list[Estimate]:
     """
     Return what a solved batch says of each window, in the fixed frame.
 
-    Where that does not deserve trust it is the input, `kept`. Beside points at all and finite
-    numbers, a refined box must hold nearly as many of the points as the input box does: a test
+    Where that does not deserve trust it is the input. Beside points at all and finite numbers, a
+    refined box must hold nearly as many of the points as the input box does: a test
     the objective does not make.
 
     """
@@ -142,12 +140,13 @@ def _judged(
     found, spread = boxes.cpu().numpy(), covariances.cpu().numpy()
     found[..., :3] += base[:, None]
     arrays, estimates = [part.cpu().numpy() for part in left], []
-    for b, known in enumerate(kept):
+    for b, window in enumerate(windows):
         memory = Memory(base[b], *(a[b] for a in arrays)) if left and finite[b].all() else None
-        n, is_lasting = len(known.boxes), memory is not None and np.isfinite(memory.step).all()
-        is_own = good[b, :n, None]
-        own = np.where(is_own, found[b, :n], known.boxes)
-        error = np.where(is_own[..., None], spread[b, :n], known.covariances)
+        is_lasting = memory is not None and np.isfinite(memory.step).all()
+        n = len(window.observations)
+        own, error = found[b, :n].copy(), spread[b, :n].copy()
+        for i in np.flatnonzero(~good[b, :n]).tolist():
+            own[i], error[i] = window.observations[i].box, np.eye(6)
         words = tuple(status[b, :n].tolist()), tuple(reasons[b, :n].tolist())
         estimates.append(Estimate(own, *words, error, memory if is_lasting else None))
     return estimates
@@ -395,8 +394,9 @@ def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     return (x.maximum(y).maximum(z) < 0.05).sum(-1)
 
 
-def _kept(window: Window, reason: str) -> Estimate:
-    """Return the input boxes of a window."""
+def _kept(window: Window) -> Estimate:
+    """Return the input boxes of a window that is too short."""
     n = len(window.observations)
     boxes = np.array([o.box for o in window.observations]).reshape(n, 9)
-    return Estimate(boxes, (KEPT,) * n, (reason,) * n, np.broadcast_to(np.eye(6), (n, 6, 6)))
+    words = (KEPT,) * n, ('short_track',) * n
+    return Estimate(boxes, *words, np.broadcast_to(np.eye(6), (n, 6, 6)))

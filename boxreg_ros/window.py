@@ -134,9 +134,10 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     recalled = np.nan_to_num(state + move)
     recalled[:, ANGLES] += np.pi * turns
     information *= FADING * (turns % 2 == 0).all(1)[:, None, None]
-    kinds = [config.class_config(window.class_name) for window in windows]
+    kinds = {name: config.class_config(name) for name in {w.class_name for w in windows}}
     names = [item.name for item in fields(ClassConfig)[1:]]
-    numbers = np.array([[getattr(k, name) for name in names] for k in kinds], dtype=np.float64)
+    rows = {kind: [getattr(k, name) for name in names] for kind, k in kinds.items()}
+    numbers = np.array([rows[window.class_name] for window in windows], dtype=np.float64)
     deviations = dict(zip(names, torch.from_numpy(numbers).to(device).unbind(1), strict=True))
     arrays: list[Any] = [boxes, start, valid, times, points, mask, delays, origins, ground]
     arrays += [recalled, information, seen]
