@@ -123,8 +123,8 @@ def _judged(
     Return what a solved batch says of each window, in the fixed frame.
 
     Where that does not deserve trust it is the input. Beside points at all and finite numbers, a
-    refined box must hold nearly as many of the points as the input box does: a test
-    the objective does not make.
+    refined box must hold nearly as many of the points as the input box does: a test the objective
+    does not make.
 
     """
     state, covariances, left = solved
