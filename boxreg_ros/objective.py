@@ -88,10 +88,10 @@ class Problem(NamedTuple):
         """Return deviations by name, (B, n)."""
         return torch.stack([self.deviations[name] for name in names], -1)
 
-    def thinned(self, step: int) -> 'Problem':
-        """Return the same with every `step`-th point."""
+    def thinned(self, stride: int) -> 'Problem':
+        """Return the same with every `stride`-th point."""
         names = 'points', 'mask', 'delays'
-        return self._replace(**{name: getattr(self, name)[:, :, ::step] for name in names})
+        return self._replace(**{name: getattr(self, name)[:, :, ::stride] for name in names})
 
 
 # --- the paper ----------------------------------------------------------------------------------

@@ -166,7 +166,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     limits = solver.iterations, solver.history, solver.tolerance
     is_track = config.estimate == 'track'
     rule, noise, turn = model.rule(), model.noise(), 0
-    step = max(1, problem.points.shape[2] // COARSE if rounds > 1 else 1)
+    stride = max(1, problem.points.shape[2] // COARSE if rounds > 1 else 1)
     everyone = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), everyone.clone())
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
@@ -177,8 +177,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
 
     @torch.inference_mode()
     def improve(rows: Tensor) -> Tensor:
-        """Take round `turn` with some windows, every `step`-th point; return those not done."""
-        part, here = select(problem, rows).thinned(step), select(state, rows)
+        """Take round `turn` with some windows, every `stride`-th point; return those not done."""
+        part, here = select(problem, rows).thinned(stride), select(state, rows)
         expected = everyone[rows]
         here.shared[:, objective.ANCHOR] = 0.0
         sights = support(part, here, config.faces.outermost, rule.depths)
@@ -210,8 +210,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
             rows, turn = torch.cat(list(run(improve, parts))), turn + 1
             if is_track:
                 noise = InputNoise.measure(scatter(problem, state), problem.valid)
-            if not len(rows) and step > 1:
-                rows, step = every, 1  # where few points lead to, all of them tell
+            if not len(rows) and stride > 1:
+                rows, stride = every, 1  # where few points lead to, all of them tell
     return Solution(state, covariances, left)
 
 
@@ -288,8 +288,8 @@ def weigh(
     correlation = USUAL + noise.trust * (noise.correlation.to(error) - USUAL)
     ratio = (noise.deviation[:6].to(error) / error).clamp(0.05, 4.0)
     ratio = (1 + noise.trust * (ratio**2 - 1)).sqrt()
-    step = (problem.times * valid).amax(1, keepdim=True) / (valid.sum(1, keepdim=True) - 1)
-    slow = ((correlation ** (TENTH / step) - 0.15) / 0.3).clamp(0.1, 1.0)
+    interval = (problem.times * valid).amax(1, keepdim=True) / (valid.sum(1, keepdim=True) - 1)
+    slow = ((correlation ** (TENTH / interval) - 0.15) / 0.3).clamp(0.1, 1.0)
     bias = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]) * slow[:, :6] * ratio.clamp(0.1, 2.0)
     error, extent = error * ratio, of('extent') * slow[:, 6:]
     inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()

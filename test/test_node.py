@@ -181,26 +181,42 @@ def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path)
     assert np.abs(refined - [vision.from_msg(message).boxes for message in given]).max() > 1e-4
 
 
-def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
-    # Ten times the backlog is 1 s. With so many updates of its multipliers a window of the paper's
-    # objective takes some 2 s: the fifth stamp is solved while those after it wait.
+DEEP = tuple(
+    part
+    for name in ('points', 'boxes')
+    for part in ('-p', f'qos_overrides./{name}.subscription.depth:=100')
+)
+
+
+def thirty_stamps(graph, tmp_path):
+    """Return a drive of 30 stamps, its records, and what will come of early and final boxes."""
     drive = Drive(sweeps=30)
     records = records_of(drive.write(tmp_path / 'drive'))
     publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    found = (graph.collect(DETECTIONS, f'/refined_boxes{end}') for end in ('', '_final'))
+    return drive, records, *found
+
+
+def all_published(graph, early):
+    """Wait until all 30 early boxes are there and counted; return the counters."""
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    deep = [f'qos_overrides./{name}.subscription.depth:=100' for name in ('points', 'boxes')]
+    graph.wait(lambda: len(early) == 30, 'early boxes')
+    graph.wait(lambda: int(values_of(diagnostics).get('early_published', 0)) == 30, 'counters')
+    return values_of(diagnostics)
+
+
+def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
+    # Ten times the backlog is 1 s. With so many updates of its multipliers a window of the paper's
+    # objective takes some 2 s: the fifth stamp is solved while those after it wait.
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
     slow = ['objective:=paper', 'paper.multiplier_rounds:=60', 'paper.iterations:=10000']
-    options = [part for text in (*deep, *slow, 'backlog:=0.1') for part in ('-p', text)]
-    node = graph.start(*RELIABLE, *options)
+    options = [part for text in (*slow, 'backlog:=0.1') for part in ('-p', text)]
+    node = graph.start(*RELIABLE, *DEEP, *options)
     graph.wait_until_connected()
     first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[3])
     play(graph, records[:first], early)
     play(graph, records[first:])
-    graph.wait(lambda: len(early) == 30, 'early boxes')
-    graph.wait(lambda: int(values_of(diagnostics).get('early_published', 0)) == 30, 'counters')
-    passed = int(values_of(diagnostics)['boxes_queue_full'])
+    passed = int(all_published(graph, early)['boxes_queue_full'])
     assert 0 < passed < 30
     assert 'boxes_queue_full' in node.output()
     assert ended_cleanly(node)
@@ -208,21 +224,12 @@ def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
 
 
 def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
-    drive = Drive(sweeps=30)
-    records = records_of(drive.write(tmp_path / 'drive'))
-    publishers_for(graph, records)
-    early = graph.collect(DETECTIONS, '/refined_boxes')
-    final = graph.collect(DETECTIONS, '/refined_boxes_final')
-    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    reliable = [*RELIABLE, '-p', 'qos_overrides./points.subscription.depth:=100']
-    reliable += ['-p', 'qos_overrides./boxes.subscription.depth:=100']
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
     slow = ('-p', 'solver.rounds:=40', '-p', 'solver.iterations:=400')
-    node = graph.start(*reliable, *slow, '-p', 'backlog:=0.2')
+    node = graph.start(*RELIABLE, *DEEP, *slow, '-p', 'backlog:=0.2')
     graph.wait_until_connected()
     play(graph, records)
-    graph.wait(lambda: len(early) == 30, 'early boxes')
-    graph.wait(lambda: int(values_of(diagnostics).get('early_published', 0)) == 30, 'counters')
-    assert int(values_of(diagnostics)['points_queue_full']) > 5
+    assert int(all_published(graph, early)['points_queue_full']) > 5
     assert 'points_queue_full' in node.output()
     assert ended_cleanly(node)
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps

@@ -432,14 +432,19 @@ def test_garbage_does_not_touch_its_neighbours():
         assert iou_3d(found.boxes, truth).mean() > iou_3d(good.boxes, truth).mean()
 
 
+def truth_of(scene):
+    """Return the true boxes (9,) of a scene by stamp [ns] and track."""
+    table = scene.truth
+    keys = zip(table.stamps_ns.tolist(), table.track_ids, strict=True)
+    return dict(zip(keys, table.boxes, strict=True))
+
+
 def normalised_errors(scenario, seeds):
     """Return the mean of e' C^-1 e / 6 over refined boxes, e the error and C its covariance."""
     values = []
     for seed in seeds:
         scene = simulate(scenario, seed)
-        table = scene.truth
-        keys = zip(table.stamps_ns.tolist(), table.track_ids, strict=True)
-        truth = dict(zip(keys, table.boxes, strict=True))
+        truth = truth_of(scene)
         tracks = scene.tracks()
         for track, refined in zip(tracks, refine(tracks), strict=True):
             for i, stamp_ns in enumerate(track.stamps_ns.tolist()):
@@ -463,9 +468,7 @@ def test_whole_tracks_tell_more_than_windows_at_half_the_rate_too():
     overlaps = []
     for seed in range(4):
         scene = simulate('street', seed)
-        table = scene.truth
-        keys = zip(table.stamps_ns.tolist(), table.track_ids, strict=True)
-        truth = dict(zip(keys, table.boxes, strict=True))
+        truth = truth_of(scene)
         tracks = [
             Track(
                 track.track_id, track.class_name, track.stamps_ns[::2], track.boxes[::2],
