@@ -17,7 +17,7 @@ from torch.nn.functional import pad
 LINK = 6
 NEXT = 2 * LINK  # variables ahead of a link that it is coupled to
 SPAN = NEXT + LINK + NEXT
-BLOCK = 10  # most links eliminated at once
+BLOCK = 5  # most links eliminated at once: fewer cost calls, more cost multiplications
 
 
 class Chain(NamedTuple):
