@@ -98,6 +98,10 @@ INGREDIENTS = {
     ),
     'rigid shape': Ingredient('the points of a track need not agree', _every_kind(shape=1.0)),
     'learnt gaps': Ingredient('the expected annotation rule holds', {'faces.learn': False}),
+    'strips': Ingredient(
+        'the outermost points of a face may all be at one end of it',
+        replaced=((correspondence, 'STRIPS', 1),),
+    ),
     'hidden faces': Ingredient(
         'a face behind its edge tells nothing', replaced=((correspondence, 'VEILED', 0.0),)
     ),

@@ -8,11 +8,14 @@ from boxreg_ros.objective import EXTENT, GAP, Problem, State
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import embedding, pad
 
 BOTTOM = 5
 MARGIN = 0.4  # outside a face, points still count for it [m]
 LEAST = 3  # points without which a face is not seen
+STRIPS = 3  # of a face side by side: each has outermost points of its own
+ACROSS = [1, 1, 0, 0, 1]  # axis along which they lie
+BEHIND = 0.2  # what is this far behind the outermost point of all is not on the face [m]
 BESIDE = 0.2  # outside the edges of a face, points still count for it [m]
 INSIDE = 0.3  # more room on the inner side of a face than on its outer side [m]
 VEILED = 0.25  # say of a face that is hidden behind its edge
@@ -105,7 +108,10 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     -----
     The paper takes the K points closest to a face, visible by their centre of mass. We take
     those furthest out: the closest ones may lie anywhere on a face that is given too far inside.
-    What moves is measured at its own time: points are carried along to the stamp of the box.
+    On a face that is given askew these are all at one end: each of three strips has its own, so
+    that the face turns as well. A strip far behind the others shows something else, say a wheel
+    or a hood. What moves is measured at its own time: points are carried along to the stamp of
+    the box.
 
     """
     points, openness = carried(problem, state), problem.openness
@@ -122,15 +128,20 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
         inside = (local if k else -local)[..., part, :] - offset[..., k:BOTTOM:2, :]
         far = (-MARGIN - inside).maximum(aside[..., part, :]).mul_(FAR)
         torch.maximum(inside, far, out=depth[..., k::2, :])
-    most = min(depth.shape[-1], max(LEAST, int(outermost * depth.shape[-1]) + 1))
-    depth, index = smallest(depth, most)  # (B, N, 5, K)
-    wanted = (outermost * count).clamp(min=LEAST)[..., None, None]
-    chosen = (depth <= MARGIN + INSIDE) & (torch.arange(most, device=depth.device) < wanted)
-    number = chosen.sum(-1)
-    share = chosen / number.clamp(min=1)[..., None].to(points)
-    best = pad(torch.take_along_dim(points[:, :, None], index[..., None], 3), (0, 1), value=1.0)
-    moments = product((best * share[..., None]).mT, best)
-    out = -(torch.where(chosen, depth, 0.0) * share).sum(-1)
+    strip = (local[..., :2, :] / half[..., :2, :] + 1).mul_(STRIPS / 2).clamp_(0, STRIPS - 1)
+    share = outermost / STRIPS
+    most = max(LEAST, int(share * points.shape[2]) + 1)
+    depth, index = smallest(depth, strip.floor_()[..., ACROSS, :], most)  # (B, N, 5, 3, K)
+    limit = (depth.amin((-1, -2), keepdim=True) + BEHIND).clamp(max=MARGIN + INSIDE)
+    wanted = (share * count).clamp(min=LEAST)[..., None, None, None]
+    chosen = (depth <= limit) & (torch.arange(most, device=index.device) < wanted)
+    number = chosen.sum((-1, -2))
+    weight = chosen / number.clamp(min=1)[..., None, None].to(points)
+    first = points.shape[2] * torch.arange(count.numel(), device=index.device)
+    best = embedding(index + first.view(*count.shape, 1, 1, 1), points.flatten(0, 2))
+    best = pad(best, (0, 1), value=1.0)
+    moments = product((best * weight[..., None]).flatten(3, 4).mT, best.flatten(3, 4))
+    out = -(torch.where(chosen, depth, 0.0) * weight).sum((-1, -2))
     trust = (number >= LEAST) * torch.where(openness[..., :BOTTOM] > 0, 1.0, VEILED)
     # The bottom is where a point of the road is, under the centre of the box.
     shift = state.pose[..., :3] - problem.pose[..., :3]
@@ -140,26 +151,28 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     bottom = point[..., None] * point[..., None, :], shift[..., 2] - road - height / 2 + gap, known
     pairs = zip((moments, out, trust), bottom, strict=True)
     found: Any = (torch.cat([five.to(road), one[:, :, None].to(road)], 2) for five, one in pairs)
-    inset[..., BOTTOM] = 0.0
     return Support(*[*found, inset, count.to(road)])
 
 
-def smallest(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def smallest(depth: Tensor, strip: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """
-    Return the `count` smallest of `values` (..., M), ascending but for rounding, and their places.
+    Return the `count` smallest of `depth` (..., M) in each `strip` (..., M), and their places.
 
-    Both are (..., count). The last bits of a value make room for its place: numpy parts numbers
-    four times as fast as torch tells which are smallest.
+    Both are (..., 3, count), ascending; more than 2 m stands for what there is not enough of.
+    One number holds strip, depth and place: numpy sorts those faster than torch finds the least.
 
     """
-    if not values.is_cpu:
-        return values.topk(count, largest=False)
-    size, low = values.shape[-1], (1 << (values.shape[-1] - 1).bit_length()) - 1
-    keys = values.float().view(torch.int32) & ~low
-    keys |= torch.arange(size, dtype=torch.int32)
-    (numbers := keys.numpy().view(np.float32)).partition(count - 1)
-    places = torch.from_numpy(np.sort(numbers[..., :count]).view(np.int32) & low).long()
-    return values.gather(-1, places), places
+    size, device = depth.shape[-1], depth.device
+    scale = 2.0 ** (27 - (bits := (size - 1).bit_length()))  # of a number below 12 [1/m]
+    keys = depth.clamp(max=2.5).add_(strip, alpha=4).add_(1).mul_(scale).int() << bits
+    keys |= torch.arange(size, dtype=torch.int32, device=device)
+    keys = torch.from_numpy(np.sort(keys.numpy())) if keys.is_cpu else keys.sort().values
+    edges = 4 * torch.arange(STRIPS, device=device)
+    first = (edges * scale).int().expand(*keys.shape[:-1], -1) << bits
+    places = torch.searchsorted(keys, first)[..., None] + torch.arange(count, device=device)
+    keys = keys.gather(-1, places.clamp(max=size - 1).flatten(-2)).unflatten(-1, (STRIPS, count))
+    depth = torch.where(places < size, (keys >> bits) / scale - edges[:, None] - 1, FAR)
+    return depth, (keys & (1 << bits) - 1).long()
 
 
 def in_box_axes(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:

@@ -12,13 +12,7 @@ from typing import NamedTuple
 
 from boxreg_ros.chain import Chain, cholesky, Factor, LINK, product
 from boxreg_ros.config import PaperConfig
-from boxreg_ros.geometry import (
-    FACE_AXIS,
-    face_distances,
-    rotation_derivatives,
-    rotation_from_rpy,
-    wrap_angle,
-)
+from boxreg_ros.geometry import face_distances, rotation_derivatives, rotation_from_rpy, wrap_angle
 from boxreg_ros.lbfgs import select
 from boxreg_ros.structures import POSE
 import torch
@@ -394,9 +388,9 @@ def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:
     by_pose[..., 3, 3:] = -(shift[:, :, None, None] @ dR)[..., 0, :].mT
     planes = torch.cat([R.mT, by_pose[..., 3, :3] @ shift[..., None]], -1)
     residual, by_pose = (torch.stack([x, -x], 3).flatten(2, 3) for x in (planes, by_pose))
-    residual[..., 3] += inset + (state.shared[:, GAP] - state.shared[:, FACE_AXIS] / 2)[:, None]
     by_shared, one = R.new_zeros(6, 4, GAP.stop), torch.eye(GAP.stop).to(R)
     by_shared[:, 3] = one[GAP] - one[EXTENT].repeat_interleave(2, 0) / 2
+    residual[..., 3] += inset + (state.shared[:, : GAP.stop] @ by_shared[:, 3].mT)[:, None]
     return Linearised(residual, by_pose, by_shared)
 
 

@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-RETREAT_SPREAD = 0.4  # of a retreat, between objects
 PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
 USUAL = 0.385  # correlation of the errors of an input from one observation to the next
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
@@ -280,8 +279,7 @@ def weigh(
 
     # Closeness and enclosure: outermost points on their faces.
     errors = [faces.ends] * 2 + [faces.sides] * 2 + [faces.top, faces.bottom]
-    trust = sights.trust * (sights.points / (sights.points + 5.0))[..., None]
-    trust = trust / (1 + (sights.outwardness / faces.outlier) ** 2) ** 2
+    trust = sights.trust / (1 + (sights.outwardness / faces.outlier) ** 2) ** 2
     trust = trust * valid[..., None] / torch.tensor(errors).to(trust) ** 2
     # The input, its bias and its extents.
     error = problem.of(*ERRORS)
@@ -297,10 +295,8 @@ def weigh(
     off = objective.prior(state, given, axes).residual[:, :, 0].abs() + surprise(problem, axes)
     off = off / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
-    hidden = (sights.retreat * valid[..., None]).sum(1) / valid.sum(1, keepdim=True)
-    gap = (faces.spread**2 + (RETREAT_SPREAD * hidden) ** 2).sqrt()
-    unusual = (state.shared[:, objective.GAP] - expected[:, objective.GAP]) / gap
-    gap = gap * (1 + (unusual / GAP_OUTLIER) ** 2).sqrt()
+    unusual = (state.shared[:, objective.GAP] - expected[:, objective.GAP]) / faces.spread
+    gap = faces.spread * (1 + (unusual / GAP_OUTLIER) ** 2).sqrt()
     pivot, anchor = expected[:, :1] / 4, torch.ones_like(gap)
     shared = torch.cat([expected[:, :3] * extent, bias, gap, pivot, anchor], 1) ** -2
     # Motion: smoothness, alignment, rest.

@@ -75,15 +75,38 @@ def test_points_on_faces_stand_as_far_out_as_expected(gap):
 
 
 def test_outermost_points_are_the_furthest_out():
-    # Five of 100 points (0.05) on the front, told by hand: their moment and their mean.
+    # Twelve of 240 points (0.05) on the front, four in each of the strips between y = -1, -1/3,
+    # 1/3 and 1, told by hand: their moment and their mean.
     rng = np.random.default_rng(5)
-    points = np.c_[rng.uniform(1.5, 1.95, 100), rng.uniform(-0.7, 0.7, (100, 2))]
+    points = np.c_[rng.uniform(1.8, 1.95, 240), rng.uniform(-0.9, 0.9, (240, 2))]
     found = supported(seen_from([30.0, 0.0, 0.0], points))
-    outer = points[np.argsort(-points[:, 0])[:5]]
-    homogeneous = np.c_[outer, np.ones(5)]
-    np.testing.assert_allclose(found.moments[0, 0, 0], homogeneous.T @ homogeneous / 5)
-    assert found.outwardness[0, 0, 0].item() == pytest.approx(outer[:, 0].mean() - 2)
+    strips = [points[(points[:, 1] > y) & (points[:, 1] < y + 2 / 3)] for y in (-1, -1 / 3, 1 / 3)]
+    outer = np.concatenate([strip[np.argsort(-strip[:, 0])[:4]] for strip in strips])
+    homogeneous = np.c_[outer, np.ones(12)]
+    np.testing.assert_allclose(found.moments[0, 0, 0], homogeneous.T @ homogeneous / 12, rtol=1e-6)
+    assert found.outwardness[0, 0, 0].item() == pytest.approx(outer[:, 0].mean() - 2, abs=1e-4)
     assert found.trust[0, 0, 0] == 1
+
+
+@pytest.mark.parametrize(('behind', 'used'), [(0.15, 9), (0.25, 6)])
+def test_a_strip_far_behind_the_others_is_no_part_of_the_face(behind, used):
+    # The left strip of the front stands 0.15 or 0.25 m behind the other two; 0.2 m is the limit.
+    # Of 60 points the fewest, three, tell a strip.
+    y = np.repeat([-0.7, 0.0, 0.7], 20)
+    points = np.c_[np.where(y > 0.5, 1.9 - behind, 1.9), y, np.tile(np.linspace(-0.8, 0.8, 20), 3)]
+    found = supported(seen_from([30.0, 0.0, 0.0], points))
+    mean = 1.9 - (behind / 3 if used == 9 else 0.0)
+    assert found.outwardness[0, 0, 0].item() == pytest.approx(mean - 2, abs=1e-4)
+    side = found.moments[0, 0, 0][1, 3]  # mean y
+    assert side.item() == pytest.approx(0.0 if used == 9 else -0.35, abs=1e-6)
+
+
+def test_strips_without_points_are_no_part_of_the_face():
+    # Two points in one strip, two in the next, none in the last: the mean of four.
+    points = np.array([[1.9, -0.7, 0.1], [1.8, -0.6, 0.2], [1.9, 0.0, 0.3], [1.8, 0.1, 0.4]])
+    found = supported(seen_from([30.0, 0.0, 0.0], points))
+    assert found.outwardness[0, 0, 0].item() == pytest.approx(-0.15, abs=1e-4)
+    np.testing.assert_allclose(found.moments[0, 0, 0][3, :3], points.mean(0), atol=1e-6)
 
 
 def test_faces_turned_away_have_less_say():

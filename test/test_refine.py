@@ -335,10 +335,11 @@ def test_the_result_moves_with_the_fixed_frame(estimate):
 @each_estimate
 @pytest.mark.parametrize('angle', [0.7, 3.0, -1.7])
 def test_the_result_turns_with_the_fixed_frame(estimate, angle):
-    # 300 points at most: none is thinned out, which goes by their order along x.
+    # 300 points at most: none is thinned out, which goes by their order along x. Two rounds:
+    # whether it takes another one may be a matter of rounding.
     track, _ = a_track()
     R = Rotation.from_euler('z', angle).as_matrix()
-    config = Config(estimate=estimate).updated({'sampling.points': 300})
+    config = Config(estimate=estimate).updated({'sampling.points': 300, 'solver.rounds': 2})
     known, found = only(track, config), only(moved(track, R, np.zeros(3)), config)
     turned = moved(replace(track, boxes=known.boxes), R, np.zeros(3)).boxes
     errors = pose_errors(found.boxes, turned)

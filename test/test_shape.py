@@ -79,7 +79,7 @@ def test_a_wall_pins_no_step_along_it():
 @pytest.mark.parametrize('seed', range(2))
 def test_relative_poses_are_better_with_it(seed):
     # A real shape, seen in parts: errors that are not common to all boxes are what it can tell,
-    # and they fall by a third at least.
+    # and they fall by a quarter at least, to what the faces alone leave.
     scene = simulate('paper', seed)
     (track,) = scene.tracks()
 
@@ -88,4 +88,4 @@ def test_relative_poses_are_better_with_it(seed):
         return (refined.boxes - scene.truth.boxes)[:, :3].std(0).max()
 
     config = Config()
-    assert spread(config) < 0.67 * spread(config.updated({'vehicle.shape': 1.0}))
+    assert spread(config) < 0.75 * spread(config.updated({'vehicle.shape': 1.0}))
