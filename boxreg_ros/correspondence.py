@@ -129,9 +129,8 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
         far = (-MARGIN - inside).maximum(aside[..., part, :]).mul_(FAR)
         torch.maximum(inside, far, out=depth[..., k::2, :])
     strip = (local[..., :2, :] / half[..., :2, :] + 1).mul_(STRIPS / 2).clamp_(0, STRIPS - 1)
-    share = outermost / STRIPS
-    most = max(LEAST, int(share * points.shape[2]) + 1)
-    depth, index = smallest(depth, strip.floor_()[..., ACROSS, :], most)  # (B, N, 5, 3, K)
+    most = max(LEAST, int((share := outermost / STRIPS) * points.shape[2]) + 1)
+    depth, index = smallest(depth, strip.floor_(), most)  # (B, N, 5, 3, K)
     limit = (depth.amin((-1, -2), keepdim=True) + BEHIND).clamp(max=MARGIN + INSIDE)
     wanted = (share * count).clamp(min=LEAST)[..., None, None, None]
     chosen = (depth <= limit) & (torch.arange(most, device=index.device) < wanted)
@@ -156,16 +155,18 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
 
 def smallest(depth: Tensor, strip: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """
-    Return the `count` smallest of `depth` (..., M) in each `strip` (..., M), and their places.
+    Return the `count` smallest of `depth` (..., 5, M) in each `strip` (..., 2, M), and where.
 
-    Both are (..., 3, count), ascending; more than 2 m stands for what there is not enough of.
+    Both are (..., 5, 3, count), ascending; more than 2 m stands for what there is not enough of.
     One number holds strip, depth and place: numpy sorts those faster than torch finds the least.
+    `depth` is written to: fresh memory would cost more than what is done in it.
 
     """
     size, device = depth.shape[-1], depth.device
     scale = 2.0 ** (27 - (bits := (size - 1).bit_length()))  # of a number below 12 [1/m]
-    keys = depth.clamp(max=2.5).add_(strip, alpha=4).add_(1).mul_(scale).int() << bits
-    keys |= torch.arange(size, dtype=torch.int32, device=device)
+    for values, axis in zip(depth.clamp_(max=2.5).unbind(-2), ACROSS, strict=True):
+        values.add_(strip[..., axis, :], alpha=4).add_(1).mul_(scale)
+    keys = depth.int().bitwise_left_shift_(bits).add_(torch.arange(size, device=device))
     keys = torch.from_numpy(np.sort(keys.numpy())) if keys.is_cpu else keys.sort().values
     edges = 4 * torch.arange(STRIPS, device=device)
     first = (edges * scale).int().expand(*keys.shape[:-1], -1) << bits
