@@ -63,7 +63,7 @@ class Rule(NamedTuple):
     gaps : Tensor, shape (6,)
         Gap of each face less the one expected of its class [m].
     depths : Tensor, shape (6,)
-        How much further in points stand on a face that is hidden [m].
+        How much further in points stand on a face that is hidden [m]; 0 for roof and road.
 
     """
 

@@ -109,9 +109,9 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     The paper takes the K points closest to a face, visible by their centre of mass. We take
     those furthest out: the closest ones may lie anywhere on a face that is given too far inside.
     On a face that is given askew these are all at one end: each of three strips has its own, so
-    that the face turns as well. A strip far behind the others shows something else, say a wheel
-    or a hood. What moves is measured at its own time: points are carried along to the stamp of
-    the box.
+    that the face turns as well. What is far behind the outermost point of all shows something
+    else, say a wheel or a hood. What moves is measured at its own time: points are carried along
+    to the stamp of the box.
 
     """
     points, openness = carried(problem, state), problem.openness
@@ -155,11 +155,28 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
 
 def smallest(depth: Tensor, strip: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """
-    Return the `count` smallest of `depth` (..., 5, M) in each `strip` (..., 2, M), and where.
+    Find the outermost points in every strip of every face.
 
-    Both are (..., 5, 3, count), ascending; more than 2 m stands for what there is not enough of.
-    One number holds strip, depth and place: numpy sorts those faster than torch finds the least.
-    `depth` is written to: fresh memory would cost more than what is done in it.
+    Parameters
+    ----------
+    depth : Tensor, shape (..., 5, M)
+        How far inside of each face but the bottom each point is, above -1 [m]; written to.
+    strip : Tensor, shape (..., 2, M)
+        0, 1 or 2: the strip each point is in, along x and along y of the box.
+    count : int
+        K, the points wanted of each strip.
+
+    Returns
+    -------
+    depth : Tensor, shape (..., 5, 3, K)
+        The least of each strip, ascending [m]; above 2 where there are not as many.
+    index : Tensor, shape (..., 5, 3, K)
+        Which of the M points these are.
+
+    Notes
+    -----
+    One integer holds strip, depth and place of a point: numpy sorts these faster than torch finds
+    the least. Fresh memory would cost more than what is done in it, so `depth` is reused.
 
     """
     size, device = depth.shape[-1], depth.device
