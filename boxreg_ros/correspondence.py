@@ -122,13 +122,13 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     x, y, z = local.abs().sub_(half).unbind(-2)
     count = (x.maximum(y).maximum(z) < MARGIN).sum(-1)
     # Masks cost five times as much as sums: what does not count is made to lie very far inside.
-    aside = torch.stack([y.maximum(z), x.maximum(z), x.maximum(y)], -2).sub_(BESIDE)
-    depth = points.new_empty(*count.shape, BOTTOM, points.shape[-2])
-    for k, part in enumerate((slice(3), slice(2))):  # front left top, back right
-        inside = (local if k else -local)[..., part, :] - offset[..., k:BOTTOM:2, :]
-        far = (-MARGIN - inside).maximum(aside[..., part, :]).mul_(FAR)
-        torch.maximum(inside, far, out=depth[..., k::2, :])
-    strip = (local[..., :2, :] / half[..., :2, :] + 1).mul_(STRIPS / 2).clamp_(0, STRIPS - 1)
+    aside = torch.stack([y.maximum(z), x.maximum(z), x.maximum(y)], -2).sub_(BESIDE).mul_(FAR)
+    x, y, z = local.unbind(-2)
+    depth = torch.stack([-x, x, -y, y, -z], -2).sub_(offset[..., :BOTTOM, :]).float()
+    for k in (0, 1):  # front left top, back right
+        side = depth[..., k::2, :]
+        torch.maximum(side, aside[..., : 3 - k, :], out=side)
+    strip = (local[..., :2, :] / half[..., :2, :]).add_(1).mul_(STRIPS / 2).clamp_(0, STRIPS - 1)
     most = max(LEAST, int((share := outermost / STRIPS) * points.shape[2]) + 1)
     depth, index = smallest(depth, strip.floor_(), most)  # (B, N, 5, 3, K)
     limit = (depth.amin((-1, -2), keepdim=True) + BEHIND).clamp(max=MARGIN + INSIDE)
@@ -160,7 +160,7 @@ def smallest(depth: Tensor, strip: Tensor, count: int) -> tuple[Tensor, Tensor]:
     Parameters
     ----------
     depth : Tensor, shape (..., 5, M)
-        How far inside of each face but the bottom each point is, above -1 [m]; written to.
+        How far inside of each face but the bottom each point is [m], float32; written to.
     strip : Tensor, shape (..., 2, M)
         0, 1 or 2: the strip each point is in, along x and along y of the box.
     count : int
@@ -180,13 +180,15 @@ def smallest(depth: Tensor, strip: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     """
     size, device = depth.shape[-1], depth.device
-    scale = 2.0 ** (27 - (bits := (size - 1).bit_length()))  # of a number below 12 [1/m]
-    for values, axis in zip(depth.clamp_(max=2.5).unbind(-2), ACROSS, strict=True):
-        values.add_(strip[..., axis, :], alpha=4).add_(1).mul_(scale)
-    keys = depth.int().bitwise_left_shift_(bits).add_(torch.arange(size, device=device))
+    scale = 2.0 ** (27 - (bits := max(8, (size - 1).bit_length())))  # of a number below 12 [1/m]
+    strip.mul_(4 * scale).add_(scale + 2**23)  # above it a float ends in the bits of its integer
+    for values, axis in zip(depth.clamp_(-1, 2.5).unbind(-2), ACROSS, strict=True):
+        torch.add(strip[..., axis, :], values, alpha=scale, out=values)
+    places = torch.arange(size, dtype=torch.int32, device=device)  # 64 bits would cost a third
+    keys = depth.view(torch.int32).bitwise_left_shift_(bits).add_(places)
     keys = torch.from_numpy(np.sort(keys.numpy())) if keys.is_cpu else keys.sort().values
     edges = 4 * torch.arange(STRIPS, device=device)
-    first = (edges * scale).int().expand(*keys.shape[:-1], -1) << bits
+    first = ((edges + 1 - MARGIN) * scale).int().expand(*keys.shape[:-1], -1) << bits
     places = torch.searchsorted(keys, first)[..., None] + torch.arange(count, device=device)
     keys = keys.gather(-1, places.clamp(max=size - 1).flatten(-2)).unflatten(-1, (STRIPS, count))
     depth = torch.where(places < size, (keys >> bits) / scale - edges[:, None] - 1, FAR)

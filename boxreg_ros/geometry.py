@@ -51,6 +51,5 @@ def face_distances(points: Tensor, boxes: Tensor) -> Tensor:
 
     """
     local = (points - boxes[..., None, :3]) @ rotation_from_rpy(boxes[..., 6:9])
-    sign = FACE_SIGN.to(local)
     half = boxes[..., None, 3:6][..., FACE_AXIS] / 2
-    return local[..., FACE_AXIS] * sign - half
+    return local[..., FACE_AXIS] * FACE_SIGN.to(local) - half

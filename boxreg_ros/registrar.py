@@ -229,8 +229,7 @@ class _TrackBuffer:
             return np.zeros(3)
         boxes = [e.observation.box if e.estimate is None else e.estimate for e in known]
         seconds = [(e.observation.stamp_ns - stamp_ns) * 1e-9 for e in known]
-        slope: Floats = np.polyfit([*seconds, 0.0], np.array([*boxes, box])[:, X : Z + 1], 1)[0]
-        return slope
+        return np.asarray(np.polyfit([*seconds, 0.0], np.array([*boxes, box])[:, X : Z + 1], 1)[0])
 
     def write(self, estimate: Estimate) -> None:
         self.memory = estimate.memory

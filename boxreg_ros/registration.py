@@ -165,7 +165,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     limits = solver.iterations, solver.history, solver.tolerance
     is_track = config.estimate == 'track'
     rule, noise, turn = model.rule(), model.noise(), 0
-    stride = max(1, problem.points.shape[2] // COARSE if rounds > 1 else 1)
+    every_point = problem.points.shape[2]
+    most = COARSE if rounds > 1 else every_point
     everyone = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), everyone.clone())
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
@@ -176,8 +177,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
 
     @torch.inference_mode()
     def improve(rows: Tensor) -> Tensor:
-        """Take round `turn` with some windows, every `stride`-th point; return those not done."""
-        part, here = select(problem, rows).thinned(stride), select(state, rows)
+        """Take round `turn` with some windows, `most` points or more; return those not done."""
+        part, here = select(problem.thinned(most), rows), select(state, rows)
         expected = everyone[rows]
         here.shared[:, objective.ANCHOR] = 0.0
         sights = support(part, here, config.faces.outermost, rule.depths)
@@ -209,8 +210,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
             rows, turn = torch.cat(list(run(improve, parts))), turn + 1
             if is_track:
                 noise = InputNoise.measure(scatter(problem, state), problem.valid)
-            if not len(rows) and stride > 1:
-                rows, stride = every, 1  # where few points lead to, all of them tell
+            if not len(rows) and 2 * most <= every_point:
+                rows, most = every, every_point  # where few points lead to, all of them tell
     return Solution(state, covariances, left)
 
 
@@ -377,7 +378,7 @@ def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None
     """Show the model the fresh observations at their input boxes."""
     fresh = [window.fresh_part() for window in windows if window.fresh > 0]
     if fresh:
-        (problem, _), rule = stack(fresh, config), model.rule()
+        problem, rule = stack(fresh, config)[0].thinned(COARSE), model.rule()
         state = State(problem.pose, expected_shared(problem, rule))
         sights = support(problem, state, config.faces.outermost, rule.depths)
         model.learn_rule([window.track_id for window in fresh], sights, problem.valid, rule)
@@ -392,7 +393,6 @@ def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
 
 def _kept(window: Window) -> Estimate:
     """Return the input boxes of a window that is too short."""
-    n = len(window.observations)
-    boxes = np.array([o.box for o in window.observations]).reshape(n, 9)
-    words = (KEPT,) * n, ('short_track',) * n
+    boxes = np.array([o.box for o in window.observations]).reshape(-1, 9)
+    words = (KEPT,) * (n := len(boxes)), ('short_track',) * n
     return Estimate(boxes, *words, np.broadcast_to(np.eye(6), (n, 6, 6)))
