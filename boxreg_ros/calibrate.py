@@ -172,7 +172,7 @@ def _errors_of_kind(
     off = scatter(problem, State(pose, extent))
 
     def deviations(rows: slice) -> Floats:
-        noise = InputNoise.measure(off[rows], problem.valid[rows])
+        noise = InputNoise.measure(off[rows])
         lon, lat, z, roll, pitch, yaw = noise.deviation[:6].tolist()
         return np.array([lon, lat, z, np.hypot(roll, pitch) / np.sqrt(2), yaw])
 

@@ -17,6 +17,7 @@ KINDS = ([0, 1], [2, 3], [4], [5])  # ends, sides, top, bottom
 RULE_ERROR = (0.05, 0.05, 0.05, 0.15)  # how far a rule may be from the expected one [m]
 TRACKS, SCATTERS = 100, 100  # remembered: tracks, and observations of each
 LEAST = 20  # observations of a track, that it tells how its input errs
+HELD = 1e-3  # step of a box that only repeats the one before [m, rad]
 
 
 class InputNoise(NamedTuple):
@@ -38,9 +39,10 @@ class InputNoise(NamedTuple):
     trust: float = 0.0
 
     @classmethod
-    def measure(cls, scatter: Tensor, valid: Tensor) -> 'InputNoise':
-        """Pool the tracks (B, N, 9) that are long enough to tell, `valid` (B, N)."""
-        valid = valid & (valid.sum(1, keepdim=True) >= LEAST)
+    def measure(cls, scatter: Tensor) -> 'InputNoise':
+        """Pool the tracks (B, N, 9) that are long enough to tell; NaN tells nothing."""
+        valid, scatter = scatter.isfinite().all(2), scatter.nan_to_num()
+        valid &= valid.sum(1, keepdim=True) >= LEAST
         if not (total := int(valid.sum())):
             return cls()
         count = valid.sum(1)[:, None, None].clamp(min=1)
@@ -49,9 +51,12 @@ class InputNoise(NamedTuple):
         bounded = scatter.clamp(-3 * deviation, 3 * deviation)
         both = valid[:, 1:] & valid[:, :-1]
         first, second = bounded[:, :-1][both], bounded[:, 1:][both]
-        power = (first.square() + second.square()).sum(0).clamp(min=1e-12) / 2
-        correlation = ((first * second).sum(0) / power).clamp(0.0, 0.9)
-        return cls(deviation, correlation, total / (total + LEAST))
+        power = (first.square() + second.square()).sum(0) / 2
+        # What never changes, such as an extent that a tracker holds, errs by the same all along;
+        # one or two tracks cannot tell it from the gap of their faces.
+        held = 1 - 2 / valid.any(1).sum()
+        correlation = torch.where(power > 1e-12, (first * second).sum(0) / power, held)
+        return cls(deviation, correlation.clamp(0.0, 0.9), total / (total + LEAST))
 
 
 class Rule(NamedTuple):
@@ -72,11 +77,18 @@ class Rule(NamedTuple):
 
 
 def scatter(problem: Problem, state: State) -> Tensor:
-    """Return input minus fit along the box axes, as `InputNoise` counts them, (B, N, 9)."""
+    """
+    Return input minus fit along the box axes, as `InputNoise` counts them, (B, N, 9).
+
+    NaN for boxes that repeat the one before: what a tracker holds does not tell how it errs.
+
+    """
     difference = problem.pose - state.pose
     along = (rotation_from_rpy(state.pose[..., 3:]).mT @ difference[..., :3, None])[..., 0]
     extent = problem.boxes[..., 3:6] / state.shared[:, None, EXTENT] - 1
-    return torch.cat([along, difference[..., 3:], extent], -1)
+    found = torch.cat([along, difference[..., 3:], extent], -1)
+    held = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1) < HELD  # the first: the last
+    return torch.where((problem.valid & ~held)[..., None], found, torch.nan)
 
 
 class InputModel:
@@ -121,7 +133,7 @@ class InputModel:
         for name, row in zip(names, scatters, strict=True):
             known = _of(self._scatter, name, np.full((SCATTERS, 9), np.nan))
             known[:-1], known[-1] = known[1:].copy(), row
-        self._fresh += len(names)
+        self._fresh += int(np.isfinite(scatters).all(1).sum())
 
     def rule(self) -> Rule:
         """Return the annotation rule to expect."""
@@ -150,13 +162,10 @@ class InputModel:
         Measured anew when that has grown by a twentieth: it costs as much as there is.
 
         """
-        if self._fresh < 0.05 * self._measured:
-            return self._noise
-        if self._scatter:
+        if self._fresh > 0.05 * self._measured:
             known = torch.from_numpy(np.array(list(self._scatter.values())))
-            valid = known.isfinite().all(2)
-            self._noise = InputNoise.measure(known.nan_to_num(), valid)
-            self._fresh, self._measured = 0, int(valid.sum())
+            self._noise = InputNoise.measure(known)
+            self._fresh, self._measured = 0, int(known[..., 0].isfinite().sum())
         return self._noise
 
 

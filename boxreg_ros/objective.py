@@ -192,8 +192,8 @@ def total(
 
     """
     points = problem.points + problem.boxes[..., None, :3]
-    both = (term(boxes, problem.valid, rounding) for term in (smoothness, alignment))
-    violation = torch.stack(list(both), -1)
+    terms = smoothness, alignment
+    violation = torch.stack([term(boxes, problem.valid, rounding) for term in terms], -1)
     penalty = violation.new_tensor([weights.smoothness, weights.alignment])
     loss = weights.closeness * closeness(boxes, points, problem.mask, weights.nearest)
     loss = loss + weights.enclosure * enclosure(boxes, points, problem.mask)

@@ -28,6 +28,8 @@ SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 1000  # observations that a thread works on at once: what its cache holds
 COARSE = 256  # points of a box that tell where it is but for the last round
+EVERY = 2**62  # all of them, however many
+CAREFUL = 0.4  # part of the usual error: boxes that scatter less were drawn with care
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 
@@ -165,8 +167,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     limits = solver.iterations, solver.history, solver.tolerance
     is_track = config.estimate == 'track'
     rule, noise, turn = model.rule(), model.noise(), 0
-    every_point = problem.points.shape[2]
-    most = COARSE if rounds > 1 else every_point
+    most = COARSE if rounds > 1 else EVERY
     everyone = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), everyone.clone())
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
@@ -202,16 +203,16 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     workers = solver.threads or cpu_count()
     with ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool:
         rows = every = torch.arange(len(state.pose), device=free.device)
-        size = (PART if rows.is_cpu else 2**62) / length
+        size = (PART if rows.is_cpu else EVERY) / length
         while len(rows):
             count = workers * int(1 + len(rows) / size / workers) if len(rows) > size else 1
             parts = rows.tensor_split(min(len(rows), count))
             run = pool.map if len(parts) > 1 else map
             rows, turn = torch.cat(list(run(improve, parts))), turn + 1
             if is_track:
-                noise = InputNoise.measure(scatter(problem, state), problem.valid)
-            if not len(rows) and 2 * most <= every_point:
-                rows, most = every, every_point  # where few points lead to, all of them tell
+                noise = InputNoise.measure(scatter(problem, state))
+            if not len(rows) and 2 * most <= problem.points.shape[2]:
+                rows, most = every, EVERY  # where few points lead to, all of them tell
     return Solution(state, covariances, left)
 
 
@@ -285,16 +286,17 @@ def weigh(
     # The input, its bias and its extents.
     error = problem.of(*ERRORS)
     correlation = USUAL + noise.trust * (noise.correlation.to(error) - USUAL)
-    ratio = (noise.deviation[:6].to(error) / error).clamp(0.05, 4.0)
+    ratio = noise.deviation[:6].to(error) / error
+    ratio = (ratio * (ratio / CAREFUL).square().clamp(max=1.0)).clamp(0.02, 4.0)
     ratio = (1 + noise.trust * (ratio**2 - 1)).sqrt()
     interval = (problem.times * valid).amax(1, keepdim=True) / (valid.sum(1, keepdim=True) - 1)
     slow = ((correlation ** (TENTH / interval) - 0.15) / 0.3).clamp(0.1, 1.0)
     bias = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]) * slow[:, :6] * ratio.clamp(0.1, 2.0)
-    error, extent = error * ratio, of('extent') * slow[:, 6:]
+    error, extent = error * ratio, of('extent') * slow[:, 6:] * (2 * ratio[:, :3]).clamp(0.1, 1.0)
     inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
     axes = rotation_from_rpy(state.pose[..., 3:])
-    off = objective.prior(state, given, axes).residual[:, :, 0].abs() + surprise(problem, axes)
-    off = off / error[:, None]
+    input_off = objective.prior(state, given, axes)
+    off = (input_off.residual[:, :, 0].abs() + surprise(problem, axes)) / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     unusual = (state.shared[:, objective.GAP] - expected[:, objective.GAP]) / faces.spread
     gap = faces.spread * (1 + (unusual / GAP_OUTLIER) ** 2).sqrt()
@@ -302,8 +304,7 @@ def weigh(
     shared = torch.cat([expected[:, :3] * extent, bias, gap, pivot, anchor], 1) ** -2
     # Motion: smoothness, alignment, rest.
     change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2
-    turn = torch.eye(6).to(state.pose).expand(*state.pose.shape[:2], 6, 6).clone()
-    turn[..., :3, :3] = axes
+    turn = input_off.by_pose[:, :, 0].mT
     change = ((turn * change[:, None, None]) @ turn.mT)[:, 1:-1] * valid[:, 2:, None, None]
     slip = of('slip', 'climb') ** -2
     still = (of('drift') * error.new_tensor([1, 1, 0.5, 0.15, 0.15, 0.15])) ** -2
@@ -348,8 +349,7 @@ def _parked(problem: Problem) -> Tensor:
     late = (t - (t * valid).sum(1, keepdim=True) / valid.sum(1, keepdim=True)) * valid
     slope = (late[..., None] * problem.boxes[..., :2]).sum(1) / (late * t).sum(1)[:, None]
     speed, seconds = slope.square().sum(1).sqrt(), (t * valid).amax(1)
-    is_parked = (speed < PARKED[0]) & (speed * seconds < PARKED[1])
-    return is_parked[:, None].to(valid) * valid[:, 1:]
+    return ((speed < PARKED[0]) & (speed * seconds < PARKED[1]))[:, None] * valid[:, 1:]
 
 
 def expected_shared(problem: Problem, rule: Rule) -> Tensor:
@@ -358,9 +358,8 @@ def expected_shared(problem: Problem, rule: Rule) -> Tensor:
     total = (problem.boxes[..., 3:6] * problem.valid[..., None]).sum(1) + problem.seen[:, :3]
     mean = total / (n + problem.seen[:, 3:])
     gaps = problem.of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
-    none = torch.zeros_like(gaps)
     pivot = mean[:, :1] * problem.deviations['pivot'][:, None]
-    return torch.cat([mean, none, gaps + rule.gaps.to(mean), pivot, none], 1)
+    return torch.cat([mean, 0 * gaps, gaps + rule.gaps.to(mean), pivot, 0 * gaps], 1)
 
 
 def free_variables(problem: Problem, config: Config) -> Tensor:

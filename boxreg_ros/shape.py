@@ -1,7 +1,5 @@
 """One rigid shape per track: what all its observations say of it in the frame of its box."""
 
-import math
-
 from boxreg_ros.correspondence import carried, in_box_axes
 from boxreg_ros.objective import EXTENT, Problem, State
 import torch
@@ -49,7 +47,7 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     scaled = (p / half.index_select(0, window) + 1) * (counts / 2)
     place = scaled.floor().clamp(counts * 0, counts - 1)
     cell = (place * counts.new_tensor([CELLS[1] * CELLS[2], CELLS[2], 1])).sum(1).long()
-    cell += window * (count := math.prod(CELLS))
+    cell += window * (count := CELLS[0] * CELLS[1] * CELLS[2])
     # Moments of the points in each cell, their number last; a plane through them.
     p = pad(p, (0, 1), value=1.0)
     sums = p.new_zeros(B * count, 16).index_add_(0, cell, (p[:, :, None] * p[:, None]).flatten(1))

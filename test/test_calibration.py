@@ -21,10 +21,6 @@ D = torch.float64
 FACES = FaceConfig()
 
 
-def real(values):
-    return torch.ones(values.shape[:2], dtype=torch.bool)
-
-
 # --- noise --------------------------------------------------------------------------------------
 
 
@@ -46,46 +42,54 @@ def test_noise_is_measured(correlation):
     # 15 % at 0.8.
     deviation = np.array([0.3, 0.1, 0.05, 0.01, 0.02, 0.03, 0.1, 0.2, 0.05])
     values = autoregressive(30, 60, deviation, correlation)
-    noise = InputNoise.measure(values, real(values))
+    noise = InputNoise.measure(values)
     np.testing.assert_allclose(noise.deviation, deviation, rtol=0.2)
     np.testing.assert_allclose(noise.correlation, correlation, atol=0.1)
 
 
 def test_noise_does_not_hang_on_outliers_or_on_bias():
     values = autoregressive(30, 60, np.ones(9), 0.0)
-    known = InputNoise.measure(values, real(values))
+    known = InputNoise.measure(values)
     rng = np.random.default_rng(1)
     spoilt = values + 7 * torch.from_numpy(rng.normal(size=(30, 1, 9)))  # one bias per track
-    found = InputNoise.measure(spoilt, real(values))
+    found = InputNoise.measure(spoilt)
     np.testing.assert_allclose(found.deviation, known.deviation, rtol=1e-9)
     np.testing.assert_allclose(found.correlation, known.correlation, atol=1e-9)
     spoilt = values.clone()
     spoilt[:, 7] += 30.0  # one of 60 flips
-    found = InputNoise.measure(spoilt, real(values))
+    found = InputNoise.measure(spoilt)
     np.testing.assert_allclose(found.deviation, known.deviation, rtol=0.25)
 
 
 def test_correlation_stays_in_its_bounds():
     steady = torch.linspace(-1, 1, 50, dtype=D)[None, :, None].expand(2, 50, 9)
-    np.testing.assert_allclose(InputNoise.measure(steady, real(steady)).correlation, 0.9)
+    np.testing.assert_allclose(InputNoise.measure(steady).correlation, 0.9)
     zigzag = ((-1.0) ** torch.arange(50, dtype=D))[None, :, None].expand(2, 50, 9)
-    np.testing.assert_allclose(InputNoise.measure(zigzag, real(zigzag)).correlation, 0.0)
+    np.testing.assert_allclose(InputNoise.measure(zigzag).correlation, 0.0)
     nothing = torch.zeros(2, 50, 9, dtype=D)
-    noise = InputNoise.measure(nothing, real(nothing))
+    noise = InputNoise.measure(nothing)
     np.testing.assert_array_equal(noise.deviation, 0)
-    assert noise.correlation.isfinite().all()
+    np.testing.assert_array_equal(noise.correlation, 0)
+
+
+@pytest.mark.parametrize(('tracks', 'correlation'), [(1, 0), (2, 0), (4, 0.5), (30, 0.9)])
+def test_what_never_changes_errs_by_the_same_all_along(tracks, correlation):
+    # 1 - 2 / tracks, at most 0.9: of one track alone it may be the gap of the faces as well.
+    values = autoregressive(tracks, 50, np.ones(9), 0.5)
+    values[:, :, 6] = torch.linspace(-1, 1, tracks, dtype=D)[:, None]
+    noise = InputNoise.measure(values)
+    assert noise.deviation[6] < 1e-12
+    assert noise.correlation[6] == pytest.approx(correlation)
 
 
 def test_short_tracks_do_not_tell_and_padding_does_not_count():
     values = autoregressive(3, 40, np.ones(9), 0.3)
-    valid = real(values)
-    assert InputNoise.measure(values[:, : LEAST - 1], valid[:, : LEAST - 1]).trust == 0
-    known = InputNoise.measure(values[:2, :30], valid[:2, :30])
-    valid[:2, 30:] = False
-    valid[2, LEAST - 1 :] = False
-    values[~valid] = 1e6
+    assert InputNoise.measure(values[:, : LEAST - 1]).trust == 0
+    known = InputNoise.measure(values[:2, :30])
+    values[:2, 30:] = torch.nan
     values[2] *= 100  # too short to be heard
-    found = InputNoise.measure(values, valid)
+    values[2, LEAST - 1 :] = torch.nan
+    found = InputNoise.measure(values)
     np.testing.assert_allclose(found.deviation, known.deviation)
     np.testing.assert_allclose(found.correlation, known.correlation)
     assert found.trust == known.trust == 60 / 80
@@ -95,12 +99,29 @@ def test_scatter_by_hand():
     # The fit heads along +y and is 0.3 m behind the input along y and 0.2 m to its right (+x),
     # so the input is 0.3 m ahead and 0.2 m to the left. 4.4 m given for 4 m is a tenth too long.
     box = [0.0, 0, 0, 4.4, 2, 1.5, 0.01, 0.02, np.pi / 2 + 0.05]
-    problem = problem_of([[box]])
-    pose = torch.tensor([[[0.2, -0.3, 0.1, 0.0, 0.0, np.pi / 2]]], dtype=D)
+    problem = problem_of([[box, [1.0, *box[1:]]]])  # one alone repeats itself
+    pose = torch.tensor([[[0.2, -0.3, 0.1, 0.0, 0.0, np.pi / 2]] * 2], dtype=D)
     shared = shared_of()
-    found = scatter(problem, State(pose, shared))
+    found = scatter(problem, State(pose, shared))[:, :1]
     known = [[[0.3, 0.2, -0.1, 0.01, 0.02, 0.05, 0.1, 0.0, -0.25]]]
     np.testing.assert_allclose(found, known, atol=1e-12)
+
+
+def test_boxes_that_a_tracker_holds_do_not_tell_how_it_errs():
+    # Moved, moved, moved, held, moved: what repeats the one before tells nothing; padding neither.
+    x = [0.0, 1.0, 2.0, 2.0, 3.0, 3.0]
+    boxes = [[a, 0, 0, 4, 2, 1.5, 0, 0, 0] for a in x]
+    problem = problem_of([boxes])
+    problem.valid[0, -1] = False
+    found = scatter(problem, State(problem.pose, shared_of()))
+    tells = found.isfinite().all(2)
+    assert tells.tolist() == [[True, True, True, False, True, False]]
+    # An extent that changes is news, and so is a turn.
+    for part in (3, 8):
+        changed = problem._replace(boxes=problem.boxes.clone())
+        changed.boxes[0, 3, part] += 0.01
+        found = scatter(changed, State(problem.pose, shared_of()))
+        assert found.isfinite().all(2).tolist() == [[True] * 5 + [False]]
 
 
 def test_noise_of_a_stream():
@@ -114,8 +135,8 @@ def test_noise_of_a_stream():
         model.learn_noise([str(b) for b in alive], values[alive, i].numpy())
         if i == LEAST - 2:
             assert model.noise().trust == 0
-    valid = torch.arange(40) < torch.tensor(lengths)[:, None]
-    known = InputNoise.measure(values, valid)
+    is_there = torch.arange(40) < torch.tensor(lengths)[:, None]
+    known = InputNoise.measure(torch.where(is_there[..., None], values, torch.nan))
     np.testing.assert_allclose(model.noise().deviation, known.deviation)
     np.testing.assert_allclose(model.noise().correlation, known.correlation)
 
@@ -127,7 +148,7 @@ def test_of_a_track_its_last_observations_count():
     model = InputModel(FACES)
     for row in values.unbind(1):
         model.learn_noise(['a', 'b', 'c'], row.numpy())
-    known = InputNoise.measure(values[:, SCATTERS:], real(values[:, SCATTERS:]))
+    known = InputNoise.measure(values[:, SCATTERS:])
     np.testing.assert_allclose(model.noise().deviation, known.deviation)
     np.testing.assert_allclose(model.noise().correlation, known.correlation)
 
@@ -139,9 +160,7 @@ def test_noise_of_what_is_not_finite_is_left_out():
     model = InputModel(FACES)
     for row in values.unbind(1):
         model.learn_noise(['a', 'b'], row.numpy())
-    valid = real(values)
-    valid[0, 20] = False
-    known = InputNoise.measure(values.nan_to_num(), valid)
+    known = InputNoise.measure(values)
     np.testing.assert_allclose(model.noise().deviation, known.deviation)
     np.testing.assert_allclose(model.noise().correlation, known.correlation)
 
@@ -154,7 +173,7 @@ def test_scatters_of_the_tracks_seen_last_are_remembered():
     for kind, values in zip(names, (old, new), strict=True):
         for row in values.unbind(1):
             model.learn_noise(kind, row.numpy())
-    known = InputNoise.measure(new, real(new))
+    known = InputNoise.measure(new)
     np.testing.assert_allclose(model.noise().deviation, known.deviation)
 
 
