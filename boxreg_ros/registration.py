@@ -29,6 +29,7 @@ ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 1000  # observations that a thread works on at once: what its cache holds
 COARSE = 256  # points of a box that tell where it is but for the last round
 EVERY = 2**62  # all of them, however many
+SHOWN = 64  # points of a box that show the shape of its track
 CAREFUL = 0.4  # part of the usual error: boxes that scatter less were drawn with care
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
@@ -185,7 +186,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         sights = support(part, here, config.faces.outermost, rule.depths)
         terms = [t for t in weigh(part, here, sights, expected, noise, config) if t.weight.any()]
         if turn > 0 and is_track:
-            information, wanted = agreement(part, here)
+            information, wanted = agreement(part.thinned(SHOWN), here)
             terms.append(Term(objective.shape, information[:, :, None], (here.pose, wanted)))
         x = here.pack()
         total = Sum(terms, x, length, free[rows])

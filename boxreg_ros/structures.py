@@ -33,9 +33,8 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ShapeError(f'{name}: expected numbers of shape {wanted}: {error}') from None
-    if array.ndim != len(shape) or any(
-        want not in (None, got) for want, got in zip(shape, array.shape, strict=True)
-    ):
+    fits = [want in (None, got) for want, got in zip(shape, array.shape, strict=False)]
+    if array.ndim != len(shape) or not all(fits):
         raise ShapeError(f'{name}: expected shape {wanted}, got {array.shape}')
     return array
 
