@@ -30,7 +30,7 @@ PART = 1000  # observations that a thread works on at once: what its cache holds
 COARSE = 256  # points of a box that tell where it is but for the last round
 EVERY = 2**62  # all of them, however many
 SHOWN = 64  # points of a box that show the shape of its track
-CAREFUL = 0.4  # part of the usual error: boxes that scatter less were drawn with care
+CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 

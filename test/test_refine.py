@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from boxreg_ros import Config, refine, Track, window
+from boxreg_ros import Config, refine, registration, Track, window
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.metrics import iou_3d, pose_errors, wrap
 from boxreg_ros.simulate import simulate
@@ -334,9 +334,10 @@ def test_the_result_moves_with_the_fixed_frame(estimate):
 
 @each_estimate
 @pytest.mark.parametrize('angle', [0.7, 3.0, -1.7])
-def test_the_result_turns_with_the_fixed_frame(estimate, angle):
+def test_the_result_turns_with_the_fixed_frame(monkeypatch, estimate, angle):
     # 300 points at most: none is thinned out, which goes by their order along x. Two rounds:
     # whether it takes another one may be a matter of rounding.
+    monkeypatch.setattr(registration, 'SHOWN', 300)
     track, _ = a_track()
     R = Rotation.from_euler('z', angle).as_matrix()
     config = Config(estimate=estimate).updated({'sampling.points': 300, 'solver.rounds': 2})

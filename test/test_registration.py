@@ -79,6 +79,49 @@ def test_covariances_are_of_the_size_of_the_errors():
     assert 1 / 36 < np.mean(ratios) < 2
 
 
+# --- what a tracker holds -----------------------------------------------------------------------
+
+WHOLE = ALONE.updated({'estimate': 'track'})
+
+
+def test_extents_that_a_tracker_holds_are_estimated():
+    # Eight cars of one length pass the sensor, which sees their fronts first and their backs
+    # later: that length is there to be measured. The input is 6 % too long for one half of them
+    # and too short for the other, always the same.
+    truth = drive(40, turn=0, start=(-10.0, 6.0, 0.0))
+    many = []
+    for k in range(8):
+        track = track_of(truth, np.random.default_rng(k), str(k))
+        track.boxes[:, 3] *= 1.06 if k % 2 else 0.94
+        many.append(window_of(track, WHOLE))
+    lengths = [found.boxes[0, 3] for found in register(many, WHOLE, InputModel(WHOLE.faces))]
+    before = 0.12 * truth[0, 3]
+    assert np.mean(lengths[1::2]) - np.mean(lengths[::2]) < before / 2
+
+
+def test_parked_boxes_that_a_tracker_holds_do_not_pass_for_exact():
+    # Nine parked cars, the box of each always the same, 0.2 m off along or across; and three
+    # that move, whose boxes wander by 0.15 m: by these the input is judged, and the others too.
+    rng, many, truths, n = np.random.default_rng(0), [], [], 60
+    for k in range(12):
+        is_parked = k % 4 > 0
+        truth = drive(n, turn=0, start=(4.0 * k - 22.0, 6.0, 0.0), speed=0 if is_parked else 5.0)
+        track = track_of(truth, rng, str(k), position=0.0, heading=0.0)
+        if is_parked:
+            track.boxes[:, k % 2] += 0.2 * (-1) ** (k // 2)
+            truths.append(truth)
+        else:
+            drift = np.zeros(2)
+            for box in track.boxes:
+                drift = 0.8 * drift + 0.6 * 0.15 * rng.normal(size=2)
+                box[:2] += drift
+        many.append(window_of(track, WHOLE))
+    estimates = register(many, WHOLE, InputModel(WHOLE.faces))
+    parked = [found.boxes for k, found in enumerate(estimates) if k % 4]
+    off = np.linalg.norm((np.array(parked) - truths)[..., :2], axis=2)
+    assert off.mean() < 0.2 / 2
+
+
 # --- independence -------------------------------------------------------------------------------
 
 
