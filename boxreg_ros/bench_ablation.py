@@ -112,9 +112,7 @@ INGREDIENTS = {
     ),
     'measured noise': Ingredient(
         'the input errs as the settings say',
-        replaced=(
-            (calibration.InputNoise, 'measure', classmethod(lambda cls, scatter, valid: cls())),
-        ),
+        replaced=((calibration.InputNoise, 'measure', classmethod(lambda cls, scatter: cls())),),
     ),
     'bias': Ingredient(
         'errors of the input have no constant part',
