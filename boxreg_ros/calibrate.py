@@ -160,7 +160,7 @@ def _errors_of_kind(
     """Return the errors of tracks of (stamp, input box, true box) long enough to tell."""
     tracks = [track for track in tracks if len(track) >= LEAST]
     if not tracks:
-        return {name: Measured(np.nan, np.nan, 0) for name in ERRORS}
+        return dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
     problem, base = stack([_bare([row[:2] for row in track]) for track in tracks], config)
     true, true_base = stack([_bare([row[::2] for row in track]) for track in tracks], config)
     pose = true.pose + torch.nn.functional.pad(torch.from_numpy(true_base - base), (0, 3))[:, None]
@@ -170,19 +170,19 @@ def _errors_of_kind(
     rule = Rule(torch.zeros(6), torch.zeros(6))
     extent = expected_shared(true, rule)
     off = scatter(problem, State(pose, extent))
+    off = off[off.isfinite().all(2).sum(1) >= LEAST]  # the boxes of others were held
 
     def deviations(rows: slice) -> Floats:
         noise = InputNoise.measure(off[rows])
         lon, lat, z, roll, pitch, yaw = noise.deviation[:6].tolist()
         return np.array([lon, lat, z, np.hypot(roll, pitch) / np.sqrt(2), yaw])
 
-    pooled = deviations(slice(None))
-    single = np.array([deviations(slice(b, b + 1)) for b in range(len(tracks))])
-    spreads = [_deviation(column - np.median(column)) for column in single.T]
-    found = {
-        name: Measured(float(value), spread, len(tracks))
-        for name, value, spread in zip(ERRORS, pooled, spreads, strict=False)
-    }
+    found = dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
+    if len(off):
+        single = np.array([deviations(slice(b, b + 1)) for b in range(len(off))])
+        spreads = [_deviation(column - np.median(column)) for column in single.T]
+        for name, value, spread in zip(ERRORS, deviations(slice(None)), spreads, strict=False):
+            found[name] = Measured(float(value), spread, len(off))
     # What counts for the one extent of a track is the error of its mean.
     error = (expected_shared(problem, rule) / extent)[:, EXTENT].numpy() - 1
     size = 1.48 * np.median(np.abs(error), axis=1)

@@ -145,6 +145,21 @@ def test_errors_of_the_input_are_found(bias, turned):
         assert 0 < measured.spread < value
 
 
+@pytest.mark.parametrize('held', [10, 25])
+def test_boxes_that_are_held_tell_the_errors_of_extents_only(held):
+    # Of 25 tracks some have the same box at all stamps.
+    drive = noisy_drive(DEVIATION)
+    first = drive.boxes[0].boxes[:held]
+    boxes = tuple(replace(a, boxes=np.r_[first, a.boxes[held:]]) for a in drive.boxes)
+    found = input_errors(replace(drive, boxes=boxes), Config())
+    assert found['vehicle.extent'].tracks == 25
+    assert found['vehicle.position'].tracks == 25 - held
+    if held < 25:
+        assert found['vehicle.position'].value == pytest.approx(0.2, rel=0.1)
+    else:
+        assert set(calibrated(Config(), found)) == {'vehicle.extent'}
+
+
 def test_kinds_have_errors_of_their_own():
     drives = [noisy_drive(DEVIATION * k, class_name=c) for k, c in ((1, 'bus'), (2, 'person'))]
     walkers = [replace(a, track_ids=tuple(f'p{n}' for n in a.track_ids)) for a in drives[1].boxes]
