@@ -176,10 +176,8 @@ class Config:
     def class_config(self, class_name: str) -> ClassConfig:
         """Return how objects of `class_name` move; unknown classes move like vehicles."""
         words = class_name.lower().replace('_', ' ').replace('-', ' ').replace('.', ' ').split()
-        for kind in (self.cyclist, self.pedestrian):
-            if any(name in words for name in kind.names):
-                return kind
-        return self.vehicle
+        kinds = (kind for kind in (self.cyclist, self.pedestrian) if {*words} & {*kind.names})
+        return next(kinds, self.vehicle)
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, as `from_dict` and YAML take them."""

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 Pairs = tuple[Ints, Ints, Floats, Floats]
 RING = 1.0  # how far beside a box the road is looked for [m]
 CLEARANCE = 0.2  # what is lower above the road may be road [m]
+EITHER = 0.2  # deeper in one of two boxes by less, a point may be of either [m]
 
 
 class Observation(NamedTuple):
@@ -51,8 +52,9 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     Return what `boxes` (n, 9) see of `sweep`, one observation each.
 
     A point near several boxes belongs to the one it is deepest inside of (or least outside), so
-    that a neighbour's bumper is no evidence. Points lower than the road beside the box plus a
-    clearance are left out, and the road's height is kept instead.
+    that a neighbour's bumper is no evidence, and to those it is nearly as deep inside of: two
+    boxes of one object do not take each other's points away. Points lower than the road beside
+    the box plus a clearance are left out, and the road's height is kept instead.
 
     All boxes are seen at once, as pairs of a point and a box.
 
@@ -67,7 +69,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     road = _road(height.take(beside), owner.take(beside), n)
     nearest = np.full(len(sweep.points), np.inf)
     np.minimum.at(nearest, index, depth)
-    is_own = (depth < config.sampling.margin) & (depth <= nearest.take(index))
+    is_own = (depth < config.sampling.margin) & (depth <= nearest.take(index) + EITHER)
     own = np.flatnonzero(is_own & (height > (np.nan_to_num(road) + CLEARANCE).take(owner)))
     inside = np.bincount(owner.take(np.flatnonzero(depth <= 0)), minlength=n).tolist()
     owner, x = owner.take(own), offset[0].take(own)
