@@ -87,7 +87,8 @@ def scatter(problem: Problem, state: State) -> Tensor:
     along = (rotation_from_rpy(state.pose[..., 3:]).mT @ difference[..., :3, None])[..., 0]
     extent = problem.boxes[..., 3:6] / state.shared[:, None, EXTENT] - 1
     found = torch.cat([along, difference[..., 3:], extent], -1)
-    held = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1) < HELD  # the first: the last
+    # Before the first comes the last: of an object that is held all along it is the same box.
+    held = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1) < HELD
     return torch.where((problem.valid & ~held)[..., None], found, torch.nan)
 
 

@@ -82,9 +82,9 @@ class Problem(NamedTuple):
         """Return deviations by name, (B, n)."""
         return torch.stack([self.deviations[name] for name in names], -1)
 
-    def thinned(self, most: int) -> 'Problem':
-        """Return the same with every n-th point, at least `most` of them."""
-        names, stride = ('points', 'mask', 'delays'), max(1, self.points.shape[2] // most)
+    def thinned(self, enough: int) -> 'Problem':
+        """Return the same with every n-th point, so that `enough` are left if there are."""
+        names, stride = ('points', 'mask', 'delays'), max(1, self.points.shape[2] // enough)
         return self._replace(**{name: getattr(self, name)[:, :, ::stride] for name in names})
 
 

@@ -28,7 +28,7 @@ SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 1000  # observations that a thread works on at once: what its cache holds
 COARSE = 256  # points of a box that tell where it is but for the last round
-EVERY = 2**62  # all of them, however many
+EVERY = 2**62  # enough to leave none out
 SHOWN = 64  # points of a box that show the shape of its track
 CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
@@ -168,7 +168,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     limits = solver.iterations, solver.history, solver.tolerance
     is_track = config.estimate == 'track'
     rule, noise, turn = model.rule(), model.noise(), 0
-    most = COARSE if rounds > 1 else EVERY
+    enough = COARSE if rounds > 1 else EVERY
     everyone = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), everyone.clone())
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
@@ -179,8 +179,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
 
     @torch.inference_mode()
     def improve(rows: Tensor) -> Tensor:
-        """Take round `turn` with some windows, `most` points or more; return those not done."""
-        part, here = select(problem.thinned(most), rows), select(state, rows)
+        """Take round `turn` with some windows, `enough` points; return those not done."""
+        part, here = select(problem.thinned(enough), rows), select(state, rows)
         expected = everyone[rows]
         here.shared[:, objective.ANCHOR] = 0.0
         sights = support(part, here, config.faces.outermost, rule.depths)
@@ -212,8 +212,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
             rows, turn = torch.cat(list(run(improve, parts))), turn + 1
             if is_track:
                 noise = InputNoise.measure(scatter(problem, state))
-            if not len(rows) and 2 * most <= problem.points.shape[2]:
-                rows, most = every, EVERY  # where few points lead to, all of them tell
+            if not len(rows) and 2 * enough <= problem.points.shape[2]:
+                rows, enough = every, EVERY  # where few points lead to, all of them tell
     return Solution(state, covariances, left)
 
 
@@ -275,7 +275,9 @@ def weigh(
     A face loses its say as the square of Cauchy's weight, the input as Cauchy's. The error of an
     input is a part that is constant over its track, the bias, and one that changes slowly: the
     correlation measured widens its deviation, and without correlation over a tenth of a second
-    there is no bias either.
+    there is no bias either. Input that scatters by less than `CAREFUL` of its usual error errs by
+    less than its scatter tells, and where that is below half of the usual its extents are held
+    more, too.
 
     """
     of, valid, faces, given = problem.of, problem.valid.to(state.pose), config.faces, problem.pose
