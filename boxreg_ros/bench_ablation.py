@@ -25,7 +25,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.drive import Drive
 from boxreg_ros.evaluate import finite, Scores, summarise
 from boxreg_ros.objective import BIAS, Problem, SHARED
-from boxreg_ros.structures import Floats, Ints, Sweep
+from boxreg_ros.structures import Floats, Ints, Sweep, YAW
 import numpy as np
 from numpy.typing import NDArray
 import torch
@@ -82,9 +82,9 @@ def _no_road(heights: Floats, owner: Ints, n: int) -> Floats:
     return np.full(n, np.nan)
 
 
-def _as_given(yaw: Floats, valid: NDArray[np.bool_], known: Floats) -> Floats:
+def _as_given(boxes: Floats, *_: NDArray[Any]) -> Floats:
     """Stand in for `one_heading`: headings keep their signs."""
-    return np.unwrap(yaw)
+    return np.unwrap(boxes[..., YAW])
 
 
 _free_variables = registration.free_variables

@@ -433,10 +433,9 @@ def acceleration(state: State, times: Tensor) -> Linearised:
 
 def rest(state: State) -> Linearised:
     """First differences of the pose of what is parked [m, rad]."""
-    p = state.pose
-    eye = torch.eye(6).to(p)
-    by_pose = torch.cat([-eye, eye], -1).expand(*p[:, 1:].shape[:2], 1, 6, 12)
-    return Linearised((p[:, 1:] - p[:, :-1])[:, :, None], by_pose, p.new_zeros(1, 6, 0))
+    step = state.pose.diff(dim=1)[:, :, None]
+    by_pose = torch.cat([-torch.eye(6), torch.eye(6)], 1).to(step).expand(*step.shape, 12)
+    return Linearised(step, by_pose, step.new_zeros(1, 6, 0))
 
 
 def slip(state: State, times: Tensor) -> Linearised:

@@ -241,17 +241,15 @@ class _TrackBuffer:
 
     def settle(self, count: int) -> None:
         for entry in self.entries[:count]:
-            if not entry.is_settled:
-                entry.is_settled = True
-                entry.tick.waiting -= 1
+            entry.tick.waiting -= not entry.is_settled
+            entry.is_settled = True
 
     def slide(self, config: Config) -> None:
         """Settle and forget what the next window does not need."""
-        if config.estimate != 'track':
-            del self.entries[: max(0, len(self.entries) - config.window + 1)]
-        else:
+        keep = config.window - 1
+        if config.estimate == 'track':
             # The ends of a window are its weakest part: an eighth waits for the next window,
             # which sees another eighth of settled ones before it.
-            overlap = config.track_window // 8
+            keep = 2 * (overlap := config.track_window // 8)
             self.settle(max(0, len(self.entries) - overlap))
-            del self.entries[: max(0, len(self.entries) - 2 * overlap)]
+        del self.entries[: max(0, len(self.entries) - keep)]

@@ -1,7 +1,7 @@
 """Windows of observations, and their batches as padded tensors."""
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import astuple, fields
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
@@ -18,6 +18,7 @@ NOTHING = np.full(MEMORY, np.nan), np.zeros(MEMORY), np.zeros((MEMORY, MEMORY)),
 ANGLES = [3, 4, 5, 9, 10, 11]  # of the two poses that are remembered
 AWAY = 1e6  # where points are that are not real: near no box [m]
 TELLING = 30  # observations of a track tell as much of its labels as many more
+REVERSE = 6.0  # nothing reverses faster [m/s]
 BATCH_VALUES = 3e7  # most point coordinates, or entries of the curvature, solved at once
 
 
@@ -121,7 +122,7 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     times += 0.1 * np.maximum(step - last, 0)
     known = zip(*(w.memory or (w.observations[0].box[:3], *NOTHING) for w in windows), strict=True)
     base, state, move, information, seen = (np.array(part) for part in known)
-    boxes[..., YAW] = one_heading(boxes[..., YAW], valid, state[:, 5])
+    boxes[..., YAW] = one_heading(boxes, times, valid, state[:, 5])
     start = boxes.copy()
     for b, window in enumerate(windows):
         start[b, : len(window.start)] = window.start
@@ -134,9 +135,8 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     recalled = np.nan_to_num(state + move)
     recalled[:, ANGLES] += np.pi * turns
     information *= FADING * (turns % 2 == 0).all(1)[:, None, None]
-    kinds = {name: config.class_config(name) for name in {w.class_name for w in windows}}
     names = [item.name for item in fields(ClassConfig)[1:]]
-    rows = {kind: [getattr(k, name) for name in names] for kind, k in kinds.items()}
+    rows = {k: astuple(config.class_config(k))[1:] for k in {w.class_name for w in windows}}
     numbers = np.array([rows[window.class_name] for window in windows], dtype=np.float64)
     deviations = dict(zip(names, torch.from_numpy(numbers).to(device).unbind(1), strict=True))
     arrays: list[Any] = [boxes, start, valid, times, points, mask, delays, origins, ground]
@@ -146,14 +146,20 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     return problem._replace(openness=aspect(problem)), base
 
 
-def one_heading(yaw: Floats, valid: NDArray[np.bool_], known: Floats) -> Floats:
+def one_heading(boxes: Floats, times: Floats, valid: NDArray[np.bool_], known: Floats) -> Floats:
     """
-    Return `yaw` (B, N) unwrapped [rad], with the half turns undone that are in the minority.
+    Return the yaw (B, N) of `boxes` (B, N, 9), unwrapped [rad], half turns undone.
 
-    Where the heading of the first is `known` (B,), not NaN, three quarters must say otherwise.
+    Those are undone that are in the minority; where the heading of the first is `known` (B,),
+    not NaN, three quarters must say otherwise. What is faster than anything reverses moves
+    forward, whatever its boxes say; `times` (B, N) [s].
 
     """
-    chain = np.unwrap(yaw, period=np.pi)
-    turned = ((np.cos(yaw - chain) < 0) & valid).sum(1) / valid.sum(1)
+    chain = np.unwrap(boxes[..., YAW], period=np.pi)
+    turned = ((np.cos(boxes[..., YAW] - chain) < 0) & valid).sum(1) / valid.sum(1)
     limit = np.where(np.cos(known - chain[:, 0]) < 0, 0.25, np.where(np.isnan(known), 0.5, 0.75))
-    return np.where((turned > limit)[:, None], chain + np.pi, chain)
+    dx, dy = np.moveaxis(np.diff(boxes[..., :2], axis=1, prepend=boxes[:, :1, :2]), 2, 0)
+    along = (dx * np.cos(chain) + dy * np.sin(chain)) / np.diff(times, prepend=-1.0)
+    speed = np.nanmedian(np.where(valid, along, np.nan), 1)
+    turned = np.where(np.abs(speed) > REVERSE, speed < 0, turned > limit)
+    return np.where(turned[:, None], chain + np.pi, chain)

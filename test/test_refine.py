@@ -236,6 +236,16 @@ def test_reversing_is_not_a_flip(estimate):
     assert np.abs(pose_errors(refined.boxes, truth).rotation[:, 2]).max() < 0.2
 
 
+@each_estimate
+def test_motion_tells_where_all_headings_are_turned_around(estimate):
+    track, truth = a_track(truth=drive(14, speed=9.0, turn=0.2))
+    boxes = track.boxes.copy()
+    boxes[:, 8] += np.pi
+    refined = only(replace(track, boxes=boxes), Config(estimate=estimate))
+    told = slice(3 if estimate == 'early' else 0, None)  # two steps are too few
+    assert np.abs(pose_errors(refined.boxes, truth).rotation[told, 2]).max() < 0.2
+
+
 # An input box far off, as after an identity switch. It holds no points, and comes back as it is.
 @pytest.mark.parametrize('far', [3.0, 10.0, 100.0, 10_000.0])
 def test_one_box_far_off_does_not_spoil_the_others(far):

@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.objective import MEMORY
-from boxreg_ros.structures import POSE
+from boxreg_ros.structures import POSE, YAW
 from boxreg_ros.window import batches, FADING, Memory, one_heading, stack
 import numpy as np
 import pytest
@@ -60,6 +60,11 @@ def test_stack_pads():
     assert problem.deviations['position'].tolist() == [CONFIG.vehicle.position] * 4
 
 
+def seconds(boxes):
+    """Return the times of `boxes` (1, N, 9), ten in a second."""
+    return 0.1 * np.arange(boxes.shape[1])[None]
+
+
 @pytest.mark.parametrize(
     'yaw, known',
     [
@@ -74,9 +79,10 @@ def test_stack_pads():
 def test_one_heading(yaw, known):
     # Up to whole turns; steps are small whatever the input.
     # What is padded, here by half turns, has no say.
-    padded = np.array([yaw + [yaw[-1] + np.pi] * 9])
-    valid, unknown = np.arange(padded.size)[None] < len(yaw), np.array([np.nan])
-    (found,) = one_heading(padded, valid, unknown)[:, : len(yaw)]
+    boxes = np.zeros((1, len(yaw) + 9, 9))
+    boxes[0, :, YAW] = yaw + [yaw[-1] + np.pi] * 9
+    times, valid = seconds(boxes), np.arange(boxes.shape[1])[None] < len(yaw)
+    (found,) = one_heading(boxes, times, valid, np.array([np.nan]))[:, : len(yaw)]
     np.testing.assert_allclose(np.cos(found - known), 1, atol=1e-12)
     assert (np.abs(np.diff(found)) < np.pi / 2).all()
 
@@ -100,11 +106,26 @@ def test_a_known_heading_is_kept_until_three_quarters_say_otherwise(
     # them or not; what has left headed to 0, give or take whole turns.
     steps = 0.01 * np.arange(8)
     is_contrary = np.arange(8) < contrary if is_first_turned else np.arange(8) >= 8 - contrary
-    yaw, valid = (steps + np.pi * is_contrary)[None], np.ones((1, 8), dtype=bool)
+    boxes, valid = np.zeros((1, 8, 9)), np.ones((1, 8), dtype=bool)
+    boxes[0, :, YAW] = steps + np.pi * is_contrary
     for heading, base in ((np.nan, unknown), (0.02 + turns, known)):
-        (found,) = one_heading(yaw, valid, np.array([heading]))
+        (found,) = one_heading(boxes, seconds(boxes), valid, np.array([heading]))
         np.testing.assert_allclose(np.cos(found - steps - base), 1, atol=1e-12)
         assert (np.abs(np.diff(found)) < np.pi / 2).all()
+
+
+@pytest.mark.parametrize('heading', [np.nan, 0.3, 0.3 + np.pi])
+@pytest.mark.parametrize('speed', [7.0, 5.0, 0.0, -5.0, -7.0])
+def test_what_is_faster_than_anything_reverses_moves_forward(speed, heading):
+    # Ten boxes that all head to 0.3 and move along that at `speed`; the last is 1 km off, as
+    # after an identity switch, and one is missing. Slower ones keep what the majority says.
+    times = np.delete(0.1 * np.arange(11), 4)[None]
+    boxes, valid = np.zeros((1, 10, 9)), np.ones((1, 10), dtype=bool)
+    boxes[..., YAW] = 0.3
+    boxes[..., :2] = speed * times[..., None] * [np.cos(0.3), np.sin(0.3)]
+    boxes[0, -1, :2] -= 1000.0
+    found = one_heading(boxes, times, valid, np.array([heading]))
+    np.testing.assert_allclose(np.cos(found - 0.3), -1 if speed == -7.0 else 1)
 
 
 def test_what_has_left_is_stacked():
