@@ -48,13 +48,24 @@ PERIOD = 0.1  # of the sensor of a live stream [s]
 SPEED = 4.0  # of all traffic, the sensor included [m/s]
 REFERENCE_ITERATIONS = 100  # per round; more changes its final value by less than a percent
 FUSED = 0.16 / 64  # one evaluation of a window of 10 x 128 by a fused kernel on two cores [ms]
-# Relabels argv[1] to argv[2] and ends with its own peak memory [kB]: what a parent is told of its
-# children counts the memory they share with it before they run a program of their own.
+# Relabels argv[1] to argv[2] and ends with the time in which it solves [s] and its own peak memory
+# [kB]: what a parent is told of its children counts the memory they share with it before they run
+# a program of their own.
 RELABEL = """
 import sys
+from time import perf_counter
+from boxreg_ros import registrar
 from boxreg_ros.cli import main
+register, spent = registrar.register, []
+def timed(*args):
+    begin = perf_counter()
+    estimates = register(*args)
+    spent.append(perf_counter() - begin)
+    return estimates
+registrar.register = timed
 code = main(['relabel', sys.argv[1], '-o', sys.argv[2]])
-print(next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM')))
+peak = next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM'))
+print(sum(spent), peak)
 sys.exit(code)
 """
 NO_OPEN3D = 'Open3D is not installed: pip install open3d'
@@ -85,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         'scaling': scaling(config, args.quick),
     }
     seconds = 3.0 if args.quick else 20.0
-    report['relabel'] = relabel(tracks, points, seconds, report['tick']['crop and sample'])
+    report['relabel'] = relabel(tracks, points, seconds)
     if args.out:
         args.out.mkdir(parents=True, exist_ok=True)
         report['plot'] = str(_plot(report['scaling'], config, args.out / 'speed.png'))
@@ -303,15 +314,15 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
     return result
 
 
-def relabel(tracks: int, points: int, seconds: float, crop_ms: float) -> dict[str, float]:
+def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
     """
     Return how `boxreg relabel` does on a recording of `seconds` at 10 Hz, in its own process.
 
     ``total`` is what all of it takes [s], the stages are what each is busy; as reading goes on
     while the registrar works, they add up to more. ``faster`` is how much less than the recording
-    lasts the total is, ``rest`` the part of it in which nothing is solved: the registrar solves,
-    but for `crop_ms` of each sweep. ``memory`` is its peak [MB], ``short`` and ``long`` those on
-    recordings of this length and of ten times that, with sweeps of a fifth of the points.
+    lasts the total is, ``packed`` the same of a recording compressed by zstd, ``rest`` the part of
+    the total in which nothing is solved. ``memory`` is its peak [MB], ``short`` and ``long`` those
+    on recordings of this length and of ten times that, with sweeps of a fifth of the points.
 
     """
     result: dict[str, float] = {}
@@ -319,6 +330,7 @@ def relabel(tracks: int, points: int, seconds: float, crop_ms: float) -> dict[st
         path, out = Path(name) / 'drive.mcap', Path(name) / 'out'
         for case, size, length in (
             ('memory', points, seconds),
+            ('packed', points, seconds),
             ('short', points // 5, seconds),
             ('long', points // 5, 10 * seconds),
         ):
@@ -330,18 +342,20 @@ def relabel(tracks: int, points: int, seconds: float, crop_ms: float) -> dict[st
                 (i.boxes for i in c),
                 (i.T_fixed_sensor for i in d),
                 'odom',
+                is_packed=case == 'packed',
             )
             command = [sys.executable, '-c', RELABEL, str(path), str(out)]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
                 raise RuntimeError(f'boxreg relabel failed: {done.stdout}{done.stderr}')
-            result[case] = float(done.stdout.split()[-1]) / 1024
+            solved, peak = map(float, done.stdout.split()[-2:])
+            spent = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['seconds']
+            result[case] = peak / 1024
             if case == 'memory':
-                summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
-                spent = summary['seconds']
-                solved = spent['registrar'] - 1e-3 * crop_ms * summary['sweeps']
                 result |= spent
                 result |= {'faster': seconds / spent['total'], 'rest': 1 - solved / spent['total']}
+            elif case == 'packed':
+                result[case] = seconds / spent['total']
     return result
 
 
@@ -522,7 +536,7 @@ def _text(report: dict[str, Any]) -> str:
     stages = ('read', 'decode', 'transform', 'registrar', 'write')
     lines.append(
         f'relabel: {r["faster"]:.1f} times faster than the recording lasts ({r["total"]:.1f} s; '
-        'busy, partly at once: '
+        f'{r["packed"]:.1f} times where it is compressed; busy, partly at once: '
         + ', '.join(f'{k} {r[k]:.1f}' for k in stages)
         + f'), all but the solve {r["rest"]:.0%}; peak {r["memory"]:.0f} MB; of a smaller one '
         f'{r["short"]:.0f} MB, ten times as long {r["long"]:.0f} MB'

@@ -244,7 +244,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads."""
     parser.add_argument(
         'predicted', type=Path, metavar='PREDICTED',
-        help='boxes.csv of a run, or a recording: its input boxes as they are',
+        help='folder or boxes.csv of a run, or a recording: its input boxes as they are',
     )  # fmt: skip
     parser.add_argument('truth', type=Path, metavar='TRUTH.csv', help='true boxes, same columns')
     parser.add_argument(
@@ -261,12 +261,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the scores of one table of boxes, or of a recording's own boxes."""
     truth = BoxTable.read(args.truth)
-    if args.predicted.suffix == '.csv':
-        predicted = BoxTable.read(args.predicted)
+    source = args.predicted
+    if (table_of_run := source / 'boxes.csv').is_file():
+        source = table_of_run
+    if source.suffix == '.csv':
+        predicted = BoxTable.read(source)
     else:
         from boxreg_ros.relabel import input_boxes  # reads bags: not needed for tables
 
-        predicted = BoxTable.from_arrays(input_boxes(args.predicted))
+        predicted = BoxTable.from_arrays(input_boxes(source))
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes)
     if not len(matches.is_matched):

@@ -26,6 +26,7 @@ def write_recording(
     detections: Iterable[BoxArray],
     T_fixed_sensor: Iterable[Floats],
     fixed_frame: str,
+    is_packed: bool = False,
 ) -> None:
     """
     Write ``/points``, ``/detections``, ``/odom`` and ``/tf``; an old file is replaced whole.
@@ -40,6 +41,8 @@ def write_recording(
         Where the sensor was at each stamp, in `fixed_frame`.
     fixed_frame : str
         Parent frame of the odometry.
+    is_packed : bool
+        Compress by zstd; `ros2 bag record` does not unless asked to.
 
     Raises
     ------
@@ -54,7 +57,8 @@ def write_recording(
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f'.{path.stem}-') as folder:
             bag = Path(folder) / path.stem
             writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
-            writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            if is_packed:
+                writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             with writer:
                 topics: dict[str, Any] = {}
 

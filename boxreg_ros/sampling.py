@@ -65,7 +65,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     height = offset[2] + half[:, 2].take(owner)  # above the bottom of the box
     beside = np.flatnonzero((aside > 0.05) & (depth < RING) & (np.abs(height) < 0.6))
     corner = np.hypot(half[:, 0], half[:, 1]) + RING  # the ring ends at an upright square
-    beside = beside[np.abs(offset[:2, beside]).max(0) < corner.take(owner.take(beside))]
+    beside = beside[np.abs(offset[:2].take(beside, 1)).max(0) < corner.take(owner.take(beside))]
     road = _road(height.take(beside), owner.take(beside), n)
     nearest = np.full(len(sweep.points), np.inf)
     np.minimum.at(nearest, index, depth)

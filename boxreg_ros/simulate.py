@@ -179,8 +179,9 @@ def run(args: argparse.Namespace) -> int:
     truth = args.truth or args.output.with_name(f'{args.output.stem}_truth.csv')
     intensities = [np.where(o == ROAD, 10, 40 + 13 * o % 60) for o in scene.owners]
     write_recording(
-        args.output, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, 'odom'
-    )
+        args.output, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, 'odom',
+        is_packed=True,
+    )  # fmt: skip
     scene.truth.write(truth)
     print(
         f'{args.output}: {len(scene.sweeps)} sweeps, '

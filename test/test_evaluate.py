@@ -187,6 +187,8 @@ def test_command(tmp_path, capsys):
     assert report['missing'] == 4
     assert report['iou_3d'] == pytest.approx(1, abs=1e-6)
     assert report['by_class']['Car']['recall_3d'] == [0.8] * 3
+    assert run(tmp_path, tmp_path / 'truth.csv', '--json') == 0, 'the folder of a run'
+    assert json.loads(capsys.readouterr().out) == report
     words = ('--min-points', 100, '--classes', 'car,van', 'truck')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', *words) == 0
     text = capsys.readouterr().out
