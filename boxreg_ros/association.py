@@ -91,6 +91,5 @@ class StampMatcher:
         self._oldest_ns = max(self._oldest_ns, oldest_ns)
         while self._sweeps and self._sweeps[0].stamp_ns < oldest_ns:
             stamp_ns = self._sweeps.pop(0).stamp_ns
-            if stamp_ns not in self._used:
-                self._counts['sweep_without_boxes'] += 1
+            self._counts.update([] if stamp_ns in self._used else ['sweep_without_boxes'])
             self._used.discard(stamp_ns)

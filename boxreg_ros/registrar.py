@@ -115,8 +115,7 @@ class BoxRegistrar:
         newest_ns, self._newest_ns = self._newest_ns, max(now_ns, self._newest_ns)
         late = '' if now_ns > newest_ns else 'late' if now_ns < newest_ns else 'duplicate_stamp'
         tick.is_paired = sweep is not None and not late
-        if sweep is None:
-            self.counts['boxes_without_sweep'] += 1
+        self.counts.update(['boxes_without_sweep'] if sweep is None else [])
         tick.refuse(late or ('no_sweep' if sweep is None else ''))
         admitted = [i for i, reason in enumerate(tick.reasons) if not reason]
         silent = now_ns - round(self.config.max_gap * 1e9)
