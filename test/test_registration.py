@@ -292,6 +292,34 @@ def test_the_bias_to_expect_by_hand(trust, fast, slow):
     np.testing.assert_allclose(bias, known, rtol=1e-9)
 
 
+def test_how_far_a_gap_may_be_off_by_hand():
+    # Points 0.3 m above the roofs of two boxes of three, of which each has its say; the left side
+    # has been found with a gap 0.1 m wider than expected, 2 of its deviations; on the other faces
+    # all is as expected. An input correlated as usual, by 0.385, has biases of
+    # (0.385 - 0.15) / 0.3 of its errors, and so for extents, half of which a face moves by.
+    kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
+    problem = problem_of(drive(3)[None], deviations=kinds)
+    expected = expected_shared(problem, InputModel(ALONE.faces).rule())
+    left, top = objective.GAP.start + 2, objective.GAP.start + 4
+    sights = support(problem, State(problem.pose, expected), 0.05, torch.zeros(6, dtype=D))
+    outwardness, trust = torch.zeros(1, 3, 6, dtype=D), torch.ones(1, 3, 6, dtype=D)
+    outwardness[0, :, 4], trust[0, 2, 4] = torch.tensor([0.3, 0.3, 9.0], dtype=D), 0.0
+    sights = sights._replace(outwardness=outwardness, trust=trust)
+    state = State(problem.pose, expected.clone())
+    state.shared[0, left] += 2 * ALONE.faces.spread
+    (weight,) = (
+        term.weight[0, 0, 0].diagonal()
+        for term in weigh(problem, state, sights, expected, InputNoise(), ALONE)
+        if term.function is objective.shared_prior
+    )
+    part, height = (0.385 - 0.15) / 0.3, drive(1)[0, 5]
+    z, half = part * ALONE.vehicle.height, part * ALONE.vehicle.extent * height / 2
+    known = np.full(22, ALONE.faces.spread)
+    known[left] *= 2**0.5
+    known[top] *= (1 + 0.3**2 / (ALONE.faces.spread**2 + z**2 + half**2) / 4) ** 0.5
+    np.testing.assert_allclose(weight[objective.GAP] ** -0.5, known[objective.GAP], rtol=1e-9)
+
+
 def numbers(kind):
     return ((f.name, getattr(kind, f.name)) for f in fields(kind) if f.name != 'names')
 
