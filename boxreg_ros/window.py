@@ -160,6 +160,6 @@ def one_heading(boxes: Floats, times: Floats, valid: NDArray[np.bool_], known: F
     limit = np.where(np.cos(known - chain[:, 0]) < 0, 0.25, np.where(np.isnan(known), 0.5, 0.75))
     dx, dy = np.moveaxis(np.diff(boxes[..., :2], axis=1, prepend=boxes[:, :1, :2]), 2, 0)
     along = (dx * np.cos(chain) + dy * np.sin(chain)) / np.diff(times, prepend=-1.0)
-    speed = np.nanmedian(np.where(valid, along, np.nan), 1)
+    speed = np.sort(np.where(valid, along, np.inf))[np.arange(len(boxes)), (valid.sum(1) - 1) // 2]
     turned = np.where(np.abs(speed) > REVERSE, speed < 0, turned > limit)
     return np.where(turned[:, None], chain + np.pi, chain)

@@ -70,7 +70,7 @@ def test_boxes_come_closer_to_the_truth(estimate, motion):
     # Errors of 0.15 m and 0.05 rad leave 0.8 of overlap: a third of what is missing must be
     # gained by the early estimates, which know no future and begin late, and half by the others.
     missing = []
-    for seed in range(2):
+    for seed in range(4):
         track, truth = a_track(seed, truth=drive(14, **motion))
         refined = only(track, Config(estimate=estimate))
         missing.append([1 - iou_3d(boxes, truth).mean() for boxes in (track.boxes, refined.boxes)])
