@@ -277,8 +277,8 @@ def weigh(
     correlation measured widens its deviation, and without correlation over a tenth of a second
     there is no bias either. Input that scatters by less than `CAREFUL` of its usual error errs by
     less than its scatter tells, and where that is below half of the usual its extents are held
-    more, too. The gap of a face is unusual by how far it is from the expected one, or the points
-    from the face, in deviations: points on a load or under a branch are not to lift the roof.
+    more, too. A gap is unusual by how many deviations it is from the expected one, or the points
+    from where they are expected: those of a load, or of a branch above, are not to lift the roof.
 
     """
     of, valid, faces, given = problem.of, problem.valid.to(state.pose), config.faces, problem.pose
@@ -302,10 +302,10 @@ def weigh(
     input_off = objective.prior(state, given, axes)
     off = (input_off.residual[:, :, 0].abs() + surprise(problem, axes)) / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
-    free = faces.spread**2 + (bias[:, :3] ** 2 + (expected[:, :3] * extent / 2) ** 2)[:, FACE_AXIS]
+    wide = faces.spread**2 + (bias[:, :3] ** 2 + (expected[:, :3] * extent / 2) ** 2)[:, FACE_AXIS]
     away = (sights.outwardness * trust).sum(1) / trust.sum(1).clamp(min=1e-9)
     unusual = (state.shared - expected)[:, objective.GAP] ** 2 / faces.spread**2
-    gap = faces.spread * (1 + unusual.maximum(away**2 / free) / GAP_OUTLIER**2).sqrt()
+    gap = faces.spread * (1 + unusual.maximum(away**2 / wide) / GAP_OUTLIER**2).sqrt()
     pivot, anchor = expected[:, :1] / 4, torch.ones_like(gap)
     shared = torch.cat([expected[:, :3] * extent, bias, gap, pivot, anchor], 1) ** -2
     # Motion: smoothness, alignment, rest.

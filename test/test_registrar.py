@@ -196,7 +196,8 @@ def test_points_measured_before_their_stamp(estimate):
 @each_estimate
 @pytest.mark.parametrize('offset_ns', [-45_000_000, 45_000_000])
 def test_boxes_stamped_between_sweeps(estimate, offset_ns):
-    # A car at 15 m/s, which moves 0.68 m in these 45 ms: nearly as good as with equal stamps.
+    # A car at 15 m/s, which moves 0.68 m in these 45 ms: nearly as good as with equal stamps, but
+    # for a twenty-fifth of that, as its speed is told by its noisy boxes.
     truth = drive(16, speed=15.0, turn=0.2, start=(-10.0, 6.0, 0.0))
     there = np.array([[np.interp(t + offset_ns, stamps(16), x) for x in truth.T]
                       for t in stamps(16)])  # fmt: skip
@@ -217,7 +218,7 @@ def test_boxes_stamped_between_sweeps(estimate, offset_ns):
     swapped = [r for s, b in stream[1:-1] for r in registrar.add_boxes(b) + registrar.add_sweep(s)]
     assert_equal(swapped + registrar.flush(), results)
     exact, moved = np.mean(errors[::2]), np.mean(errors[1::2])
-    assert moved < exact + 0.02, (exact, moved)
+    assert moved < exact + 0.68 / 25, (exact, moved)
 
 
 # --- determinism --------------------------------------------------------------------------------
