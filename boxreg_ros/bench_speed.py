@@ -320,9 +320,9 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
 
     ``total`` is what all of it takes [s], the stages are what each is busy; as reading goes on
     while the registrar works, they add up to more. ``faster`` is how much less than the recording
-    lasts the total is, ``packed`` the same of a recording compressed by zstd, ``rest`` the part of
-    the total in which nothing is solved. ``memory`` is its peak [MB], ``short`` and ``long`` those
-    on recordings of this length and of ten times that, with sweeps of a fifth of the points.
+    lasts the total is, ``compressed`` the same where zstd has packed it, ``rest`` the part of the
+    total in which nothing is solved. ``memory`` is its peak [MB], ``short`` and ``long`` those on
+    recordings of this length and of ten times that, with sweeps of a fifth of the points.
 
     """
     result: dict[str, float] = {}
@@ -330,7 +330,7 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
         path, out = Path(name) / 'drive.mcap', Path(name) / 'out'
         for case, size, length in (
             ('memory', points, seconds),
-            ('packed', points, seconds),
+            ('compressed', points, seconds),
             ('short', points // 5, seconds),
             ('long', points // 5, 10 * seconds),
         ):
@@ -342,7 +342,7 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
                 (i.boxes for i in c),
                 (i.T_fixed_sensor for i in d),
                 'odom',
-                is_packed=case == 'packed',
+                is_compressed=case == 'compressed',
             )
             command = [sys.executable, '-c', RELABEL, str(path), str(out)]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -354,7 +354,7 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
             if case == 'memory':
                 result |= spent
                 result |= {'faster': seconds / spent['total'], 'rest': 1 - solved / spent['total']}
-            elif case == 'packed':
+            elif case == 'compressed':
                 result[case] = seconds / spent['total']
     return result
 
@@ -536,7 +536,7 @@ def _text(report: dict[str, Any]) -> str:
     stages = ('read', 'decode', 'transform', 'registrar', 'write')
     lines.append(
         f'relabel: {r["faster"]:.1f} times faster than the recording lasts ({r["total"]:.1f} s; '
-        f'{r["packed"]:.1f} times where it is compressed; busy, partly at once: '
+        f'{r["compressed"]:.1f} times where it is compressed; busy, partly at once: '
         + ', '.join(f'{k} {r[k]:.1f}' for k in stages)
         + f'), all but the solve {r["rest"]:.0%}; peak {r["memory"]:.0f} MB; of a smaller one '
         f'{r["short"]:.0f} MB, ten times as long {r["long"]:.0f} MB'

@@ -26,7 +26,7 @@ def write_recording(
     detections: Iterable[BoxArray],
     T_fixed_sensor: Iterable[Floats],
     fixed_frame: str,
-    is_packed: bool = False,
+    is_compressed: bool = False,
 ) -> None:
     """
     Write ``/points``, ``/detections``, ``/odom`` and ``/tf``; an old file is replaced whole.
@@ -41,7 +41,7 @@ def write_recording(
         Where the sensor was at each stamp, in `fixed_frame`.
     fixed_frame : str
         Parent frame of the odometry.
-    is_packed : bool
+    is_compressed : bool
         Compress by zstd; `ros2 bag record` does not unless asked to.
 
     Raises
@@ -57,7 +57,7 @@ def write_recording(
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f'.{path.stem}-') as folder:
             bag = Path(folder) / path.stem
             writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
-            if is_packed:
+            if is_compressed:
                 writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             with writer:
                 topics: dict[str, Any] = {}

@@ -302,6 +302,7 @@ def weigh(
     input_off = objective.prior(state, given, axes)
     off = (input_off.residual[:, :, 0].abs() + surprise(problem, axes)) / error[:, None]
     hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
+    # Points and the face of the input are apart by gap, bias and half the error of the extent.
     wide = faces.spread**2 + (bias[:, :3] ** 2 + (expected[:, :3] * extent / 2) ** 2)[:, FACE_AXIS]
     away = (sights.outwardness * trust).sum(1) / trust.sum(1).clamp(min=1e-9)
     unusual = (state.shared - expected)[:, objective.GAP] ** 2 / faces.spread**2

@@ -180,7 +180,7 @@ def run(args: argparse.Namespace) -> int:
     intensities = [np.where(o == ROAD, 10, 40 + 13 * o % 60) for o in scene.owners]
     write_recording(
         args.output, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, 'odom',
-        is_packed=True,
+        is_compressed=True,
     )  # fmt: skip
     scene.truth.write(truth)
     print(
