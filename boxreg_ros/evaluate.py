@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 import json
 import math
 from pathlib import Path
+import sys
 from typing import Any
 
 from boxreg_ros.boxtable import BoxTable
@@ -277,6 +278,8 @@ def run(args: argparse.Namespace) -> int:
             f'{args.truth}: none of {len(truth.boxes)} true boxes is in scope; lower --min-points '
             f'or name other --classes; there are {", ".join(sorted(set(truth.class_names)))}'
         )
+    if len(predicted.boxes) and not matches.is_matched.any():
+        print(f'boxreg: {_why_none_matches(predicted, truth)}', file=sys.stderr)
     overall, grouped = summarise(matches), groups(matches)
     if args.json:
         report = asdict(overall) | {
@@ -293,6 +296,18 @@ def run(args: argparse.Namespace) -> int:
             'predictions without one; recalls are 3D, errors in m and rad, jitter in m/s^2'
         )
     return 0
+
+
+def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
+    """Return what stamps and tracks of two tables have in common."""
+    mine, true = predicted.stamps_ns, truth.stamps_ns
+    stamps, tracks = np.intersect1d(mine, true), set(predicted.track_ids) & set(truth.track_ids)
+    own, other = ([f'{x * 1e-9:.3f}' for x in (side.min(), side.max())] for side in (mine, true))
+    return (
+        f'no predicted box has the stamp and the track of a true one: {len(stamps)} stamps and '
+        f'{len(tracks)} track ids are in both; predicted boxes are of {" to ".join(own)} s, '
+        f'true ones of {" to ".join(other)} s; are they of one recording, with ids of one tracker?'
+    )
 
 
 def table(rows: dict[str, Scores]) -> str:

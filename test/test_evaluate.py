@@ -196,3 +196,14 @@ def test_command(tmp_path, capsys):
     assert '10 true boxes, 2 missing' in text
     with pytest.raises(RecordingError, match='none of 20 true boxes is in scope'):
         run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'tank')
+
+
+def test_nothing_in_common_is_explained(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    replace(truth, stamps_ns=truth.stamps_ns + 10**12).write(tmp_path / 'boxes.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    assert (
+        '0 stamps and 2 track ids are in both; predicted boxes are of 1000.000 to 1000.900 s, '
+        'true ones of 0.000 to 0.900 s'
+    ) in capsys.readouterr().err
