@@ -17,12 +17,12 @@ consumers := .venv-consumers/.done-$(version)
 .PHONY: demo test lint format clean
 
 demo: $(runtime)
-	$(BIN)/boxreg relabel bags/street.mcap -o out/demo
+	$(BIN)/boxreg relabel bags/street.mcap -o out/demo --report
 	@echo; echo 'Before:'
 	$(BIN)/boxreg evaluate bags/street.mcap bags/street_truth.csv
 	@echo; echo 'After:'
 	$(BIN)/boxreg evaluate out/demo/boxes.csv bags/street_truth.csv
-	@echo; echo 'Refined boxes: out/demo/boxes.csv    What was done: out/demo/summary.json'
+	@echo; echo 'Refined boxes: out/demo/boxes.csv    What was done, to look at: out/demo/report.html'
 
 test: $(tests) $(consumers)
 	$(BIN)/python -m pytest
@@ -41,11 +41,11 @@ $(runtime): constraints.txt setup.py package.xml
 	@echo 'Setting up $(VENV): the first time takes some minutes'
 	[ "$$($(BIN)/python -V 2>&1)" = 'Python $(version)' ] || $(PYTHON) -m venv --clear $(VENV)
 	$(PIP) install -qq -c constraints.txt setuptools
-	$(INSTALL) -e '.[ros]'
+	$(INSTALL) -e '.[ros,report]'
 	@touch $@
 
 $(tests): $(runtime) $(shell find test/interfaces test/build_interfaces.py -type f)
-	$(INSTALL) -e '.[ros,bench,test,interfaces]'
+	$(INSTALL) -e '.[ros,report,bench,test,interfaces]'
 	$(BIN)/python test/build_interfaces.py
 	@touch $@
 

@@ -19,7 +19,8 @@ setup(
         ('share/ament_index/resource_index/packages', [f'{NAME}/resource/{NAME}']),
         (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
     ],
-    package_data={NAME: ['share/*']},  # `boxreg bench node` runs without an installation too
+    # Read by `boxreg bench node` and `relabel --report`, without an installation too.
+    package_data={NAME: ['share/*']},
     entry_points={
         'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.node:main']
     },
@@ -46,6 +47,8 @@ setup(
         'formats': ['pyarrow'],
         # MCAP files whose boxes are protobuf.
         'foxglove': ['mcap-protobuf-support'],
+        # The pictures and the page of `boxreg relabel --report`.
+        'report': ['jinja2', 'matplotlib'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -59,6 +62,7 @@ setup(
             'flake8-import-order',
             'flake8-quotes',
             'foxglove-schemas-protobuf',
+            'jinja2',
             'matplotlib',
             'mcap-protobuf-support',
             'mcap-ros2-support',

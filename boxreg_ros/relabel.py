@@ -46,6 +46,7 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.report import Changes, check_packages, REPORT, write_report
 from boxreg_ros.results import earlier_summary, SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import (
@@ -102,6 +103,8 @@ class Request:
     bridge : float
         Where a track is missing between two of its boxes that are no further apart than this,
         a box is put in [s]; 0 for nowhere.
+    report : bool
+        Write ``report.html`` too, for which the recording is read a second time.
 
     """
 
@@ -119,6 +122,7 @@ class Request:
     label_frame: str | None = None
     convention: Convention = STANDARD
     bridge: float = 0.0
+    report: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what cannot work before any work is done."""
@@ -136,6 +140,8 @@ class Request:
             )
         for name in (*self.formats, *(self.labels or ())[:1]):
             module_of(str(name))
+        if self.report:
+            check_packages()
 
     def recording(self) -> Recording:
         """Return the recording, not yet open."""
@@ -172,7 +178,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         Folder of results. It appears whole or not at all; results of an earlier run are
         replaced.
     progress : callable, optional
-        Called with the part of the recording that is done and all of it [s].
+        Called with the part of the recording that is done and all of it [s]; for a report both
+        count the recording twice.
 
     Returns
     -------
@@ -203,13 +210,17 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         writers = {name: writer_for(name, folder, provenance, options) for name in names}
         is_early = request.config.estimate == 'early'
         bridge: Bridge[_Slot] = Bridge(request.bridge, fixed_frame, request.config)
+        changes = Changes(fixed_frame) if request.report else None
+        passes = 2 if request.report else 1
         with (
-            _Sink(writers, spool, bridge, fixed_frame, sensor_frame, is_early, clock) as sink,
+            _Sink(
+                writers, spool, bridge, fixed_frame, sensor_frame, is_early, clock, changes
+            ) as sink,
             ahead(iter(arrivals), AHEAD) as coming,
         ):
             for arrival in coming:
                 if progress is not None:
-                    progress(arrival.seconds, arrivals.seconds)
+                    progress(arrival.seconds, passes * arrivals.seconds)
                 sink.expect(arrival)
                 with clock('registrar'):
                     ready = _add(registrar, arrival.moved)
@@ -221,6 +232,14 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             spool.remove()
         summary = _summary(request, recording, arrivals, registrar.counts, sink)
         summary['seconds'] = clock.seconds()
+        if changes is not None:
+            with clock('report'):
+                items = _again(request, progress)
+                line = closing_line(summary, out)
+                write_report(
+                    folder / REPORT, line, summary, request.config, changes.tracks(), items
+                )
+            summary['seconds'] = clock.seconds()
         (folder / 'config.yaml').write_text(
             yaml.safe_dump(request.config.to_dict(), sort_keys=False), encoding='utf-8'
         )
@@ -440,6 +459,7 @@ class _Sink:
         sensor_frame: str,
         is_early: bool,
         clock: _Clock,
+        changes: Changes | None,
     ) -> None:
         self._writers = writers
         self._spool = spool
@@ -447,6 +467,7 @@ class _Sink:
         self._fixed_frame, self._sensor_frame = fixed_frame, sensor_frame
         self._is_early = is_early
         self._clock = clock
+        self._changes = changes
         self._slots: list[_Slot] = []
         self._unsettled: dict[int, deque[_Slot]] = {}
         self.boxes_in = 0
@@ -530,6 +551,8 @@ class _Sink:
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
         self.heading_flips += slot.flips(refined)
+        if self._changes is not None:
+            self._changes.add(slot.boxes, refined)
         with self._clock('write'):
             sweep = intensities = None
             if self._spool and slot.T_fixed_sensor is not None:
@@ -548,6 +571,17 @@ def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[Refined
     if item is None:
         return []
     return registrar.add_sweep(item) if isinstance(item, Sweep) else registrar.add_boxes(item)
+
+
+def _again(request: Request, progress: Progress | None) -> Iterator[Sweep | BoxArray]:
+    """Yield the clouds and boxes of the recording once more, in the fixed frame."""
+    with request.recording() as recording:
+        arrivals = _Arrivals(recording, request, _Clock())
+        for arrival in arrivals:
+            if progress is not None:
+                progress(arrivals.seconds + arrival.seconds, 2 * arrivals.seconds)
+            if arrival.moved is not None:
+                yield arrival.moved
 
 
 def _summary(
@@ -646,6 +680,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='put boxes in where a track is missing between two that are no further apart [s]',
     )  # fmt: skip
     parser.add_argument(
+        '--report', action='store_true',
+        help='write report.html, a page to look at: what was changed, and where to look closer',
+    )  # fmt: skip
+    parser.add_argument(
         '--resume', action='store_true',
         help='do nothing if OUT holds the results of the same request, files and settings',
     )  # fmt: skip
@@ -671,7 +709,7 @@ def run(args: argparse.Namespace) -> int:
         tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
         args.formats, args.start, args.end, config,
         Options(args.with_points, args.camera, args.swap_axes), args.labels, args.label_frame,
-        convention_from(args), args.bridge,
+        convention_from(args), args.bridge, args.report,
     )  # fmt: skip
     earlier = earlier_summary(args.out)
     if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():
