@@ -27,6 +27,7 @@ from boxreg_ros import __version__
 from boxreg_ros.ahead import ahead
 from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
 from boxreg_ros.bridge import Bridge
+from boxreg_ros.changes import Changes
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.intake import Intake
@@ -46,7 +47,7 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.report import Changes, check_packages, REPORT, write_report
+from boxreg_ros.report import check_packages, REPORT, write_report
 from boxreg_ros.results import earlier_summary, SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import (

@@ -10,7 +10,6 @@ from __future__ import annotations
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from io import BytesIO
 from math import isfinite
@@ -20,21 +19,20 @@ from string import ascii_uppercase
 from typing import Any, NamedTuple
 
 from boxreg_ros.association import Pair, StampMatcher
+from boxreg_ros.changes import known, mean, median, TrackChanges
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.metrics import EXTENT, pose_errors, wrap
+from boxreg_ros.metrics import EXTENT
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.sampling import CLEARANCE, crop
 from boxreg_ros.structures import (
     BoxArray,
     Floats,
     INTERPOLATED,
-    Ints,
     KEPT,
     LENGTH,
     PITCH,
     REFINED,
-    RefinedBoxes,
     ROLL,
     Sweep,
     WIDTH,
@@ -44,7 +42,7 @@ from boxreg_ros.structures import (
     Z,
 )
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 REPORT = 'report.html'
@@ -59,126 +57,6 @@ STYLE: Any = {'font.size': 8, 'axes.spines.top': False, 'axes.spines.right': Fal
 COLOURS = {REFINED: '#1769aa', KEPT: '#e07b00', INTERPOLATED: '#8e44ad'}
 GREY = '#9a9a9a'
 AXES = 'along [m]', 'across [m]', 'up [m]', 'yaw [deg]'
-
-
-@dataclass(frozen=True, slots=True)
-class TrackChanges:
-    """
-    What became of the boxes of one track, by stamp.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        As in the input; the class that most boxes have.
-    stamps_ns : array, shape (n,)
-        Header stamps [ns].
-    given, boxes : array, shape (n, 9)
-        Before and after in the fixed frame; NaN where a box has no place there, and before where
-        it was put in.
-    change : array, shape (n, 4)
-        After minus before along the axes of the box [m] and in yaw [rad], half turns undone.
-    deviations : array, shape (n, 4)
-        Standard deviations of the same; NaN for boxes that are not refined.
-    is_flipped : array, shape (n,)
-        True where the heading was turned around.
-    status : array of str, shape (n,)
-        As in `RefinedBoxes`.
-    reasons : Counter
-        Why boxes were kept.
-    num_points : array, shape (n,)
-        Returns inside the input boxes.
-
-    """
-
-    track_id: str
-    class_name: str
-    stamps_ns: Ints
-    given: Floats
-    boxes: Floats
-    change: Floats
-    deviations: Floats
-    is_flipped: NDArray[np.bool_]
-    status: NDArray[np.str_]
-    reasons: Counter[str]
-    num_points: Ints
-
-    @property
-    def is_refined(self) -> NDArray[np.bool_]:
-        """Return where boxes are refined, shape (n,)."""
-        return np.asarray(self.status == REFINED)
-
-    @property
-    def shift(self) -> float:
-        """Return how far refined centres moved, on average [m]; NaN where none is refined."""
-        return _mean(np.linalg.norm(self.change[self.is_refined, :3], axis=1))
-
-    @property
-    def turn(self) -> float:
-        """Return how far refined boxes were turned, on average [deg]; NaN where none is."""
-        return float(np.degrees(_mean(np.abs(self.change[self.is_refined, 3]))))
-
-    @property
-    def deviation(self) -> float:
-        """Return the median deviation of refined centres from above [m]; NaN without any."""
-        return _median(np.linalg.norm(self.deviations[self.is_refined, :2], axis=1))
-
-
-class Changes:
-    """
-    Collects what became of every box, in few numbers each.
-
-    Parameters
-    ----------
-    fixed_frame : str
-        Boxes in another frame are counted, but have no place.
-
-    """
-
-    def __init__(self, fixed_frame: str) -> None:
-        self._fixed_frame = fixed_frame
-        self._names: list[tuple[str, str, str, str]] = []  # id, class, status and reason
-        self._numbers: list[Floats] = []
-        self._counts: list[Ints] = []
-
-    def add(self, given: BoxArray, refined: RefinedBoxes) -> None:
-        """Take the boxes of one stamp before and after; those put in come behind the others."""
-        boxes, n = refined.boxes, len(refined.status)
-        before, after = np.full((n, 9), np.nan), boxes.boxes.copy()
-        before[: len(given.boxes)] = given.boxes
-        has_place = np.isfinite(after).all(axis=1) & (after[:, EXTENT] > 0).all(axis=1)
-        has_place &= boxes.frame_id == self._fixed_frame
-        before[~has_place] = after[~has_place] = np.nan
-        deviations = _deviations(after, refined.covariances)
-        self._numbers.append(np.hstack([before, after, deviations]))
-        self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
-        self._names += zip(
-            boxes.track_ids, boxes.class_names, refined.status, refined.reasons, strict=True
-        )
-
-    def tracks(self) -> list[TrackChanges]:
-        """Return all tracks, those that were moved most first."""
-        numbers = np.concatenate([np.zeros((0, 22)), *self._numbers])
-        counts = np.concatenate([np.zeros((0, 2), np.int64), *self._counts])
-        given, boxes, deviations = np.split(numbers, [9, 18], axis=1)
-        errors = pose_errors(given, boxes)  # in the axes of the boxes after
-        change = -np.column_stack([errors.translation, wrap(2 * errors.rotation[:, 2]) / 2])
-        rows_of: dict[str, list[int]] = {}
-        for row in np.argsort(counts[:, 0], kind='stable').tolist():
-            rows_of.setdefault(self._names[row][0], []).append(row)
-        found = []
-        for name, rows in rows_of.items():
-            _, classes, status, reasons = zip(*(self._names[row] for row in rows), strict=True)
-            is_refined = np.array(status) == REFINED
-            found.append(
-                TrackChanges(
-                    name, Counter(classes).most_common(1)[0][0], counts[rows, 0], given[rows],
-                    boxes[rows], change[rows],
-                    np.where(is_refined[:, None], deviations[rows], np.nan),
-                    errors.is_flipped[rows] & is_refined, np.array(status),
-                    Counter(filter(None, reasons)), counts[rows, 1],
-                )
-            )  # fmt: skip
-        return sorted(found, key=lambda track: -np.nan_to_num(track.shift, nan=-1.0))
 
 
 def check_packages() -> None:
@@ -234,11 +112,11 @@ def write_report(
     reasons = chosen(tracks)
     letters = dict(zip(reasons, ascii_uppercase, strict=False))
     shown = [track for name in letters for track in tracks if track.track_id == name]
-    seen, path_of_sensor = _gathered(shown, items, config)
+    seen, origins = _gathered(shown, items, config)
     begin_ns = min((int(track.stamps_ns[0]) for track in tracks), default=0)
     with matplotlib.rc_context(STYLE):
         placed = [track for track in tracks if np.isfinite(track.boxes[:, X]).any()]
-        overview = _overview(placed, letters, path_of_sensor) if placed else ''
+        overview = _overview(placed, letters, origins) if placed else ''
         sections = [
             _facts(track)
             | {'letter': letters[track.track_id], 'why': reasons[track.track_id]}
@@ -256,8 +134,8 @@ def write_report(
         summary=summary,
         names=[Path(name).name for name in summary['recordings']],
         warnings=_warnings(summary),
-        shift=_mean(np.linalg.norm(changes[:, :3], axis=1)),
-        turn=np.degrees(_mean(np.abs(changes[:, 3]))),
+        shift=mean(np.linalg.norm(changes[:, :3], axis=1)),
+        turn=np.degrees(mean(np.abs(changes[:, 3]))),
         reasons=_explained(summary['reasons']),
         dropped=_explained(summary['dropped']),
         settings=[(item, value) for item, value in config.items() if value != item.default],
@@ -275,7 +153,7 @@ def chosen(tracks: Sequence[TrackChanges]) -> dict[str, str]:
     """Return the ids of the tracks to be shown, and why each of them is."""
     able = [t for t in tracks if t.track_id and np.isfinite(t.boxes[:, X]).sum() >= SHORTEST]
     kept = [int(((t.status == KEPT) & (t.num_points > 0)).sum()) for t in able]
-    points = [_median(t.num_points) for t in able]
+    points = [median(t.num_points) for t in able]
     orders: list[list[tuple[float, str, TrackChanges]]] = [
         [(t.shift, f'moved most: {t.shift:.2f} m on average', t) for t in able],
         [(t.deviation, f'least certain: {t.deviation:.2f} m (1 sigma)', t) for t in able],
@@ -338,8 +216,9 @@ def _pairs(
 
 
 def _spread(track: TrackChanges) -> list[int]:
-    """Return rows of boxes with points, all over the track."""
-    rows = np.flatnonzero(np.isfinite(track.change).all(axis=1) & (track.num_points > 0))
+    """Return rows of boxes with points in or near them, all over the track."""
+    has_points = track.is_refined | (track.num_points > 0)
+    rows = np.flatnonzero(np.isfinite(track.change).all(axis=1) & has_points)
     picks = np.linspace(0, len(rows) - 1, min(SWEEPS, len(rows))).astype(int)
     return [int(row) for row in rows[picks]]
 
@@ -410,7 +289,7 @@ def _draw_series(track: TrackChanges, figure: Any, begin_ns: int) -> None:
         for status in (REFINED, KEPT):
             of_kind = track.status == status
             panel.plot(seconds[of_kind], values[of_kind], '.', ms=3, color=COLOURS[status])
-        most = max([0.02, *np.abs(values[np.isfinite(values)]), *_known([_median(reach)])])
+        most = max([0.02, *np.abs(values[np.isfinite(values)]), *known([median(reach)])])
         panel.set(ylabel=name, ylim=(-1.15 * most, 1.15 * most))
     figure.align_ylabels(panels)
     panels[0].set_title('refined minus input; band: ±2 sigma', fontweight='bold')
@@ -425,7 +304,7 @@ def _overview(tracks: Sequence[TrackChanges], letters: Mapping[str, str], sensor
     given = np.concatenate([part for track in tracks for part in (track.given, gap)])
     boxes = np.concatenate([track.boxes for track in tracks])
     status = np.concatenate([track.status for track in tracks])
-    width, depth = (np.ptp(_known(column)) + 20.0 for column in boxes[:, :2].T)
+    width, depth = (np.ptp(known(column)) + 20.0 for column in boxes[:, :2].T)
     figure = Figure((13, float(np.clip(13 * depth / width, 4, 8))))
     axes = figure.add_axes((0.05, 0.08, 0.94, 0.9))
     axes.plot(given[:, X], given[:, Y], color=GREY, lw=0.7, label='input')
@@ -474,27 +353,18 @@ def _png(figure: Any) -> str:
     return b64encode(buffer.getvalue()).decode('ascii')
 
 
-def _deviations(boxes: Floats, covariances: Floats) -> Floats:
-    """Return standard deviations (n, 4) along the heading, across it, up [m] and of yaw [rad]."""
-    cos, sin = np.cos(boxes[:, YAW]), np.sin(boxes[:, YAW])
-    axes = np.array([[cos, sin], [-sin, cos]])
-    flat = np.einsum('kin,nij,kjn->nk', axes, covariances[:, :2, :2], axes)
-    variances = np.column_stack([flat, covariances[:, 2, 2], covariances[:, 5, 5]])
-    return np.asarray(np.sqrt(variances.clip(0)))
-
-
 def _facts(track: TrackChanges) -> dict[str, Any]:
     """Return what the page says about a track in numbers."""
     counts = Counter(track.status.tolist())
     n = len(track.status) - counts[INTERPOLATED]
-    extents = [[_median(v) for v in b[:, EXTENT].T] for b in (track.given, track.boxes)]
+    extents = [[median(v) for v in b[:, EXTENT].T] for b in (track.given, track.boxes)]
     return {
         'track_id': track.track_id,
         'class_name': track.class_name,
         'boxes': n,
         'interpolated': counts[INTERPOLATED],
         'seconds': (track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
-        'points': _median(track.num_points[track.status != INTERPOLATED]),
+        'points': median(track.num_points[track.status != INTERPOLATED]),
         'refined': counts[REFINED] / n if n else np.nan,
         'kept': ', '.join(f'{name} {k:,}' for name, k in track.reasons.most_common()),
         'shift': track.shift,
@@ -537,21 +407,3 @@ def _code(text: str) -> Any:
     from markupsafe import escape, Markup
 
     return Markup(re.sub(r'`([^`]+)`', r'<code>\1</code>', str(escape(text))))
-
-
-def _mean(values: ArrayLike) -> float:
-    """Return the mean of what is known; NaN where nothing is."""
-    known = _known(values)
-    return float(known.mean()) if len(known) else np.nan
-
-
-def _median(values: ArrayLike) -> float:
-    """Return the median of what is known; NaN where nothing is."""
-    known = _known(values)
-    return float(np.median(known)) if len(known) else np.nan
-
-
-def _known(values: ArrayLike) -> Floats:
-    """Return the values that are finite, in one row."""
-    values = np.asarray(values, dtype=np.float64)
-    return np.asarray(values[np.isfinite(values)])

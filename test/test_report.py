@@ -9,16 +9,18 @@ import shutil
 import subprocess
 import sys
 
+from boxreg_ros.changes import Changes
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.relabel import closing_line, relabel, Request
-from boxreg_ros.report import Changes, chosen, SHOWN, write_report
+from boxreg_ros.report import chosen, SHOWN, write_report
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
+from msg_adapters.convention import Convention
 import numpy as np
 from PIL import Image
 import pytest
-from ros_messages import Drive
+from ros_messages import Drive, JSK
 from scenes import drive, jittered, PERIOD_NS, START_NS, track_of
 
 STREET = Path(__file__).resolve().parents[1] / 'bags' / 'street.mcap'
@@ -192,6 +194,18 @@ def test_nothing_refined_is_still_a_page(tmp_path, kind):
     assert ('No box was refined' in page.text) == (kind != 'no boxes')
     assert 'There is no track' in page.text
     assert len(page.pictures) == (kind == 'no points')
+
+
+def test_points_are_found_wherever_boxes_and_ids_come_from(tmp_path):
+    recording = Drive(sweeps=12).write(tmp_path / 'drive', 'sqlite3')
+    nameless = Drive(sweeps=12, boxes=JSK).write(tmp_path / 'nameless', 'rosbag1')
+    run(recording, tmp_path / 'out')
+    labels = 'csv', tmp_path / 'out' / 'boxes.csv'
+    for path, options in (
+        (recording, {'labels': labels}), (nameless, {'convention': Convention(associate=True)}),
+    ):  # fmt: skip
+        _, page = run(path, tmp_path / 'more', **options)
+        assert page.text.count('The points of 12 sweeps fill') == 2
 
 
 def test_off_by_default_and_another_request(tmp_path):
