@@ -163,6 +163,7 @@ def _errors_of_kind(
         return dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
     problem, base = stack([_bare([row[:2] for row in track]) for track in tracks], config)
     true, true_base = stack([_bare([row[::2] for row in track]) for track in tracks], config)
+    problem = problem._replace(mask=problem.valid[..., None])  # the truth tells, not points
     pose = true.pose + torch.nn.functional.pad(torch.from_numpy(true_base - base), (0, 3))[:, None]
     # Headings against those of the truth, whichever of the two directions a track is given in.
     half_turns = torch.tensor([2.0, 2.0, 1.0]) * torch.pi

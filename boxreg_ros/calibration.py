@@ -80,7 +80,8 @@ def scatter(problem: Problem, state: State) -> Tensor:
     """
     Return input minus fit along the box axes, as `InputNoise` counts them, (B, N, 9).
 
-    NaN for boxes that repeat the one before: what a tracker holds does not tell how it errs.
+    NaN for boxes that repeat the one before, since what a tracker holds does not tell how it errs,
+    and for those without points: their fit follows the input.
 
     """
     difference = problem.pose - state.pose
@@ -89,7 +90,7 @@ def scatter(problem: Problem, state: State) -> Tensor:
     found = torch.cat([along, difference[..., 3:], extent], -1)
     # Before the first comes the last: of an object that is held all along it is the same box.
     held = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1) < HELD
-    return torch.where((problem.valid & ~held)[..., None], found, torch.nan)
+    return torch.where((problem.mask.any(-1) & ~held)[..., None], found, torch.nan)
 
 
 class InputModel:

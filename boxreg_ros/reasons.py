@@ -97,7 +97,7 @@ REASONS = {
     'invalid_box': Reason('box', 'NaN, or an extent that is not positive', 'check the detector'),
     'not_finite': Reason('box', 'its window could not be solved', 'check stamps and coordinates'),
     'sweep_without_boxes': Reason('cloud', 'no boxes came for it, or too late'),
-    'no_points': Reason('box', 'no returns near it: it is hidden or far away'),
+    'no_points': Reason('box', 'no returns near any box of its window: it is hidden or far away'),
     'no_gain': Reason('box', 'the refined box would have lost the points of the input box'),
     'short_track': Reason('box', 'fewer than `min_observations` in its window'),
 }

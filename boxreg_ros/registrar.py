@@ -2,7 +2,7 @@
 
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
-from math import inf
+from math import dist, inf
 
 from boxreg_ros.association import Pair, StampMatcher
 from boxreg_ros.calibration import InputModel
@@ -10,10 +10,12 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.registration import Estimate, register
 from boxreg_ros.sampling import Observation, observe
-from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep, X, Z
+from boxreg_ros.structures import BoxArray, Floats, KEPT, LENGTH, RefinedBoxes, Sweep, X, Z
 from boxreg_ros.window import Memory, Window
 import numpy as np
 import torch
+
+SWERVE = 10.0  # nothing leaves its way faster [m/s]
 
 
 class BoxRegistrar:
@@ -72,7 +74,7 @@ class BoxRegistrar:
         """End all tracks and return everything still held."""
         ready = self._advance(self._matcher.flush())
         self._end(list(self._tracks))
-        self._solve_tracks()
+        self._solve([])
         for tick in self._ticks:
             tick.waiting = 0
         return ready + self._settled()
@@ -89,22 +91,12 @@ class BoxRegistrar:
                 for old in [t for t in self._ticks if t.is_paired][::-1][lag:]:
                     old.waiting = 0
             elif self._count >= full // 2 and len(self._ticks) >= full - full // 8:
-                self._solve_tracks()  # a track may have filled its window
+                # A track may have filled its window. Those that are half full are solved with it:
+                # the more at once, the better they tell the errors of the input.
+                self._solve([t for t in self._tracks.values() if len(t.entries) > full // 2])
+                self._count = 0
             ready += self._settled()
         return ready
-
-    def _solve_tracks(self) -> None:
-        """
-        Solve, all at once, the tracks that have ended and those whose window is half full.
-
-        The more at once, the better they tell the errors of the input.
-
-        """
-        half, self._count = self.config.track_window // 2, 0
-        self._solve(self._ended + [t for t in self._tracks.values() if len(t.entries) > half])
-        for track in self._ended:
-            track.settle(len(track.entries))
-        self._ended.clear()
 
     def _open(self, pair: Pair) -> '_Tick':
         """Start a tick: sort its boxes out and add an observation to the track of each."""
@@ -134,24 +126,25 @@ class BoxRegistrar:
                 tick.num_points[i] = observation.num_points
                 track.entries.append(_Entry(observation._replace(box=box), tick, i))
                 tick.waiting += 1
+                if other := track.parted():
+                    self._end([track.track_id])
+                    self._tracks[track.track_id] = other
         return tick
 
     def _end(self, names: list[str]) -> None:
-        """Close tracks; in estimate 'track' they are solved with the next batch."""
-        ended = [self._tracks.pop(name) for name in names]
-        if self.config.estimate == 'track':
-            self._ended += ended
-        else:
-            for track in ended:
-                track.settle(len(track.entries))
+        """Close tracks; they are solved once more, with the next ones."""
+        self._ended += [self._tracks.pop(name) for name in names]
 
     def _solve(self, tracks: list['_TrackBuffer']) -> None:
-        """Register the window of each track and write the estimates to the ticks they are of."""
-        windows = [track.window() for track in tracks]
-        estimates = register(windows, self.config, self._model)
+        """Register windows, ended ones too, and write the estimates to the ticks they are of."""
+        tracks = self._ended + tracks
+        estimates = register([track.window() for track in tracks], self.config, self._model)
         for track, estimate in zip(tracks, estimates, strict=True):
             track.write(estimate)
             track.slide(self.config)
+        for track in self._ended:
+            track.settle(len(track.entries))
+        self._ended = []
 
     def _settled(self) -> list[RefinedBoxes]:
         ready = []
@@ -221,14 +214,34 @@ class _TrackBuffer:
         fresh, start = len(observations) - len(solved), np.array(solved).reshape(-1, 9)
         return Window(self.track_id, self.class_name, observations, fresh, start, self.memory)
 
+    def parted(self) -> '_TrackBuffer | None':
+        """
+        Return the last two entries as a track of their own, if another object has got their id.
+
+        Then neither is where constant velocity leads; a single one may be an outlier.
+
+        """
+        if len(self.entries) < 5:
+            return None
+        first, *_, latest, last, new = (entry.observation for entry in self.entries[-6:])
+        velocity = (latest.box - first.box) / (latest.stamp_ns - first.stamp_ns)
+        for seen in (last, new):
+            late = seen.stamp_ns - latest.stamp_ns
+            away = dist(seen.box[:2], (latest.box + late * velocity)[:2])
+            if away < latest.box[LENGTH] / 2 + SWERVE * late * 1e-9:
+                return None
+        self.entries, moved = self.entries[:-2], self.entries[-2:]
+        moved[0].estimate = None
+        return _TrackBuffer(self.track_id, self.class_name, moved)
+
     def velocity(self, box: Floats, stamp_ns: int) -> Floats:
-        """Return that of the centre over the last stamps and `box`, the newest [m/s]."""
-        known = self.entries[-4:]
-        if not known:
+        """Return that of the centre over the last stamps to `box`, the newest [m/s]."""
+        if not self.entries:
             return np.zeros(3)
-        boxes = [e.observation.box if e.estimate is None else e.estimate for e in known]
-        seconds = [(e.observation.stamp_ns - stamp_ns) * 1e-9 for e in known]
-        return np.asarray(np.polyfit([*seconds, 0.0], np.array([*boxes, box])[:, X : Z + 1], 1)[0])
+        first = self.entries[-4:][0]
+        before = first.observation.box if first.estimate is None else first.estimate
+        seconds = (stamp_ns - first.observation.stamp_ns) * 1e-9
+        return np.asarray((box - before)[X : Z + 1] / seconds)
 
     def write(self, estimate: Estimate) -> None:
         self.memory = estimate.memory

@@ -124,9 +124,9 @@ def _judged(
     """
     Return what a solved batch says of each window, in the fixed frame.
 
-    Where that does not deserve trust it is the input. Beside points at all and finite numbers, a
-    refined box must hold nearly as many of the points as the input box does: a test the objective
-    does not make.
+    Where that does not deserve trust it is the input. Beside points anywhere in the window and
+    finite numbers, a refined box must hold nearly as many of the points as the input box does: a
+    test the objective does not make.
 
     """
     state, covariances, left = solved
@@ -135,7 +135,8 @@ def _judged(
     boxes = torch.cat([state.pose[..., :3], extent, wrap_angle(state.pose[..., 3:])], -1)
     finite = boxes.isfinite().all(-1) & (extent > 0).all(-1) & covariances.isfinite().all((2, 3))
     before, after = _held(problem, problem.pose, given), _held(problem, state.pose, extent)
-    failed = torch.stack([~problem.mask.any(-1), ~finite, after < before / 2 - 3])
+    is_blind = ~problem.mask.any((1, 2))[:, None].expand_as(finite)
+    failed = torch.stack([is_blind, ~finite, after < before / 2 - 3])
     good = (~failed.any(0)).cpu().numpy()
     status = np.where(good, REFINED, KEPT)
     reasons = np.select(list(failed.cpu().numpy()), ['no_points', 'not_finite', 'no_gain'], '')

@@ -95,11 +95,15 @@ def test_short_tracks_do_not_tell_and_padding_does_not_count():
     assert found.trust == known.trust == 60 / 80
 
 
+def seen(problem):
+    return problem._replace(mask=problem.valid[..., None])
+
+
 def test_scatter_by_hand():
     # The fit heads along +y and is 0.3 m behind the input along y and 0.2 m to its right (+x),
     # so the input is 0.3 m ahead and 0.2 m to the left. 4.4 m given for 4 m is a tenth too long.
     box = [0.0, 0, 0, 4.4, 2, 1.5, 0.01, 0.02, np.pi / 2 + 0.05]
-    problem = problem_of([[box, [1.0, *box[1:]]]])  # one alone repeats itself
+    problem = seen(problem_of([[box, [1.0, *box[1:]]]]))  # one alone repeats itself
     pose = torch.tensor([[[0.2, -0.3, 0.1, 0.0, 0.0, np.pi / 2]] * 2], dtype=D)
     shared = shared_of()
     found = scatter(problem, State(pose, shared))[:, :1]
@@ -113,6 +117,8 @@ def test_boxes_that_a_tracker_holds_do_not_tell_how_it_errs():
     boxes = [[a, 0, 0, 4, 2, 1.5, 0, 0, 0] for a in x]
     problem = problem_of([boxes])
     problem.valid[0, -1] = False
+    assert not scatter(problem, State(problem.pose, shared_of())).isfinite().any()  # no points
+    problem = seen(problem)
     found = scatter(problem, State(problem.pose, shared_of()))
     tells = found.isfinite().all(2)
     assert tells.tolist() == [[True, True, True, False, True, False]]

@@ -386,13 +386,11 @@ def test_short_tracks_and_boxes_without_points(stream, estimate):
     results, counts = run(part, setup(estimate))
     assert counts['short_track'] == 2
     assert [r.reasons for r in finals(results)][2:4] == [('', 'short_track')] * 2
-    assert counts['no_points'] == 1
     blind = finals(results)[7]
-    assert blind.reasons == ('no_points',)
+    assert blind.status == ('refined',)
     assert blind.num_points.tolist() == [0]
-    np.testing.assert_array_equal(blind.boxes.boxes, part[7][1].boxes)
-    assert counts['kept'] == 3
-    assert counts['refined'] == 13
+    assert counts['kept'] == 2
+    assert counts['refined'] == 14
 
 
 # --- tracks end ---------------------------------------------------------------------------------
