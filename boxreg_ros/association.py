@@ -2,6 +2,7 @@
 
 from bisect import insort
 from collections import Counter
+from collections.abc import Iterator
 from math import inf
 from typing import NamedTuple
 
@@ -53,7 +54,7 @@ class StampMatcher:
         else:
             insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
         self._newest_ns = max(self._newest_ns, sweep.stamp_ns)
-        pairs = self._complete()
+        pairs = list(self._complete())
         if len(self._sweeps) > self._capacity:
             self._forget_before(self._sweeps[1].stamp_ns)
         return pairs
@@ -61,16 +62,15 @@ class StampMatcher:
     def add_boxes(self, boxes: BoxArray) -> list[Pair]:
         """Take a box array; return the pairs that are complete now."""
         insort(self._boxes, boxes, key=lambda item: item.stamp_ns)
-        return self._complete()
+        return list(self._complete())
 
     def flush(self) -> list[Pair]:
         """Return what still waits, paired or not, and forget all sweeps."""
-        pairs = self._complete(hopeless=True)
+        pairs = list(self._complete(hopeless=True))
         self._forget_before(self._newest_ns + 1)
         return pairs
 
-    def _complete(self, hopeless: bool = False) -> list[Pair]:
-        pairs = []
+    def _complete(self, hopeless: bool = False) -> Iterator[Pair]:
         while self._boxes:
             stamp_ns = self._boxes[0].stamp_ns
             distances = [abs(sweep.stamp_ns - stamp_ns) for sweep in self._sweeps]
@@ -83,9 +83,8 @@ class StampMatcher:
                 sweep = self._sweeps[distances.index(away)]
                 self._used.add(sweep.stamp_ns)
                 near = None if sweep.is_lost else sweep
-            pairs.append(Pair(self._boxes.pop(0), near))
+            yield Pair(self._boxes.pop(0), near)
             self._forget_before(stamp_ns - self._reach_ns)
-        return pairs
 
     def _forget_before(self, oldest_ns: float) -> None:
         self._oldest_ns = max(self._oldest_ns, oldest_ns)

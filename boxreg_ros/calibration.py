@@ -15,7 +15,7 @@ from torch import Tensor
 
 KINDS = ([0, 1], [2, 3], [4], [5])  # ends, sides, top, bottom
 RULE_ERROR = (0.05, 0.05, 0.05, 0.15)  # how far a rule may be from the expected one [m]
-TRACKS, SCATTERS = 100, 100  # remembered: tracks, and observations of each
+TRACKS, SCATTERS = 1000, 100  # remembered: tracks, and observations of each
 LEAST = 20  # observations of a track, that it tells how its input errs
 HELD = 1e-3  # step of a box that only repeats the one before [m, rad]
 

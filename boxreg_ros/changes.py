@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-from boxreg_ros.metrics import EXTENT, pose_errors, wrap
+from boxreg_ros.evaluate import pose_errors
+from boxreg_ros.metrics import EXTENT, wrap
 from boxreg_ros.structures import BoxArray, Floats, Ints, REFINED, RefinedBoxes, YAW
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

@@ -1,40 +1,17 @@
-"""How well boxes (n, 9) agree with true ones, row by row in one frame: overlap and errors."""
+"""How much boxes (n, 9) overlap with true ones, row by row in one frame."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.structures import checked, Floats, HEIGHT, LENGTH, ROLL
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 import torch
 
 PAIRS_AT_ONCE = 1000  # bounds the memory of one clipping step to about 100 MB
 EXTENT = slice(LENGTH, HEIGHT + 1)
 SHIFT = 1e-9  # [m], so much the second box is grown: no two faces are ever in one plane
-
-
-class PoseErrors(NamedTuple):
-    """
-    Predicted minus true, one row per pair.
-
-    Attributes
-    ----------
-    translation, extent : array, shape (n, 3)
-        Of the centre along the true box's axes; of length, width and height [m].
-    rotation : array, shape (n, 3)
-        Of roll, pitch and yaw, each wrapped to [-pi, pi) [rad].
-    is_flipped : array, shape (n,)
-        True where the heading points the wrong way: |yaw error| > pi / 2.
-
-    """
-
-    translation: Floats
-    extent: Floats
-    rotation: Floats
-    is_flipped: NDArray[np.bool_]
 
 
 def iou_bev(boxes: ArrayLike, truth: ArrayLike) -> Floats:
@@ -64,15 +41,6 @@ def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
     union = a[:, EXTENT].prod(axis=1) + b[:, EXTENT].prod(axis=1) - overlap
     valid = np.isfinite(overlap) & (overlap > 0)
     return np.asarray(np.divide(overlap, union, out=np.zeros(len(a)), where=valid)).clip(0.0, 1.0)
-
-
-def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
-    """Return the errors of `boxes`, in the frames `PoseErrors` names."""
-    a, b = _rows(boxes, truth)
-    translation = np.einsum('nij,ni->nj', _rotation(b), a[:, :3] - b[:, :3])
-    rotation = wrap(a[:, ROLL:] - b[:, ROLL:])
-    extent = a[:, EXTENT] - b[:, EXTENT]
-    return PoseErrors(translation, extent, rotation, np.abs(rotation[:, 2]) > np.pi / 2)
 
 
 def wrap(angles: Floats) -> Floats:

@@ -1,6 +1,7 @@
 """The one stateful object of the core: sweeps and boxes in, refined boxes out, nothing else."""
 
 from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from math import dist, inf
 
@@ -63,30 +64,28 @@ class BoxRegistrar:
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
         """Take a sweep; return what has become ready."""
         self.counts['sweeps'] += 1
-        return self._advance(self._matcher.add_sweep(sweep))
+        return list(self._advance(self._matcher.add_sweep(sweep)))
 
     def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
         """Take a box array; return what has become ready."""
         self.counts['boxes'] += len(boxes.track_ids)
-        return self._advance(self._matcher.add_boxes(boxes))
+        return list(self._advance(self._matcher.add_boxes(boxes)))
 
     def flush(self) -> list[RefinedBoxes]:
         """End all tracks and return everything still held."""
-        ready = self._advance(self._matcher.flush())
+        ready = list(self._advance(self._matcher.flush()))
         self._end(list(self._tracks))
         self._solve([])
-        for tick in self._ticks:
-            tick.waiting = 0
-        return ready + self._settled()
+        return [*ready, *self._settled()]
 
-    def _advance(self, pairs: list[Pair]) -> list[RefinedBoxes]:
-        ready, full = [], self.config.track_window
+    def _advance(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
+        full = self.config.track_window
         for pair in pairs:
             tick = self._open(pair)
             self._count += 1
             if self.config.estimate != 'track':
                 self._solve([t for t in self._tracks.values() if t.entries[-1].tick is tick])
-                ready.append(tick.result(is_final=False))
+                yield tick.result(is_final=False)
                 lag = min(self.config.lag, self.config.window - 1)
                 for old in [t for t in self._ticks if t.is_paired][::-1][lag:]:
                     old.waiting = 0
@@ -95,8 +94,7 @@ class BoxRegistrar:
                 # the more at once, the better they tell the errors of the input.
                 self._solve([t for t in self._tracks.values() if len(t.entries) > full // 2])
                 self._count = 0
-            ready += self._settled()
-        return ready
+            yield from self._settled()
 
     def _open(self, pair: Pair) -> '_Tick':
         """Start a tick: sort its boxes out and add an observation to the track of each."""
@@ -123,7 +121,7 @@ class BoxRegistrar:
                 there[:, X : Z + 1] += delay * np.array(moves)
             seen = observe(sweep, there, now_ns, self.config)
             for i, track, box, observation in zip(admitted, tracks, given, seen, strict=True):
-                tick.num_points[i] = observation.num_points
+                tick.num_points[i], tick.reasons[i] = observation.num_points, 'short_track'
                 track.entries.append(_Entry(observation._replace(box=box), tick, i))
                 tick.waiting += 1
                 if other := track.parted():
@@ -138,21 +136,25 @@ class BoxRegistrar:
     def _solve(self, tracks: list['_TrackBuffer']) -> None:
         """Register windows, ended ones too, and write the estimates to the ticks they are of."""
         tracks = self._ended + tracks
-        estimates = register([track.window() for track in tracks], self.config, self._model)
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # tensors are small: threads of torch would wait, not work
+        try:
+            estimates = register([track.window() for track in tracks], self.config, self._model)
+        finally:
+            torch.set_num_threads(threads)
         for track, estimate in zip(tracks, estimates, strict=True):
-            track.write(estimate)
+            if estimate is not None:
+                track.write(estimate)
             track.slide(self.config)
         for track in self._ended:
             track.settle(len(track.entries))
         self._ended = []
 
-    def _settled(self) -> list[RefinedBoxes]:
-        ready = []
-        while self._ticks and self._ticks[0].waiting == 0:
+    def _settled(self) -> Iterator[RefinedBoxes]:
+        while self._ticks and self._ticks[0].waiting <= 0:
             tick = self._ticks.popleft()
             self.counts.update([*tick.status, *filter(None, tick.reasons)])
-            ready.append(tick.result(is_final=True))
-        return ready
+            yield tick.result(is_final=True)
 
 
 class _Tick:
@@ -240,8 +242,7 @@ class _TrackBuffer:
             return np.zeros(3)
         first = self.entries[-4:][0]
         before = first.observation.box if first.estimate is None else first.estimate
-        seconds = (stamp_ns - first.observation.stamp_ns) * 1e-9
-        return np.asarray((box - before)[X : Z + 1] / seconds)
+        return (box - before)[X : Z + 1] / (stamp_ns - first.observation.stamp_ns) * 1e9
 
     def write(self, estimate: Estimate) -> None:
         self.memory = estimate.memory

@@ -49,6 +49,9 @@ class Estimate(NamedTuple):
     memory: Memory | None = None
 
 
+Estimates = list[Estimate | None]
+
+
 class Solution(NamedTuple):
     """
     A solved batch.
@@ -69,7 +72,7 @@ class Solution(NamedTuple):
     left: tuple[Tensor, ...] = ()
 
 
-def register(windows: Sequence[Window], config: Config, model: InputModel) -> list[Estimate]:
+def register(windows: Sequence[Window], config: Config, model: InputModel) -> Estimates:
     """
     Refine the boxes of many windows.
 
@@ -84,20 +87,10 @@ def register(windows: Sequence[Window], config: Config, model: InputModel) -> li
 
     Returns
     -------
-    estimates : list of Estimate
-        In the order of `windows`.
+    estimates : list of Estimate or None
+        In the order of `windows`; None for those that are too short.
 
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)  # tensors are small: threads of torch would wait, not work
-    try:
-        return _register(windows, config, model)
-    finally:
-        torch.set_num_threads(before)
-
-
-def _register(windows: Sequence[Window], config: Config, model: InputModel) -> list[Estimate]:
-    """Do what `register` says."""
     estimates: dict[int, Estimate] = {}
     groups = batches(windows, config)
     for rows in groups:
@@ -115,7 +108,7 @@ def _register(windows: Sequence[Window], config: Config, model: InputModel) -> l
             known = scatter(problem, solved.state)[range(len(part)), best].cpu().numpy()
             model.learn_noise([window.track_id for window in part], known)
         estimates.update(zip(rows, _judged(part, problem, base, solved, config), strict=True))
-    return [estimates.get(i) or _kept(window) for i, window in enumerate(windows)]
+    return [estimates.get(i) for i in range(len(windows))]
 
 
 def _judged(
@@ -357,7 +350,10 @@ def _parked(problem: Problem) -> Tensor:
     late = (t - (t * valid).sum(1, keepdim=True) / valid.sum(1, keepdim=True)) * valid
     slope = (late[..., None] * problem.boxes[..., :2]).sum(1) / (late * t).sum(1)[:, None]
     speed, seconds = slope.square().sum(1).sqrt(), (t * valid).amax(1)
-    return ((speed < PARKED[0]) & (speed * seconds < PARKED[1]))[:, None] * valid[:, 1:]
+    where = torch.where(problem.valid[..., None], problem.boxes[..., :2], torch.nan)
+    away = (where - where.nanmedian(1, keepdim=True).values).norm(dim=2).nanmedian(1).values
+    is_slow = (speed < PARKED[0]) & (torch.maximum(speed * seconds, 2 * away) < PARKED[1])
+    return is_slow[:, None] * valid[:, 1:]
 
 
 def expected_shared(problem: Problem, rule: Rule) -> Tensor:
@@ -396,10 +392,3 @@ def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     local = in_box_axes(problem.points, problem, pose).abs_()
     x, y, z = local.sub_(extent[..., None].to(local) / 2).unbind(-2)
     return (x.maximum(y).maximum(z) < 0.05).sum(-1)
-
-
-def _kept(window: Window) -> Estimate:
-    """Return the input boxes of a window that is too short."""
-    boxes = np.array([o.box for o in window.observations]).reshape(-1, 9)
-    words = (KEPT,) * (n := len(boxes)), ('short_track',) * n
-    return Estimate(boxes, *words, np.broadcast_to(np.eye(6), (n, 6, 6)))

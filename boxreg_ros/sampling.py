@@ -62,7 +62,8 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     centers, half, n = boxes[:, :3], boxes[:, 3:6] / 2, len(boxes)
     index, owner, offset, outside = crop(sweep.points, boxes, max(RING, config.sampling.margin))
     aside, depth = outside[:2].max(0), outside.max(0)
-    height = offset[2] + half[:, 2].take(owner)  # above the bottom of the box
+    up = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()[:, :, 2]  # on a slope, too
+    height = (offset * up.T.take(owner, 1)).sum(0) + half[:, 2].take(owner)  # above the bottom
     beside = np.flatnonzero((aside > 0.05) & (depth < RING) & (np.abs(height) < 0.6))
     corner = np.hypot(half[:, 0], half[:, 1]) + RING  # the ring ends at an upright square
     beside = beside[np.abs(offset[:2].take(beside, 1)).max(0) < corner.take(owner.take(beside))]
@@ -79,7 +80,8 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     near = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
     times = sweep.times if config.sampling.deskew else None
     late = (np.zeros(len(rows)) if times is None else times[rows]).astype(np.float32)
-    origin, ground, parts = sweep.origin - centers, (road - half[:, 2]).tolist(), _parts(owner, n)
+    ground = ((road - half[:, 2]) / up[:, 2].clip(0.1)).tolist()  # along z of the frame
+    origin, parts = sweep.origin - centers, _parts(owner, n)
     columns = boxes, [near[p] for p in parts], [late[p] for p in parts], origin, ground, inside
     return [Observation(stamp_ns, *row) for row in zip(*columns, strict=True)]
 

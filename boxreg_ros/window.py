@@ -8,7 +8,7 @@ from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.correspondence import aspect
 from boxreg_ros.objective import MEMORY, Problem, SHARED
 from boxreg_ros.sampling import Observation
-from boxreg_ros.structures import Floats, YAW
+from boxreg_ros.structures import Floats, ROLL, YAW
 import numpy as np
 from numpy.typing import NDArray
 import torch
@@ -122,7 +122,9 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     times += 0.1 * np.maximum(step - last, 0)
     known = zip(*(w.memory or (w.observations[0].box[:3], *NOTHING) for w in windows), strict=True)
     base, state, move, information, seen = (np.array(part) for part in known)
-    boxes[..., YAW] = one_heading(boxes, times, valid, state[:, 5])
+    yaw = one_heading(boxes, times, valid, state[:, 5])
+    boxes[..., ROLL:YAW] *= np.sign(np.cos(yaw - boxes[..., YAW]))[..., None]
+    boxes[..., YAW] = yaw
     start = boxes.copy()
     for b, window in enumerate(windows):
         start[b, : len(window.start)] = window.start
@@ -152,10 +154,15 @@ def one_heading(boxes: Floats, times: Floats, valid: NDArray[np.bool_], known: F
 
     Those are undone that are in the minority; where the heading of the first is `known` (B,),
     not NaN, three quarters must say otherwise. What is faster than anything reverses moves
-    forward, whatever its boxes say; `times` (B, N) [s].
+    forward, whatever its boxes say; `times` (B, N) [s]. A box that is turned by a quarter does
+    not take those after it along.
 
     """
-    chain = np.unwrap(boxes[..., YAW], period=np.pi)
+    chain = boxes[..., YAW].copy()
+    near = chain[:, 0]
+    for now in chain.T[1:]:
+        off = (now - near + np.pi / 2) % np.pi - np.pi / 2
+        now[:], near = near + off, near + off * 2 / 3
     turned = ((np.cos(boxes[..., YAW] - chain) < 0) & valid).sum(1) / valid.sum(1)
     limit = np.where(np.cos(known - chain[:, 0]) < 0, 0.25, np.where(np.isnan(known), 0.5, 0.75))
     dx, dy = np.moveaxis(np.diff(boxes[..., :2], axis=1, prepend=boxes[:, :1, :2]), 2, 0)

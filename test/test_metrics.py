@@ -1,7 +1,8 @@
 """Overlap and pose errors against answers known by hand, shapely and Monte Carlo."""
 
 from boxreg_ros.errors import ShapeError
-from boxreg_ros.metrics import iou_3d, iou_bev, pose_errors, wrap
+from boxreg_ros.evaluate import pose_errors
+from boxreg_ros.metrics import iou_3d, iou_bev, wrap
 import numpy as np
 import pytest
 from scipy.optimize import linprog

@@ -70,7 +70,7 @@ def test_every_reason_that_is_counted_is_explained():
             r"counts\[f?'(\w+)'\]",
             r"self\.reasons\[i\] = '(\w+)'",
             r"_trouble\(\s*'(\w+)'",
-            r"_kept\(window, '(\w+)'",
+            r"tick\.reasons\[i\] = .*'(\w+)'$",
             r"sink\.expect\(item, '(\w+)'",
         ):
             found |= set(re.findall(pattern, text))

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 from boxreg_ros import Config, refine, registration, Track, window
 from boxreg_ros.errors import ShapeError
-from boxreg_ros.metrics import iou_3d, pose_errors, wrap
+from boxreg_ros.evaluate import pose_errors
+from boxreg_ros.metrics import iou_3d, wrap
 from boxreg_ros.simulate import simulate
 import numpy as np
 import pytest

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from boxreg_ros import Config, refine
 from boxreg_ros.geometry import face_distances
+from boxreg_ros.metrics import iou_3d
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.registration import register
 from boxreg_ros.structures import BoxArray, Sweep
@@ -517,3 +518,45 @@ def test_memory_is_bounded(estimate):
     # Ticks wait for the lag, or for the window of 10.
     assert max(held) <= 15
     assert max(held[40:]) <= max(held[:40])
+
+
+@each_estimate
+def test_an_id_that_another_object_gets_begins_a_track(estimate):
+    # Two cars 5 m apart swap their ids half-way. That is to be as good as new ids.
+    rng, early, late = np.random.default_rng(0), slice(12), slice(12, 24)
+    truths = [drive(24, turn=0, start=(5.0, y, 0.0)) for y in (6.0, 11.0)]
+    a, b = (track_of(truth, rng, name) for truth, name in zip(truths, 'ab', strict=True))
+
+    def overlap(of_b, of_a):
+        parts = [cut(a, early), cut(b, early)]
+        parts += [replace(cut(b, late), track_id=of_b), replace(cut(a, late), track_id=of_a)]
+        config = setup(estimate, **{'faces.learn': False})  # more ids would tell more of the rule
+        results, counts = run(stream_of(parts), config)
+        order = [('a', 'b'), (of_b, of_a)], [(0, 1), (1, 0)]
+        found = []
+        for i, result in enumerate(finals(results)):
+            assert result.boxes.track_ids == order[0][i // 12]
+            where = [truths[k][i] for k in order[1][i // 12]]
+            found.append(iou_3d(result.boxes.boxes, where))
+        assert counts['boxes'] == 48
+        return np.array(found)
+
+    new, swapped = overlap('c', 'd'), overlap('a', 'b')
+    assert swapped.mean() > new.mean() - 0.02
+    assert swapped.min() > new.min() - 0.1
+
+
+def test_torch_has_one_thread_meanwhile(stream, monkeypatch):
+    threads, before = [], torch.get_num_threads()
+
+    def noted(*args):
+        threads.append(torch.get_num_threads())
+        return register(*args)
+
+    monkeypatch.setattr('boxreg_ros.registrar.register', noted)
+    torch.set_num_threads(2)
+    try:
+        run(stream, setup())
+        assert ({*threads}, torch.get_num_threads()) == ({1}, 2)
+    finally:
+        torch.set_num_threads(before)

@@ -186,20 +186,16 @@ def test_what_was_seen_before_is_not_learnt_again():
     np.testing.assert_array_equal(model.rule().gaps, known)
 
 
-def test_short_windows_are_kept():
+def test_short_windows_tell_nothing():
     many = [window(drive(2), 0, name='a'), window(drive(3), 0, name='b')]
     short, long = register(many, ALONE, InputModel(ALONE.faces))
-    assert short.status == ('kept',) * 2
-    assert short.reasons == ('short_track',) * 2
-    np.testing.assert_array_equal(short.boxes, given(many[0]))
-    assert short.covariances.shape == (2, 6, 6)
+    assert short is None
     assert set(long.status) == {'refined'}
 
 
 @pytest.mark.parametrize('many', [[], [window(drive(1))]], ids=['none', 'one box'])
 def test_nothing_to_solve(many):
-    found = register(many, ALONE, InputModel(ALONE.faces))
-    assert [set(estimate.status) for estimate in found] == [{'kept'}] * len(many)
+    assert register(many, ALONE, InputModel(ALONE.faces)) == [None] * len(many)
 
 
 # --- what is shared and what rests --------------------------------------------------------------
@@ -223,6 +219,14 @@ def test_what_is_expected_of_the_shared_by_hand():
     known[:, objective.GAP] = [[1.1, 1.2, 3.3, 3.4, 5.5, 7.6], [2.1, 2.2, 4.3, 4.4, 6.5, 8.6]]
     known[:, objective.PIVOT] = [4.3 / 4, 4.3 / 5]
     np.testing.assert_allclose(found, known, atol=1e-12)
+
+
+def test_what_comes_back_is_not_parked():
+    # 4 m forward and back: on average it goes nowhere.
+    boxes = drive(60, 0.0, 0.0)
+    boxes[:, 0] += 2.0 * (1 - np.cos(np.linspace(0, 2 * np.pi, 60)))
+    assert registration._parked(problem_of([drive(60, 0.0, 0.0)])).all()
+    assert not registration._parked(problem_of([boxes])).any()
 
 
 @pytest.mark.parametrize(
@@ -389,24 +393,6 @@ def test_an_error_in_a_thread_comes_out(monkeypatch, part):
     with pytest.raises(RuntimeError, match='must match'):
         register(windows(), ALONE, WrongNoise(ALONE.faces))
     assert torch.get_num_threads() == threads
-
-
-class Watching(InputModel):
-    """Notes the threads of torch while its rule is asked for."""
-
-    def rule(self):
-        self.threads = torch.get_num_threads()
-        return super().rule()
-
-
-def test_torch_has_one_thread_meanwhile():
-    before, model = torch.get_num_threads(), Watching(ALONE.faces)
-    torch.set_num_threads(2)
-    try:
-        register(windows(), ALONE, model)
-        assert (model.threads, torch.get_num_threads()) == (1, 2)
-    finally:
-        torch.set_num_threads(before)
 
 
 # --- what is remembered -------------------------------------------------------------------------

@@ -200,16 +200,18 @@ def test_many_boxes_equal_brute_force():
     ]  # fmt: skip
     points = rng.uniform(-25, 25, (3000, 3)) * [1, 1, 0.2]
     points = points.astype(np.float32).astype(np.float64)
-    outside = []
-    for box in boxes:
-        local = (points - box[:3]) @ Rotation.from_euler('ZYX', box[[8, 7, 6]]).as_matrix()
-        outside.append((np.abs(local) - box[3:6] / 2).max(1))
-    outside = np.array(outside)
+    axes = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()
+    local = [(points - box[:3]) @ R for box, R in zip(boxes, axes, strict=True)]
+    outside = np.array(
+        [(np.abs(p) - b[3:6] / 2).max(1) for p, b in zip(local, boxes, strict=True)]
+    )
     seen = see(points, *boxes, changes={'sampling.points': 100000})
     assert sum(len(observation.points) for observation in seen) > 500
     for i, (box, observation) in enumerate(zip(boxes, seen, strict=True)):
-        ground = -box[5] / 2 if np.isnan(observation.ground) else observation.ground
-        above = points[:, 2] - box[2] > ground + 0.2
+        # The road is parallel to the bottom; its height is told along z of the frame.
+        known = not np.isnan(observation.ground)
+        ground = observation.ground * axes[i, 2, 2] if known else -box[5] / 2
+        above = local[i][:, 2] > ground + 0.2
         own = (outside[i] < 0.6) & (outside[i] <= outside.min(0) + 0.2) & above
         assert rows(observation.points) == rows((points[own] - box[:3]).astype(np.float32))
         assert observation.num_points == (outside[i] <= 0).sum()
@@ -272,18 +274,14 @@ def test_every_box_has_its_own_road():
 @pytest.mark.parametrize('roll', [0.0, 0.3])
 def test_the_road_is_looked_for_up_to_a_metre_beside_the_box(roll):
     # 20 points lie 0.95 m beside the left face on the road, 80 points 0.05 m higher 1.05 m beside
-    # it: only the first count. The box stands rolled on its lower left edge: along y, a metre
-    # beside that face is 1 / cos(roll) metres from the edge.
-    corner = [10.0, 21.3, 0.0]
-    box = np.r_[corner, CAR[3:6], roll, 0, 0]
-    box[:3] -= Rotation.from_euler('x', roll).apply([0, 1.0, -1.0])
+    # it: only the first count. On a slope as well: the road is 1 m below the centre then, square
+    # to the bottom, and 1 m / cos(roll) straight down.
+    slope = Rotation.from_euler('x', roll)
+    box = np.r_[slope.apply([10.0, 20.3, 1.0]), CAR[3:6], roll, 0, 0]
     near, far = road(0.0, count=20), road(0.05, count=80)
-    near[:, 1], far[:, 1] = (
-        21.3 + 0.95 / np.cos(roll),
-        21.3 + (1.05 + 0.05 * np.sin(roll)) / np.cos(roll),
-    )
-    (seen,) = see(np.r_[near, far], box)
-    assert seen.ground + box[2] == pytest.approx(0.0, abs=1e-6)
+    near[:, 1], far[:, 1] = 21.3 + 0.95, 21.3 + 1.05
+    (seen,) = see(slope.apply(np.r_[near, far]), box)
+    assert seen.ground == pytest.approx(-1 / np.cos(roll), abs=1e-5)
 
 
 @pytest.mark.parametrize('distance, is_seen', [(3.2, True), (3.27, False)])

@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.objective import MEMORY
-from boxreg_ros.structures import POSE, YAW
+from boxreg_ros.structures import POSE, ROLL, YAW
 from boxreg_ros.window import batches, FADING, Memory, one_heading, stack
 import numpy as np
 import pytest
@@ -85,6 +85,23 @@ def test_one_heading(yaw, known):
     (found,) = one_heading(boxes, times, valid, np.array([np.nan]))[:, : len(yaw)]
     np.testing.assert_allclose(np.cos(found - known), 1, atol=1e-12)
     assert (np.abs(np.diff(found)) < np.pi / 2).all()
+
+
+def test_a_quarter_turn_takes_no_other_box_along():
+    yaw = np.zeros(60)
+    yaw[29:32] = -0.05, 1.54, -0.05  # nearer to -pi / 2 than to pi / 2, seen from the next one
+    boxes = yaw[None, :, None] * np.eye(9)[YAW]
+    (found,) = one_heading(boxes, seconds(boxes), np.ones((1, 60), bool), np.array([np.nan]))
+    np.testing.assert_allclose(np.delete(found, 30), np.delete(yaw, 30), atol=1e-12)
+
+
+def test_a_half_turn_is_one_about_the_axis_of_the_box():
+    # Turned around, what rolls to its left and noses up rolls to its right and noses down.
+    truth = drive(9, turn=0) + np.array([0, 0, 0, 0, 0, 0, 0.1, -0.2, 0])
+    track = track_of(truth, np.random.default_rng(0), position=0.0, heading=0.0)
+    track.boxes[::3, ROLL:] = track.boxes[::3, ROLL:] * [-1, -1, 1] + [0, 0, np.pi]
+    problem, _ = stack([window_of(track, CONFIG)], CONFIG)
+    np.testing.assert_allclose(problem.boxes[0, :, ROLL:YAW], truth[:, ROLL:YAW], atol=1e-9)
 
 
 @pytest.mark.parametrize('turns', [0.0, 2 * np.pi, -6 * np.pi])
