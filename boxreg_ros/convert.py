@@ -99,7 +99,8 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
         )
     provenance = Provenance.of(request.recordings or (request.source,))
     counts: Counter[str] = Counter()
-    with whole_folder(out) as folder:
+    inputs = (request.source, *request.recordings, request.options.camera)
+    with whole_folder(out, inputs) as folder:
         writers = {
             name: writer_for(name, folder, provenance, request.options) for name in request.wanted
         }

@@ -46,7 +46,7 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.results import earlier_summary, SUMMARY, whole_folder
+from boxreg_ros.results import earlier_summary, spare, SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import (
     BoxArray,
@@ -149,12 +149,16 @@ class Request:
             return LabelledRecording(self.labels, self.recordings, **options)
         return Recording(self.recordings, boxes=self.boxes, convention=self.convention, **options)
 
+    def inputs(self) -> tuple[Path, ...]:
+        """Return the files and folders it reads."""
+        label_files = (self.labels or ())[1:]
+        return (*self.recordings, *filter(None, (self.options.camera, *label_files)))
+
     def fingerprint(self) -> str:
         """Return a digest of the request and of the files it reads, by size and time."""
-        label_files = (self.labels or ())[1:]
         files = [
             (str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns)
-            for path in (*self.recordings, *filter(None, (self.options.camera, *label_files)))
+            for path in self.inputs()
             for file in sorted([path] if path.is_file() else path.rglob('*'))
         ]
         return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
@@ -191,7 +195,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     registrar = BoxRegistrar(request.config)
     names = dict.fromkeys(('csv', *request.formats))
     recording = request.recording()
-    with recording, whole_folder(out) as folder:
+    with recording, whole_folder(out, request.inputs()) as folder:
         with clock('read'):
             arrivals = _Arrivals(recording, request, clock)
         fixed_frame, sensor_frame = arrivals.fixed_frame, arrivals.sensor_frame
@@ -677,6 +681,7 @@ def run(args: argparse.Namespace) -> int:
     if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():
         print(f'{args.out}: already there, made from the same recording and settings')
         return 0
+    spare(args.out, [args.config])
     from tqdm import tqdm
 
     with tqdm(

@@ -2,12 +2,14 @@ from collections import Counter
 import csv
 import json
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
+from boxreg_ros.convert import Conversion, convert
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.relabel import closing_line, input_boxes, relabel, Request
 from msg_adapters.convention import Convention
@@ -350,6 +352,29 @@ def test_folders_of_others_are_left_alone(tmp_path, content):
     (tmp_path / 'file').write_text('mine')
     with pytest.raises(RecordingError, match='choose another'):
         run(tmp_path / 'drive' / 'drive.mcap', tmp_path / 'file')
+
+
+@pytest.mark.parametrize('given', ['{out}/drive.mcap', '{out}', '{link}', '{bag}'])
+def test_inputs_inside_of_the_output_survive(tmp_path, capsys, given):
+    out, link = tmp_path / 'out', tmp_path / 'link.mcap'
+    bag = Drive(sweeps=3).write(tmp_path / 'drive')
+    run(bag, out)
+    shutil.copy(bag, out / 'drive.mcap')
+    link.symlink_to(out / 'drive.mcap')
+    rule = out / 'rule.yaml'
+    rule.write_text('')
+    before = sorted(out.rglob('*'))
+    words = ['relabel', given.format(out=out, link=link, bag=bag), '-o', str(out)]
+    words += ['--config', str(rule)] if given == '{bag}' else []
+    assert main(words) == 1
+    assert 'choose another with -o' in capsys.readouterr().err
+    labels = 'csv', out / 'boxes.csv'
+    with pytest.raises(RecordingError, match=r"no input is in, got one with .*boxes\.csv'"):
+        run(bag, out, labels=labels)
+    conversion = Conversion(out, 'csv', ('openlabel',))
+    with pytest.raises(RecordingError, match='choose another'):
+        convert(conversion, out)
+    assert sorted(out.rglob('*')) == before
 
 
 def test_unknown_format_is_refused_at_once():
