@@ -266,7 +266,7 @@ def run(args: argparse.Namespace) -> int:
     if (table_of_run := source / 'boxes.csv').is_file():
         source = table_of_run
     if source.suffix == '.csv':
-        predicted = BoxTable.read(source)
+        predicted = _in_frame(BoxTable.read_frames(source), truth.frame_id)
     else:
         from boxreg_ros.relabel import input_boxes  # reads bags: not needed for tables
 
@@ -296,6 +296,23 @@ def run(args: argparse.Namespace) -> int:
             'predictions without one; recalls are 3D, errors in m and rad, jitter in m/s^2'
         )
     return 0
+
+
+def _in_frame(tables: dict[str, BoxTable], frame_id: str) -> BoxTable:
+    """Return the boxes in a frame, those without a transform to it left out; else the most."""
+    found = max(
+        tables.values(),
+        key=lambda table: (table.frame_id == frame_id, len(table.boxes)),
+        default=BoxTable.from_arrays([]),
+    )
+    for name, other in tables.items():
+        if other is not found:
+            print(
+                f'boxreg: {len(other.boxes)} predicted boxes in {name!r} are left out, those in '
+                f'{found.frame_id!r} compared',
+                file=sys.stderr,
+            )
+    return found
 
 
 def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:

@@ -198,6 +198,23 @@ def test_command(tmp_path, capsys):
         run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'tank')
 
 
+def test_boxes_that_stayed_in_another_frame_are_missing(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    # Without a transform for most of the drive, as relabel leaves them.
+    replace(rows(truth, np.arange(14)), frame_id='lidar').write(tmp_path / 'boxes.csv')
+    rows(truth, np.arange(14, 20)).write(tmp_path / 'more.csv')
+    with (tmp_path / 'boxes.csv').open('a') as file:
+        file.writelines((tmp_path / 'more.csv').read_text().splitlines(keepends=True)[1:])
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    told = capsys.readouterr()
+    assert '20 true boxes, 14 missing, 0 predictions' in told.out
+    assert "14 predicted boxes in 'lidar' are left out" in told.err
+    replace(truth, frame_id='map').write(tmp_path / 'truth.csv')
+    with pytest.raises(RecordingError, match=r"boxes are in 'lidar', true ones in 'map'"):
+        run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv')
+
+
 def test_nothing_in_common_is_explained(tmp_path, capsys):
     truth = truth_table()
     truth.write(tmp_path / 'truth.csv')
