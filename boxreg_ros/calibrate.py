@@ -12,6 +12,7 @@ import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+import sys
 from typing import Any
 
 from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
@@ -276,6 +277,8 @@ def run(args: argparse.Namespace) -> int:
     )
     recording.has_boxes = not args.no_boxes
     drive = Drive.of(recording, truth)
+    if drive.left_out:
+        print(f'boxreg: {drive.left_out}', file=sys.stderr)
     measured = annotation_rule(drive, config)
     if not any(found.tracks for found in measured.values()):
         raise RecordingError(

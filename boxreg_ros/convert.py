@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros import __version__
-from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.labelled import (
     add_label_arguments,
     label_frame_of,
@@ -104,7 +104,7 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
         writers = {
             name: writer_for(name, folder, provenance, request.options) for name in request.wanted
         }
-        for frame in _frames(request, folder):
+        for frame in _frames(request, folder, counts):
             counts['frames'] += 1
             counts['boxes'] += len(frame.refined.status)
             for writer in writers.values():
@@ -127,6 +127,7 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
             'to': list(request.wanted),
             'frames': counts['frames'],
             'boxes': counts['boxes'],
+            'unreadable': counts['unreadable'],
             'left_out_of_labels': {name: found for name, found in left_out.items() if found},
             'versions': {'boxreg_ros': __version__},
             'fingerprint': hashlib.sha256(repr((__version__, request)).encode()).hexdigest(),
@@ -135,8 +136,8 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
     return summary
 
 
-def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
-    """Yield the labels, in the fixed frame if the way there is known."""
+def _frames(request: Conversion, folder: Path, counts: Counter[str]) -> Iterator[LabelFrame]:
+    """Yield the labels, in the fixed frame if the way there is known; count the unreadable."""
     if not request.recordings:
         for frame in frames_of(request.given, request.source):
             yield frame.moved('fixed')
@@ -148,7 +149,11 @@ def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
         for record in recording.records(tree):
-            item = recording.decode(record)
+            try:
+                item = recording.decode(record)
+            except UnsupportedMessage as error:
+                recording.pass_over(record, error)
+                continue
             if isinstance(item, Sweep):
                 T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
                 if spool is not None and T_fixed_sweep is not None:
@@ -166,6 +171,7 @@ def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
             yield LabelFrame(
                 refined, fixed_frame, sensor_frame, T_fixed_sensor, sweep, intensities
             )
+        counts['unreadable'] = recording.unreadable.total()
     if spool is not None:
         spool.remove()
 
@@ -206,6 +212,8 @@ def run(args: argparse.Namespace) -> int:
     )
     print(
         f'{args.out}: {summary["boxes"]:,} boxes of {summary["frames"]:,} frames from '
-        f'{args.given} to {", ".join(args.wanted)}' + (f'; {left_out}' if left_out else '')
+        f'{args.given} to {", ".join(args.wanted)}'
+        + (f'; {left_out}' if left_out else '')
+        + (f'; {n:,} messages could not be read' if (n := summary['unreadable']) else '')
     )
     return 0
