@@ -1,5 +1,5 @@
 """
-KITTI raw: ``tracklet_labels.xml``, a tracklet per unbroken run of a track.
+KITTI raw: ``tracklet_labels.xml``, a tracklet per unbroken run of a track in one class.
 
 A tracklet has one extent: the median of the track's. Its poses are of the centre of the bottom
 face, in the LiDAR's frame, by the number of their frame. What KITTI calls length lies along the
@@ -100,21 +100,22 @@ class Writer:
         # The number of tracklets comes before them: they wait in a file of their own.
         self._body = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
         self._timeline = Timeline(folder, provenance)
-        self._runs: dict[str, _Run] = {}
+        self._runs: dict[tuple[str, str], _Run] = {}
         self._count = self._frames = 0
 
     def write(self, frame: LabelFrame) -> None:
         """Add a pose to each track that is seen, and write those that are not."""
         rows, boxes = frame.placed('sensor', self.dropped)
         given = frame.refined.boxes
-        runs: dict[str, _Run] = {}
+        runs: dict[tuple[str, str], _Run] = {}
         for row, box in zip(rows, boxes, strict=True):
-            name = given.track_ids[row]
-            key = f'\0{row}' if not name or name in runs else name  # nameless: one of its own
-            if name not in self._runs or key != name:
-                run = _Run(name, given.class_names[row], self._frames)
+            name, class_name = given.track_ids[row], given.class_names[row]
+            run = _Run(name, class_name, self._frames)
+            key = name, class_name
+            if not name or key in runs:  # without an identity: a run of its own
+                key = f'\0{row}', ''
             else:
-                run = self._runs.pop(name)
+                run = self._runs.pop(key, run)
             runs[key] = run
             is_guess = frame.refined.status[row] == INTERPOLATED
             run.boxes.append(box)
