@@ -47,7 +47,7 @@ class Conversion:
     recordings : tuple of Path
         What the labels are of: where the sensor was, and its clouds. Not needed where the
         labels tell the poses.
-    points, fixed_frame, label_frame : str or None
+    points, fixed_frame, label_frame, odometry : str or None
         As for `boxreg relabel`.
 
     """
@@ -60,6 +60,7 @@ class Conversion:
     points: str | None = None
     fixed_frame: str | None = None
     label_frame: str | None = None
+    odometry: str | None = None
 
 
 def convert(request: Conversion, out: Path) -> dict[str, Any]:
@@ -91,11 +92,13 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
     """
     for name in (request.given, *request.wanted):
         module_of(name)
-    of_recording = (request.points, request.fixed_frame, request.label_frame)
+    of_recording = (
+        request.points, request.odometry, request.fixed_frame, request.label_frame,
+    )  # fmt: skip
     if not request.recordings and (request.options.with_points or any(of_recording)):
         raise ConfigError(
-            '--with-points, --points, --fixed-frame, --label-frame: expected a recording that '
-            'they are about, got none; give it with --recording'
+            '--with-points, --points, --odometry, --fixed-frame, --label-frame: expected a '
+            'recording that they are about, got none; give it with --recording'
         )
     provenance = Provenance.of(request.recordings or (request.source,))
     counts: Counter[str] = Counter()
@@ -145,7 +148,8 @@ def _frames(request: Conversion, folder: Path, counts: Counter[str]) -> Iterator
     tree = TransformTree()
     labels = (request.given, request.source)
     spool = Spool(folder, TOLERANCE_NS) if request.options.with_points else None
-    with LabelledRecording(labels, request.recordings, points=request.points) as recording:
+    topics = {'points': request.points, 'odometry': request.odometry}
+    with LabelledRecording(labels, request.recordings, **topics) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
         for record in recording.records(tree):
@@ -195,6 +199,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_label_arguments(parser)
     parser.add_argument('--points', metavar='TOPIC', help='point clouds of the recording')
+    parser.add_argument(
+        '--odometry', metavar='TOPIC', help='of the recording, where TF is not enough'
+    )
     parser.add_argument('--fixed-frame', metavar='FRAME', help='of the recording')
 
 
@@ -203,7 +210,7 @@ def run(args: argparse.Namespace) -> int:
     request = Conversion(
         args.source, args.given, args.wanted,
         Options(args.with_points, args.camera, args.swap_axes), tuple(args.recording),
-        args.points, args.fixed_frame, args.label_frame,
+        args.points, args.fixed_frame, args.label_frame, args.odometry,
     )  # fmt: skip
     summary = convert(request, args.out)
     left_out = '; '.join(

@@ -12,8 +12,9 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from boxreg_ros.arguments import add_topic_arguments
 from boxreg_ros.boxtable import BoxTable
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.metrics import EXTENT, iou_3d, iou_bev, pose_errors, wrap
 from boxreg_ros.structures import Floats, Ints, YAW
 import numpy as np
@@ -256,6 +257,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--classes', nargs='+', default=[], metavar='WORD',
         help='only true boxes whose class name holds one of these words, as in car,van,truck',
     )  # fmt: skip
+    add_topic_arguments(parser)
+    parser.add_argument('--fixed-frame', metavar='FRAME', help='as of `boxreg relabel`')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
 
@@ -263,14 +266,20 @@ def run(args: argparse.Namespace) -> int:
     """Print the scores of one table of boxes, or of a recording's own boxes."""
     truth = BoxTable.read(args.truth)
     source = args.predicted
+    topics = {name: getattr(args, name) for name in ('points', 'boxes', 'odometry')}
     if (table_of_run := source / 'boxes.csv').is_file():
         source = table_of_run
     if source.suffix == '.csv':
+        if any((*topics.values(), args.fixed_frame)):
+            raise ConfigError(
+                f'--points, --boxes, --odometry, --fixed-frame: expected a recording that they '
+                f'are about, got the table {str(source)!r}; leave them out'
+            )
         predicted = _in_frame(BoxTable.read_frames(source), truth.frame_id)
     else:
         from boxreg_ros.relabel import input_boxes  # reads bags: not needed for tables
 
-        predicted = BoxTable.from_arrays(input_boxes(source))
+        predicted = BoxTable.from_arrays(input_boxes(source, args.fixed_frame, **topics))
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes)
     if not len(matches.is_matched):

@@ -232,16 +232,17 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     return summary
 
 
-def input_boxes(path: Path) -> list[BoxArray]:
+def input_boxes(path: Path, fixed_frame: str | None = None, **topics: Any) -> list[BoxArray]:
     """
     Return the boxes of a recording as they are, in the fixed frame `relabel` would choose.
 
-    Box arrays without a transform to that frame are left out, and what cannot be read.
+    Box arrays without a transform to that frame are left out, and what cannot be read. `topics`
+    are those that `Recording` wants to be told where several fit.
 
     """
     tree = TransformTree()
-    with Recording([path]) as recording:
-        fixed_frame = recording.choose_fixed_frame(tree)
+    with Recording([path], **topics) as recording:
+        fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
         arrays = []
         for record in recording.records(tree):
             if record.connection.topic == recording.boxes_topic:

@@ -440,6 +440,26 @@ def test_input_boxes_are_those_of_the_recording_in_the_fixed_frame(tmp_path):
         np.testing.assert_allclose(array.boxes, drive.truth[array.stamp_ns], atol=0.25)
 
 
+def test_what_evaluate_and_convert_ask_for_they_take(tmp_path, capsys):
+    drive = Drive(sweeps=4, motion='odometry')
+    for topic in ('/boxes', '/odom'):
+        drive.items += [(f'{topic}2', *item[1:]) for item in drive.items if item[0] == topic]
+    path, table = str(drive.write(tmp_path / 'drive')), str(tmp_path / 'input.csv')
+    topics = {'boxes': '/boxes2', 'odometry': '/odom2'}
+    BoxTable.from_arrays(input_boxes(Path(path), **topics)).write(table)
+    assert main(['evaluate', path, table]) == 1
+    assert 'choose one with --boxes' in capsys.readouterr().err
+    words = ['--boxes', '/boxes2', '--odometry', '/odom2', '--fixed-frame', 'odom']
+    assert main(['evaluate', path, table, *words]) == 0
+    assert '8 true boxes, 0 missing' in capsys.readouterr().out
+    assert main(['evaluate', table, table, *words[:2]]) == 2
+    assert 'leave them out' in capsys.readouterr().err
+    words = ['--from', 'csv', '--to', 'nuscenes', '--recording', path, '-o', str(tmp_path / 'out')]
+    assert main(['convert', table, *words]) == 1
+    assert 'choose one with --odometry' in capsys.readouterr().err
+    assert main(['convert', table, *words, '--odometry', '/odom']) == 0
+
+
 # Real data -------------------------------------------------------------------------------------
 
 SHARED = Path(__file__).resolve().parents[2] / 'shared'
