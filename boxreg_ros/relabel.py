@@ -41,6 +41,7 @@ from boxreg_ros.labels import (
     LabelWriter,
     module_of,
     Options,
+    place_of,
     Provenance,
     writer_for,
 )
@@ -159,7 +160,10 @@ class Request:
         files = [
             (str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns)
             for path in self.inputs()
-            for file in sorted([path] if path.is_file() else path.rglob('*'))
+            # Folders in that of a recording are no part of it; one may be that of the results.
+            for deep in ['*' if path in self.recordings else '**/*']
+            for file in sorted([path] if path.is_file() else path.glob(deep))
+            if file.is_file()
         ]
         return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
 
@@ -679,7 +683,12 @@ def run(args: argparse.Namespace) -> int:
         convention_from(args), args.bridge,
     )  # fmt: skip
     earlier = earlier_summary(args.out)
-    if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():
+    if (
+        args.resume
+        and earlier
+        and earlier['fingerprint'] == request.fingerprint()
+        and all((args.out / place_of(name)).exists() for name in ('csv', *request.formats))
+    ):
         print(f'{args.out}: already there, made from the same recording and settings')
         return 0
     spare(args.out, [args.config])

@@ -82,6 +82,17 @@ def test_resume_does_what_is_left_to_do(tmp_path, capsys):
     assert ' boxes in' in boxreg(capsys, *command, '--set', 'max_gap=0.9')[1]
 
 
+def test_resume_where_results_lie_in_the_recording_or_are_gone(tmp_path, capsys):
+    folder = Drive(sweeps=3).write(tmp_path / 'drive', 'sqlite3')
+    out = folder / 'out'
+    command = ['relabel', folder, '-o', out, *QUICK, '--formats', 'openlabel,mcap', '--resume']
+    assert ' boxes in' in boxreg(capsys, *command)[1]
+    assert 'already there' in boxreg(capsys, *command)[1]
+    for name in ('boxes.csv', 'overlay.mcap'):
+        (out / name).unlink()
+        assert ' boxes in' in boxreg(capsys, *command)[1], f'without {name}'
+
+
 @pytest.mark.parametrize(
     ('options', 'status', 'expected'),
     [
