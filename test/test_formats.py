@@ -387,6 +387,15 @@ def test_a_track_may_change_its_class(tmp_path, name):
     assert [(b.track_ids, b.class_names) for b in found] == [(('7',), (kind,)) for kind in kinds]
 
 
+@pytest.mark.parametrize('name', OURS)
+def test_names_come_back_as_they_were(tmp_path, name):
+    names = ('a--b', 'a---', '-', '<i> & co', '&amp;', '&#45;', 'a - -b')
+    frames = [frame_of([IN_FIXED] * len(names), names)]
+    _, folder = written(name, tmp_path, frames)
+    (frame,) = frames_of(name, folder)
+    assert sorted(frame.refined.boxes.track_ids) == sorted(names)
+
+
 @pytest.mark.parametrize('name', [name for name in OURS if name != 'csv'])
 def test_boxes_without_a_place_are_counted(tmp_path, name):
     flat, lost = [*IN_FIXED[:3], 4.0, 0.0, 1.6, 0, 0, 0], [np.nan, *IN_FIXED[1:]]

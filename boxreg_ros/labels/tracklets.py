@@ -17,7 +17,7 @@ from pathlib import Path
 import shutil
 from tempfile import TemporaryFile
 from xml.etree import ElementTree
-from xml.sax.saxutils import escape
+from xml.sax.saxutils import escape, unescape
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
@@ -51,6 +51,8 @@ POSE = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz')
 EXTENTS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
 """Where length, width and height are written, as KITTI has it and as Datumaro reads it."""
 SWAPPED, TRACK = 'axes swapped', 'track '
+HYPHEN = '&#45;'
+"""What a hyphen is in a comment where XML does not take it: beside another, or at the end."""
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
 <!DOCTYPE boost_serialization>
@@ -186,7 +188,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         for number, item in enumerate(tree.getroot().findall('tracklets/item')):
             comments = [str(e.text) for e in item if e.tag is ElementTree.Comment]
             named = [text for text in comments if text.startswith(TRACK)]
-            name = named[0].removeprefix(TRACK) if named else str(number)
+            name = unescape(named[0].removeprefix(TRACK), {HYPHEN: '-'}) if named else str(number)
             extent = [_number(item, key) for key in EXTENTS[is_swapped]]
             first = int(_number(item, 'first_frame'))
             for index, pose in enumerate(item.findall('poses/item'), first):
@@ -229,5 +231,6 @@ def _number(item: ElementTree.Element, name: str) -> float:
 
 
 def _comment(text: str) -> str:
-    """Return text that may stand in a comment of XML."""
-    return escape(text.replace('--', '- -')).rstrip('-')
+    """Return text as may stand in a comment of XML; `unescape` returns it."""
+    text = escape(text).replace('--', f'-{HYPHEN}')
+    return text.removesuffix('-') + HYPHEN if text.endswith('-') else text
