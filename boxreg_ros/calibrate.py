@@ -31,7 +31,7 @@ from boxreg_ros.calibration import (
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.correspondence import support
 from boxreg_ros.drive import Drive
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.objective import EXTENT, State
 from boxreg_ros.recording import Recording
 from boxreg_ros.registration import expected_shared
@@ -271,6 +271,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print what was found, and write it as settings."""
     config = config_from(args)
+    if args.output and not args.output.parent.is_dir():
+        raise ConfigError(
+            f'output {str(args.output)!r}: expected a folder that is there, got '
+            f'{str(args.output.parent)!r}; make it first'
+        )
     truth = BoxTable.read(args.truth)
     recording = Recording(
         args.recordings, args.points, args.boxes, args.odometry, convention=convention_from(args)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import hashlib
 from importlib.metadata import version
 import json
+from math import isfinite
 from pathlib import Path
 import platform
 import sys
@@ -130,6 +131,12 @@ class Request:
                 f'{self.convention}: expected for boxes of a topic, got label files; each format '
                 f'has its own convention, see boxreg formats'
             )
+        for name, seconds in (('start', self.start), ('end', self.end)):
+            if seconds is not None and not isfinite(seconds):
+                raise ConfigError(
+                    f'{name}: expected seconds from the beginning, got {seconds}; leave it out '
+                    f'for all of the recording'
+                )
         if not 0 <= self.bridge <= self.config.max_gap:
             raise ConfigError(
                 f'bridge: expected 0 to max_gap ({self.config.max_gap:g} s), after which an id is '

@@ -280,3 +280,5 @@ def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
     arguments = ['calibrate', str(street), '--truth', str(tmp_path / 'truth.csv')]
     assert cli.main(arguments) == 1
     assert 'are stamps and frame those of the recording?' in capsys.readouterr().err
+    assert cli.main([*arguments, '-o', str(tmp_path / 'nowhere' / 'rule.yaml')]) == 2
+    assert 'make it first' in capsys.readouterr().err, 'before any work'

@@ -100,6 +100,8 @@ def test_resume_where_results_lie_in_the_recording_or_are_gone(tmp_path, capsys)
         (['--boxes', '/points'], 1, 'Detection3DArray'),
         (['--fixed-frame', 'world'], 1, "fixed frame 'world'"),
         (['--start', '9'], 1, 'start and end'),
+        (['--start', 'nan'], 2, 'start: expected seconds from the beginning, got nan'),
+        (['--end', 'inf'], 2, 'end: expected seconds from the beginning, got inf'),
         (['--set', 'windw=5'], 2, 'windw: no such setting'),
         (['--set', 'window=five'], 2, 'window: expected int'),
         (['--set', 'window=2'], 2, 'window: expected 3 to 1000'),

@@ -1,6 +1,7 @@
 """Scores of boxes whose errors are known."""
 
 import argparse
+import codecs
 from dataclasses import replace
 import json
 
@@ -153,6 +154,9 @@ def test_table_round_trip(tmp_path):
     assert again.stamps_ns.dtype == np.int64
     assert again.num_points.tolist() == table.num_points.tolist()
     assert (tmp_path / 'boxes.csv').read_text().splitlines()[0] == ','.join(COLUMNS)
+    content = (tmp_path / 'boxes.csv').read_bytes()
+    (tmp_path / 'boxes.csv').write_bytes(codecs.BOM_UTF8 + content)
+    assert BoxTable.read(tmp_path / 'boxes.csv').track_ids == table.track_ids
 
 
 @pytest.mark.parametrize(
@@ -160,10 +164,13 @@ def test_table_round_trip(tmp_path):
     [
         ('stamp_ns,x\n1,2\n', 'columns missing: frame_id'),
         ('', 'columns missing: stamp_ns'),
-        (','.join(COLUMNS) + '\n' + ','.join(['1'] * 6 + ['far'] + ['1'] * 10), 'hold numbers'),
-        (','.join(COLUMNS) + '\n1,odom,1\n', 'hold numbers'),
+        (','.join(COLUMNS) + '\n' + ','.join(['1'] * 6 + ['far'] + ['1'] * 10),
+         'line 2, column y: expected a number, got far'),
+        (','.join(COLUMNS) + '\n1,odom,1\n', 'line 2, column num_points: .*got nothing'),
+        (','.join(COLUMNS) + '\n' + '1,' * 16 + '1\n' + '1,' * 16 + '\n',
+         'line 3, column num_points: expected a whole number, got nothing'),
     ],
-)
+)  # fmt: skip
 def test_bad_table(tmp_path, text, message):
     (tmp_path / 'boxes.csv').write_text(text)
     with pytest.raises(RecordingError, match=message):
