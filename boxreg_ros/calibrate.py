@@ -281,7 +281,7 @@ def run(args: argparse.Namespace) -> int:
         args.recordings, args.points, args.boxes, args.odometry, convention=convention_from(args)
     )
     recording.has_boxes = not args.no_boxes
-    drive = Drive.of(recording, truth)
+    drive = Drive.of(recording, truth, config.tolerance)
     if drive.left_out:
         print(f'boxreg: {drive.left_out}', file=sys.stderr)
     measured = annotation_rule(drive, config)
@@ -315,7 +315,7 @@ def _true_windows(drive: Drive, config: Config) -> list[Window]:
     rows = np.flatnonzero([_is_box(box) for box in truth.boxes])
     seen: dict[str, list[Observation]] = {}
     classes: dict[str, str] = {}
-    for stamp_ns in np.unique(truth.stamps_ns[rows]).tolist():
+    for stamp_ns in np.unique(truth.stamps_ns[rows]).tolist() if drive.sweeps else ():
         (sweep,) = drive.sweeps_at(np.array([stamp_ns]))
         if abs(sweep.stamp_ns - stamp_ns) > config.tolerance * 1e9:
             continue

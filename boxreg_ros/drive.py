@@ -82,11 +82,12 @@ class Drive:
         return cls.of(Recording(found), truth)
 
     @classmethod
-    def of(cls, recording: Recording, truth: BoxTable) -> Drive:
+    def of(cls, recording: Recording, truth: BoxTable, within: float | None = None) -> Drive:
         """
         Read a recording that is not open yet, in the frame of its true boxes.
 
-        Messages that cannot be read or have no transform are passed over.
+        Messages that cannot be read or have no transform are passed over. All sweeps are held in
+        memory, or those no further from the stamp of a true box than `within` [s].
 
         Raises
         ------
@@ -96,6 +97,7 @@ class Drive:
         """
         tree = TransformTree()
         sweeps, boxes, unmoved = [], [], []
+        has_sweeps = False
         with recording:
             fixed_frame = recording.choose_fixed_frame(tree, truth.frame_id)
             for record in recording.records(tree):
@@ -106,10 +108,13 @@ class Drive:
                 except TransformUnavailable as error:
                     unmoved.append(str(error))
                 else:
-                    if isinstance(item, Sweep):
-                        sweeps.append(item)
-                    else:
+                    if isinstance(item, BoxArray):
                         boxes.append(item)
+                        continue
+                    has_sweeps = True
+                    off_ns = np.abs(truth.stamps_ns - item.stamp_ns)
+                    if within is None or (off_ns <= within * 1e9).any():
+                        sweeps.append(item)
         unread = [str(error) for error in recording.first_errors.values()]
         left_out = '; '.join(
             f'{count} messages {what}, first: {reasons[0]}'
@@ -119,7 +124,7 @@ class Drive:
             )
             if count
         )
-        if not sweeps:
+        if not has_sweeps:
             reason = f': {left_out}' if left_out else ''
             raise RecordingError(f'{recording}: expected sweeps, got none{reason}')
         return cls(

@@ -252,6 +252,14 @@ def test_a_recording_without_boxes_has_a_rule(street, scene, tmp_path, capsys):
     assert 'vehicle.position' not in text
 
 
+def test_sweeps_without_labels_are_not_held(street, scene):
+    few = scene.truth.stamps_ns[[0, -1]]
+    truth = replace(scene.truth, stamps_ns=np.where(scene.truth.stamps_ns < few[1], *few))
+    drive = Drive.of(Recording([street]), truth, Config().tolerance)
+    assert [sweep.stamp_ns for sweep in drive.sweeps] == few.tolist()
+    assert len(drive.boxes) == len(scene.detections)
+
+
 def test_what_cannot_be_used_is_passed_over_and_told(tmp_path, capsys):
     made = Recorded(sweeps=8)
     made.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
