@@ -17,11 +17,7 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
         'recordings', nargs='+', type=Path, metavar='RECORDING',
         help='MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; several are merged by time',
     )  # fmt: skip
-    parser.add_argument('--points', metavar='TOPIC', help='point clouds (default: found by type)')
-    parser.add_argument('--boxes', metavar='TOPIC', help='boxes (default: found by type)')
-    parser.add_argument(
-        '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
-    )
+    add_topic_arguments(parser)
     parser.add_argument(
         '--pose-reference', metavar='POINT', default=STANDARD.pose_reference,
         help=f'point of a box that its pose is at: {", ".join(REFERENCES)}, or X,Y,Z in parts of '
@@ -44,6 +40,15 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
         '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
         help='one setting, as in solver.rounds=2; wins over --config',
     )  # fmt: skip
+
+
+def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which topics are read."""
+    parser.add_argument('--points', metavar='TOPIC', help='point clouds (default: found by type)')
+    parser.add_argument('--boxes', metavar='TOPIC', help='boxes (default: found by type)')
+    parser.add_argument(
+        '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
+    )
 
 
 def convention_from(args: argparse.Namespace) -> Convention:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.metrics import EXTENT
@@ -101,33 +102,44 @@ class BoxTable:
     def read_frames(cls, path: str | Path) -> dict[str, BoxTable]:
         """Return a table per frame of a file, and raise as `read` does but for several frames."""
         try:
-            with open(path, newline='', encoding='utf-8') as file:
+            with open(path, newline='', encoding='utf-8-sig') as file:  # spreadsheets add a BOM
                 reader = csv.DictReader(file)
                 missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
                 if missing:
                     raise RecordingError(
                         f'{path}: not a table of boxes, columns missing: {", ".join(missing)}'
                     )
-                rows = list(reader)
+                rows = [(reader.line_num, row) for row in reader]
         except OSError as error:
             raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
         except (UnicodeDecodeError, csv.Error) as error:
             raise RecordingError(f'{path}: cannot be read as CSV: {error}') from None
-        of_frame: dict[str, list[dict[str, str]]] = {}
-        for row in rows:
-            of_frame.setdefault(row['frame_id'], []).append(row)
+        of_frame: dict[str, list[tuple[int, dict[str, str]]]] = {}
+        for line, row in rows:
+            of_frame.setdefault(row['frame_id'], []).append((line, row))
         return {name: cls._parsed(path, name, part) for name, part in of_frame.items()}
 
     @classmethod
-    def _parsed(cls, path: str | Path, frame_id: str, rows: list[dict[str, str]]) -> BoxTable:
-        try:
-            stamps = np.array([int(row['stamp_ns']) for row in rows], np.int64)
-            num_points = np.array([int(row['num_points']) for row in rows], np.int64)
-            numbers = np.array(
-                [[float(row[name] or 'nan') for name in COLUMNS[4:15]] for row in rows]
-            ).reshape(-1, 11)
-        except (TypeError, ValueError) as error:
-            raise RecordingError(f'{path}: a column does not hold numbers: {error}') from None
+    def _parsed(
+        cls, path: str | Path, frame_id: str, numbered: list[tuple[int, dict[str, str]]]
+    ) -> BoxTable:
+        def column(name: str, kind: type[int] | type[float], empty: str = '') -> list[Any]:
+            values = []
+            for line, row in numbered:
+                try:
+                    values.append(kind(row[name] or empty))
+                except ValueError:
+                    what = 'a whole number' if kind is int else 'a number'
+                    raise RecordingError(
+                        f'{path}: line {line}, column {name}: expected {what}, got '
+                        f'{row[name] or "nothing"}'
+                    ) from None
+            return values
+
+        rows = [row for _, row in numbered]
+        stamps = np.array(column('stamp_ns', int), np.int64)
+        num_points = np.array(column('num_points', int), np.int64)
+        numbers = np.array([column(name, float, 'nan') for name in COLUMNS[4:15]]).T
         boxes = np.full((len(rows), 9), np.nan)
         boxes[:, :3], boxes[:, EXTENT] = numbers[:, 1:4], numbers[:, 8:11]
         turned = (np.linalg.norm(numbers[:, 4:8], axis=1) > 1e-6) & np.isfinite(

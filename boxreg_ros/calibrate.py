@@ -12,6 +12,7 @@ import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+import sys
 from typing import Any
 
 from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
@@ -30,7 +31,7 @@ from boxreg_ros.calibration import (
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.correspondence import support
 from boxreg_ros.drive import Drive
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.objective import EXTENT, State
 from boxreg_ros.recording import Recording
 from boxreg_ros.registration import expected_shared
@@ -271,12 +272,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print what was found, and write it as settings."""
     config = config_from(args)
+    if args.output and not args.output.parent.is_dir():
+        raise ConfigError(
+            f'output {str(args.output)!r}: expected a folder that is there, got '
+            f'{str(args.output.parent)!r}; make it first'
+        )
     truth = BoxTable.read(args.truth)
     recording = Recording(
         args.recordings, args.points, args.boxes, args.odometry, convention=convention_from(args)
     )
     recording.has_boxes = not args.no_boxes
-    drive = Drive.of(recording, truth)
+    drive = Drive.of(recording, truth, config.tolerance)
+    if drive.left_out:
+        print(f'boxreg: {drive.left_out}', file=sys.stderr)
     measured = annotation_rule(drive, config)
     if not any(found.tracks for found in measured.values()):
         raise RecordingError(
@@ -308,7 +316,7 @@ def _true_windows(drive: Drive, config: Config) -> list[Window]:
     rows = np.flatnonzero([_is_box(box) for box in truth.boxes])
     seen: dict[str, list[Observation]] = {}
     classes: dict[str, str] = {}
-    for stamp_ns in np.unique(truth.stamps_ns[rows]).tolist():
+    for stamp_ns in np.unique(truth.stamps_ns[rows]).tolist() if drive.sweeps else ():
         (sweep,) = drive.sweeps_at(np.array([stamp_ns]))
         if abs(sweep.stamp_ns - stamp_ns) > config.tolerance * 1e9:
             continue

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros import __version__
-from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.labelled import (
     add_label_arguments,
     label_frame_of,
@@ -47,7 +47,7 @@ class Conversion:
     recordings : tuple of Path
         What the labels are of: where the sensor was, and its clouds. Not needed where the
         labels tell the poses.
-    points, fixed_frame, label_frame : str or None
+    points, fixed_frame, label_frame, odometry : str or None
         As for `boxreg relabel`.
 
     """
@@ -60,6 +60,7 @@ class Conversion:
     points: str | None = None
     fixed_frame: str | None = None
     label_frame: str | None = None
+    odometry: str | None = None
 
 
 def convert(request: Conversion, out: Path) -> dict[str, Any]:
@@ -91,19 +92,22 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
     """
     for name in (request.given, *request.wanted):
         module_of(name)
-    of_recording = (request.points, request.fixed_frame, request.label_frame)
+    of_recording = (
+        request.points, request.odometry, request.fixed_frame, request.label_frame,
+    )  # fmt: skip
     if not request.recordings and (request.options.with_points or any(of_recording)):
         raise ConfigError(
-            '--with-points, --points, --fixed-frame, --label-frame: expected a recording that '
-            'they are about, got none; give it with --recording'
+            '--with-points, --points, --odometry, --fixed-frame, --label-frame: expected a '
+            'recording that they are about, got none; give it with --recording'
         )
     provenance = Provenance.of(request.recordings or (request.source,))
     counts: Counter[str] = Counter()
-    with whole_folder(out) as folder:
+    inputs = (request.source, *request.recordings, request.options.camera)
+    with whole_folder(out, inputs) as folder:
         writers = {
             name: writer_for(name, folder, provenance, request.options) for name in request.wanted
         }
-        for frame in _frames(request, folder):
+        for frame in _frames(request, folder, counts):
             counts['frames'] += 1
             counts['boxes'] += len(frame.refined.status)
             for writer in writers.values():
@@ -126,6 +130,7 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
             'to': list(request.wanted),
             'frames': counts['frames'],
             'boxes': counts['boxes'],
+            'unreadable': counts['unreadable'],
             'left_out_of_labels': {name: found for name, found in left_out.items() if found},
             'versions': {'boxreg_ros': __version__},
             'fingerprint': hashlib.sha256(repr((__version__, request)).encode()).hexdigest(),
@@ -134,8 +139,8 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
     return summary
 
 
-def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
-    """Yield the labels, in the fixed frame if the way there is known."""
+def _frames(request: Conversion, folder: Path, counts: Counter[str]) -> Iterator[LabelFrame]:
+    """Yield the labels, in the fixed frame if the way there is known; count the unreadable."""
     if not request.recordings:
         for frame in frames_of(request.given, request.source):
             yield frame.moved('fixed')
@@ -143,11 +148,16 @@ def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
     tree = TransformTree()
     labels = (request.given, request.source)
     spool = Spool(folder, TOLERANCE_NS) if request.options.with_points else None
-    with LabelledRecording(labels, request.recordings, points=request.points) as recording:
+    topics = {'points': request.points, 'odometry': request.odometry}
+    with LabelledRecording(labels, request.recordings, **topics) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
         for record in recording.records(tree):
-            item = recording.decode(record)
+            try:
+                item = recording.decode(record)
+            except UnsupportedMessage as error:
+                recording.pass_over(record, error)
+                continue
             if isinstance(item, Sweep):
                 T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
                 if spool is not None and T_fixed_sweep is not None:
@@ -165,6 +175,7 @@ def _frames(request: Conversion, folder: Path) -> Iterator[LabelFrame]:
             yield LabelFrame(
                 refined, fixed_frame, sensor_frame, T_fixed_sensor, sweep, intensities
             )
+        counts['unreadable'] = recording.unreadable.total()
     if spool is not None:
         spool.remove()
 
@@ -188,6 +199,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_label_arguments(parser)
     parser.add_argument('--points', metavar='TOPIC', help='point clouds of the recording')
+    parser.add_argument(
+        '--odometry', metavar='TOPIC', help='of the recording, where TF is not enough'
+    )
     parser.add_argument('--fixed-frame', metavar='FRAME', help='of the recording')
 
 
@@ -196,7 +210,7 @@ def run(args: argparse.Namespace) -> int:
     request = Conversion(
         args.source, args.given, args.wanted,
         Options(args.with_points, args.camera, args.swap_axes), tuple(args.recording),
-        args.points, args.fixed_frame, args.label_frame,
+        args.points, args.fixed_frame, args.label_frame, args.odometry,
     )  # fmt: skip
     summary = convert(request, args.out)
     left_out = '; '.join(
@@ -205,6 +219,8 @@ def run(args: argparse.Namespace) -> int:
     )
     print(
         f'{args.out}: {summary["boxes"]:,} boxes of {summary["frames"]:,} frames from '
-        f'{args.given} to {", ".join(args.wanted)}' + (f'; {left_out}' if left_out else '')
+        f'{args.given} to {", ".join(args.wanted)}'
+        + (f'; {left_out}' if left_out else '')
+        + (f'; {n:,} messages could not be read' if (n := summary['unreadable']) else '')
     )
     return 0

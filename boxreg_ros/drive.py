@@ -8,7 +8,7 @@ from typing import Any
 
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.config import Config
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.metrics import EXTENT
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
@@ -37,11 +37,22 @@ MARGIN = 1.0  # [m], points this far outside a box are handed to the baselines
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Sweeps and noisy boxes of one drive, in time order, in the frame of its true boxes."""
+    """
+    Sweeps and noisy boxes of one drive, in time order, in the frame of its true boxes.
+
+    Attributes
+    ----------
+    sweeps, boxes, truth
+        What there is.
+    left_out : str
+        How many messages of a recording are not among these, and why; '' if all are.
+
+    """
 
     sweeps: tuple[Sweep, ...]
     boxes: tuple[BoxArray, ...]
     truth: BoxTable
+    left_out: str = ''
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Drive:
@@ -71,9 +82,12 @@ class Drive:
         return cls.of(Recording(found), truth)
 
     @classmethod
-    def of(cls, recording: Recording, truth: BoxTable) -> Drive:
+    def of(cls, recording: Recording, truth: BoxTable, within: float | None = None) -> Drive:
         """
         Read a recording that is not open yet, in the frame of its true boxes.
+
+        Messages that cannot be read or have no transform are passed over. All sweeps are held in
+        memory, or those no further from the stamp of a true box than `within` [s].
 
         Raises
         ------
@@ -82,21 +96,42 @@ class Drive:
 
         """
         tree = TransformTree()
-        sweeps, boxes = [], []
+        sweeps, boxes, unmoved = [], [], []
+        has_sweeps = False
         with recording:
             fixed_frame = recording.choose_fixed_frame(tree, truth.frame_id)
             for record in recording.records(tree):
-                item = to_fixed_frame(recording.decode(record), tree, fixed_frame)
-                if isinstance(item, Sweep):
-                    sweeps.append(item)
+                try:
+                    item = to_fixed_frame(recording.decode(record), tree, fixed_frame)
+                except UnsupportedMessage as error:
+                    recording.pass_over(record, error)
+                except TransformUnavailable as error:
+                    unmoved.append(str(error))
                 else:
-                    boxes.append(item)
-        if not sweeps:
-            raise RecordingError(f'{recording}: expected sweeps, got none')
+                    if isinstance(item, BoxArray):
+                        boxes.append(item)
+                        continue
+                    has_sweeps = True
+                    off_ns = np.abs(truth.stamps_ns - item.stamp_ns)
+                    if within is None or (off_ns <= within * 1e9).any():
+                        sweeps.append(item)
+        unread = [str(error) for error in recording.first_errors.values()]
+        left_out = '; '.join(
+            f'{count} messages {what}, first: {reasons[0]}'
+            for count, what, reasons in (
+                (recording.unreadable.total(), 'could not be read', unread),
+                (len(unmoved), 'had no transform', unmoved),
+            )
+            if count
+        )
+        if not has_sweeps:
+            reason = f': {left_out}' if left_out else ''
+            raise RecordingError(f'{recording}: expected sweeps, got none{reason}')
         return cls(
             tuple(sorted(sweeps, key=lambda sweep: sweep.stamp_ns)),
             tuple(sorted(boxes, key=lambda array: array.stamp_ns)),
             truth,
+            left_out,
         )
 
     def registered(self, config: Config) -> dict[str, BoxTable]:

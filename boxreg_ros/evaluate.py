@@ -12,8 +12,9 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
+from boxreg_ros.arguments import add_topic_arguments
 from boxreg_ros.boxtable import BoxTable
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.metrics import EXTENT, iou_3d, iou_bev, wrap
 from boxreg_ros.structures import Floats, Ints, PITCH, ROLL, YAW
 import numpy as np
@@ -287,6 +288,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--classes', nargs='+', default=[], metavar='WORD',
         help='only true boxes whose class name holds one of these words, as in car,van,truck',
     )  # fmt: skip
+    add_topic_arguments(parser)
+    parser.add_argument('--fixed-frame', metavar='FRAME', help='as of `boxreg relabel`')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
 
@@ -294,14 +297,20 @@ def run(args: argparse.Namespace) -> int:
     """Print the scores of one table of boxes, or of a recording's own boxes."""
     truth = BoxTable.read(args.truth)
     source = args.predicted
+    topics = {name: getattr(args, name) for name in ('points', 'boxes', 'odometry')}
     if (table_of_run := source / 'boxes.csv').is_file():
         source = table_of_run
     if source.suffix == '.csv':
-        predicted = BoxTable.read(source)
+        if any((*topics.values(), args.fixed_frame)):
+            raise ConfigError(
+                f'--points, --boxes, --odometry, --fixed-frame: expected a recording that they '
+                f'are about, got the table {str(source)!r}; leave them out'
+            )
+        predicted = _in_frame(BoxTable.read_frames(source), truth.frame_id)
     else:
         from boxreg_ros.relabel import input_boxes  # reads bags: not needed for tables
 
-        predicted = BoxTable.from_arrays(input_boxes(source))
+        predicted = BoxTable.from_arrays(input_boxes(source, args.fixed_frame, **topics))
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes)
     if not len(matches.is_matched):
@@ -327,6 +336,23 @@ def run(args: argparse.Namespace) -> int:
             'predictions without one; recalls are 3D, errors in m and rad, jitter in m/s^2'
         )
     return 0
+
+
+def _in_frame(tables: dict[str, BoxTable], frame_id: str) -> BoxTable:
+    """Return the boxes in a frame, those without a transform to it left out; else the most."""
+    found = max(
+        tables.values(),
+        key=lambda table: (table.frame_id == frame_id, len(table.boxes)),
+        default=BoxTable.from_arrays([]),
+    )
+    for name, other in tables.items():
+        if other is not found:
+            print(
+                f'boxreg: {len(other.boxes)} predicted boxes in {name!r} are left out, those in '
+                f'{found.frame_id!r} compared',
+                file=sys.stderr,
+            )
+    return found
 
 
 def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:

@@ -149,12 +149,13 @@ class Recording:
         held: deque[Record] = deque()
         begin, end = self.start_ns - LOOKAHEAD_NS, self.end_ns + LOOKAHEAD_NS
         for record in self._read([*data, *motion], begin, end):
+            # First what needs no more transforms: those after a pause make the tree forget.
+            while held and held[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
+                yield held.popleft()
             if record.connection.topic in motion_topics:
                 self._add_motion(tree, record)
             elif self.start_ns <= record.received_ns < self.end_ns:
                 held.append(record)
-            while held and held[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
-                yield held.popleft()
         yield from held
 
     def decode(self, record: Record) -> Sweep | BoxArray:

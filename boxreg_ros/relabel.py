@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import hashlib
 from importlib.metadata import version
 import json
+from math import isfinite
 from pathlib import Path
 import platform
 import sys
@@ -42,13 +43,14 @@ from boxreg_ros.labels import (
     LabelWriter,
     module_of,
     Options,
+    place_of,
     Provenance,
     writer_for,
 )
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.report import check_packages, REPORT, write_report
-from boxreg_ros.results import earlier_summary, SUMMARY, whole_folder
+from boxreg_ros.results import earlier_summary, spare, SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import (
     BoxArray,
@@ -134,6 +136,12 @@ class Request:
                 f'{self.convention}: expected for boxes of a topic, got label files; each format '
                 f'has its own convention, see boxreg formats'
             )
+        for name, seconds in (('start', self.start), ('end', self.end)):
+            if seconds is not None and not isfinite(seconds):
+                raise ConfigError(
+                    f'{name}: expected seconds from the beginning, got {seconds}; leave it out '
+                    f'for all of the recording'
+                )
         if not 0 <= self.bridge <= self.config.max_gap:
             raise ConfigError(
                 f'bridge: expected 0 to max_gap ({self.config.max_gap:g} s), after which an id is '
@@ -156,13 +164,20 @@ class Request:
             return LabelledRecording(self.labels, self.recordings, **options)
         return Recording(self.recordings, boxes=self.boxes, convention=self.convention, **options)
 
+    def inputs(self) -> tuple[Path, ...]:
+        """Return the files and folders it reads."""
+        label_files = (self.labels or ())[1:]
+        return (*self.recordings, *filter(None, (self.options.camera, *label_files)))
+
     def fingerprint(self) -> str:
         """Return a digest of the request and of the files it reads, by size and time."""
-        label_files = (self.labels or ())[1:]
         files = [
             (str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns)
-            for path in (*self.recordings, *filter(None, (self.options.camera, *label_files)))
-            for file in sorted([path] if path.is_file() else path.rglob('*'))
+            for path in self.inputs()
+            # Folders in that of a recording are no part of it; one may be that of the results.
+            for deep in ['*' if path in self.recordings else '**/*']
+            for file in sorted([path] if path.is_file() else path.glob(deep))
+            if file.is_file()
         ]
         return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
 
@@ -199,7 +214,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     registrar = BoxRegistrar(request.config)
     names = dict.fromkeys(('csv', *request.formats))
     recording = request.recording()
-    with recording, whole_folder(out) as folder:
+    with recording, whole_folder(out, request.inputs()) as folder:
         with clock('read'):
             arrivals = _Arrivals(recording, request, clock)
         fixed_frame, sensor_frame = arrivals.fixed_frame, arrivals.sensor_frame
@@ -248,16 +263,17 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     return summary
 
 
-def input_boxes(path: Path) -> list[BoxArray]:
+def input_boxes(path: Path, fixed_frame: str | None = None, **topics: Any) -> list[BoxArray]:
     """
     Return the boxes of a recording as they are, in the fixed frame `relabel` would choose.
 
-    Box arrays without a transform to that frame are left out, and what cannot be read.
+    Box arrays without a transform to that frame are left out, and what cannot be read. `topics`
+    are those that `Recording` wants to be told where several fit.
 
     """
     tree = TransformTree()
-    with Recording([path]) as recording:
-        fixed_frame = recording.choose_fixed_frame(tree)
+    with Recording([path], **topics) as recording:
+        fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
         arrays = []
         for record in recording.records(tree):
             if record.connection.topic == recording.boxes_topic:
@@ -713,9 +729,16 @@ def run(args: argparse.Namespace) -> int:
         convention_from(args), args.bridge, args.report,
     )  # fmt: skip
     earlier = earlier_summary(args.out)
-    if args.resume and earlier and earlier['fingerprint'] == request.fingerprint():
+    if (
+        args.resume
+        and earlier
+        and earlier['fingerprint'] == request.fingerprint()
+        and all((args.out / place_of(name)).exists() for name in ('csv', *request.formats))
+    ):
         print(f'{args.out}: already there, made from the same recording and settings')
         return 0
+    if args.config != args.out / 'config.yaml':  # which will be there again
+        spare(args.out, [args.config])
     from tqdm import tqdm
 
     with tqdm(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 import json
 import os
@@ -25,17 +25,37 @@ def earlier_summary(out: Path) -> dict[str, Any] | None:
     return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
 
 
+def spare(out: Path, inputs: Iterable[Path | None]) -> None:
+    """
+    Refuse to replace a folder of results that holds what it would be made from.
+
+    Raises
+    ------
+    RecordingError
+        If one of `inputs` is `out` or lies in it, links followed.
+
+    """
+    folder = out.resolve()
+    for path in filter(None, inputs):
+        if path.resolve().is_relative_to(folder):
+            raise RecordingError(
+                f'output {str(out)!r}: expected a folder that no input is in, got one with '
+                f'{str(path)!r}, which would be replaced with it; choose another with -o'
+            )
+
+
 @contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
+def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path]:
     """
     Yield a folder to fill that becomes `out` on success, and vanishes otherwise.
 
     Raises
     ------
     RecordingError
-        If `out` exists and is not the result of an earlier run.
+        If `out` exists and is not the result of an earlier run, or one of `inputs` is in it.
 
     """
+    spare(out, inputs)
     if out.exists() and earlier_summary(out) is None and not _is_empty(out):
         raise RecordingError(
             f'output {str(out)!r}: expected a new folder or an earlier result, got something '

@@ -39,7 +39,8 @@ def from_msg(msg: Any) -> Sweep:
     where a float64 field lies within a second of the stamp in s, ms, us or ns (Hesai,
     RoboSense, Livox); else relative to the stamp, in the coarsest of these units that keeps
     all points within a second of it, seconds being for floats only (Velodyne: s, Ouster: ns).
-    Times that fit nothing are left out: ``times`` is None.
+    Times that fit nothing are left out: ``times`` is None. A point whose own time is not finite
+    is taken for measured at the stamp.
 
     """
     stamp = stamp_ns(msg.header)
@@ -63,7 +64,6 @@ def from_msg(msg: Any) -> Sweep:
     times = None
     if time_field is not None:
         raw = table[time_field].ravel()  # a copy without gaps: it is gone through several times
-        good &= np.isfinite(raw)
         times = _seconds(raw if good.all() else raw[good], stamp)
     if not good.all():
         columns = columns[:, good]
@@ -85,9 +85,8 @@ def intensities(msg: Any) -> Floats | None:
     name = _first(INTENSITY_FIELDS, fields)
     if name is None or not msg.width * msg.height:
         return None
-    needed = [n for n in (*'xyz', _first(TIME_FIELDS, fields)) if n]
-    table = _table(msg, [fields[n] for n in (*needed, name)])
-    good = np.logical_and.reduce([np.isfinite(table[n].reshape(-1)) for n in needed])
+    table = _table(msg, [fields[n] for n in (*'xyz', name)])
+    good = np.logical_and.reduce([np.isfinite(table[n].reshape(-1)) for n in 'xyz'])
     return np.nan_to_num(table[name].reshape(-1)[good].astype(np.float64), posinf=0, neginf=0)
 
 
@@ -138,6 +137,14 @@ def _seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
     """Return times relative to the stamp [s]; see the notes of `from_msg`."""
     if not raw.size:
         return np.zeros(0)
+    known = np.isfinite(raw)
+    if not known.all():
+        seconds = _seconds(raw[known], stamp) if known.any() else None
+        if seconds is None:
+            return None
+        times = np.zeros(raw.shape)
+        times[known] = seconds
+        return times
     low, high = float(raw.min()), float(raw.max())
     floating = raw.dtype.kind == 'f'
     if floating and raw.dtype.itemsize == 8:

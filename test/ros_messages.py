@@ -353,15 +353,15 @@ class Drive:
 
     """
 
-    def __init__(self, sweeps=8, boxes='vision', motion='tf', ros1=False, seed=5):
+    def __init__(self, sweeps=8, boxes='vision', motion='tf', ros1=False, seed=5, start=START):
         self.messages = m = Messages(ros1)
         self.items, self.truth, self.stamps = [], {}, []
         rng = np.random.default_rng(seed)
         self.items.append(
-            ('/tf_static', START, m.tf(m.transform(START, 'base', 'lidar', (0, 0, 2))))
+            ('/tf_static', start, m.tf(m.transform(start, 'base', 'lidar', (0, 0, 2))))
         )
         for k in range(sweeps):
-            stamp = START + k * SECOND // 10
+            stamp = start + k * SECOND // 10
             self.stamps.append(stamp)
             ego = np.array([0.5 * k, 0.0, 0.0])
             sensor = ego + np.array([0.0, 0.0, 2.0])

@@ -104,8 +104,8 @@ def test_absolute_times_of_a_simulated_clock():
 
 
 def test_intensities_go_with_their_points():
-    xyz, seconds = XYZ.copy(), np.array([0.0, 0.1, np.nan, 0.3])
-    xyz[1, 2] = np.inf
+    xyz, seconds = XYZ.copy(), np.array([0.0, 0.1, 0.2, 0.3])
+    xyz[1:3, 2] = np.inf, np.nan
     extra = [('t', 'f4', seconds), ('intensity', 'u2', np.array([5, 6, 7, 800]))]
     message = M.cloud(STAMP, 'lidar', [*columns(xyz=xyz), *extra], height=2, row_padding=3)
     np.testing.assert_array_equal(pointcloud.from_msg(message).points, XYZ[[0, 3]])
@@ -117,6 +117,22 @@ def test_intensities_that_are_missing():
     strange = [*columns(), ('i', 'f4', np.array([np.nan, np.inf, 2.0, -np.inf]))]
     message = M.cloud(STAMP, 'lidar', strange)
     np.testing.assert_array_equal(pointcloud.intensities(message), [0, 0, 2, 0])
+
+
+@pytest.mark.parametrize(('kind', 'origin'), [('f4', 0.0), ('f8', 0.0), ('f8', STAMP * 1e-9)])
+def test_points_of_unknown_time_are_kept(kind, origin):
+    for unknown, expected in (([1, 3], [-0.01, 0.0, 0.05, 0.0]), ([0, 1, 2, 3], None)):
+        seconds = SECONDS + origin
+        seconds[unknown] = np.tile([np.nan, np.inf], 2)[: len(unknown)]
+        extra = [('t', kind, seconds), ('i', 'f4', np.arange(4.0))]
+        message = M.cloud(STAMP, 'lidar', [*columns(), *extra])
+        sweep = pointcloud.from_msg(message)
+        np.testing.assert_array_equal(sweep.points, XYZ)
+        np.testing.assert_array_equal(pointcloud.intensities(message), np.arange(4))
+        if expected is None:
+            assert sweep.times is None
+        else:
+            np.testing.assert_allclose(sweep.times, expected, atol=1e-6)
 
 
 def test_times_that_fit_nothing_are_left_out():

@@ -8,10 +8,12 @@ from boxreg_ros.calibrate import annotation_rule, calibrated, GAPS, input_errors
 from boxreg_ros.config import Config
 from boxreg_ros.drive import Drive
 from boxreg_ros.recorder import write_recording
+from boxreg_ros.recording import Recording
 from boxreg_ros.simulate import simulate
 from boxreg_ros.structures import BoxArray
 import numpy as np
 import pytest
+from ros_messages import Drive as Recorded
 from scipy.spatial.transform import Rotation
 import yaml
 
@@ -250,9 +252,41 @@ def test_a_recording_without_boxes_has_a_rule(street, scene, tmp_path, capsys):
     assert 'vehicle.position' not in text
 
 
+def test_sweeps_without_labels_are_not_held(street, scene):
+    few = scene.truth.stamps_ns[[0, -1]]
+    truth = replace(scene.truth, stamps_ns=np.where(scene.truth.stamps_ns < few[1], *few))
+    drive = Drive.of(Recording([street]), truth, Config().tolerance)
+    assert [sweep.stamp_ns for sweep in drive.sweeps] == few.tolist()
+    assert len(drive.boxes) == len(scene.detections)
+
+
+def test_what_cannot_be_used_is_passed_over_and_told(tmp_path, capsys):
+    made = Recorded(sweeps=8)
+    made.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
+    made.replace('/boxes', 4, lambda m: setattr(m.detections[0].header, 'frame_id', 'camera'))
+    # TF begins at the fifth stamp; two before it are too far from that.
+    made.items = [i for i in made.items if i[0] != '/tf' or i[1] >= made.stamps[4]]
+    true = [
+        BoxArray(stamp, 'odom', ('1', '2'), ('car', 'car'), np.ones(2), boxes)
+        for stamp, boxes in made.truth.items()
+    ]
+    truth, path = BoxTable.from_arrays(true, 'truth'), made.write(tmp_path / 'drive')
+    drive = Drive.of(Recording([path]), truth)
+    assert [sweep.stamp_ns for sweep in drive.sweeps] == [*made.stamps[2:3], *made.stamps[4:]]
+    assert [array.stamp_ns for array in drive.boxes] == [*made.stamps[2:4], *made.stamps[5:]]
+    assert '2 messages could not be read, first: ' in drive.left_out
+    assert '4 messages had no transform, first: transform odom -> base is known' in drive.left_out
+    truth.write(tmp_path / 'truth.csv')
+    words = ['calibrate', str(path), '--truth', str(tmp_path / 'truth.csv')]
+    assert cli.main(words) == 0
+    assert '2 messages could not be read' in capsys.readouterr().err
+
+
 def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
     truth = replace(scene.truth, stamps_ns=scene.truth.stamps_ns + 10**12)
     truth.write(tmp_path / 'truth.csv')
     arguments = ['calibrate', str(street), '--truth', str(tmp_path / 'truth.csv')]
     assert cli.main(arguments) == 1
     assert 'are stamps and frame those of the recording?' in capsys.readouterr().err
+    assert cli.main([*arguments, '-o', str(tmp_path / 'nowhere' / 'rule.yaml')]) == 2
+    assert 'make it first' in capsys.readouterr().err, 'before any work'

@@ -82,6 +82,17 @@ def test_resume_does_what_is_left_to_do(tmp_path, capsys):
     assert ' boxes in' in boxreg(capsys, *command, '--set', 'max_gap=0.9')[1]
 
 
+def test_resume_where_results_lie_in_the_recording_or_are_gone(tmp_path, capsys):
+    folder = Drive(sweeps=3).write(tmp_path / 'drive', 'sqlite3')
+    out = folder / 'out'
+    command = ['relabel', folder, '-o', out, *QUICK, '--formats', 'openlabel,mcap', '--resume']
+    assert ' boxes in' in boxreg(capsys, *command)[1]
+    assert 'already there' in boxreg(capsys, *command)[1]
+    for name in ('boxes.csv', 'overlay.mcap'):
+        (out / name).unlink()
+        assert ' boxes in' in boxreg(capsys, *command)[1], f'without {name}'
+
+
 @pytest.mark.parametrize(
     ('options', 'status', 'expected'),
     [
@@ -89,6 +100,8 @@ def test_resume_does_what_is_left_to_do(tmp_path, capsys):
         (['--boxes', '/points'], 1, 'Detection3DArray'),
         (['--fixed-frame', 'world'], 1, "fixed frame 'world'"),
         (['--start', '9'], 1, 'start and end'),
+        (['--start', 'nan'], 2, 'start: expected seconds from the beginning, got nan'),
+        (['--end', 'inf'], 2, 'end: expected seconds from the beginning, got inf'),
         (['--set', 'windw=5'], 2, 'windw: no such setting'),
         (['--set', 'window=five'], 2, 'window: expected int'),
         (['--set', 'window=2'], 2, 'window: expected 3 to 1000'),

@@ -205,6 +205,17 @@ def test_convert_needs_poses_where_labels_have_none(tmp_path, drive, camera):
         convert(Conversion(table, 'csv', ('csv',), Options(with_points=True)), tmp_path / 'out')
 
 
+def test_convert_passes_over_clouds_that_cannot_be_read(tmp_path, drive, capsys):
+    _, table = drive
+    broken = Drive(sweeps=7)
+    broken.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
+    words = ['convert', table, '-o', tmp_path / 'out', '--from', 'csv', '--to', 'csv']
+    words += ['--recording', broken.write(tmp_path / 'broken')]
+    assert cli.main([str(word) for word in words]) == 0
+    told = capsys.readouterr().out
+    assert '14 boxes of 7 frames from csv to csv; 1 messages could not be read' in told
+
+
 def test_convert_on_the_command_line(tmp_path, drive, capsys):
     recording, table = drive
     made, again = tmp_path / 'made', tmp_path / 'again'

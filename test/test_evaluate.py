@@ -1,6 +1,7 @@
 """Scores of boxes whose errors are known."""
 
 import argparse
+import codecs
 from dataclasses import replace
 import json
 
@@ -153,6 +154,9 @@ def test_table_round_trip(tmp_path):
     assert again.stamps_ns.dtype == np.int64
     assert again.num_points.tolist() == table.num_points.tolist()
     assert (tmp_path / 'boxes.csv').read_text().splitlines()[0] == ','.join(COLUMNS)
+    content = (tmp_path / 'boxes.csv').read_bytes()
+    (tmp_path / 'boxes.csv').write_bytes(codecs.BOM_UTF8 + content)
+    assert BoxTable.read(tmp_path / 'boxes.csv').track_ids == table.track_ids
 
 
 @pytest.mark.parametrize(
@@ -160,10 +164,13 @@ def test_table_round_trip(tmp_path):
     [
         ('stamp_ns,x\n1,2\n', 'columns missing: frame_id'),
         ('', 'columns missing: stamp_ns'),
-        (','.join(COLUMNS) + '\n' + ','.join(['1'] * 6 + ['far'] + ['1'] * 10), 'hold numbers'),
-        (','.join(COLUMNS) + '\n1,odom,1\n', 'hold numbers'),
+        (','.join(COLUMNS) + '\n' + ','.join(['1'] * 6 + ['far'] + ['1'] * 10),
+         'line 2, column y: expected a number, got far'),
+        (','.join(COLUMNS) + '\n1,odom,1\n', 'line 2, column num_points: .*got nothing'),
+        (','.join(COLUMNS) + '\n' + '1,' * 16 + '1\n' + '1,' * 16 + '\n',
+         'line 3, column num_points: expected a whole number, got nothing'),
     ],
-)
+)  # fmt: skip
 def test_bad_table(tmp_path, text, message):
     (tmp_path / 'boxes.csv').write_text(text)
     with pytest.raises(RecordingError, match=message):
@@ -196,6 +203,23 @@ def test_command(tmp_path, capsys):
     assert '10 true boxes, 2 missing' in text
     with pytest.raises(RecordingError, match='none of 20 true boxes is in scope'):
         run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'tank')
+
+
+def test_boxes_that_stayed_in_another_frame_are_missing(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    # Without a transform for most of the drive, as relabel leaves them.
+    replace(rows(truth, np.arange(14)), frame_id='lidar').write(tmp_path / 'boxes.csv')
+    rows(truth, np.arange(14, 20)).write(tmp_path / 'more.csv')
+    with (tmp_path / 'boxes.csv').open('a') as file:
+        file.writelines((tmp_path / 'more.csv').read_text().splitlines(keepends=True)[1:])
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    told = capsys.readouterr()
+    assert '20 true boxes, 14 missing, 0 predictions' in told.out
+    assert "14 predicted boxes in 'lidar' are left out" in told.err
+    replace(truth, frame_id='map').write(tmp_path / 'truth.csv')
+    with pytest.raises(RecordingError, match=r"boxes are in 'lidar', true ones in 'map'"):
+        run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv')
 
 
 def test_nothing_in_common_is_explained(tmp_path, capsys):

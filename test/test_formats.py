@@ -66,11 +66,13 @@ LOSE_TILT = {'kitti', 'waymo'}
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, 0.25]], np.float32)
 
 
-def frame_of(boxes=(IN_FIXED,), tracks=('7',), stamp_ns=STAMP, frame_id='odom', **changes):
+def frame_of(
+    boxes=(IN_FIXED,), tracks=('7',), stamp_ns=STAMP, frame_id='odom', kind='Car', **changes
+):
     n = len(tracks)
     refined = RefinedBoxes(
         BoxArray(
-            stamp_ns, frame_id, tuple(tracks), ('Car',) * n, np.full(n, 0.75),
+            stamp_ns, frame_id, tuple(tracks), (kind,) * n, np.full(n, 0.75),
             np.array(boxes, float).reshape(n, 9),
         ),
         ('refined',) * n, ('',) * n, np.arange(n) + 42, np.tile(COVARIANCE, (n, 1, 1)),
@@ -374,6 +376,24 @@ def test_round_trip(tmp_path, name):
         if name != 'csv':
             np.testing.assert_allclose(after.T_fixed_sensor, before.T_fixed_sensor, atol=1e-9)
             assert after.sensor_frame == 'lidar'
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_a_track_may_change_its_class(tmp_path, name):
+    kinds = ['Car', 'Car', 'Van', 'Car']
+    frames = [frame_of(stamp_ns=STAMP + i * 10**8, kind=kind) for i, kind in enumerate(kinds)]
+    _, folder = written(name, tmp_path, frames)
+    found = [frame.refined.boxes for frame in frames_of(name, folder)]
+    assert [(b.track_ids, b.class_names) for b in found] == [(('7',), (kind,)) for kind in kinds]
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_names_come_back_as_they_were(tmp_path, name):
+    names = ('a--b', 'a---', '-', '<i> & co', '&amp;', '&#45;', 'a - -b')
+    frames = [frame_of([IN_FIXED] * len(names), names)]
+    _, folder = written(name, tmp_path, frames)
+    (frame,) = frames_of(name, folder)
+    assert sorted(frame.refined.boxes.track_ids) == sorted(names)
 
 
 @pytest.mark.parametrize('name', [name for name in OURS if name != 'csv'])

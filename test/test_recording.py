@@ -115,6 +115,20 @@ def test_only_a_window_of_the_recording_is_held(tmp_path):
             assert not tree.covers('odom', 'lidar', record.received_ns - 40 * SECOND)
 
 
+def test_what_comes_before_a_long_pause_has_its_transforms(tmp_path):
+    pause = 3600 * SECOND
+    drives = [Drive(), Drive(start=START + pause)]
+    del drives[1].items[0]  # the first after the pause is a motion
+    paths = [drive.write(tmp_path / f'drive{k}') for k, drive in enumerate(drives)]
+    tree, found = TransformTree(), []
+    with Recording(paths) as recording:
+        recording.choose_fixed_frame(tree)
+        for record in recording.records(tree):
+            found.append(recording.decode(record).stamp_ns)
+            tree.lookup('odom', 'lidar', found[-1])
+    assert sorted(set(found)) == drives[0].stamps + drives[1].stamps
+
+
 def test_static_transforms_are_known_from_the_start(tmp_path):
     drive = Drive()
     topic, _, message = drive.items.pop(0)

@@ -2,12 +2,14 @@ from collections import Counter
 import csv
 import json
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
+from boxreg_ros.convert import Conversion, convert
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.relabel import closing_line, input_boxes, relabel, Request
 from msg_adapters.convention import Convention
@@ -352,6 +354,29 @@ def test_folders_of_others_are_left_alone(tmp_path, content):
         run(tmp_path / 'drive' / 'drive.mcap', tmp_path / 'file')
 
 
+@pytest.mark.parametrize('given', ['{out}/drive.mcap', '{out}', '{link}', '{bag}'])
+def test_inputs_inside_of_the_output_survive(tmp_path, capsys, given):
+    out, link = tmp_path / 'out', tmp_path / 'link.mcap'
+    bag = Drive(sweeps=3).write(tmp_path / 'drive')
+    run(bag, out)
+    shutil.copy(bag, out / 'drive.mcap')
+    link.symlink_to(out / 'drive.mcap')
+    rule = out / 'rule.yaml'
+    rule.write_text('')
+    before = sorted(out.rglob('*'))
+    words = ['relabel', given.format(out=out, link=link, bag=bag), '-o', str(out)]
+    words += ['--config', str(rule)] if given == '{bag}' else []
+    assert main(words) == 1
+    assert 'choose another with -o' in capsys.readouterr().err
+    labels = 'csv', out / 'boxes.csv'
+    with pytest.raises(RecordingError, match=r"no input is in, got one with .*boxes\.csv'"):
+        run(bag, out, labels=labels)
+    conversion = Conversion(out, 'csv', ('openlabel',))
+    with pytest.raises(RecordingError, match='choose another'):
+        convert(conversion, out)
+    assert sorted(out.rglob('*')) == before
+
+
 def test_unknown_format_is_refused_at_once():
     with pytest.raises(ConfigError, match="format 'kiti'"):
         Request((Path('nothing'),), formats=('csv', 'kiti'))
@@ -413,6 +438,26 @@ def test_input_boxes_are_those_of_the_recording_in_the_fixed_frame(tmp_path):
     for array in arrays:
         assert (array.frame_id, array.track_ids) == ('odom', ('1', '2'))
         np.testing.assert_allclose(array.boxes, drive.truth[array.stamp_ns], atol=0.25)
+
+
+def test_what_evaluate_and_convert_ask_for_they_take(tmp_path, capsys):
+    drive = Drive(sweeps=4, motion='odometry')
+    for topic in ('/boxes', '/odom'):
+        drive.items += [(f'{topic}2', *item[1:]) for item in drive.items if item[0] == topic]
+    path, table = str(drive.write(tmp_path / 'drive')), str(tmp_path / 'input.csv')
+    topics = {'boxes': '/boxes2', 'odometry': '/odom2'}
+    BoxTable.from_arrays(input_boxes(Path(path), **topics)).write(table)
+    assert main(['evaluate', path, table]) == 1
+    assert 'choose one with --boxes' in capsys.readouterr().err
+    words = ['--boxes', '/boxes2', '--odometry', '/odom2', '--fixed-frame', 'odom']
+    assert main(['evaluate', path, table, *words]) == 0
+    assert '8 true boxes, 0 missing' in capsys.readouterr().out
+    assert main(['evaluate', table, table, *words[:2]]) == 2
+    assert 'leave them out' in capsys.readouterr().err
+    words = ['--from', 'csv', '--to', 'nuscenes', '--recording', path, '-o', str(tmp_path / 'out')]
+    assert main(['convert', table, *words]) == 1
+    assert 'choose one with --odometry' in capsys.readouterr().err
+    assert main(['convert', table, *words, '--odometry', '/odom']) == 0
 
 
 # Real data -------------------------------------------------------------------------------------

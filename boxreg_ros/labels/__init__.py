@@ -280,6 +280,11 @@ def writer_for(
     return writer
 
 
+def place_of(name: str) -> str:
+    """Return what a format's writer leaves in the folder of results: its own, or one file."""
+    return str(module_of(name).FORMAT.files.split(',')[0]) if name in BESIDE_RESULTS else name
+
+
 def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
     """
     Yield the frames of a label file or folder.

@@ -4,7 +4,7 @@ nuScenes: the thirteen tables, one scene, boxes in the global frame; and T4, whi
 The sensor's frame stands for the ego vehicle's, so that its calibration is the identity;
 ``--label-frame`` takes another. A sample is a frame of boxes whose pose is known. Beside the
 columns of the data set, annotations have status, reason, score, covariance and the stamp in
-nanoseconds, instances the name of the track.
+nanoseconds, instances the name of the track. A track of several classes is as many instances.
 
 """
 
@@ -164,11 +164,11 @@ class Writer:
         seen = set()
         for row, box, turn in zip(rows, boxes, turns, strict=True):
             name = given.track_ids[row]
-            key = name
-            if not name or name in seen:  # without an identity: an instance of its own
+            key = f'{name}\0{given.class_names[row]}'  # the class is the instance's
+            if not name or key in seen:  # without an identity: an instance of its own
                 self._nameless += 1
                 key = f'\0{self._nameless}'
-            seen.add(name)
+            seen.add(key)
             token = self._token('annotation', f'{sample} {key}')
             score = float(given.scores[row])
             self._append('sample_annotation', {

@@ -1,9 +1,9 @@
 """
 ASAM OpenLABEL 1.0: ``openlabel/labels.json``.
 
-A frame per box array, an object per track, and in each frame a cuboid per object: its ten values
-are x y z, qx qy qz qw, and the extents along the box's own x, y and z. Objects are numbered, as
-the format wants it, and carry the track id as their name.
+A frame per box array, an object per track and class, and in each frame a cuboid per object: its
+ten values are x y z, qx qy qz qw, and the extents along the box's own x, y and z. Objects are
+numbered, as the format wants it, and carry the track id as their name.
 
 """
 
@@ -66,7 +66,7 @@ class Writer:
         self._file.write(',\n"frames": {')
         self._frames = 0
         self._numbers = count()
-        self._tracks: dict[str, int] = {}
+        self._tracks: dict[tuple[str, str], int] = {}
         self._objects: dict[int, dict[str, Any]] = {}
         self._frame_ids: set[str] = set()
         self._sensors: dict[str, str] = {}
@@ -149,11 +149,12 @@ class Writer:
 
     def _number(self, track_id: str, class_name: str, taken: dict[int, Any]) -> int:
         """Return the object's number, and note that it is in this frame."""
-        number = self._tracks.get(track_id) if track_id else None
+        track = track_id, class_name  # the class is the object's: a track may have several
+        number = self._tracks.get(track) if track_id else None
         if number is None or number in taken:
             number = next(self._numbers)
             if track_id:
-                self._tracks.setdefault(track_id, number)
+                self._tracks.setdefault(track, number)
             intervals: list[dict[str, int]] = []
             self._objects[number] = {
                 'name': track_id,

@@ -1,5 +1,5 @@
 """
-KITTI raw: ``tracklet_labels.xml``, a tracklet per unbroken run of a track.
+KITTI raw: ``tracklet_labels.xml``, a tracklet per unbroken run of a track in one class.
 
 A tracklet has one extent: the median of the track's. Its poses are of the centre of the bottom
 face, in the LiDAR's frame, by the number of their frame. What KITTI calls length lies along the
@@ -17,7 +17,7 @@ from pathlib import Path
 import shutil
 from tempfile import TemporaryFile
 from xml.etree import ElementTree
-from xml.sax.saxutils import escape
+from xml.sax.saxutils import escape, unescape
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
@@ -51,6 +51,8 @@ POSE = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz')
 EXTENTS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
 """Where length, width and height are written, as KITTI has it and as Datumaro reads it."""
 SWAPPED, TRACK = 'axes swapped', 'track '
+HYPHEN = '&#45;'
+"""What a hyphen is in a comment where XML does not take it: beside another, or at the end."""
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
 <!DOCTYPE boost_serialization>
@@ -100,21 +102,22 @@ class Writer:
         # The number of tracklets comes before them: they wait in a file of their own.
         self._body = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
         self._timeline = Timeline(folder, provenance)
-        self._runs: dict[str, _Run] = {}
+        self._runs: dict[tuple[str, str], _Run] = {}
         self._count = self._frames = 0
 
     def write(self, frame: LabelFrame) -> None:
         """Add a pose to each track that is seen, and write those that are not."""
         rows, boxes = frame.placed('sensor', self.dropped)
         given = frame.refined.boxes
-        runs: dict[str, _Run] = {}
+        runs: dict[tuple[str, str], _Run] = {}
         for row, box in zip(rows, boxes, strict=True):
-            name = given.track_ids[row]
-            key = f'\0{row}' if not name or name in runs else name  # nameless: one of its own
-            if name not in self._runs or key != name:
-                run = _Run(name, given.class_names[row], self._frames)
+            name, class_name = given.track_ids[row], given.class_names[row]
+            run = _Run(name, class_name, self._frames)
+            key = name, class_name
+            if not name or key in runs:  # without an identity: a run of its own
+                key = f'\0{row}', ''
             else:
-                run = self._runs.pop(name)
+                run = self._runs.pop(key, run)
             runs[key] = run
             is_guess = frame.refined.status[row] == INTERPOLATED
             run.boxes.append(box)
@@ -185,7 +188,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         for number, item in enumerate(tree.getroot().findall('tracklets/item')):
             comments = [str(e.text) for e in item if e.tag is ElementTree.Comment]
             named = [text for text in comments if text.startswith(TRACK)]
-            name = named[0].removeprefix(TRACK) if named else str(number)
+            name = unescape(named[0].removeprefix(TRACK), {HYPHEN: '-'}) if named else str(number)
             extent = [_number(item, key) for key in EXTENTS[is_swapped]]
             first = int(_number(item, 'first_frame'))
             for index, pose in enumerate(item.findall('poses/item'), first):
@@ -228,5 +231,6 @@ def _number(item: ElementTree.Element, name: str) -> float:
 
 
 def _comment(text: str) -> str:
-    """Return text that may stand in a comment of XML."""
-    return escape(text.replace('--', '- -')).rstrip('-')
+    """Return text as may stand in a comment of XML; `unescape` returns it."""
+    text = escape(text).replace('--', f'-{HYPHEN}')
+    return text.removesuffix('-') + HYPHEN if text.endswith('-') else text
