@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+from threading import Event, Thread
 import time
 
 from boxreg_ros.calibrate import calibrated, GAPS, Measured, write_settings
@@ -181,6 +182,43 @@ def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path)
     assert 'WARN' not in second.output()
     refined = np.array([vision.from_msg(message).boxes for message in final])
     assert np.abs(refined - [vision.from_msg(message).boxes for message in given]).max() > 1e-4
+
+
+SLOW_EVENTS = """
+import sys, threading, time
+notify = threading.Condition.notify_all
+def slowly(self):
+    if threading.get_ident() == threading.main_thread().ident:
+        time.sleep(0.1)
+    notify(self)
+threading.Condition.notify_all = slowly
+from boxreg_ros.node import main
+sys.exit(main())
+"""
+
+
+def test_signals_in_quick_succession_end_it_cleanly_while_data_flow(graph, tmp_path):
+    records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    node = graph.start(*RELIABLE, *QUICK, command=('-c', SLOW_EVENTS))
+    graph.wait_until_connected()
+    is_over = Event()
+
+    def flow():
+        while not is_over.is_set():
+            play(graph, records)
+            time.sleep(0.01)
+
+    player = Thread(target=flow)
+    player.start()
+    time.sleep(0.5)
+    node.popen.send_signal(signal.SIGTERM)
+    time.sleep(0.05)
+    try:
+        assert ended_cleanly(node)
+    finally:
+        is_over.set()
+        player.join()
 
 
 DEEP = tuple(
