@@ -49,7 +49,7 @@ STATUS_PERIOD = 1.0
 BOXES_PATIENCE = 10.0
 """Boxes that wait this many times as long as clouds may pass through, not even decoded."""
 LAST_WORK, LAST_ACKNOWLEDGEMENT = 0.5, 0.4
-"""So long may, on shutdown, the worker go on, and subscribers take what it published [s]."""
+"""So long may, on shutdown, the worker be busy, and subscribers take what it published [s]."""
 
 
 class BoxregNode(Node):
@@ -99,7 +99,7 @@ class BoxregNode(Node):
         self._subscribe_to_tf()
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/save_config', self._on_save_config)
-        self._final_depth = 10 + config.lag  # so many may leave at once, at the end
+        self._depth = 10 + config.lag + self._inbox.capacity['boxes']  # may leave at the end
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         if options.boxes_type:
@@ -184,8 +184,8 @@ class BoxregNode(Node):
     def _open_boxes(self, type_name: str) -> None:
         adapter, kind = adapter_for(type_name, self._convention), import_message(type_name)
         self._live.adapter = adapter
-        self._early = self._publisher(kind, 'refined_boxes', 10)
-        self._final = self._publisher(kind, 'refined_boxes_final', self._final_depth)
+        self._early = self._publisher(kind, 'refined_boxes', self._depth)
+        self._final = self._publisher(kind, 'refined_boxes_final', self._depth)
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._subscribe(kind, 'boxes', self._on_boxes, qos)
         self.get_logger().info(f'boxes are {type_name}')
@@ -293,17 +293,15 @@ class BoxregNode(Node):
         return None
 
     def _finish_work(self, item: Arrival | None) -> None:
-        """Process what is left as long as there is time, then publish what is held."""
-        end = time.monotonic() + LAST_WORK
+        """Publish what is held, and pass what still waits through: nobody waits for the solver."""
         self._take_news()
-        while time.monotonic() < end:
-            item = item or self._decoded(self._inbox.take())
-            if item is None and not any(self._inbox.sizes().values()):
-                break
-            if item is not None:
-                self._process(item)
-                item = None
         self._publish(self._guarded(self._live.flush))
+        left = [] if item is None else [item.message]
+        while message := self._inbox.take():
+            left.append(message.content)
+        for content in left:
+            if not isinstance(content, PointCloud2):
+                self._publish(LiveRegistrar.passed_through(content))
         self._markers.publish(self._board.clear())
         for publisher in (self._early, self._final, self._markers):
             if publisher is not None:

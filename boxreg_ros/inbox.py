@@ -31,10 +31,15 @@ class Inbox:
     capacity : int
         Clouds that may wait.
 
+    Attributes
+    ----------
+    capacity : dict
+        How many messages of each topic may wait.
+
     """
 
     def __init__(self, capacity: int) -> None:
-        self._capacity = {'points': capacity, 'boxes': 20 * capacity}
+        self.capacity = {'points': capacity, 'boxes': 20 * capacity}
         self._lock = Lock()
         self._number = 0
         self._news: deque[tuple[str, Any]] = deque()
@@ -52,7 +57,7 @@ class Inbox:
             self._number += 1
             queue = self._waiting[topic]
             queue.append(Message(self._number, topic, content, time.monotonic()))
-            dropped = queue.popleft() if len(queue) > self._capacity[topic] else None
+            dropped = queue.popleft() if len(queue) > self.capacity[topic] else None
         self.news.set()
         return dropped
 

@@ -275,6 +275,18 @@ def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
 
 
+def test_what_waits_when_the_node_ends_comes_out(graph, tmp_path):
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    slow = ('-p', 'solver.rounds:=20', '-p', 'solver.iterations:=100', '-p', 'backlog:=60.0')
+    node = graph.start(*RELIABLE, *DEEP, *slow, '-p', 'queue:=100')
+    graph.wait_until_connected()
+    play(graph, records)
+    graph.wait(lambda: len(early) >= 4, 'some boxes')
+    assert len(early) < 20
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+
+
 def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
     records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
     publishers_for(graph, records)
