@@ -286,6 +286,9 @@ class BoxregNode(Node):
         message = self._inbox.take()
         if message is None:
             return None
+        if message.topic == 'passing':
+            self._publish(self._live.last(message.content))
+            return None
         patience = self._backlog * (1.0 if message.topic == 'points' else BOXES_PATIENCE)
         if time.monotonic() <= max(message.received, self._idle_at) + patience:
             return message
@@ -296,12 +299,13 @@ class BoxregNode(Node):
         """Publish what is held, and pass what still waits through: nobody waits for the solver."""
         self._take_news()
         self._publish(self._guarded(self._live.flush))
-        left = [] if item is None else [item.message]
+        if item is not None and not isinstance(item.message, PointCloud2):
+            self._publish(self._live.passed_through(item.message))
         while message := self._inbox.take():
-            left.append(message.content)
-        for content in left:
-            if not isinstance(content, PointCloud2):
-                self._publish(LiveRegistrar.passed_through(content))
+            if message.topic == 'boxes':
+                self._publish(self._live.passed_through(message.content))
+            elif message.topic == 'passing':
+                self._publish(self._live.last(message.content))
         self._markers.publish(self._board.clear())
         for publisher in (self._early, self._final, self._markers):
             if publisher is not None:
@@ -333,7 +337,7 @@ class BoxregNode(Node):
         except Exception as error:  # whatever a malformed message leads to
             self._trouble('unreadable', f'{message.topic}: {error}')
             if message.topic == 'boxes':
-                self._publish(LiveRegistrar.passed_through(message.content))
+                self._publish(self._live.passed_through(message.content))
             return None
         return Arrival(message.content, content, message.received)
 
@@ -378,7 +382,8 @@ class BoxregNode(Node):
         reason = f'{message.topic}_queue_full'
         self._trouble(reason, REASONS[reason].remedy)
         if message.topic == 'boxes':
-            self._publish(LiveRegistrar.passed_through(message.content))
+            self._publish([Outgoing(message.content, False)])
+            self._inbox.let_pass(message)  # its final copy, in the order of all
         else:
             self._inbox.put_news('lost', stamp_ns(message.content.header))
 

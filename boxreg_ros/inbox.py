@@ -43,7 +43,9 @@ class Inbox:
         self._lock = Lock()
         self._number = 0
         self._news: deque[tuple[str, Any]] = deque()
-        self._waiting: dict[str, deque[Message]] = {'points': deque(), 'boxes': deque()}
+        self._waiting: dict[str, deque[Message]] = {
+            topic: deque() for topic in ('points', 'boxes', 'passing')
+        }
         self.news = Event()
 
     def put_news(self, topic: str, content: Any) -> None:
@@ -60,6 +62,12 @@ class Inbox:
             dropped = queue.popleft() if len(queue) > self.capacity[topic] else None
         self.news.set()
         return dropped
+
+    def let_pass(self, message: Message) -> None:
+        """Have `take` return boxes that were dropped, in their turn, as of topic ``passing``."""
+        with self._lock:
+            self._waiting['passing'].append(message._replace(topic='passing'))
+        self.news.set()
 
     def take_news(self) -> list[tuple[str, Any]]:
         """Return what has come by `put_news` since the last call."""

@@ -65,6 +65,12 @@ class _Pending:
     is_early_out: bool = False
 
 
+class _Passing(NamedTuple):
+    """A message that passes through, its final copy behind those that came before it."""
+
+    message: Any
+
+
 class LiveRegistrar:
     """
     Bring messages into the fixed frame, register them, and make the messages to publish.
@@ -118,7 +124,7 @@ class LiveRegistrar:
         self._convention = convention
         self._intake = Intake(convention, config)
         self._registrar = BoxRegistrar(config)
-        self._pending: dict[int, deque[_Pending]] = {}
+        self._held: deque[_Pending | _Passing] = deque()  # as they came; the first is pending
         self.cloud_frame = ''
         self._choose_at: float | None = None
         self.adapter: Adapter | None = None
@@ -190,7 +196,7 @@ class LiveRegistrar:
         given = boxes_to_frame(content, T_output_item, self._output_of(content))
         given = replace(given, track_ids=boxes.track_ids)
         pending = _Pending(item.message, given, T_output_fixed, T_output_item if others else None)
-        self._pending.setdefault(stamp_ns, deque()).append(pending)
+        self._held.append(pending)
         return self._outgoing(self._registrar.add_boxes(boxes))
 
     def lose(self, stamp_ns: int) -> list[Outgoing]:
@@ -201,7 +207,7 @@ class LiveRegistrar:
     def is_silent(self, now: float) -> bool:
         """Tell whether boxes are held, but no others have come for long."""
         silence = max(SILENCE, self.config.max_gap)
-        return bool(self._pending) and now >= self._last_boxes + silence
+        return bool(self._held) and now >= self._last_boxes + silence
 
     def flush(self) -> list[Outgoing]:
         """End all tracks and return everything still held."""
@@ -219,14 +225,12 @@ class LiveRegistrar:
         """Start afresh after a fault; pass what is held, and the arrival at fault, through."""
         self._registrar.reset()
         self._intake = Intake(self._convention, self.config)
-        held = [p for _, pending in sorted(self._pending.items()) for p in pending]
-        self._pending.clear()
-        passed = [
-            out
-            for p in held
-            for out in self.passed_through(p.message)
-            if out.is_final or not p.is_early_out
-        ]
+        held = list(self._held)
+        self._held.clear()
+        passed = []
+        for p in held:
+            is_early_out = isinstance(p, _Passing) or p.is_early_out
+            passed += ([] if is_early_out else [Outgoing(p.message, False)]) + self.last(p.message)
         is_held = item is None or any(p.message is item.message for p in held)
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
             passed += self.passed_through(item.message)
@@ -237,10 +241,16 @@ class LiveRegistrar:
         """Return what there is to tell about the boxes beside the counts."""
         return self._intake.facts
 
-    @staticmethod
-    def passed_through(message: Any) -> list[Outgoing]:
-        """Return a message as it came, as early and as final."""
-        return [Outgoing(message, False), Outgoing(message, True)]
+    def passed_through(self, message: Any) -> list[Outgoing]:
+        """Return a message as it came, as early and, if nothing before it is held, as final."""
+        return [Outgoing(message, False), *self.last(message)]
+
+    def last(self, message: Any) -> list[Outgoing]:
+        """Return a message as it came, as final, or hold it behind what came before it."""
+        if not self._held:
+            return [Outgoing(message, True)]
+        self._held.append(_Passing(message))
+        return []
 
     def _output_of(self, boxes: BoxArray) -> str:
         return self.output_frame or boxes.frame_id
@@ -280,14 +290,14 @@ class LiveRegistrar:
         outgoing = []
         for refined in ready:
             stamp_ns = refined.boxes.stamp_ns
-            waiting = self._pending[stamp_ns]
-            if refined.is_final:
-                pending = waiting.popleft()
-                if not waiting:
-                    del self._pending[stamp_ns]
-            else:
-                pending = next(p for p in waiting if not p.is_early_out)
-                pending.is_early_out = True
+            pending = next(
+                p
+                for p in self._held
+                if isinstance(p, _Pending)
+                and p.given.stamp_ns == stamp_ns
+                and (refined.is_final or not p.is_early_out)
+            )
+            pending.is_early_out = True
             moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
             assert self.adapter is not None  # it has read the message
             covariances = covariances_to_write(moved)
@@ -295,6 +305,10 @@ class LiveRegistrar:
                 pending.message, moved.boxes, covariances, pending.T_output_item
             )
             outgoing.append(Outgoing(message, refined.is_final, pending.given, moved))
+            if refined.is_final:
+                self._held.remove(pending)
+                while self._held and isinstance(self._held[0], _Passing):
+                    outgoing.append(Outgoing(self._held.popleft().message, True))
         return outgoing
 
 

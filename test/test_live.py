@@ -170,6 +170,23 @@ def test_arrivals_wait_until_transforms_cover_them_but_not_for_ever():
     assert not live.told
 
 
+def test_final_boxes_come_in_the_order_of_the_input_where_some_pass_through():
+    drive = Drive(sweeps=12)
+    boxes = items_of(drive, '/boxes')
+    for k in (5, 6, 11):
+        for item in (boxes[k], *boxes[k].detections):
+            item.header.frame_id = 'nowhere'
+    live = Live(timeout=0.4)
+    out = live.feed(drive)
+    (unread,) = live.passed_through('unread')
+    out += [unread, *live.flush()]
+    for is_final in (False, True):
+        messages = [item.message for item in out if item.is_final == is_final]
+        assert messages.pop() == 'unread'
+        assert [vision.from_msg(message).stamp_ns for message in messages] == drive.stamps
+    assert [item.message for item in live.passed_through('free')] == ['free', 'free']
+
+
 def test_boxes_without_transform_pass_through_with_the_remedy():
     drive = Drive(sweeps=2, motion='none')
     live = Live()
