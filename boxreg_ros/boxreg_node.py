@@ -218,12 +218,15 @@ class BoxregNode(Node):
     def _on_save_config(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         config, options = self._settings
         path = Path(options.config_file).absolute()
-        partial_path = path.with_name(f'.{path.name}.partial')
+        partial_path = path.parent / f'.{path.name}.partial'
         try:
             text = parameters_yaml(config, options, self.get_fully_qualified_name())
-            partial_path.write_text(text, encoding='utf-8')
-            os.replace(partial_path, path)
-        except OSError as error:
+            try:
+                partial_path.write_text(text, encoding='utf-8')
+                os.replace(partial_path, path)
+            finally:
+                partial_path.unlink(missing_ok=True)
+        except (OSError, ValueError) as error:  # ValueError: a name with a NUL
             response.message = f'{error}; choose another config_file'
         else:
             response.success, response.message = True, str(path)

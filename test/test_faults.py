@@ -87,10 +87,13 @@ def test_wishes_at_run_time(graph, tmp_path):
     assert Config.from_yaml(file) == Config().updated(expected)
     assert 'transform_timeout: 0.5' in file.read_text()
     assert asked(graph, Trigger, 'reset', Trigger.Request()).success
-    set_to(config_file=str(tmp_path / 'missing' / 'saved.yaml'))
-    answer = asked(graph, Trigger, 'save_config', Trigger.Request())
-    assert not answer.success
-    assert 'config_file' in answer.message
+    (folder := tmp_path / 'folder').mkdir()
+    for bad_file in (tmp_path / 'missing' / 'saved.yaml', folder, Path('/')):
+        set_to(config_file=str(bad_file))
+        answer = asked(graph, Trigger, 'save_config', Trigger.Request())
+        assert not answer.success
+        assert 'config_file' in answer.message
+    assert not list(tmp_path.glob('.*.partial'))
     assert ended_cleanly(node)
     # What was saved starts a node, in another namespace too.
     again = graph.start('--params-file', str(file), '-r', '__ns:=/front')
