@@ -69,7 +69,17 @@ class BoxregNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        try:
+            super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        except ValueError as error:
+            if 'PARAMETER_NOT_SET' not in str(error):
+                raise
+            given = getattr(self, '_parameter_overrides', {}).values()
+            names = ', '.join(sorted(p.name for p in given if p.value is None))
+            raise ConfigError(
+                f'{names}: expected a value, got an empty list or none; ROS has no empty lists: '
+                f"write ['']"
+            ) from None
         config, options = self._settings = declare(self)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)

@@ -348,6 +348,7 @@ def refused(tmp_path_factory):
         'boxes': ['--ros-args', '-p', 'boxes_type:=std_msgs/msg/String'],
         'device': ['--ros-args', '-p', 'device:=abacus'],
         'file': ['--ros-args', '--params-file', 'missing.yaml'],
+        'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
     }
     started = {
         name: subprocess.Popen(
@@ -369,6 +370,7 @@ def refused(tmp_path_factory):
         ('boxes', 1, ('std_msgs/msg/String', 'Detection3DArray')),
         ('device', 2, ('device', 'abacus', 'cpu')),
         ('file', 2, ('missing.yaml',)),
+        ('list', 2, ('vehicle.names', "['']")),
     ],
 )
 def test_bad_arguments_are_told_in_one_line(refused, case, status, words):
