@@ -97,6 +97,7 @@ class BoxregNode(Node):
         self._board = MarkerBoard()
         self._cloud_frame = self._fixed_frame = ''
         self._tracks = 0
+        self._cloud_received = 0.0
         self._newest_motion_ns: int | None = None
         self._stopping = Event()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on when /clock does not
@@ -208,6 +209,7 @@ class BoxregNode(Node):
 
     def _on_points(self, msg: PointCloud2) -> None:
         self._cloud_frame = msg.header.frame_id
+        self._cloud_received = time.monotonic()
         self._receive('points', msg)
 
     def _on_boxes(self, msg: Any) -> None:
@@ -279,6 +281,7 @@ class BoxregNode(Node):
         while not self._stopping.is_set():
             self._inbox.news.clear()
             self._take_news()
+            self._miss_clouds(item)
             item = item or self._decoded(self._take())
             if item is not None and self._live.is_ready(item, time.monotonic()):
                 self._process(item)
@@ -293,6 +296,13 @@ class BoxregNode(Node):
                 self._inbox.news.wait(STATUS_PERIOD)
                 self._idle_at = time.monotonic()
         self._finish_work(item)
+
+    def _miss_clouds(self, item: Arrival | None) -> None:
+        """Let boxes go that wait for a cloud, if none is on its way."""
+        is_cloud = item is not None and isinstance(item.message, PointCloud2)
+        if not is_cloud and not self._inbox.sizes()['points_waiting']:
+            now, newest = time.monotonic(), self._cloud_received
+            self._publish(self._guarded(partial(self._live.lose_overdue, now, newest)))
 
     def _take(self) -> Message | None:
         """Return what has waited longest, but for what has waited for the solver too long."""
@@ -360,9 +370,6 @@ class BoxregNode(Node):
             self._fixed_frame = self._live.fixed_frame
             self.get_logger().info(f'fixed frame is {self._fixed_frame!r}')
         self._publish(ready)
-        self._health.set_counts(self._live.counts)
-        if any(not out.is_final for out in ready):
-            self._health.add_latency(time.monotonic() - item.received)
 
     def _guarded(
         self, task: Callable[[], list[Outgoing]], item: Arrival | None = None
@@ -373,6 +380,8 @@ class BoxregNode(Node):
         except Exception as error:
             self._trouble('failed', f'{type(error).__name__}: {error}')
             return self._live.abandon(item)
+        finally:
+            self._health.set_counts(self._live.counts)
 
     def _publish(self, ready: list[Outgoing]) -> None:
         for out in ready:
@@ -380,6 +389,8 @@ class BoxregNode(Node):
             assert publisher is not None  # it was made before boxes were subscribed to
             publisher.publish(out.message)
             self._health.count('final_published' if out.is_final else 'early_published')
+            if not out.is_final and out.received is not None:
+                self._health.add_latency(time.monotonic() - out.received)
             if not out.is_final and out.given is not None:
                 self._tracks = len(set(out.given.track_ids) - {''})
         if not self._markers.get_subscription_count():

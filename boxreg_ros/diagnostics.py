@@ -44,7 +44,7 @@ class Health:
             self._elsewhere = Counter(counts)
 
     def add_latency(self, seconds: float) -> None:
-        """Note how long after the later of cloud and boxes an early estimate was published."""
+        """Note how long after its boxes had come an early estimate was published."""
         with self._lock:
             self._latencies.append(seconds)
 

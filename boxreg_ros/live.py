@@ -31,6 +31,10 @@ SILENCE = 3.0
 """After so long without boxes, final ones are not held back any more [s]."""
 
 
+CLOUD_SILENCE = 0.5
+"""After so long without clouds, boxes that have waited as long do not wait for theirs [s]."""
+
+
 class Arrival(NamedTuple):
     """A decoded message, and when it was received by a clock that never jumps [s]."""
 
@@ -44,7 +48,7 @@ class Outgoing(NamedTuple):
     A message to publish.
 
     `given` and `refined` are in the frame of `message`; both are None where the input message
-    is passed through as it came.
+    is passed through as it came; `received` is when the boxes were, None for those.
 
     """
 
@@ -52,6 +56,7 @@ class Outgoing(NamedTuple):
     is_final: bool
     given: BoxArray | None = None
     refined: RefinedBoxes | None = None
+    received: float | None = None
 
 
 @dataclass(eq=False, slots=True)
@@ -60,6 +65,7 @@ class _Pending:
 
     message: Any
     given: BoxArray
+    received: float
     T_output_fixed: Floats
     T_output_item: Floats | None
     is_early_out: bool = False
@@ -195,7 +201,9 @@ class LiveRegistrar:
         T_output_item = T_output_fixed @ T_fixed_item if others else np.eye(4)
         given = boxes_to_frame(content, T_output_item, self._output_of(content))
         given = replace(given, track_ids=boxes.track_ids)
-        pending = _Pending(item.message, given, T_output_fixed, T_output_item if others else None)
+        pending = _Pending(
+            item.message, given, item.received, T_output_fixed, T_output_item if others else None
+        )
         self._held.append(pending)
         return self._outgoing(self._registrar.add_boxes(boxes))
 
@@ -203,6 +211,21 @@ class LiveRegistrar:
         """Have the boxes of a cloud that was dropped not wait for it."""
         sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_lost=True)
         return self._outgoing(self._registrar.add_sweep(sweep))
+
+    def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:
+        """Have boxes not wait for clouds that do not come any more."""
+        if now < cloud_received + CLOUD_SILENCE:
+            return []
+        overdue = [
+            p.given.stamp_ns
+            for p in self._held
+            if isinstance(p, _Pending) and not p.is_early_out and now >= p.received + CLOUD_SILENCE
+        ]
+        if not overdue:
+            return []
+        # Out of reach of the boxes: a cloud that came before them is still theirs.
+        reach = max(self.config.reach, self.config.tolerance)
+        return self.lose(max(overdue) + round(reach * 1e9) + 1)
 
     def is_silent(self, now: float) -> bool:
         """Tell whether boxes are held, but no others have come for long."""
@@ -304,7 +327,9 @@ class LiveRegistrar:
             message = self.adapter.to_msg(
                 pending.message, moved.boxes, covariances, pending.T_output_item
             )
-            outgoing.append(Outgoing(message, refined.is_final, pending.given, moved))
+            outgoing.append(
+                Outgoing(message, refined.is_final, pending.given, moved, pending.received)
+            )
             if refined.is_final:
                 self._held.remove(pending)
                 while self._held and isinstance(self._held[0], _Passing):

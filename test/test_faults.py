@@ -157,6 +157,23 @@ def test_a_node_that_is_killed_is_replaced(graph, tmp_path):
     assert [stamp_of(message) for message in early] == Drive(sweeps=12).stamps
 
 
+def test_a_lidar_that_stops_costs_half_a_second(graph, tmp_path):
+    records = records_of(Drive(sweeps=12).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK)
+    graph.wait_until_connected()
+    half = [i for i, record in enumerate(records) if record.topic == '/boxes'][5] + 1
+    play(graph, records[:half], early)
+    play(graph, [record for record in records[half:] if record.topic != '/points'])
+    graph.wait(lambda: len(early) == 12, 'boxes without their clouds', 2.5)  # silence: 3 s
+    graph.wait(lambda: values_of(diagnostics).get('no_sweep') == '12', 'counters')
+    slowest = [values_of([d]).get('latency most [ms]', 0) for d in diagnostics]
+    assert max(map(float, slowest)) >= 500.0
+    assert ended_cleanly(node)
+
+
 def rubbish():
     """Yield (topic, message) that no sensor and no detector should send."""
     drive = Drive(sweeps=1)

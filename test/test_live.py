@@ -302,6 +302,22 @@ def test_boxes_of_a_cloud_that_was_dropped_do_not_wait_for_it():
     assert early == drive.stamps
 
 
+def test_when_the_lidar_stops_boxes_do_not_wait_for_it():
+    drive = Drive(sweeps=6)
+    late = drive.stamps[3]
+    drive.items = [i for i in drive.items if i[0] != '/points' or i[1] <= late]
+    live = Live()
+    out = live.feed(drive, now=10.0)
+    assert not live.lose_overdue(10.6, cloud_received=10.2)
+    assert not live.lose_overdue(10.4, cloud_received=0.0)
+    out += live.lose_overdue(10.6, cloud_received=10.0)
+    assert not live.lose_overdue(10.6, cloud_received=10.0)
+    early = [item for item in out if not item.is_final]
+    assert [vision.from_msg(item.message).stamp_ns for item in early] == drive.stamps
+    assert all(item.received == 10.0 for item in early)
+    assert [set(item.refined.reasons) for item in early][4:] == [{'no_sweep'}] * 2
+
+
 def test_reset_returns_what_is_held_and_keeps_the_transforms():
     drive = Drive(sweeps=6)
     live = Live()
