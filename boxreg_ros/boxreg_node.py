@@ -180,17 +180,26 @@ class BoxregNode(Node):
 
     def _find_boxes(self) -> None:
         """Look for publishers of boxes; the first type that can be read is taken."""
+        topic = self.resolve_topic_name('boxes')
         types = {info.topic_type for info in self.get_publishers_info_by_topic('boxes')}
-        readable = sorted(name for name in types if name in ADAPTERS)
-        try:
-            if readable:
-                self._open_boxes(readable[0])
-                self._search.cancel()
-            elif types:
-                adapter_for(types.pop(), self._convention)
-        except UnsupportedMessage as error:
-            if self._health.is_time_to_warn('boxes_type'):
-                self.get_logger().warning(f'{self.resolve_topic_name("boxes")}: {error}')
+        readable, complaints = [], []
+        for name in sorted(types, key=lambda name: (name not in ADAPTERS, name)):
+            try:
+                adapter_for(name, self._convention)
+                import_message(name)
+            except UnsupportedMessage as error:
+                complaints.append(f'{topic}: {error}')
+            else:
+                readable.append(name)
+        if readable:
+            self._search.cancel()
+            self._open_boxes(readable[0])
+            if others := ', '.join(readable[1:]):
+                self.get_logger().warning(
+                    f'{topic} also has boxes of type {others}: set boxes_type if these are meant'
+                )
+        elif complaints and self._health.is_time_to_warn('boxes_type'):
+            self.get_logger().warning(complaints[0])
 
     def _open_boxes(self, type_name: str) -> None:
         adapter, kind = adapter_for(type_name, self._convention), import_message(type_name)

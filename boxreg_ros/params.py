@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 NODE_SETTINGS = (
     Setting(
         'boxes_type', '',
-        'message type of the boxes, as package/msg/Type; empty: that of the first publisher',
+        'message type of the boxes, as package/msg/Type; empty: the first that can be read',
         '', None, None, (),
     ),
     Setting(

@@ -1,5 +1,6 @@
 """The real node, a process of its own, over DDS."""
 
+from contextlib import ExitStack
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
-from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_graph import Graph, graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
@@ -219,6 +220,22 @@ def test_signals_in_quick_succession_end_it_cleanly_while_data_flow(graph, tmp_p
     finally:
         is_over.set()
         player.join()
+
+
+def test_of_several_types_the_one_that_can_be_read_is_taken(graph, tmp_path):
+    """BoundingBox3DArray, the first by name, has no ids."""
+    with ExitStack() as stack:  # one participant cannot have several
+        for type_name in ('vision_msgs/msg/BoundingBox3DArray', MARKERS, DETECTIONS):
+            other = Graph(tmp_path, graph.domain)
+            stack.callback(other.close)
+            other.publisher(type_name, '/boxes')
+        for _ in range(10):
+            graph.executor.spin_once(timeout_sec=0.05)
+        node = graph.start(*RELIABLE, *QUICK)
+        graph.wait(lambda: 'set boxes_type' in node.output(), 'a choice')
+        assert ended_cleanly(node)
+    assert f'boxes are {DETECTIONS}' in node.output()
+    assert f'{MARKERS}: set boxes_type' in node.output()
 
 
 DEEP = tuple(
