@@ -154,7 +154,7 @@ class LiveRegistrar:
     def is_ready(self, item: Arrival, now: float) -> bool:
         """Tell whether the transforms of an arrival have come, or are no longer waited for."""
         content = item.content
-        if now >= item.received + self.transform_timeout:
+        if now >= item.received + self.transform_timeout or _says_nothing(content):
             return True
         if self._choose_at is None:
             self._choose_at = now + SETTLE
@@ -168,8 +168,8 @@ class LiveRegistrar:
     def process(self, item: Arrival) -> list[Outgoing]:
         """Register an arrival; return what has become ready."""
         content = item.content
-        if isinstance(content, BoxArray) and not content.track_ids and not content.frame_id:
-            return self.passed_through(item.message)  # an empty MarkerArray has no stamp either
+        if _says_nothing(content):
+            return self.passed_through(item.message)
         ready: list[Outgoing] = []
         if self._rewinds[isinstance(content, BoxArray)].happened(content.stamp_ns):
             self._trouble('time_jump', f'stamps went back to {content.stamp_ns} ns', 1)
@@ -188,7 +188,8 @@ class LiveRegistrar:
             if isinstance(content, Sweep):
                 self._trouble('sweep_without_transform', str(error), 1)
                 return []
-            self._trouble('no_transform', str(error), len(content.track_ids))
+            if content.track_ids:
+                self._trouble('no_transform', str(error), len(content.track_ids))
             return self.passed_through(item.message)
         if isinstance(content, Sweep):
             sweep = sweep_to_frame(content, T_fixed_item, self.fixed_frame)
@@ -335,6 +336,12 @@ class LiveRegistrar:
                 while self._held and isinstance(self._held[0], _Passing):
                     outgoing.append(Outgoing(self._held.popleft().message, True))
         return outgoing
+
+
+def _says_nothing(content: Sweep | BoxArray) -> bool:
+    """Tell whether this is an array without boxes, and without a stamp or a frame to wait for."""
+    is_empty = isinstance(content, BoxArray) and not content.track_ids
+    return is_empty and not (content.frame_id and content.stamp_ns)
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:

@@ -210,6 +210,20 @@ def test_a_sensor_that_does_not_move_needs_no_transform():
     assert not live.told
 
 
+def test_arrays_without_boxes_and_stamp_neither_wait_nor_warn():
+    drive = Drive(sweeps=2)
+    empty, stamped = items_of(drive, '/boxes')
+    empty.detections, stamped.detections = [], []
+    empty.header.stamp.sec = empty.header.stamp.nanosec = 0
+    live = Live()
+    assert live.is_ready(arrival('/boxes', empty), 0.0)
+    assert not live.is_ready(arrival('/boxes', stamped), 0.0)
+    for message in (empty, stamped):
+        out = live.process(arrival('/boxes', message))
+        assert [item.message for item in out] == [message, message]
+    assert not live.told
+
+
 def test_boxes_before_any_cloud_say_what_is_missing():
     drive = Drive(sweeps=1)
     live = Live()
