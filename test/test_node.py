@@ -455,6 +455,13 @@ def test_health_tells_the_worst_of_the_last_period():
     assert not list(health.complaints())  # at a limited rate
     assert health.is_time_to_warn('unreadable') and not health.is_time_to_warn('unreadable')
     assert health.is_time_to_warn('invalid_box')
+    health.status('node', {})
+    for name in ('points_received', 'boxes_received', 'no_points', 'no_gain', 'no_gain'):
+        health.count(name)
+    health.count('kept', 3)
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.WARN
+    assert 'no box was refined' in status.message and 'no_gain' in status.message
 
 
 def test_without_ros_the_remedy_is_told():
