@@ -301,6 +301,7 @@ class BoxregNode(Node):
             elif not any(self._inbox.sizes().values()):
                 if self._live.is_silent(time.monotonic()):
                     self._publish(self._guarded(self._live.flush))
+                if self._board.is_showing and self._live.has_ceased(time.monotonic()):
                     self._markers.publish(self._board.clear())
                 self._inbox.news.wait(STATUS_PERIOD)
                 self._idle_at = time.monotonic()

@@ -230,8 +230,11 @@ class LiveRegistrar:
 
     def is_silent(self, now: float) -> bool:
         """Tell whether boxes are held, but no others have come for long."""
-        silence = max(SILENCE, self.config.max_gap)
-        return bool(self._held) and now >= self._last_boxes + silence
+        return bool(self._held) and self.has_ceased(now)
+
+    def has_ceased(self, now: float) -> bool:
+        """Tell whether no boxes have come for long."""
+        return now >= self._last_boxes + max(SILENCE, self.config.max_gap)
 
     def flush(self) -> list[Outgoing]:
         """End all tracks and return everything still held."""

@@ -299,7 +299,7 @@ def test_silence_ends_what_is_held():
     assert not live.is_silent(12.9)
     assert live.is_silent(13.1)
     out += live.flush()
-    assert not live.is_silent(99.0)
+    assert not live.is_silent(99.0) and live.has_ceased(99.0)
     assert sum(item.is_final for item in out) == 6
     assert sum(item.is_final for item in live.feed(moved(Drive(sweeps=6), 1)) + live.flush()) == 6
 

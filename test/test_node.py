@@ -413,6 +413,7 @@ def refined_of(boxes, *status):
 def test_markers_stay_with_their_track():
     board = MarkerBoard()
     given = boxes_of('a', 'b', '', '')
+    assert not board.is_showing
     first = board.update(given, refined_of(given, REFINED, KEPT, KEPT, KEPT)).markers
     assert first.pop(0).action == 3  # what an earlier node may have left
     assert len({(m.ns, m.id) for m in first}) == len(first) == 20
@@ -426,6 +427,7 @@ def test_markers_stay_with_their_track():
         (ns, number) for ns in NAMESPACES for number in (0, 2, 3)
     }
     assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
+    assert board.is_showing and board.clear() and not board.is_showing
 
 
 def test_health_tells_the_worst_of_the_last_period():
