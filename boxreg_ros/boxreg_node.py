@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 import gc
 from importlib import import_module
@@ -135,19 +136,22 @@ class BoxregNode(Node):
             incompatible_qos=partial(self._on_incompatible, name, 'publisher'),
             message_lost=partial(self._on_lost, topic),
         )
-        self.create_subscription(
-            kind, topic, callback, qos, event_callbacks=events, qos_overriding_options=overrides
-        )
+        with _told_overrides(f'{name}.subscription'):
+            self.create_subscription(
+                kind, topic, callback, qos, event_callbacks=events,
+                qos_overriding_options=overrides,
+            )  # fmt: skip
 
     def _publisher(self, kind: type, topic: str, depth: int) -> Publisher:
         name = self.resolve_topic_name(topic)
-        return self.create_publisher(
-            kind, topic, depth,
-            event_callbacks=PublisherEventCallbacks(
-                incompatible_qos=partial(self._on_incompatible, name, 'subscriber')
-            ),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )  # fmt: skip
+        events = PublisherEventCallbacks(
+            incompatible_qos=partial(self._on_incompatible, name, 'subscriber')
+        )
+        overrides = QoSOverridingOptions.with_default_policies()
+        with _told_overrides(f'{name}.publisher'):
+            return self.create_publisher(
+                kind, topic, depth, event_callbacks=events, qos_overriding_options=overrides
+            )
 
     def _on_lost(self, topic: str, event: Any) -> None:
         self._health.count(f'{topic}_lost', event.total_count_change)
@@ -426,6 +430,18 @@ class BoxregNode(Node):
         self._health.count(reason, number)
         if self._health.is_time_to_warn(reason):
             self.get_logger().warning(f'{reason}: {" ".join(text.split())}')
+
+
+@contextmanager
+def _told_overrides(name: str) -> Iterator[None]:
+    """Say which QoS is meant: rclpy asserts the types of overrides without a word."""
+    try:
+        yield
+    except (AssertionError, AttributeError, TypeError):
+        raise ConfigError(
+            f'qos_overrides.{name}: expected a whole number for depth, names such as reliable for '
+            f'the other policies, got something else'
+        ) from None
 
 
 class _TransformsToInbox:

@@ -363,8 +363,10 @@ def refused(tmp_path_factory):
     cases = {
         'range': ['--ros-args', '-p', 'window:=2'],
         'boxes': ['--ros-args', '-p', 'boxes_type:=std_msgs/msg/String'],
+        'type': ['--ros-args', '-p', 'boxes_type:=Detection3DArray'],
         'device': ['--ros-args', '-p', 'device:=abacus'],
         'file': ['--ros-args', '--params-file', 'missing.yaml'],
+        'qos': ['--ros-args', '-p', 'qos_overrides./points.subscription.depth:=deep'],
         'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
     }
     started = {
@@ -385,8 +387,10 @@ def refused(tmp_path_factory):
     [
         ('range', 2, ('window', '3', 'got 2')),
         ('boxes', 1, ('std_msgs/msg/String', 'Detection3DArray')),
+        ('type', 1, ("'Detection3DArray'", 'vision_msgs/msg/Detection3DArray')),
         ('device', 2, ('device', 'abacus', 'cpu')),
         ('file', 2, ('missing.yaml',)),
+        ('qos', 2, ('qos_overrides./points.subscription', 'depth')),
         ('list', 2, ('vehicle.names', "['']")),
     ],
 )
