@@ -112,6 +112,7 @@ class BoxregNode(Node):
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/save_config', self._on_save_config)
         self._depth = 10 + config.lag + self._inbox.capacity['boxes']  # may leave at the end
+        self._boxes_type = ''
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         if options.boxes_type:
@@ -184,8 +185,7 @@ class BoxregNode(Node):
 
     def _find_boxes(self) -> None:
         """Look for publishers of boxes; the first type that can be read is taken."""
-        topic = self.resolve_topic_name('boxes')
-        types = {info.topic_type for info in self.get_publishers_info_by_topic('boxes')}
+        topic, types = self.resolve_topic_name('boxes'), self._types_of_boxes()
         readable, complaints = [], []
         for name in sorted(types, key=lambda name: (name not in ADAPTERS, name)):
             try:
@@ -205,8 +205,12 @@ class BoxregNode(Node):
         elif complaints and self._health.is_time_to_warn('boxes_type'):
             self.get_logger().warning(complaints[0])
 
+    def _types_of_boxes(self) -> set[str]:
+        return {info.topic_type for info in self.get_publishers_info_by_topic('boxes')}
+
     def _open_boxes(self, type_name: str) -> None:
         adapter, kind = adapter_for(type_name, self._convention), import_message(type_name)
+        self._boxes_type = type_name
         self._live.adapter = adapter
         self._early = self._publisher(kind, 'refined_boxes', self._depth)
         self._final = self._publisher(kind, 'refined_boxes_final', self._depth)
@@ -271,6 +275,13 @@ class BoxregNode(Node):
     def _publish_status(self) -> None:
         for complaint in self._health.complaints():
             self.get_logger().warning(complaint)
+        types = self._types_of_boxes()
+        is_other = self._boxes_type and types and self._boxes_type not in types
+        if is_other and self._health.is_time_to_warn('boxes_type'):
+            self.get_logger().warning(
+                f'{self.resolve_topic_name("boxes")}: expected boxes of type {self._boxes_type}, '
+                f'got {", ".join(sorted(types))}; start the node anew or set boxes_type'
+            )
         now, age = self.get_clock().now(), 'none'
         if self._newest_motion_ns is not None:
             age = f'{1e-9 * (now.nanoseconds - self._newest_motion_ns):.3f}'

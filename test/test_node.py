@@ -238,6 +238,14 @@ def test_of_several_types_the_one_that_can_be_read_is_taken(graph, tmp_path):
     assert f'{MARKERS}: set boxes_type' in node.output()
 
 
+def test_boxes_of_another_type_than_before_are_told(graph):
+    graph.publisher(MARKERS, '/boxes')
+    node = graph.start('-p', f'boxes_type:={DETECTIONS}')
+    graph.wait(lambda: 'start the node anew' in node.output(), 'a warning')
+    assert f'expected boxes of type {DETECTIONS}, got {MARKERS}' in node.output()
+    assert ended_cleanly(node)
+
+
 DEEP = tuple(
     part
     for name in ('points', 'boxes')
