@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 import gc
 from importlib import import_module
@@ -49,7 +50,7 @@ STATUS_PERIOD = 1.0
 BOXES_PATIENCE = 10.0
 """Boxes that wait this many times as long as clouds may pass through, not even decoded."""
 LAST_WORK, LAST_ACKNOWLEDGEMENT = 0.5, 0.4
-"""So long may, on shutdown, the worker go on, and subscribers take what it published [s]."""
+"""So long may, on shutdown, the worker be busy, and subscribers take what it published [s]."""
 
 
 class BoxregNode(Node):
@@ -69,7 +70,17 @@ class BoxregNode(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        try:
+            super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        except ValueError as error:
+            if 'PARAMETER_NOT_SET' not in str(error):
+                raise
+            given = getattr(self, '_parameter_overrides', {}).values()
+            names = ', '.join(sorted(p.name for p in given if p.value is None))
+            raise ConfigError(
+                f'{names}: expected a value, got an empty list or none; ROS has no empty lists: '
+                f"write ['']"
+            ) from None
         config, options = self._settings = declare(self)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
@@ -87,6 +98,7 @@ class BoxregNode(Node):
         self._board = MarkerBoard()
         self._cloud_frame = self._fixed_frame = ''
         self._tracks = 0
+        self._cloud_received = 0.0
         self._newest_motion_ns: int | None = None
         self._stopping = Event()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on when /clock does not
@@ -99,7 +111,8 @@ class BoxregNode(Node):
         self._subscribe_to_tf()
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/save_config', self._on_save_config)
-        self._final_depth = 10 + config.lag  # so many may leave at once, at the end
+        self._depth = 10 + config.lag + self._inbox.capacity['boxes']  # may leave at the end
+        self._boxes_type = ''
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         if options.boxes_type:
@@ -124,19 +137,22 @@ class BoxregNode(Node):
             incompatible_qos=partial(self._on_incompatible, name, 'publisher'),
             message_lost=partial(self._on_lost, topic),
         )
-        self.create_subscription(
-            kind, topic, callback, qos, event_callbacks=events, qos_overriding_options=overrides
-        )
+        with _told_overrides(f'{name}.subscription'):
+            self.create_subscription(
+                kind, topic, callback, qos, event_callbacks=events,
+                qos_overriding_options=overrides,
+            )  # fmt: skip
 
     def _publisher(self, kind: type, topic: str, depth: int) -> Publisher:
         name = self.resolve_topic_name(topic)
-        return self.create_publisher(
-            kind, topic, depth,
-            event_callbacks=PublisherEventCallbacks(
-                incompatible_qos=partial(self._on_incompatible, name, 'subscriber')
-            ),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )  # fmt: skip
+        events = PublisherEventCallbacks(
+            incompatible_qos=partial(self._on_incompatible, name, 'subscriber')
+        )
+        overrides = QoSOverridingOptions.with_default_policies()
+        with _told_overrides(f'{name}.publisher'):
+            return self.create_publisher(
+                kind, topic, depth, event_callbacks=events, qos_overriding_options=overrides
+            )
 
     def _on_lost(self, topic: str, event: Any) -> None:
         self._health.count(f'{topic}_lost', event.total_count_change)
@@ -169,23 +185,35 @@ class BoxregNode(Node):
 
     def _find_boxes(self) -> None:
         """Look for publishers of boxes; the first type that can be read is taken."""
-        types = {info.topic_type for info in self.get_publishers_info_by_topic('boxes')}
-        readable = sorted(name for name in types if name in ADAPTERS)
-        try:
-            if readable:
-                self._open_boxes(readable[0])
-                self._search.cancel()
-            elif types:
-                adapter_for(types.pop(), self._convention)
-        except UnsupportedMessage as error:
-            if self._health.is_time_to_warn('boxes_type'):
-                self.get_logger().warning(f'{self.resolve_topic_name("boxes")}: {error}')
+        topic, types = self.resolve_topic_name('boxes'), self._types_of_boxes()
+        readable, complaints = [], []
+        for name in sorted(types, key=lambda name: (name not in ADAPTERS, name)):
+            try:
+                adapter_for(name, self._convention)
+                import_message(name)
+            except UnsupportedMessage as error:
+                complaints.append(f'{topic}: {error}')
+            else:
+                readable.append(name)
+        if readable:
+            self._search.cancel()
+            self._open_boxes(readable[0])
+            if others := ', '.join(readable[1:]):
+                self.get_logger().warning(
+                    f'{topic} also has boxes of type {others}: set boxes_type if these are meant'
+                )
+        elif complaints and self._health.is_time_to_warn('boxes_type'):
+            self.get_logger().warning(complaints[0])
+
+    def _types_of_boxes(self) -> set[str]:
+        return {info.topic_type for info in self.get_publishers_info_by_topic('boxes')}
 
     def _open_boxes(self, type_name: str) -> None:
         adapter, kind = adapter_for(type_name, self._convention), import_message(type_name)
+        self._boxes_type = type_name
         self._live.adapter = adapter
-        self._early = self._publisher(kind, 'refined_boxes', 10)
-        self._final = self._publisher(kind, 'refined_boxes_final', self._final_depth)
+        self._early = self._publisher(kind, 'refined_boxes', self._depth)
+        self._final = self._publisher(kind, 'refined_boxes_final', self._depth)
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._subscribe(kind, 'boxes', self._on_boxes, qos)
         self.get_logger().info(f'boxes are {type_name}')
@@ -198,6 +226,7 @@ class BoxregNode(Node):
 
     def _on_points(self, msg: PointCloud2) -> None:
         self._cloud_frame = msg.header.frame_id
+        self._cloud_received = time.monotonic()
         self._receive('points', msg)
 
     def _on_boxes(self, msg: Any) -> None:
@@ -218,12 +247,15 @@ class BoxregNode(Node):
     def _on_save_config(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         config, options = self._settings
         path = Path(options.config_file).absolute()
-        partial_path = path.with_name(f'.{path.name}.partial')
+        partial_path = path.parent / f'.{path.name}.partial'
         try:
             text = parameters_yaml(config, options, self.get_fully_qualified_name())
-            partial_path.write_text(text, encoding='utf-8')
-            os.replace(partial_path, path)
-        except OSError as error:
+            try:
+                partial_path.write_text(text, encoding='utf-8')
+                os.replace(partial_path, path)
+            finally:
+                partial_path.unlink(missing_ok=True)
+        except (OSError, ValueError) as error:  # ValueError: a name with a NUL
             response.message = f'{error}; choose another config_file'
         else:
             response.success, response.message = True, str(path)
@@ -243,6 +275,13 @@ class BoxregNode(Node):
     def _publish_status(self) -> None:
         for complaint in self._health.complaints():
             self.get_logger().warning(complaint)
+        types = self._types_of_boxes()
+        is_other = self._boxes_type and types and self._boxes_type not in types
+        if is_other and self._health.is_time_to_warn('boxes_type'):
+            self.get_logger().warning(
+                f'{self.resolve_topic_name("boxes")}: expected boxes of type {self._boxes_type}, '
+                f'got {", ".join(sorted(types))}; start the node anew or set boxes_type'
+            )
         now, age = self.get_clock().now(), 'none'
         if self._newest_motion_ns is not None:
             age = f'{1e-9 * (now.nanoseconds - self._newest_motion_ns):.3f}'
@@ -266,6 +305,7 @@ class BoxregNode(Node):
         while not self._stopping.is_set():
             self._inbox.news.clear()
             self._take_news()
+            self._miss_clouds(item)
             item = item or self._decoded(self._take())
             if item is not None and self._live.is_ready(item, time.monotonic()):
                 self._process(item)
@@ -276,15 +316,26 @@ class BoxregNode(Node):
             elif not any(self._inbox.sizes().values()):
                 if self._live.is_silent(time.monotonic()):
                     self._publish(self._guarded(self._live.flush))
+                if self._board.is_showing and self._live.has_ceased(time.monotonic()):
                     self._markers.publish(self._board.clear())
                 self._inbox.news.wait(STATUS_PERIOD)
                 self._idle_at = time.monotonic()
         self._finish_work(item)
 
+    def _miss_clouds(self, item: Arrival | None) -> None:
+        """Let boxes go that wait for a cloud, if none is on its way."""
+        is_cloud = item is not None and isinstance(item.message, PointCloud2)
+        if not is_cloud and not self._inbox.sizes()['points_waiting']:
+            now, newest = time.monotonic(), self._cloud_received
+            self._publish(self._guarded(partial(self._live.lose_overdue, now, newest)))
+
     def _take(self) -> Message | None:
         """Return what has waited longest, but for what has waited for the solver too long."""
         message = self._inbox.take()
         if message is None:
+            return None
+        if message.topic == 'passing':
+            self._publish(self._live.last(message.content))
             return None
         patience = self._backlog * (1.0 if message.topic == 'points' else BOXES_PATIENCE)
         if time.monotonic() <= max(message.received, self._idle_at) + patience:
@@ -293,17 +344,16 @@ class BoxregNode(Node):
         return None
 
     def _finish_work(self, item: Arrival | None) -> None:
-        """Process what is left as long as there is time, then publish what is held."""
-        end = time.monotonic() + LAST_WORK
+        """Publish what is held, and pass what still waits through: nobody waits for the solver."""
         self._take_news()
-        while time.monotonic() < end:
-            item = item or self._decoded(self._inbox.take())
-            if item is None and not any(self._inbox.sizes().values()):
-                break
-            if item is not None:
-                self._process(item)
-                item = None
         self._publish(self._guarded(self._live.flush))
+        if item is not None and not isinstance(item.message, PointCloud2):
+            self._publish(self._live.passed_through(item.message))
+        while message := self._inbox.take():
+            if message.topic == 'boxes':
+                self._publish(self._live.passed_through(message.content))
+            elif message.topic == 'passing':
+                self._publish(self._live.last(message.content))
         self._markers.publish(self._board.clear())
         for publisher in (self._early, self._final, self._markers):
             if publisher is not None:
@@ -335,7 +385,7 @@ class BoxregNode(Node):
         except Exception as error:  # whatever a malformed message leads to
             self._trouble('unreadable', f'{message.topic}: {error}')
             if message.topic == 'boxes':
-                self._publish(LiveRegistrar.passed_through(message.content))
+                self._publish(self._live.passed_through(message.content))
             return None
         return Arrival(message.content, content, message.received)
 
@@ -345,9 +395,6 @@ class BoxregNode(Node):
             self._fixed_frame = self._live.fixed_frame
             self.get_logger().info(f'fixed frame is {self._fixed_frame!r}')
         self._publish(ready)
-        self._health.set_counts(self._live.counts)
-        if any(not out.is_final for out in ready):
-            self._health.add_latency(time.monotonic() - item.received)
 
     def _guarded(
         self, task: Callable[[], list[Outgoing]], item: Arrival | None = None
@@ -358,6 +405,8 @@ class BoxregNode(Node):
         except Exception as error:
             self._trouble('failed', f'{type(error).__name__}: {error}')
             return self._live.abandon(item)
+        finally:
+            self._health.set_counts(self._live.counts)
 
     def _publish(self, ready: list[Outgoing]) -> None:
         for out in ready:
@@ -365,6 +414,8 @@ class BoxregNode(Node):
             assert publisher is not None  # it was made before boxes were subscribed to
             publisher.publish(out.message)
             self._health.count('final_published' if out.is_final else 'early_published')
+            if not out.is_final and out.received is not None:
+                self._health.add_latency(time.monotonic() - out.received)
             if not out.is_final and out.given is not None:
                 self._tracks = len(set(out.given.track_ids) - {''})
         if not self._markers.get_subscription_count():
@@ -380,7 +431,8 @@ class BoxregNode(Node):
         reason = f'{message.topic}_queue_full'
         self._trouble(reason, REASONS[reason].remedy)
         if message.topic == 'boxes':
-            self._publish(LiveRegistrar.passed_through(message.content))
+            self._publish([Outgoing(message.content, False)])
+            self._inbox.let_pass(message)  # its final copy, in the order of all
         else:
             self._inbox.put_news('lost', stamp_ns(message.content.header))
 
@@ -389,6 +441,18 @@ class BoxregNode(Node):
         self._health.count(reason, number)
         if self._health.is_time_to_warn(reason):
             self.get_logger().warning(f'{reason}: {" ".join(text.split())}')
+
+
+@contextmanager
+def _told_overrides(name: str) -> Iterator[None]:
+    """Say which QoS is meant: rclpy asserts the types of overrides without a word."""
+    try:
+        yield
+    except (AssertionError, AttributeError, TypeError):
+        raise ConfigError(
+            f'qos_overrides.{name}: expected a whole number for depth, names such as reliable for '
+            f'the other policies, got something else'
+        ) from None
 
 
 class _TransformsToInbox:

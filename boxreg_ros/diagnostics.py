@@ -44,7 +44,7 @@ class Health:
             self._elsewhere = Counter(counts)
 
     def add_latency(self, seconds: float) -> None:
-        """Note how long after the later of cloud and boxes an early estimate was published."""
+        """Note how long after its boxes had come an early estimate was published."""
         with self._lock:
             self._latencies.append(seconds)
 
@@ -102,4 +102,8 @@ def _verdict(fresh: Counter[str]) -> tuple[bytes, str]:
     missing = [name for name in ('points', 'boxes') if not fresh[f'{name}_received']]
     if missing:
         return DiagnosticStatus.WARN, f'nothing received on {" and ".join(missing)}'
+    if fresh['kept'] and not fresh['refined']:
+        why = max((n for n in REASONS if REASONS[n].unit == 'box'), key=lambda name: fresh[name])
+        text = f'no box was refined; most often {why}: {REASONS[why].meaning}'
+        return DiagnosticStatus.WARN, text
     return DiagnosticStatus.OK, 'refining'

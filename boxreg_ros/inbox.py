@@ -31,14 +31,21 @@ class Inbox:
     capacity : int
         Clouds that may wait.
 
+    Attributes
+    ----------
+    capacity : dict
+        How many messages of each topic may wait.
+
     """
 
     def __init__(self, capacity: int) -> None:
-        self._capacity = {'points': capacity, 'boxes': 20 * capacity}
+        self.capacity = {'points': capacity, 'boxes': 20 * capacity}
         self._lock = Lock()
         self._number = 0
         self._news: deque[tuple[str, Any]] = deque()
-        self._waiting: dict[str, deque[Message]] = {'points': deque(), 'boxes': deque()}
+        self._waiting: dict[str, deque[Message]] = {
+            topic: deque() for topic in ('points', 'boxes', 'passing')
+        }
         self.news = Event()
 
     def put_news(self, topic: str, content: Any) -> None:
@@ -52,9 +59,15 @@ class Inbox:
             self._number += 1
             queue = self._waiting[topic]
             queue.append(Message(self._number, topic, content, time.monotonic()))
-            dropped = queue.popleft() if len(queue) > self._capacity[topic] else None
+            dropped = queue.popleft() if len(queue) > self.capacity[topic] else None
         self.news.set()
         return dropped
+
+    def let_pass(self, message: Message) -> None:
+        """Have `take` return boxes that were dropped, in their turn, as of topic ``passing``."""
+        with self._lock:
+            self._waiting['passing'].append(message._replace(topic='passing'))
+        self.news.set()
 
     def take_news(self) -> list[tuple[str, Any]]:
         """Return what has come by `put_news` since the last call."""

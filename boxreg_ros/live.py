@@ -31,6 +31,10 @@ SILENCE = 3.0
 """After so long without boxes, final ones are not held back any more [s]."""
 
 
+CLOUD_SILENCE = 0.5
+"""After so long without clouds, boxes that have waited as long do not wait for theirs [s]."""
+
+
 class Arrival(NamedTuple):
     """A decoded message, and when it was received by a clock that never jumps [s]."""
 
@@ -44,7 +48,7 @@ class Outgoing(NamedTuple):
     A message to publish.
 
     `given` and `refined` are in the frame of `message`; both are None where the input message
-    is passed through as it came.
+    is passed through as it came; `received` is when the boxes were, None for those.
 
     """
 
@@ -52,6 +56,7 @@ class Outgoing(NamedTuple):
     is_final: bool
     given: BoxArray | None = None
     refined: RefinedBoxes | None = None
+    received: float | None = None
 
 
 @dataclass(eq=False, slots=True)
@@ -60,9 +65,16 @@ class _Pending:
 
     message: Any
     given: BoxArray
+    received: float
     T_output_fixed: Floats
     T_output_item: Floats | None
     is_early_out: bool = False
+
+
+class _Passing(NamedTuple):
+    """A message that passes through, its final copy behind those that came before it."""
+
+    message: Any
 
 
 class LiveRegistrar:
@@ -118,7 +130,7 @@ class LiveRegistrar:
         self._convention = convention
         self._intake = Intake(convention, config)
         self._registrar = BoxRegistrar(config)
-        self._pending: dict[int, deque[_Pending]] = {}
+        self._held: deque[_Pending | _Passing] = deque()  # as they came; the first is pending
         self.cloud_frame = ''
         self._choose_at: float | None = None
         self.adapter: Adapter | None = None
@@ -142,7 +154,7 @@ class LiveRegistrar:
     def is_ready(self, item: Arrival, now: float) -> bool:
         """Tell whether the transforms of an arrival have come, or are no longer waited for."""
         content = item.content
-        if now >= item.received + self.transform_timeout:
+        if now >= item.received + self.transform_timeout or _says_nothing(content):
             return True
         if self._choose_at is None:
             self._choose_at = now + SETTLE
@@ -156,8 +168,8 @@ class LiveRegistrar:
     def process(self, item: Arrival) -> list[Outgoing]:
         """Register an arrival; return what has become ready."""
         content = item.content
-        if isinstance(content, BoxArray) and not content.track_ids and not content.frame_id:
-            return self.passed_through(item.message)  # an empty MarkerArray has no stamp either
+        if _says_nothing(content):
+            return self.passed_through(item.message)
         ready: list[Outgoing] = []
         if self._rewinds[isinstance(content, BoxArray)].happened(content.stamp_ns):
             self._trouble('time_jump', f'stamps went back to {content.stamp_ns} ns', 1)
@@ -176,7 +188,8 @@ class LiveRegistrar:
             if isinstance(content, Sweep):
                 self._trouble('sweep_without_transform', str(error), 1)
                 return []
-            self._trouble('no_transform', str(error), len(content.track_ids))
+            if content.track_ids:
+                self._trouble('no_transform', str(error), len(content.track_ids))
             return self.passed_through(item.message)
         if isinstance(content, Sweep):
             sweep = sweep_to_frame(content, T_fixed_item, self.fixed_frame)
@@ -189,8 +202,10 @@ class LiveRegistrar:
         T_output_item = T_output_fixed @ T_fixed_item if others else np.eye(4)
         given = boxes_to_frame(content, T_output_item, self._output_of(content))
         given = replace(given, track_ids=boxes.track_ids)
-        pending = _Pending(item.message, given, T_output_fixed, T_output_item if others else None)
-        self._pending.setdefault(stamp_ns, deque()).append(pending)
+        pending = _Pending(
+            item.message, given, item.received, T_output_fixed, T_output_item if others else None
+        )
+        self._held.append(pending)
         return self._outgoing(self._registrar.add_boxes(boxes))
 
     def lose(self, stamp_ns: int) -> list[Outgoing]:
@@ -198,10 +213,28 @@ class LiveRegistrar:
         sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_lost=True)
         return self._outgoing(self._registrar.add_sweep(sweep))
 
+    def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:
+        """Have boxes not wait for clouds that do not come any more."""
+        if now < cloud_received + CLOUD_SILENCE:
+            return []
+        overdue = [
+            p.given.stamp_ns
+            for p in self._held
+            if isinstance(p, _Pending) and not p.is_early_out and now >= p.received + CLOUD_SILENCE
+        ]
+        if not overdue:
+            return []
+        # Out of reach of the boxes: a cloud that came before them is still theirs.
+        reach = max(self.config.reach, self.config.tolerance)
+        return self.lose(max(overdue) + round(reach * 1e9) + 1)
+
     def is_silent(self, now: float) -> bool:
         """Tell whether boxes are held, but no others have come for long."""
-        silence = max(SILENCE, self.config.max_gap)
-        return bool(self._pending) and now >= self._last_boxes + silence
+        return bool(self._held) and self.has_ceased(now)
+
+    def has_ceased(self, now: float) -> bool:
+        """Tell whether no boxes have come for long."""
+        return now >= self._last_boxes + max(SILENCE, self.config.max_gap)
 
     def flush(self) -> list[Outgoing]:
         """End all tracks and return everything still held."""
@@ -219,14 +252,12 @@ class LiveRegistrar:
         """Start afresh after a fault; pass what is held, and the arrival at fault, through."""
         self._registrar.reset()
         self._intake = Intake(self._convention, self.config)
-        held = [p for _, pending in sorted(self._pending.items()) for p in pending]
-        self._pending.clear()
-        passed = [
-            out
-            for p in held
-            for out in self.passed_through(p.message)
-            if out.is_final or not p.is_early_out
-        ]
+        held = list(self._held)
+        self._held.clear()
+        passed = []
+        for p in held:
+            is_early_out = isinstance(p, _Passing) or p.is_early_out
+            passed += ([] if is_early_out else [Outgoing(p.message, False)]) + self.last(p.message)
         is_held = item is None or any(p.message is item.message for p in held)
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
             passed += self.passed_through(item.message)
@@ -237,10 +268,16 @@ class LiveRegistrar:
         """Return what there is to tell about the boxes beside the counts."""
         return self._intake.facts
 
-    @staticmethod
-    def passed_through(message: Any) -> list[Outgoing]:
-        """Return a message as it came, as early and as final."""
-        return [Outgoing(message, False), Outgoing(message, True)]
+    def passed_through(self, message: Any) -> list[Outgoing]:
+        """Return a message as it came, as early and, if nothing before it is held, as final."""
+        return [Outgoing(message, False), *self.last(message)]
+
+    def last(self, message: Any) -> list[Outgoing]:
+        """Return a message as it came, as final, or hold it behind what came before it."""
+        if not self._held:
+            return [Outgoing(message, True)]
+        self._held.append(_Passing(message))
+        return []
 
     def _output_of(self, boxes: BoxArray) -> str:
         return self.output_frame or boxes.frame_id
@@ -280,22 +317,34 @@ class LiveRegistrar:
         outgoing = []
         for refined in ready:
             stamp_ns = refined.boxes.stamp_ns
-            waiting = self._pending[stamp_ns]
-            if refined.is_final:
-                pending = waiting.popleft()
-                if not waiting:
-                    del self._pending[stamp_ns]
-            else:
-                pending = next(p for p in waiting if not p.is_early_out)
-                pending.is_early_out = True
+            pending = next(
+                p
+                for p in self._held
+                if isinstance(p, _Pending)
+                and p.given.stamp_ns == stamp_ns
+                and (refined.is_final or not p.is_early_out)
+            )
+            pending.is_early_out = True
             moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
             assert self.adapter is not None  # it has read the message
             covariances = covariances_to_write(moved)
             message = self.adapter.to_msg(
                 pending.message, moved.boxes, covariances, pending.T_output_item
             )
-            outgoing.append(Outgoing(message, refined.is_final, pending.given, moved))
+            outgoing.append(
+                Outgoing(message, refined.is_final, pending.given, moved, pending.received)
+            )
+            if refined.is_final:
+                self._held.remove(pending)
+                while self._held and isinstance(self._held[0], _Passing):
+                    outgoing.append(Outgoing(self._held.popleft().message, True))
         return outgoing
+
+
+def _says_nothing(content: Sweep | BoxArray) -> bool:
+    """Tell whether this is an array without boxes, and without a stamp or a frame to wait for."""
+    is_empty = isinstance(content, BoxArray) and not content.track_ids
+    return is_empty and not (content.frame_id and content.stamp_ns)
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:

@@ -38,7 +38,6 @@ def main(args: Sequence[str] | None = None) -> int:
         return _fail(BoxregError(f'{error}: {WITHOUT_ROS}'), 1)
 
     arguments = list(sys.argv[1:] if args is None else args)
-    stop = Event()
     failures: list[Exception] = []
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
@@ -51,24 +50,34 @@ def main(args: Sequence[str] | None = None) -> int:
         rclpy.try_shutdown()
         is_usage = isinstance(error, ConfigError) or not isinstance(error, BoxregError)
         return _fail(error, 2 if is_usage else 1)
+    # A handler runs within whatever the main thread is at, be it another handler: it must take no
+    # lock. Python itself writes to the pipe, whichever thread the signal comes to.
+    end_asked, ask_end = os.pipe()
+    os.set_blocking(ask_end, False)
+    signal.set_wakeup_fd(ask_end, warn_on_full_buffer=False)
     for number in SIGNALS:
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, lambda *_: None)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    stop = Event()
 
     def guarded(task: Callable[[], None]) -> None:
         try:
             task()
         except Exception as error:
             failures.append(error)
-        stop.set()
+        os.write(ask_end, b'x')
 
-    # Python runs signal handlers in the main thread alone, which therefore only waits.
-    threads = [Thread(target=guarded, args=(t,), daemon=True) for t in (executor.spin, node.work)]
+    def spin() -> None:
+        while rclpy.ok() and not stop.is_set():
+            executor.spin_once()
+
+    threads = [Thread(target=guarded, args=(task,), daemon=True) for task in (spin, node.work)]
     for thread in threads:
         thread.start()
-    stop.wait()
-    executor.shutdown(timeout_sec=0.3)
+    os.read(end_asked, 1)
+    stop.set()
+    executor.wake()  # its `shutdown` would destroy what its thread is about to wait for
     node.stop()
     end = time.monotonic() + LAST_WORK + LAST_ACKNOWLEDGEMENT
     for thread in threads:

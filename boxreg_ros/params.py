@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 NODE_SETTINGS = (
     Setting(
         'boxes_type', '',
-        'message type of the boxes, as package/msg/Type; empty: that of the first publisher',
+        'message type of the boxes, as package/msg/Type; empty: the first that can be read',
         '', None, None, (),
     ),
     Setting(
@@ -107,7 +107,7 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
 
     """
     parameters: dict[str, Any] = node.get_parameters_by_prefix('')  # typed wrongly in rclpy
-    given = {name: parameter.value for name, parameter in parameters.items()}
+    given = _values_of(parameters.values())
     changes = {item.name: given[item.name] for item in settings() if item.name in given}
     config = Config().updated(changes)
     if changes.get('estimate', 'final') != 'final':
@@ -122,8 +122,7 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
     for item, value in values:
         if item.name in given:
             node.undeclare_parameter(item.name)
-        plain = list(value) if isinstance(value, tuple) else value
-        node.declare_parameter(item.name, plain, describe(item), ignore_override=True)
+        node.declare_parameter(item.name, _plain(value), describe(item), ignore_override=True)
     known = {item.name for item, _ in values}
     if unknown := sorted(n for n in given if n not in known and not n.startswith(ROS_OWN)):
         node.get_logger().warning(
@@ -144,7 +143,7 @@ def changed(
         For a value of the wrong type or out of its bounds, by name.
 
     """
-    given = {parameter.name: parameter.value for parameter in parameters}
+    given = _values_of(parameters)
     config = config.updated({s.name: given[s.name] for s in settings() if s.name in given})
     own = {s.name: _checked(s, given[s.name]) for s in NODE_SETTINGS if s.name in given}
     return config, options._replace(**own)
@@ -180,8 +179,21 @@ def _yaml_line(item: Setting, indent: str, name: str, value: Any) -> str:
     if item.low is not None and item.high is not None:
         bounds = f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
     note = f'{item.meaning} ({bounds})' if bounds else item.meaning
-    plain = json.dumps(list(value) if isinstance(value, tuple) else value)
-    return f'{indent}{name}: {plain}  # {note}'
+    return f'{indent}{name}: {json.dumps(_plain(value))}  # {note}'
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as a parameter takes it: of an empty list ROS cannot tell the type."""
+    return (list(value) or ['']) if isinstance(value, tuple) else value
+
+
+def _values_of(parameters: Iterable[Parameter]) -> dict[str, Any]:
+    """Return values by name, lists without the empty texts that stand for no text at all."""
+    values = {parameter.name: parameter.value for parameter in parameters}
+    return {
+        name: [v for v in value if v != ''] if isinstance(value, list) else value
+        for name, value in values.items()
+    }
 
 
 def _checked(item: Setting, value: Any) -> Any:

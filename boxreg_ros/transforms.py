@@ -208,6 +208,7 @@ class _Edge:
         self.stamps: list[int] = []
         self._poses: list[Floats] = []
         self._rewind = Rewind()
+        self._was_forgotten = False
 
     def add(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
         """Add x y z qx qy qz qw; a second one of the same stamp replaces the first."""
@@ -234,6 +235,7 @@ class _Edge:
     def _forget(self) -> None:
         self.stamps.clear()
         self._poses.clear()
+        self._was_forgotten = True
 
     def covers(self, stamp_ns: int) -> bool:
         if self.is_static:
@@ -244,10 +246,10 @@ class _Edge:
         """Return ``T_parent_child`` at a stamp."""
         stamps = self.stamps
         if not stamps:
-            raise TransformUnavailable(
-                f'transform {self.parent} -> {self.child}: every pose so far is NaN or has no '
-                f'orientation; mend its publisher'
-            )
+            cause = 'every pose so far is NaN or has no orientation; mend its publisher'
+            if self._was_forgotten:
+                cause = 'no pose has come since time went back; look whether its publisher goes on'
+            raise TransformUnavailable(f'transform {self.parent} -> {self.child}: {cause}')
         outside = max(stamps[0] - stamp_ns, stamp_ns - stamps[-1])
         if not self.is_static and outside > max_extrapolation_ns:
             raise TransformUnavailable(

@@ -44,6 +44,11 @@ class MarkerBoard:
         self._shown: dict[str, int] = {}
         self._numbers = count()
 
+    @property
+    def is_showing(self) -> bool:
+        """Tell whether boxes are shown."""
+        return bool(self._shown)
+
     def update(self, given: BoxArray, refined: RefinedBoxes) -> Any:
         """
         Return the markers that bring what is shown up to date.

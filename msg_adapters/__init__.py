@@ -93,8 +93,9 @@ class _Converting:
 
 def canonical(type_name: str) -> str:
     """Return ``package/msg/Type`` for ``package/Type``; other spellings stay as they are."""
-    package, *middle, name = type_name.split('/')
-    return type_name if middle or not package else f'{package}/msg/{name}'
+    package, slash, name = type_name.partition('/')
+    is_short = package and slash and '/' not in name
+    return f'{package}/msg/{name}' if is_short else type_name
 
 
 def adapter_for(type_name: str, convention: Convention | None = None) -> Adapter:

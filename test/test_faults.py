@@ -87,10 +87,13 @@ def test_wishes_at_run_time(graph, tmp_path):
     assert Config.from_yaml(file) == Config().updated(expected)
     assert 'transform_timeout: 0.5' in file.read_text()
     assert asked(graph, Trigger, 'reset', Trigger.Request()).success
-    set_to(config_file=str(tmp_path / 'missing' / 'saved.yaml'))
-    answer = asked(graph, Trigger, 'save_config', Trigger.Request())
-    assert not answer.success
-    assert 'config_file' in answer.message
+    (folder := tmp_path / 'folder').mkdir()
+    for bad_file in (tmp_path / 'missing' / 'saved.yaml', folder, Path('/')):
+        set_to(config_file=str(bad_file))
+        answer = asked(graph, Trigger, 'save_config', Trigger.Request())
+        assert not answer.success
+        assert 'config_file' in answer.message
+    assert not list(tmp_path.glob('.*.partial'))
     assert ended_cleanly(node)
     # What was saved starts a node, in another namespace too.
     again = graph.start('--params-file', str(file), '-r', '__ns:=/front')
@@ -152,6 +155,23 @@ def test_a_node_that_is_killed_is_replaced(graph, tmp_path):
     assert shown[count].markers[0].action == 3  # the first one's are removed
     assert ended_cleanly(second)
     assert [stamp_of(message) for message in early] == Drive(sweeps=12).stamps
+
+
+def test_a_lidar_that_stops_costs_half_a_second(graph, tmp_path):
+    records = records_of(Drive(sweeps=12).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK)
+    graph.wait_until_connected()
+    half = [i for i, record in enumerate(records) if record.topic == '/boxes'][5] + 1
+    play(graph, records[:half], early)
+    play(graph, [record for record in records[half:] if record.topic != '/points'])
+    graph.wait(lambda: len(early) == 12, 'boxes without their clouds', 2.5)  # silence: 3 s
+    graph.wait(lambda: values_of(diagnostics).get('no_sweep') == '12', 'counters')
+    slowest = [values_of([d]).get('latency most [ms]', 0) for d in diagnostics]
+    assert max(map(float, slowest)) >= 500.0
+    assert ended_cleanly(node)
 
 
 def rubbish():

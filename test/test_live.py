@@ -170,6 +170,23 @@ def test_arrivals_wait_until_transforms_cover_them_but_not_for_ever():
     assert not live.told
 
 
+def test_final_boxes_come_in_the_order_of_the_input_where_some_pass_through():
+    drive = Drive(sweeps=12)
+    boxes = items_of(drive, '/boxes')
+    for k in (5, 6, 11):
+        for item in (boxes[k], *boxes[k].detections):
+            item.header.frame_id = 'nowhere'
+    live = Live(timeout=0.4)
+    out = live.feed(drive)
+    (unread,) = live.passed_through('unread')
+    out += [unread, *live.flush()]
+    for is_final in (False, True):
+        messages = [item.message for item in out if item.is_final == is_final]
+        assert messages.pop() == 'unread'
+        assert [vision.from_msg(message).stamp_ns for message in messages] == drive.stamps
+    assert [item.message for item in live.passed_through('free')] == ['free', 'free']
+
+
 def test_boxes_without_transform_pass_through_with_the_remedy():
     drive = Drive(sweeps=2, motion='none')
     live = Live()
@@ -190,6 +207,20 @@ def test_a_sensor_that_does_not_move_needs_no_transform():
     live = Live(fixed_frame='lidar')
     out = live.feed(Drive(sweeps=4, motion='none'))
     assert sum(not item.is_final for item in out) == 4
+    assert not live.told
+
+
+def test_arrays_without_boxes_and_stamp_neither_wait_nor_warn():
+    drive = Drive(sweeps=2)
+    empty, stamped = items_of(drive, '/boxes')
+    empty.detections, stamped.detections = [], []
+    empty.header.stamp.sec = empty.header.stamp.nanosec = 0
+    live = Live()
+    assert live.is_ready(arrival('/boxes', empty), 0.0)
+    assert not live.is_ready(arrival('/boxes', stamped), 0.0)
+    for message in (empty, stamped):
+        out = live.process(arrival('/boxes', message))
+        assert [item.message for item in out] == [message, message]
     assert not live.told
 
 
@@ -268,7 +299,7 @@ def test_silence_ends_what_is_held():
     assert not live.is_silent(12.9)
     assert live.is_silent(13.1)
     out += live.flush()
-    assert not live.is_silent(99.0)
+    assert not live.is_silent(99.0) and live.has_ceased(99.0)
     assert sum(item.is_final for item in out) == 6
     assert sum(item.is_final for item in live.feed(moved(Drive(sweeps=6), 1)) + live.flush()) == 6
 
@@ -283,6 +314,22 @@ def test_boxes_of_a_cloud_that_was_dropped_do_not_wait_for_it():
     assert kept[4:] == [('', '')] * 2
     early = [vision.from_msg(item.message).stamp_ns for item in out if not item.is_final]
     assert early == drive.stamps
+
+
+def test_when_the_lidar_stops_boxes_do_not_wait_for_it():
+    drive = Drive(sweeps=6)
+    late = drive.stamps[3]
+    drive.items = [i for i in drive.items if i[0] != '/points' or i[1] <= late]
+    live = Live()
+    out = live.feed(drive, now=10.0)
+    assert not live.lose_overdue(10.6, cloud_received=10.2)
+    assert not live.lose_overdue(10.4, cloud_received=0.0)
+    out += live.lose_overdue(10.6, cloud_received=10.0)
+    assert not live.lose_overdue(10.6, cloud_received=10.0)
+    early = [item for item in out if not item.is_final]
+    assert [vision.from_msg(item.message).stamp_ns for item in early] == drive.stamps
+    assert all(item.received == 10.0 for item in early)
+    assert [set(item.refined.reasons) for item in early][4:] == [{'no_sweep'}] * 2
 
 
 def test_reset_returns_what_is_held_and_keeps_the_transforms():

@@ -1,8 +1,10 @@
 """The real node, a process of its own, over DDS."""
 
+from contextlib import ExitStack
 import signal
 import subprocess
 import sys
+from threading import Event, Thread
 import time
 
 from boxreg_ros.calibrate import calibrated, GAPS, Measured, write_settings
@@ -16,7 +18,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
-from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_graph import Graph, graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
@@ -183,6 +185,67 @@ def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path)
     assert np.abs(refined - [vision.from_msg(message).boxes for message in given]).max() > 1e-4
 
 
+SLOW_EVENTS = """
+import sys, threading, time
+notify = threading.Condition.notify_all
+def slowly(self):
+    if threading.get_ident() == threading.main_thread().ident:
+        time.sleep(0.1)
+    notify(self)
+threading.Condition.notify_all = slowly
+from boxreg_ros.node import main
+sys.exit(main())
+"""
+
+
+def test_signals_in_quick_succession_end_it_cleanly_while_data_flow(graph, tmp_path):
+    records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    node = graph.start(*RELIABLE, *QUICK, command=('-c', SLOW_EVENTS))
+    graph.wait_until_connected()
+    is_over = Event()
+
+    def flow():
+        while not is_over.is_set():
+            play(graph, records)
+            time.sleep(0.01)
+
+    player = Thread(target=flow)
+    player.start()
+    time.sleep(0.5)
+    node.popen.send_signal(signal.SIGTERM)
+    time.sleep(0.05)
+    try:
+        assert ended_cleanly(node)
+    finally:
+        is_over.set()
+        player.join()
+
+
+def test_of_several_types_the_one_that_can_be_read_is_taken(graph, tmp_path):
+    """BoundingBox3DArray, the first by name, has no ids."""
+    with ExitStack() as stack:  # one participant cannot have several
+        for type_name in ('vision_msgs/msg/BoundingBox3DArray', MARKERS, DETECTIONS):
+            other = Graph(tmp_path, graph.domain)
+            stack.callback(other.close)
+            other.publisher(type_name, '/boxes')
+        for _ in range(10):
+            graph.executor.spin_once(timeout_sec=0.05)
+        node = graph.start(*RELIABLE, *QUICK)
+        graph.wait(lambda: 'set boxes_type' in node.output(), 'a choice')
+        assert ended_cleanly(node)
+    assert f'boxes are {DETECTIONS}' in node.output()
+    assert f'{MARKERS}: set boxes_type' in node.output()
+
+
+def test_boxes_of_another_type_than_before_are_told(graph):
+    graph.publisher(MARKERS, '/boxes')
+    node = graph.start('-p', f'boxes_type:={DETECTIONS}')
+    graph.wait(lambda: 'start the node anew' in node.output(), 'a warning')
+    assert f'expected boxes of type {DETECTIONS}, got {MARKERS}' in node.output()
+    assert ended_cleanly(node)
+
+
 DEEP = tuple(
     part
     for name in ('points', 'boxes')
@@ -233,6 +296,18 @@ def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
     play(graph, records)
     assert int(all_published(graph, early)['points_queue_full']) > 5
     assert 'points_queue_full' in node.output()
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+
+
+def test_what_waits_when_the_node_ends_comes_out(graph, tmp_path):
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    slow = ('-p', 'solver.rounds:=20', '-p', 'solver.iterations:=100', '-p', 'backlog:=60.0')
+    node = graph.start(*RELIABLE, *DEEP, *slow, '-p', 'queue:=100')
+    graph.wait_until_connected()
+    play(graph, records)
+    graph.wait(lambda: len(early) >= 4, 'some boxes')
+    assert len(early) < 20
     assert ended_cleanly(node)
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
 
@@ -296,8 +371,11 @@ def refused(tmp_path_factory):
     cases = {
         'range': ['--ros-args', '-p', 'window:=2'],
         'boxes': ['--ros-args', '-p', 'boxes_type:=std_msgs/msg/String'],
+        'type': ['--ros-args', '-p', 'boxes_type:=Detection3DArray'],
         'device': ['--ros-args', '-p', 'device:=abacus'],
         'file': ['--ros-args', '--params-file', 'missing.yaml'],
+        'qos': ['--ros-args', '-p', 'qos_overrides./points.subscription.depth:=deep'],
+        'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
     }
     started = {
         name: subprocess.Popen(
@@ -317,8 +395,11 @@ def refused(tmp_path_factory):
     [
         ('range', 2, ('window', '3', 'got 2')),
         ('boxes', 1, ('std_msgs/msg/String', 'Detection3DArray')),
+        ('type', 1, ("'Detection3DArray'", 'vision_msgs/msg/Detection3DArray')),
         ('device', 2, ('device', 'abacus', 'cpu')),
         ('file', 2, ('missing.yaml',)),
+        ('qos', 2, ('qos_overrides./points.subscription', 'depth')),
+        ('list', 2, ('vehicle.names', "['']")),
     ],
 )
 def test_bad_arguments_are_told_in_one_line(refused, case, status, words):
@@ -344,6 +425,7 @@ def refined_of(boxes, *status):
 def test_markers_stay_with_their_track():
     board = MarkerBoard()
     given = boxes_of('a', 'b', '', '')
+    assert not board.is_showing
     first = board.update(given, refined_of(given, REFINED, KEPT, KEPT, KEPT)).markers
     assert first.pop(0).action == 3  # what an earlier node may have left
     assert len({(m.ns, m.id) for m in first}) == len(first) == 20
@@ -357,6 +439,7 @@ def test_markers_stay_with_their_track():
         (ns, number) for ns in NAMESPACES for number in (0, 2, 3)
     }
     assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
+    assert board.is_showing and board.clear() and not board.is_showing
 
 
 def test_health_tells_the_worst_of_the_last_period():
@@ -386,6 +469,13 @@ def test_health_tells_the_worst_of_the_last_period():
     assert not list(health.complaints())  # at a limited rate
     assert health.is_time_to_warn('unreadable') and not health.is_time_to_warn('unreadable')
     assert health.is_time_to_warn('invalid_box')
+    health.status('node', {})
+    for name in ('points_received', 'boxes_received', 'no_points', 'no_gain', 'no_gain'):
+        health.count(name)
+    health.count('kept', 3)
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.WARN
+    assert 'no box was refined' in status.message and 'no_gain' in status.message
 
 
 def test_without_ros_the_remedy_is_told():

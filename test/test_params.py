@@ -135,11 +135,14 @@ def test_a_parameter_file_says_it_all_and_serves_both(make_node, tmp_path):
     config = Config(estimate='final').updated(
         {'window': 7, 'vehicle.names': ['ute', 'car'], 'solver.tolerance': 1e-5, 'mode': 'bev'}
     )
+    config = config.updated({'cyclist.names': []})
     _, options = declare(make_node())
     options = options._replace(fixed_frame='map', backlog=9.0)
     path.write_text(parameters_yaml(config, options, '/**/params'))
     again = declare(make_node(cli_args=['--ros-args', '--params-file', str(path)]))
     assert again == (config, options)
-    assert Config.from_yaml(path) == config.updated({'estimate': 'track'})
+    read = Config.from_yaml(path)
+    assert read.cyclist.names == ('',)  # no class is named so
+    assert read.updated({'cyclist.names': []}) == config.updated({'estimate': 'track'})
     for item in settings():
         assert item.name == 'estimate' or item.meaning in path.read_text()
