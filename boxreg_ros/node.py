@@ -76,8 +76,8 @@ def main(args: Sequence[str] | None = None) -> int:
     for thread in threads:
         thread.start()
     os.read(end_asked, 1)
-    stop.set()
-    executor.wake()  # its `shutdown` would destroy what its thread is about to wait for
+    # `Executor.shutdown` would destroy what its thread is about to wait for.
+    executor.create_task(stop.set)
     node.stop()
     end = time.monotonic() + LAST_WORK + LAST_ACKNOWLEDGEMENT
     for thread in threads:
