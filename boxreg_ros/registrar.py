@@ -16,8 +16,6 @@ from boxreg_ros.window import Memory, Window
 import numpy as np
 import torch
 
-SWERVE = 10.0  # nothing leaves its way faster [m/s]
-
 
 class BoxRegistrar:
     """
@@ -75,7 +73,10 @@ class BoxRegistrar:
         """End all tracks and return everything still held."""
         ready = list(self._advance(self._matcher.flush()))
         self._end(list(self._tracks))
-        self._solve([])
+        if self.config.estimate == 'track':  # what is live is known already, and may be in haste
+            self._solve([])
+        for tick in self._ticks:
+            tick.waiting = 0
         return [*ready, *self._settled()]
 
     def _advance(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
@@ -230,7 +231,7 @@ class _TrackBuffer:
         for seen in (last, new):
             late = seen.stamp_ns - latest.stamp_ns
             away = dist(seen.box[:2], (latest.box + late * velocity)[:2])
-            if away < latest.box[LENGTH] / 2 + SWERVE * late * 1e-9:
+            if away < latest.box[LENGTH] / 2 + 10.0 * late * 1e-9:  # nothing swerves by 10 m/s
                 return None
         self.entries, moved = self.entries[:-2], self.entries[-2:]
         moved[0].estimate = None

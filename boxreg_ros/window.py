@@ -158,8 +158,7 @@ def one_heading(boxes: Floats, times: Floats, valid: NDArray[np.bool_], known: F
     not take those after it along.
 
     """
-    chain = boxes[..., YAW].copy()
-    near = chain[:, 0]
+    chain, near = boxes[..., YAW].copy(), boxes[:, 0, YAW]
     for now in chain.T[1:]:
         off = (now - near + np.pi / 2) % np.pi - np.pi / 2
         now[:], near = near + off, near + off * 2 / 3
