@@ -244,7 +244,7 @@ def evaluate(
 
 
 def pose_errors(boxes: Floats, truth: Floats) -> PoseErrors:
-    """Return the errors of `boxes` (n, 9) against `truth` (n, 9)."""
+    """Return the errors of `boxes` (n, 9) against `truth` (n, 9), as `PoseErrors` says."""
     axes = Rotation.from_euler('ZYX', truth[:, [YAW, PITCH, ROLL]]).as_matrix()
     translation = np.einsum('nij,ni->nj', axes, (boxes - truth)[:, :3])
     rotation = wrap((boxes - truth)[:, ROLL:])

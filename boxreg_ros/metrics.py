@@ -55,11 +55,6 @@ def _rows(boxes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:
     return a, b
 
 
-def _rotation(boxes: Floats) -> Floats:
-    """Return R (n, 3, 3), box axes as columns."""
-    return np.asarray(rotation_from_rpy(torch.from_numpy(boxes[:, ROLL:])))
-
-
 def _intersection(a: Floats, b: Floats) -> Floats:
     """
     Return the volume that both boxes of each pair fill [m^3], shape (n,).
@@ -70,7 +65,7 @@ def _intersection(a: Floats, b: Floats) -> Floats:
     by edges) gives V = 1/6 sum_{i<j} L_ij (2 d_i d_j - c (d_i^2 + d_j^2)) / s.
 
     """
-    axes = [np.swapaxes(_rotation(rows), 1, 2) for rows in (a, b)]
+    axes = [rotation_from_rpy(torch.from_numpy(rows[:, ROLL:])).mT.numpy() for rows in (a, b)]
     normals = np.concatenate([axes[0], -axes[0], axes[1], -axes[1]], axis=1)  # (n, 12, 3)
     shift = np.einsum('nij,nj->ni', axes[1], b[:, :3] - a[:, :3])  # origin: the centre of a
     half_a, half_b = a[:, EXTENT] / 2, b[:, EXTENT] / 2 + SHIFT

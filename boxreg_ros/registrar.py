@@ -72,9 +72,10 @@ class BoxRegistrar:
     def flush(self) -> list[RefinedBoxes]:
         """End all tracks and return everything still held."""
         ready = list(self._advance(self._matcher.flush()))
-        self._end(list(self._tracks))
         if self.config.estimate == 'track':  # what is live is known already, and may be in haste
+            self._end(list(self._tracks))
             self._solve([])
+        self._tracks.clear()
         for tick in self._ticks:
             tick.waiting = 0
         return [*ready, *self._settled()]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import cpu_count
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from boxreg_ros import objective
 from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
@@ -49,6 +49,9 @@ class Estimate(NamedTuple):
     memory: Memory | None = None
 
 
+Estimates = list[Estimate | None]
+
+
 class Solution(NamedTuple):
     """
     A solved batch.
@@ -69,7 +72,7 @@ class Solution(NamedTuple):
     left: tuple[Tensor, ...] = ()
 
 
-def register(windows: Sequence[Window], config: Config, model: InputModel) -> list[Any]:
+def register(windows: Sequence[Window], config: Config, model: InputModel) -> Estimates:
     """
     Refine the boxes of many windows.
 
