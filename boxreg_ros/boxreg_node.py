@@ -113,6 +113,7 @@ class BoxregNode(Node):
         self.create_service(Trigger, '~/save_config', self._on_save_config)
         self._depth = 10 + config.lag + self._inbox.capacity['boxes']  # may leave at the end
         self._boxes_type = ''
+        self._types: set[str] = set()  # of boxes, that have been seen
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         if options.boxes_type:
@@ -184,26 +185,48 @@ class BoxregNode(Node):
             self._subscribe(kind, topic, callback, qos, is_open=False)
 
     def _find_boxes(self) -> None:
-        """Look for publishers of boxes; the first type that can be read is taken."""
-        topic, types = self.resolve_topic_name('boxes'), self._types_of_boxes()
+        """Look for publishers of boxes; of types that stay, the first to be read is taken."""
+        before, self._types = self._types, self._types_of_boxes()
+        if self._types != before:
+            return  # publishers are found one by one
+        readable, complaints = self._told_apart(self._types)
+        if readable:
+            self._search.cancel()
+            self._types = {readable[0]}  # the others are told of by `_watch_types`
+            self._open_boxes(readable[0])
+        elif complaints and self._health.is_time_to_warn('boxes_type'):
+            self.get_logger().warning(f'{self.resolve_topic_name("boxes")}: {complaints[0]}')
+
+    def _told_apart(self, types: set[str]) -> tuple[list[str], list[str]]:
+        """Return the types of boxes that can be read, best first, and why the others cannot."""
         readable, complaints = [], []
         for name in sorted(types, key=lambda name: (name not in ADAPTERS, name)):
             try:
                 adapter_for(name, self._convention)
                 import_message(name)
             except UnsupportedMessage as error:
-                complaints.append(f'{topic}: {error}')
+                complaints.append(str(error))
             else:
                 readable.append(name)
-        if readable:
-            self._search.cancel()
-            self._open_boxes(readable[0])
-            if others := ', '.join(readable[1:]):
+        return readable, complaints
+
+    def _watch_types(self) -> None:
+        """Tell of boxes whose type is not that subscribed to."""
+        topic, taken = self.resolve_topic_name('boxes'), self._boxes_type
+        types = self._types_of_boxes()
+        if taken in types:
+            others, _ = self._told_apart(types - self._types)
+            self._types |= types
+            if others and not self._settings[1].boxes_type:
                 self.get_logger().warning(
-                    f'{topic} also has boxes of type {others}: set boxes_type if these are meant'
+                    f'{topic} also has boxes of type {", ".join(others)}: '
+                    'set boxes_type if these are meant'
                 )
-        elif complaints and self._health.is_time_to_warn('boxes_type'):
-            self.get_logger().warning(complaints[0])
+        elif taken and types and self._health.is_time_to_warn('boxes_type'):
+            self.get_logger().warning(
+                f'{topic}: expected boxes of type {taken}, got {", ".join(sorted(types))}; '
+                'start the node anew or set boxes_type'
+            )
 
     def _types_of_boxes(self) -> set[str]:
         return {info.topic_type for info in self.get_publishers_info_by_topic('boxes')}
@@ -275,13 +298,7 @@ class BoxregNode(Node):
     def _publish_status(self) -> None:
         for complaint in self._health.complaints():
             self.get_logger().warning(complaint)
-        types = self._types_of_boxes()
-        is_other = self._boxes_type and types and self._boxes_type not in types
-        if is_other and self._health.is_time_to_warn('boxes_type'):
-            self.get_logger().warning(
-                f'{self.resolve_topic_name("boxes")}: expected boxes of type {self._boxes_type}, '
-                f'got {", ".join(sorted(types))}; start the node anew or set boxes_type'
-            )
+        self._watch_types()
         now, age = self.get_clock().now(), 'none'
         if self._newest_motion_ns is not None:
             age = f'{1e-9 * (now.nanoseconds - self._newest_motion_ns):.3f}'

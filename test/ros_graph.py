@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 
 ROOT = Path(__file__).resolve().parents[1]
-PATIENCE = 40.0  # [s]; nodes start slowly on a busy machine
+PATIENCE = 90.0  # [s]; nodes start slowly on a busy machine
 RELIABLE = [
     part
     for topic in ('/points', '/odom')
