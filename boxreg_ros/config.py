@@ -175,8 +175,8 @@ class Config:
 
     def class_config(self, class_name: str) -> ClassConfig:
         """Return how objects of `class_name` move; unknown classes move like vehicles."""
-        words = class_name.lower().replace('_', ' ').replace('-', ' ').replace('.', ' ').split()
-        kinds = (kind for kind in (self.cyclist, self.pedestrian) if {*words} & {*kind.names})
+        words = {*class_name.lower().translate(str.maketrans('_-.', '   ')).split()}
+        kinds = (k for k in (self.cyclist, self.pedestrian) if words & {*map(str.lower, k.names)})
         return next(kinds, self.vehicle)
 
     def to_dict(self) -> dict[str, Any]:

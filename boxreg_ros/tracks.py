@@ -138,14 +138,14 @@ def refine(tracks: Sequence[Track], config: Config | None = None) -> list[Refine
         origins = [
             track.sensor_origins[row]
             for track, (_, row) in zip(members, places, strict=True)
-            if track.sensor_origins is not None
+            if track.sensor_origins is not None and np.isfinite(track.sensor_origins[row]).all()
         ]
         origin = origins[0] if origins else np.full(3, np.nan)
         boxes = np.array([tracks[index].boxes[row] for index, row in places])
         points = np.concatenate([tracks[index].points[row] for index, row in places])
         points = points[np.isfinite(points).all(1)]
         results += registrar.add_sweep(Sweep(stamp_ns, '', points, None, origin))
-        ids, classes = [t.track_id or '?' for t in members], [t.class_name for t in members]
+        ids, classes = [str(index) for index, _ in places], [t.class_name for t in members]
         results += registrar.add_boxes(
             BoxArray(stamp_ns, '', tuple(ids), tuple(classes), np.ones(len(ids)), boxes)
         )

@@ -123,7 +123,8 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     known = zip(*(w.memory or (w.observations[0].box[:3], *NOTHING) for w in windows), strict=True)
     base, state, move, information, seen = (np.array(part) for part in known)
     yaw = one_heading(boxes, times, valid, state[:, 5])
-    boxes[..., ROLL:YAW] *= np.sign(np.cos(yaw - boxes[..., YAW]))[..., None]
+    tilt = boxes[..., ROLL:YAW] * np.sign(np.cos(yaw - boxes[..., YAW]))[..., None]
+    boxes[..., ROLL:YAW] = (tilt + np.pi) % (2 * np.pi) - np.pi
     boxes[..., YAW] = yaw
     start = boxes.copy()
     for b, window in enumerate(windows):
@@ -132,9 +133,8 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     start[..., 6:9] += turns * np.round((boxes[..., 6:9] - start[..., 6:9]) / turns)
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]
-    turns = (start[:, [0, min(1, N - 1)], 6:9].reshape(B, 6) - state[:, ANGLES]) / np.pi
-    turns = np.nan_to_num(np.round(turns))
-    recalled = np.nan_to_num(state + move)
+    turns = np.rint((start[:, [0, 1 % N], 6:9].reshape(B, 6) - state[:, ANGLES]) / np.pi)
+    recalled = state + move
     recalled[:, ANGLES] += np.pi * turns
     information *= FADING * (turns % 2 == 0).all(1)[:, None, None]
     names = [item.name for item in fields(ClassConfig)[1:]]
@@ -142,7 +142,7 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     numbers = np.array([rows[window.class_name] for window in windows], dtype=np.float64)
     deviations = dict(zip(names, torch.from_numpy(numbers).to(device).unbind(1), strict=True))
     arrays: list[Any] = [boxes, start, valid, times, points, mask, delays, origins, ground]
-    arrays += [recalled, information, seen]
+    arrays += [np.nan_to_num(recalled), information, seen]
     parts: list[Any] = [torch.from_numpy(array).to(device) for array in arrays]
     problem = Problem(*[*parts, torch.empty(0), deviations])
     return problem._replace(openness=aspect(problem)), base

@@ -160,3 +160,9 @@ def test_missing_and_foreign_files_are_named(tmp_path):
 def test_class_names_find_their_kind(class_name, kind):
     config = Config()
     assert config.class_config(class_name) is getattr(config, kind)
+
+
+def test_names_of_a_kind_may_be_in_any_case():
+    config = Config().updated({'pedestrian.names': ['Fussgaenger']})
+    for name in ('FUSSGAENGER', 'fussgaenger', 'human-Fussgaenger'):
+        assert config.class_config(name) is config.pedestrian

@@ -109,6 +109,29 @@ def test_tracks_do_not_depend_on_their_order():
         np.testing.assert_allclose(a.boxes, b.boxes, atol=1e-6)
 
 
+def test_tracks_may_have_any_ids_and_some_no_origin():
+    """An empty id is as good as another, and the sensor is where any track of a stamp says."""
+    (known, _), (other, _) = a_track(0), a_track(1, truth=drive(12, start=(-20.0, 9.0, 2.0)))
+    blind = replace(other, sensor_origins=np.full((12, 3), np.nan))
+    for ids in (('', '?'), ('0', '')):
+        named = [replace(t, track_id=name) for t, name in zip((blind, known), ids, strict=True)]
+        expected = refine([replace(other, track_id='a'), replace(known, track_id='b')])
+        for found, one in zip(refine(named), expected, strict=True):
+            assert set(found.status) == {'refined'}
+            np.testing.assert_array_equal(found.boxes, one.boxes)
+
+
+@each_estimate
+def test_angles_may_be_whole_turns_off(estimate):
+    track, _ = a_track(0)
+    turns = np.random.default_rng(0).integers(-1, 2, (12, 3))
+    boxes = track.boxes + np.pad(2 * np.pi * turns, ((0, 0), (6, 0)))
+    config = Config(estimate=estimate)
+    found, known = only(replace(track, boxes=boxes), config), only(track, config)
+    assert found.status == known.status
+    np.testing.assert_allclose(wrap(found.boxes - known.boxes), 0, atol=1e-6)
+
+
 # --- little to go by ----------------------------------------------------------------------------
 
 
