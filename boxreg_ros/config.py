@@ -164,9 +164,9 @@ class Config:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        """Check every value against its bounds."""
+        """Check type and bounds of every value."""
         for item, value in self.items():
-            _check(item, value)
+            _check(item, _cast(item.name, value, item.default))
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
         """Yield every setting with its present value, groups flattened to dotted names."""

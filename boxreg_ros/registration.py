@@ -371,7 +371,7 @@ def free_variables(problem: Problem, config: Config) -> Tensor:
     pose = problem.valid[..., None].to(problem.boxes).expand(-1, -1, 6).clone()
     shared = pose.new_ones((len(pose), SHARED))
     if config.mode == 'bev':
-        pose[..., [2, 3, 4]] = 0.0
+        pose[..., [2, 3, 4]], shared[:, 2] = 0.0, 0.0
     if config.extent == 'fixed':
         shared[:, :3] = 0.0
     return State(pose, shared).pack()

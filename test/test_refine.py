@@ -330,6 +330,13 @@ def test_bev_leaves_z_roll_and_pitch(estimate):
     assert iou_3d(refined.boxes, truth).mean() > iou_3d(track.boxes, truth).mean()
 
 
+def test_bev_keeps_the_height_the_input_has_on_average():
+    track, _ = a_track(extent=0.05)
+    refined = only(track, Config(mode='bev'))
+    np.testing.assert_allclose(refined.boxes[:, 5], track.boxes[:, 5].mean(), rtol=1e-9)
+    assert np.ptp(refined.boxes[:, 3:6], axis=0).max() == 0
+
+
 @each_estimate
 def test_fixed_extents_are_the_inputs(estimate):
     track, _ = a_track(extent=0.05)

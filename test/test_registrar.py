@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from boxreg_ros import Config, refine
+from boxreg_ros import Config, refine, registration
 from boxreg_ros.geometry import face_distances
 from boxreg_ros.metrics import iou_3d
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.registration import register
+from boxreg_ros.registration import register, solve
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
@@ -484,6 +484,20 @@ def test_tracks_are_solved_together_when_a_window_is_full(monkeypatch):
         {'long': 5, 'late': 5},
     ]
     assert len(results) == 30
+
+
+def test_live_windows_are_solved_in_full_once_then_in_one_round(monkeypatch):
+    """Three observations make the first window; what comes after goes on from its boxes."""
+    asked = []
+
+    def note(problem, config, model, rounds):
+        asked.append((problem.boxes.shape[1], rounds))
+        return solve(problem, config, model, rounds)
+
+    monkeypatch.setattr(registration, 'solve', note)
+    config = setup(**{'solver.rounds': 7})
+    fed(BoxRegistrar(config), stream_of([track_of(drive(8), np.random.default_rng(0), 'a')]))
+    assert asked == [(3, 7), (4, 1), (5, 1), (6, 1), (6, 1), (6, 1)]
 
 
 def test_a_track_that_ends_comes_back_before_the_end():
