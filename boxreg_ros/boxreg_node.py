@@ -16,7 +16,7 @@ from typing import Any
 from boxreg_ros.diagnostics import Health
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.inbox import Inbox, Message
-from boxreg_ros.live import Arrival, LiveRegistrar, Outgoing, warm_up
+from boxreg_ros.live import Arrival, LiveRegistrar, Outgoing, says_nothing, warm_up
 from boxreg_ros.params import changed, declare, parameters_yaml
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.visual import MarkerBoard
@@ -38,6 +38,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -45,6 +46,8 @@ from visualization_msgs.msg import MarkerArray
 NAME = 'boxreg_node'
 POLL = 0.02
 """The worker looks this often whether an arrival has waited long enough [s]."""
+HELD_PERIOD = 0.1
+"""And so often whether boxes have, if nothing else is to be done [s]."""
 GRAPH_PERIOD = 0.2
 STATUS_PERIOD = 1.0
 BOXES_PATIENCE = 10.0
@@ -90,7 +93,7 @@ class BoxregNode(Node):
         self._convention = options.convention
         self._health = Health()
         self._inbox = Inbox(config.queue)
-        self._backlog, self._idle_at = options.backlog, 0.0
+        self._backlog, self._idle_at, self._waited = options.backlog, 0.0, 0.0
         self._live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
             self._trouble, options.convention,
@@ -130,7 +133,7 @@ class BoxregNode(Node):
 
     def _subscribe(
         self, kind: type, topic: str, callback: Any, qos: QoSProfile, is_open: bool = True
-    ) -> None:
+    ) -> Subscription:
         """Subscribe; what DDS loses or does not connect is counted. `is_open`: to overrides."""
         name = self.resolve_topic_name(topic)
         overrides = QoSOverridingOptions.with_default_policies() if is_open else None
@@ -139,7 +142,7 @@ class BoxregNode(Node):
             message_lost=partial(self._on_lost, topic),
         )
         with _told_overrides(f'{name}.subscription'):
-            self.create_subscription(
+            return self.create_subscription(
                 kind, topic, callback, qos, event_callbacks=events,
                 qos_overriding_options=overrides,
             )  # fmt: skip
@@ -160,6 +163,12 @@ class BoxregNode(Node):
 
     def _on_incompatible(self, topic: str, who: str, event: Any) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind)
+        override = self.get_parameter_or(f'qos_overrides.{topic}.subscription.reliability')
+        is_open = override.value in (None, 'best_available')
+        is_ours = (topic, who) == (self.resolve_topic_name('boxes'), 'publisher')
+        if is_ours and is_open and policy == 'RELIABILITY' and self.executor is not None:
+            self.executor.create_task(self._listen_again)
+            return
         text = f'{topic}: a {who} whose {policy} QoS policy does not go with that of this node'
         self._trouble('qos_incompatible', f'{text}: {REASONS["qos_incompatible"].remedy}')
 
@@ -237,9 +246,18 @@ class BoxregNode(Node):
         self._live.adapter = adapter
         self._early = self._publisher(kind, 'refined_boxes', self._depth)
         self._final = self._publisher(kind, 'refined_boxes_final', self._depth)
-        qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-        self._subscribe(kind, 'boxes', self._on_boxes, qos)
+        self._boxes = self._subscribe_to_boxes()
         self.get_logger().info(f'boxes are {type_name}')
+
+    def _subscribe_to_boxes(self) -> Subscription:
+        # What is best is settled now, by the publishers there are.
+        qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE)
+        return self._subscribe(import_message(self._boxes_type), 'boxes', self._on_boxes, qos)
+
+    def _listen_again(self) -> None:
+        """Subscribe to boxes anew, as a publisher has come that offers less than the others."""
+        self.destroy_subscription(self._boxes)
+        self._boxes = self._subscribe_to_boxes()
 
     def _on_transforms(self, topic: str, msg: Any) -> None:
         self._inbox.put_news(topic, msg.transforms)
@@ -324,19 +342,21 @@ class BoxregNode(Node):
             self._take_news()
             self._miss_clouds(item)
             item = item or self._decoded(self._take())
+            self._live.cloud_frame = self._cloud_frame  # boxes may wait for the first cloud
             if item is not None and self._live.is_ready(item, time.monotonic()):
                 self._process(item)
                 item = None
             elif item is not None:
                 self._inbox.news.wait(POLL)
                 self._idle_at = time.monotonic()
+                self._waited = self._idle_at - item.received
             elif not any(self._inbox.sizes().values()):
                 if self._live.is_silent(time.monotonic()):
                     self._publish(self._guarded(self._live.flush))
                 if self._board.is_showing and self._live.has_ceased(time.monotonic()):
                     self._markers.publish(self._board.clear())
-                self._inbox.news.wait(STATUS_PERIOD)
-                self._idle_at = time.monotonic()
+                self._inbox.news.wait(HELD_PERIOD if self._live.is_holding else STATUS_PERIOD)
+                self._idle_at, self._waited = time.monotonic(), 0.0
         self._finish_work(item)
 
     def _miss_clouds(self, item: Arrival | None) -> None:
@@ -355,7 +375,9 @@ class BoxregNode(Node):
             self._publish(self._live.last(message.content))
             return None
         patience = self._backlog * (1.0 if message.topic == 'points' else BOXES_PATIENCE)
-        if time.monotonic() <= max(message.received, self._idle_at) + patience:
+        # What has come while a transform was waited for may take as long again to be solved.
+        since = max(message.received, self._idle_at + self._waited)
+        if time.monotonic() <= since + patience:
             return message
         self._drop(message)
         return None
@@ -395,7 +417,6 @@ class BoxregNode(Node):
     def _decoded(self, message: Message | None) -> Arrival | None:
         if message is None:
             return None
-        self._live.cloud_frame = self._cloud_frame
         reader: Any = pointcloud if message.topic == 'points' else self._live.adapter
         try:
             content = reader.from_msg(message.content)
@@ -412,6 +433,8 @@ class BoxregNode(Node):
             self._fixed_frame = self._live.fixed_frame
             self.get_logger().info(f'fixed frame is {self._fixed_frame!r}')
         self._publish(ready)
+        if says_nothing(item.content) and self._board.is_showing:
+            self._markers.publish(self._board.clear())
 
     def _guarded(
         self, task: Callable[[], list[Outgoing]], item: Arrival | None = None

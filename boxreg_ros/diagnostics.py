@@ -12,6 +12,8 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 LOG_PERIOD = 10.0
 """The same trouble is logged this often at most [s]."""
+WITHOUT_CLOUDS = ('no_transform', 'no_sweep')
+"""What becomes of boxes if no clouds come."""
 RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')
 
 
@@ -93,6 +95,8 @@ class Health:
 def _verdict(fresh: Counter[str]) -> tuple[bytes, str]:
     """Return level and message for what happened since the last time."""
     trouble = next((name for name, why in REASONS.items() if fresh[name] and why.remedy), None)
+    if trouble in WITHOUT_CLOUDS and not fresh['points_received']:
+        return DiagnosticStatus.ERROR, 'no box was refined; nothing received on points'
     if trouble is not None:
         reason = REASONS[trouble]
         is_idle = bool(fresh['boxes_received']) and not fresh['refined']

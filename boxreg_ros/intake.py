@@ -18,8 +18,20 @@ class Intake:
     """Give boxes ids where wanted, and look whether boxes stand where their points are."""
 
     def __init__(self, convention: Convention, config: Config) -> None:
-        self._check = PoseCheck(convention, config.tolerance)
+        self._convention = convention
         self._tracker = Tracker(config.max_gap) if convention.associate else None
+        self.begin(config)
+
+    def begin(self, config: Config) -> None:
+        """Forget what has been taken; ids that were given do not come again."""
+        self._check = PoseCheck(self._convention, config.tolerance)
+        if self._tracker is not None:
+            self._tracker.forget()
+
+    def change(self, config: Config) -> None:
+        """Take over the setting that may change: how long a track may be unseen."""
+        if self._tracker is not None:
+            self._tracker.max_gap = config.max_gap
 
     def take(self, item: _T) -> _T:
         """Return a sweep or boxes, in the fixed frame, as the registrar is to have them."""

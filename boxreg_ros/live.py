@@ -127,7 +127,6 @@ class LiveRegistrar:
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
         self._trouble = trouble
-        self._convention = convention
         self._intake = Intake(convention, config)
         self._registrar = BoxRegistrar(config)
         self._held: deque[_Pending | _Passing] = deque()  # as they came; the first is pending
@@ -145,6 +144,7 @@ class LiveRegistrar:
     @config.setter
     def config(self, config: Config) -> None:
         self._registrar.config = config
+        self._intake.change(config)
 
     @property
     def counts(self) -> Counter[str]:
@@ -154,7 +154,7 @@ class LiveRegistrar:
     def is_ready(self, item: Arrival, now: float) -> bool:
         """Tell whether the transforms of an arrival have come, or are no longer waited for."""
         content = item.content
-        if now >= item.received + self.transform_timeout or _says_nothing(content):
+        if now >= item.received + self.transform_timeout or says_nothing(content):
             return True
         if self._choose_at is None:
             self._choose_at = now + SETTLE
@@ -168,7 +168,7 @@ class LiveRegistrar:
     def process(self, item: Arrival) -> list[Outgoing]:
         """Register an arrival; return what has become ready."""
         content = item.content
-        if _says_nothing(content):
+        if says_nothing(content):
             return self.passed_through(item.message)
         ready: list[Outgoing] = []
         if self._rewinds[isinstance(content, BoxArray)].happened(content.stamp_ns):
@@ -228,30 +228,35 @@ class LiveRegistrar:
         reach = max(self.config.reach, self.config.tolerance)
         return self.lose(max(overdue) + round(reach * 1e9) + 1)
 
+    @property
+    def is_holding(self) -> bool:
+        """Tell whether boxes are held back, for a cloud or for what comes later."""
+        return bool(self._held)
+
     def is_silent(self, now: float) -> bool:
         """Tell whether boxes are held, but no others have come for long."""
-        return bool(self._held) and self.has_ceased(now)
+        return self.is_holding and self.has_ceased(now)
 
     def has_ceased(self, now: float) -> bool:
         """Tell whether no boxes have come for long."""
         return now >= self._last_boxes + max(SILENCE, self.config.max_gap)
 
     def flush(self) -> list[Outgoing]:
-        """End all tracks and return everything still held."""
+        """Return everything still held; tracks go on, should more boxes come."""
         return self._outgoing(self._registrar.flush())
 
     def reset(self) -> list[Outgoing]:
         """Start afresh but for the transforms; return everything still held."""
         ready = self.flush()
         self._registrar.reset()
-        self._intake = Intake(self._convention, self.config)
+        self._intake.begin(self.config)
         self._rewinds = Rewind(), Rewind()
         return ready
 
     def abandon(self, item: Arrival | None) -> list[Outgoing]:
         """Start afresh after a fault; pass what is held, and the arrival at fault, through."""
         self._registrar.reset()
-        self._intake = Intake(self._convention, self.config)
+        self._intake.begin(self.config)
         held = list(self._held)
         self._held.clear()
         passed = []
@@ -341,7 +346,7 @@ class LiveRegistrar:
         return outgoing
 
 
-def _says_nothing(content: Sweep | BoxArray) -> bool:
+def says_nothing(content: Sweep | BoxArray) -> bool:
     """Tell whether this is an array without boxes, and without a stamp or a frame to wait for."""
     is_empty = isinstance(content, BoxArray) and not content.track_ids
     return is_empty and not (content.frame_id and content.stamp_ns)

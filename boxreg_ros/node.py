@@ -27,7 +27,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
     """
     for number in SIGNALS:
-        signal.signal(number, lambda *_: sys.exit(0))  # nothing has begun
+        # Nothing has begun. Raised within a destructor, SystemExit would be lost.
+        signal.signal(number, lambda *_: os._exit(0))
     try:  # what takes seconds to import, or is not there without ROS
         from boxreg_ros.boxreg_node import BoxregNode, LAST_ACKNOWLEDGEMENT, LAST_WORK
         import rclpy

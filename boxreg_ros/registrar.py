@@ -61,7 +61,7 @@ class BoxRegistrar:
 
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
         """Take a sweep; return what has become ready."""
-        self.counts['sweeps'] += 1
+        self.counts['sweeps'] += not sweep.is_lost
         return list(self._advance(self._matcher.add_sweep(sweep)))
 
     def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
@@ -70,12 +70,11 @@ class BoxRegistrar:
         return list(self._advance(self._matcher.add_boxes(boxes)))
 
     def flush(self) -> list[RefinedBoxes]:
-        """End all tracks and return everything still held."""
+        """Return everything still held; with `estimate` 'track' tracks end, else they go on."""
         ready = list(self._advance(self._matcher.flush()))
         if self.config.estimate == 'track':  # what is live is known already, and may be in haste
             self._end(list(self._tracks))
             self._solve([])
-        self._tracks.clear()
         for tick in self._ticks:
             tick.waiting = 0
         return [*ready, *self._settled()]

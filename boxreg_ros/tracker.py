@@ -72,7 +72,7 @@ class Tracker:
     Parameters
     ----------
     max_gap : float
-        A track that was not seen for longer is forgotten [s].
+        A track that was not seen for longer is forgotten [s]; may change.
 
     Attributes
     ----------
@@ -82,10 +82,14 @@ class Tracker:
     """
 
     def __init__(self, max_gap: float) -> None:
-        self._max_gap_ns = round(max_gap * 1e9)
+        self.max_gap = max_gap
+        self.count = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew; ids that were given do not come again."""
         self._tracks: list[_Track] = []
         self._newest_ns: int | None = None
-        self.count = 0
 
     def identify(self, boxes: BoxArray) -> BoxArray:
         """
@@ -96,13 +100,13 @@ class Tracker:
         go back further than `max_gap`, all tracks are forgotten.
 
         """
-        stamp_ns = boxes.stamp_ns
-        if self._newest_ns is not None and stamp_ns < self._newest_ns - self._max_gap_ns:
-            self._tracks, self._newest_ns = [], None  # a recording that starts again
+        stamp_ns, max_gap_ns = boxes.stamp_ns, round(self.max_gap * 1e9)
+        if self._newest_ns is not None and stamp_ns < self._newest_ns - max_gap_ns:
+            self.forget()  # a recording that starts again
         is_late = self._newest_ns is not None and stamp_ns <= self._newest_ns
         if not is_late:
             self._newest_ns = stamp_ns
-            oldest = stamp_ns - self._max_gap_ns
+            oldest = stamp_ns - max_gap_ns
             self._tracks = [track for track in self._tracks if track.stamp_ns >= oldest]
         extents = boxes.boxes[:, LENGTH : HEIGHT + 1]
         valid = np.isfinite(boxes.boxes).all(axis=1) & (extents > 0).all(axis=1)

@@ -24,6 +24,8 @@ MEMORY = 30.0
 """How long transforms are remembered [s]."""
 BACK = 1.0
 """Stamps that go back further than this mean that time starts again [s]."""
+FRAMES = 500
+"""So many frames are kept, and more if they move: some trackers give every object a frame."""
 FLOAT32_RANGE = 4096.0
 """Nearer than this to its origin [m], a frame is resolved to 0.5 mm by float32."""
 
@@ -79,6 +81,7 @@ class TransformTree:
         self._tf: dict[str, _Edge] = {}
         self._odometry: dict[str, _Edge] = {}
         self._routes: dict[tuple[str, str], list[tuple[_Edge, bool]]] = {}
+        self._most = FRAMES
 
     def add_transforms(self, transforms: Iterable[Any], is_static: bool = False) -> None:
         """Add the ``geometry_msgs/TransformStamped`` of one TFMessage."""
@@ -174,9 +177,13 @@ class TransformTree:
             edge = edges[child] = _Edge(parent, child, self._memory_ns)
             self._routes.clear()
         edge.is_static |= is_static
-        stamp = item.header.stamp
-        pose = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
-        edge.add(stamp.sec * 10**9 + stamp.nanosec, pose)
+        stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
+        edge.add(stamp_ns, (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w))
+        if len(edges) > self._most:
+            oldest_ns = stamp_ns - self._memory_ns
+            for name in [name for name, edge in edges.items() if edge.is_older(oldest_ns)]:
+                del edges[name]
+            self._most = max(FRAMES, 2 * len(edges))
 
     def _edges(self) -> list[_Edge]:
         return [*self._tf.values(), *self._odometry.values()]
@@ -236,6 +243,9 @@ class _Edge:
         self.stamps.clear()
         self._poses.clear()
         self._was_forgotten = True
+
+    def is_older(self, stamp_ns: int) -> bool:
+        return not self.is_static and bool(self.stamps) and self.stamps[-1] < stamp_ns
 
     def covers(self, stamp_ns: int) -> bool:
         if self.is_static:

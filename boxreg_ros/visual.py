@@ -56,9 +56,9 @@ class MarkerBoard:
         Parameters
         ----------
         given, refined : BoxArray, RefinedBoxes
-            The same boxes before and after, in one frame. Boxes that are not finite are not
-            shown. Green is refined, orange kept as it was; grey is the input. The blue ellipse
-            is the covariance of x and y of a refined box, 2 standard deviations.
+            The same boxes before and after, in one frame. Boxes that are not finite, or have
+            no volume, are not shown. Green is refined, orange kept as it was; grey is the input.
+            The blue ellipse is the covariance of x and y of a refined box, 2 standard deviations.
 
         """
         m = self._messages
@@ -72,7 +72,8 @@ class MarkerBoard:
         for i, track_id in enumerate(given.track_ids):
             key = track_id if track_id and track_id not in self._shown else f'{track_id}#{i}'
             box = refined.boxes.boxes[i]
-            if not np.isfinite([*box, *given.boxes[i]]).all():
+            extents = [*box[LENGTH : HEIGHT + 1], *given.boxes[i, LENGTH : HEIGHT + 1]]
+            if not np.isfinite([*box, *given.boxes[i]]).all() or min(extents) <= 0:
                 continue
             self._shown[key] = number = was_shown[key] if key in was_shown else self._number()
             is_refined = refined.status[i] == REFINED
