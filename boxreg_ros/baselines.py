@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from boxreg_ros.metrics import EXTENT, wrap
+from boxreg_ros.metrics import EXTENT
 from boxreg_ros.structures import Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
 from boxreg_ros.tracks import Track
+from boxreg_ros.transforms import wrap
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded

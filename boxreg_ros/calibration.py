@@ -1,6 +1,5 @@
 """What the input tells about itself: its annotation rule, and how it errs."""
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -106,8 +105,8 @@ class InputModel:
 
     def __init__(self, config: FaceConfig) -> None:
         self._config = config
-        self._sights: OrderedDict[str, Floats] = OrderedDict()
-        self._scatter: OrderedDict[str, Floats] = OrderedDict()
+        self._sights: dict[str, Floats] = {}
+        self._scatter: dict[str, Floats] = {}
         self._noise = InputNoise()
         self._fresh = self._measured = 0
 
@@ -171,10 +170,9 @@ class InputModel:
         return self._noise
 
 
-def _of(known: OrderedDict[str, Floats], name: str, fresh: Floats) -> Floats:
+def _of(known: dict[str, Floats], name: str, fresh: Floats) -> Floats:
     """Return the array of a track, `fresh` for a new one; forget the one seen longest ago."""
-    found = known.setdefault(name, fresh)
-    known.move_to_end(name)
+    known[name] = found = known.pop(name, fresh)
     if len(known) > TRACKS:
-        known.popitem(last=False)
+        del known[next(iter(known))]
     return found

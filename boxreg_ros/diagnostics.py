@@ -95,13 +95,13 @@ class Health:
 def _verdict(fresh: Counter[str]) -> tuple[bytes, str]:
     """Return level and message for what happened since the last time."""
     trouble = next((name for name, why in REASONS.items() if fresh[name] and why.remedy), None)
-    if trouble in WITHOUT_CLOUDS and not fresh['points_received']:
-        return DiagnosticStatus.ERROR, 'no box was refined; nothing received on points'
     if trouble is not None:
         reason = REASONS[trouble]
         is_idle = bool(fresh['boxes_received']) and not fresh['refined']
         level = DiagnosticStatus.ERROR if is_idle or trouble in FAULTS else DiagnosticStatus.WARN
         text = f'{trouble}: {reason.meaning}; {reason.remedy}'
+        if trouble in WITHOUT_CLOUDS and not fresh['points_received']:
+            text = 'nothing received on points'
         return level, f'no box was refined; {text}' if is_idle else text
     missing = [name for name in ('points', 'boxes') if not fresh[f'{name}_received']]
     if missing:

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 from boxreg_ros.arguments import add_topic_arguments
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.metrics import EXTENT, iou_3d, iou_bev, wrap
+from boxreg_ros.metrics import EXTENT, iou_3d, iou_bev
 from boxreg_ros.structures import Floats, Ints, PITCH, ROLL, YAW
+from boxreg_ros.transforms import wrap
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

@@ -25,6 +25,7 @@ class Intake:
     def begin(self, config: Config) -> None:
         """Forget what has been taken; ids that were given do not come again."""
         self._check = PoseCheck(self._convention, config.tolerance)
+        self.change(config)
         if self._tracker is not None:
             self._tracker.forget()
 

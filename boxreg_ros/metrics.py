@@ -34,18 +34,12 @@ def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
 
     """
     a, b = _rows(boxes, truth)
-    overlap = np.zeros(len(a))
-    for start in range(0, len(a), PAIRS_AT_ONCE):
-        part = slice(start, start + PAIRS_AT_ONCE)
-        overlap[part] = _intersection(a[part], b[part])
+    count = 1 + len(a) // PAIRS_AT_ONCE
+    parts = zip(np.array_split(a, count), np.array_split(b, count), strict=True)
+    overlap = np.concatenate([_intersection(*part) for part in parts])
     union = a[:, EXTENT].prod(axis=1) + b[:, EXTENT].prod(axis=1) - overlap
     valid = np.isfinite(overlap) & (overlap > 0)
     return np.asarray(np.divide(overlap, union, out=np.zeros(len(a)), where=valid)).clip(0.0, 1.0)
-
-
-def wrap(angles: Floats) -> Floats:
-    """Return `angles` in [-pi, pi) [rad]."""
-    return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _rows(boxes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:

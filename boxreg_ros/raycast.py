@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from boxreg_ros.metrics import wrap
 from boxreg_ros.structures import Floats, Ints
+from boxreg_ros.transforms import wrap
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

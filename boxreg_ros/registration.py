@@ -31,6 +31,8 @@ COARSE = 256  # points of a box that tell where it is but for the last round
 EVERY = 2**62  # enough to leave none out
 SHOWN = 64  # points of a box that show the shape of its track
 CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
+MOTION = objective.acceleration, objective.slip
+SWERVE = 3.0  # motion this many deviations off has lost three quarters of its say
 PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
 
 
@@ -131,8 +133,7 @@ def _judged(
     is_blind = ~problem.mask.any((1, 2))[:, None].expand_as(finite)
     failed = torch.stack([is_blind, ~finite, after < before / 2 - 3])
     good = (~failed.any(0)).cpu().numpy()
-    status = np.where(good, REFINED, KEPT)
-    reasons = np.select(list(failed.cpu().numpy()), ['no_points', 'not_finite', 'no_gain'], '')
+    why = np.select(list(failed.cpu().numpy()), ['no_points', 'not_finite', 'no_gain'], '')
     found, spread = boxes.cpu().numpy(), covariances.cpu().numpy()
     found[..., :3] += base[:, None]
     arrays, estimates = [part.cpu().numpy() for part in left], []
@@ -143,7 +144,7 @@ def _judged(
         own, error = found[b, :n].copy(), spread[b, :n].copy()
         for i in np.flatnonzero(~good[b, :n]).tolist():
             own[i], error[i] = window.observations[i].box, np.eye(6)
-        words = tuple(status[b, :n].tolist()), tuple(reasons[b, :n].tolist())
+        words = tuple(np.where(good[b, :n], REFINED, KEPT).tolist()), tuple(why[b, :n].tolist())
         estimates.append(Estimate(own, *words, error, memory if is_lasting else None))
     return estimates
 
@@ -158,9 +159,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     windows do not depend on each other: threads share them.
 
     """
-    length, solver = problem.boxes.shape[1], config.solver
+    length, solver, is_track = problem.boxes.shape[1], config.solver, config.estimate == 'track'
     limits = solver.iterations, solver.history, solver.tolerance
-    is_track = config.estimate == 'track'
     rule, noise, turn = model.rule(), model.noise(), 0
     enough = COARSE if rounds > 1 else EVERY
     everyone = expected_shared(problem, rule)
@@ -179,6 +179,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         here.shared[:, objective.ANCHOR] = 0.0
         sights = support(part, here, config.faces.outermost, rule.depths)
         terms = [t for t in weigh(part, here, sights, expected, noise, config) if t.weight.any()]
+        if turn > 0 or rounds == 1:  # where it begins, a cold window is as noisy as its input
+            terms = [yielding(t, here) if t.function in MOTION else t for t in terms]
         if turn > 0 and is_track:
             information, wanted = agreement(part.thinned(SHOWN), here)
             terms.append(Term(objective.shape, information[:, :, None], (here.pose, wanted)))
@@ -324,6 +326,20 @@ def weigh(
     ]
 
 
+def yielding(term: Term, state: State) -> Term:
+    """
+    Return `term` of the motion with less weight where `state` is far off what it expects.
+
+    Else who brakes hard, swerves or drifts would be moved off the points, which then lose their
+    say. A stencil yields no more than the one before it: the newest box is as noisy as its input.
+
+    """
+    r = term.linearise(state).residual[:, :, 0, :, None]
+    far = (r.mT @ term.weight[:, :, 0] @ r)[..., None] / SWERVE**2
+    far[:, 1:] = far[:, 1:].minimum(far[:, :-1])
+    return term._replace(weight=term.weight / (1 + far) ** 2)
+
+
 def surprise(problem: Problem, axes: Tensor) -> Tensor:
     """
     Return how far off each input pose is from what its neighbours make expect, (B, N, 6).
@@ -358,9 +374,8 @@ def _parked(problem: Problem) -> Tensor:
 
 def expected_shared(problem: Problem, rule: Rule) -> Tensor:
     """Return the expectation of what is shared (B, 22): mean extent, no bias, rule, pivot."""
-    n = problem.valid.sum(1, keepdim=True)
     total = (problem.boxes[..., 3:6] * problem.valid[..., None]).sum(1) + problem.seen[:, :3]
-    mean = total / (n + problem.seen[:, 3:])
+    mean = total / (problem.valid.sum(1, keepdim=True) + problem.seen[:, 3:])
     gaps = problem.of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
     pivot = mean[:, :1] * problem.deviations['pivot'][:, None]
     return torch.cat([mean, 0 * gaps, gaps + rule.gaps.to(mean), pivot, 0 * gaps], 1)

@@ -17,7 +17,6 @@ from typing import Any
 
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.metrics import wrap
 from boxreg_ros.raycast import Actor, body, Motion, PERIOD, revolution, ROAD, Sensor, to_matrix
 from boxreg_ros.recorder import write_recording
 from boxreg_ros.structures import (
@@ -31,7 +30,7 @@ from boxreg_ros.structures import (
     YAW,
 )
 from boxreg_ros.tracks import Track
-from boxreg_ros.transforms import boxes_to_frame, inverse
+from boxreg_ros.transforms import boxes_to_frame, inverse, wrap
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

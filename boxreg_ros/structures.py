@@ -31,7 +31,7 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float
     wanted = str(shape).replace('None', 'N')
     try:
         array = np.ascontiguousarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (RuntimeError, TypeError, ValueError) as error:  # torch says it its way
         raise ShapeError(f'{name}: expected numbers of shape {wanted}: {error}') from None
     fits = [want in (None, got) for want, got in zip(shape, array.shape, strict=False)]
     if array.ndim != len(shape) or not all(fits):

@@ -1,10 +1,10 @@
 """Whole tracks in, refined tracks out: the core without topics and files."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ShapeError
+from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.structures import (
     BoxArray,
@@ -29,11 +29,12 @@ class Track:
     track_id, class_name : str
         Identity and category.
     stamps_ns : array, shape (N,)
-        Strictly increasing [ns].
+        Strictly increasing [ns]; datetime64 of any unit as well.
     boxes : array, shape (N, 9)
         Input boxes.
     points : sequence of N arrays, shape (M_i, 3)
-        Returns on and around the object [m]; M_i may be 0.
+        Returns on and around the object [m]; M_i may be 0. Those of all tracks of a stamp make one
+        sweep: what several have counts as often.
     sensor_origins : array, shape (N, 3), or None
         Where the sensor was [m]; without it visible faces are told by the points' centre of mass.
     scores : array, shape (N,), or None
@@ -51,10 +52,24 @@ class Track:
 
     def __post_init__(self) -> None:
         """Check shapes and order; convert lists to arrays."""
-        stamps = np.asarray(self.stamps_ns, dtype=np.int64)
+        given = np.asarray(self.stamps_ns)
+        if given.dtype.kind == 'M':  # whatever its unit
+            given = given.astype('datetime64[ns]')
+        if given.size and given.dtype.kind not in 'iuM':
+            raise ShapeError(
+                f'stamps_ns of track {self.track_id!r}: expected whole numbers [ns], got '
+                f'{given.dtype}; of seconds: (seconds * 1e9).round().astype(int)'
+            )
+        stamps = given.astype(np.int64)
         if stamps.ndim != 1 or (np.diff(stamps) <= 0).any():
             raise ShapeError(
-                f'stamps_ns of track {self.track_id!r}: expected (N,) strictly increasing [ns]'
+                f'stamps_ns of track {self.track_id!r}: expected (N,) strictly increasing [ns], '
+                f'got shape {stamps.shape}; sort them, and leave repeated ones out'
+            )
+        if not isinstance(self.class_name, str):
+            raise ShapeError(
+                f"class_name of track {self.track_id!r}: expected text such as 'car', got "
+                f'{self.class_name!r}'
             )
         n = len(stamps)
         object.__setattr__(self, 'stamps_ns', stamps)
@@ -63,7 +78,7 @@ class Track:
             raise ShapeError(
                 f'points of track {self.track_id!r}: expected {n}, got {len(self.points)}'
             )
-        rows = [p if np.size(p) else np.zeros((0, 3)) for p in self.points]
+        rows = [p if len(p) else np.zeros((0, 3)) for p in self.points]
         points = tuple(checked(f'points[{i}]', p, (None, 3)) for i, p in enumerate(rows))
         object.__setattr__(self, 'points', points)
         for name, shape in (('sensor_origins', (n, 3)), ('scores', (n,))):
@@ -99,13 +114,13 @@ class RefinedTrack:
     covariances: Floats
 
 
-def refine(tracks: Sequence[Track], config: Config | None = None) -> list[RefinedTrack]:
+def refine(tracks: Iterable[Track], config: Config | None = None) -> list[RefinedTrack]:
     """
     Refine whole tracks; the same core, and the same boxes, as node and recordings get.
 
     Parameters
     ----------
-    tracks : sequence of Track
+    tracks : iterable of Track
         Objects over time in one fixed frame. Tracks that share a stamp share its sweep and its
         sensor: they are fitted knowing each other's boxes.
     config : Config, optional
@@ -121,12 +136,16 @@ def refine(tracks: Sequence[Track], config: Config | None = None) -> list[Refine
     ------
     ShapeError
         If a track has no valid box at all, or two tracks the same id.
+    ConfigError
+        If `config` is no Config.
 
     """
-    config = config or Config()
+    tracks, config = list(tracks), Config() if config is None else config
+    if not isinstance(config, Config):
+        raise ConfigError(f'config: expected a Config, got {config!r}; see Config.from_dict')
     names = [track.track_id for track in tracks]
     if len(set(names)) < len(names):
-        raise ShapeError(f'tracks: expected different track ids, got {sorted(names)}')
+        raise ShapeError(f'tracks: expected different track ids, got {sorted(map(str, names))}')
     at: dict[int, list[tuple[int, int]]] = {}
     for index, track in enumerate(tracks):
         for row, stamp_ns in enumerate(track.stamps_ns):

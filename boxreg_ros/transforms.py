@@ -337,6 +337,11 @@ def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> Box
     return replace(boxes, frame_id=frame_id, boxes=moved)
 
 
+def wrap(angles: Floats) -> Floats:
+    """Return `angles` in [-pi, pi) [rad]."""
+    return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
+
+
 def _name(frame_id: str) -> str:
     """Return a frame's name as tf2 spells it: ROS 1 put a slash before it."""
     return frame_id.lstrip('/')

@@ -293,6 +293,23 @@ def test_after_a_gap_tracks_begin_anew():
     assert live.counts['short_track'] == 0
 
 
+def test_a_pause_of_playback_changes_nothing_after_it():
+    finals = []
+    for is_paused in (False, True):
+        live = Live()
+        drive = Drive(sweeps=16)
+        first, second = Drive(sweeps=16), Drive(sweeps=16)
+        limit = drive.stamps[8]
+        first.items = [item for item in drive.items if item[1] < limit]
+        second.items = [item for item in drive.items if item[1] >= limit]
+        out = live.feed(first)
+        out += live.flush() if is_paused else []
+        out += live.feed(second) + live.flush()
+        finals.append([item.refined.boxes.boxes for item in out if item.is_final][8:])
+    assert len(finals[0]) == 8
+    np.testing.assert_array_equal(*finals)
+
+
 def test_silence_ends_what_is_held():
     live = Live()
     out = live.feed(Drive(sweeps=6), now=10.0)

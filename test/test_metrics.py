@@ -2,7 +2,8 @@
 
 from boxreg_ros.errors import ShapeError
 from boxreg_ros.evaluate import pose_errors
-from boxreg_ros.metrics import iou_3d, iou_bev, wrap
+from boxreg_ros.metrics import iou_3d, iou_bev
+from boxreg_ros.transforms import wrap
 import numpy as np
 import pytest
 from scipy.optimize import linprog

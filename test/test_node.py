@@ -7,6 +7,7 @@ import sys
 from threading import Event, Thread
 import time
 
+from boxreg_ros.boxreg_node import import_message
 from boxreg_ros.calibrate import calibrated, GAPS, Measured, write_settings
 from boxreg_ros.config import Config, settings
 from boxreg_ros.diagnostics import Health
@@ -250,6 +251,60 @@ def test_boxes_of_another_type_than_before_are_told(graph):
     assert ended_cleanly(node)
 
 
+def test_best_effort_boxes_are_heard_whenever_their_publisher_comes(graph, tmp_path):
+    """Which QoS fits is settled when a node subscribes, and then nobody publishes yet."""
+    records = records_of(Drive(sweeps=4).write(tmp_path / 'drive'))
+    publishers_for(graph, [record for record in records if record.topic != '/boxes'])
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    node = graph.start(*RELIABLE, *QUICK, '-p', f'boxes_type:={DETECTIONS}')
+    graph.wait(lambda: graph.node.count_subscribers('/boxes') > 0, 'a subscription')
+    graph.publisher(DETECTIONS, '/boxes', is_reliable=False)
+    graph.wait_until_connected()
+    play(graph, records, early)
+    assert len(early) == 4
+    assert ended_cleanly(node)
+    assert 'qos_incompatible' not in node.output()
+
+
+def test_what_waited_for_transforms_is_not_the_solvers_fault(graph, tmp_path):
+    # All clouds become ready at once, when the transforms come, and take longer to be solved than
+    # `backlog`; boxes come before the first cloud, by which the fixed frame is found.
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    options = ['transform_timeout:=60.0', 'queue:=100', 'backlog:=0.02']
+    node = graph.start(*RELIABLE, *DEEP, *[part for text in options for part in ('-p', text)])
+    graph.wait_until_connected()
+    moving = [record for record in records if record.topic == '/tf']
+    others = [record for record in records if record.topic != '/tf']
+    others.sort(key=lambda record: record.topic)  # boxes before points
+    play(graph, others)
+    deadline = time.monotonic() + 5.0
+    while time.monotonic() < deadline:
+        graph.executor.spin_once(timeout_sec=0.02)
+    assert not early
+    play(graph, moving)
+    values = all_published(graph, early)
+    assert int(values['refined']) > 50
+    assert not {'points_queue_full', 'boxes_queue_full', 'no_transform'} & values.keys()
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+
+
+def test_markers_leave_with_an_array_without_boxes(graph, tmp_path):
+    """Markers carry the stamp: an empty array of them has none."""
+    records = records_of(Drive(sweeps=4, boxes='markers').write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(MARKERS, '/refined_boxes')
+    shown = graph.collect(MARKERS, '/refined_markers')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'max_gap:=1000.0')  # else they leave after a while
+    graph.wait_until_connected()
+    play(graph, records, early)
+    graph.wait(lambda: len(shown) == 4, 'markers')
+    graph.publishers['/boxes'].publish(import_message(MARKERS)())
+    graph.wait(lambda: len(shown) == 5, 'no markers')
+    assert [m.action for m in shown[-1].markers] == [3]
+    assert ended_cleanly(node)
+
+
 DEEP = tuple(
     part
     for name in ('points', 'boxes')
@@ -444,6 +499,8 @@ def test_markers_stay_with_their_track():
     }
     assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
     assert board.is_showing and board.clear() and not board.is_showing
+    given.boxes[1, 4] = 0.0  # nor this
+    assert not board.update(given, refined_of(given, KEPT, KEPT)).markers
 
 
 def test_health_tells_the_worst_of_the_last_period():
@@ -457,6 +514,12 @@ def test_health_tells_the_worst_of_the_last_period():
     assert values['latency median [ms]'] == '50.0'
     assert values['fixed_frame'] == 'odom'
     assert health.status('node', {}).level == DiagnosticStatus.WARN  # nothing more came
+    health.count('no_sweep', 3)
+    health.count('boxes_received')
+    status = health.status('node', {})  # its remedy would lead astray
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.message == 'no box was refined; nothing received on points'
+    health.count('points_received')
     health.set_counts({'no_sweep': 3, 'refined': 5})
     status = health.status('node', {})
     assert status.level == DiagnosticStatus.WARN
@@ -491,6 +554,31 @@ def test_without_ros_the_remedy_is_told():
     assert process.returncode == 1
     (line,) = process.stderr.splitlines()
     assert 'rclpy' in line and 'boxreg_ros[ros]' in line
+
+
+SIGNAL_IN_DESTRUCTOR = """
+import os, signal, sys
+class Last:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == 'rclpy.executors':
+            sys.meta_path.remove(self)
+            Last()
+sys.meta_path.insert(0, Finder())
+from boxreg_ros.node import main
+sys.exit(main())
+"""
+
+
+def test_a_signal_within_a_destructor_ends_it_too():
+    """Imports are full of them; what is raised in one is lost."""
+    process = subprocess.run(
+        [sys.executable, '-c', SIGNAL_IN_DESTRUCTOR], cwd=ROOT, capture_output=True, timeout=60,
+        text=True,
+    )  # fmt: skip
+    assert (process.returncode, process.stdout + process.stderr) == (0, '')
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

@@ -3,14 +3,16 @@
 from dataclasses import replace
 
 from boxreg_ros import Config, refine, registration, Track, window
-from boxreg_ros.errors import ShapeError
+from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.evaluate import pose_errors
-from boxreg_ros.metrics import iou_3d, wrap
+from boxreg_ros.metrics import iou_3d
 from boxreg_ros.simulate import simulate
+from boxreg_ros.transforms import wrap
 import numpy as np
 import pytest
 from scenes import drive, stamps, track_of
 from scipy.spatial.transform import Rotation
+import torch
 
 ESTIMATES = ['early', 'final', 'track']
 each_estimate = pytest.mark.parametrize('estimate', ESTIMATES)
@@ -78,6 +80,28 @@ def test_boxes_come_closer_to_the_truth(estimate, motion):
         assert set(refined.status[begun(estimate) :]) == {'refined'}
     before, after = np.mean(missing, axis=0)
     assert after < (2 / 3 if estimate == 'early' else 1 / 2) * before
+
+
+def braking(n=40, speed=14.0, brake=8.0, start=1.5):
+    """Return true boxes of a car that comes to a stand, as hard as a car can."""
+    truth, t = drive(n, speed=0.0, turn=0.0, start=(-18.0, 5.0, 0.0)), 0.1 * np.arange(n)
+    late = (t - start).clip(0, speed / brake)
+    truth[:, 0] += speed * (np.minimum(t, start) + late) - brake * late**2 / 2
+    return truth
+
+
+@pytest.mark.parametrize('estimate', ['final', 'track'])
+def test_hard_braking_is_followed(estimate):
+    # Whoever is expected to change speed by 1.5 m/s^2 is off by 6.5 * 0.9^2 / 2 = 2.6 m at the end
+    # of a window of 0.9 s. The points must win; boxes this good must not get worse on the whole.
+    missing = []
+    for seed in range(3):
+        track, truth = a_track(seed, truth=braking(), position=0.05, heading=0.01)
+        refined = only(track, Config(estimate=estimate))
+        assert np.abs(refined.boxes - truth)[:, 0].max() < 0.5
+        missing.append([1 - iou_3d(boxes, truth).mean() for boxes in (track.boxes, refined.boxes)])
+    before, after = np.mean(missing, axis=0)
+    assert after < before
 
 
 def test_a_parked_object_rests():
@@ -231,6 +255,38 @@ def test_points_that_are_not_numbers_are_left_out():
     points = [np.r_[p, [[np.nan, 0, 0], [0, np.inf, 0], [-np.inf] * 3]] for p in track.points]
     known = only(track)
     np.testing.assert_array_equal(only(replace(track, points=points)).boxes, known.boxes)
+
+
+@pytest.mark.parametrize('unit', ['us', 'ns'])
+def test_stamps_may_be_times_of_any_unit(unit):
+    track, _ = a_track()
+    times = track.stamps_ns.astype('datetime64[ns]').astype(f'datetime64[{unit}]')
+    np.testing.assert_array_equal(replace(track, stamps_ns=times).stamps_ns, track.stamps_ns)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        ({'stamps_ns': np.arange(12) * 0.1}, ['stamps_ns', 'float64', '1e9']),
+        ({'stamps_ns': [None] * 12}, ['stamps_ns', 'object']),
+        ({'class_name': None}, ['class_name', 'None']),
+        ({'boxes': torch.zeros(12, 9, requires_grad=True)}, ['boxes', 'grad']),
+    ],
+)
+def test_what_is_no_track_is_refused(changes, words):
+    with pytest.raises(ShapeError) as error:
+        replace(a_track()[0], **changes)
+    assert all(word in str(error.value) for word in words)
+
+
+def test_settings_must_be_a_config_and_tracks_may_come_one_by_one():
+    track, _ = a_track()
+    with pytest.raises(ConfigError, match=r'^config: .*from_dict$'):
+        refine([track], {'window': 5})
+    (found,), (known,) = refine(t for t in [track]), refine([track])
+    np.testing.assert_array_equal(found.boxes, known.boxes)
+    empty = replace(track, points=[torch.zeros(0)] * 12)
+    assert [len(points) for points in empty.points] == [0] * 12
 
 
 def test_what_cannot_be_refined_is_refused():

@@ -111,6 +111,17 @@ def test_intake_gives_ids_where_they_are_wanted_and_says_so():
     assert intake.facts == {'ids': 'by association', 'associated_tracks': 1}
 
 
+def test_intake_begins_anew_with_new_ids_and_takes_another_gap():
+    intake = Intake(Convention(associate=True), Config(max_gap=0.5))
+    first, later = array_of(START, (0, 0, CAR)), array_of(START + 8 * 10**8, (0, 0, CAR))
+    assert intake.take(first).track_ids == ('1',)
+    intake.change(Config(max_gap=1.0))
+    assert intake.take(later).track_ids == ('1',)
+    intake.begin(Config(max_gap=0.5))
+    assert intake.take(first).track_ids == ('2',)
+    assert intake.take(later).track_ids == ('3',)
+
+
 def test_ids_of_a_real_drive():
     """A drive past parked and moving cars, with the noise of a detector: no id changes."""
     path = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'kitti_raw_0001.npz'

@@ -1,6 +1,13 @@
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.structures import BoxArray, Sweep
-from boxreg_ros.transforms import boxes_to_frame, inverse, Rewind, sweep_to_frame, TransformTree
+from boxreg_ros.transforms import (
+    boxes_to_frame,
+    FRAMES,
+    inverse,
+    Rewind,
+    sweep_to_frame,
+    TransformTree,
+)
 import numpy as np
 import pytest
 from ros_messages import Messages
@@ -157,6 +164,17 @@ def test_old_samples_are_forgotten():
         tree.lookup('odom', 'base', 40 * S)
     tree.add_transforms([M.transform(10_000 * S, 'odom', 'base', (10_000, 0, 0))])
     assert tree.lookup('odom', 'base', 99 * S + S)[0, 3] == pytest.approx(100)
+
+
+def test_frames_of_objects_are_forgotten_those_of_the_car_are_not():
+    """Some trackers give every object a frame of its own: thousands in an hour."""
+    tree = tree_of(static=[(0, 'base', 'lidar', (0, 0, 2))])
+    for k in range(10 * FRAMES):
+        tree.add_transforms([M.transform(k * S, 'odom', 'base', (k, 0, 0))])
+        tree.add_transforms([M.transform(k * S, 'odom', f'object {k}')])
+        assert tree.lookup('odom', 'lidar', k * S)[0, 3] == k
+    assert len(tree.frames()) < 2 * FRAMES
+    assert tree.connects('odom', f'object {k}')
 
 
 def test_clear_forgets_all():
