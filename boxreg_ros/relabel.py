@@ -62,7 +62,7 @@ from boxreg_ros.structures import (
     Sweep,
     YAW,
 )
-from boxreg_ros.transforms import boxes_to_frame, sweep_to_frame, TransformTree
+from boxreg_ros.transforms import boxes_to_frame, Rewind, sweep_to_frame, TransformTree
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import yaml
@@ -212,6 +212,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     """
     clock = _Clock()
     registrar = BoxRegistrar(request.config)
+    feed = _Feed(registrar)
     names = dict.fromkeys(('csv', *request.formats))
     recording = request.recording()
     with recording, whole_folder(out, request.inputs()) as folder:
@@ -239,7 +240,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                     progress(arrival.seconds, passes * arrivals.seconds)
                 sink.expect(arrival)
                 with clock('registrar'):
-                    ready = _add(registrar, arrival.moved)
+                    ready = feed.add(arrival.moved)
                 sink.take(ready)
             with clock('registrar'):
                 ready = registrar.flush()
@@ -247,6 +248,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         if spool is not None:
             spool.remove()
         summary = _summary(request, recording, arrivals, registrar.counts, sink)
+        summary['time_jumps'] = feed.time_jumps
         summary['seconds'] = clock.seconds()
         if changes is not None:
             with clock('report'):
@@ -464,6 +466,29 @@ class _Arrivals:
         return pose_of(self._tree, self.fixed_frame, frame, stamp_ns)
 
 
+class _Feed:
+    """Feeds the registrar, afresh where stamps start again, as the node does."""
+
+    def __init__(self, registrar: BoxRegistrar) -> None:
+        self._registrar = registrar
+        self._rewinds = Rewind(), Rewind()
+        self.time_jumps = 0
+
+    def add(self, item: Sweep | BoxArray | None) -> list[RefinedBoxes]:
+        """Add what has a transform; return what has become ready."""
+        if item is None:
+            return []
+        ready: list[RefinedBoxes] = []
+        if self._rewinds[isinstance(item, BoxArray)].happened(item.stamp_ns):
+            self.time_jumps += 1
+            self._rewinds = Rewind(), Rewind()
+            ready = self._registrar.flush()
+            self._registrar.reset()
+        if isinstance(item, Sweep):
+            return ready + self._registrar.add_sweep(item)
+        return ready + self._registrar.add_boxes(item)
+
+
 class _Sink:
     """Brings results into the order of stamps, each box array once, and has them written."""
 
@@ -582,12 +607,6 @@ class _Sink:
             )  # fmt: skip
             for writer in self._writers.values():
                 writer.write(frame)
-
-
-def _add(registrar: BoxRegistrar, item: Sweep | BoxArray | None) -> list[RefinedBoxes]:
-    if item is None:
-        return []
-    return registrar.add_sweep(item) if isinstance(item, Sweep) else registrar.add_boxes(item)
 
 
 def _again(request: Request, progress: Progress | None) -> Iterator[Sweep | BoxArray]:

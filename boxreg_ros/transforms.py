@@ -261,7 +261,8 @@ class _Edge:
                 cause = 'no pose has come since time went back; look whether its publisher goes on'
             raise TransformUnavailable(f'transform {self.parent} -> {self.child}: {cause}')
         outside = max(stamps[0] - stamp_ns, stamp_ns - stamps[-1])
-        if not self.is_static and outside > max_extrapolation_ns:
+        # A motion is carried on from two samples: a single one tells no speed.
+        if not self.is_static and outside > max_extrapolation_ns * (len(stamps) > 1):
             raise TransformUnavailable(
                 f'transform {self.parent} -> {self.child} is known from {stamps[0]} to '
                 f'{stamps[-1]} ns: expected to cover {stamp_ns} ns within '

@@ -91,7 +91,9 @@ def test_motion_is_carried_on_a_little_and_no_farther():
             tree.lookup('odom', 'base', stamp)
     patient = TransformTree(max_extrapolation=1.0)
     patient.add_transforms([M.transform(0, 'odom', 'base', (3, 0, 0))])
-    assert patient.lookup('odom', 'base', S)[0, 3] == 3.0, 'one sample says nothing of motion'
+    assert patient.lookup('odom', 'base', 0)[0, 3] == 3.0
+    with pytest.raises(TransformUnavailable, match='odom -> base is known from 0 to 0'):
+        patient.lookup('odom', 'base', 1)  # one sample says nothing of motion
 
 
 def test_covers_tells_known_from_carried_on():
