@@ -35,6 +35,7 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.objective import EXTENT, State
 from boxreg_ros.recording import Recording
 from boxreg_ros.registration import expected_shared
+from boxreg_ros.results import spare_file
 from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import Floats, LENGTH, ROLL
 from boxreg_ros.window import batches, stack, Window
@@ -277,6 +278,8 @@ def run(args: argparse.Namespace) -> int:
             f'output {str(args.output)!r}: expected a folder that is there, got '
             f'{str(args.output.parent)!r}; make it first'
         )
+    if args.output:  # that of --config may be measured anew
+        spare_file(args.output, [*args.recordings, args.truth])
     truth = BoxTable.read(args.truth)
     recording = Recording(
         args.recordings, args.points, args.boxes, args.odometry, convention=convention_from(args)
