@@ -238,7 +238,8 @@ def write_settings(path: Path, values: Mapping[str, Any], origin: str) -> None:
             inner = inner.setdefault(group, {})
         inner[last] = value
     text = yaml.safe_dump({'/**': {'ros__parameters': nested}}, sort_keys=False)
-    path.write_text(f'# boxreg calibrate, {origin}\n{text}', encoding='utf-8')
+    text = f'# boxreg calibrate, {origin}\n{text}'
+    path.write_text(text, encoding='utf-8', errors='backslashreplace')  # names of files in origin
 
 
 def table(measured: Mapping[str, Measured], config: Config) -> list[str]:

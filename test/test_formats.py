@@ -18,6 +18,8 @@ import gc
 from itertools import product
 import json
 from math import atan2, cos, pi, radians, sin, sqrt
+from pathlib import Path
+import shutil
 import tracemalloc
 from xml.etree import ElementTree
 
@@ -389,7 +391,7 @@ def test_a_track_may_change_its_class(tmp_path, name):
 
 @pytest.mark.parametrize('name', OURS)
 def test_names_come_back_as_they_were(tmp_path, name):
-    names = ('a--b', 'a---', '-', '<i> & co', '&amp;', '&#45;', 'a - -b')
+    names = ('a--b', 'a---', '-', '<i> & co', '&amp;', '&#45;', 'a - -b', 'a\x01\x1bb')
     frames = [frame_of([IN_FIXED] * len(names), names)]
     _, folder = written(name, tmp_path, frames)
     (frame,) = frames_of(name, folder)
@@ -441,6 +443,44 @@ def test_broken_files_are_told_in_a_line(tmp_path, name):
 def test_what_is_not_there_is_told_in_a_line(tmp_path, name):
     with pytest.raises((RecordingError, ConfigError), match='nowhere'):
         list(frames_of(name, tmp_path / 'nowhere'))
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_what_is_not_in_this_folder_is_told_in_a_line(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((RecordingError, ConfigError), match='nowhere'):
+        list(frames_of(name, Path('nowhere')))
+
+
+@pytest.mark.parametrize(
+    ('name', 'inside'),
+    [('kitti', 'label_02'), ('waymo', 'lidar_box'), ('nuscenes', 'v1.0-boxreg'), ('t4', '.')],
+)
+def test_labels_beside_the_working_folder(tmp_path, monkeypatch, name, inside):
+    _, folder = written(name, tmp_path)
+    monkeypatch.chdir(folder / inside)
+    path = next(Path().glob('*.[tp][xa][tr]*'), Path())  # a label file; tables are a folder
+    (frame,) = frames_of(name, path)
+    assert (frame.fixed_frame, frame.sensor_frame) == ('odom', 'lidar')
+    np.testing.assert_allclose(frame.T_fixed_sensor, T_FIXED_SENSOR, atol=1e-9)
+
+
+def test_one_of_several_sequences_of_kitti_is_named(tmp_path):
+    _, folder = written('kitti', tmp_path)
+    for part in ('label_02', 'calib'):
+        shutil.copy(folder / part / '0000.txt', folder / part / '0001.txt')
+    with pytest.raises(RecordingError, match=r'expected one sequence .*, got 2; name the file'):
+        list(frames_of('kitti', folder))
+    assert len(list(frames_of('kitti', folder / 'label_02' / '0001.txt'))) == 1
+
+
+def test_recordings_have_names_that_can_be_written(tmp_path, monkeypatch):
+    (tmp_path / 'drive').mkdir()
+    monkeypatch.chdir(tmp_path / 'drive')
+    link = tmp_path / 'link'
+    link.symlink_to('drive')
+    paths = (Path(), Path('..', 'drive', '.'), link, Path('caf\udce9.mcap'))
+    assert Provenance.of(paths).recordings == ('drive', 'drive', 'link', 'caf\\udce9.mcap')
 
 
 def test_timestamps_as_kitti_has_them(tmp_path):
