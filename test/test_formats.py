@@ -474,6 +474,15 @@ def test_one_of_several_sequences_of_kitti_is_named(tmp_path):
     assert len(list(frames_of('kitti', folder / 'label_02' / '0001.txt'))) == 1
 
 
+@pytest.mark.parametrize('name', OURS)
+def test_folders_may_have_names_that_are_not_utf8(tmp_path, name):
+    out = tmp_path / 'caf\udce9'
+    out.mkdir()
+    _, folder = written(name, out, [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))],
+                        with_points=True)  # fmt: skip
+    assert len(list(frames_of(name, folder))) == 1
+
+
 def test_recordings_have_names_that_can_be_written(tmp_path, monkeypatch):
     (tmp_path / 'drive').mkdir()
     monkeypatch.chdir(tmp_path / 'drive')
