@@ -14,6 +14,7 @@ As a quaternion x y z w, half angles multiplied: (c15 s30, s15 c30, -s15 s30, c1
 """
 
 from collections import Counter
+from dataclasses import replace
 import gc
 from itertools import product
 import json
@@ -23,6 +24,7 @@ import shutil
 import tracemalloc
 from xml.etree import ElementTree
 
+from boxreg_ros.boxtable import COLUMNS
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.labels import (
     arrow,
@@ -39,6 +41,8 @@ from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from boxreg_ros.transforms import inverse
 from consumers import consumer
 import numpy as np
+import pyarrow
+from pyarrow import parquet
 import pytest
 
 STAMP = 1_700_000_000_123_456_789
@@ -292,6 +296,47 @@ def test_parquet(tmp_path):
     np.testing.assert_allclose(np.reshape(row['covariance'], (6, 6)), COVARIANCE)
     origin = json.loads(table.schema.metadata[b'boxreg'])
     assert (origin['tool'], origin['config_hash']) == ('boxreg_ros', 'cafe')
+
+
+@pytest.mark.parametrize('unit', ['int64', 'uint64', 'timestamp[ns]', 'timestamp[ns, tz=UTC]'])
+def test_parquet_of_other_writers(tmp_path, unit):
+    """As pandas makes it of boxes.csv: ids are numbers, and what is missing is null."""
+    numbers = {name: [1.0, 2.0] for name in COLUMNS}
+    zone = 'UTC' if 'tz' in unit else None
+    kind = pyarrow.timestamp('ns', zone) if 'stamp' in unit else pyarrow.type_for_alias(unit)
+    table = numbers | {
+        'stamp_ns': pyarrow.array([STAMP, STAMP], kind), 'frame_id': ['odom'] * 2,
+        'track_id': [7, 8], 'class_name': [None, None], 'status': ['truth', None],
+        'num_points': [None, 3.0], 'score': [None, 0.5],
+    }  # fmt: skip
+    path = tmp_path / 'boxes.parquet'
+    parquet.write_table(pyarrow.table(table), path)
+    (frame,) = frames_of('parquet', tmp_path)
+    found, boxes = frame.refined, frame.refined.boxes
+    assert boxes.stamp_ns == STAMP
+    assert (boxes.track_ids, boxes.class_names) == (('7', '8'), ('', ''))
+    assert (found.status, found.num_points.tolist()) == (('truth', 'input'), [0, 3])
+    np.testing.assert_array_equal(boxes.scores, [np.nan, 0.5])
+    for name in ('openlabel', 'tracklets', 'waymo', 'argoverse2', 'datumaro', 'kitti'):
+        placed = replace(frame, sensor_frame='odom', T_fixed_sensor=np.eye(4))
+        written(name, tmp_path, [placed])
+
+
+@pytest.mark.parametrize(
+    ('name', 'values', 'message'),
+    [
+        ('stamp_ns', [1.7e18], 'column stamp_ns: expected whole nanoseconds .* got double'),
+        ('stamp_ns', ['1700'], 'column stamp_ns: .* got string'),
+        ('stamp_ns', pyarrow.array([None], 'int64'), 'got int64, 1 of 1 empty'),
+        ('num_points', [1.5], 'column num_points: expected int64, got double'),
+        ('x', ['far'], 'column x: expected double, got string'),
+    ],
+)
+def test_parquet_that_is_no_table_of_boxes(tmp_path, name, values, message):
+    table = {key: [1] for key in COLUMNS} | {name: values}
+    parquet.write_table(pyarrow.table(table), tmp_path / 'boxes.parquet')
+    with pytest.raises(RecordingError, match=message):
+        list(frames_of('parquet', tmp_path))
 
 
 def test_openlabel_holds_the_pose_of_the_sensor(tmp_path):

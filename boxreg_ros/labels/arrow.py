@@ -69,8 +69,13 @@ class Table:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Return all rows of a Parquet or Feather file, and raise as `read_table` does."""
+    return list(read_table(path).to_pylist())
+
+
+def read_table(path: Path) -> Any:
     """
-    Return all rows of a Parquet or Feather file.
+    Return the pyarrow table of a Parquet or Feather file.
 
     Raises
     ------
@@ -84,8 +89,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     try:
         with path.open('rb') as file:
             if path.suffix == '.parquet':
-                return list(parquet.ParquetFile(file).read().to_pylist())
-            return list(feather.read_table(file).to_pylist())
+                return parquet.ParquetFile(file).read()
+            return feather.read_table(file)
     except (OSError, pyarrow.ArrowException) as error:
         text = ' '.join(str(error).split())
         raise RecordingError(f'{path}: cannot be read: {text}') from None
