@@ -85,10 +85,11 @@ def test_resume_does_what_is_left_to_do(tmp_path, capsys):
 def test_resume_where_results_lie_in_the_recording_or_are_gone(tmp_path, capsys):
     folder = Drive(sweeps=3).write(tmp_path / 'drive', 'sqlite3')
     out = folder / 'out'
-    command = ['relabel', folder, '-o', out, *QUICK, '--formats', 'openlabel,mcap', '--resume']
+    formats = 'openlabel,mcap'
+    command = ['relabel', folder, '-o', out, *QUICK, '--formats', formats, '--report', '--resume']
     assert ' boxes in' in boxreg(capsys, *command)[1]
     assert 'already there' in boxreg(capsys, *command)[1]
-    for name in ('boxes.csv', 'overlay.mcap'):
+    for name in ('boxes.csv', 'overlay.mcap', 'report.html', 'openlabel/labels.json'):
         (out / name).unlink()
         assert ' boxes in' in boxreg(capsys, *command)[1], f'without {name}'
 

@@ -30,6 +30,7 @@ from boxreg_ros.labels import (
     arrow,
     FORMATS,
     frames_of,
+    is_written,
     LabelFrame,
     module_of,
     Options,
@@ -472,6 +473,16 @@ def test_boxes_without_identity_stay_apart(tmp_path, name):
 def test_nothing_is_something_to_write(tmp_path, name):
     _, folder = written(name, tmp_path, [])
     assert list(frames_of(name, folder)) == []
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_what_is_gone_is_missed(tmp_path, name):
+    _, folder = written(name, tmp_path)
+    assert is_written(name, tmp_path)
+    for path in folder.rglob('*'):
+        if (path.is_file() and path.parent != tmp_path) or path.name == 'boxes.csv':
+            path.unlink()
+    assert not is_written(name, tmp_path)
 
 
 @pytest.mark.parametrize('name', OURS)

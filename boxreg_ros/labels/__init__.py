@@ -288,9 +288,14 @@ def writer_for(
     return writer
 
 
-def place_of(name: str) -> str:
-    """Return what a format's writer leaves in the folder of results: its own, or one file."""
-    return str(module_of(name).FORMAT.files.split(',')[0]) if name in BESIDE_RESULTS else name
+def is_written(name: str, out: Path) -> bool:
+    """Return whether what a format's writer leaves first, a file or a folder of some, is there."""
+    first = (
+        out / ('' if name in BESIDE_RESULTS else name) / module_of(name).FORMAT.files.split(',')[0]
+    )
+    if 'STAMP' in first.name:  # a file per frame
+        first = first.parent
+    return first.is_file() or (first.is_dir() and any(first.iterdir()))
 
 
 def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
