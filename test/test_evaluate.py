@@ -252,9 +252,9 @@ def test_true_boxes_that_are_none_are_left_out_and_told(tmp_path, capsys):
 def test_predictions_that_are_all_invalid_are_explained(tmp_path, capsys):
     truth = truth_table()
     truth.write(tmp_path / 'truth.csv')
-    replace(truth, boxes=truth.boxes + [np.inf, 0, 0, 0, 0, 0, 0, 0, 0]).write(
-        tmp_path / 'boxes.csv'
-    )
+    boxes = truth.boxes.copy()
+    boxes[:, 0] = np.inf
+    replace(truth, boxes=boxes).write(tmp_path / 'boxes.csv')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'car') == 0
     told = capsys.readouterr()
     assert 'all 10 predicted boxes of the stamp and the track of a true one are' in told.err
