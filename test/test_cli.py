@@ -196,7 +196,8 @@ def test_interrupt_leaves_nothing(tmp_path, number):
 def test_a_hangup_does_not_end_what_is_run_by_nohup(tmp_path):
     recording = Drive(sweeps=20).write(tmp_path / 'drive')
     command = ['nohup', sys.executable, '-m', 'boxreg_ros.cli', 'relabel', recording]
-    process = subprocess.Popen([*command, '-o', tmp_path / 'out', *QUICK], cwd=ROOT)
+    silent = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
+    process = subprocess.Popen([*command, '-o', tmp_path / 'out', *QUICK], cwd=ROOT, **silent)
     deadline = time.monotonic() + 60
     while not any(tmp_path.glob('.out.*')) and time.monotonic() < deadline:
         time.sleep(0.01)
