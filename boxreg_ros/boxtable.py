@@ -127,9 +127,11 @@ class BoxTable:
             values = []
             for line, row in numbered:
                 try:
-                    values.append(kind(row[name] or empty))
-                except ValueError:
+                    value = kind(row[name] or empty)
+                    values.append(np.int64(value) if kind is int else value)
+                except (ValueError, OverflowError) as error:
                     what = 'a whole number' if kind is int else 'a number'
+                    what += ' of 64 bits' * isinstance(error, OverflowError)
                     raise RecordingError(
                         f'{path}: line {line}, column {name}: expected {what}, got '
                         f'{row[name] or "nothing"}'

@@ -35,6 +35,7 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.objective import EXTENT, State
 from boxreg_ros.recording import Recording
 from boxreg_ros.registration import expected_shared
+from boxreg_ros.results import spare_file
 from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import Floats, LENGTH, ROLL
 from boxreg_ros.window import batches, stack, Window
@@ -237,7 +238,8 @@ def write_settings(path: Path, values: Mapping[str, Any], origin: str) -> None:
             inner = inner.setdefault(group, {})
         inner[last] = value
     text = yaml.safe_dump({'/**': {'ros__parameters': nested}}, sort_keys=False)
-    path.write_text(f'# boxreg calibrate, {origin}\n{text}', encoding='utf-8')
+    text = f'# boxreg calibrate, {origin}\n{text}'
+    path.write_text(text, encoding='utf-8', errors='backslashreplace')  # names of files in origin
 
 
 def table(measured: Mapping[str, Measured], config: Config) -> list[str]:
@@ -277,6 +279,8 @@ def run(args: argparse.Namespace) -> int:
             f'output {str(args.output)!r}: expected a folder that is there, got '
             f'{str(args.output.parent)!r}; make it first'
         )
+    if args.output:  # that of --config may be measured anew
+        spare_file(args.output, [*args.recordings, args.truth])
     truth = BoxTable.read(args.truth)
     recording = Recording(
         args.recordings, args.points, args.boxes, args.odometry, convention=convention_from(args)

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
+from io import TextIOWrapper
 import os
+import signal
 import sys
+from threading import current_thread, main_thread
+from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import BoxregError, ConfigError
@@ -21,21 +26,30 @@ COMMANDS = {
     'bench': 'measure accuracy and speed',
     'node': 'run the live node (where there is no ros2 run)',
 }
-DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, WRONG_USAGE, SIGNALLED = 0, 1, 2, 128
+ENDING = signal.SIGTERM, signal.SIGHUP
+
+
+class _Ended(BaseException):
+    """One of `ENDING` came."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Run a subcommand and return the exit status.
 
-    0 done, 1 the data or the run failed, 2 wrong usage, 130 interrupted; failures are told in
-    one line on stderr.
+    0 done, 1 the data or the run failed, 2 wrong usage, 128 and the number of the signal that
+    ended it; failures are told in one line on stderr.
 
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     is_debug = '--debug' in arguments
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # names of files may be more than it can show
+            stream.reconfigure(errors='backslashreplace')
     try:
-        status = _run(arguments)
+        with _signals(arguments):
+            status = _run(arguments)
         sys.stdout.flush()
         return status
     except BrokenPipeError:
@@ -43,7 +57,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except KeyboardInterrupt:
-        return _fail('interrupted; nothing was written', INTERRUPTED)
+        return _fail('interrupted; nothing was written', SIGNALLED + signal.SIGINT)
+    except _Ended as end:
+        name = signal.Signals(end.args[0]).name
+        return _fail(f'ended by {name}; nothing was written', SIGNALLED + end.args[0])
     except (BoxregError, OSError) as error:
         if is_debug:
             raise
@@ -53,6 +70,28 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         text = f'{type(error).__name__}: {error}'
         return _fail(f'unexpected {text} (--debug shows where)', FAILED)
+
+
+@contextmanager
+def _signals(arguments: list[str]) -> Iterator[None]:
+    """Let the signals of `ENDING` end a run as Ctrl-C does; those of a node are its own matter."""
+
+    def end(number: int, _: Any) -> None:
+        for one in ours:  # what is cleaned up after the first is not left to a second
+            signal.signal(one, signal.SIG_IGN)
+        raise _Ended(number)
+
+    before = {one: signal.getsignal(one) for one in ENDING}
+    ours = [one for one, handler in before.items() if handler == signal.SIG_DFL]  # no nohup
+    if arguments[:1] == ['node'] or current_thread() is not main_thread():
+        ours = []
+    try:
+        for one in ours:
+            signal.signal(one, end)
+        yield
+    finally:
+        for one in ours:
+            signal.signal(one, before[one])
 
 
 def _run(arguments: list[str]) -> int:
@@ -80,7 +119,8 @@ def parser(command: str | None) -> argparse.ArgumentParser:
 
 
 def _fail(message: str, status: int) -> int:
-    print(f'boxreg: {" ".join(message.split())}', file=sys.stderr)
+    with suppress(OSError):  # a terminal that is gone
+        print(f'boxreg: {" ".join(message.split())}', file=sys.stderr)
     return status
 
 

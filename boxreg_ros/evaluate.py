@@ -80,6 +80,8 @@ class Matches:
         The same of the true centre, to read `jitter` against.
     unmatched : int
         Predictions whose stamp and track are not in the truth at all.
+    invalid : int
+        True boxes left out of scope: NaN, or an extent that is not positive.
 
     """
 
@@ -98,6 +100,7 @@ class Matches:
     turn_jitter: Floats
     true_jitter: Floats
     unmatched: int
+    invalid: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +180,8 @@ def match(
         stamp, track_id = Counter(true_keys).most_common(1)[0][0]
         raise RecordingError(f'true boxes: track {track_id!r} comes twice at stamp {stamp}')
     in_class = np.array([has_word(name, classes) for name in truth.class_names], bool)
-    kept = np.flatnonzero(in_class & (truth.num_points >= min_points))
+    is_valid = np.isfinite(truth.boxes).all(axis=1) & (truth.boxes[:, EXTENT] > 0).all(axis=1)
+    kept = np.flatnonzero(is_valid & in_class & (truth.num_points >= min_points))
     finite = np.isfinite(predicted.boxes).all(axis=1)
     rows = np.array([row_of.get(key, -1) for key in true_keys], np.int64)[kept]
     matched = (rows >= 0) & np.append(finite, False)[rows]
@@ -208,6 +212,7 @@ def match(
         turn_jitter=spread(_second_difference(stamps, tracks, a[:, [YAW]], is_angle=True), np.nan),
         true_jitter=spread(_second_difference(stamps, tracks, b[:, :3]), np.nan),
         unmatched=len(row_of.keys() - set(true_keys)),
+        invalid=int((~is_valid).sum()),
     )
 
 
@@ -314,13 +319,19 @@ def run(args: argparse.Namespace) -> int:
         predicted = BoxTable.from_arrays(input_boxes(source, args.fixed_frame, **topics))
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes)
+    if matches.invalid:
+        print(
+            f'boxreg: {matches.invalid} of {len(truth.boxes)} true boxes are left out: NaN, or an '
+            f'extent that is not positive',
+            file=sys.stderr,
+        )
     if not len(matches.is_matched):
         raise RecordingError(
             f'{args.truth}: none of {len(truth.boxes)} true boxes is in scope; lower --min-points '
             f'or name other --classes; there are {", ".join(sorted(set(truth.class_names)))}'
         )
     if len(predicted.boxes) and not matches.is_matched.any():
-        print(f'boxreg: {_why_none_matches(predicted, truth)}', file=sys.stderr)
+        print(f'boxreg: {_why_none_matches(predicted, truth, matches)}', file=sys.stderr)
     overall, grouped = summarise(matches), groups(matches)
     if args.json:
         report = asdict(overall) | {
@@ -356,8 +367,14 @@ def _in_frame(tables: dict[str, BoxTable], frame_id: str) -> BoxTable:
     return found
 
 
-def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
+def _why_none_matches(predicted: BoxTable, truth: BoxTable, matches: Matches) -> str:
     """Return what stamps and tracks of two tables have in common."""
+    true_keys, keys = _keys(truth), set(_keys(predicted))
+    if invalid := sum(true_keys[row] in keys for row in matches.rows):
+        return (
+            f'all {invalid} predicted boxes of the stamp and the track of a true one are invalid: '
+            f'expected finite numbers and a quaternion other than 0 0 0 0'
+        )
     mine, true = predicted.stamps_ns, truth.stamps_ns
     stamps, tracks = np.intersect1d(mine, true), set(predicted.track_ids) & set(truth.track_ids)
     own, other = ([f'{x * 1e-9:.3f}' for x in (side.min(), side.max())] for side in (mine, true))

@@ -70,7 +70,8 @@ REASONS = {
     'no_sweep': Reason(
         'box',
         'no cloud within `tolerance` and `reach` of its stamp',
-        'copy the stamp of the cloud to its boxes, and see the counters of clouds',
+        'copy the stamp of the cloud to its boxes, and see the counters of clouds; raise `queue` '
+        'where boxes were recorded much later than their clouds, as in another bag',
     ),
     'sweep_late': Reason(
         'cloud', 'came after younger boxes had left', 'publish clouds in order and before boxes'

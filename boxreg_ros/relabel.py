@@ -39,11 +39,11 @@ from boxreg_ros.labelled import (
     pose_of,
 )
 from boxreg_ros.labels import (
+    is_written,
     LabelFrame,
     LabelWriter,
     module_of,
     Options,
-    place_of,
     Provenance,
     writer_for,
 )
@@ -752,7 +752,8 @@ def run(args: argparse.Namespace) -> int:
         args.resume
         and earlier
         and earlier['fingerprint'] == request.fingerprint()
-        and all((args.out / place_of(name)).exists() for name in ('csv', *request.formats))
+        and all(is_written(name, args.out) for name in ('csv', *request.formats))
+        and (not request.report or (args.out / REPORT).exists())
     ):
         print(f'{args.out}: already there, made from the same recording and settings')
         return 0

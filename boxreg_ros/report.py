@@ -22,6 +22,7 @@ from boxreg_ros.association import Pair, StampMatcher
 from boxreg_ros.changes import known, mean, median, TrackChanges
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.labels import absolute
 from boxreg_ros.metrics import EXTENT
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.sampling import CLEARANCE, crop
@@ -132,7 +133,7 @@ def write_report(
     page = environment.get_template(TEMPLATE.name).render(
         line=line,
         summary=summary,
-        names=[Path(name).name for name in summary['recordings']],
+        names=[absolute(Path(name)).name for name in summary['recordings']],
         warnings=_warnings(summary),
         shift=mean(np.linalg.norm(changes[:, :3], axis=1)),
         turn=np.degrees(mean(np.abs(changes[:, 3]))),
@@ -146,7 +147,8 @@ def write_report(
         count=len(tracks),
         shortest=SHORTEST,
     )
-    path.write_text(page, encoding='utf-8')
+    # Names of files need not be UTF-8.
+    path.write_text(page, encoding='utf-8', errors='backslashreplace')
 
 
 def chosen(tracks: Sequence[TrackChanges]) -> dict[str, str]:

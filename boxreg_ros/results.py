@@ -11,7 +11,7 @@ import shutil
 from typing import Any
 from uuid import uuid4
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import ConfigError, RecordingError
 
 SUMMARY = 'summary.json'
 
@@ -31,16 +31,35 @@ def spare(out: Path, inputs: Iterable[Path | None]) -> None:
 
     Raises
     ------
-    RecordingError
+    ConfigError
         If one of `inputs` is `out` or lies in it, links followed.
 
     """
     folder = out.resolve()
     for path in filter(None, inputs):
         if path.resolve().is_relative_to(folder):
-            raise RecordingError(
+            raise ConfigError(
                 f'output {str(out)!r}: expected a folder that no input is in, got one with '
                 f'{str(path)!r}, which would be replaced with it; choose another with -o'
+            )
+
+
+def spare_file(out: Path, inputs: Iterable[Path]) -> None:
+    """
+    Refuse to write a file over what it would be made from.
+
+    Raises
+    ------
+    ConfigError
+        If `out` is one of `inputs`, or in a folder that is one, links followed.
+
+    """
+    file = out.resolve()
+    for path in inputs:
+        if file.is_relative_to(path.resolve()):
+            raise ConfigError(
+                f'output {str(out)!r}: expected a file that is no input and in none, got one '
+                f'that would change {str(path)!r}; choose another with -o'
             )
 
 
@@ -51,8 +70,10 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
 
     Raises
     ------
+    ConfigError
+        If one of `inputs` is in `out`.
     RecordingError
-        If `out` exists and is not the result of an earlier run, or one of `inputs` is in it.
+        If `out` exists and is not the result of an earlier run.
 
     """
     spare(out, inputs)

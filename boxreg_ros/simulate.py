@@ -146,13 +146,15 @@ def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None)
     Raises
     ------
     ConfigError
-        For an unknown scenario, or fewer than one sweep.
+        For an unknown scenario, fewer than one sweep, or a seed below 0.
 
     """
     if scenario not in SCENARIOS:
         raise ConfigError(f'scenario: expected one of {", ".join(SCENARIOS)}, got {scenario!r}')
     if sweeps is not None and sweeps < 1:
         raise ConfigError(f'sweeps: expected 1 or more, got {sweeps}')
+    if seed < 0:
+        raise ConfigError(f'seed: expected 0 or more, got {seed}')
     return SCENARIOS[scenario](np.random.default_rng(seed), sweeps)
 
 
@@ -174,8 +176,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write a recording and its truth, and say what is in them."""
-    scene = simulate(args.scenario, args.seed, args.sweeps)
     truth = args.truth or args.output.with_name(f'{args.output.stem}_truth.csv')
+    if truth.resolve() == args.output.resolve():
+        raise ConfigError(
+            f'--truth {str(truth)!r}: expected a file beside the recording, got the recording '
+            f'itself; choose another'
+        )
+    scene = simulate(args.scenario, args.seed, args.sweeps)
     intensities = [np.where(o == ROAD, 10, 40 + 13 * o % 60) for o in scene.owners]
     write_recording(
         args.output, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, 'odom',

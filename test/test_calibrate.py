@@ -290,3 +290,20 @@ def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
     assert 'are stamps and frame those of the recording?' in capsys.readouterr().err
     assert cli.main([*arguments, '-o', str(tmp_path / 'nowhere' / 'rule.yaml')]) == 2
     assert 'make it first' in capsys.readouterr().err, 'before any work'
+
+
+@pytest.mark.parametrize('given', ['{bag}', '{link}', '{truth}', '{folder}/rule.yaml'])
+def test_the_rule_is_not_written_over_what_it_is_measured_from(tmp_path, capsys, given):
+    folder = Recorded(sweeps=2).write(tmp_path / 'drive', 'sqlite3')
+    bag, truth, link = next(folder.glob('*.db3')), tmp_path / 'truth.csv', tmp_path / 'link'
+    BoxTable.from_arrays([]).write(truth)
+    link.symlink_to(bag)
+    before = {path: path.read_bytes() for path in (bag, truth)}
+    out = given.format(bag=bag, link=link, truth=truth, folder=folder)
+    for recording in (folder, bag):
+        if recording == folder or given != '{folder}/rule.yaml':
+            words = ['calibrate', str(recording), '--truth', str(truth), '-o', out]
+            assert cli.main(words) == 2
+            assert 'expected a file that is no input' in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in (bag, truth)} == before
+    assert not (folder / 'rule.yaml').exists()

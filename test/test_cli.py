@@ -85,10 +85,11 @@ def test_resume_does_what_is_left_to_do(tmp_path, capsys):
 def test_resume_where_results_lie_in_the_recording_or_are_gone(tmp_path, capsys):
     folder = Drive(sweeps=3).write(tmp_path / 'drive', 'sqlite3')
     out = folder / 'out'
-    command = ['relabel', folder, '-o', out, *QUICK, '--formats', 'openlabel,mcap', '--resume']
+    formats = 'openlabel,mcap'
+    command = ['relabel', folder, '-o', out, *QUICK, '--formats', formats, '--report', '--resume']
     assert ' boxes in' in boxreg(capsys, *command)[1]
     assert 'already there' in boxreg(capsys, *command)[1]
-    for name in ('boxes.csv', 'overlay.mcap'):
+    for name in ('boxes.csv', 'overlay.mcap', 'report.html', 'openlabel/labels.json'):
         (out / name).unlink()
         assert ' boxes in' in boxreg(capsys, *command)[1], f'without {name}'
 
@@ -170,7 +171,8 @@ def test_help_and_version(capsys):
         assert option in out
 
 
-def test_interrupt_leaves_nothing(tmp_path):
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interrupt_leaves_nothing(tmp_path, number):
     recording = Drive(sweeps=60).write(tmp_path / 'drive')
     process = started(
         'relabel', recording, '-o', tmp_path / 'results' / 'out',
@@ -181,13 +183,38 @@ def test_interrupt_leaves_nothing(tmp_path):
     deadline = time.monotonic() + 60
     while not any((tmp_path / 'results').glob('.out.*')) and time.monotonic() < deadline:
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     out, err = process.communicate(timeout=60)
     # Started by -m, Python ends by the signal itself where that came amid an exec() of text, as
     # of rosbags' generated readers; a shell shows 130 for both.
-    assert process.returncode in (130, -signal.SIGINT)
-    assert (out, err) == ('', 'boxreg: interrupted; nothing was written\n')
+    assert process.returncode in ((130, -number) if number == signal.SIGINT else (128 + number,))
+    how = 'interrupted' if number == signal.SIGINT else f'ended by {number.name}'
+    assert (out, err) == ('', f'boxreg: {how}; nothing was written\n')
     assert list((tmp_path / 'results').iterdir()) == []
+
+
+def test_a_hangup_does_not_end_what_is_run_by_nohup(tmp_path):
+    recording = Drive(sweeps=20).write(tmp_path / 'drive')
+    command = ['nohup', sys.executable, '-m', 'boxreg_ros.cli', 'relabel', recording]
+    silent = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
+    process = subprocess.Popen([*command, '-o', tmp_path / 'out', *QUICK], cwd=ROOT, **silent)
+    deadline = time.monotonic() + 60
+    while not any(tmp_path.glob('.out.*')) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGHUP)
+    assert process.wait(timeout=60) == 0
+    assert (tmp_path / 'out' / 'boxes.csv').exists()
+
+
+def test_names_that_a_terminal_cannot_show(tmp_path):
+    recording = Drive(sweeps=2).write(tmp_path / 'drive')
+    process = started(
+        'relabel', recording, '-o', tmp_path / 'ü', *QUICK, stdout=subprocess.PIPE,
+        env=os.environ | {'PYTHONIOENCODING': 'ascii'},
+    )  # fmt: skip
+    out = process.communicate(timeout=60)[0]
+    assert process.returncode == 0
+    assert '\\xfc: 4 boxes in' in out
 
 
 def test_reader_that_goes_away_is_no_error(tmp_path):

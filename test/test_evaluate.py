@@ -169,6 +169,8 @@ def test_table_round_trip(tmp_path):
         (','.join(COLUMNS) + '\n1,odom,1\n', 'line 2, column num_points: .*got nothing'),
         (','.join(COLUMNS) + '\n' + '1,' * 16 + '1\n' + '1,' * 16 + '\n',
          'line 3, column num_points: expected a whole number, got nothing'),
+        (','.join(COLUMNS) + '\n' + '9' * 25 + ',1' * 16,
+         'line 2, column stamp_ns: expected a whole number of 64 bits, got 99999'),
     ],
 )  # fmt: skip
 def test_bad_table(tmp_path, text, message):
@@ -231,3 +233,29 @@ def test_nothing_in_common_is_explained(tmp_path, capsys):
         '0 stamps and 2 track ids are in both; predicted boxes are of 1000.000 to 1000.900 s, '
         'true ones of 0.000 to 0.900 s'
     ) in capsys.readouterr().err
+
+
+def test_true_boxes_that_are_none_are_left_out_and_told(tmp_path, capsys):
+    truth = truth_table()
+    boxes = truth.boxes.copy()
+    boxes[3, 0], boxes[5, 4] = np.nan, 0
+    broken = replace(truth, boxes=boxes)
+    scores = evaluate(truth, broken)
+    assert (scores.boxes, scores.missing, scores.unmatched) == (18, 0, 0)
+    assert scores.iou_3d == pytest.approx(1, abs=1e-8)
+    truth.write(tmp_path / 'boxes.csv')
+    broken.write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    assert '2 of 20 true boxes are left out' in capsys.readouterr().err
+
+
+def test_predictions_that_are_all_invalid_are_explained(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    boxes = truth.boxes.copy()
+    boxes[:, 0] = np.inf
+    replace(truth, boxes=boxes).write(tmp_path / 'boxes.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'car') == 0
+    told = capsys.readouterr()
+    assert 'all 10 predicted boxes of the stamp and the track of a true one are' in told.err
+    assert '10 true boxes, 10 missing' in told.out

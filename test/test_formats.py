@@ -14,18 +14,23 @@ As a quaternion x y z w, half angles multiplied: (c15 s30, s15 c30, -s15 s30, c1
 """
 
 from collections import Counter
+from dataclasses import replace
 import gc
 from itertools import product
 import json
 from math import atan2, cos, pi, radians, sin, sqrt
+from pathlib import Path
+import shutil
 import tracemalloc
 from xml.etree import ElementTree
 
+from boxreg_ros.boxtable import COLUMNS
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.labels import (
     arrow,
     FORMATS,
     frames_of,
+    is_written,
     LabelFrame,
     module_of,
     Options,
@@ -37,6 +42,8 @@ from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from boxreg_ros.transforms import inverse
 from consumers import consumer
 import numpy as np
+import pyarrow
+from pyarrow import parquet
 import pytest
 
 STAMP = 1_700_000_000_123_456_789
@@ -292,6 +299,47 @@ def test_parquet(tmp_path):
     assert (origin['tool'], origin['config_hash']) == ('boxreg_ros', 'cafe')
 
 
+@pytest.mark.parametrize('unit', ['int64', 'uint64', 'timestamp[ns]', 'timestamp[ns, tz=UTC]'])
+def test_parquet_of_other_writers(tmp_path, unit):
+    """As pandas makes it of boxes.csv: ids are numbers, and what is missing is null."""
+    numbers = {name: [1.0, 2.0] for name in COLUMNS}
+    zone = 'UTC' if 'tz' in unit else None
+    kind = pyarrow.timestamp('ns', zone) if 'stamp' in unit else pyarrow.type_for_alias(unit)
+    table = numbers | {
+        'stamp_ns': pyarrow.array([STAMP, STAMP], kind), 'frame_id': ['odom'] * 2,
+        'track_id': [7, 8], 'class_name': [None, None], 'status': ['truth', None],
+        'num_points': [None, 3.0], 'score': [None, 0.5],
+    }  # fmt: skip
+    path = tmp_path / 'boxes.parquet'
+    parquet.write_table(pyarrow.table(table), path)
+    (frame,) = frames_of('parquet', tmp_path)
+    found, boxes = frame.refined, frame.refined.boxes
+    assert boxes.stamp_ns == STAMP
+    assert (boxes.track_ids, boxes.class_names) == (('7', '8'), ('', ''))
+    assert (found.status, found.num_points.tolist()) == (('truth', 'input'), [0, 3])
+    np.testing.assert_array_equal(boxes.scores, [np.nan, 0.5])
+    for name in ('openlabel', 'tracklets', 'waymo', 'argoverse2', 'datumaro', 'kitti'):
+        placed = replace(frame, sensor_frame='odom', T_fixed_sensor=np.eye(4))
+        written(name, tmp_path, [placed])
+
+
+@pytest.mark.parametrize(
+    ('name', 'values', 'message'),
+    [
+        ('stamp_ns', [1.7e18], 'column stamp_ns: expected whole nanoseconds .* got double'),
+        ('stamp_ns', ['1700'], 'column stamp_ns: .* got string'),
+        ('stamp_ns', pyarrow.array([None], 'int64'), 'got int64, 1 of 1 empty'),
+        ('num_points', [1.5], 'column num_points: expected int64, got double'),
+        ('x', ['far'], 'column x: expected double, got string'),
+    ],
+)
+def test_parquet_that_is_no_table_of_boxes(tmp_path, name, values, message):
+    table = {key: [1] for key in COLUMNS} | {name: values}
+    parquet.write_table(pyarrow.table(table), tmp_path / 'boxes.parquet')
+    with pytest.raises(RecordingError, match=message):
+        list(frames_of('parquet', tmp_path))
+
+
 def test_openlabel_holds_the_pose_of_the_sensor(tmp_path):
     checker = pytest.importorskip('openlabel_checker', reason='openlabel-checker not installed')
     _, folder = written('openlabel', tmp_path)
@@ -389,7 +437,7 @@ def test_a_track_may_change_its_class(tmp_path, name):
 
 @pytest.mark.parametrize('name', OURS)
 def test_names_come_back_as_they_were(tmp_path, name):
-    names = ('a--b', 'a---', '-', '<i> & co', '&amp;', '&#45;', 'a - -b')
+    names = ('a--b', 'a---', '-', '<i> & co', '&amp;', '&#45;', 'a - -b', 'a\x01\x1bb')
     frames = [frame_of([IN_FIXED] * len(names), names)]
     _, folder = written(name, tmp_path, frames)
     (frame,) = frames_of(name, folder)
@@ -428,6 +476,16 @@ def test_nothing_is_something_to_write(tmp_path, name):
 
 
 @pytest.mark.parametrize('name', OURS)
+def test_what_is_gone_is_missed(tmp_path, name):
+    _, folder = written(name, tmp_path)
+    assert is_written(name, tmp_path)
+    for path in folder.rglob('*'):
+        if (path.is_file() and path.parent != tmp_path) or path.name == 'boxes.csv':
+            path.unlink()
+    assert not is_written(name, tmp_path)
+
+
+@pytest.mark.parametrize('name', OURS)
 def test_broken_files_are_told_in_a_line(tmp_path, name):
     _, folder = written(name, tmp_path)
     for path in folder.rglob('*'):
@@ -441,6 +499,53 @@ def test_broken_files_are_told_in_a_line(tmp_path, name):
 def test_what_is_not_there_is_told_in_a_line(tmp_path, name):
     with pytest.raises((RecordingError, ConfigError), match='nowhere'):
         list(frames_of(name, tmp_path / 'nowhere'))
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_what_is_not_in_this_folder_is_told_in_a_line(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((RecordingError, ConfigError), match='nowhere'):
+        list(frames_of(name, Path('nowhere')))
+
+
+@pytest.mark.parametrize(
+    ('name', 'inside'),
+    [('kitti', 'label_02'), ('waymo', 'lidar_box'), ('nuscenes', 'v1.0-boxreg'), ('t4', '.')],
+)
+def test_labels_beside_the_working_folder(tmp_path, monkeypatch, name, inside):
+    _, folder = written(name, tmp_path)
+    monkeypatch.chdir(folder / inside)
+    path = next(Path().glob('*.[tp][xa][tr]*'), Path())  # a label file; tables are a folder
+    (frame,) = frames_of(name, path)
+    assert (frame.fixed_frame, frame.sensor_frame) == ('odom', 'lidar')
+    np.testing.assert_allclose(frame.T_fixed_sensor, T_FIXED_SENSOR, atol=1e-9)
+
+
+def test_one_of_several_sequences_of_kitti_is_named(tmp_path):
+    _, folder = written('kitti', tmp_path)
+    for part in ('label_02', 'calib'):
+        shutil.copy(folder / part / '0000.txt', folder / part / '0001.txt')
+    with pytest.raises(RecordingError, match=r'expected one sequence .*, got 2; name the file'):
+        list(frames_of('kitti', folder))
+    assert len(list(frames_of('kitti', folder / 'label_02' / '0001.txt'))) == 1
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_folders_may_have_names_that_are_not_utf8(tmp_path, name):
+    out = tmp_path / 'caf\udce9'
+    out.mkdir()
+    _, folder = written(name, out, [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))],
+                        with_points=True)  # fmt: skip
+    assert len(list(frames_of(name, folder))) == 1
+
+
+def test_recordings_have_names_that_can_be_written(tmp_path, monkeypatch):
+    (tmp_path / 'drive').mkdir()
+    monkeypatch.chdir(tmp_path / 'drive')
+    link = tmp_path / 'link'
+    link.symlink_to('drive')
+    paths = (Path(), Path('..', 'drive', '.'), link, Path('caf\udce9.mcap'))
+    assert Provenance.of(paths).recordings == ('drive', 'drive', 'link', 'caf\\udce9.mcap')
 
 
 def test_timestamps_as_kitti_has_them(tmp_path):

@@ -11,6 +11,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.convert import Conversion, convert
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
+from boxreg_ros.reasons import REASONS
 from boxreg_ros.relabel import closing_line, input_boxes, relabel, Request
 from msg_adapters.convention import Convention
 import numpy as np
@@ -219,6 +220,20 @@ def test_sweeps_and_boxes_that_miss_each_other(tmp_path):
     assert summary['dropped']['sweep_without_boxes'] == 1
 
 
+def test_boxes_of_a_later_recording_find_their_clouds_in_a_long_queue(tmp_path):
+    drive = Drive(sweeps=12)
+    clouds = [item for item in drive.items if item[0] != '/boxes']
+    boxes = [(topic, t + 2 * SECOND, m) for topic, t, m in drive.items if topic == '/boxes']
+    paths = tuple(
+        write_recording(tmp_path / name, part) for name, part in (('a', clouds), ('b', boxes))
+    )
+    missed = relabel(Request(paths, config=QUICK.updated({'queue': 5})), tmp_path / 'short')
+    assert missed['reasons']['no_sweep'] > 0
+    assert '`queue`' in REASONS['no_sweep'].remedy
+    found = relabel(Request(paths, config=QUICK.updated({'queue': 10_000})), tmp_path / 'long')
+    assert 'no_sweep' not in found['reasons']
+
+
 def test_boxes_of_one_stamp_in_two_messages(tmp_path):
     drive = Drive(sweeps=5)
     extra = [item for item in drive.items if item[0] == '/boxes'][1]
@@ -389,13 +404,13 @@ def test_inputs_inside_of_the_output_survive(tmp_path, capsys, given):
     before = sorted(out.rglob('*'))
     words = ['relabel', given.format(out=out, link=link, bag=bag), '-o', str(out)]
     words += ['--config', str(rule)] if given == '{bag}' else []
-    assert main(words) == 1
+    assert main(words) == 2
     assert 'choose another with -o' in capsys.readouterr().err
     labels = 'csv', out / 'boxes.csv'
-    with pytest.raises(RecordingError, match=r"no input is in, got one with .*boxes\.csv'"):
+    with pytest.raises(ConfigError, match=r"no input is in, got one with .*boxes\.csv'"):
         run(bag, out, labels=labels)
     conversion = Conversion(out, 'csv', ('openlabel',))
-    with pytest.raises(RecordingError, match='choose another'):
+    with pytest.raises(ConfigError, match='choose another'):
         convert(conversion, out)
     assert sorted(out.rglob('*')) == before
 

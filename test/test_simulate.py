@@ -254,6 +254,12 @@ def test_refused(tmp_path):
         simulate('moon')
     with pytest.raises(ConfigError, match='sweeps: expected 1 or more, got 0'):
         simulate('street', sweeps=0)
+    with pytest.raises(ConfigError, match='seed: expected 0 or more, got -1'):
+        simulate('street', seed=-1)
+    same = tmp_path / 'same.mcap'
+    with pytest.raises(ConfigError, match='got the recording itself'):
+        run('-o', same, '--truth', tmp_path / '.' / 'same.mcap')
+    assert not same.exists()
     with pytest.raises(RecordingError, match=r'ends in \.mcap'):
         run('-o', tmp_path / 'street.bag', '--sweeps', 1)
     with pytest.raises(RecordingError, match='cannot be written'):

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import hashlib
 from importlib import import_module
 import json
+import os
 from pathlib import Path
 from types import ModuleType
 from typing import Protocol, TYPE_CHECKING
@@ -188,7 +189,9 @@ class Provenance:
         """Return the provenance of labels of `recordings`, made with `config`."""
         text = '' if config is None else json.dumps(config.to_dict(), sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:16] if text else ''
-        return cls(tuple(path.name for path in recordings), digest)
+        names = (absolute(path).name for path in recordings)
+        # Names of files need not be UTF-8, label files are.
+        return cls(tuple(n.encode('utf-8', 'backslashreplace').decode() for n in names), digest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +241,11 @@ class LabelWriter(Protocol):
         """Complete the files."""
 
 
+def absolute(path: Path) -> Path:
+    """Return a path that has a name and parents, as ``.`` has not; links stay what they are."""
+    return Path(os.path.abspath(path))
+
+
 def module_of(name: str) -> ModuleType:
     """
     Return the module of a format.
@@ -280,9 +288,14 @@ def writer_for(
     return writer
 
 
-def place_of(name: str) -> str:
-    """Return what a format's writer leaves in the folder of results: its own, or one file."""
-    return str(module_of(name).FORMAT.files.split(',')[0]) if name in BESIDE_RESULTS else name
+def is_written(name: str, out: Path) -> bool:
+    """Return whether what a format's writer leaves first, a file or a folder of some, is there."""
+    first = (
+        out / ('' if name in BESIDE_RESULTS else name) / module_of(name).FORMAT.files.split(',')[0]
+    )
+    if 'STAMP' in first.name:  # a file per frame
+        first = first.parent
+    return first.is_file() or (first.is_dir() and any(first.iterdir()))
 
 
 def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:

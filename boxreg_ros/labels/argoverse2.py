@@ -154,4 +154,5 @@ def _write_cloud(path: Path, points: np.ndarray, intensities: Floats | None) -> 
     zeros = {name: np.zeros(n, kind) for name, kind in POINT.items()}
     if intensities is not None:
         zeros['intensity'] = intensities.clip(0, 255).astype(np.uint8)
-    feather.write_feather(pyarrow.table(columns | zeros), path)
+    with path.open('wb') as file:
+        feather.write_feather(pyarrow.table(columns | zeros), file)

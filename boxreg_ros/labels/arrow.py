@@ -41,10 +41,10 @@ class Table:
             if bracket:
                 kinds[name] = pyarrow.list_(kinds[name], int(count or -1))
         self._schema = pyarrow.schema(kinds.items(), metadata={ORIGIN: origin} if origin else None)
-        if path.suffix == '.parquet':
-            self._file = parquet.ParquetWriter(path, self._schema)
-        else:
-            self._file = ipc.new_file(path, self._schema)
+        self._file = path.open('wb')  # pyarrow itself takes no name that is not UTF-8
+        is_parquet = path.suffix == '.parquet'
+        new = parquet.ParquetWriter if is_parquet else ipc.new_file
+        self._writer = new(self._file, self._schema)
         self._rows: list[Sequence[Any]] = []
         self._names = list(columns)
 
@@ -57,19 +57,25 @@ class Table:
     def close(self) -> None:
         """Complete the file."""
         self._flush()
+        self._writer.close()
         self._file.close()
 
     def _flush(self) -> None:
         import pyarrow
 
         rows = [dict(zip(self._names, row, strict=True)) for row in self._rows]
-        self._file.write_table(pyarrow.Table.from_pylist(rows, self._schema))
+        self._writer.write_table(pyarrow.Table.from_pylist(rows, self._schema))
         self._rows.clear()
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Return all rows of a Parquet or Feather file, and raise as `read_table` does."""
+    return list(read_table(path).to_pylist())
+
+
+def read_table(path: Path) -> Any:
     """
-    Return all rows of a Parquet or Feather file.
+    Return the pyarrow table of a Parquet or Feather file.
 
     Raises
     ------
@@ -81,9 +87,10 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     from pyarrow import feather, parquet
 
     try:
-        if path.suffix == '.parquet':
-            return list(parquet.ParquetFile(path).read().to_pylist())
-        return list(feather.read_table(path).to_pylist())
+        with path.open('rb') as file:
+            if path.suffix == '.parquet':
+                return parquet.ParquetFile(file).read()
+            return feather.read_table(file)
     except (OSError, pyarrow.ArrowException) as error:
         text = ' '.join(str(error).split())
         raise RecordingError(f'{path}: cannot be read: {text}') from None

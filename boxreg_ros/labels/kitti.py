@@ -15,7 +15,7 @@ from itertools import groupby
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import read_timeline, refined_boxes, Timeline, TrackNumbers
@@ -108,7 +108,7 @@ class Writer:
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the frames of a label file, or of the first sequence of a folder.
+    Yield the frames of a label file, or of the only sequence of a folder.
 
     ``calib/NAME.txt`` lies beside ``label_02/NAME.txt``, `Timeline`'s files in the folder of
     both. What is not to be cared for is left out.
@@ -116,13 +116,15 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """
     if path.is_dir():
         found = sorted((path / 'label_02').glob('*.txt'))
-        if not found:
-            raise RecordingError(f'{path}: expected KITTI labels in label_02/*.txt')
+        if len(found) != 1:
+            raise RecordingError(
+                f'{path}: expected one sequence in label_02/*.txt, got {len(found)}; name the '
+                f'file of one'
+            )
         path = found[0]
-    folder = path.parents[1]
-    camera = Camera.read(folder / 'calib' / path.name)
-    lines = (line.split() for line in path.read_text(encoding='utf-8').splitlines())
+    folder = absolute(path).parent.parent
     try:
+        lines = [line.split() for line in path.read_text(encoding='utf-8').splitlines()]
         rows = sorted((r for r in lines if r and r[2] != 'DontCare'), key=lambda r: int(r[0]))
         of_frame = {frame: list(part) for frame, part in groupby(rows, lambda r: int(r[0]))}
         numbers = {
@@ -133,10 +135,13 @@ def read(path: Path) -> Iterator[LabelFrame]:
             frame: [float(row[17]) if len(row) > 17 else np.nan for row in part]
             for frame, part in of_frame.items()
         }
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     except (IndexError, ValueError) as error:
         raise RecordingError(
             f'{path}: expected 17 or 18 columns of KITTI tracking: {error}'
         ) from None
+    camera = Camera.read(folder / 'calib' / path.name)
     timeline = read_timeline(folder, 1 + max(of_frame, default=-1))
     for index, stamp_ns in enumerate(timeline.stamps_ns):
         part = of_frame.get(index, [])

@@ -20,7 +20,7 @@ from typing import Any
 import zlib
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import (
     boxes_from,
@@ -223,6 +223,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     they have one; stamps are whole microseconds unless our own column has them.
 
     """
+    path = absolute(path)
     found = [path] if (path / 'sample.json').exists() else sorted(
         file.parent for file in path.glob('*/sample.json')
     )  # fmt: skip

@@ -14,11 +14,12 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from boxreg_ros.boxtable import COLUMNS
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.arrow import read_rows, Table
+from boxreg_ros.labels.arrow import read_table, Table
 from boxreg_ros.labels.files import boxes_from, refined_boxes, to_json
 from boxreg_ros.structures import HEIGHT, LENGTH, X, Z
 from msg_adapters.poses import quaternions_of
@@ -45,6 +46,8 @@ TYPES = {
     'sensor_frame': 'string',
     'T_fixed_sensor': 'double[]',
 }
+EMPTY = {'string': '', 'int64': 0, 'double': np.nan}
+"""What stands for null."""
 
 
 class Writer:
@@ -81,10 +84,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """Yield the boxes of each stamp and frame; only the columns of boxes.csv have to be there."""
     if path.is_dir():
         path = path / 'boxes.parquet'
-    rows = read_rows(path)
-    missing = [name for name in COLUMNS if rows and name not in rows[0]]
-    if missing:
-        raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
+    rows = _rows(path)
     rows.sort(key=lambda row: row['stamp_ns'])
     for (stamp_ns, frame_id), part in groupby(rows, lambda r: (r['stamp_ns'], r['frame_id'])):
         items = list(part)
@@ -108,3 +108,41 @@ def read(path: Path) -> Iterator[LabelFrame]:
             items[0].get('sensor_frame') or '',
             None if T is None else np.array(T).reshape(4, 4),
         )
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    """
+    Return the rows of a file, whatever types whoever wrote it gave the columns.
+
+    Texts may be numbers (of pandas, ids are) and timestamps of any unit stand for their
+    nanoseconds; where there is none, a text is '' and a count 0.
+
+    """
+    from pyarrow import ArrowException, timestamp, types
+
+    table = read_table(path)
+    missing = [name for name in COLUMNS if name not in table.column_names]
+    if missing:
+        raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
+    for i, name in enumerate(table.column_names):
+        column, kind = table[name], TYPES.get(name)
+        if kind not in EMPTY:
+            continue
+        try:
+            if name == 'stamp_ns':
+                is_timestamp = types.is_timestamp(column.type)
+                if not (is_timestamp or types.is_integer(column.type)) or column.null_count:
+                    raise RecordingError(
+                        f'{path}: column stamp_ns: expected whole nanoseconds (int64) in every '
+                        f'row, got {column.type}, {column.null_count} of {len(column)} empty; '
+                        f'write them as integers'
+                    )
+                if is_timestamp:
+                    column = column.cast(timestamp('ns', column.type.tz))
+            column = column.cast(kind).fill_null(EMPTY[kind])
+        except ArrowException as error:
+            raise RecordingError(
+                f'{path}: column {name}: expected {kind}, got {column.type}: {error}'
+            ) from None
+        table = table.set_column(i, name, column)
+    return list(table.to_pylist())

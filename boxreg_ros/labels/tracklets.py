@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+import re
 import shutil
 from tempfile import TemporaryFile
 from xml.etree import ElementTree
@@ -53,6 +54,8 @@ EXTENTS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
 SWAPPED, TRACK = 'axes swapped', 'track '
 HYPHEN = '&#45;'
 """What a hyphen is in a comment where XML does not take it: beside another, or at the end."""
+UNFIT = re.compile('[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
+"""Characters that XML does not take, or not as they are (carriage returns)."""
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
 <!DOCTYPE boost_serialization>
@@ -150,7 +153,7 @@ class Writer:
         sizes = dict(zip(EXTENTS[self._swap], extent.tolist(), strict=True))
         down = 0.0 if self._swap else -extent[2] / 2
         poses = np.hstack([_shifted(boxes, down), boxes[:, ROLL : YAW + 1]])
-        names = ' '.join(run.class_name.split()) or 'Misc'
+        names = UNFIT.sub('\N{REPLACEMENT CHARACTER}', ' '.join(run.class_name.split())) or 'Misc'
         flags = FLAGS.format(unknown=UNKNOWN_TRUNCATION[self._swap])
         item, poses_item, pose_item = CLASS_IDS if self._count == 0 else ('', '', '')
         lines = [
@@ -188,7 +191,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         for number, item in enumerate(tree.getroot().findall('tracklets/item')):
             comments = [str(e.text) for e in item if e.tag is ElementTree.Comment]
             named = [text for text in comments if text.startswith(TRACK)]
-            name = unescape(named[0].removeprefix(TRACK), {HYPHEN: '-'}) if named else str(number)
+            name = _uncomment(named[0].removeprefix(TRACK)) if named else str(number)
             extent = [_number(item, key) for key in EXTENTS[is_swapped]]
             first = int(_number(item, 'first_frame'))
             for index, pose in enumerate(item.findall('poses/item'), first):
@@ -231,6 +234,12 @@ def _number(item: ElementTree.Element, name: str) -> float:
 
 
 def _comment(text: str) -> str:
-    """Return text as may stand in a comment of XML; `unescape` returns it."""
-    text = escape(text).replace('--', f'-{HYPHEN}')
+    """Return text as may stand in a comment of XML; `_uncomment` returns it."""
+    text = UNFIT.sub(lambda found: f'&#{ord(found[0])};', escape(text))
+    text = text.replace('--', f'-{HYPHEN}')
     return text.removesuffix('-') + HYPHEN if text.endswith('-') else text
+
+
+def _uncomment(text: str) -> str:
+    """Return what `_comment` was given."""
+    return unescape(re.sub('&#([0-9]{1,7});', lambda found: chr(int(found[1])), text))

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.arrow import read_rows, Table
 from boxreg_ros.labels.files import frame_names, refined_boxes, to_json, write_origin
 from boxreg_ros.structures import HEIGHT, LENGTH, X, YAW, Z
@@ -122,7 +122,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
                 f'file of one'
             )
         path = files[0]
-    folder = path.parents[1]
+    folder = absolute(path).parent.parent
     rows = read_rows(path)
     missing = [name for name in COLUMNS if rows and name not in (*rows[0], *UNKNOWN, *OURS)]
     if missing:
