@@ -331,12 +331,13 @@ def yielding(term: Term, state: State) -> Term:
     Return `term` of the motion with less weight where `state` is far off what it expects.
 
     Else who brakes hard, swerves or drifts would be moved off the points, which then lose their
-    say. A stencil yields no more than the one before it: the newest box is as noisy as its input.
+    say. A stencil yields no more than the two before it: the newest boxes are nearly as noisy as
+    their input.
 
     """
     r = term.linearise(state).residual[:, :, 0, :, None]
     far = (r.mT @ term.weight[:, :, 0] @ r)[..., None] / SWERVE**2
-    far[:, 1:] = far[:, 1:].minimum(far[:, :-1])
+    far[:, 2:] = far[:, 2:].minimum(far[:, 1:-1]).minimum(far[:, :-2])
     return term._replace(weight=term.weight / (1 + far) ** 2)
 
 
