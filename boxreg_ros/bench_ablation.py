@@ -132,6 +132,10 @@ INGREDIENTS = {
             acceleration=LOOSE, cornering=LOOSE, vertical=LOOSE, turning=LOOSE, tilting=LOOSE
         ),
     ),
+    'yielding': Ingredient(
+        'motion has its full say, whatever boxes and points say',
+        replaced=((registration, 'SWERVE', inf),),
+    ),
     'slip and pivot': Ingredient(
         'heading and motion have nothing to do with each other',
         _every_kind(slip=LOOSE, climb=LOOSE),

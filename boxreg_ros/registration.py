@@ -328,11 +328,12 @@ def weigh(
 
 def yielding(term: Term, state: State) -> Term:
     """
-    Return `term` of the motion with less weight where `state` is far off what it expects.
+    Return `term` of the motion with less weight where `state` is far off it [for Eq. 6 and 7].
 
     Else who brakes hard, swerves or drifts would be moved off the points, which then lose their
-    say. A stencil yields no more than the two before it: the newest boxes are nearly as noisy as
-    their input.
+    say. The weight (B, n, 1, R, R) falls by how many deviations the residual (B, n, 1, R) is. A
+    stencil yields no more than the two before it: the newest boxes are nearly as noisy as their
+    input.
 
     """
     r = term.linearise(state).residual[:, :, 0, :, None]

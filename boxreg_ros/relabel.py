@@ -248,7 +248,6 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         if spool is not None:
             spool.remove()
         summary = _summary(request, recording, arrivals, registrar.counts, sink)
-        summary['time_jumps'] = feed.time_jumps
         summary['seconds'] = clock.seconds()
         if changes is not None:
             with clock('report'):
@@ -472,7 +471,6 @@ class _Feed:
     def __init__(self, registrar: BoxRegistrar) -> None:
         self._registrar = registrar
         self._rewinds = Rewind(), Rewind()
-        self.time_jumps = 0
 
     def add(self, item: Sweep | BoxArray | None) -> list[RefinedBoxes]:
         """Add what has a transform; return what has become ready."""
@@ -480,7 +478,7 @@ class _Feed:
             return []
         ready: list[RefinedBoxes] = []
         if self._rewinds[isinstance(item, BoxArray)].happened(item.stamp_ns):
-            self.time_jumps += 1
+            self._registrar.counts['time_jump'] += 1
             self._rewinds = Rewind(), Rewind()
             ready = self._registrar.flush()
             self._registrar.reset()
@@ -650,6 +648,7 @@ def _summary(
         'boxes_out': sink.boxes_out,
         'status': dict(sink.status),
         'reasons': dict(sink.reasons.most_common()),
+        'time_jumps': registered['time_jump'],
         'heading_flips': sink.heading_flips,
         'dropped': {name: n for name, n in sorted(unused.items()) if n},
         'first_missing_transform': arrivals.first_missing_transform,
