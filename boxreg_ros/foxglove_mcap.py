@@ -82,20 +82,11 @@ class Reader:
         """Close all files."""
         self._opened.close()
 
-    @property
-    def start_time(self) -> int:
-        """Return when the first message was received [ns]."""
-        return min(reader.start_time for reader in self._readers)
-
-    @property
-    def end_time(self) -> int:
-        """Return the first stamp after the last message [ns]."""
-        return max(reader.end_time for reader in self._readers)
-
-    @property
-    def duration(self) -> int:
-        """Return the time between both [ns]."""
-        return self.end_time - self.start_time
+    @staticmethod
+    def span_ns(connection: Connection) -> tuple[int, int]:
+        """Return when the first message in the file of a connection came, and the end [ns]."""
+        about: Any = getattr(connection.owner, 'metadata', connection.owner)
+        return about.start_time, about.end_time
 
     def messages(
         self, connections: Collection[Connection], start: int | None, stop: int | None
@@ -104,7 +95,7 @@ class Reader:
         streams = []
         for reader in self._readers:
             own = [c for c in reader.connections if c in connections]
-            if own:
+            if own:  # for the readers, none would mean all
                 streams.append(reader.messages(own, start, stop))
         return merge(*streams, key=lambda item: item[1])
 

@@ -71,7 +71,7 @@ REASONS = {
         'box',
         'no cloud within `tolerance` and `reach` of its stamp',
         'copy the stamp of the cloud to its boxes, and see the counters of clouds; raise `queue` '
-        'where boxes were recorded much later than their clouds, as in another bag',
+        'where boxes come later than so many clouds',
     ),
     'sweep_late': Reason(
         'cloud', 'came after younger boxes had left', 'publish clouds in order and before boxes'

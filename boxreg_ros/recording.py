@@ -21,8 +21,9 @@ from boxreg_ros.errors import (
 )
 from boxreg_ros.foxglove_mcap import encoded, Reader
 from boxreg_ros.structures import BoxArray, Floats, Sweep
+from boxreg_ros.timeline import Timeline
 from boxreg_ros.transforms import TransformTree
-from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, WITHOUT_IDS
+from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, poses, WITHOUT_IDS
 from msg_adapters.convention import Convention, STANDARD
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -66,7 +67,8 @@ class Recording:
     One or several recordings of one drive, merged by receive time.
 
     Receive time only orders the stream and cuts out the part between `start` and `end`; stamps
-    are those of the messages' headers. Use as a context manager; a copy can be opened once more.
+    are those of the messages' headers. What was recorded apart from the clouds is merged by
+    stamp, see `Timeline`. Use as a context manager; a copy can be opened once more.
 
     Parameters
     ----------
@@ -83,6 +85,8 @@ class Recording:
     ----------
     has_boxes : bool
         Whether there have to be boxes; without them `boxes_topic` is ''.
+    part_ns : tuple of int or None
+        Begin and end of the part that was asked for, in receive time [ns].
     unreadable, first_errors : Counter and dict
         How many messages of each topic were passed over, and the error of the first.
 
@@ -108,7 +112,7 @@ class Recording:
         self._convention = convention
         self._paths = [Path(path) for path in paths]
         self._asked = {'points': points, 'boxes': boxes, 'odometry': odometry}
-        self._start, self._end = start or 0.0, end
+        self._start, self._end = start, end
         self.odometry_topic: str | None = None
         self.unreadable: Counter[str] = Counter()
         self.first_errors: dict[str, UnsupportedMessage] = {}
@@ -147,14 +151,15 @@ class Recording:
         motion_topics = self._motion_topics()
         motion = self._connections(motion_topics)
         held: deque[Record] = deque()
-        begin, end = self.start_ns - LOOKAHEAD_NS, self.end_ns + LOOKAHEAD_NS
-        for record in self._read([*data, *motion], begin, end):
+        begin, end = self.part_ns
+        wide = begin and begin - LOOKAHEAD_NS, end and end + LOOKAHEAD_NS
+        for record in self._read([*data, *motion], *wide):
             # First what needs no more transforms: those after a pause make the tree forget.
             while held and held[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
                 yield held.popleft()
             if record.connection.topic in motion_topics:
                 self._add_motion(tree, record)
-            elif self.start_ns <= record.received_ns < self.end_ns:
+            elif (begin or 0) <= record.received_ns and (not end or record.received_ns < end):
                 held.append(record)
         yield from held
 
@@ -196,6 +201,15 @@ class Recording:
         store, kind = self._reader.typestore, self._topics[self.boxes_topic]
         encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
         return bytes(encode(replaced, kind))
+
+    def received_ns(self, received_ns: int, stamp_ns: int) -> int:
+        """Return when boxes count as received: with their clouds, if recorded apart [ns]."""
+        return self._timeline.received_ns(self.boxes_topic, received_ns, stamp_ns)
+
+    @property
+    def apart(self) -> dict[str, float]:
+        """Return the topics recorded apart from the clouds, and how much later [s]."""
+        return self._timeline.apart
 
     @property
     def typestore(self) -> Typestore:
@@ -312,15 +326,22 @@ class Recording:
             stock = stock_types().fielddefs
             self._reader.typestore.register({k: v for k, v in stock.items() if k not in known})
 
-        begin, self.end_ns = self._reader.start_time, self._reader.end_time
+        self._timeline = Timeline(self._reader, self.points_topic, self._stamp_of)
+        odometry = {t for t, kind in self._topics.items() if kind == ODOMETRY_TYPE}
+        begin_ns, last_ns = self._timeline.span_ns(self.data_topics | self._tf_topics() | odometry)
+        self.start_ns = begin_ns + round((self._start or 0.0) * 1e9)
+        self.end_ns = last_ns
         if self._end is not None:
-            self.end_ns = min(self.end_ns, begin + round(self._end * 1e9))
-        self.start_ns = begin + round(self._start * 1e9)
+            self.end_ns = min(last_ns, begin_ns + round(self._end * 1e9))
+        self.part_ns = (
+            self.start_ns if self._start else None,
+            None if self._end is None else self.end_ns,
+        )
         if self.start_ns >= self.end_ns:
-            end = '' if self._end is None else f'{self._end:g}'
+            end = 'the end' if self._end is None else f'{self._end:g}'
             raise RecordingError(
-                f'start and end: expected a part of the {self._reader.duration * 1e-9:.1f} s of '
-                f'{self}, got {self._start:g} to {end or "the end"}'
+                f'start and end: expected a part of the {(last_ns - begin_ns) * 1e-9:.1f} s of '
+                f'{self}, got {self._start or 0:g} to {end}'
             )
 
     def _topic(self, role: str, what: str, types: tuple[str, ...]) -> str:
@@ -395,10 +416,9 @@ class Recording:
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[Record]:
-        if connections:  # for the reader, none would mean all
-            with _readable(self):
-                for item in self._reader.messages(connections, start_ns, end_ns):
-                    yield Record(*item)
+        with _readable(self):
+            for item in self._timeline.messages(connections, start_ns, end_ns):
+                yield Record(*item)
 
     def _message(self, record: Record) -> Any:
         connection = record.connection
@@ -411,6 +431,19 @@ class Recording:
                 f'{self}: a message on {connection.topic!r} is not a {connection.msgtype} as '
                 f'defined there: {_text(error)}'
             ) from None
+
+    def _stamp_of(self, connection: Connection, data: bytes) -> int | None:
+        """Return the stamp of clouds, boxes and motion [ns]; None if there is none."""
+        if connection.topic in self._static_topics():
+            return None
+        try:
+            message = self._message(Record(connection, 0, data))
+            if connection.topic in self.data_topics:
+                return int(self._content(connection.topic, message).stamp_ns)
+        except UnsupportedMessage:
+            return None
+        stamped = message.transforms if hasattr(message, 'transforms') else [message]
+        return poses.stamp_ns(stamped[0].header) if len(stamped) else None
 
     def _content(self, topic: str, message: Any) -> Any:
         """Return the sweep or the boxes in a message."""

@@ -649,6 +649,7 @@ def _summary(
         'status': dict(sink.status),
         'reasons': dict(sink.reasons.most_common()),
         'time_jumps': registered['time_jump'],
+        'recorded_apart': {t: round(late, 3) for t, late in recording.apart.items()},
         'heading_flips': sink.heading_flips,
         'dropped': {name: n for name, n in sorted(unused.items()) if n},
         'first_missing_transform': arrivals.first_missing_transform,

@@ -11,7 +11,6 @@ from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.convert import Conversion, convert
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
-from boxreg_ros.reasons import REASONS
 from boxreg_ros.relabel import closing_line, input_boxes, relabel, Request
 from msg_adapters.convention import Convention
 import numpy as np
@@ -220,18 +219,66 @@ def test_sweeps_and_boxes_that_miss_each_other(tmp_path):
     assert summary['dropped']['sweep_without_boxes'] == 1
 
 
-def test_boxes_of_a_later_recording_find_their_clouds_in_a_long_queue(tmp_path):
-    drive = Drive(sweeps=12)
-    clouds = [item for item in drive.items if item[0] != '/boxes']
-    boxes = [(topic, t + 2 * SECOND, m) for topic, t, m in drive.items if topic == '/boxes']
-    paths = tuple(
-        write_recording(tmp_path / name, part) for name, part in (('a', clouds), ('b', boxes))
+@pytest.mark.parametrize(
+    ('storage', 'topic', 'late'),
+    [
+        ('mcap', '/boxes', 3600),
+        ('sqlite3', '/boxes', -3600),
+        ('rosbag1', '/boxes', 2),
+        ('mcap', '/tf', -3600),
+        ('rosbag1', '/tf', 3600),
+        ('mcap', '/odom', 3600),
+    ],
+)
+def test_a_topic_recorded_another_time_is_merged_by_stamp(tmp_path, storage, topic, late):
+    motion = 'odometry' if topic == '/odom' else 'tf'
+    drive = Drive(sweeps=12, motion=motion, ros1=storage == 'rosbag1')
+    whole = drive.write(tmp_path / 'whole', storage)
+    together, expected = run(whole, tmp_path / 'expected')
+    parts = (
+        [item for item in drive.items if item[0] != topic],
+        [(name, t + late * SECOND, m) for name, t, m in drive.items if name == topic],
     )
-    missed = relabel(Request(paths, config=QUICK.updated({'queue': 5})), tmp_path / 'short')
-    assert missed['reasons']['no_sweep'] > 0
-    assert '`queue`' in REASONS['no_sweep'].remedy
-    found = relabel(Request(paths, config=QUICK.updated({'queue': 10_000})), tmp_path / 'long')
-    assert 'no_sweep' not in found['reasons']
+    paths = tuple(
+        write_recording(tmp_path / name, part, storage, drive.messages)
+        for name, part in zip('ab', parts, strict=True)
+    )
+    summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
+    assert rows_of(tmp_path / 'out') == expected
+    assert summary['status'] == {'refined': 24}
+    assert summary['recorded_apart'] == {topic: pytest.approx(late)}
+    assert together['recorded_apart'] == {}
+    # A part is one of the clouds' recording, whenever the rest was recorded.
+    options = {'start': 0.35, 'end': 0.75, 'config': QUICK}
+    relabel(Request(paths, **options), tmp_path / 'part')
+    relabel(Request((whole,), **options), tmp_path / 'part_expected')
+    assert rows_of(tmp_path / 'part') == rows_of(tmp_path / 'part_expected')
+
+
+def test_a_detector_that_falls_behind_loses_nothing(tmp_path):
+    """Its last boxes come 5.5 s late, which is more clouds than `queue` waits with."""
+    drive = Drive(sweeps=56)
+    expected = run(drive.write(tmp_path / 'punctual'), tmp_path / 'expected')[1]
+    slow = [
+        (topic, t + (t - drive.stamps[0]) * (topic == '/boxes'), m) for topic, t, m in drive.items
+    ]
+    path = write_recording(tmp_path / 'slow', sorted(slow, key=lambda item: item[1]))
+    summary, rows = run(path, tmp_path / 'out')
+    assert rows == expected
+    assert summary['recorded_apart'] == {'/boxes': pytest.approx(5.5)}
+
+
+def test_stamps_of_another_clock_are_no_order(tmp_path):
+    """Boxes stamped by a clock that the clouds know nothing of stay where they were received."""
+    drive = Drive(sweeps=12)
+    for topic, _, message in drive.items:
+        if topic == '/boxes':
+            for item in (message, *message.detections):
+                item.header.stamp.sec -= 10_000
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert summary['recorded_apart'] == {}
+    assert len(rows) == summary['boxes_in'] == 24
+    assert {row['status'] for row in rows} == {'kept'}
 
 
 def test_boxes_of_one_stamp_in_two_messages(tmp_path):

@@ -4,7 +4,8 @@ MCAP: the recording again, with the refined boxes on a topic beside it, as ``ove
 Everything of the recording is copied as it is, byte by byte: topics of any encoding, and of MCAP
 files also attachments and metadata. Of every message with boxes there is a second one under the
 same times, with the boxes refined, on its topic with ``_refined`` behind, and for the eyes what
-the node shows as markers, on that topic with ``_markers`` behind.
+the node shows as markers, on that topic with ``_markers`` behind. If the boxes were recorded apart
+from the clouds, these come under the times of their clouds.
 
 """
 
@@ -97,7 +98,7 @@ class Writer:
         self.dropped: Counter[str] = Counter()
         self._recording = copy(options.recording).__enter__()
         self._topic = self._recording.boxes_topic
-        part = self._recording.start_ns, self._recording.end_ns
+        part = self._recording.part_ns
         files = [file for path in self._recording.files for file in _storage_files(path)]
         sources = [(_mcap if file.suffix == '.mcap' else _bag)(file, *part) for file in files]
         self._messages = merge(*sources, key=lambda raw: raw.log_time)
@@ -148,7 +149,10 @@ class Writer:
             message, given = self._recording.box_message(raw.data)
         except UnsupportedMessage:
             return []  # `relabel` passes it over too, and counts it
+        seen_ns = self._recording.received_ns(raw.log_time, given.stamp_ns)
         copied = raw._replace(topic=self._refined_topic)
+        if seen_ns != raw.log_time:  # beside their clouds, where they can be looked at
+            copied = copied._replace(log_time=seen_ns, publish_time=seen_ns)
         if not given.track_ids:
             return [copied]
         waiting = self._waiting.get(given.stamp_ns)
@@ -259,7 +263,7 @@ def _storage_files(path: Path) -> list[Path]:
     return [path]
 
 
-def _mcap(path: Path, start_ns: int, end_ns: int) -> Iterator[Raw]:
+def _mcap(path: Path, start_ns: int | None, end_ns: int | None) -> Iterator[Raw]:
     """Yield the messages of an MCAP file in a part, and all static transforms."""
     with path.open('rb') as file:
         reader = make_reader(file)
@@ -282,7 +286,7 @@ def _mcap(path: Path, start_ns: int, end_ns: int) -> Iterator[Raw]:
                 )
 
 
-def _bag(path: Path, start_ns: int, end_ns: int) -> Iterator[Raw]:
+def _bag(path: Path, start_ns: int | None, end_ns: int | None) -> Iterator[Raw]:
     """Yield the same of any other storage, which has one time per message and counts none."""
     with AnyReader([path], default_typestore=stock_types()) as reader:
         static = [c for c in reader.connections if c.topic.endswith(STATIC)]
@@ -294,11 +298,15 @@ def _bag(path: Path, start_ns: int, end_ns: int) -> Iterator[Raw]:
 
 
 def _parts(
-    every: _T, static: _T, start_ns: int, end_ns: int
+    every: _T, static: _T, start_ns: int | None, end_ns: int | None
 ) -> list[tuple[_T, int | None, int | None]]:
     """Return what to read from when to when: before and after the part, what is static."""
-    part: tuple[_T, int | None, int | None] = (every, start_ns, end_ns)
-    return [(static, None, start_ns), part, (static, end_ns, None)] if static else [part]
+    parts: list[tuple[_T, int | None, int | None]] = [(every, start_ns, end_ns)]
+    if static and start_ns is not None:
+        parts.insert(0, (static, None, start_ns))
+    if static and end_ns is not None:
+        parts.append((static, end_ns, None))
+    return parts
 
 
 def _channel(
