@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-from boxreg_ros.evaluate import pose_errors
-from boxreg_ros.metrics import EXTENT
+from boxreg_ros.metrics import EXTENT, pose_errors
 from boxreg_ros.structures import BoxArray, Floats, Ints, REFINED, RefinedBoxes, YAW
 from boxreg_ros.transforms import wrap
 import numpy as np

@@ -14,10 +14,12 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import ConfigError
 import yaml
+
+_T = TypeVar('_T')
 
 
 class Setting(NamedTuple):
@@ -193,16 +195,11 @@ class Config:
             For a name that does not exist, or a value of the wrong type or out of bounds.
 
         """
-        values = self.to_dict()
+        values: dict[str, Any] = {}
         for name, value in changes.items():
-            *groups, last = name.split('.')
-            inner = values
-            for group in groups:
-                inner = inner.setdefault(group, {})
-                if not isinstance(inner, dict):
-                    raise ConfigError(f'{name}: no such setting; see the table in the README')
-            inner[last] = value
-        return Config.from_dict(values)
+            group, _, last = name.rpartition('.')
+            (values.setdefault(group, {}) if group else values)[last] = value
+        return _filled(self, values, '')
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Config:
@@ -215,8 +212,7 @@ class Config:
             For an unknown key, by name, or a value of the wrong type or out of bounds.
 
         """
-        config: Config = _filled(cls(), values, '')
-        return config
+        return _filled(cls(), values, '')
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
@@ -252,10 +248,10 @@ def settings() -> Iterator[Setting]:
             yield part.metadata['of']._replace(name=name, default=default)
 
 
-def _filled(default: Any, value: Any, name: str) -> Any:
+def _filled(default: _T, value: Any, name: str) -> _T:
     """Return `value` as a setting, or a group of them where what is absent is `default`."""
     if not is_dataclass(default):
-        return _cast(name, value, default)
+        return _cast(name, value, default)  # type: ignore[no-any-return]
     if not isinstance(value, Mapping):
         raise ConfigError(f'{name or "all"}: expected a group of settings, got {value!r}')
     known = {item.name: getattr(default, item.name) for item in fields(default)}

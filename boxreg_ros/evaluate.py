@@ -10,44 +10,22 @@ import json
 import math
 from pathlib import Path
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 from boxreg_ros.arguments import add_topic_arguments
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.metrics import EXTENT, iou_3d, iou_bev
-from boxreg_ros.structures import Floats, Ints, PITCH, ROLL, YAW
+from boxreg_ros.metrics import EXTENT, iou_3d, iou_bev, pose_errors
+from boxreg_ros.structures import Floats, Ints, YAW
 from boxreg_ros.transforms import wrap
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 RECALLS = (0.5, 0.7, 0.8)
 POINT_BINS = (0, 10, 30, 100, 300, 1000)
 LONGEST_STEP = 1.0  # [s], jitter is not read across longer silences
 
 Mask = NDArray[np.bool_]
-
-
-class PoseErrors(NamedTuple):
-    """
-    Predicted minus true, one row per pair.
-
-    Attributes
-    ----------
-    translation, extent : array, shape (n, 3)
-        Of the centre along the true box's axes; of length, width and height [m].
-    rotation : array, shape (n, 3)
-        Of roll, pitch and yaw, each wrapped to [-pi, pi) [rad].
-    is_flipped : array, shape (n,)
-        True where the heading points the wrong way: |yaw error| > pi / 2.
-
-    """
-
-    translation: Floats
-    extent: Floats
-    rotation: Floats
-    is_flipped: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,15 +225,6 @@ def evaluate(
 ) -> Scores:
     """Return the scores of `predicted` over all true boxes in scope; see `match`."""
     return summarise(match(predicted, truth, min_points, classes))
-
-
-def pose_errors(boxes: Floats, truth: Floats) -> PoseErrors:
-    """Return the errors of `boxes` (n, 9) against `truth` (n, 9), as `PoseErrors` says."""
-    axes = Rotation.from_euler('ZYX', truth[:, [YAW, PITCH, ROLL]]).as_matrix()
-    translation = np.einsum('nij,ni->nj', axes, (boxes - truth)[:, :3])
-    rotation = wrap((boxes - truth)[:, ROLL:])
-    extent = (boxes - truth)[:, EXTENT]
-    return PoseErrors(translation, extent, rotation, np.abs(rotation[:, 2]) > np.pi / 2)
 
 
 def has_word(class_name: str, words: Sequence[str]) -> bool:

@@ -18,7 +18,6 @@ CURVATURE = 1e-10  # a pair with s.y below this part of |s||y| is not remembered
 BACKTRACKS = 12
 PATIENCE = 4  # turns between questions to a device that must be waited for
 
-Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Metric = Callable[[Tensor, Tensor], Tensor]
 Pair = tuple[Tensor, Tensor, Tensor]  # step, change of the gradient, 1 / their product
 
@@ -52,7 +51,7 @@ class Minimum(NamedTuple):
 
 
 def minimize(
-    function: Function,
+    function: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
     start: Tensor,
     iterations: int,
     history: int,

@@ -1,17 +1,48 @@
-"""How much boxes (n, 9) overlap with true ones, row by row in one frame."""
+"""How far boxes (n, 9) are from true ones, row by row in one frame: overlap and pose errors."""
 
 from __future__ import annotations
 
-from boxreg_ros.errors import ShapeError
-from boxreg_ros.geometry import rotation_from_rpy
+from typing import NamedTuple
+
+from boxreg_ros.geometry import rotation_from_rpy, wrap_angle
 from boxreg_ros.structures import checked, Floats, HEIGHT, LENGTH, ROLL
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 import torch
 
 PAIRS_AT_ONCE = 1000  # bounds the memory of one clipping step to about 100 MB
 EXTENT = slice(LENGTH, HEIGHT + 1)
 SHIFT = 1e-9  # [m], so much the second box is grown: no two faces are ever in one plane
+
+
+class PoseErrors(NamedTuple):
+    """
+    Predicted minus true, one row per pair.
+
+    Attributes
+    ----------
+    translation, extent : array, shape (n, 3)
+        Of the centre along the true box's axes; of length, width and height [m].
+    rotation : array, shape (n, 3)
+        Of roll, pitch and yaw, each wrapped to [-pi, pi] [rad].
+    is_flipped : array, shape (n,)
+        True where the heading points the wrong way: |yaw error| > pi / 2.
+
+    """
+
+    translation: Floats
+    extent: Floats
+    rotation: Floats
+    is_flipped: NDArray[np.bool_]
+
+
+def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
+    """Return the errors of `boxes` (n, 9) against `truth` (n, 9), as `PoseErrors` says."""
+    a, b = _rows(boxes, truth)
+    rotation = wrap_angle(torch.from_numpy((a - b)[:, ROLL:])).numpy()
+    axes = rotation_from_rpy(torch.from_numpy(b[:, ROLL:])).numpy()
+    along, is_flipped = ((a - b)[:, None, :3] @ axes)[:, 0], np.abs(rotation[:, 2]) > np.pi / 2
+    return PoseErrors(along, (a - b)[:, EXTENT], rotation, is_flipped)
 
 
 def iou_bev(boxes: ArrayLike, truth: ArrayLike) -> Floats:
@@ -43,10 +74,8 @@ def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
 
 
 def _rows(boxes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:
-    a, b = checked('boxes', boxes, (None, 9)), checked('truth', truth, (None, 9))
-    if len(a) != len(b):
-        raise ShapeError(f'boxes, truth: expected as many rows, got {len(a)} and {len(b)}')
-    return a, b
+    a = checked('boxes', boxes, (None, 9))
+    return a, checked('truth', truth, a.shape)
 
 
 def _intersection(a: Floats, b: Floats) -> Floats:

@@ -210,9 +210,8 @@ def _mean(values: Tensor, real: Tensor) -> Tensor:
 
 SHARED = 22  # extent (3), bias of the input (6), gap of the faces (6), pivot, anchor (6)
 EXTENT, BIAS, GAP = slice(0, 3), slice(3, 9), slice(9, 15)
-PIVOT = 15
+PIVOT, ANCHOR = 15, slice(16, 22)
 ERRORS = 'position', 'lateral', 'height', 'tilt', 'tilt', 'heading'  # of a pose, by deviation
-ANCHOR = slice(16, 22)
 MEMORY = 12 + SHARED
 
 

@@ -42,9 +42,8 @@ class BoxRegistrar:
         try:
             torch.zeros(1, device=config.device)
         except (AssertionError, RuntimeError) as error:  # torch says it in either way
-            reason = str(error).splitlines()[0]
             wanted = "device: expected one that torch can use here, such as 'cpu', got "
-            raise ConfigError(f'{wanted}{config.device!r}: {reason}') from None
+            raise ConfigError(f'{wanted}{config.device!r}: {str(error).splitlines()[0]}') from None
         self.config = config
         self.counts: Counter[str] = Counter()
         self.reset()
@@ -168,8 +167,7 @@ class _Tick:
         self.status, self.reasons = [KEPT] * n, [''] * n
         self.num_points = np.zeros(n, int)
         self.covariances = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()
-        self.waiting = 0
-        self.is_paired = False
+        self.waiting, self.is_paired = 0, False
 
     def refuse(self, reason: str) -> None:
         """Give a reason to each box the core cannot take; `reason` holds for all if not empty."""

@@ -22,6 +22,7 @@ FLOORS = (
         'labels',
         'pose_check',
         'recording',
+        'timeline',
         'tracker',
         'transforms',
         'visual',

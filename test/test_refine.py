@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from boxreg_ros import Config, refine, registration, Track, window
 from boxreg_ros.errors import ConfigError, ShapeError
-from boxreg_ros.evaluate import pose_errors
-from boxreg_ros.metrics import iou_3d
+from boxreg_ros.metrics import iou_3d, pose_errors
 from boxreg_ros.simulate import simulate
 from boxreg_ros.transforms import wrap
 import numpy as np
