@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import embedding, pad
 
 BOTTOM = 5
-MARGIN = 0.4  # outside a face, points still count for it [m]
+MARGIN = 0.3  # outside a face, points still count for it [m]
 LEAST = 3  # points without which a face is not seen
 STRIPS = 3  # of a face side by side: each has outermost points of its own
 ACROSS = [1, 1, 0, 0, 1]  # axis along which they lie

@@ -202,9 +202,11 @@ class Recording:
         encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
         return bytes(encode(replaced, kind))
 
-    def received_ns(self, received_ns: int, stamp_ns: int) -> int:
-        """Return when boxes count as received: with their clouds, if recorded apart [ns]."""
-        return self._timeline.received_ns(self.boxes_topic, received_ns, stamp_ns)
+    def received_ns(self, topic: str, received_ns: int, data: bytes) -> int:
+        """Return when a message counts as received: with its clouds, if recorded apart [ns]."""
+        if topic not in self.apart:
+            return received_ns
+        return self._timeline.received_ns(self._connections({topic})[0], received_ns, data)
 
     @property
     def apart(self) -> dict[str, float]:
@@ -328,7 +330,8 @@ class Recording:
 
         self._timeline = Timeline(self._reader, self.points_topic, self._stamp_of)
         odometry = {t for t, kind in self._topics.items() if kind == ODOMETRY_TYPE}
-        begin_ns, last_ns = self._timeline.span_ns(self.data_topics | self._tf_topics() | odometry)
+        motion = (self._tf_topics() - self._static_topics()) | odometry
+        begin_ns, last_ns = self._timeline.span_ns(self.data_topics | motion)
         self.start_ns = begin_ns + round((self._start or 0.0) * 1e9)
         self.end_ns = last_ns
         if self._end is not None:
@@ -359,6 +362,8 @@ class Recording:
                     f'{self._topics[asked]}'
                 )
             return asked
+        if empty := [t for t, kind in self._topics.items() if kind in types and not candidates]:
+            raise RecordingError(f'{self}: no {what}: no messages on {", ".join(empty)}')
         if not candidates:
             raise RecordingError(
                 f'{self}: no {what}, expected a topic of type {" or ".join(types)}; there: {there}'
@@ -438,12 +443,12 @@ class Recording:
             return None
         try:
             message = self._message(Record(connection, 0, data))
-            if connection.topic in self.data_topics:
-                return int(self._content(connection.topic, message).stamp_ns)
+            if connection.topic == self.boxes_topic:
+                return self._content(connection.topic, message).stamp_ns or None
         except UnsupportedMessage:
             return None
         stamped = message.transforms if hasattr(message, 'transforms') else [message]
-        return poses.stamp_ns(stamped[0].header) if len(stamped) else None
+        return poses.stamp_ns(stamped[0].header) or None if len(stamped) else None
 
     def _content(self, topic: str, message: Any) -> Any:
         """Return the sweep or the boxes in a message."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from functools import cached_property
 from heapq import merge
-from itertools import chain, islice
+from itertools import islice
 
 from boxreg_ros.foxglove_mcap import Item, Reader
 from rosbags.interfaces import Connection
@@ -31,8 +32,7 @@ class Timeline:
     points_topic : str
         Topic of the clouds, which the others are compared with.
     stamp_of : callable
-        Returns the stamp of a message [ns], of any connection that is asked for; None if there is
-        none.
+        Returns the stamp of a message [ns]; None where there is none.
 
     Attributes
     ----------
@@ -45,18 +45,12 @@ class Timeline:
         self._reader, self._stamp_of = reader, stamp_of
         self._clouds = [c for c in reader.connections if c.topic == points_topic]
         self._known: dict[tuple[int, int], bool] = {}
-        self._delays_ns: list[int] | None = None
         self.apart: dict[str, float] = {}
 
     def span_ns(self, topics: Collection[str]) -> tuple[int, int]:
-        """Return begin and end [ns], without files in which `topics` were recorded apart."""
-        files = {id(c.owner): self._reader.span_ns(c) for c in self._reader.connections}
-        for connection in self._reader.connections:
-            if connection.topic in topics and self._is_apart(connection):
-                files.pop(id(connection.owner), None)
-        files |= {id(c.owner): self._reader.span_ns(c) for c in self._clouds}
-        begins, ends = zip(*files.values(), strict=True)
-        return min(begins), max(ends)
+        """Return begin and end of the files with clouds, or with `topics` not apart [ns]."""
+        used = [c for c in self._reader.connections if c.topic in topics and c.msgcount]
+        return self._span([*self._clouds, *(c for c in used if not self._is_apart(c))])
 
     def messages(
         self, connections: Collection[Connection], start_ns: int | None, end_ns: int | None
@@ -68,15 +62,15 @@ class Timeline:
         streams += [self._by_stamp(c, start_ns, end_ns) for c in apart]
         return merge(*streams, key=lambda item: item[1])
 
-    def received_ns(self, topic: str, received_ns: int, stamp_ns: int) -> int:
-        """Return when a message of this stamp counts as received [ns]."""
-        due_ns = self._due_ns(stamp_ns) if topic in self.apart else None
-        return received_ns if due_ns is None else due_ns
+    def received_ns(self, connection: Connection, received_ns: int, data: bytes) -> int:
+        """Return when a message on one of the topics `apart` counts as received [ns]."""
+        due_ns = self._due_ns(self._stamp_of(connection, data))
+        return received_ns if due_ns is None or abs(received_ns - due_ns) < APART_NS else due_ns
 
     def _by_stamp(
         self, connection: Connection, start_ns: int | None, end_ns: int | None
     ) -> Iterator[Item]:
-        last_ns = self._span_of_clouds()[0]
+        last_ns = self._span(self._clouds)[0]
         for _, _, data in self._reader.messages([connection], None, None):
             due_ns = self._due_ns(self._stamp_of(connection, data))
             # What has no place among the clouds keeps its place behind the message before.
@@ -90,34 +84,59 @@ class Timeline:
             return False
         key = id(connection.owner), connection.id
         if key not in self._known:
-            due = [(t, self._due_ns(stamp_ns)) for t, stamp_ns in self._ends(connection)]
-            late_ns = max([0, *(t - due_ns for t, due_ns in due if due_ns is not None)], key=abs)
+            late_ns = self._late_ns(connection)
             self._known[key] = abs(late_ns) > APART_NS
             if self._known[key]:
                 self.apart.setdefault(connection.topic, late_ns * 1e-9)
         return self._known[key]
 
+    def _late_ns(self, connection: Connection) -> int:
+        """Return how late the first or the last message was, whichever is more; 0 if unknown."""
+        delay_ns = self._delay_ns
+        ends = [] if delay_ns is None else self._ends(connection)
+        due = [(t, stamp_ns + (delay_ns or 0)) for t, stamp_ns in ends]
+        among = [(t, due_ns) for t, due_ns in due if self._is_among(due_ns)]
+        begin_ns, end_ns = self._span(self._clouds)
+        # Both may be outside: what was recorded before the first cloud, and after the last.
+        if not among and due and due[0][1] < begin_ns < end_ns < due[-1][1]:
+            among = due
+        return max((t - due_ns for t, due_ns in among), key=abs, default=0)
+
     def _ends(self, connection: Connection) -> list[tuple[int, int]]:
-        """Return time of receipt and stamp of the first and the last message, if known [ns]."""
-        newest_ns = self._reader.span_ns(connection)[1] - APART_NS
-        first = islice(self._reader.messages([connection], None, None), 1)
-        last = deque(self._reader.messages([connection], newest_ns, None), maxlen=1)
-        ends = [(t, self._stamp_of(connection, data)) for _, t, data in chain(first, last)]
-        return [(t, stamp_ns) for t, stamp_ns in ends if stamp_ns is not None]
+        """Return time of receipt and stamp of the first and the last message with a stamp [ns]."""
+        begin_ns, end_ns = self._reader.span_ns(connection)
+        ends = list(islice(self._stamped(connection, None), 1))
+        window_ns = APART_NS // 10
+        while len(ends) == 1:  # from the end backward, further and further
+            start_ns = max(begin_ns, end_ns - window_ns)
+            ends += deque(self._stamped(connection, start_ns), maxlen=1)
+            window_ns *= 2
+        return ends
+
+    def _stamped(self, connection: Connection, start_ns: int | None) -> Iterator[tuple[int, int]]:
+        for _, received_ns, data in self._reader.messages([connection], start_ns, None):
+            if (stamp_ns := self._stamp_of(connection, data)) is not None:
+                yield received_ns, stamp_ns
+
+    @cached_property
+    def _delay_ns(self) -> int | None:
+        """How long after their stamps clouds were received [ns]; None where that changes."""
+        ends = [end for connection in self._clouds for end in self._ends(connection)]
+        delays = [received_ns - stamp_ns for received_ns, stamp_ns in ends]
+        # It does in a loop of playback, and when playback is paused: stamps give no order then.
+        return delays[0] if delays and max(delays) - min(delays) < APART_NS else None
 
     def _due_ns(self, stamp_ns: int | None) -> int | None:
-        """Return when a cloud of this stamp was received; None if there cannot be any [ns]."""
-        if self._delays_ns is None:
-            ends = [end for connection in self._clouds for end in self._ends(connection)]
-            self._delays_ns = [received_ns - cloud_ns for received_ns, cloud_ns in ends]
-        delays_ns = self._delays_ns
-        # Where the clouds' own clock changes, as in a loop of playback, stamps give no order.
-        if stamp_ns is None or not delays_ns or max(delays_ns) - min(delays_ns) > APART_NS:
+        """Return when a cloud of this stamp was received [ns]; None if there cannot be any."""
+        if stamp_ns is None or self._delay_ns is None:
             return None
-        begin_ns, end_ns = self._span_of_clouds()
-        due_ns = stamp_ns + delays_ns[0]
-        return due_ns if begin_ns - APART_NS <= due_ns < end_ns + APART_NS else None
+        due_ns = stamp_ns + self._delay_ns
+        return due_ns if self._is_among(due_ns) else None
 
-    def _span_of_clouds(self) -> tuple[int, int]:
-        begins, ends = zip(*map(self._reader.span_ns, self._clouds), strict=True)
+    def _is_among(self, due_ns: int) -> bool:
+        begin_ns, end_ns = self._span(self._clouds)
+        return begin_ns - APART_NS <= due_ns < end_ns + APART_NS
+
+    def _span(self, connections: Iterable[Connection]) -> tuple[int, int]:
+        begins, ends = zip(*map(self._reader.span_ns, connections), strict=True)
         return min(begins), max(ends)

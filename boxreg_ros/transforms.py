@@ -224,6 +224,7 @@ class _Edge:
             return  # says nothing; a lookup reports the stamps that remain
         if self._rewind.happened(stamp_ns):
             self._forget()
+            self._was_forgotten = True
         if self.is_static:
             first, end = 0, len(self.stamps)
         else:
@@ -237,12 +238,12 @@ class _Edge:
     def rewind(self, stamp_ns: int) -> None:
         if not self.is_static and self.stamps and self.stamps[-1] > stamp_ns + BACK * 1e9:
             self._forget()
+            self._was_forgotten = stamp_ns > 0  # what is read once more has not gone back
             self._rewind = Rewind()
 
     def _forget(self) -> None:
         self.stamps.clear()
         self._poses.clear()
-        self._was_forgotten = True
 
     def is_older(self, stamp_ns: int) -> bool:
         return not self.is_static and bool(self.stamps) and self.stamps[-1] < stamp_ns

@@ -110,19 +110,20 @@ def test_markers_show_boxes_before_and_after(tmp_path, storage):
 
 
 def test_boxes_of_another_day_come_beside_their_clouds(tmp_path):
-    drive, day_ns = Drive(sweeps=4), 86_400 * 10**9
+    drive, day_ns = Drive(sweeps=8), 86_400 * 10**9
     parts = (
         [item for item in drive.items if item[0] != '/boxes'],
         [(topic, t + day_ns, m) for topic, t, m in drive.items if topic == '/boxes'],
     )
     names = zip('ab', parts, strict=True)
-    summary = run(tuple(write_recording(tmp_path / n, p) for n, p in names), tmp_path / 'out')
-    rows, _ = messages_of(tmp_path / 'out' / 'overlay.mcap')
-    assert [t for topic, t, *_ in rows if topic == '/boxes'] == [t + day_ns for t in drive.stamps]
-    for topic in ADDED:
-        times = [row[1:3] for row in rows if row[0] == topic]
-        assert times == [(t, t) for t in drive.stamps]
-    assert summary['left_out_of_labels'] == {}
+    paths = tuple(write_recording(tmp_path / name, part) for name, part in names)
+    for part, stamps in (({}, drive.stamps), ({'start': 0.25, 'end': 0.55}, drive.stamps[3:6])):
+        summary = run(paths, tmp_path / 'out', **part)
+        rows, _ = messages_of(tmp_path / 'out' / 'overlay.mcap')
+        for topic in ('/points', '/boxes', *ADDED):
+            times = [row[1:3] for row in rows if row[0] == topic]
+            assert times == [(t, t) for t in stamps]
+        assert summary['left_out_of_labels'] == {}
 
 
 def test_ros1_stays_ros1(tmp_path):

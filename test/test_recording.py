@@ -4,6 +4,8 @@ from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedM
 from boxreg_ros.recording import Recording
 from boxreg_ros.structures import BoxArray, Sweep
 from boxreg_ros.transforms import TransformTree
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 import numpy as np
 import pytest
 from ros_messages import Drive, Messages, SECOND, START, write_recording
@@ -261,6 +263,33 @@ def test_no_clouds_or_no_boxes(tmp_path, gone, what):
     text = refused(drive.write(tmp_path / 'drive'))
     assert f'no {what}' in text
     assert '/tf (tf2_msgs/msg/TFMessage)' in text
+
+
+def test_topics_without_messages_are_named(tmp_path):
+    drive = Drive()
+    empty = drive.messages.detections(START, 'lidar', [])
+    path = write_recording(
+        tmp_path / 'drive',
+        [*(item for item in drive.items if item[0] != '/boxes'), ('/late', START + SECOND, empty)],
+    )
+    (tmp_path / 'cut').mkdir()
+    cut = tmp_path / 'cut' / 'cut.mcap'
+    with path.open('rb') as source, cut.open('wb') as target:
+        reader, writer = make_reader(source), McapWriter(target)
+        writer.start('ros2')
+        channels = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            if channel.topic != '/late':
+                writer.add_message(
+                    channels[channel.topic], message.log_time, message.data, message.log_time
+                )
+        writer.finish()
+    assert 'no messages on /late' in refused(cut)
 
 
 def test_several_topics_fit(tmp_path):

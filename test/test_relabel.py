@@ -268,6 +268,59 @@ def test_a_detector_that_falls_behind_loses_nothing(tmp_path):
     assert summary['recorded_apart'] == {'/boxes': pytest.approx(5.5)}
 
 
+def test_what_begins_before_the_clouds_and_ends_after_them_is_merged_by_stamp(tmp_path):
+    """Poses of the whole drive, worked out another day, and clouds of a part in its middle."""
+    whole, (begin, end) = Drive(sweeps=60), (20, 40)
+    stamps = whole.stamps[begin:end]
+    part = [item for item in whole.items if stamps[0] <= item[1] <= stamps[-1]]
+    part.insert(0, whole.items[0])  # /tf_static
+    expected = run(write_recording(tmp_path / 'part', part), tmp_path / 'expected')[1]
+    poses = [(topic, t + 3600 * SECOND, m) for topic, t, m in whole.items if topic == '/tf']
+    paths = (
+        write_recording(tmp_path / 'clouds', [item for item in part if item[0] != '/tf']),
+        write_recording(tmp_path / 'poses', poses),
+    )
+    summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
+    assert summary['recorded_apart'] == {'/tf': pytest.approx(3600)}
+    assert rows_of(tmp_path / 'out') == expected
+
+
+def test_ends_that_say_nothing_do_not_hide_what_was_recorded_apart(tmp_path):
+    """Trackers begin and end with empty arrays, which have no stamp where items carry it."""
+    drive = Drive(sweeps=30, boxes='markers')
+    for topic, _, message in drive.items:
+        if topic == '/boxes' and message.markers[0].header.stamp.nanosec % 10**9 in (0, 10**8):
+            message.markers = []
+    drive.replace('/points', 0, lambda cloud: setattr(cloud.header.stamp, 'sec', 0))
+    drive.replace('/points', 0, lambda cloud: setattr(cloud.header.stamp, 'nanosec', 0))
+    drive.replace('/boxes', -1, lambda message: setattr(message, 'markers', []))
+    expected = run(drive.write(tmp_path / 'whole'), tmp_path / 'expected')[1]
+    paths = tuple(
+        write_recording(tmp_path / name, part)
+        for name, part in (
+            ('a', [item for item in drive.items if item[0] != '/boxes']),
+            ('b', [(n, t + 3600 * SECOND, m) for n, t, m in drive.items if n == '/boxes']),
+        )
+    )
+    summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
+    assert rows_of(tmp_path / 'out') == expected
+    assert summary['status']['refined'] > 40
+
+
+def test_a_part_begins_with_the_clouds_whatever_else_is_in_the_files(tmp_path):
+    drive, day = Drive(sweeps=10), 86_400 * SECOND
+    expected = run(drive.write(tmp_path / 'drive'), tmp_path / 'expected', start=0.25, end=0.75)[1]
+    static = [(topic, t - day, m) for topic, t, m in drive.items if topic == '/tf_static']
+    other = [('/points2', t - day, m) for topic, t, m in drive.items if topic == '/points']
+    paths = (
+        write_recording(tmp_path / 'rest', [*static, *other]),
+        write_recording(tmp_path / 'main', [i for i in drive.items if i[0] != '/tf_static']),
+    )
+    request = Request(paths, points='/points', start=0.25, end=0.75, config=QUICK)
+    relabel(request, tmp_path / 'out')
+    assert rows_of(tmp_path / 'out') == expected
+
+
 def test_stamps_of_another_clock_are_no_order(tmp_path):
     """Boxes stamped by a clock that the clouds know nothing of stay where they were received."""
     drive = Drive(sweeps=12)

@@ -4,15 +4,15 @@ MCAP: the recording again, with the refined boxes on a topic beside it, as ``ove
 Everything of the recording is copied as it is, byte by byte: topics of any encoding, and of MCAP
 files also attachments and metadata. Of every message with boxes there is a second one under the
 same times, with the boxes refined, on its topic with ``_refined`` behind, and for the eyes what
-the node shows as markers, on that topic with ``_markers`` behind. If the boxes were recorded apart
-from the clouds, these come under the times of their clouds.
+the node shows as markers, on that topic with ``_markers`` behind. What was recorded apart from the
+clouds comes under the times of its clouds, so that all can be looked at together.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from copy import copy
 from dataclasses import asdict, replace
 from functools import partial
@@ -100,8 +100,10 @@ class Writer:
         self._topic = self._recording.boxes_topic
         part = self._recording.part_ns
         files = [file for path in self._recording.files for file in _storage_files(path)]
-        sources = [(_mcap if file.suffix == '.mcap' else _bag)(file, *part) for file in files]
-        self._messages = merge(*sources, key=lambda raw: raw.log_time)
+        uncut = self._recording.apart
+        sources = [(_mcap if f.suffix == '.mcap' else _bag)(f, *part, uncut) for f in files]
+        placed = [self._placed(source, *part) for source in sources]
+        self._messages = merge(*placed, key=lambda raw: raw.log_time)
         self._next = next(self._messages, None)
         self._waiting: dict[int, deque[LabelFrame]] = {}
         self._channels: dict[tuple[object, ...], int] = {}
@@ -133,6 +135,18 @@ class Writer:
         left = sum(len(f.refined.status) for frames in self._waiting.values() for f in frames)
         self.dropped['no_message'] += left
 
+    def _placed(
+        self, messages: Iterator[Raw], start_ns: int | None, end_ns: int | None
+    ) -> Iterator[Raw]:
+        """Yield messages; those that were recorded apart come with their clouds."""
+        for raw in messages:
+            seen_ns = self._recording.received_ns(raw.topic, raw.log_time, raw.data)
+            is_in = (start_ns or 0) <= seen_ns and (end_ns is None or seen_ns < end_ns)
+            if seen_ns != raw.log_time and is_in:
+                yield raw._replace(log_time=seen_ns, publish_time=seen_ns)
+            elif is_in or raw.topic not in self._recording.apart:
+                yield raw
+
     def _copy(self, is_end: bool) -> None:
         """Copy messages up to the first whose boxes are not ready yet."""
         while (raw := self._next) is not None:
@@ -149,10 +163,7 @@ class Writer:
             message, given = self._recording.box_message(raw.data)
         except UnsupportedMessage:
             return []  # `relabel` passes it over too, and counts it
-        seen_ns = self._recording.received_ns(raw.log_time, given.stamp_ns)
         copied = raw._replace(topic=self._refined_topic)
-        if seen_ns != raw.log_time:  # beside their clouds, where they can be looked at
-            copied = copied._replace(log_time=seen_ns, publish_time=seen_ns)
         if not given.track_ids:
             return [copied]
         waiting = self._waiting.get(given.stamp_ns)
@@ -263,14 +274,16 @@ def _storage_files(path: Path) -> list[Path]:
     return [path]
 
 
-def _mcap(path: Path, start_ns: int | None, end_ns: int | None) -> Iterator[Raw]:
-    """Yield the messages of an MCAP file in a part, and all static transforms."""
+def _mcap(
+    path: Path, start_ns: int | None, end_ns: int | None, whole: Collection[str]
+) -> Iterator[Raw]:
+    """Yield the messages of an MCAP file in a part, all of static transforms and of `whole`."""
     with path.open('rb') as file:
         reader = make_reader(file)
         summary = reader.get_summary()
         topics = {c.topic for c in summary.channels.values()} if summary else set()
-        static = [topic for topic in topics if topic.endswith(STATIC)]
-        for wanted, begin, end in _parts(None, static, start_ns, end_ns):
+        uncut = [topic for topic in topics if topic.endswith(STATIC) or topic in whole]
+        for wanted, begin, end in _parts(None, uncut, start_ns, end_ns):
             for schema, channel, message in reader.iter_messages(
                 wanted, starting_at=begin, ending_before=end
             ):
@@ -286,26 +299,28 @@ def _mcap(path: Path, start_ns: int | None, end_ns: int | None) -> Iterator[Raw]
                 )
 
 
-def _bag(path: Path, start_ns: int | None, end_ns: int | None) -> Iterator[Raw]:
+def _bag(
+    path: Path, start_ns: int | None, end_ns: int | None, whole: Collection[str]
+) -> Iterator[Raw]:
     """Yield the same of any other storage, which has one time per message and counts none."""
     with AnyReader([path], default_typestore=stock_types()) as reader:
-        static = [c for c in reader.connections if c.topic.endswith(STATIC)]
+        uncut = [c for c in reader.connections if c.topic.endswith(STATIC) or c.topic in whole]
         channels = {(c.id, id(c.owner)): _channel(c, reader) for c in reader.connections}
-        for part in _parts(reader.connections, static, start_ns, end_ns):
+        for part in _parts(reader.connections, uncut, start_ns, end_ns):
             for connection, time_ns, data in reader.messages(*part):
                 channel = channels[connection.id, id(connection.owner)]
                 yield Raw(*channel, time_ns, time_ns, 0, bytes(data))
 
 
 def _parts(
-    every: _T, static: _T, start_ns: int | None, end_ns: int | None
+    every: _T, uncut: _T, start_ns: int | None, end_ns: int | None
 ) -> list[tuple[_T, int | None, int | None]]:
-    """Return what to read from when to when: before and after the part, what is static."""
+    """Return what to read from when to when: before and after the part, what is not cut."""
     parts: list[tuple[_T, int | None, int | None]] = [(every, start_ns, end_ns)]
-    if static and start_ns is not None:
-        parts.insert(0, (static, None, start_ns))
-    if static and end_ns is not None:
-        parts.append((static, end_ns, None))
+    if uncut and start_ns is not None:
+        parts.insert(0, (uncut, None, start_ns))
+    if uncut and end_ns is not None:
+        parts.append((uncut, end_ns, None))
     return parts
 
 
