@@ -210,8 +210,9 @@ class Recording:
 
     @property
     def apart(self) -> dict[str, float]:
-        """Return the topics recorded apart from the clouds, and how much later [s]."""
-        return self._timeline.apart
+        """Return the topics in use that were recorded apart, and how much later [s]."""
+        used = self.data_topics | self._motion_topics()
+        return {topic: late for topic, late in self._timeline.apart.items() if topic in used}
 
     @property
     def typestore(self) -> Typestore:

@@ -70,6 +70,8 @@ import yaml
 UNUSED = 'sweep_', 'boxes_'  # reasons of what was not used begin so
 BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
 
+NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
+
 AHEAD = 20
 """So many clouds and box arrays, mostly half of each, are made ready while the registrar works."""
 Progress = Callable[[float, float], None]
@@ -654,7 +656,7 @@ def _summary(
         'dropped': {name: n for name, n in sorted(unused.items()) if n},
         'first_missing_transform': arrivals.first_missing_transform,
         'first_unreadable': '; '.join(map(str, recording.first_errors.values())),
-        'warning': arrivals.intake.finding,
+        'warning': arrivals.intake.finding or ('' if sink.boxes_in else NO_BOXES),
         **arrivals.intake.facts,
         'left_out_of_labels': sink.left_out(),
         'versions': {'boxreg_ros': __version__, 'python': platform.python_version()}

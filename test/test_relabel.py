@@ -307,6 +307,14 @@ def test_ends_that_say_nothing_do_not_hide_what_was_recorded_apart(tmp_path):
     assert summary['status']['refined'] > 40
 
 
+def test_a_part_without_boxes_is_told(tmp_path, capsys):
+    drive = Drive(sweeps=10)
+    drive.items = [i for i in drive.items if i[0] != '/boxes' or i[1] < drive.stamps[5]]
+    path = drive.write(tmp_path / 'drive')
+    assert main(['relabel', str(path), '-o', str(tmp_path / 'out'), '--start', '0.55']) == 0
+    assert 'no boxes in this part' in capsys.readouterr().err
+
+
 def test_a_part_begins_with_the_clouds_whatever_else_is_in_the_files(tmp_path):
     drive, day = Drive(sweeps=10), 86_400 * SECOND
     expected = run(drive.write(tmp_path / 'drive'), tmp_path / 'expected', start=0.25, end=0.75)[1]
