@@ -257,9 +257,7 @@ class _Edge:
         """Return ``T_parent_child`` at a stamp."""
         stamps = self.stamps
         if not stamps:
-            cause = (
-                'none has come but what is NaN or has no orientation; look at its publisher'
-            )
+            cause = 'none has come but what is NaN or has no orientation; look at its publisher'
             if self._was_forgotten:
                 cause = 'no pose has come since time went back; look whether its publisher goes on'
             raise TransformUnavailable(f'transform {self.parent} -> {self.child}: {cause}')
