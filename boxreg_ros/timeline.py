@@ -108,8 +108,9 @@ class Timeline:
         ends = list(islice(self._stamped(connection, None), 1))
         window_ns = APART_NS // 10
         while len(ends) == 1:  # from the end backward, further and further
-            start_ns = max(begin_ns, end_ns - window_ns)
-            ends += deque(self._stamped(connection, start_ns), maxlen=1)
+            start_ns = end_ns - window_ns
+            found = self._stamped(connection, start_ns if start_ns > begin_ns else None)
+            ends += deque(found, maxlen=1)
             window_ns *= 2
         return ends
 
