@@ -683,10 +683,12 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
     if put_in := status.get(INTERPOLATED):
         kept += f', {put_in:,} interpolated'
     unreadable = summary['dropped'].get('unreadable')
+    apart = ', '.join(f'{t} ({late:+,.1f} s)' for t, late in summary['recorded_apart'].items())
     return (
         f'{out}: {summary["boxes_in"]:,} boxes in, {status.get(REFINED, 0):,} refined, {kept} '
         f'from {summary["sweeps"]:,} sweeps in {summary["seconds"]["total"]:.1f} s, '
         f'fixed frame {summary["fixed_frame"]}'
+        + (f'; merged by stamp: {apart}' if apart else '')
         + (f'; {unreadable:,} messages could not be read' if unreadable else '')
     )
 

@@ -266,6 +266,7 @@ def test_a_detector_that_falls_behind_loses_nothing(tmp_path):
     summary, rows = run(path, tmp_path / 'out')
     assert rows == expected
     assert summary['recorded_apart'] == {'/boxes': pytest.approx(5.5)}
+    assert closing_line(summary, tmp_path).endswith('; merged by stamp: /boxes (+5.5 s)')
 
 
 def test_what_begins_before_the_clouds_and_ends_after_them_is_merged_by_stamp(tmp_path):
