@@ -11,13 +11,13 @@ from torch import Tensor
 from torch.nn.functional import embedding, pad
 
 BOTTOM = 5
-MARGIN = 0.3  # outside a face, points still count for it [m]
+MARGIN = 0.35  # outside a face, points still count for it [m]
 LEAST = 3  # points without which a face is not seen
 STRIPS = 3  # of a face side by side: each has outermost points of its own
 ACROSS = [1, 1, 0, 0, 1]  # axis along which they lie
 BEHIND = 0.2  # what is this far behind the outermost point of all is not on the face [m]
 BESIDE = 0.2  # outside the edges of a face, points still count for it [m]
-INSIDE = 0.3  # more room on the inner side of a face than on its outer side [m]
+INSIDE = 0.35  # more room on the inner side of a face than on its outer side [m]
 VEILED = 0.25  # say of a face that is hidden behind its edge
 TURN = 0.25  # how fast a face is lost when it turns away; its edges are rounder at the ends
 FAR = 1e9
