@@ -203,9 +203,7 @@ class Recording:
         return bytes(encode(replaced, kind))
 
     def received_ns(self, topic: str, received_ns: int, data: bytes) -> int:
-        """Return when a message counts as received: with its clouds, if recorded apart [ns]."""
-        if topic not in self.apart:
-            return received_ns
+        """Return when a message on a topic of `apart` counts as received: with its clouds [ns]."""
         return self._timeline.received_ns(self._connections({topic})[0], received_ns, data)
 
     @property

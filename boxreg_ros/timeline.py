@@ -44,6 +44,7 @@ class Timeline:
     def __init__(self, reader: Reader, points_topic: str, stamp_of: StampOf) -> None:
         self._reader, self._stamp_of = reader, stamp_of
         self._clouds = [c for c in reader.connections if c.topic == points_topic]
+        self._begin_ns, self._end_ns = self._span(self._clouds)
         self._known: dict[tuple[int, int], bool] = {}
         self.apart: dict[str, float] = {}
 
@@ -70,7 +71,7 @@ class Timeline:
     def _by_stamp(
         self, connection: Connection, start_ns: int | None, end_ns: int | None
     ) -> Iterator[Item]:
-        last_ns = self._span(self._clouds)[0]
+        last_ns = self._begin_ns
         for _, _, data in self._reader.messages([connection], None, None):
             due_ns = self._due_ns(self._stamp_of(connection, data))
             # What has no place among the clouds keeps its place behind the message before.
@@ -93,12 +94,12 @@ class Timeline:
     def _late_ns(self, connection: Connection) -> int:
         """Return how late the first or the last message was, whichever is more; 0 if unknown."""
         delay_ns = self._delay_ns
-        ends = [] if delay_ns is None else self._ends(connection)
-        due = [(t, stamp_ns + (delay_ns or 0)) for t, stamp_ns in ends]
+        if delay_ns is None:
+            return 0
+        due = [(t, stamp_ns + delay_ns) for t, stamp_ns in self._ends(connection)]
         among = [(t, due_ns) for t, due_ns in due if self._is_among(due_ns)]
-        begin_ns, end_ns = self._span(self._clouds)
-        # Both may be outside: what was recorded before the first cloud, and after the last.
-        if not among and due and due[0][1] < begin_ns < end_ns < due[-1][1]:
+        # Both may be outside: what begins before the first cloud and ends after the last.
+        if not among and due and due[0][1] < self._begin_ns < self._end_ns < due[-1][1]:
             among = due
         return max((t - due_ns for t, due_ns in among), key=abs, default=0)
 
@@ -135,8 +136,7 @@ class Timeline:
         return due_ns if self._is_among(due_ns) else None
 
     def _is_among(self, due_ns: int) -> bool:
-        begin_ns, end_ns = self._span(self._clouds)
-        return begin_ns - APART_NS <= due_ns < end_ns + APART_NS
+        return self._begin_ns - APART_NS <= due_ns < self._end_ns + APART_NS
 
     def _span(self, connections: Iterable[Connection]) -> tuple[int, int]:
         begins, ends = zip(*map(self._reader.span_ns, connections), strict=True)

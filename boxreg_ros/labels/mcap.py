@@ -139,13 +139,15 @@ class Writer:
         self, messages: Iterator[Raw], start_ns: int | None, end_ns: int | None
     ) -> Iterator[Raw]:
         """Yield messages; those that were recorded apart come with their clouds."""
+        apart = self._recording.apart
         for raw in messages:
-            seen_ns = self._recording.received_ns(raw.topic, raw.log_time, raw.data)
-            is_in = (start_ns or 0) <= seen_ns and (end_ns is None or seen_ns < end_ns)
-            if seen_ns != raw.log_time and is_in:
-                yield raw._replace(log_time=seen_ns, publish_time=seen_ns)
-            elif is_in or raw.topic not in self._recording.apart:
+            if raw.topic not in apart:
                 yield raw
+                continue
+            seen_ns = self._recording.received_ns(raw.topic, raw.log_time, raw.data)
+            if (start_ns or 0) <= seen_ns and (end_ns is None or seen_ns < end_ns):
+                is_same = seen_ns == raw.log_time
+                yield raw if is_same else raw._replace(log_time=seen_ns, publish_time=seen_ns)
 
     def _copy(self, is_end: bool) -> None:
         """Copy messages up to the first whose boxes are not ready yet."""
