@@ -16,7 +16,8 @@ from typing import Any
 from boxreg_ros.diagnostics import Health
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.inbox import Inbox, Message
-from boxreg_ros.live import Arrival, LiveRegistrar, Outgoing, says_nothing, warm_up
+from boxreg_ros.intake import says_nothing
+from boxreg_ros.live import Arrival, LiveRegistrar, Outgoing, warm_up
 from boxreg_ros.params import changed, declare, parameters_yaml
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.visual import MarkerBoard

@@ -12,7 +12,6 @@ from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedM
 from boxreg_ros.metrics import EXTENT
 from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.relabel import to_fixed_frame
 from boxreg_ros.simulate import Scene
 from boxreg_ros.structures import (
     BoxArray,
@@ -27,7 +26,7 @@ from boxreg_ros.structures import (
     YAW,
 )
 from boxreg_ros.tracks import Track
-from boxreg_ros.transforms import sweep_to_frame, TransformTree
+from boxreg_ros.transforms import sweep_to_frame, to_fixed_frame, TransformTree
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

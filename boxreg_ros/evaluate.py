@@ -283,7 +283,7 @@ def run(args: argparse.Namespace) -> int:
             )
         predicted = _in_frame(BoxTable.read_frames(source), truth.frame_id)
     else:
-        from boxreg_ros.relabel import input_boxes  # reads bags: not needed for tables
+        from boxreg_ros.recording import input_boxes  # reads bags: not needed for tables
 
         predicted = BoxTable.from_arrays(input_boxes(source, args.fixed_frame, **topics))
     classes = [word for part in args.classes for word in part.split(',') if word]

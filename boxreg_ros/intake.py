@@ -8,6 +8,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.pose_check import PoseCheck
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from boxreg_ros.tracker import Tracker
+from boxreg_ros.transforms import Rewind
 from msg_adapters.convention import Convention
 import numpy as np
 
@@ -15,7 +16,12 @@ _T = TypeVar('_T', bound=Sweep | BoxArray)
 
 
 class Intake:
-    """Give boxes ids where wanted, and look whether boxes stand where their points are."""
+    """
+    Tell where stamps start again, give boxes ids where wanted, and look whether they fit.
+
+    Boxes fit that stand where their points are.
+
+    """
 
     def __init__(self, convention: Convention, config: Config) -> None:
         self._convention = convention
@@ -26,13 +32,21 @@ class Intake:
         """Forget what has been taken; ids that were given do not come again."""
         self._check = PoseCheck(self._convention, config.tolerance)
         self.change(config)
-        if self._tracker is not None:
-            self._tracker.forget()
+        self._forget()
 
     def change(self, config: Config) -> None:
         """Take over the setting that may change: how long a track may be unseen."""
         if self._tracker is not None:
             self._tracker.max_gap = config.max_gap
+
+    def begins_anew(self, item: Sweep | BoxArray) -> bool:
+        """Tell whether stamps start again with the next sweep or boxes; then ids do, too."""
+        if says_nothing(item):
+            return False
+        if not self._rewinds[isinstance(item, BoxArray)].happened(item.stamp_ns):
+            return False
+        self._forget()
+        return True
 
     def take(self, item: _T) -> _T:
         """Return a sweep or boxes, in the fixed frame, as the registrar is to have them."""
@@ -52,6 +66,17 @@ class Intake:
         if self._tracker is None:
             return {'ids': 'of the input'}
         return {'ids': 'by association', 'associated_tracks': self._tracker.count}
+
+    def _forget(self) -> None:
+        self._rewinds = Rewind(), Rewind()
+        if self._tracker is not None:
+            self._tracker.forget()
+
+
+def says_nothing(item: Sweep | BoxArray) -> bool:
+    """Tell whether this is an array without boxes, and without a stamp or a frame to wait for."""
+    is_empty = isinstance(item, BoxArray) and not item.track_ids
+    return is_empty and not (item.frame_id and item.stamp_ns)
 
 
 def covariances_to_write(refined: RefinedBoxes) -> Floats:

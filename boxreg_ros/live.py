@@ -10,16 +10,10 @@ from typing import Any, NamedTuple
 from boxreg_ros import refine, Track
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.intake import covariances_to_write, Intake
+from boxreg_ros.intake import covariances_to_write, Intake, says_nothing
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
-from boxreg_ros.transforms import (
-    boxes_to_frame,
-    inverse,
-    Rewind,
-    sweep_to_frame,
-    TransformTree,
-)
+from boxreg_ros.transforms import boxes_to_frame, inverse, sweep_to_frame, TransformTree
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.poses import turned_covariances
@@ -29,8 +23,6 @@ SETTLE = 0.3
 """Transforms are collected this long before a fixed frame is chosen among them [s]."""
 SILENCE = 3.0
 """After so long without boxes, final ones are not held back any more [s]."""
-
-
 CLOUD_SILENCE = 0.5
 """After so long without clouds, boxes that have waited as long do not wait for theirs [s]."""
 
@@ -133,7 +125,6 @@ class LiveRegistrar:
         self.cloud_frame = ''
         self._choose_at: float | None = None
         self.adapter: Adapter | None = None
-        self._rewinds = Rewind(), Rewind()
         self._last_boxes = 0.0
 
     @property
@@ -171,7 +162,7 @@ class LiveRegistrar:
         if says_nothing(content):
             return self.passed_through(item.message)
         ready: list[Outgoing] = []
-        if self._rewinds[isinstance(content, BoxArray)].happened(content.stamp_ns):
+        if self._intake.begins_anew(content):
             self._trouble('time_jump', f'stamps went back to {content.stamp_ns} ns', 1)
             ready = self.reset()
             self.tree.rewind(content.stamp_ns)
@@ -250,7 +241,6 @@ class LiveRegistrar:
         ready = self.flush()
         self._registrar.reset()
         self._intake.begin(self.config)
-        self._rewinds = Rewind(), Rewind()
         return ready
 
     def abandon(self, item: Arrival | None) -> list[Outgoing]:
@@ -344,12 +334,6 @@ class LiveRegistrar:
                 while self._held and isinstance(self._held[0], _Passing):
                     outgoing.append(Outgoing(self._held.popleft().message, True))
         return outgoing
-
-
-def says_nothing(content: Sweep | BoxArray) -> bool:
-    """Tell whether this is an array without boxes, and without a stamp or a frame to wait for."""
-    is_empty = isinstance(content, BoxArray) and not content.track_ids
-    return is_empty and not (content.frame_id and content.stamp_ns)
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:

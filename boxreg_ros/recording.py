@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 import shlex
 from typing import Any, NamedTuple, Self
@@ -17,12 +17,13 @@ from typing import Any, NamedTuple, Self
 from boxreg_ros.errors import (
     BoxregError,
     RecordingError,
+    TransformUnavailable,
     UnsupportedMessage,
 )
 from boxreg_ros.foxglove_mcap import encoded, Reader
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from boxreg_ros.timeline import Timeline
-from boxreg_ros.transforms import TransformTree
+from boxreg_ros.transforms import to_fixed_frame, TransformTree
 from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, poses, WITHOUT_IDS
 from msg_adapters.convention import Convention, STANDARD
 from rosbags.interfaces import Connection
@@ -526,3 +527,22 @@ def _readable(what: object) -> Iterator[None]:
 def _text(error: Exception) -> str:
     """Return an error in one line."""
     return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
+
+
+def input_boxes(path: Path, fixed_frame: str | None = None, **topics: Any) -> list[BoxArray]:
+    """
+    Return the boxes of a recording as they are, in the fixed frame `relabel` would choose.
+
+    Box arrays without a transform to that frame are left out, and what cannot be read. `topics`
+    are those that `Recording` wants to be told where several fit.
+
+    """
+    tree = TransformTree()
+    with Recording([path], **topics) as recording:
+        fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
+        arrays = []
+        for record in recording.records(tree):
+            if record.connection.topic == recording.boxes_topic:
+                with suppress(TransformUnavailable, UnsupportedMessage):
+                    arrays.append(to_fixed_frame(recording.decode(record), tree, fixed_frame))
+    return [array for array in arrays if isinstance(array, BoxArray)]

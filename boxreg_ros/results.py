@@ -14,6 +14,7 @@ from uuid import uuid4
 from boxreg_ros.errors import ConfigError, RecordingError
 
 SUMMARY = 'summary.json'
+CONFIG = 'config.yaml'
 
 
 def earlier_summary(out: Path) -> dict[str, Any] | None:

@@ -324,6 +324,24 @@ def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     return replace(sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t)
 
 
+def to_fixed_frame(
+    item: Sweep | BoxArray, tree: TransformTree, fixed_frame: str
+) -> Sweep | BoxArray:
+    """
+    Return a sweep or boxes in the fixed frame.
+
+    Raises
+    ------
+    TransformUnavailable
+        If none is known at its stamp.
+
+    """
+    T_fixed_item = tree.lookup(fixed_frame, item.frame_id, item.stamp_ns)
+    if isinstance(item, Sweep):
+        return sweep_to_frame(item, T_fixed_item, fixed_frame)
+    return boxes_to_frame(item, T_fixed_item, fixed_frame)
+
+
 def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> BoxArray:
     """Return the boxes in another frame; what is NaN stays NaN."""
     moved = boxes.boxes.copy()

@@ -8,7 +8,8 @@ from boxreg_ros.convert import Conversion, convert
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.formats import HEAD, rows
 from boxreg_ros.labels import FORMATS, frames_of, Options
-from boxreg_ros.relabel import input_boxes, relabel, Request
+from boxreg_ros.recording import input_boxes
+from boxreg_ros.relabel import relabel, Request
 import numpy as np
 import pytest
 from ros_messages import Drive, SECOND

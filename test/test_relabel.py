@@ -11,7 +11,8 @@ from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.convert import Conversion, convert
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
-from boxreg_ros.relabel import closing_line, input_boxes, relabel, Request
+from boxreg_ros.recording import input_boxes
+from boxreg_ros.relabel import closing_line, relabel, Request
 from msg_adapters.convention import Convention
 import numpy as np
 import pytest

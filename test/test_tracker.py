@@ -1,5 +1,6 @@
 """Ids by association: the same for the same object, whatever comes between."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from boxreg_ros.config import Config
@@ -120,6 +121,21 @@ def test_intake_begins_anew_with_new_ids_and_takes_another_gap():
     intake.begin(Config(max_gap=0.5))
     assert intake.take(first).track_ids == ('2',)
     assert intake.take(later).track_ids == ('3',)
+
+
+def test_intake_tells_where_stamps_start_again():
+    intake = Intake(Convention(associate=True), Config())
+    ids, jumps = [], []
+    # A stray that is old is none; two in a row are a new beginning, and so is what follows it.
+    for seconds in (10.0, 10.1, 3.0, 10.2, 3.0, 3.1, 3.2):
+        boxes = array_of(START + round(seconds * SECOND), (5.0, 0.0, CAR))
+        jumps.append(intake.begins_anew(boxes))
+        ids.append(intake.take(boxes).track_ids[0])
+    assert jumps == [False] * 5 + [True, False]
+    assert ids[5] == ids[6] not in ids[:5]
+    # An array without boxes, stamp and frame is older than anything, and tells nothing.
+    nothing = replace(array_of(0), frame_id='')
+    assert not any(intake.begins_anew(nothing) for _ in range(3))
 
 
 def test_ids_of_a_real_drive():
