@@ -1,6 +1,7 @@
 """Labels for SUSTechPOINTS, Datumaro and CVAT, Supervisely and Xtreme1, and clouds beside them."""
 
 import json
+import shutil
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.labels import frames_of, LabelFrame, Options, Provenance, writer_for
@@ -265,6 +266,28 @@ def test_foreign_json_is_refused(tmp_path, name, file):
     (tmp_path / name / file).write_text('[{"a": 1}]')
     with pytest.raises(RecordingError, match='expected'):
         list(frames_of(name, tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    ('name', 'part', 'word'),
+    [('supervisely', 'episode', 'episode'), ('xtreme1', 'scene_1', 'scene')],
+)
+def test_of_several_parts_one_is_to_be_named(tmp_path, name, part, word):
+    write(name, tmp_path, [frame(STAMP, ['a'])])
+    project = tmp_path / name
+    shutil.copytree(project / part, project / 'second')
+    with pytest.raises(RecordingError, match=rf'expected one {word}.*got {part}, second; name'):
+        list(frames_of(name, project))
+    (found,) = frames_of(name, project / 'second')
+    assert found.refined.boxes.track_ids == ('a',)
+    # Of another time: its own timeline is in its folder.
+    (project / 'second' / 'timestamps.txt').write_text(f'{STAMP + 7}\n')
+    stamps = [next(frames_of(name, project / p)).refined.boxes.stamp_ns for p in (part, 'second')]
+    assert stamps == [STAMP, STAMP + 7]
+    shutil.rmtree(project / part)
+    shutil.rmtree(project / 'second')
+    with pytest.raises(RecordingError, match=rf'expected one {word}.*got none'):
+        list(frames_of(name, project))
 
 
 # Clouds ---------------------------------------------------------------------------------------

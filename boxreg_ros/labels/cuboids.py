@@ -10,13 +10,13 @@ frame; the extents are along the box's own x (forward), y (left) and z.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import INPUT, LabelFrame
+from boxreg_ros.labels import absolute, INPUT, LabelFrame
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import read_timeline, refined_boxes, STAMPS
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, PITCH, RefinedBoxes, ROLL, X, YAW, Z
@@ -124,6 +124,39 @@ def write_points(frame: LabelFrame, path: Path) -> None:
     """Write the frame's cloud, an empty one if none belongs to it: the tools need a file."""
     points = np.zeros((0, 3)) if frame.sweep is None else frame.sweep.points
     write_cloud(path, points, frame.intensities)
+
+
+def part_of(path: Path, what: str, marks: Collection[str]) -> tuple[Path, Path]:
+    """
+    Return the folder of the only part of a project, its scene or episode, and of its `Timeline`.
+
+    The timeline is in the part, or else beside it.
+
+    Parameters
+    ----------
+    path : Path
+        The project, or the part itself.
+    what : str
+        What a part is called.
+    marks : collection of str
+        Files or folders, one of which every part holds.
+
+    Raises
+    ------
+    RecordingError
+        If there is no part, or several.
+
+    """
+    folders = [path, *(sorted(path.iterdir()) if path.is_dir() else ())]
+    found = [folder for folder in folders if any((folder / mark).exists() for mark in marks)]
+    if len(found) != 1:
+        names = ', '.join(folder.name for folder in found) or 'none'
+        raise RecordingError(
+            f'{path}: expected one {what}, a folder with {" or ".join(marks)}, got {names}; name '
+            f'the folder of one'
+        )
+    (part,) = found
+    return part, part if (part / STAMPS).exists() else absolute(part).parent
 
 
 def frames_in(

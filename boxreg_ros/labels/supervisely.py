@@ -23,6 +23,7 @@ from boxreg_ros.labels.cuboids import (
     frames_in,
     numbers,
     OURS,
+    part_of,
     write_points,
 )
 from boxreg_ros.labels.files import from_json, Timeline, to_json
@@ -142,17 +143,19 @@ class Writer:
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the frames of the project's first episode.
+    Yield the frames of an episode, or of a project's only one.
 
-    ``timestamps.txt`` in the project has a stamp [ns] per frame.
+    ``timestamps.txt`` in the episode or in the project has a stamp [ns] per frame.
 
     Raises
     ------
     RecordingError
-        If a file is missing or does not hold cuboids of Supervisely.
+        If a file is missing or does not hold cuboids of Supervisely, or there are several
+        episodes.
 
     """
-    file = next(iter(sorted(path.glob('*/annotation.json'))), path / EPISODE / 'annotation.json')
+    episode, folder = part_of(path, 'episode', ['annotation.json'])
+    file = episode / 'annotation.json'
     content = from_json(file)
     clouds = from_json(file.with_name('frame_pointcloud_map.json'))
     try:
@@ -170,7 +173,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         raise RecordingError(
             f'{file}: expected cuboids as Supervisely has them: {error!r}'
         ) from None
-    yield from frames_in(path, list(items), items.__getitem__)
+    yield from frames_in(folder, list(items), items.__getitem__)
 
 
 def _item(

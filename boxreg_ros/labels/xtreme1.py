@@ -23,6 +23,7 @@ from boxreg_ros.labels.cuboids import (
     frames_in,
     numbers,
     OURS,
+    part_of,
     write_points,
 )
 from boxreg_ros.labels.files import from_json, Timeline, to_json
@@ -94,17 +95,18 @@ class Writer:
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the frames of a folder; ``timestamps.txt`` in it has a stamp [ns] per frame.
+    Yield the frames of a scene, or of a folder with one scene.
 
-    Boxes that Xtreme1 exports are read as well, in one file per frame of ``scene_1/result``.
+    ``timestamps.txt`` in either has a stamp [ns] per frame. Boxes that Xtreme1 exports are read as
+    well, in one file per frame of the scene's ``result``.
 
     Raises
     ------
     RecordingError
-        If a file is missing or is not what Xtreme1 takes.
+        If a file is missing or is not what Xtreme1 takes, or there are several scenes.
 
     """
-    scene = path / SCENE
+    scene, folder = part_of(path, 'scene', [RESULT, CLOUDS])
 
     def items_of(name: str) -> list[tuple[str, str, Floats, Mapping[str, Any]]]:
         file = scene / RESULT / f'{name}.json'
@@ -122,7 +124,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             ) from None
 
     names = {f.stem for f in (*scene.glob(f'{RESULT}/*.json'), *scene.glob(f'{CLOUDS}/*.pcd'))}
-    yield from frames_in(path, sorted(names), items_of)
+    yield from frames_in(folder, sorted(names), items_of)
 
 
 def _item(item: dict[str, Any]) -> tuple[str, str, Floats, Mapping[str, Any]]:
