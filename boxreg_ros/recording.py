@@ -122,7 +122,7 @@ class Recording:
         """Open all files and find the topics."""
         with _readable(self):
             self.files = _files(self._paths)
-            self._reader = Reader(self.files, stock_types)
+            self._reader = _opened(self.files)
         try:
             self._find()
         except BaseException:
@@ -500,6 +500,17 @@ def _files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
+def _opened(files: Sequence[Path]) -> Reader:
+    """Return a reader of all files; an error names the one that cannot be read."""
+    try:
+        return Reader(files, stock_types)
+    except Exception:
+        for path in files:
+            with _readable(path):
+                Reader([path], stock_types).close()
+        raise
+
+
 def stock_types() -> Typestore:
     """Return the definitions used where a recording has none (before ROS 2 Iron)."""
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -520,7 +531,7 @@ def _readable(what: object) -> Iterator[None]:
     except Exception as error:
         raise RecordingError(
             f'{what}: {_text(error)}; expected a whole MCAP file, rosbag2 folder, .db3 file or '
-            f'ROS 1 bag'
+            f'ROS 1 bag; mcap recover, ros2 bag reindex and rosbag reindex mend those cut short'
         ) from None
 
 

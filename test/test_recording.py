@@ -322,6 +322,9 @@ def test_recording_that_was_cut_off(tmp_path):
     path = Drive().write(tmp_path / 'drive')
     path.write_bytes(path.read_bytes()[:-500])
     assert 'expected a whole MCAP' in refused(path)
+    # Of several it is the one that is named.
+    whole = [Drive().write(tmp_path / name) for name in ('before', 'behind')]
+    assert refused([whole[0], path, whole[1]]).startswith(f'{path}: ')
 
 
 def test_recording_without_messages(tmp_path):
