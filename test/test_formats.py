@@ -525,7 +525,7 @@ def test_one_of_several_sequences_of_kitti_is_named(tmp_path):
     _, folder = written('kitti', tmp_path)
     for part in ('label_02', 'calib'):
         shutil.copy(folder / part / '0000.txt', folder / part / '0001.txt')
-    with pytest.raises(RecordingError, match=r'expected one sequence .*, got 2; name the file'):
+    with pytest.raises(RecordingError, match=r'one sequence, .*, got 0000.txt, 0001.txt; name'):
         list(frames_of('kitti', folder))
     assert len(list(frames_of('kitti', folder / 'label_02' / '0001.txt'))) == 1
 

@@ -18,7 +18,7 @@ from typing import Any
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import absolute, INPUT, LabelFrame
 from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import read_timeline, refined_boxes, STAMPS
+from boxreg_ros.labels.files import read_timeline, refined_boxes, STAMPS, the_one
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, PITCH, RefinedBoxes, ROLL, X, YAW, Z
 import numpy as np
 from numpy.typing import ArrayLike
@@ -149,13 +149,7 @@ def part_of(path: Path, what: str, marks: Collection[str]) -> tuple[Path, Path]:
     """
     folders = [path, *(sorted(path.iterdir()) if path.is_dir() else ())]
     found = [folder for folder in folders if any((folder / mark).exists() for mark in marks)]
-    if len(found) != 1:
-        names = ', '.join(folder.name for folder in found) or 'none'
-        raise RecordingError(
-            f'{path}: expected one {what}, a folder with {" or ".join(marks)}, got {names}; name '
-            f'the folder of one'
-        )
-    (part,) = found
+    part = the_one(found, path, f'{what}, a folder with {" or ".join(marks)}')
     return part, part if (part / STAMPS).exists() else absolute(part).parent
 
 

@@ -21,6 +21,22 @@ STAMPS, POSES, ORIGIN = 'timestamps.txt', 'poses.txt', 'boxreg.json'
 FIRST_GIVEN_NUMBER = 10**6
 
 
+def the_one(found: Sequence[Path], path: Path, what: str) -> Path:
+    """
+    Return what was found in `path`.
+
+    Raises
+    ------
+    RecordingError
+        If that is none, or several.
+
+    """
+    if len(found) != 1:
+        names = ', '.join(item.name for item in found) or 'none'
+        raise RecordingError(f'{path}: expected one {what}, got {names}; name the path of one')
+    return found[0]
+
+
 def refined_boxes(
     stamp_ns: int,
     frame_id: str,

@@ -18,7 +18,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import read_timeline, refined_boxes, Timeline, TrackNumbers
+from boxreg_ros.labels.files import read_timeline, refined_boxes, the_one, Timeline, TrackNumbers
 from boxreg_ros.structures import HEIGHT, LENGTH, WIDTH
 import numpy as np
 
@@ -116,12 +116,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """
     if path.is_dir():
         found = sorted((path / 'label_02').glob('*.txt'))
-        if len(found) != 1:
-            raise RecordingError(
-                f'{path}: expected one sequence in label_02/*.txt, got {len(found)}; name the '
-                f'file of one'
-            )
-        path = found[0]
+        path = the_one(found, path, 'sequence, label_02/NAME.txt')
     folder = absolute(path).parent.parent
     try:
         lines = [line.split() for line in path.read_text(encoding='utf-8').splitlines()]

@@ -28,6 +28,7 @@ from boxreg_ros.labels.files import (
     from_json,
     JsonList,
     refined_boxes,
+    the_one,
     write_origin,
 )
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, WIDTH, X, Z
@@ -227,12 +228,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
     found = [path] if (path / 'sample.json').exists() else sorted(
         file.parent for file in path.glob('*/sample.json')
     )  # fmt: skip
-    if len(found) != 1:
-        names = ', '.join(item.name for item in found) or 'none'
-        raise RecordingError(
-            f'{path}: expected one folder with the tables of nuScenes, got {names}'
-        )
-    tables, folder = found[0], found[0].parent
+    tables = the_one(found, path, 'folder with the tables of nuScenes')
+    folder = tables.parent
     try:
         category = {item['token']: item['name'] for item in from_json(tables / 'category.json')}
         instance = {item['token']: item for item in from_json(tables / 'instance.json')}

@@ -19,7 +19,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.arrow import read_rows, Table
-from boxreg_ros.labels.files import frame_names, refined_boxes, to_json, write_origin
+from boxreg_ros.labels.files import frame_names, refined_boxes, the_one, to_json, write_origin
 from boxreg_ros.structures import HEIGHT, LENGTH, X, YAW, Z
 import numpy as np
 
@@ -115,13 +115,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
     """
     if path.is_dir():
-        files = sorted((path / 'lidar_box').glob('*.parquet'))
-        if len(files) != 1:
-            raise RecordingError(
-                f'{path}: expected one segment in lidar_box/*.parquet, got {len(files)}; name the '
-                f'file of one'
-            )
-        path = files[0]
+        found = sorted((path / 'lidar_box').glob('*.parquet'))
+        path = the_one(found, path, 'segment, lidar_box/NAME.parquet')
     folder = absolute(path).parent.parent
     rows = read_rows(path)
     missing = [name for name in COLUMNS if rows and name not in (*rows[0], *UNKNOWN, *OURS)]
