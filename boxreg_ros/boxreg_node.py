@@ -22,7 +22,7 @@ from boxreg_ros.params import changed, declare, parameters_yaml
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.visual import MarkerBoard
 from diagnostic_msgs.msg import DiagnosticArray
-from msg_adapters import adapter_for, ADAPTERS, canonical, pointcloud
+from msg_adapters import adapter_for, canonical, pointcloud
 from msg_adapters.poses import stamp_ns
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
@@ -208,9 +208,9 @@ class BoxregNode(Node):
             self.get_logger().warning(f'{self.resolve_topic_name("boxes")}: {complaints[0]}')
 
     def _told_apart(self, types: set[str]) -> tuple[list[str], list[str]]:
-        """Return the types of boxes that can be read, best first, and why the others cannot."""
+        """Return the types of boxes that can be read, sorted, and why the others cannot."""
         readable, complaints = [], []
-        for name in sorted(types, key=lambda name: (name not in ADAPTERS, name)):
+        for name in sorted(types):
             try:
                 adapter_for(name, self._convention)
                 import_message(name)
@@ -338,8 +338,10 @@ class BoxregNode(Node):
     def work(self) -> None:
         """Take arrivals until `stop`, each as soon as its transforms are there."""
         item: Arrival | None = None
-        while not self._stopping.is_set():
-            self._inbox.news.clear()
+        while True:
+            self._inbox.news.clear()  # before the look at `_stopping`: `stop` sets both
+            if self._stopping.is_set():
+                break
             self._take_news()
             self._miss_clouds(item)
             item = item or self._decoded(self._take())

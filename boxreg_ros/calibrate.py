@@ -274,10 +274,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print what was found, and write it as settings."""
     config = config_from(args)
-    if args.output and not args.output.parent.is_dir():
+    if args.associate and not args.no_boxes:
         raise ConfigError(
-            f'output {str(args.output)!r}: expected a folder that is there, got '
-            f'{str(args.output.parent)!r}; make it first'
+            '--associate: expected boxes with the ids of the truth, got none that could have '
+            'them; measure the rule alone with --no-boxes'
+        )
+    if args.output and (args.output.is_dir() or not args.output.parent.is_dir()):
+        raise ConfigError(
+            f'output {str(args.output)!r}: expected a file in a folder that is there, got '
+            f'{str(args.output if args.output.is_dir() else args.output.parent)!r}; choose another'
         )
     if args.output:  # that of --config may be measured anew
         spare_file(args.output, [*args.recordings, args.truth])

@@ -177,7 +177,7 @@ class Config:
 
     def class_config(self, class_name: str) -> ClassConfig:
         """Return how objects of `class_name` move; unknown classes move like vehicles."""
-        words = {*class_name.lower().translate(str.maketrans('_-.', '   ')).split()}
+        words = words_of(class_name)
         kinds = (k for k in (self.cyclist, self.pedestrian) if words & {*map(str.lower, k.names)})
         return next(kinds, self.vehicle)
 
@@ -235,6 +235,11 @@ class Config:
         except (OSError, UnicodeDecodeError, yaml.YAMLError, ConfigError) as error:
             reason = ' '.join(str(error).split())
             raise ConfigError(f'config file {str(path)!r}: {reason}') from None
+
+
+def words_of(class_name: str) -> set[str]:
+    """Return the words of a class name, in lower case."""
+    return {*class_name.lower().translate(str.maketrans('_-./', '    ')).split()}
 
 
 def settings() -> Iterator[Setting]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros import __version__
+from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.labelled import (
     add_label_arguments,
@@ -24,9 +25,6 @@ from boxreg_ros.results import SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import Sweep
 from boxreg_ros.transforms import boxes_to_frame, TransformTree
-
-TOLERANCE_NS = 20_000_000
-"""A cloud belongs to boxes within this [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +145,7 @@ def _frames(request: Conversion, folder: Path, counts: Counter[str]) -> Iterator
         return
     tree = TransformTree()
     labels = (request.given, request.source)
-    spool = Spool(folder, TOLERANCE_NS) if request.options.with_points else None
+    spool = Spool(folder, Config()) if request.options.with_points else None
     topics = {'points': request.points, 'odometry': request.odometry}
     with LabelledRecording(labels, request.recordings, **topics) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
@@ -191,7 +189,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--to', dest='wanted', required=True, metavar='FORMAT,...',
-        type=lambda text: tuple(dict.fromkeys(text.split(','))), help='formats to write',
+        type=lambda text: tuple(dict.fromkeys(name.strip() for name in text.split(','))),
+        help='formats to write',
     )  # fmt: skip
     parser.add_argument(
         '--recording', type=Path, action='append', default=[], metavar='RECORDING',

@@ -57,6 +57,7 @@ class Health:
             is_time = now - self._warned.get(reason, -LOG_PERIOD) >= LOG_PERIOD
             if is_time:
                 self._warned[reason] = now
+                self._logged[reason] = self._counts[reason] + self._elsewhere[reason]
         return is_time
 
     def complaints(self) -> Iterator[str]:
@@ -66,7 +67,6 @@ class Health:
         for name, reason in REASONS.items():
             number = counts[name] - self._logged[name]
             if number and reason.remedy and self.is_time_to_warn(name):
-                self._logged[name] = counts[name]
                 yield f'{name} ({number} more): {reason.meaning}; {reason.remedy}'
 
     def status(self, name: str, facts: Mapping[str, object]) -> DiagnosticStatus:

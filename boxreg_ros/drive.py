@@ -114,15 +114,7 @@ class Drive:
                     off_ns = np.abs(truth.stamps_ns - item.stamp_ns)
                     if within is None or (off_ns <= within * 1e9).any():
                         sweeps.append(item)
-        unread = [str(error) for error in recording.first_errors.values()]
-        left_out = '; '.join(
-            f'{count} messages {what}, first: {reasons[0]}'
-            for count, what, reasons in (
-                (recording.unreadable.total(), 'could not be read', unread),
-                (len(unmoved), 'had no transform', unmoved),
-            )
-            if count
-        )
+        left_out = recording.left_out(unmoved)
         if not has_sweeps:
             reason = f': {left_out}' if left_out else ''
             raise RecordingError(f'{recording}: expected sweeps, got none{reason}')

@@ -14,6 +14,7 @@ from typing import Any
 
 from boxreg_ros.arguments import add_topic_arguments
 from boxreg_ros.boxtable import BoxTable
+from boxreg_ros.config import words_of
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.metrics import EXTENT, iou_3d, iou_bev, pose_errors
 from boxreg_ros.structures import Floats, Ints, YAW
@@ -229,9 +230,7 @@ def evaluate(
 
 def has_word(class_name: str, words: Sequence[str]) -> bool:
     """Return whether `class_name` holds one of `words`, any case; True for no words."""
-    for mark in '_-./':
-        class_name = class_name.replace(mark, ' ')
-    return not words or not {w.lower() for w in words}.isdisjoint(class_name.lower().split())
+    return not words or not {w.lower() for w in words}.isdisjoint(words_of(class_name))
 
 
 def groups(matches: Matches) -> dict[str, dict[str, Scores]]:
@@ -285,7 +284,10 @@ def run(args: argparse.Namespace) -> int:
     else:
         from boxreg_ros.recording import input_boxes  # reads bags: not needed for tables
 
-        predicted = BoxTable.from_arrays(input_boxes(source, args.fixed_frame, **topics))
+        arrays, left_out = input_boxes(source, args.fixed_frame, **topics)
+        if left_out:
+            print(f'boxreg: {left_out}', file=sys.stderr)
+        predicted = BoxTable.from_arrays(arrays)
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes)
     if matches.invalid:

@@ -34,7 +34,7 @@ class LabelledRecording(Recording):
     ----------
     label : LabelFrame
         What the boxes last decoded are of.
-    left_out : int
+    outside : int
         Boxes of the label files outside of the part that is read.
 
     """
@@ -47,7 +47,7 @@ class LabelledRecording(Recording):
         self._labels = labels
         self._is_part = any(options.get(name) is not None for name in ('start', 'end'))
         self._newest_ns: int | None = None
-        self.left_out = 0
+        self.outside = 0
 
     def records(self, tree: TransformTree) -> Iterator[Record]:
         """Yield clouds and stand-ins for labels; each wants to be decoded before the next."""
@@ -60,13 +60,13 @@ class LabelledRecording(Recording):
             begin_ns = self._newest_ns if begin_ns is None else begin_ns
             while waiting is not None and _stamp(waiting) <= (self._newest_ns or 0):
                 if self._is_part and _stamp(waiting) < (begin_ns or 0):
-                    self.left_out += len(waiting.refined.status)
+                    self.outside += len(waiting.refined.status)
                 else:
                     yield self._stand_in(record, waiting, tree, sensor_frame)
                 waiting = next(frames, None)
         while waiting is not None:
             if self._is_part:
-                self.left_out += len(waiting.refined.status)
+                self.outside += len(waiting.refined.status)
             else:
                 yield self._stand_in(record, waiting, tree, sensor_frame)
             waiting = next(frames, None)

@@ -129,10 +129,15 @@ class PoseCheck:
                 if part
             )
         wanted = getattr(other, name)
+        instead = ''
+        if name == 'size_order' and wanted[:2] in ('wl', 'lw'):
+            # The points of a box tell its length from its width, but not what is forward.
+            sideways = 'x+ or x-' if self._convention.forward_axis[0] == 'y' else 'y+ or y-'
+            instead = f', or forward_axis:={sideways} if it is that axis which points forward'
         return (
             f'boxes {how} their points, of which they hold {share:.0%}: expected {name} '
-            f'{wanted!r}, got {getattr(self._convention, name)!r}; set {name}:={wanted} (boxreg '
-            f'relabel: --{name.replace("_", "-")} {wanted})'
+            f'{wanted!r}, got {getattr(self._convention, name)!r}; set {name}:={wanted}{instead} '
+            f'(boxreg relabel: --{name.replace("_", "-")} {wanted})'
         )
 
 

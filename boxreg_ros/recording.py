@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 import shlex
 from typing import Any, NamedTuple, Self
@@ -184,9 +184,25 @@ class Recording:
         self.unreadable[record.connection.topic] += 1
         self.first_errors.setdefault(record.connection.topic, error)
 
+    def left_out(self, unmoved: Sequence[str]) -> str:
+        """Return how many messages are not used, and why; `unmoved`: why some had no transform."""
+        unread = [str(error) for error in self.first_errors.values()]
+        return '; '.join(
+            f'{count} messages {what}, first: {reasons[0]}'
+            for count, what, reasons in (
+                (self.unreadable.total(), 'could not be read', unread),
+                (len(unmoved), 'had no transform', unmoved),
+            )
+            if count
+        )
+
     def intensities(self, record: Record) -> Floats | None:
-        """Return the intensities of a sweep's points; None if the record has none."""
-        return pointcloud.intensities(self._message(record))
+        """Return the intensities of a sweep's points; None if it has none that can be read."""
+        try:
+            return pointcloud.intensities(self._message(record))
+        except UnsupportedMessage as error:
+            self.pass_over(record, error)
+            return None
 
     def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
         """Return a message of the boxes' topic from its bytes, and its boxes; see `decode`."""
@@ -540,20 +556,28 @@ def _text(error: Exception) -> str:
     return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
 
 
-def input_boxes(path: Path, fixed_frame: str | None = None, **topics: Any) -> list[BoxArray]:
+def input_boxes(
+    path: Path, fixed_frame: str | None = None, **topics: Any
+) -> tuple[list[BoxArray], str]:
     """
     Return the boxes of a recording as they are, in the fixed frame `relabel` would choose.
 
-    Box arrays without a transform to that frame are left out, and what cannot be read. `topics`
-    are those that `Recording` wants to be told where several fit.
+    Box arrays without a transform to that frame are left out, and what cannot be read: how many
+    comes beside, and why. `topics` are those that `Recording` wants to be told where several fit.
 
     """
-    tree = TransformTree()
+    tree, unmoved = TransformTree(), []
+    arrays = []
     with Recording([path], **topics) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
-        arrays = []
         for record in recording.records(tree):
-            if record.connection.topic == recording.boxes_topic:
-                with suppress(TransformUnavailable, UnsupportedMessage):
-                    arrays.append(to_fixed_frame(recording.decode(record), tree, fixed_frame))
-    return [array for array in arrays if isinstance(array, BoxArray)]
+            if record.connection.topic != recording.boxes_topic:
+                continue
+            try:
+                arrays.append(to_fixed_frame(recording.decode(record), tree, fixed_frame))
+            except UnsupportedMessage as error:
+                recording.pass_over(record, error)
+            except TransformUnavailable as error:
+                unmoved.append(str(error))
+        left_out = recording.left_out(unmoved)
+    return [array for array in arrays if isinstance(array, BoxArray)], left_out

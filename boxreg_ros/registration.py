@@ -51,9 +51,6 @@ class Estimate(NamedTuple):
     memory: Memory | None = None
 
 
-Estimates = list[Estimate | None]
-
-
 class Solution(NamedTuple):
     """
     A solved batch.
@@ -74,13 +71,13 @@ class Solution(NamedTuple):
     left: tuple[Tensor, ...] = ()
 
 
-def register(windows: Sequence[Window], config: Config, model: InputModel) -> Estimates:
+def register(windows: list[Window], config: Config, model: InputModel) -> list[Estimate | None]:
     """
     Refine the boxes of many windows.
 
     Parameters
     ----------
-    windows : sequence of Window
+    windows : list of Window
         Each of its own track.
     config : Config
         Settings.

@@ -74,6 +74,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     """
     clock = Stopwatch()
     registrar = BoxRegistrar(request.config)
+    fingerprint = request.fingerprint()  # of what is read from here on
     with request.recording() as recording, whole_folder(out, request.inputs()) as folder:
         with clock('read'):
             arrivals = Arrivals(recording, request, clock)
@@ -93,6 +94,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                 ready = registrar.flush()
             sink.take(ready)
         summary = _summary(request, recording, arrivals, registrar.counts, sink)
+        summary['fingerprint'] = fingerprint
         summary['seconds'] = clock.seconds()
         if sink.changes is not None:
             with clock('report'):
@@ -171,9 +173,9 @@ def _summary(
         'warning': arrivals.intake.finding or ('' if sink.boxes_in else NO_BOXES),
         **arrivals.intake.facts,
         'left_out_of_labels': sink.left_out(),
+        'frames_without_cloud': sink.without_cloud,
         'versions': {'boxreg_ros': __version__, 'python': platform.python_version()}
         | {name: version(name) for name in ('torch', 'numpy', 'scipy', 'rosbags')},
-        'fingerprint': request.fingerprint(),
     }
 
 
@@ -182,7 +184,7 @@ def _labels(request: Request, recording: Recording) -> dict[str, Any] | None:
     if request.labels is None or not isinstance(recording, LabelledRecording):
         return None
     name, path = request.labels
-    return {'format': name, 'path': str(path), 'boxes_outside_part': recording.left_out}
+    return {'format': name, 'path': str(path), 'boxes_outside_part': recording.outside}
 
 
 def closing_line(summary: dict[str, Any], out: Path) -> str:
@@ -205,6 +207,21 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
     )
 
 
+def notes(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield what a user should know beside what was done, a line each."""
+    if warning := summary['warning']:
+        yield warning
+    if why := summary['first_missing_transform']:
+        boxes = summary['reasons'].get('no_transform', 0)
+        sweeps = summary['dropped'].get('sweep_without_transform', 0)
+        yield f'{boxes:,} boxes and {sweeps:,} clouds have no transform; first: {why}'
+    for name, found in summary['left_out_of_labels'].items():
+        reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
+        yield f'format {name} has no place for boxes: {reasons}'
+    if count := summary['frames_without_cloud']:
+        yield f'{count:,} of {summary["box_arrays"]:,} box arrays have no cloud beside them'
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg relabel`."""
     add_recording_arguments(parser)
@@ -217,7 +234,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--formats', default='csv,openlabel', metavar='NAME,...',
-        type=lambda text: tuple(text.split(',')),
+        type=lambda text: tuple(name.strip() for name in text.split(',')),
         help='label formats, see `boxreg formats`; csv is always there (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument(
@@ -286,7 +303,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update(max(0.0, done - bar.n))
 
         summary = relabel(request, args.out, progress)
-    if summary['warning']:
-        print(f'boxreg: {summary["warning"]}', file=sys.stderr)
+    for note in notes(summary):
+        print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))
     return 0

@@ -74,7 +74,7 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
     ConfigError
         If one of `inputs` is in `out`.
     RecordingError
-        If `out` exists and is not the result of an earlier run.
+        If `out` exists and is not the result of an earlier run, as that left it.
 
     """
     spare(out, inputs)
@@ -82,6 +82,12 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
         raise RecordingError(
             f'output {str(out)!r}: expected a new folder or an earlier result, got something '
             f'else; choose another with -o'
+        )
+    if (changed := _changed_since(out)) is not None:
+        raise RecordingError(
+            f'output {str(out)!r}: expected an earlier result as it was made, got one with '
+            f'{str(changed)!r} changed or added since, which would be lost; choose another with '
+            f'-o, or remove this one'
         )
     out = out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -98,6 +104,15 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
             os.replace(earlier, out)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(earlier, ignore_errors=True)
+
+
+def _changed_since(out: Path) -> Path | None:
+    """Return a file in a result that is younger than its summary, which is written last."""
+    if not (out / SUMMARY).is_file():
+        return None
+    made_ns = (out / SUMMARY).stat().st_mtime_ns
+    files = (file for file in out.rglob('*') if file.is_file())
+    return next((f.relative_to(out) for f in files if f.stat().st_mtime_ns > made_ns), None)
 
 
 def _is_empty(folder: Path) -> bool:

@@ -67,6 +67,8 @@ class Sink:
         Of the boxes that have come.
     heading_flips : int
         Refined headings that are off the given ones by more than a right angle.
+    without_cloud : int
+        Box arrays that came without one, where clouds are to be written.
     changes : Changes or None
         What a report is to show.
 
@@ -84,7 +86,7 @@ class Sink:
         self._fixed_frame, self._sensor_frame = arrivals.fixed_frame, arrivals.sensor_frame
         self._is_early = config.estimate == 'early'
         self._clock = clock
-        self._spool = Spool(folder, round(config.tolerance * 1e9)) if with_points else None
+        self._spool = Spool(folder, config) if with_points else None
         provenance = Provenance.of(request.recordings, config)
         options = replace(request.options, recording=recording)
         self._writers = {
@@ -99,6 +101,7 @@ class Sink:
         self.status: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
         self.heading_flips = 0
+        self.without_cloud = 0
 
     def expect(self, arrival: Arrival) -> None:
         """Keep a cloud that files need, or a place for boxes: those not moved stay as they are."""
@@ -185,6 +188,7 @@ class Sink:
                 sweep, intensities = self._spool.take(
                     slot.stamp_ns, self._sensor_frame, slot.T_fixed_sensor
                 )
+            self.without_cloud += bool(self._spool) and sweep is None
             frame = LabelFrame(
                 refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep,
                 intensities, slot.T_fixed_given,

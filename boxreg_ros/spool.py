@@ -6,6 +6,7 @@ from bisect import bisect_left, insort
 from pathlib import Path
 import shutil
 
+from boxreg_ros.config import Config
 from boxreg_ros.structures import Floats, Sweep
 from boxreg_ros.transforms import inverse, sweep_to_frame
 import numpy as np
@@ -19,14 +20,14 @@ class Spool:
     ----------
     folder : Path
         Of results; the clouds are in a folder of their own in it, until `remove`.
-    tolerance_ns : int
-        A cloud belongs to boxes within this [ns].
+    config : Config
+        Tells how far off boxes a cloud may be that is theirs, as for the registrar.
 
     """
 
-    def __init__(self, folder: Path, tolerance_ns: int) -> None:
+    def __init__(self, folder: Path, config: Config) -> None:
         self._folder = folder / '.clouds'
-        self._tolerance_ns = tolerance_ns
+        self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
         self._poses: dict[int, tuple[str, Floats]] = {}
         self._stamps: list[int] = []
         self._folder.mkdir()
@@ -49,16 +50,16 @@ class Spool:
         Return the cloud nearest to a stamp, in a frame as that was at the stamp.
 
         Its intensities come with it. Clouds that are older are removed. None if there is none
-        within the tolerance.
+        within reach.
 
         """
-        first = bisect_left(self._stamps, stamp_ns - self._tolerance_ns)
+        first = bisect_left(self._stamps, stamp_ns - self._reach_ns)
         for old in self._stamps[:first]:
             self._file(old).unlink()
             del self._poses[old]
         del self._stamps[:first]
         nearest = min(self._stamps, key=lambda stamp: abs(stamp - stamp_ns), default=None)
-        if nearest is None or abs(nearest - stamp_ns) > self._tolerance_ns:
+        if nearest is None or abs(nearest - stamp_ns) > self._reach_ns:
             return None, None
         own_frame, T_fixed_sweep = self._poses[nearest]
         table = np.load(self._file(nearest))

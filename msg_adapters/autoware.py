@@ -61,6 +61,9 @@ def to_msg(
         given = poses.moved(own.pose, T_out_in)
         spread = None if covariances is None else covariances[i]
         pose, size = poses.with_box(given, o.shape.dimensions, box, quaternions_xyzw[i])
+        if o.shape.type == CYLINDER and np.isfinite(box).all():
+            across = float(box[LENGTH : WIDTH + 1].mean())  # it has one diameter
+            size = poses.replaced(size, x=across, y=across)
         fields = {'pose_with_covariance': poses.with_covariance(own, pose, spread, T_out_in)}
         if hasattr(o.kinematics, 'has_position_covariance'):
             is_ours = spread is not None and bool(np.isfinite(spread).all())

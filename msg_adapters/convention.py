@@ -107,13 +107,12 @@ class Convention:
 
     def covariances_from_centers(self, boxes: BoxArray, covariances: Floats) -> Floats:
         """Return covariances (n, 6, 6) of the poses as messages of this convention have them."""
-        yaw, pitch = boxes.boxes[:, YAW], boxes.boxes[:, ROLL + 1]
-        axes = np.zeros((len(yaw), 3, 3))  # what roll, pitch and yaw turn about
-        axes[:, 0] = np.stack([np.cos(yaw), np.sin(yaw), -np.tan(pitch)], 1)
-        axes[:, 0] *= np.cos(pitch)[:, None]
-        axes[:, 1, 0], axes[:, 1, 1], axes[:, 2, 2] = -np.sin(yaw), np.cos(yaw), 1.0
-        J = np.tile(np.eye(6), (len(yaw), 1, 1))
+        axes, angle = _axes(boxes.boxes), FORWARD[self.forward_axis]
+        J = np.tile(np.eye(6), (len(axes), 1, 1))
         J[:, :3, 3:] = np.cross(axes, self._offsets(boxes.boxes)[:, None]).swapaxes(1, 2)
+        if angle:  # one small turn, by the angles of either
+            after = np.linalg.pinv(np.nan_to_num(_axes(self._turned(boxes.boxes, -angle))))
+            J[:, 3:, 3:] = (axes @ after).swapaxes(1, 2)
         return J @ covariances @ J.swapaxes(1, 2)
 
     @property
@@ -142,6 +141,16 @@ class Convention:
             angles = turns.as_euler('ZYX', suppress_warnings=True)
             changed[known, ROLL : YAW + 1] = angles[:, ::-1]
         return changed
+
+
+def _axes(boxes: Floats) -> Floats:
+    """Return what roll, pitch and yaw of boxes (n, 9) turn about, a row of (n, 3, 3) for each."""
+    yaw, pitch = boxes[:, YAW], boxes[:, ROLL + 1]
+    axes = np.zeros((len(boxes), 3, 3))
+    axes[:, 0] = np.stack([np.cos(yaw), np.sin(yaw), -np.tan(pitch)], 1)
+    axes[:, 0] *= np.cos(pitch)[:, None]
+    axes[:, 1, 0], axes[:, 1, 1], axes[:, 2, 2] = -np.sin(yaw), np.cos(yaw), 1.0
+    return axes
 
 
 STANDARD = Convention()

@@ -66,6 +66,7 @@ def to_msg(
                 twist=poses.turned_motion(o.twist, 'twist', T_out_in),
                 accel=poses.turned_motion(o.accel, 'accel', T_out_in),
                 shape=poses.replaced(o.shape, dimensions=size),
+                polygon=poses.moved_polygon(o.polygon, T_out_in),
             )
         )  # fmt: skip
     return poses.replaced(

@@ -190,10 +190,26 @@ def turned(vector: Any, T_out_in: Floats | None) -> Any:
     return replaced(vector, x=float(x), y=float(y), z=float(z))
 
 
+def moved_polygon(polygon: Any, T_out_in: Floats | None) -> Any:
+    """Return a polygon of the input frame in the output frame."""
+    if T_out_in is None:
+        return polygon
+    points = [T_out_in[:3, :3] @ [p.x, p.y, p.z] + T_out_in[:3, 3] for p in polygon.points]
+    moved_points = [
+        replaced(p, **dict(zip('xyz', xyz.tolist(), strict=True)))
+        for p, xyz in zip(polygon.points, points, strict=True)
+    ]
+    return replaced(polygon, points=moved_points)
+
+
 def turned_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
     """Return a twist or an accel, named so within one with covariance, as `turned` does."""
     if hasattr(motion, 'covariance'):
-        return replaced(motion, **{name: turned_motion(getattr(motion, name), name, T_out_in)})
+        inner, covariance = turned_motion(getattr(motion, name), name, T_out_in), motion.covariance
+        if T_out_in is not None:
+            J = np.kron(np.eye(2), T_out_in[:3, :3])
+            covariance = (J @ np.reshape(covariance, (6, 6)) @ J.T).ravel()
+        return replaced(motion, **{name: inner, 'covariance': covariance})
     return replaced(
         motion, linear=turned(motion.linear, T_out_in), angular=turned(motion.angular, T_out_in)
     )

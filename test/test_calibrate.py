@@ -289,7 +289,11 @@ def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
     assert cli.main(arguments) == 1
     assert 'are stamps and frame those of the recording?' in capsys.readouterr().err
     assert cli.main([*arguments, '-o', str(tmp_path / 'nowhere' / 'rule.yaml')]) == 2
-    assert 'make it first' in capsys.readouterr().err, 'before any work'
+    assert 'in a folder that is there' in capsys.readouterr().err, 'before any work'
+    assert cli.main([*arguments, '-o', str(tmp_path)]) == 2
+    assert 'expected a file' in capsys.readouterr().err
+    assert cli.main([*arguments, '--associate']) == 2
+    assert 'measure the rule alone with --no-boxes' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('given', ['{bag}', '{link}', '{truth}', '{folder}/rule.yaml'])

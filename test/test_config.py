@@ -158,6 +158,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
         ('car', 'vehicle'),
         ('Pedestrian', 'pedestrian'),
         ('human.pedestrian.adult', 'pedestrian'),
+        ('pedestrian/child', 'pedestrian'),
         ('motorcycle_rider', 'cyclist'),
         ('BICYCLE', 'cyclist'),
         ('carpet', 'vehicle'),

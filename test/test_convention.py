@@ -65,9 +65,10 @@ def test_there_and_back(pose_reference, forward_axis):
         assert np.isnan(back[1, 8])
 
 
-def test_covariance_is_that_of_the_reference():
+@pytest.mark.parametrize('forward_axis', ['x+', 'x-', 'y+', 'y-'])
+def test_covariance_is_that_of_the_reference(forward_axis):
     """Against the spread of many boxes drawn about one."""
-    convention = Convention('rear_bottom')
+    convention = Convention('rear_bottom', forward_axis=forward_axis)
     box = np.array([5, 6, 1, 4, 2, 1.5, 0.05, -0.1, 2.0])
     given = np.diag([0.1, 0.2, 0.1, 0.02, 0.03, 0.05]) ** 2
     drawn = np.tile(box, (40000, 1))
@@ -158,6 +159,9 @@ def checked(true, points, taken, meant):
         ({}, {'pose_reference': 'bottom'}, ('0.5 heights below', 'pose_reference:=bottom')),
         ({}, {'pose_reference': 'rear'}, ('0.5 lengths behind', '--pose-reference rear')),
         ({}, {'size_order': 'wlh'}, ('size_order:=wlh', '--size-order wlh')),
+        # What is forward the points do not tell: both settings that fit are named.
+        ({}, {'forward_axis': 'y+'}, ('size_order:=wlh', 'or forward_axis:=y+ or y-')),
+        ({'forward_axis': 'y-'}, {}, ('size_order:=wlh', 'or forward_axis:=x+ or x-')),
     ],
 )
 def test_poses_that_do_not_fit_their_points_are_reported(taken, meant, words):

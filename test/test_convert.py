@@ -34,7 +34,7 @@ def drive(tmp_path):
     """Return a recording, and its boxes as they are in a table, in the fixed frame."""
     recording = Drive(sweeps=7).write(tmp_path / 'drive')
     table = tmp_path / 'input.csv'
-    BoxTable.from_arrays(input_boxes(recording)).write(table)
+    BoxTable.from_arrays(input_boxes(recording)[0]).write(table)
     return recording, table
 
 
@@ -237,7 +237,7 @@ def test_convert_on_the_command_line(tmp_path, drive, capsys):
     [
         (['convert', '{csv}', '-o', '{out}', '--from', 'kiti', '--to', 'csv'], 2, 'one of csv'),
         (['convert', '{csv}', '-o', '{out}', '--from', 'csv', '--to', 'kitti'], 2, '--camera'),
-        (['convert', '{out}', '-o', '{out}x', '--from', 'csv', '--to', 'csv'], 1, 'cannot be'),
+        (['convert', '{out}', '-o', '{out}x', '--from', 'csv', '--to', 'csv'], 1, 'no such file'),
         (['relabel', '{bag}', '-o', '{out}', '--labels', 'csv'], 2, 'expected FORMAT:PATH'),
         (['relabel', '{bag}', '-o', '{out}', '--labels', 'kiti:{csv}'], 2, 'expected one of csv'),
         (['relabel', '{bag}', '-o', '{out}', '--labels', 'csv:{bag}'], 1, 'cannot be read as CSV'),

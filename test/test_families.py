@@ -167,6 +167,33 @@ def test_orientation_that_is_not_available_makes_no_box_but_a_cylinder():
     assert out.objects[0].kinematics.orientation_availability == 1
 
 
+def test_a_cylinder_has_one_diameter():
+    message = message_of(TRACKED)
+    message.objects[0].shape.type = 1
+    adapter = adapter_for(TRACKED)
+    out = adapter.to_msg(message, moved(adapter.from_msg(message)))
+    # 4.5 m and 1.8 m become 5.4 m and 2.16 m, on average 3.78 m.
+    first, second = (o.shape.dimensions for o in out.objects)
+    np.testing.assert_allclose([first.x, first.y, first.z], [3.78, 3.78, 1.6])
+    assert second.x != second.y
+
+
+def test_all_that_is_in_the_frame_of_the_header_moves_with_it():
+    message = message_of(OBJECTS_WITH_COVARIANCE)
+    message.objects[0].twist.covariance = np.diag([9.0, 1, 1, 4, 1, 1]).ravel()
+    corner = M.make('geometry_msgs/msg/Point32', x=4.0, y=-1.0, z=0.5)
+    message.objects[0].polygon.points = [corner]
+    adapter = adapter_for(OBJECTS_WITH_COVARIANCE)
+    T = np.eye(4)
+    T[:2, :2], T[:3, 3] = [[0, -1], [1, 0]], [100.0, 200.0, 0.0]
+    out = adapter.to_msg(message, moved(adapter.from_msg(message), 'map'), None, T).objects[0]
+    spread = np.reshape(out.twist.covariance, (6, 6))
+    np.testing.assert_allclose(np.diag(spread), [1, 9, 1, 1, 4, 1], atol=1e-12)
+    # (4, -1) a quarter turn further is (1, 4).
+    (point,) = out.polygon.points
+    np.testing.assert_allclose([point.x, point.y, point.z], [101.0, 204.0, 0.5])
+
+
 def test_labels_that_came_later_and_ids_that_say_nothing():
     message = message_of(TRACKED)
     message.objects[0].classification[0].probability = 1.0

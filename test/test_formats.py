@@ -43,7 +43,7 @@ from boxreg_ros.transforms import inverse
 from consumers import consumer
 import numpy as np
 import pyarrow
-from pyarrow import parquet
+from pyarrow import feather, parquet
 import pytest
 
 STAMP = 1_700_000_000_123_456_789
@@ -250,8 +250,6 @@ def test_nuscenes(tmp_path, name, version):
 
 
 def test_argoverse2(tmp_path):
-    from pyarrow import feather
-
     _, folder = written('argoverse2', tmp_path)
     (row,) = feather.read_table(folder / 'annotations.feather').to_pylist()
     x, y, z, w = XYZW_SENSOR
@@ -638,6 +636,18 @@ def test_av2_finds_pose_and_sweep(tmp_path):
     np.testing.assert_allclose(found['points'], POINTS)
     np.testing.assert_allclose(found['city_SE3_ego'], T_FIXED_SENSOR, atol=1e-9)
     np.testing.assert_allclose(found['ego_SE3_lidar'], np.eye(4), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('given', 'written_'), [([0.0, 0.5, 1.0], [0, 127, 255]), ([0.0, 100.0, 300.0], [0, 100, 255])]
+)
+def test_av2_intensities_are_whole_numbers(tmp_path, given, written_):
+    points = np.arange(9, dtype=np.float32).reshape(3, 3)
+    sweep = Sweep(STAMP, 'lidar', points)
+    frames = [frame_of(sweep=sweep, intensities=np.array(given))]
+    _, folder = written('argoverse2', tmp_path, frames, with_points=True)
+    (file,) = folder.glob('sensors/lidar/*.feather')
+    assert feather.read_table(file)['intensity'].to_pylist() == written_
 
 
 def test_waymo_components_hold_it(tmp_path):

@@ -252,6 +252,24 @@ def test_a_scene_of_the_tool_itself(tmp_path):
         list(frames_of('sustechpoints', tmp_path))
 
 
+@pytest.mark.parametrize('name', ['supervisely', 'datumaro'])
+def test_frames_with_names_of_others_come_in_their_order(tmp_path, name):
+    # By name, frame_10 and frame_11 would come before frame_2.
+    boxes = [[float(k), 0, 0, 4, 2, 1.5, 0, 0, 0] for k in range(12)]
+    given = [frame(STAMP + k, ['a'], boxes=[boxes[k]], frame_id='lidar') for k in range(12)]
+    write(name, tmp_path, given)
+    project = tmp_path / name
+    for file in [*project.glob('*/*.json'), *project.glob('*.json')]:
+        text = file.read_text()
+        for k in range(12):
+            text = text.replace(f'{STAMP + k}.pcd', f'frame_{k}.pcd')
+            text = text.replace(f'"{STAMP + k}"', f'"frame_{k}"')
+        file.write_text(text)
+    found = [f.moved('sensor').refined.boxes for f in frames_of(name, project)]
+    assert [boxes.stamp_ns for boxes in found] == [STAMP + k for k in range(12)]
+    assert [float(boxes.boxes[0, 0]) for boxes in found] == pytest.approx(range(12))
+
+
 @pytest.mark.parametrize(
     ('name', 'file'),
     [

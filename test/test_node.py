@@ -534,7 +534,10 @@ def test_health_tells_the_worst_of_the_last_period():
     assert [line.split()[0] for line in health.complaints()] == ['failed', 'no_sweep', 'late']
     health.count('late')
     assert not list(health.complaints())  # at a limited rate
+    health.count('unreadable')
     assert health.is_time_to_warn('unreadable') and not health.is_time_to_warn('unreadable')
+    health._warned.clear()  # as if the period were over
+    assert [line.split()[0] for line in health.complaints()] == ['late']  # told, not told again
     assert health.is_time_to_warn('invalid_box')
     health.status('node', {})
     for name in ('points_received', 'boxes_received', 'no_points', 'no_gain', 'no_gain'):

@@ -1,6 +1,7 @@
 from collections import Counter
 import csv
 import json
+import os
 from pathlib import Path
 import shutil
 import subprocess
@@ -11,12 +12,15 @@ from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.convert import Conversion, convert
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
+from boxreg_ros.labels import Options
 from boxreg_ros.recording import input_boxes
-from boxreg_ros.relabel import closing_line, relabel, Request
+from boxreg_ros.relabel import closing_line, notes, relabel, Request
+from boxreg_ros.spool import Spool
+from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention
 import numpy as np
 import pytest
-from ros_messages import Drive, JSK, Messages, SECOND, write_recording
+from ros_messages import Drive, JSK, Messages, SECOND, START, write_recording
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -191,6 +195,11 @@ def test_missing_transforms_keep_the_boxes_in_their_frame(tmp_path):
     assert summary['reasons']['no_transform'] == 4
     assert summary['dropped']['sweep_without_transform'] == 2
     assert 'odom -> base is known from' in summary['first_missing_transform']
+    (note,) = notes(summary)
+    assert note.startswith('4 boxes and 2 clouds have no transform; first: transform odom -> base')
+    arrays, left_out = input_boxes(tmp_path / 'drive')
+    assert len(arrays) == 8
+    assert left_out.startswith('2 messages had no transform, first: transform odom -> base')
 
 
 def test_boxes_in_a_frame_that_nothing_connects(tmp_path):
@@ -484,9 +493,54 @@ def test_earlier_results_survive_a_failure_and_are_replaced_by_success(tmp_path)
         run(broken.write(tmp_path / 'broken'), tmp_path / 'out')
     assert (tmp_path / 'out' / 'boxes.csv').read_bytes() == before
     (tmp_path / 'out' / 'old').touch()
+    os.utime(tmp_path / 'out' / 'old', (1, 1))  # no younger than the results
     assert len(run(Drive(sweeps=5).write(tmp_path / 'more'), tmp_path / 'out')[1]) == 10
     assert not (tmp_path / 'out' / 'old').exists()
     assert not [item for item in tmp_path.iterdir() if item.name.startswith('.')]
+
+
+def test_clouds_beside_labels_are_those_the_boxes_are_paired_with(tmp_path):
+    spool = Spool(tmp_path, Config(tolerance=0.02, reach=0.06))
+    spool.add(Sweep(START, 'lidar', np.ones((1, 3))), np.eye(4))
+    assert spool.take(START - SECOND * 50 // 1000, 'lidar', np.eye(4))[0] is not None
+    assert spool.take(START - SECOND * 70 // 1000, 'lidar', np.eye(4))[0] is None
+
+
+def test_clouds_that_are_missing_beside_labels_are_told(tmp_path):
+    drive = Drive(sweeps=6)
+    gone = drive.stamps[2:4]
+    drive.items = [item for item in drive.items if item[0] != '/points' or item[1] not in gone]
+    path = drive.write(tmp_path / 'drive')
+    options = {'formats': ('sustechpoints',), 'options': Options(with_points=True)}
+    summary, _ = run(path, tmp_path / 'out', **options)
+    assert summary['frames_without_cloud'] == 2
+    assert list(notes(summary)) == ['2 of 6 box arrays have no cloud beside them']
+    assert list(notes(run(path, tmp_path / 'plain')[0])) == []
+
+
+def test_intensities_that_cannot_be_read_cost_no_cloud(tmp_path):
+    drive = Drive(sweeps=4)
+    field = drive.messages.build(
+        'sensor_msgs/msg/PointField', name='intensity', offset=0, datatype=7, count=2
+    )
+    for k in range(4):
+        drive.replace('/points', k, lambda message: message.fields.append(field))
+    options = {'formats': ('sustechpoints',), 'options': Options(with_points=True)}
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out', **options)
+    assert {row['status'] for row in rows} == {'refined'}
+    assert summary['frames_without_cloud'] == 0
+    assert 'intensity' in summary['first_unreadable']
+
+
+@pytest.mark.parametrize('name', ['boxes.csv', 'mine/notes.txt'])
+def test_results_that_were_changed_by_hand_are_not_lost(tmp_path, name):
+    drive, file = Drive(sweeps=3).write(tmp_path / 'drive'), tmp_path / 'out' / name
+    run(drive, tmp_path / 'out')
+    file.parent.mkdir(exist_ok=True)
+    file.write_text('by hand')
+    with pytest.raises(RecordingError, match=rf"'{name}' changed or added since.*choose another"):
+        run(drive, tmp_path / 'out')
+    assert file.read_text() == 'by hand'
 
 
 @pytest.mark.parametrize('content', ['notes.txt', 'summary.json'])
@@ -581,7 +635,8 @@ def test_topics_with_ids_go_before_those_without(tmp_path):
 
 def test_input_boxes_are_those_of_the_recording_in_the_fixed_frame(tmp_path):
     drive = Drive(sweeps=4)
-    arrays = input_boxes(drive.write(tmp_path / 'drive'))
+    arrays, left_out = input_boxes(drive.write(tmp_path / 'drive'))
+    assert not left_out
     assert [array.stamp_ns for array in arrays] == drive.stamps
     for array in arrays:
         assert (array.frame_id, array.track_ids) == ('odom', ('1', '2'))
@@ -594,7 +649,7 @@ def test_what_evaluate_and_convert_ask_for_they_take(tmp_path, capsys):
         drive.items += [(f'{topic}2', *item[1:]) for item in drive.items if item[0] == topic]
     path, table = str(drive.write(tmp_path / 'drive')), str(tmp_path / 'input.csv')
     topics = {'boxes': '/boxes2', 'odometry': '/odom2'}
-    BoxTable.from_arrays(input_boxes(Path(path), **topics)).write(table)
+    BoxTable.from_arrays(input_boxes(Path(path), **topics)[0]).write(table)
     assert main(['evaluate', path, table]) == 1
     assert 'choose one with --boxes' in capsys.readouterr().err
     words = ['--boxes', '/boxes2', '--odometry', '/odom2', '--fixed-frame', 'odom']
@@ -623,7 +678,7 @@ def test_real_boxes_come_back_each_once(tmp_path, storage, boxes):
     subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL)
     recording = tmp_path / ('recording' if storage == 'sqlite3' else 'recording.mcap')
     given = [
-        (array.stamp_ns, track) for array in input_boxes(recording) for track in array.track_ids
+        (array.stamp_ns, track) for array in input_boxes(recording)[0] for track in array.track_ids
     ]
     summary, rows = run(recording, tmp_path / 'out')
     assert len(given) > 50

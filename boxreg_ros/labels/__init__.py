@@ -22,7 +22,7 @@ from typing import Protocol, TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.structures import Floats, HEIGHT, Ints, LENGTH, RefinedBoxes, Sweep
 from boxreg_ros.transforms import boxes_to_frame, inverse
 import numpy as np
@@ -316,5 +316,7 @@ def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
     if not hasattr(module, 'read'):
         able = [other for other in FORMATS if hasattr(import_module(FORMATS[other]), 'read')]
         raise ConfigError(f'format {name!r} can only be written; readable: {", ".join(able)}')
+    if not path.exists():
+        raise RecordingError(f'labels {str(path)!r}: no such file or folder')
     frames: Iterator[LabelFrame] = module.read(path)
     return frames

@@ -153,6 +153,7 @@ def _write_cloud(path: Path, points: np.ndarray, intensities: Floats | None) -> 
     columns = dict(zip('xyz', points.T.astype(np.float32), strict=True))
     zeros = {name: np.zeros(n, kind) for name, kind in POINT.items()}
     if intensities is not None:
-        zeros['intensity'] = intensities.clip(0, 255).astype(np.uint8)
+        full = 255 if intensities.max(initial=0) <= 1 else 1  # some sensors give parts of one
+        zeros['intensity'] = (intensities * full).clip(0, 255).astype(np.uint8)
     with path.open('wb') as file:
         feather.write_feather(pyarrow.table(columns | zeros), file)

@@ -166,7 +166,7 @@ def frames_in(
     folder : Path
         Where the timeline is.
     names : list of str
-        Names of all frames that have labels or points.
+        Names of all frames that have labels or points, in their order.
     items_of : callable
         Returns the boxes of a name: track id, class, box (9,) and evidence.
 
@@ -179,13 +179,13 @@ def frames_in(
     timeline = read_timeline(folder, len(names))
     maker = FrameNames()
     order = [maker.of(stamp_ns) for stamp_ns in timeline.stamps_ns]
-    if not set(names) <= set(order):  # not our names: frames sorted by name, a stamp for each
+    if not set(names) <= set(order):  # not our names: a stamp for each
         if len(names) != len(order):
             raise RecordingError(
                 f'{folder / STAMPS}: expected one stamp for each of {len(names)} frames, got '
                 f'{len(order)}'
             )
-        order = sorted(names)
+        order = names
     for index, name in enumerate(order):
         items = items_of(name)
         notes = [note for *_, note in items]

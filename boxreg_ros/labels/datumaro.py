@@ -123,11 +123,16 @@ def read(path: Path) -> Iterator[LabelFrame]:
             str(item['id']): [
                 _item(a, labels, axes) for a in item['annotations'] if a['type'] == 'cuboid_3d'
             ]
-            for item in content['items']
+            for item in sorted(content['items'], key=_place)
         }
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise RecordingError(f'{file}: expected cuboids as Datumaro has them: {error!r}') from None
     yield from frames_in(path, list(items), items.__getitem__)
+
+
+def _place(item: dict[str, Any]) -> tuple[int, str]:
+    """Return where an item comes: by its number, or else by its name."""
+    return int(item.get('attr', {}).get('frame', 0)), str(item['id'])
 
 
 def _item(

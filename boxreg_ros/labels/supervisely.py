@@ -167,7 +167,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
                 for figure in figures.get(index, ())
                 if figure['geometryType'] == CUBOID
             ]
-            for index, cloud in clouds.items()
+            for index, cloud in sorted(clouds.items(), key=lambda item: int(item[0]))
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RecordingError(

@@ -15,7 +15,7 @@ from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, words_of
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.arrow import read_rows, Table
@@ -153,13 +153,11 @@ def read(path: Path) -> Iterator[LabelFrame]:
 @lru_cache
 def _type(class_name: str) -> int:
     """Return the number of the data set's class that the words of a name tell."""
-    for character in '_-./':
-        class_name = class_name.replace(character, ' ')
-    words, kinds = class_name.lower().split(), Config()
+    words, kinds = words_of(class_name), Config()
     known = {
         'vehicle': kinds.vehicle.names,
         'cyclist': kinds.cyclist.names,
         'pedestrian': kinds.pedestrian.names,
         'sign': ('sign',),
     }
-    return next((TYPES.index(k) for k, names in known.items() if {*names} & {*words}), 0)
+    return next((TYPES.index(k) for k, names in known.items() if {*names} & words), 0)
