@@ -14,7 +14,7 @@ from torch import Tensor
 
 KINDS = ([0, 1], [2, 3], [4], [5])  # ends, sides, top, bottom
 RULE_ERROR = (0.05, 0.05, 0.05, 0.15)  # how far a rule may be from the expected one [m]
-TRACKS, SCATTERS = 1000, 100  # remembered: tracks, and observations of each
+TRACKS, SCATTERS = 200, 100  # remembered: tracks, and observations of each
 LEAST = 20  # observations of a track, that it tells how its input errs
 HELD = 1e-3  # step of a box that only repeats the one before [m, rad]
 
@@ -139,11 +139,11 @@ class InputModel:
     def rule(self) -> Rule:
         """Return the annotation rule to expect."""
         depths = self._config.depth_ends, self._config.depth_sides, 0.0, 0.0
-        return Rule(self._median(0, (0.0,) * 4), self._median(1, depths))
+        known = np.array(list(self._sights.values())).reshape(-1, 2, 2, 6)
+        return Rule(self._median(known[:, 0], (0.0,) * 4), self._median(known[:, 1], depths))
 
-    def _median(self, which: int, expected: Sequence[float]) -> Tensor:
+    def _median(self, known: Floats, expected: Sequence[float]) -> Tensor:
         """Weigh what is `expected` of each kind of face against the median over tracks."""
-        known = np.array(list(self._sights.values())).reshape(-1, 2, 2, 6)[:, which]
         values = torch.zeros(6, dtype=torch.float64)
         for faces, value, deviation in zip(KINDS, expected, RULE_ERROR, strict=True):
             total, count = known[:, 0, faces].ravel(), known[:, 1, faces].ravel()

@@ -132,9 +132,7 @@ class Config:
         '3d', "free variables: '3d' x y z roll pitch yaw, 'bev' x y yaw", choices=('3d', 'bev')
     )
     estimate: str = setting(
-        'track',
-        "what tells a box: 'early' what came before, 'final' `lag` boxes more, 'track' all",
-        choices=('early', 'final', 'track'),
+        'track', 'told by boxes before, `lag` more, or all', choices=('early', 'final', 'track')
     )
     extent: str = setting(
         'track', "'track' estimates one, 'fixed' keeps the input's", choices=('track', 'fixed')
@@ -143,7 +141,7 @@ class Config:
     lag: int = setting(9, 'observations a final box waits for, within its window', '', 0, 999)
     track_window: int = setting(130, "observations solved at once for 'track'", '', 10, 10000)
     min_observations: int = setting(3, 'shorter windows keep their input', '', 2, 1000)
-    max_gap: float = setting(1.0, 'a longer silence ends a track', 's', 0.01, 1e4)
+    max_gap: float = setting(1.6, 'a longer silence ends a track', 's', 0.01, 1e4)
     tolerance: float = setting(0.02, 'boxes and sweep belong together within this', 's', 0.0, 10.0)
     reach: float = setting(0.06, 'a sweep this far off serves, moved along', 's', 0.0, 10.0)
     queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)

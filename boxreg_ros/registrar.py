@@ -108,9 +108,8 @@ class BoxRegistrar:
         self.counts.update(['boxes_without_sweep'] if sweep is None else [])
         tick.refuse(late or ('no_sweep' if sweep is None else ''))
         admitted = [i for i, reason in enumerate(tick.reasons) if not reason]
-        silent = now_ns - round(self.config.max_gap * 1e9)
-        newest = {name: t.entries[-1].observation.stamp_ns for name, t in self._tracks.items()}
-        self._end([name for name, stamp_ns in newest.items() if stamp_ns < silent])
+        due = now_ns - round(self.config.max_gap * 1e9)
+        self._end([k for k, t in self._tracks.items() if t.entries[-1].observation.stamp_ns < due])
         if sweep is not None and admitted:
             fresh = [_TrackBuffer(boxes.track_ids[i], boxes.class_names[i]) for i in admitted]
             tracks = [self._tracks.setdefault(track.track_id, track) for track in fresh]
@@ -162,8 +161,7 @@ class _Tick:
 
     def __init__(self, boxes: BoxArray) -> None:
         n = len(boxes.track_ids)
-        self.boxes = boxes
-        self.refined = boxes.boxes.copy()
+        self.boxes, self.refined = boxes, boxes.boxes.copy()
         self.status, self.reasons = [KEPT] * n, [''] * n
         self.num_points = np.zeros(n, int)
         self.covariances = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()

@@ -13,7 +13,7 @@ from boxreg_ros.geometry import FACE_AXIS, rotation_from_rpy, wrap_angle
 from boxreg_ros.lbfgs import minimize, select
 from boxreg_ros.objective import ERRORS, EXTENT, Problem, remembered, SHARED, State, Sum, Term
 from boxreg_ros.shape import agreement
-from boxreg_ros.structures import Floats, KEPT, POSE, REFINED
+from boxreg_ros.structures import Floats, KEPT, POSE, REFINED, YAW
 from boxreg_ros.window import batches, Memory, stack, Window
 import numpy as np
 import torch
@@ -33,7 +33,9 @@ SHOWN = 64  # points of a box that show the shape of its track
 CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
 MOTION = objective.acceleration, objective.slip
 SWERVE = 3.0  # motion this many deviations off has lost three quarters of its say
-PARKED = 0.3, 0.7  # what is slower [m/s] and moved less [m] is parked
+# What is slower [m/s], moved less [m] and turned less [errors of a heading] is parked; it rests
+# where it is not faster for half a second [m/s].
+PARKED = 0.3, 0.7, 3.0, 1.0
 
 
 class Estimate(NamedTuple):
@@ -360,15 +362,26 @@ def surprise(problem: Problem, axes: Tensor) -> Tensor:
 
 
 def _parked(problem: Problem) -> Tensor:
-    """Return 1 for the steps (B, N - 1) of windows whose input hardly moves, else 0."""
-    valid, t = problem.valid.to(problem.times), problem.times
+    """
+    Return 1 for the steps (B, N - 1) of windows whose input hardly moves or turns, else 0.
+
+    At an end of a long stand, a vehicle may brake or drive off: no step is at rest within four of
+    one where the medians of the five boxes before and after are apart.
+
+    """
+    valid, t, xy = problem.valid.to(problem.times), problem.times, problem.boxes[..., :2]
     late = (t - (t * valid).sum(1, keepdim=True) / valid.sum(1, keepdim=True)) * valid
-    slope = (late[..., None] * problem.boxes[..., :2]).sum(1) / (late * t).sum(1)[:, None]
-    speed, seconds = slope.square().sum(1).sqrt(), (t * valid).amax(1)
-    where = torch.where(problem.valid[..., None], problem.boxes[..., :2], torch.nan)
-    away = (where - where.nanmedian(1, keepdim=True).values).norm(dim=2).nanmedian(1).values
-    is_slow = (speed < PARKED[0]) & (torch.maximum(speed * seconds, 2 * away) < PARKED[1])
-    return is_slow[:, None] * valid[:, 1:]
+    rate = (late[..., None] * problem.boxes[..., [0, 1, YAW]]).sum(1) / (late * t).sum(1)[:, None]
+    where = torch.where(problem.valid[..., None], torch.cat([xy, t[..., None]], 2), torch.nan)
+    away = (where - where.nanmedian(1, keepdim=True).values)[..., :2].norm(dim=2)
+    speed, seconds = rate[:, :2].square().sum(1).sqrt(), (t * valid).amax(1)
+    moved = torch.maximum(speed * seconds, 2 * away.nanmedian(1).values)
+    turned = rate[:, 2].abs() * seconds / problem.deviations['heading']
+    is_slow = (speed < PARKED[0]) & (moved < PARKED[1]) & (turned < PARKED[2])
+    five: Tensor = pad(where.mT, (5, 5), value=torch.nan).unfold(2, 5, 1).median(3).values
+    step = five[..., 6:-1] - five[..., 1:-6]  # from five to the next five
+    drives = (step[:, :2].norm(dim=1) > PARKED[3] * step[:, 2]).to(t)
+    return valid[:, 1:] * is_slow[:, None] * torch.max_pool1d(drives, 9, 1, 4).eq(0)
 
 
 def expected_shared(problem: Problem, rule: Rule) -> Tensor:

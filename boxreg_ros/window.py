@@ -114,8 +114,7 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     ground[valid] = [o.ground for o in every]
     begin = np.repeat([w.observations[0].stamp_ns for w in windows], lengths)
     times[valid] = (np.array([o.stamp_ns for o in every]) - begin) * 1e-9
-    for (b, n), o in zip(np.argwhere(valid).tolist(), every, strict=True):
-        points[b, n, : len(o.points)] = o.points
+    points[mask] = np.concatenate([o.points for o in every])
     delays[mask] = np.concatenate([o.delays for o in every])
     row, step, last = np.arange(B)[:, None], np.arange(N), lengths[:, None] - 1
     boxes, times = (part[row, np.minimum(step, last)] for part in (boxes, times))

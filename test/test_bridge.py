@@ -150,7 +150,7 @@ def test_every_format_has_what_is_put_in(tmp_path):
 
 
 def test_bridge_is_refused_where_ids_mean_other_tracks(tmp_path):
-    for seconds in (-0.1, 1.5, float('nan')):
+    for seconds in (-0.1, 1.7, float('nan')):
         with pytest.raises(ConfigError, match='bridge: expected 0 to max_gap'):
             Request((tmp_path,), bridge=seconds)
 

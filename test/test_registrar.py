@@ -401,7 +401,7 @@ def test_short_tracks_and_boxes_without_points(stream, estimate):
 def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate):
     # The same id, after 0.9 s or 1.1 s of silence: after the longer one the boxes that follow
     # are refined as if nothing had been before, but for what is learnt of the input.
-    config = setup(estimate, **{'faces.learn': False})
+    config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
     track = track_of(drive(28), np.random.default_rng(0))
     whole = stream_of([track])
     for gap, is_new in ((8, False), (9, False), (10, True)):
@@ -420,7 +420,7 @@ def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate):
 def test_a_new_track_of_a_known_id_remembers_nothing(estimate):
     # Eleven boxes, a silence, then eleven under the same id, in windows of six; too few for the
     # noise of the input to be measured. All that follow are as if nothing had been before.
-    config = setup(estimate, **{'faces.learn': False})
+    config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
     whole = stream_of([track_of(drive(33), np.random.default_rng(0), 'a')])
     registrar = BoxRegistrar(config)
     fed(registrar, whole[:11])

@@ -221,12 +221,35 @@ def test_what_is_expected_of_the_shared_by_hand():
     np.testing.assert_allclose(found, known, atol=1e-12)
 
 
+def parked(boxes):
+    kinds = {'heading': torch.tensor([ALONE.vehicle.heading])}
+    return registration._parked(problem_of([boxes], deviations=kinds))
+
+
 def test_what_comes_back_is_not_parked():
     # 4 m forward and back: on average it goes nowhere.
     boxes = drive(60, 0.0, 0.0)
     boxes[:, 0] += 2.0 * (1 - np.cos(np.linspace(0, 2 * np.pi, 60)))
-    assert registration._parked(problem_of([drive(60, 0.0, 0.0)])).all()
-    assert not registration._parked(problem_of([boxes])).any()
+    assert parked(drive(60, 0.0, 0.0)).all()
+    assert not parked(boxes).any()
+
+
+def test_what_turns_on_the_spot_is_not_parked():
+    # 0.01 rad/s over 5.9 s are 0.059 rad, less than three errors of 0.04 rad of a heading.
+    assert parked(drive(60, 0.0, 0.01)).all()
+    assert not parked(drive(60, 0.0, 0.03)).any()
+
+
+def test_where_a_parked_vehicle_drives_off_it_does_not_rest():
+    boxes = drive(80, 0.0, 0.0)
+    since = (np.arange(80) - 68).clip(0) / 10
+    boxes[:, 0] += since**2  # 2 m/s^2 for 1.1 s
+    rests = parked(boxes)[0].numpy()
+    # Middles of five boxes and the next five are 0.5 s apart: about step 72 by 0.7^2 - 0.2^2 =
+    # 0.45 m, which is slower than 1 m/s, about step 73 by 0.8^2 - 0.3^2 = 0.55 m. So it drives
+    # from step 73 on, and does not rest from four before that.
+    np.testing.assert_array_equal(rests, np.arange(79) < 69)
+    np.testing.assert_array_equal(parked(boxes[::-1])[0], rests[::-1])
 
 
 @pytest.mark.parametrize(
