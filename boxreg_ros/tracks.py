@@ -101,7 +101,7 @@ class RefinedTrack:
     status : tuple of N str
         ``refined``, ``kept`` or ``interpolated``.
     reasons : tuple of N str
-        Why a box was kept; empty for the others.
+        Why a box was kept, or had to be put in; empty for those refined.
     covariances : array, shape (N, 6, 6)
         Of x y z roll pitch yaw [m, rad].
 
