@@ -19,6 +19,24 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_topic_arguments(parser)
     parser.add_argument(
+        '--associate', action='store_true',
+        help='give boxes ids by association, whatever ids they have',
+    )  # fmt: skip
+    parser.add_argument('--config', type=Path, metavar='FILE', help='settings as YAML')
+    parser.add_argument(
+        '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
+        help='one setting, as in solver.rounds=2; wins over --config',
+    )  # fmt: skip
+
+
+def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which topics are read, and what the poses of boxes mean."""
+    parser.add_argument('--points', metavar='TOPIC', help='point clouds (default: found by type)')
+    parser.add_argument('--boxes', metavar='TOPIC', help='boxes (default: found by type)')
+    parser.add_argument(
+        '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
+    )
+    parser.add_argument(
         '--pose-reference', metavar='POINT', default=STANDARD.pose_reference,
         help=f'point of a box that its pose is at: {", ".join(REFERENCES)}, or X,Y,Z in parts of '
         f'length, width and height (default: %(default)s)',
@@ -31,29 +49,12 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
         '--forward-axis', choices=FORWARD, default=STANDARD.forward_axis,
         help='axis of a pose that points forward (default: %(default)s)',
     )  # fmt: skip
-    parser.add_argument(
-        '--associate', action='store_true',
-        help='give boxes ids by association, whatever ids they have',
-    )  # fmt: skip
-    parser.add_argument('--config', type=Path, metavar='FILE', help='settings as YAML')
-    parser.add_argument(
-        '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
-        help='one setting, as in solver.rounds=2; wins over --config',
-    )  # fmt: skip
-
-
-def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which topics are read."""
-    parser.add_argument('--points', metavar='TOPIC', help='point clouds (default: found by type)')
-    parser.add_argument('--boxes', metavar='TOPIC', help='boxes (default: found by type)')
-    parser.add_argument(
-        '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
-    )
 
 
 def convention_from(args: argparse.Namespace) -> Convention:
     """Return what `--pose-reference` and the options beside it say."""
-    return Convention(args.pose_reference, args.size_order, args.forward_axis, args.associate)
+    associate = getattr(args, 'associate', False)
+    return Convention(args.pose_reference, args.size_order, args.forward_axis, associate)
 
 
 def setting(text: str) -> tuple[str, Any]:

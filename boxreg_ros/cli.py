@@ -108,6 +108,7 @@ def parser(command: str | None) -> argparse.ArgumentParser:
     whole = argparse.ArgumentParser(
         'boxreg', description='Register tracked 3D boxes to point clouds.'
     )
+    whole.add_argument('--debug', action='store_true', help=argparse.SUPPRESS)
     whole.add_argument('--version', action='version', version=f'boxreg {__version__}')
     subparsers = whole.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for name, summary in COMMANDS.items():

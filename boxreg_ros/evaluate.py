@@ -12,7 +12,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from boxreg_ros.arguments import add_topic_arguments
+from boxreg_ros.arguments import add_topic_arguments, convention_from
 from boxreg_ros.boxtable import BoxTable
 from boxreg_ros.config import words_of
 from boxreg_ros.errors import ConfigError, RecordingError
@@ -272,19 +272,20 @@ def run(args: argparse.Namespace) -> int:
     truth = BoxTable.read(args.truth)
     source = args.predicted
     topics = {name: getattr(args, name) for name in ('points', 'boxes', 'odometry')}
+    convention = convention_from(args)
     if (table_of_run := source / 'boxes.csv').is_file():
         source = table_of_run
     if source.suffix == '.csv':
-        if any((*topics.values(), args.fixed_frame)):
+        if any((*topics.values(), args.fixed_frame)) or not convention.is_standard:
             raise ConfigError(
-                f'--points, --boxes, --odometry, --fixed-frame: expected a recording that they '
-                f'are about, got the table {str(source)!r}; leave them out'
+                f'--points, --boxes, --odometry, --fixed-frame, {convention}: expected a '
+                f'recording that they are about, got the table {str(source)!r}; leave them out'
             )
         predicted = _in_frame(BoxTable.read_frames(source), truth.frame_id)
     else:
         from boxreg_ros.recording import input_boxes  # reads bags: not needed for tables
 
-        arrays, left_out = input_boxes(source, args.fixed_frame, **topics)
+        arrays, left_out = input_boxes(source, args.fixed_frame, convention=convention, **topics)
         if left_out:
             print(f'boxreg: {left_out}', file=sys.stderr)
         predicted = BoxTable.from_arrays(arrays)

@@ -122,6 +122,7 @@ class LiveRegistrar:
         self._intake = Intake(convention, config)
         self._registrar = BoxRegistrar(config)
         self._held: deque[_Pending | _Passing] = deque()  # as they came; the first is pending
+        self._made: list[Outgoing] = []  # from what has become ready, up to a fault
         self.cloud_frame = ''
         self._choose_at: float | None = None
         self.adapter: Adapter | None = None
@@ -249,7 +250,7 @@ class LiveRegistrar:
         self._intake.begin(self.config)
         held = list(self._held)
         self._held.clear()
-        passed = []
+        passed, self._made = self._made, []
         for p in held:
             is_early_out = isinstance(p, _Passing) or p.is_early_out
             passed += ([] if is_early_out else [Outgoing(p.message, False)]) + self.last(p.message)
@@ -309,7 +310,6 @@ class LiveRegistrar:
         self.fixed_frame = found
 
     def _outgoing(self, ready: list[RefinedBoxes]) -> list[Outgoing]:
-        outgoing = []
         for refined in ready:
             stamp_ns = refined.boxes.stamp_ns
             pending = next(
@@ -319,21 +319,22 @@ class LiveRegistrar:
                 and p.given.stamp_ns == stamp_ns
                 and (refined.is_final or not p.is_early_out)
             )
-            pending.is_early_out = True
             moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
             assert self.adapter is not None  # it has read the message
             covariances = covariances_to_write(moved)
             message = self.adapter.to_msg(
                 pending.message, moved.boxes, covariances, pending.T_output_item
             )
-            outgoing.append(
+            self._made.append(
                 Outgoing(message, refined.is_final, pending.given, moved, pending.received)
             )
+            pending.is_early_out = True
             if refined.is_final:
                 self._held.remove(pending)
                 while self._held and isinstance(self._held[0], _Passing):
-                    outgoing.append(Outgoing(self._held.popleft().message, True))
-        return outgoing
+                    self._made.append(Outgoing(self._held.popleft().message, True))
+        made, self._made = self._made, []
+        return made
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:

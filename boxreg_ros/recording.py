@@ -557,18 +557,18 @@ def _text(error: Exception) -> str:
 
 
 def input_boxes(
-    path: Path, fixed_frame: str | None = None, **topics: Any
+    path: Path, fixed_frame: str | None = None, **options: Any
 ) -> tuple[list[BoxArray], str]:
     """
     Return the boxes of a recording as they are, in the fixed frame `relabel` would choose.
 
     Box arrays without a transform to that frame are left out, and what cannot be read: how many
-    comes beside, and why. `topics` are those that `Recording` wants to be told where several fit.
+    comes beside, and why. `options` are those of `Recording`.
 
     """
     tree, unmoved = TransformTree(), []
     arrays = []
-    with Recording([path], **topics) as recording:
+    with Recording([path], **options) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
         for record in recording.records(tree):
             if record.connection.topic != recording.boxes_topic:

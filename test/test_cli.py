@@ -154,6 +154,8 @@ def test_unexpected_errors_point_to_debug(tmp_path, capsys, monkeypatch):
     assert err == 'boxreg: unexpected ZeroDivisionError: impossible (--debug shows where)\n'
     with pytest.raises(ZeroDivisionError):
         cli.main(['relabel', 'a', '-o', 'b', '--debug'])
+    with pytest.raises(ZeroDivisionError):
+        cli.main(['--debug', 'relabel', 'a', '-o', 'b'])
 
 
 def test_help_and_version(capsys):

@@ -253,6 +253,35 @@ def test_after_a_fault_all_that_is_held_passes_through_once():
     assert len(live.feed(again) + live.flush()) == 12
 
 
+def test_what_was_made_before_a_fault_is_not_lost():
+    drive = Drive(sweeps=6)
+    live = Live()
+    made = [0]
+
+    class Faulty:
+        from_msg = staticmethod(vision.from_msg)
+
+        @staticmethod
+        def to_msg(message, *given):
+            made[0] += 1
+            if made[0] == 2:
+                raise ZeroDivisionError
+            return vision.to_msg(message, *given)
+
+    live.adapter = Faulty
+    made[0] = -100
+    out = live.feed(drive)
+    made[0] = 0  # the second of those that become final at the end fails
+    with pytest.raises(ZeroDivisionError):
+        live.flush()
+    out += live.abandon(None)
+    for is_final in (False, True):
+        stamps = [
+            vision.from_msg(item.message).stamp_ns for item in out if item.is_final == is_final
+        ]
+        assert stamps == drive.stamps
+
+
 def moved(drive, seconds, south=0.0):
     """Return a drive, its stamps later, all poses and boxes to the south."""
     for _, _, message in drive.items:

@@ -617,6 +617,15 @@ def test_boxes_are_read_as_they_are_meant(tmp_path, capsys):
         assert float(row['length']) == pytest.approx(float(other['length']), abs=1e-6)
     assert main([*command, str(tmp_path / 'x'), path, '--pose-reference', 'floor']) == 2
     assert 'pose_reference' in capsys.readouterr().err
+    # The input is scored under the convention it is meant in; a table has its own.
+    truth = str(tmp_path / 'expected' / 'boxes.csv')
+    scores = []
+    for options in ([], meant):
+        assert main(['evaluate', path, truth, '--json', *options]) == 0
+        scores.append(json.loads(capsys.readouterr().out)['iou_3d'])
+    assert scores[0] < 0.5 < 0.75 < scores[1]
+    assert main(['evaluate', truth, truth, *meant]) == 2
+    assert 'expected a recording that they are about' in capsys.readouterr().err
 
 
 def test_topics_with_ids_go_before_those_without(tmp_path):
