@@ -18,10 +18,6 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
         help='MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; several are merged by time',
     )  # fmt: skip
     add_topic_arguments(parser)
-    parser.add_argument(
-        '--associate', action='store_true',
-        help='give boxes ids by association, whatever ids they have',
-    )  # fmt: skip
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as YAML')
     parser.add_argument(
         '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
@@ -51,9 +47,8 @@ def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def convention_from(args: argparse.Namespace) -> Convention:
+def convention_from(args: argparse.Namespace, associate: bool = False) -> Convention:
     """Return what `--pose-reference` and the options beside it say."""
-    associate = getattr(args, 'associate', False)
     return Convention(args.pose_reference, args.size_order, args.forward_axis, associate)
 
 

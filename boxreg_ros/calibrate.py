@@ -274,11 +274,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print what was found, and write it as settings."""
     config = config_from(args)
-    if args.associate and not args.no_boxes:
-        raise ConfigError(
-            '--associate: expected boxes with the ids of the truth, got none that could have '
-            'them; measure the rule alone with --no-boxes'
-        )
     if args.output and (args.output.is_dir() or not args.output.parent.is_dir()):
         raise ConfigError(
             f'output {str(args.output)!r}: expected a file in a folder that is there, got '

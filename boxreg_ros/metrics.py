@@ -105,7 +105,7 @@ def _intersection(a: Floats, b: Floats) -> Floats:
     foot_i, foot_j = (d_i - cosine * d_j) / sine**2, (d_j - cosine * d_i) / sine**2
     foot = foot_i[..., None] * dots[:, i] + foot_j[..., None] * dots[:, j]
     room = offsets[:, None] - foot
-    room[:, np.arange(66), i] = room[:, np.arange(66), j] = np.inf  # its own planes
+    room[:, np.arange(66), i] = room[:, np.arange(66), j] = np.inf  # a line, its planes
     with np.errstate(divide='ignore', invalid='ignore'):
         crossing = np.where(slope == 0, np.copysign(np.inf, room), room / slope)
         end = np.where(slope >= 0, crossing, np.inf).min(axis=2)

@@ -319,7 +319,7 @@ def weigh(
         Term(objective.prior, diagonal(hold), (given, axes)),
         Term(objective.acceleration, change[:, :, None], (problem.times,)),
         Term(objective.slip, diagonal(slip[:, None] * valid[:, 1:, None]), (problem.times,)),
-        Term(objective.rest, diagonal(still[:, None] * _parked(problem)[..., None])),
+        Term(objective.rest, diagonal(still[:, None] * _parked(problem, error[:, 5])[..., None])),
         Term(objective.shared_prior, diagonal(shared[:, None]), (expected,)),
         Term(objective.memory, problem.information[:, None, None], (problem.recalled[:, None],)),
     ]
@@ -361,12 +361,13 @@ def surprise(problem: Problem, axes: Tensor) -> Tensor:
     return torch.where(least.isfinite(), least, 0.0) / 3
 
 
-def _parked(problem: Problem) -> Tensor:
+def _parked(problem: Problem, heading: Tensor) -> Tensor:
     """
     Return 1 for the steps (B, N - 1) of windows whose input hardly moves or turns, else 0.
 
-    At an end of a long stand, a vehicle may brake or drive off: no step is at rest within four of
-    one where the medians of the five boxes before and after are apart.
+    `heading` (B,) is how far its yaw errs as measured [rad]: noise alone is no turn. At an end of
+    a long stand, a vehicle may brake or drive off: no step is at rest within four of one where the
+    medians of the five boxes before and after are apart.
 
     """
     valid, t, xy = problem.valid.to(problem.times), problem.times, problem.boxes[..., :2]
@@ -376,7 +377,7 @@ def _parked(problem: Problem) -> Tensor:
     away = (where - where.nanmedian(1, keepdim=True).values)[..., :2].norm(dim=2)
     speed, seconds = rate[:, :2].square().sum(1).sqrt(), (t * valid).amax(1)
     moved = torch.maximum(speed * seconds, 2 * away.nanmedian(1).values)
-    turned = rate[:, 2].abs() * seconds / problem.deviations['heading']
+    turned = rate[:, 2].abs() * seconds / heading.maximum(problem.deviations['heading'])
     is_slow = (speed < PARKED[0]) & (moved < PARKED[1]) & (turned < PARKED[2])
     five: Tensor = pad(where.mT, (5, 5), value=torch.nan).unfold(2, 5, 1).median(3).values
     step = five[..., 6:-1] - five[..., 1:-6]  # from five to the next five

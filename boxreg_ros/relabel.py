@@ -229,6 +229,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '-o', '--out', type=Path, required=True, help='folder of results; appears whole or not'
     )
     parser.add_argument(
+        '--associate', action='store_true',
+        help='give boxes ids by association, whatever ids they have',
+    )  # fmt: skip
+    parser.add_argument(
         '--fixed-frame', metavar='FRAME',
         help='frame to refine in (default: the topmost the frame of the clouds moves in)',
     )  # fmt: skip
@@ -278,7 +282,7 @@ def run(args: argparse.Namespace) -> int:
         tuple(args.recordings), args.points, args.boxes, args.odometry, args.fixed_frame,
         args.formats, args.start, args.end, config,
         Options(args.with_points, args.camera, args.swap_axes), args.labels, args.label_frame,
-        convention_from(args), args.bridge, args.report,
+        convention_from(args, args.associate), args.bridge, args.report,
     )  # fmt: skip
     earlier = earlier_summary(args.out)
     if (

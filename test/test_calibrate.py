@@ -292,8 +292,6 @@ def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
     assert 'in a folder that is there' in capsys.readouterr().err, 'before any work'
     assert cli.main([*arguments, '-o', str(tmp_path)]) == 2
     assert 'expected a file' in capsys.readouterr().err
-    assert cli.main([*arguments, '--associate']) == 2
-    assert 'measure the rule alone with --no-boxes' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('given', ['{bag}', '{link}', '{truth}', '{folder}/rule.yaml'])

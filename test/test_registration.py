@@ -221,9 +221,9 @@ def test_what_is_expected_of_the_shared_by_hand():
     np.testing.assert_allclose(found, known, atol=1e-12)
 
 
-def parked(boxes):
+def parked(boxes, heading=0.0):
     kinds = {'heading': torch.tensor([ALONE.vehicle.heading])}
-    return registration._parked(problem_of([boxes], deviations=kinds))
+    return registration._parked(problem_of([boxes], deviations=kinds), torch.tensor([heading]))
 
 
 def test_what_comes_back_is_not_parked():
@@ -238,6 +238,7 @@ def test_what_turns_on_the_spot_is_not_parked():
     # 0.01 rad/s over 5.9 s are 0.059 rad, less than three errors of 0.04 rad of a heading.
     assert parked(drive(60, 0.0, 0.01)).all()
     assert not parked(drive(60, 0.0, 0.03)).any()
+    assert parked(drive(60, 0.0, 0.03), heading=0.06).all()  # 0.177 rad: no more than it errs
 
 
 def test_where_a_parked_vehicle_drives_off_it_does_not_rest():
