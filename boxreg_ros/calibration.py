@@ -25,9 +25,10 @@ class InputNoise(NamedTuple):
 
     Attributes
     ----------
-    deviation, correlation : Tensor, shape (9,)
+    deviation, correlation, offset : Tensor, shape (9,)
         Robust standard deviation along the box axes (lon lat z roll pitch yaw [m, rad], extents
-        as part of each), and correlation from one observation to the next, 0 to 0.9.
+        as part of each) about the mean of a track, correlation from one observation to the next,
+        0 to 0.9, and robust standard deviation of the means of the tracks about zero.
     trust : float
         0 where nothing is known, a half after `LEAST` observations, near 1 after many.
 
@@ -35,6 +36,7 @@ class InputNoise(NamedTuple):
 
     deviation: Tensor = torch.zeros(9, dtype=torch.float64)
     correlation: Tensor = torch.zeros(9, dtype=torch.float64)
+    offset: Tensor = torch.zeros(9, dtype=torch.float64)
     trust: float = 0.0
 
     @classmethod
@@ -45,7 +47,8 @@ class InputNoise(NamedTuple):
         if not (total := int(valid.sum())):
             return cls()
         count = valid.sum(1)[:, None, None].clamp(min=1)
-        scatter = scatter - (scatter * valid[..., None]).sum(1, keepdim=True) / count
+        mean = (scatter * valid[..., None]).sum(1, keepdim=True) / count
+        offset, scatter = 1.48 * mean[valid.any(1), 0].abs().median(0).values, scatter - mean
         deviation = 1.48 * scatter[valid].abs().median(0).values
         bounded = scatter.clamp(-3 * deviation, 3 * deviation)
         both = valid[:, 1:] & valid[:, :-1]
@@ -55,7 +58,7 @@ class InputNoise(NamedTuple):
         # one or two tracks cannot tell it from the gap of their faces.
         held = 1 - 2 / valid.any(1).sum()
         correlation = torch.where(power > 1e-12, (first * second).sum(0) / power, held)
-        return cls(deviation, correlation.clamp(0.0, 0.9), total / (total + LEAST))
+        return cls(deviation, correlation.clamp(0.0, 0.9), offset, total / (total + LEAST))
 
 
 class Rule(NamedTuple):

@@ -8,7 +8,7 @@ W, adding r' W r / 2; W holds the expected deviations and the robust weights of 
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import cast, NamedTuple
 
 from boxreg_ros.chain import Chain, cholesky, Factor, LINK, product
 from boxreg_ros.config import PaperConfig
@@ -82,7 +82,7 @@ class Problem(NamedTuple):
         """Return deviations by name, (B, n)."""
         return torch.stack([self.deviations[name] for name in names], -1)
 
-    def thinned(self, enough: int) -> 'Problem':
+    def thinned(self, enough: float) -> 'Problem':
         """Return the same with every n-th point, so that `enough` are left if there are."""
         names, stride = ('points', 'mask', 'delays'), max(1, self.points.shape[2] // enough)
         return self._replace(**{name: getattr(self, name)[:, :, ::stride] for name in names})
@@ -365,8 +365,7 @@ class Sum:
 
     def newton(self, vector: Tensor, rows: Tensor) -> Tensor:
         """Return the inverse of the curvature where the search started times `vector` (b, D)."""
-        factor: Factor = select(self.factor, rows)
-        return factor.solve(vector)
+        return cast(Factor, select(self.factor, rows)).solve(vector)
 
 
 def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-PRIOR_OUTLIER = 3.0  # an input this many deviations off has lost half its say
+OUTLIER = 3.0  # what is this many deviations off yields: an input by half, motion by 3/4
 USUAL = 0.385  # correlation of the errors of an input from one observation to the next
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
 TENTH = 0.1  # of a second, over which errors that are biased are correlated
@@ -28,11 +28,10 @@ SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 1000  # observations that a thread works on at once: what its cache holds
 COARSE = 256  # points of a box that tell where it is but for the last round
-EVERY = 2**62  # enough to leave none out
 SHOWN = 64  # points of a box that show the shape of its track
+APART = 0.5  # of the usual error: tracks whose means are off their fits by more are biased
 CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
 MOTION = objective.acceleration, objective.slip
-SWERVE = 3.0  # motion this many deviations off has lost three quarters of its say
 # What is slower [m/s], moved less [m] and turned less [errors of a heading] is parked; it rests
 # where it is not faster for half a second [m/s].
 PARKED = 0.3, 0.7, 3.0, 1.0
@@ -130,9 +129,8 @@ def _judged(
     finite = boxes.isfinite().all(-1) & (extent > 0).all(-1) & covariances.isfinite().all((2, 3))
     before, after = _held(problem, problem.pose, given), _held(problem, state.pose, extent)
     is_blind = ~problem.mask.any((1, 2))[:, None].expand_as(finite)
-    failed = torch.stack([is_blind, ~finite, after < before / 2 - 3])
-    good = (~failed.any(0)).cpu().numpy()
-    why = np.select(list(failed.cpu().numpy()), ['no_points', 'not_finite', 'no_gain'], '')
+    failed = torch.stack([is_blind, ~finite, after < before / 2 - 3]).cpu().numpy()
+    good, why = ~np.any(failed, 0), np.select(failed, ['no_points', 'not_finite', 'no_gain'], '')
     found, spread = boxes.cpu().numpy(), covariances.cpu().numpy()
     found[..., :3] += base[:, None]
     arrays, estimates = [part.cpu().numpy() for part in left], []
@@ -161,7 +159,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     length, solver, is_track = problem.boxes.shape[1], config.solver, config.estimate == 'track'
     limits = solver.iterations, solver.history, solver.tolerance
     rule, noise, turn = model.rule(), model.noise(), 0
-    enough = COARSE if rounds > 1 else EVERY
+    enough = COARSE if rounds > 1 else torch.inf
     everyone = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), everyone.clone())
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
@@ -199,16 +197,15 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     workers = solver.threads or cpu_count()
     with ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool:
         rows = every = torch.arange(len(state.pose), device=free.device)
-        size = (PART if rows.is_cpu else EVERY) / length
+        size = (PART if rows.is_cpu else torch.inf) / length
         while len(rows):
             count = workers * int(1 + len(rows) / size / workers) if len(rows) > size else 1
             parts = rows.tensor_split(min(len(rows), count))
-            run = pool.map if len(parts) > 1 else map
-            rows, turn = torch.cat(list(run(improve, parts))), turn + 1
+            rows, turn = torch.cat(list(pool.map(improve, parts))), turn + 1
             if is_track:
                 noise = InputNoise.measure(scatter(problem, state))
             if not len(rows) and 2 * enough <= problem.points.shape[2]:
-                rows, enough = every, EVERY  # where few points lead to, all of them tell
+                rows, enough = every, torch.inf  # where few points lead to, all of them tell
     return Solution(state, covariances, left)
 
 
@@ -272,8 +269,11 @@ def weigh(
     correlation measured widens its deviation, and without correlation over a tenth of a second
     there is no bias either. Input that scatters by less than `CAREFUL` of its usual error errs by
     less than its scatter tells, and where that is below half of the usual its extents are held
-    more, too. A gap is unusual by how many deviations it is from the expected one, or the points
-    from where they are expected: those of a load, or of a branch above, are not to lift the roof.
+    more, too: it was drawn with care. But what a filter has smoothed scatters as little, and errs
+    by the same all along a track. Then the means of tracks are far off their fits, and bias and
+    extents stay free. A gap is unusual by how many deviations it is from the expected one, or the
+    points from where they are expected: those of a load, or of a branch above, are not to lift the
+    roof.
 
     """
     of, valid, faces, given = problem.of, problem.valid.to(state.pose), config.faces, problem.pose
@@ -290,13 +290,16 @@ def weigh(
     ratio = (1 + noise.trust * (ratio**2 - 1)).sqrt()
     interval = (problem.times * valid).amax(1, keepdim=True) / (valid.sum(1, keepdim=True) - 1)
     slow = ((correlation ** (TENTH / interval) - 0.15) / 0.3).clamp(0.1, 1.0)
-    bias = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]) * slow[:, :6] * ratio.clamp(0.1, 2.0)
-    error, extent = error * ratio, of('extent') * slow[:, 6:] * (2 * ratio[:, :3]).clamp(0.1, 1.0)
+    means = noise.offset[[0, 1, 6]].to(error) / torch.cat([error[:, :2], of('extent')], 1)
+    apart = noise.trust * (means.mean(1, keepdim=True) / APART).square().clamp(max=1.0)
+    lasting = torch.cat([ratio[:, :3].maximum(apart), ratio[:, 3:]], 1).clamp(0.1, 2.0)
+    bias = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]) * slow[:, :6] * lasting
+    error, extent = error * ratio, of('extent') * slow[:, 6:] * (2 * lasting[:, :3]).clamp(max=1)
     inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
     axes = rotation_from_rpy(state.pose[..., 3:])
     input_off = objective.prior(state, given, axes)
     off = (input_off.residual[:, :, 0].abs() + surprise(problem, axes)) / error[:, None]
-    hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
+    hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / OUTLIER) ** 2)
     # Points and the face of the input are apart by gap, bias and half the error of the extent.
     wide = faces.spread**2 + (bias[:, :3] ** 2 + (expected[:, :3] * extent / 2) ** 2)[:, FACE_AXIS]
     away = (sights.outwardness * trust).sum(1) / trust.sum(1).clamp(min=1e-9)
@@ -336,7 +339,7 @@ def yielding(term: Term, state: State) -> Term:
 
     """
     r = term.linearise(state).residual[:, :, 0, :, None]
-    far = (r.mT @ term.weight[:, :, 0] @ r)[..., None] / SWERVE**2
+    far = (r.mT @ term.weight[:, :, 0] @ r)[..., None] / OUTLIER**2
     far[:, 2:] = far[:, 2:].minimum(far[:, 1:-1]).minimum(far[:, :-2])
     return term._replace(weight=term.weight / (1 + far) ** 2)
 
@@ -418,5 +421,4 @@ def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None
 def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     """Return how many points lie in boxes of `pose` (B, N, 6) and `extent` (B, N, 3), (B, N)."""
     local = in_box_axes(problem.points, problem, pose).abs_()
-    x, y, z = local.sub_(extent[..., None].to(local) / 2).unbind(-2)
-    return (x.maximum(y).maximum(z) < 0.05).sum(-1)
+    return (local.sub_(extent[..., None].to(local) / 2).amax(-2) < 0.05).sum(-1)

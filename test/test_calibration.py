@@ -61,6 +61,17 @@ def test_noise_does_not_hang_on_outliers_or_on_bias():
     np.testing.assert_allclose(found.deviation, known.deviation, rtol=0.25)
 
 
+def test_how_far_tracks_are_off_by_hand():
+    # Five tracks that scatter by +-0.3 about 0.1, -0.2, 0.4, 5 and 0: the median of what they are
+    # off by is 0.2. A sixth is too short.
+    means = torch.tensor([0.1, -0.2, 0.4, 5.0, 0.0, 9.0], dtype=D)
+    values = means[:, None] + 0.3 * (-1.0) ** torch.arange(2 * LEAST, dtype=D)
+    values[5, LEAST - 1 :] = torch.nan
+    noise = InputNoise.measure(values[..., None].repeat(1, 1, 9))
+    np.testing.assert_allclose(noise.offset, 1.48 * 0.2)
+    np.testing.assert_allclose(noise.deviation, 1.48 * 0.3)
+
+
 def test_correlation_stays_in_its_bounds():
     steady = torch.linspace(-1, 1, 50, dtype=D)[None, :, None].expand(2, 50, 9)
     np.testing.assert_allclose(InputNoise.measure(steady).correlation, 0.9)

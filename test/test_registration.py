@@ -309,7 +309,7 @@ def test_the_bias_to_expect_by_hand(trust, fast, slow):
     sights = support(problem, state, 0.05, torch.zeros(6, dtype=D))
     error = problem.of(*objective.ERRORS)
     deviation = torch.cat([2 * error[0], torch.ones(3, dtype=D)])
-    noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), trust)
+    noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), trust=trust)
     (weight,) = (
         term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
         for term in weigh(problem, state, sights, expected, noise, ALONE)
@@ -318,6 +318,39 @@ def test_the_bias_to_expect_by_hand(trust, fast, slow):
     bias = weight[:, objective.BIAS] ** -0.5 / error
     known = torch.tensor([[fast], [slow]], dtype=D) * torch.tensor([1, 1, 1, 1, 1, 0.5])
     np.testing.assert_allclose(bias, known, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('offset', 'lasting'),
+    [
+        (0.0, 0.1),  # drawn with care: all the bias there may be is the least
+        (0.3, 0.36),  # (0.3 / 0.5)^2
+        (0.7, 1.0),  # smoothed by a filter: as large as usual, not larger
+    ],
+)
+def test_the_bias_of_what_scatters_little_by_hand(offset, lasting):
+    # Boxes that scatter by a hundredth of what is usual, correlated by 0.9 over a tenth of a
+    # second. How far tracks are off along and across, and in their lengths, tells of positions
+    # and extents, which are free where that is half; nothing is told of angles.
+    kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
+    problem = problem_of(drive(6)[None], deviations=kinds)
+    expected = expected_shared(problem, InputModel(ALONE.faces).rule())
+    state = State(problem.pose, expected)
+    sights = support(problem, state, 0.05, torch.zeros(6, dtype=D))
+    error, extent = problem.of(*objective.ERRORS), kinds['extent'][:, None]
+    usual = torch.cat([error, extent.expand(-1, 3)], 1)[0]
+    parts = torch.tensor([1.5, 0.5, 9, 9, 9, 9, 1, 9, 9], dtype=D)  # 1 on average, of three
+    noise = InputNoise(0.01 * usual, torch.full((9,), 0.9, dtype=D), parts * offset * usual, 1.0)
+    (weight,) = (
+        term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
+        for term in weigh(problem, state, sights, expected, noise, ALONE)
+        if term.function is objective.shared_prior
+    )
+    found = weight**-0.5
+    bias = torch.tensor([[lasting] * 3 + [0.1, 0.1, 0.05]], dtype=D)
+    np.testing.assert_allclose(found[:, objective.BIAS] / error, bias, rtol=1e-9)
+    extents = found[:, objective.EXTENT] / expected[:, objective.EXTENT] / extent
+    np.testing.assert_allclose(extents, np.full((1, 3), min(1.0, 2 * lasting)), rtol=1e-9)
 
 
 def test_how_far_a_gap_may_be_off_by_hand():
