@@ -29,7 +29,7 @@ ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 1000  # observations that a thread works on at once: what its cache holds
 COARSE = 256  # points of a box that tell where it is but for the last round
 SHOWN = 64  # points of a box that show the shape of its track
-APART = 0.5  # of the usual error: tracks whose means are off their fits by more are biased
+APART = 0.5, 0.7  # of usual errors: what tracks are off by that are biased; a detector's scatter
 CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
 MOTION = objective.acceleration, objective.slip
 # What is slower [m/s], moved less [m] and turned less [errors of a heading] is parked; it rests
@@ -291,7 +291,7 @@ def weigh(
     interval = (problem.times * valid).amax(1, keepdim=True) / (valid.sum(1, keepdim=True) - 1)
     slow = ((correlation ** (TENTH / interval) - 0.15) / 0.3).clamp(0.1, 1.0)
     means = noise.offset[[0, 1, 6]].to(error) / torch.cat([error[:, :2], of('extent')], 1)
-    apart = noise.trust * (means.mean(1, keepdim=True) / APART).square().clamp(max=1.0)
+    apart = noise.trust * (means.mean(1, keepdim=True) / APART[0]).square().clamp(max=APART[1])
     lasting = torch.cat([ratio[:, :3].maximum(apart), ratio[:, 3:]], 1).clamp(0.1, 2.0)
     bias = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]) * slow[:, :6] * lasting
     error, extent = error * ratio, of('extent') * slow[:, 6:] * (2 * lasting[:, :3]).clamp(max=1)
