@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-OUTLIER = 3.0  # what is this many deviations off yields: an input by half, motion by 3/4
+PRIOR_OUTLIER = SWERVE = 3.0  # so many deviations off an input loses half its say, motion 3/4
 USUAL = 0.385  # correlation of the errors of an input from one observation to the next
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
 TENTH = 0.1  # of a second, over which errors that are biased are correlated
@@ -299,7 +299,7 @@ def weigh(
     axes = rotation_from_rpy(state.pose[..., 3:])
     input_off = objective.prior(state, given, axes)
     off = (input_off.residual[:, :, 0].abs() + surprise(problem, axes)) / error[:, None]
-    hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / OUTLIER) ** 2)
+    hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     # Points and the face of the input are apart by gap, bias and half the error of the extent.
     wide = faces.spread**2 + (bias[:, :3] ** 2 + (expected[:, :3] * extent / 2) ** 2)[:, FACE_AXIS]
     away = (sights.outwardness * trust).sum(1) / trust.sum(1).clamp(min=1e-9)
@@ -339,7 +339,7 @@ def yielding(term: Term, state: State) -> Term:
 
     """
     r = term.linearise(state).residual[:, :, 0, :, None]
-    far = (r.mT @ term.weight[:, :, 0] @ r)[..., None] / OUTLIER**2
+    far = (r.mT @ term.weight[:, :, 0] @ r)[..., None] / SWERVE**2
     far[:, 2:] = far[:, 2:].minimum(far[:, 1:-1]).minimum(far[:, :-2])
     return term._replace(weight=term.weight / (1 + far) ** 2)
 
