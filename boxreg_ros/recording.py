@@ -295,7 +295,8 @@ class Recording:
         if found is None and fixed_frame is not None:
             raise RecordingError(
                 f'{self}: no transforms connect the fixed frame {fixed_frame!r} with the frame '
-                f'of the clouds {frame!r}; TF: {tree}; odometry: {", ".join(odometry) or "none"}'
+                f'of the clouds {frame!r}; TF: {tree}; odometry: {", ".join(odometry) or "none"}; '
+                f'leave --fixed-frame out to have one chosen'
             )
         if found is None:
             raise RecordingError(

@@ -29,7 +29,7 @@ ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 1000  # observations that a thread works on at once: what its cache holds
 COARSE = 256  # points of a box that tell where it is but for the last round
 SHOWN = 64  # points of a box that show the shape of its track
-APART = 0.5, 0.7  # of usual errors: what tracks are off by that are biased; a detector's scatter
+APART = 0.5, 0.7  # tracks so far off are biased, and by no more than that [usual errors]
 CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
 MOTION = objective.acceleration, objective.slip
 # What is slower [m/s], moved less [m] and turned less [errors of a heading] is parked; it rests
