@@ -100,6 +100,7 @@ def test_resume_where_results_lie_in_the_recording_or_are_gone(tmp_path, capsys)
         (['--points', '/lidar'], 1, "no topic '/lidar'; topics with point clouds: /points"),
         (['--boxes', '/points'], 1, 'Detection3DArray'),
         (['--fixed-frame', 'world'], 1, "fixed frame 'world'"),
+        (['--fixed-frame', 'world'], 1, 'leave --fixed-frame out to have one chosen'),
         (['--start', '9'], 1, 'start and end'),
         (['--start', 'nan'], 2, 'start: expected seconds from the beginning, got nan'),
         (['--end', 'inf'], 2, 'end: expected seconds from the beginning, got inf'),
