@@ -87,7 +87,12 @@ def _as_given(boxes: Floats, *_: NDArray[Any]) -> Floats:
     return np.unwrap(boxes[..., YAW])
 
 
-_free_variables = registration.free_variables
+def _sharp(problem: Problem) -> Tensor:
+    """Stand in for `retreat`: hidden faces are like open ones."""
+    return _retreat(problem) * torch.tensor([0.0, 1.0])[:, None, None, None]
+
+
+_free_variables, _retreat = registration.free_variables, correspondence.retreat
 LOOSE = 1e3  # highest bound of the deviations of motion
 INGREDIENTS = {
     WHOLE: Ingredient('all is on'),
@@ -108,7 +113,11 @@ INGREDIENTS = {
     'round edges': Ingredient(
         'points stand no further in on faces seen from the side or behind',
         {'faces.depth_ends': 0.0, 'faces.depth_sides': 0.0},
-        replaced=((correspondence, 'retreat', lambda aspect, depths: torch.zeros_like(aspect)),),
+        replaced=((correspondence, 'retreat', _sharp),),
+    ),
+    'distance': Ingredient(
+        'points stand no further in on faces far away',
+        replaced=((correspondence, 'DISTANCE', (inf, 1.0)),),
     ),
     'measured noise': Ingredient(
         'the input errs as the settings say',

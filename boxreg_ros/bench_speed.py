@@ -395,7 +395,7 @@ def _torch_minimum(
 
 def _terms(problem: objective.Problem, state: State, config: Config) -> list[Term]:
     rule = InputModel(config.faces).rule()
-    sights = support(problem, state, config.faces.outermost, rule.depths)
+    sights = support(problem, state, config.faces.outermost, rule)
     return weigh(problem, state, sights, expected_shared(problem, rule), InputNoise(), config)
 
 

@@ -17,19 +17,10 @@ from typing import Any
 
 from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
 from boxreg_ros.boxtable import BoxTable
-from boxreg_ros.calibration import (
-    InputModel,
-    InputNoise,
-    LEAST,
-    Rule,
-    scatter,
-    TRACKS,
-)
-from boxreg_ros.calibration import (
-    KINDS as FACE_KINDS,
-)
+from boxreg_ros.calibration import InputModel, InputNoise, LEAST, scatter, TRACKS
+from boxreg_ros.calibration import KINDS as FACE_KINDS
 from boxreg_ros.config import Config, Setting, settings
-from boxreg_ros.correspondence import support
+from boxreg_ros.correspondence import Rule, support
 from boxreg_ros.drive import Drive
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.objective import EXTENT, State
@@ -85,9 +76,9 @@ class _Sights(InputModel):
         """Return shifts of gaps (0) or depths (1) of faces, per track that tells some [m]."""
         means = []
         for known in self._sights.values():
-            total, count = known[which][:, faces]
+            total, count, share = known[which][:, faces]
             if (count >= FEWEST).any():  # observations, as the model wants of a track
-                means.append(total[count >= FEWEST] / count[count >= FEWEST])
+                means.append(total[count >= FEWEST] / share[count >= FEWEST])
         return means
 
 
@@ -170,7 +161,7 @@ def _errors_of_kind(
     # Headings against those of the truth, whichever of the two directions a track is given in.
     half_turns = torch.tensor([2.0, 2.0, 1.0]) * torch.pi
     pose[..., 3:] += half_turns * ((problem.pose - pose)[..., 3:] / half_turns).round()
-    rule = Rule(torch.zeros(6), torch.zeros(6))
+    rule = Rule(*torch.zeros(3, 6))
     extent = expected_shared(true, rule)
     off = scatter(problem, State(pose, extent))
     off = off[off.isfinite().all(2).sum(1) >= LEAST]  # the boxes of others were held
@@ -339,7 +330,7 @@ def _show(model: InputModel, windows: Sequence[Window], config: Config, rule: Ru
         part = [windows[i] for i in rows]
         problem, _ = stack(part, config)
         state = State(problem.pose, expected_shared(problem, rule))
-        sights = support(problem, state, config.faces.outermost, rule.depths)
+        sights = support(problem, state, config.faces.outermost, rule)
         model.learn_rule([w.track_id for w in part], sights, problem.valid, rule)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import FaceConfig
-from boxreg_ros.correspondence import Support
+from boxreg_ros.correspondence import Rule, Support
 from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.objective import EXTENT, Problem, State
 from boxreg_ros.structures import Floats
@@ -61,23 +61,6 @@ class InputNoise(NamedTuple):
         return cls(deviation, correlation.clamp(0.0, 0.9), offset, total / (total + LEAST))
 
 
-class Rule(NamedTuple):
-    """
-    How faces stand to the points on them.
-
-    Attributes
-    ----------
-    gaps : Tensor, shape (6,)
-        Gap of each face less the one expected of its class [m].
-    depths : Tensor, shape (6,)
-        How much further in points stand on a face that is hidden [m]; 0 for roof and road.
-
-    """
-
-    gaps: Tensor
-    depths: Tensor
-
-
 def scatter(problem: Problem, state: State) -> Tensor:
     """
     Return input minus fit along the box axes, as `InputNoise` counts them, (B, N, 9).
@@ -102,12 +85,14 @@ class InputModel:
     The rule is the gap between a label's faces and the outermost points on them. Each track
     gives one sight per face, the mean over its observations of the gap less the one expected of
     its class, and the median over tracks of all classes is weighed against no difference: boxes
-    that err by more than the gap still tell it if their error has no preferred direction.
+    that err by more than the gap still tell it if their error has no preferred direction. Faces
+    beyond 45 m tell how much further in points stand there; where the rule is stated, too, since
+    what all boxes err by does not matter for the difference.
 
     """
 
     def __init__(self, config: FaceConfig) -> None:
-        self._config = config
+        self._learn, self._depths = config.learn, (config.depth_ends, config.depth_sides, 0.0, 0.0)
         self._sights: dict[str, Floats] = {}
         self._scatter: dict[str, Floats] = {}
         self._noise = InputNoise()
@@ -120,17 +105,18 @@ class InputModel:
         `rule` is what `support` was made with.
 
         """
-        out, retreat = support.outwardness.cpu().numpy(), support.retreat.cpu().numpy()
-        gaps, depths = rule.gaps.cpu().numpy(), rule.depths.cpu().numpy()
-        share = retreat / np.maximum(depths, 1e-6)
-        usable = ((support.trust > 0) & (new & (support.points >= 30))[..., None]).cpu().numpy()
-        usable &= np.abs(out) < 0.5
-        sights = gaps - out, depths - out / np.maximum(share, 0.5)
-        weights = usable & (share < 0.25), usable & (share > 0.5)
-        sums = [[(s * w).sum(1), w.sum(1)] for s, w in zip(sights, weights, strict=True)]
-        for b, name in enumerate(names):
-            known = _of(self._sights, name, np.zeros((2, 2, 6)))
-            known += [[part[b] for part in pair] for pair in sums]
+        out, (hidden, distant) = support.outwardness, support.shares
+        rule = Rule(*(part.to(out) for part in rule))
+        hidden = hidden * (rule.depths > 0)  # the bottom is known by the road
+        is_open, is_far, many = hidden < 0.25, distant > 0.5, (support.points >= 30)[..., None]
+        tells = torch.stack([many & is_open & ~is_far, many & (hidden > 0.5), is_open & is_far])
+        tells &= (support.trust > 0) & (out.abs() < 0.5) & new[..., None]
+        levels = torch.stack([0 * hidden, hidden * rule.depths, distant * rule.distant]) - out
+        levels[::2] += rule.gaps  # a depth is counted from the gap of the moment
+        shares = torch.stack([torch.ones_like(out), hidden, distant])
+        sums = torch.stack([levels * tells, tells, shares * tells], 1).sum(3).movedim(2, 0)
+        for name, row in zip(names, sums.cpu().numpy(), strict=True):
+            _of(self._sights, name, np.zeros((3, 3, 6)))[:] += row
 
     def learn_noise(self, names: Sequence[str], scatters: Floats) -> None:
         """Take what one more observation of each track `names` scatters, (B, 9)."""
@@ -141,17 +127,19 @@ class InputModel:
 
     def rule(self) -> Rule:
         """Return the annotation rule to expect."""
-        depths = self._config.depth_ends, self._config.depth_sides, 0.0, 0.0
-        known = np.array(list(self._sights.values())).reshape(-1, 2, 2, 6)
-        return Rule(self._median(known[:, 0], (0.0,) * 4), self._median(known[:, 1], depths))
+        known = np.array(list(self._sights.values())).reshape(-1, 3, 3, 6)
+        gaps = self._median(known[:, 0], (0.0,) * 4)
+        depths = self._median(self._learn * known[:, 1], self._depths)
+        known[:, 2, 0] -= gaps.numpy() * known[:, 2, 1]
+        return Rule(self._learn * gaps, depths, self._median(known[:, 2], (0.0,) * 4))
 
     def _median(self, known: Floats, expected: Sequence[float]) -> Tensor:
         """Weigh what is `expected` of each kind of face against the median over tracks."""
         values = torch.zeros(6, dtype=torch.float64)
         for faces, value, deviation in zip(KINDS, expected, RULE_ERROR, strict=True):
-            total, count = known[:, 0, faces].ravel(), known[:, 1, faces].ravel()
-            sights = total[count >= 3] / count[count >= 3]
-            if self._config.learn and len(sights) >= 3:
+            level, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
+            sights = level[count >= 3] / share[count >= 3]
+            if len(sights) >= 3:
                 middle = np.median(sights)
                 error = 1.25 * (1.48 * np.median(np.abs(sights - middle)) + 0.02)
                 trust = deviation**2 / (deviation**2 + error**2 / len(sights))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -125,18 +125,10 @@ class ClassConfig:
 class Config:
     """Everything that can be set, with defaults that suit road vehicles at 10 Hz."""
 
-    objective: str = setting(
-        'robust', 'which objective: ours, or the paper to the letter', choices=('robust', 'paper')
-    )
-    mode: str = setting(
-        '3d', "free variables: '3d' x y z roll pitch yaw, 'bev' x y yaw", choices=('3d', 'bev')
-    )
-    estimate: str = setting(
-        'track', 'told by boxes before, `lag` more, or all', choices=('early', 'final', 'track')
-    )
-    extent: str = setting(
-        'track', "'track' estimates one, 'fixed' keeps the input's", choices=('track', 'fixed')
-    )
+    objective: str = setting('robust', 'ours, or that of the paper', choices=('robust', 'paper'))
+    mode: str = setting('3d', 'free: x y z roll pitch yaw, or x y yaw', choices=('3d', 'bev'))
+    estimate: str = setting('track', 'how much is waited for', choices=('early', 'final', 'track'))
+    extent: str = setting('track', "one per track, or the input's", choices=('track', 'fixed'))
     window: int = setting(10, 'observations per sliding window', '', 3, 1000)
     lag: int = setting(9, 'observations a final box waits for, within its window', '', 0, 999)
     track_window: int = setting(130, "observations solved at once for 'track'", '', 10, 10000)
@@ -178,10 +170,6 @@ class Config:
         words = words_of(class_name)
         kinds = (k for k in (self.cyclist, self.pedestrian) if words & {*map(str.lower, k.names)})
         return next(kinds, self.vehicle)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return nested plain values, as `from_dict` and YAML take them."""
-        return asdict(self)
 
     def updated(self, changes: Mapping[str, Any]) -> Config:
         """

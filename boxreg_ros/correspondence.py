@@ -22,6 +22,30 @@ VEILED = 0.25  # say of a face that is hidden behind its edge
 TURN = 0.25  # how fast a face is lost when it turns away; its edges are rounder at the ends
 FAR = 1e9
 LEAD = (0.0, 0.0, 0.2, 0.2, 0.0, 0.0)
+# Up to the first range [m] points stand as far out as they ever do, a second further away
+# further in by what is learnt, and by half as much again at most.
+DISTANCE = 20.0, 50.0
+BLURRED = 0.05  # a face whose points stand so much further in by its distance has half its say [m]
+
+
+class Rule(NamedTuple):
+    """
+    How faces stand to the points on them.
+
+    Attributes
+    ----------
+    gaps : Tensor, shape (6,)
+        Gap of each face less the one expected of its class [m].
+    depths : Tensor, shape (6,)
+        How much further in points stand on a face that is hidden [m]; 0 for roof and road.
+    distant : Tensor, shape (6,)
+        How much further in they stand where the object is 70 m away [m].
+
+    """
+
+    gaps: Tensor
+    depths: Tensor
+    distant: Tensor
 
 
 class Support(NamedTuple):
@@ -38,6 +62,8 @@ class Support(NamedTuple):
         1 for a face that is seen, less for one hidden behind its edge, 0 without points.
     retreat : Tensor, shape (B, N, 6)
         How much further in than the gap of the face they are expected [m].
+    shares : Tensor, shape (2, B, N, 6)
+        Of the depth and of the distance of the rule in that.
     points : Tensor, shape (B, N)
         How many are in and near the box.
 
@@ -47,6 +73,7 @@ class Support(NamedTuple):
     outwardness: Tensor
     trust: Tensor
     retreat: Tensor
+    shares: Tensor
     points: Tensor
 
 
@@ -72,19 +99,22 @@ def aspect(problem: Problem) -> Tensor:
     return torch.cat([sides, sides.new_tensor([9.0, -9.0]).expand(*sides.shape[:2], 2)], -1)
 
 
-def retreat(aspect: Tensor, depths: Tensor) -> Tensor:
+def retreat(problem: Problem) -> Tensor:
     """
-    Return how much further in the outermost points of a face stand for its aspect [m].
+    Return how much further in the outermost points of the faces stand, shape (2, B, N, 6).
 
-    A body is round at its edges: what is seen of a face from the side, or of its edge from
-    behind, stands further in the less open the face is, up to `depths` (6,).
+    As parts of what the rule tells: of its depths for how hidden a face is, since a body is round
+    at its edges, and of what it tells of distant ones, where fewer points reach the outermost
+    parts.
 
     """
-    shifted = aspect + aspect.new_tensor(LEAD)
-    return depths.to(aspect) * (0.5 - 0.5 * shifted / (shifted.square() + TURN).sqrt())
+    shifted = problem.openness + problem.openness.new_tensor(LEAD)
+    hidden = 0.5 - 0.5 * shifted / (shifted.square() + TURN).sqrt()
+    beyond = problem.origins[..., :2].norm(dim=-1, keepdim=True).nan_to_num() - DISTANCE[0]
+    return torch.stack([hidden, (1 - hidden) * (beyond / DISTANCE[1]).clamp(0, 1.5)])
 
 
-def support(problem: Problem, state: State, outermost: float, depths: Tensor) -> Support:
+def support(problem: Problem, state: State, outermost: float, rule: Rule) -> Support:
     """
     Find the outermost points of each face, the part `outermost` of all [for Eq. 4].
 
@@ -96,8 +126,8 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
         Where their boxes are in this round.
     outermost : float
         Part of the points in and near the box that stands for a face.
-    depths : Tensor, shape (6,)
-        How much further in a face's points stand if it is quite hidden [m].
+    rule : Rule
+        How far in its points stand on each face.
 
     Returns
     -------
@@ -114,9 +144,10 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     to the stamp of the box.
 
     """
-    points, openness = carried(problem, state), problem.openness
+    points, shares = carried(problem, state), retreat(problem)
     half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]
-    inset = retreat(openness, depths)
+    distant = shares[1] * rule.distant.to(shares)
+    inset = shares[0] * rule.depths.to(shares) + distant
     offset = (state.shared[:, None, GAP] + inset).to(points)[..., None] - half[..., FACE_AXIS, :]
     local = in_box_axes(points, problem, state.pose)
     x, y, z = local.abs().sub_(half).unbind(-2)
@@ -141,7 +172,8 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     best = pad(best, (0, 1), value=1.0)
     moments = product((best * weight[..., None]).flatten(3, 4).mT, best.flatten(3, 4))
     out = -(torch.where(chosen, depth, 0.0) * weight).sum((-1, -2))
-    trust = (number >= LEAST) * torch.where(openness[..., :BOTTOM] > 0, 1.0, VEILED)
+    trust = (number >= LEAST) * torch.where(problem.openness[..., :BOTTOM] > 0, 1.0, VEILED)
+    trust = trust / (1 + (distant[..., :BOTTOM] / BLURRED) ** 2)
     # The bottom is where a point of the road is, under the centre of the box.
     shift = state.pose[..., :3] - problem.pose[..., :3]
     known, road = problem.ground.isfinite() & problem.valid, torch.nan_to_num(problem.ground)
@@ -150,7 +182,7 @@ def support(problem: Problem, state: State, outermost: float, depths: Tensor) ->
     bottom = point[..., None] * point[..., None, :], shift[..., 2] - road - height / 2 + gap, known
     pairs = zip((moments, out, trust), bottom, strict=True)
     found: Any = (torch.cat([five.to(road), one[:, :, None].to(road)], 2) for five, one in pairs)
-    return Support(*[*found, inset, count.to(road)])
+    return Support(*[*found, inset, shares, count.to(road)])
 
 
 def smallest(depth: Tensor, strip: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -6,9 +6,9 @@ from multiprocessing import cpu_count
 from typing import NamedTuple
 
 from boxreg_ros import objective
-from boxreg_ros.calibration import InputModel, InputNoise, Rule, scatter
+from boxreg_ros.calibration import InputModel, InputNoise, scatter
 from boxreg_ros.config import Config
-from boxreg_ros.correspondence import in_box_axes, Support, support
+from boxreg_ros.correspondence import in_box_axes, Rule, Support, support
 from boxreg_ros.geometry import FACE_AXIS, rotation_from_rpy, wrap_angle
 from boxreg_ros.lbfgs import minimize, select
 from boxreg_ros.objective import ERRORS, EXTENT, Problem, remembered, SHARED, State, Sum, Term
@@ -174,7 +174,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         part, here = select(problem.thinned(enough), rows), select(state, rows)
         expected = everyone[rows]
         here.shared[:, objective.ANCHOR] = 0.0
-        sights = support(part, here, config.faces.outermost, rule.depths)
+        sights = support(part, here, config.faces.outermost, rule)
         terms = [t for t in weigh(part, here, sights, expected, noise, config) if t.weight.any()]
         if turn > 0 or rounds == 1:  # where it begins, a cold window is as noisy as its input
             terms = [yielding(t, here) if t.function in MOTION else t for t in terms]
@@ -223,7 +223,7 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
 
     """
     length, settings = problem.boxes.shape[1], config.paper
-    expected = expected_shared(problem, Rule(torch.zeros(6), torch.zeros(6)))
+    expected = expected_shared(problem, Rule(*torch.zeros(3, 6)))
     extent = expected[:, None, EXTENT].expand(-1, length, -1)
     free = free_variables(problem, config)[:, : 6 * length]
     x = problem.pose.flatten(1)
@@ -410,11 +410,10 @@ def free_variables(problem: Problem, config: Config) -> Tensor:
 
 def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None:
     """Show the model the fresh observations at their input boxes."""
-    fresh = [window.fresh_part() for window in windows if window.fresh > 0]
-    if fresh:
+    if fresh := [window.fresh_part() for window in windows if window.fresh > 0]:
         problem, rule = stack(fresh, config)[0].thinned(COARSE), model.rule()
         state = State(problem.pose, expected_shared(problem, rule))
-        sights = support(problem, state, config.faces.outermost, rule.depths)
+        sights = support(problem, state, config.faces.outermost, rule)
         model.learn_rule([window.track_id for window in fresh], sights, problem.valid, rule)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from importlib.metadata import version
 import json
 from pathlib import Path
@@ -104,7 +105,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                     folder / REPORT, line, summary, request.config, sink.changes.tracks(), items
                 )
             summary['seconds'] = clock.seconds()
-        settings = yaml.safe_dump(request.config.to_dict(), sort_keys=False)
+        settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
         (folder / CONFIG).write_text(settings, encoding='utf-8')
         (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
     return summary

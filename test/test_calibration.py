@@ -197,16 +197,35 @@ def test_scatters_of_the_tracks_seen_last_are_remembered():
 # --- rule ---------------------------------------------------------------------------------------
 
 
-def sighted(model, names, shifts, n=5, count=100, seen=1.0, retreat=0.0, fresh=True):
-    """Show `model` tracks whose gaps are `shifts` (b, 6) larger than expected of their class."""
+def sighted(
+    model,
+    names,
+    shifts,
+    n=5,
+    count=100,
+    seen=1.0,
+    fresh=True,
+    hidden=0.0,
+    distant=0.0,
+    further=0.0,
+):
+    """
+    Show `model` tracks whose gaps are `shifts` (b, 6) larger than expected of their class.
+
+    Points stand as much further in as `model` expects for what is `hidden` and `distant`, and
+    `further` [m].
+
+    """
     rule = model.rule()
     b = len(names)
     shifts = torch.as_tensor(np.broadcast_to(shifts, (b, 6)).copy(), dtype=D)
     # Outwardness is how far points stand out of the box less the gap expected of them.
-    out = (rule.gaps - shifts)[:, None].expand(b, n, 6)
+    out = (rule.gaps - shifts)[:, None].expand(b, n, 6) - further
     whole = torch.ones(b, n, 6, dtype=D)
+    shares = torch.stack([hidden * whole, distant * whole])
+    retreat = hidden * rule.depths + distant * rule.distant + 0 * whole
     sights = Support(
-        torch.zeros(b, n, 6, 4, 4, dtype=D), out, seen * whole, retreat * whole,
+        torch.zeros(b, n, 6, 4, 4, dtype=D), out, seen * whole, retreat, shares,
         count * whole[..., 0],
     )  # fmt: skip
     model.learn_rule(names, sights, torch.full((b, n), fresh), rule)
@@ -278,13 +297,7 @@ def test_depths_are_learnt_from_faces_seen_from_behind_alone():
     # The whole expected depth of retreat: faces hidden. Outwardness 0 confirms the depth, and
     # tells nothing of the gap of open faces.
     model = InputModel(FACES)
-    rule = model.rule()
-    names, whole = [str(i) for i in range(50)], torch.ones(50, 5, 6, dtype=D)
-    sights = Support(
-        torch.zeros(50, 5, 6, 4, 4, dtype=D), 0.05 * whole, whole, rule.depths.expand_as(whole),
-        100 * whole[..., 0],
-    )  # fmt: skip
-    model.learn_rule(names, sights, torch.ones(50, 5, dtype=torch.bool), rule)
+    sighted(model, [str(i) for i in range(50)], 0.0, hidden=1.0, further=-0.05)
     found = model.rule()
     # Points 0.05 m further out than expected: the depth is that much less, but for trust.
     assert FACES.depth_ends - 0.05 <= found.depths[0] < FACES.depth_ends - 0.045
@@ -292,10 +305,43 @@ def test_depths_are_learnt_from_faces_seen_from_behind_alone():
     np.testing.assert_array_equal(found.gaps[:4], 0)
 
 
-def test_learning_can_be_switched_off():
-    model = InputModel(FaceConfig(learn=False))
+def far_and_near(model, gap, distant):
+    """Show 50 tracks from near and from 45 m, where points stand further in by half `distant`."""
+    names = [str(i) for i in range(50)]
+    sighted(model, names, gap)
+    sighted(model, names, gap, count=10, distant=0.51, further=0.51 * distant)
+
+
+def test_what_is_far_tells_how_far_in_points_stand_there():
+    # Few points are enough there. Near faces tell 0.04 m of gap, far ones 0.06 m more at 0.51 of
+    # the way from 20 to 70 m: 0.12 m at 70 m, but for trust. Nothing is told of faces of neither
+    # kind, nor by far ones of the gap.
+    model = InputModel(FACES)
+    far_and_near(model, 0.04, 0.12)
+    rule = model.rule()
+    np.testing.assert_allclose(rule.gaps, 0.04, atol=1e-3)
+    np.testing.assert_allclose(rule.distant[:4], 0.12, atol=5e-3)
+    alone = InputModel(FACES)
+    sighted(alone, [str(i) for i in range(50)], 0.04, distant=0.51)
+    np.testing.assert_array_equal(alone.rule().gaps, 0)
+
+
+def test_without_far_objects_those_are_as_near_ones():
+    model = InputModel(FACES)
     sighted(model, [str(i) for i in range(50)], 0.04)
-    np.testing.assert_array_equal(model.rule().gaps, 0)
+    np.testing.assert_array_equal(model.rule().distant, 0)
+
+
+def test_learning_can_be_switched_off():
+    # What is stated are gaps and depths. How much further in far points stand is learnt still:
+    # what near and far boxes have in common, such as being too large, does not matter for that.
+    model = InputModel(FaceConfig(learn=False))
+    far_and_near(model, 0.04, 0.12)
+    sighted(model, [f'hidden {i}' for i in range(50)], 0.0, hidden=1.0, further=-0.05)
+    rule = model.rule()
+    np.testing.assert_array_equal(rule.gaps, 0)
+    np.testing.assert_allclose(rule.depths[:4], [FACES.depth_ends] * 2 + [FACES.depth_sides] * 2)
+    np.testing.assert_allclose(rule.distant[:4], 0.12, atol=5e-3)
 
 
 def test_only_the_tracks_seen_last_are_remembered():
@@ -329,7 +375,7 @@ def test_support_of_boxes_drawn_by_a_rule_teaches_it():
     car = Config().vehicle
     expected = [car.gap_ends] * 2 + [car.gap_sides] * 2 + [car.gap_top, car.gap_bottom]
     state = State(problem.pose, shared_of(B=B, GAP=expected))
-    sights = support(problem, state, 0.05, rule.depths)
+    sights = support(problem, state, 0.05, rule)
     model.learn_rule([str(b) for b in range(B)], sights, problem.valid, rule)
     # The median moves but for trust: its error, 1.25 * 0.02 m / sqrt(12), against 0.05 m.
     found = np.array(expected) + model.rule().gaps.numpy()

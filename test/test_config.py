@@ -1,3 +1,4 @@
+from dataclasses import asdict
 from pathlib import Path
 
 from boxreg_ros.config import Config, settings
@@ -37,9 +38,9 @@ def test_dictionary_and_yaml_give_back_what_they_took(tmp_path):
     assert config.solver.rounds == 2
     assert config.pedestrian.names == ('human',)
     assert config.pedestrian.slip == Config().pedestrian.slip != Config().vehicle.slip
-    assert Config.from_dict(config.to_dict()) == config
+    assert Config.from_dict(asdict(config)) == config
     path = tmp_path / 'config.yaml'
-    path.write_text(yaml.safe_dump(config.to_dict()))
+    path.write_text(yaml.safe_dump(asdict(config)))
     assert Config.from_yaml(path) == config
 
 

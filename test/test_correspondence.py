@@ -1,6 +1,6 @@
 """Which points tell where a face is, against boxes whose points are placed by hand."""
 
-from boxreg_ros.correspondence import aspect, retreat, support
+from boxreg_ros.correspondence import aspect, retreat, Rule, support
 from boxreg_ros.objective import State
 import numpy as np
 import pytest
@@ -39,12 +39,38 @@ def test_without_a_sensor_the_centre_of_mass_tells_the_open_faces():
 
 
 def test_retreat_grows_as_a_face_turns_away():
-    open_ = torch.linspace(-50, 50, 201, dtype=D)[:, None].expand(-1, 6)
-    depths = tensor([0.4, 0.4, 0.2, 0.2, 0.0, 0.0])
-    found = retreat(open_, depths)
-    assert (found.diff(dim=0) <= 0).all()
-    np.testing.assert_allclose(found[0], depths, atol=1e-4)
-    np.testing.assert_allclose(found[-1], 0, atol=1e-4)
+    open_ = torch.linspace(-50, 50, 201, dtype=D)[None, :, None].expand(-1, -1, 6)
+    problem = problem_of([[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 201], openness=open_)
+    hidden, distant = retreat(problem)[:, 0]
+    assert (hidden.diff(dim=0) <= 0).all()
+    np.testing.assert_allclose(hidden[0], 1, atol=1e-4)
+    np.testing.assert_allclose(hidden[-1], 0, atol=1e-4)
+    assert not distant.any()  # no sensor is known
+
+
+@pytest.mark.parametrize(
+    ('away', 'share'), [(10.0, 0.0), (20.0, 0.0), (45.0, 0.5), (70.0, 1.0), (200.0, 1.5)]
+)
+def test_points_of_what_is_far_stand_further_in(away, share):
+    # From 20 m on by a part of what is learnt that grows to 1 in another 50 m, 1.5 at most; what
+    # counts is the distance on the ground. The front and the roof are open, the back and the
+    # bottom hidden: they stand further in for that alone.
+    hidden, distant = retreat(seen_from([0.6 * away, 0.8 * away, 5.0]))[:, 0, 0]
+    np.testing.assert_allclose(distant, share * (1 - hidden))
+    assert (hidden[[0, 2, 4]] < 0.2).all()
+    assert (hidden[[1, 3, 5]] > 0.8).all()
+
+
+def test_faces_far_away_say_less_the_further_in_their_points_are_expected():
+    # At 70 m, points 0.15 m inside faces, of which 0.05 m are expected for the distance: half
+    # the trust, and 0.1 m less far out than expected. For 0.1 m a fifth: 1 / (1 + (0.1 / 0.05)^2).
+    problem = seen_from([42.0, 56.0, 2.0], on_faces(0.15, faces=(4,)))
+    for distant, trust in ((0.0, 1.0), (0.05, 0.5), (0.1, 0.2)):
+        found = supported(problem, distant=distant)
+        assert found.trust[0, 0, 4].item() == pytest.approx(trust, rel=0.01)
+        assert found.outwardness[0, 0, 4].item() == pytest.approx(distant - 0.15, abs=1e-3)
+        assert found.retreat[0, 0, 4].item() == pytest.approx(distant, abs=1e-3)
+        assert found.retreat[0, 0, 5].item() == pytest.approx(0, abs=1e-3)  # the road
 
 
 def on_faces(inside, n=40, faces=(0, 2, 4)):
@@ -59,10 +85,10 @@ def on_faces(inside, n=40, faces=(0, 2, 4)):
     return np.concatenate(points)
 
 
-def supported(problem, gap=0.0, outermost=0.05, depths=0.0):
+def supported(problem, gap=0.0, outermost=0.05, depths=0.0, distant=0.0):
     state = State(problem.pose, shared_of(GAP=[gap] * 6))
-    depths = torch.full((6,), depths, dtype=D)
-    return support(problem, state, outermost, depths)
+    rule = Rule(*(torch.full((6,), value, dtype=D) for value in (0.0, depths, distant)))
+    return support(problem, state, outermost, rule)
 
 
 @pytest.mark.parametrize('gap', [0.0, 0.04])
@@ -148,7 +174,7 @@ def test_order_and_padding_of_points_do_not_matter():
     boxes = [[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 2]
     order = rng.permutation(120)
     known, found = (
-        support(problem, State(problem.pose, shared_of()), 0.2, torch.ones(6, dtype=D))
+        support(problem, State(problem.pose, shared_of()), 0.2, Rule(*torch.ones(3, 6)))
         for problem in (
             problem_of(boxes, points=points, mask=mask, origins=[[[9.0, 9.0, 9.0]] * 2]),
             problem_of(

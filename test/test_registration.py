@@ -3,9 +3,9 @@
 from dataclasses import fields, replace
 
 from boxreg_ros import objective, registration
-from boxreg_ros.calibration import InputModel, InputNoise, Rule
+from boxreg_ros.calibration import InputModel, InputNoise
 from boxreg_ros.config import Config
-from boxreg_ros.correspondence import support
+from boxreg_ros.correspondence import Rule, support
 from boxreg_ros.geometry import rotation_from_rpy
 from boxreg_ros.lbfgs import minimize, Minimum, select
 from boxreg_ros.metrics import iou_3d
@@ -213,7 +213,7 @@ def test_what_is_expected_of_the_shared_by_hand():
     kinds = {name: torch.tensor(values, dtype=D) for name, values in kinds.items()}
     problem = problem_of(boxes, valid=valid, seen=seen, deviations=kinds)
     gaps = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], dtype=D)  # beyond those of the classes
-    found = expected_shared(problem, Rule(gaps, torch.zeros(6, dtype=D)))
+    found = expected_shared(problem, Rule(gaps, *torch.zeros(2, 6)))
     known = np.zeros((2, objective.SHARED))
     known[:, objective.EXTENT] = [[4.3, 2.0, 1.5], [4.3, 2.0, 1.5]]
     known[:, objective.GAP] = [[1.1, 1.2, 3.3, 3.4, 5.5, 7.6], [2.1, 2.2, 4.3, 4.4, 6.5, 8.6]]
@@ -277,7 +277,7 @@ def test_what_hardly_moves_is_parked(speed, length, rests):
     problem = problem_of(many, valid=np.stack([valid] * 2), deviations=kinds)
     expected = expected_shared(problem, InputModel(ALONE.faces).rule())
     state = State(problem.pose, expected)
-    sights = support(problem, state, 0.05, torch.zeros(6, dtype=D))
+    sights = support(problem, state, 0.05, Rule(*torch.zeros(3, 6)))
     (rest,) = (
         term.weight
         for term in weigh(problem, state, sights, expected, InputNoise(), ALONE)
@@ -306,7 +306,7 @@ def test_the_bias_to_expect_by_hand(trust, fast, slow):
     problem = problem_of(boxes, times=times, deviations=kinds)
     expected = expected_shared(problem, InputModel(ALONE.faces).rule())
     state = State(problem.pose, expected)
-    sights = support(problem, state, 0.05, torch.zeros(6, dtype=D))
+    sights = support(problem, state, 0.05, Rule(*torch.zeros(3, 6)))
     error = problem.of(*objective.ERRORS)
     deviation = torch.cat([2 * error[0], torch.ones(3, dtype=D)])
     noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), trust=trust)
@@ -336,7 +336,7 @@ def test_the_bias_of_what_scatters_little_by_hand(offset, lasting):
     problem = problem_of(drive(6)[None], deviations=kinds)
     expected = expected_shared(problem, InputModel(ALONE.faces).rule())
     state = State(problem.pose, expected)
-    sights = support(problem, state, 0.05, torch.zeros(6, dtype=D))
+    sights = support(problem, state, 0.05, Rule(*torch.zeros(3, 6)))
     error, extent = problem.of(*objective.ERRORS), kinds['extent'][:, None]
     usual = torch.cat([error, extent.expand(-1, 3)], 1)[0]
     parts = torch.tensor([1.5, 0.5, 9, 9, 9, 9, 1, 9, 9], dtype=D)  # 1 on average, of three
@@ -362,7 +362,7 @@ def test_how_far_a_gap_may_be_off_by_hand():
     problem = problem_of(drive(3)[None], deviations=kinds)
     expected = expected_shared(problem, InputModel(ALONE.faces).rule())
     left, top = objective.GAP.start + 2, objective.GAP.start + 4
-    sights = support(problem, State(problem.pose, expected), 0.05, torch.zeros(6, dtype=D))
+    sights = support(problem, State(problem.pose, expected), 0.05, Rule(*torch.zeros(3, 6)))
     outwardness, trust = torch.zeros(1, 3, 6, dtype=D), torch.ones(1, 3, 6, dtype=D)
     outwardness[0, :, 4], trust[0, 2, 4] = torch.tensor([0.3, 0.3, 9.0], dtype=D), 0.0
     sights = sights._replace(outwardness=outwardness, trust=trust)

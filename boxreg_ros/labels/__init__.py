@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 import hashlib
 from importlib import import_module
 import json
@@ -187,7 +187,7 @@ class Provenance:
     @classmethod
     def of(cls, recordings: tuple[Path, ...], config: Config | None = None) -> Provenance:
         """Return the provenance of labels of `recordings`, made with `config`."""
-        text = '' if config is None else json.dumps(config.to_dict(), sort_keys=True)
+        text = '' if config is None else json.dumps(asdict(config), sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:16] if text else ''
         names = (absolute(path).name for path in recordings)
         # Names of files need not be UTF-8, label files are.
