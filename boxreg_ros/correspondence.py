@@ -25,7 +25,7 @@ LEAD = (0.0, 0.0, 0.2, 0.2, 0.0, 0.0)
 # Up to the first range [m] points stand as far out as they ever do, a second further away
 # further in by what is learnt, and by half as much again at most.
 DISTANCE = 20.0, 50.0
-BLURRED = 0.05  # a face whose points stand so much further in by its distance has half its say [m]
+BLURRED = 0.1  # a face whose points stand so much further in by its distance has half its say [m]
 
 
 class Rule(NamedTuple):

@@ -62,10 +62,10 @@ def test_points_of_what_is_far_stand_further_in(away, share):
 
 
 def test_faces_far_away_say_less_the_further_in_their_points_are_expected():
-    # At 70 m, points 0.15 m inside faces, of which 0.05 m are expected for the distance: half
-    # the trust, and 0.1 m less far out than expected. For 0.1 m a fifth: 1 / (1 + (0.1 / 0.05)^2).
+    # At 70 m, points 0.15 m inside the roof, of which 0.1 m are expected for the distance: half
+    # the trust, and 0.05 m less far out than expected. For 0.2 m a fifth: 1 / (1 + (0.2 / 0.1)^2).
     problem = seen_from([42.0, 56.0, 2.0], on_faces(0.15, faces=(4,)))
-    for distant, trust in ((0.0, 1.0), (0.05, 0.5), (0.1, 0.2)):
+    for distant, trust in ((0.0, 1.0), (0.1, 0.5), (0.2, 0.2)):
         found = supported(problem, distant=distant)
         assert found.trust[0, 0, 4].item() == pytest.approx(trust, rel=0.01)
         assert found.outwardness[0, 0, 4].item() == pytest.approx(distant - 0.15, abs=1e-3)
