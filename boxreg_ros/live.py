@@ -12,7 +12,7 @@ from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.intake import covariances_to_write, Intake, says_nothing
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
+from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep
 from boxreg_ros.transforms import boxes_to_frame, inverse, sweep_to_frame, TransformTree
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -60,6 +60,7 @@ class _Pending:
     received: float
     T_output_fixed: Floats
     T_output_item: Floats | None
+    is_named_anew: bool
     is_early_out: bool = False
 
 
@@ -195,8 +196,9 @@ class LiveRegistrar:
         given = boxes_to_frame(content, T_output_item, self._output_of(content))
         given = replace(given, track_ids=boxes.track_ids)
         pending = _Pending(
-            item.message, given, item.received, T_output_fixed, T_output_item if others else None
-        )
+            item.message, given, item.received, T_output_fixed, T_output_item if others else None,
+            boxes.track_ids != content.track_ids,
+        )  # fmt: skip
         self._held.append(pending)
         return self._outgoing(self._registrar.add_boxes(boxes))
 
@@ -321,10 +323,11 @@ class LiveRegistrar:
             )
             moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
             assert self.adapter is not None  # it has read the message
-            covariances = covariances_to_write(moved)
-            message = self.adapter.to_msg(
-                pending.message, moved.boxes, covariances, pending.T_output_item
-            )
+            message, T = pending.message, pending.T_output_item
+            # What is kept is the input: in haste, and then most is, nothing is to be made of it.
+            if REFINED in refined.status or T is not None or pending.is_named_anew:
+                covariances = covariances_to_write(moved)
+                message = self.adapter.to_msg(message, moved.boxes, covariances, T)
             self._made.append(
                 Outgoing(message, refined.is_final, pending.given, moved, pending.received)
             )

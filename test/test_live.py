@@ -360,6 +360,10 @@ def test_boxes_of_a_cloud_that_was_dropped_do_not_wait_for_it():
     assert kept[4:] == [('', '')] * 2
     early = [vision.from_msg(item.message).stamp_ns for item in out if not item.is_final]
     assert early == drive.stamps
+    # Nothing of it is refined: it comes out as it is, which under load costs nothing.
+    given, *others = items_of(drive, '/boxes')[3:]
+    assert sum(item.message is given for item in out) == 2
+    assert not any(item.message is other for item in out for other in others)
 
 
 def test_when_the_lidar_stops_boxes_do_not_wait_for_it():
