@@ -1,5 +1,6 @@
 """One rigid shape per track: what all its observations say of it in the frame of its box."""
 
+from boxreg_ros.chain import product
 from boxreg_ros.correspondence import carried, in_box_axes
 from boxreg_ros.objective import EXTENT, Problem, State
 import torch
@@ -41,8 +42,7 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     B, N, M = problem.mask.shape
     local = in_box_axes(carried(problem, state), problem, state.pose).mT
     half, counts = (state.shared[:, EXTENT] / 2).to(local), local.new_tensor(CELLS)
-    near = (local.abs() - half[:, None, None]).amax(-1) < MARGIN
-    rows = near.flatten().nonzero()[:, 0]
+    rows = ((local.abs() - half[:, None, None]).amax(-1) < MARGIN).flatten().nonzero()[:, 0]
     window, p = rows // (N * M), local.flatten(0, 2)[rows]
     scaled = (p / half.index_select(0, window) + 1) * (counts / 2)
     place = scaled.floor().clamp(counts * 0, counts - 1)
@@ -65,6 +65,7 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     found = torch.cat([plane[:, :3], torch.linalg.cross(p[:, :3], plane[:, :3]), off[:, None]], 1)
     lever = p.new_zeros(B * N * M, 7).index_copy_(0, rows, found * weight.sqrt()).view(B, N, M, 7)
     seen = torch.bincount(rows // M, weight[:, 0] > 0, B * N).view(B, N)
-    total = (lever.mT @ lever * (SAY / seen.clamp(min=SAY))[..., None, None]).to(state.pose)
+    # What torch makes of the product depends, on some processors, on how many windows there are.
+    total = product(lever.mT * (SAY / seen.clamp(min=SAY))[..., None, None], lever).to(state.pose)
     information, pull = total[..., :6, :6], total[..., :6, 6]
     return information, torch.linalg.solve(information + 1e-3 * torch.eye(6).to(pull), pull)
