@@ -34,6 +34,7 @@ setup(
     install_requires=[
         'mcap>=1.6,<2',
         'numpy>=1.26,<3',
+        'orjson>=3.9',
         'pyyaml>=6',
         'rosbags>=0.11.5,<0.12',  # whose .db3 files may be read in a thread of their own
         'scipy>=1.11',

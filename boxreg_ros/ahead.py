@@ -6,7 +6,17 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+import sys
 from typing import Any, TypeVar
+
+TURN = 1e-4
+"""
+Neither thread lets the other wait for longer, if it has the lock of the interpreter [s].
+
+numpy and torch hand that lock over at every call of any size, and by default would get it back
+after 5 ms.
+
+"""
 
 _T = TypeVar('_T')
 
@@ -29,6 +39,7 @@ def ahead(items: Iterator[_T], count: int) -> Iterator[Iterator[_T]]:
     """
     end: Any = object()
     thread = ThreadPoolExecutor(1, thread_name_prefix='ahead')
+    before = sys.getswitchinterval()
 
     def each() -> Iterator[_T]:
         coming = deque(thread.submit(next, items, end) for _ in range(count))
@@ -36,7 +47,9 @@ def ahead(items: Iterator[_T], count: int) -> Iterator[Iterator[_T]]:
             coming.append(thread.submit(next, items, end))
             yield item
 
+    sys.setswitchinterval(TURN)
     try:
         yield each()
     finally:
         thread.shutdown(cancel_futures=True)
+        sys.setswitchinterval(before)

@@ -40,8 +40,7 @@ class StampMatcher:
         self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
         self._capacity = config.queue
         self._counts = counts
-        self._sweeps: list[Sweep] = []
-        self._boxes: list[BoxArray] = []
+        self._sweeps, self._boxes = list[Sweep](), list[BoxArray]()
         self._used: set[int] = set()
         self._newest_ns = self._oldest_ns = -inf  # sweep that came, sweep that is still of use
 
@@ -78,12 +77,9 @@ class StampMatcher:
             is_open = away > self._tolerance_ns and self._newest_ns < stamp_ns and not hopeless
             if is_open and len(self._boxes) <= self._capacity:
                 break
-            near = None
-            if away <= self._reach_ns:
-                sweep = self._sweeps[distances.index(away)]
-                self._used.add(sweep.stamp_ns)
-                near = None if sweep.is_lost else sweep
-            yield Pair(self._boxes.pop(0), near)
+            near = self._sweeps[distances.index(away)] if away <= self._reach_ns else None
+            self._used.update([near.stamp_ns] if near else [])
+            yield Pair(self._boxes.pop(0), None if near and near.is_lost else near)
             self._forget_before(stamp_ns - self._reach_ns)
 
     def _forget_before(self, oldest_ns: float) -> None:

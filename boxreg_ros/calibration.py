@@ -1,7 +1,7 @@
 """What the input tells about itself: its annotation rule, and how it errs."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import cast, NamedTuple
 
 from boxreg_ros.config import FaceConfig
 from boxreg_ros.correspondence import Rule, Support
@@ -93,9 +93,8 @@ class InputModel:
 
     def __init__(self, config: FaceConfig) -> None:
         self._learn, self._depths = config.learn, (config.depth_ends, config.depth_sides, 0.0, 0.0)
-        self._sights: dict[str, Floats] = {}
-        self._scatter: dict[str, Floats] = {}
-        self._noise = InputNoise()
+        self._sights, self._scatter = dict[str, Floats](), dict[str, Floats]()
+        self._noise, self._rule = InputNoise(), cast(Rule | None, None)
         self._fresh = self._measured = 0
 
     def learn_rule(self, names: Sequence[str], support: Support, new: Tensor, rule: Rule) -> None:
@@ -117,6 +116,7 @@ class InputModel:
         sums = torch.stack([levels * tells, tells, shares * tells], 1).sum(3).movedim(2, 0)
         for name, row in zip(names, sums.cpu().numpy(), strict=True):
             _of(self._sights, name, np.zeros((3, 3, 6)))[:] += row
+        self._rule = None
 
     def learn_noise(self, names: Sequence[str], scatters: Floats) -> None:
         """Take what one more observation of each track `names` scatters, (B, 9)."""
@@ -127,11 +127,13 @@ class InputModel:
 
     def rule(self) -> Rule:
         """Return the annotation rule to expect."""
-        known = np.array(list(self._sights.values())).reshape(-1, 3, 3, 6)
-        gaps = self._median(known[:, 0], (0.0,) * 4)
-        depths = self._median(self._learn * known[:, 1], self._depths)
-        known[:, 2, 0] -= gaps.numpy() * known[:, 2, 1]
-        return Rule(self._learn * gaps, depths, self._median(known[:, 2], (0.0,) * 4))
+        if self._rule is None:
+            known = np.array(list(self._sights.values())).reshape(-1, 3, 3, 6)
+            gaps = self._median(known[:, 0], (0.0,) * 4)
+            depths = self._median(self._learn * known[:, 1], self._depths)
+            known[:, 2, 0] -= gaps.numpy() * known[:, 2, 1]
+            self._rule = Rule(self._learn * gaps, depths, self._median(known[:, 2], (0.0,) * 4))
+        return self._rule
 
     def _median(self, known: Floats, expected: Sequence[float]) -> Tensor:
         """Weigh what is `expected` of each kind of face against the median over tracks."""

@@ -88,8 +88,8 @@ def aspect(problem: Problem) -> Tensor:
 
     """
     R = rotation_from_rpy(problem.pose[..., 3:])
-    weight = problem.mask.to(problem.points)[..., None, :]
-    mean = (weight @ problem.points)[..., 0, :] / weight.sum(-1).clamp(min=1)
+    weight = problem.mask.to(problem.points)[..., None]
+    mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
     known = problem.origins.isfinite().all(-1, keepdim=True)
     toward = (torch.where(known, problem.origins, 1e6 * mean)[..., None, :] @ R)[..., 0, :]
     outward = toward[..., [0, 0, 1, 1]] * FACE_SIGN[:4].to(R)

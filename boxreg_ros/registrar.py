@@ -51,8 +51,7 @@ class BoxRegistrar:
     def reset(self) -> None:
         """Forget everything but the counts."""
         self._matcher = StampMatcher(self.config, self.counts)
-        self._tracks: dict[str, _TrackBuffer] = {}
-        self._ticks: deque[_Tick] = deque()
+        self._tracks, self._ticks = dict[str, _TrackBuffer](), deque[_Tick]()
         self._newest_ns = -inf
         self._model = InputModel(self.config.faces)
         self._ended: list[_TrackBuffer] = []

@@ -26,7 +26,7 @@ GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
 TENTH = 0.1  # of a second, over which errors that are biased are correlated
 SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
-PART = 1000  # observations that a thread works on at once: what its cache holds
+PART = 2500  # observations that a thread works on at once: more would not stay in its cache
 COARSE = 256  # points of a box that tell where it is but for the last round
 SHOWN = 64  # points of a box that show the shape of its track
 APART = 0.5, 0.7  # tracks so far off are biased, and by no more than that [usual errors]
@@ -111,6 +111,7 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
     return [estimates.get(i) for i in range(len(windows))]
 
 
+@torch.inference_mode()
 def _judged(
     windows: Sequence[Window], problem: Problem, base: Floats, solved: Solution, config: Config
 ) -> list[Estimate]:
@@ -134,15 +135,15 @@ def _judged(
     found, spread = boxes.cpu().numpy(), covariances.cpu().numpy()
     found[..., :3] += base[:, None]
     arrays, estimates = [part.cpu().numpy() for part in left], []
+    lasts = (finite.all(1) & left[1].isfinite().all(1)).tolist() if left else [False] * len(found)
     for b, window in enumerate(windows):
-        memory = Memory(base[b], *(a[b] for a in arrays)) if left and finite[b].all() else None
-        is_lasting = memory is not None and np.isfinite(memory.step).all()
+        memory = Memory(base[b], *(a[b] for a in arrays)) if lasts[b] else None
         n = len(window.observations)
         own, error = found[b, :n].copy(), spread[b, :n].copy()
         for i in np.flatnonzero(~good[b, :n]).tolist():
             own[i], error[i] = window.observations[i].box, np.eye(6)
         words = tuple(np.where(good[b, :n], REFINED, KEPT).tolist()), tuple(why[b, :n].tolist())
-        estimates.append(Estimate(own, *words, error, memory if is_lasting else None))
+        estimates.append(Estimate(own, *words, error, memory))
     return estimates
 
 
@@ -199,9 +200,9 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         rows = every = torch.arange(len(state.pose), device=free.device)
         size = (PART if rows.is_cpu else torch.inf) / length
         while len(rows):
-            count = workers * int(1 + len(rows) / size / workers) if len(rows) > size else 1
-            parts = rows.tensor_split(min(len(rows), count))
-            rows, turn = torch.cat(list(pool.map(improve, parts))), turn + 1
+            n = min(len(rows), workers * int(1 + len(rows) / size / workers))
+            ends = pool.map(improve, rows.tensor_split(n)) if len(rows) > size else [improve(rows)]
+            rows, turn = torch.cat(list(ends)), turn + 1
             if is_track:
                 noise = InputNoise.measure(scatter(problem, state))
             if not len(rows) and 2 * enough <= problem.points.shape[2]:
@@ -408,6 +409,7 @@ def free_variables(problem: Problem, config: Config) -> Tensor:
     return State(pose, shared).pack()
 
 
+@torch.inference_mode()
 def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None:
     """Show the model the fresh observations at their input boxes."""
     if fresh := [window.fresh_part() for window in windows if window.fresh > 0]:

@@ -114,7 +114,7 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     ground[valid] = [o.ground for o in every]
     begin = np.repeat([w.observations[0].stamp_ns for w in windows], lengths)
     times[valid] = (np.array([o.stamp_ns for o in every]) - begin) * 1e-9
-    points[mask] = np.concatenate([o.points for o in every])
+    points.reshape(-1, 3)[mask.ravel()] = np.concatenate([o.points for o in every])
     delays[mask] = np.concatenate([o.delays for o in every])
     row, step, last = np.arange(B)[:, None], np.arange(N), lengths[:, None] - 1
     boxes, times = (part[row, np.minimum(step, last)] for part in (boxes, times))

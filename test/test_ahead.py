@@ -1,9 +1,10 @@
 """Work ahead: in order, bounded, and over when the block is."""
 
+import sys
 import threading
 import time
 
-from boxreg_ros.ahead import ahead
+from boxreg_ros.ahead import ahead, TURN
 import pytest
 
 
@@ -75,3 +76,15 @@ def test_the_thread_ends_when_the_block_fails(failure):
         raise failure
     assert maker.made <= 4
     assert is_over()
+
+
+def test_threads_take_turns_sooner_for_as_long_as_the_block_lasts():
+    before = sys.getswitchinterval()
+    assert before > TURN
+    with ahead(iter(range(3)), 2) as coming:
+        assert sys.getswitchinterval() == pytest.approx(TURN)
+        assert list(coming) == [0, 1, 2]
+    assert sys.getswitchinterval() == before
+    with pytest.raises(ValueError, match='no 1'), ahead(Maker(bad=1).items(3), 2) as coming:
+        list(coming)
+    assert sys.getswitchinterval() == before

@@ -3,6 +3,7 @@ import json
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.labels import FORMATS, LabelFrame, module_of, Provenance, writer_for
+from boxreg_ros.labels.files import to_json
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
 import pytest
@@ -164,3 +165,14 @@ def test_formats():
         facts = module_of(name).FORMAT
         assert facts.name == name
         assert all(getattr(facts, field) for field in facts.__slots__ if field != 'packages')
+
+
+def test_json_is_read_by_every_parser():
+    value = {1: [np.nan, np.inf, 1e-9, 0.1], 'é': None}
+    text = to_json(value)
+    assert 'é' in text  # not escaped
+
+    def refuse(constant):
+        raise AssertionError(f'{constant} is not JSON')
+
+    assert json.loads(text, parse_constant=refuse) == {'1': [None, None, 1e-9, 0.1], 'é': None}

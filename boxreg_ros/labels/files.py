@@ -15,6 +15,7 @@ from boxreg_ros.labels import INPUT, LabelFrame, Provenance
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes
 import numpy as np
 from numpy.typing import ArrayLike
+import orjson
 from scipy.spatial.transform import Rotation
 
 STAMPS, POSES, ORIGIN = 'timestamps.txt', 'poses.txt', 'boxreg.json'
@@ -87,8 +88,8 @@ def boxes_from(centres: ArrayLike, extents: ArrayLike, quaternions_xyzw: ArrayLi
 
 
 def to_json(value: Any) -> str:
-    """Return `value` as JSON that every parser reads: no NaN, text as it is."""
-    return json.dumps(value, allow_nan=False, ensure_ascii=False)
+    """Return `value` as JSON that every parser reads: null for NaN, text as it is."""
+    return orjson.dumps(value, option=orjson.OPT_NON_STR_KEYS).decode()
 
 
 def from_json(path: Path) -> Any:
