@@ -168,7 +168,7 @@ def test_formats():
 
 
 def test_json_is_read_by_every_parser():
-    value = {1: [np.nan, np.inf, 1e-9, 0.1], 'é': None}
+    value = {1: [np.nan, np.float64('inf'), 1e-9, np.float64(0.1)], 'é': None}
     text = to_json(value)
     assert 'é' in text  # not escaped
 

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 STAMPS, POSES, ORIGIN = 'timestamps.txt', 'poses.txt', 'boxreg.json'
 FIRST_GIVEN_NUMBER = 10**6
+JSON = orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY
 
 
 def the_one(found: Sequence[Path], path: Path, what: str) -> Path:
@@ -89,7 +90,7 @@ def boxes_from(centres: ArrayLike, extents: ArrayLike, quaternions_xyzw: ArrayLi
 
 def to_json(value: Any) -> str:
     """Return `value` as JSON that every parser reads: null for NaN, text as it is."""
-    return orjson.dumps(value, option=orjson.OPT_NON_STR_KEYS).decode()
+    return orjson.dumps(value, option=JSON).decode()
 
 
 def from_json(path: Path) -> Any:
