@@ -128,7 +128,9 @@ def _judged(
     extent = given if config.extent == 'fixed' else state.shared[:, None, EXTENT].expand_as(given)
     boxes = torch.cat([state.pose[..., :3], extent, wrap_angle(state.pose[..., 3:])], -1)
     finite = boxes.isfinite().all(-1) & (extent > 0).all(-1) & covariances.isfinite().all((2, 3))
-    before, after = _held(problem, problem.pose, given), _held(problem, state.pose, extent)
+    before, after = problem.mask.sum(-1), _held(problem, state.pose, extent)
+    if (after < before / 2 - 3).any():  # only then does it matter how many the input box holds
+        before = _held(problem, problem.pose, given)
     is_blind = ~problem.mask.any((1, 2))[:, None].expand_as(finite)
     failed = torch.stack([is_blind, ~finite, after < before / 2 - 3]).cpu().numpy()
     good, why = ~np.any(failed, 0), np.select(failed, ['no_points', 'not_finite', 'no_gain'], '')

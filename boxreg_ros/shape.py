@@ -60,8 +60,7 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     is_surface = (power[:, 1] > FLATNESS * thickness) & (number >= LEAST)
     plane = plane.mT.index_select(1, cell)
     off = (plane * p).sum(0)
-    weight = torch.where(is_surface[cell] & near, 1 / (thickness[cell] + off**2), 0.0)
-    weight = weight.view(B, N, 1, M)
+    weight = ((is_surface[cell] & near) / (thickness[cell] + off**2)).view(B, N, 1, M)
     # The levers of all points of an observation, and how far off each is.
     found = torch.cat([plane[:3], torch.linalg.cross(p[:3], plane[:3], dim=0), off[None]])
     lever = found.view(7, B, N, M).movedim(0, 2).contiguous()
