@@ -5,7 +5,6 @@ from boxreg_ros.correspondence import carried, in_box_axes
 from boxreg_ros.objective import EXTENT, Problem, State
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 CELLS = 8, 3, 3  # into which a box is cut, each a piece of surface
 LEAST = 8  # points that make a surface
@@ -45,11 +44,13 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     place = ((local / half + 1) * (counts / 2)).floor().clamp(counts * 0, counts - 1)
     cell = (place * counts.new_tensor([[CELLS[1] * CELLS[2]], [CELLS[2]], [1]])).sum(2).long()
     count = CELLS[0] * CELLS[1] * CELLS[2]
-    cell = (cell + count * torch.arange(B, device=cell.device)[:, None, None]).flatten()
-    # Moments of the points in each cell, their number last; a plane through them. Coordinates go
-    # by columns, and what is not near the box counts as zeros: several times as fast as rows.
+    cell += count * torch.arange(B, device=cell.device)[:, None, None]
+    # What is not near the box, or not finite, counts as zeros in the first cell; coordinates go
+    # by columns. That is several times as fast as picking out rows.
     near = ((local.abs() - half).amax(2) < MARGIN).flatten()
-    p = pad(local.movedim(2, 0).flatten(1), (0, 0, 0, 1), value=1.0) * near
+    cell, local = torch.where(near, cell.flatten(), 0), local.movedim(2, 0).flatten(1)
+    p = torch.cat([torch.where(near, local, 0.0), near[None].to(local)])
+    # Moments of the points in each cell, their number last; a plane through them.
     sums = torch.stack([torch.bincount(cell, a * b, B * count) for a in p for b in p], 1)
     number = sums[:, -1].clamp(min=1)
     mean = (sums / number[:, None]).unflatten(1, (4, 4))

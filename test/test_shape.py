@@ -89,3 +89,23 @@ def test_relative_poses_are_better_with_it(seed):
 
     config = Config()
     assert spread(config) < 0.75 * spread(config.updated({'vehicle.shape': 1.0}))
+
+
+def test_what_is_not_finite_touches_no_neighbour():
+    poses = np.zeros((2, 6, 6))
+    poses[0, 3, 0] = 0.05
+    seen = problem_of(
+        np.tile(BOX, (2, 6, 1)) + np.pad(poses[..., :3], ((0, 0), (0, 0), (0, 6))),
+        points=np.tile(corner(np.random.default_rng(0)), (2, 6, 1, 1)) - poses[..., None, :3],
+        deviations={'shape': torch.tensor([0.03, 0.03], dtype=torch.float64)},
+    )
+    shared = shared_of(EXTENT=BOX[3:6]).expand(2, -1).clone()
+    expected = agreement(seen, State(seen.pose, shared))
+    broken = seen.pose.clone()
+    broken[1] = torch.nan
+    shared[1] = torch.nan
+    seen.points[1, 0, 0] = torch.inf
+    for part, whole in zip(agreement(seen, State(broken, shared)), expected, strict=True):
+        assert whole[0].abs().max() > 0.01
+        np.testing.assert_array_equal(part[0], whole[0])
+        np.testing.assert_array_equal(part[1], 0)
