@@ -48,24 +48,16 @@ PERIOD = 0.1  # of the sensor of a live stream [s]
 SPEED = 4.0  # of all traffic, the sensor included [m/s]
 REFERENCE_ITERATIONS = 100  # per round; more changes its final value by less than a percent
 FUSED = 0.16 / 64  # one evaluation of a window of 10 x 128 by a fused kernel on two cores [ms]
-# Relabels argv[1] to argv[2] and ends with the time in which it solves [s] and its own peak memory
-# [kB]: what a parent is told of its children counts the memory they share with it before they run
-# a program of their own.
+# Relabels argv[1] to argv[2] and ends with the peak memory [kB] of its own and of the process that
+# solves beside it. What both share counts twice. Its own is not what a parent would be told of it:
+# that counts the memory they share before it runs a program of its own.
 RELABEL = """
+import resource
 import sys
-from time import perf_counter
-from boxreg_ros import registrar
 from boxreg_ros.cli import main
-register, spent = registrar.register, []
-def timed(*args):
-    begin = perf_counter()
-    estimates = register(*args)
-    spent.append(perf_counter() - begin)
-    return estimates
-registrar.register = timed
 code = main(['relabel', sys.argv[1], '-o', sys.argv[2]])
 peak = next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM'))
-print(sum(spent), peak)
+print(peak, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 sys.exit(code)
 """
 NO_OPEN3D = 'Open3D is not installed: pip install open3d'
@@ -319,10 +311,11 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
     Return how `boxreg relabel` does on a recording of `seconds` at 10 Hz, in its own process.
 
     ``total`` is what all of it takes [s], the stages are what each is busy; as reading goes on
-    while the registrar works, they add up to more. ``faster`` is how much less than the recording
+    while windows are solved, they add up to more. ``faster`` is how much less than the recording
     lasts the total is, ``compressed`` the same where zstd has packed it, ``rest`` the part of the
-    total in which nothing is solved. ``memory`` is its peak [MB], ``short`` and ``long`` those on
-    recordings of this length and of ten times that, with sweeps of a fifth of the points.
+    total in which nothing is solved. ``memory`` is the peak of its two processes [MB], ``short``
+    and ``long`` those on recordings of this length and of ten times that, with sweeps of a fifth
+    of the points, ``faster, long`` and ``rest, long`` the same of the latter.
 
     """
     result: dict[str, float] = {}
@@ -348,14 +341,15 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
                 raise RuntimeError(f'boxreg relabel failed: {done.stdout}{done.stderr}')
-            solved, peak = map(float, done.stdout.split()[-2:])
             spent = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['seconds']
-            result[case] = peak / 1024
+            faster, rest = length / spent['total'], 1 - spent['solve'] / spent['total']
+            result[case] = sum(map(float, done.stdout.split()[-2:])) / 1024
             if case == 'memory':
-                result |= spent
-                result |= {'faster': seconds / spent['total'], 'rest': 1 - solved / spent['total']}
+                result |= {**spent, 'faster': faster, 'rest': rest}
             elif case == 'compressed':
-                result[case] = seconds / spent['total']
+                result[case] = faster
+            elif case == 'long':
+                result |= {'faster, long': faster, 'rest, long': rest}
     return result
 
 
@@ -533,12 +527,14 @@ def _text(report: dict[str, Any]) -> str:
             else c['reason']
         )
     )
-    stages = ('read', 'decode', 'transform', 'registrar', 'write')
+    busy = ('read', 'decode', 'transform', 'registrar', 'solve', 'write')
     lines.append(
         f'relabel: {r["faster"]:.1f} times faster than the recording lasts ({r["total"]:.1f} s; '
         f'{r["compressed"]:.1f} times where it is compressed; busy, partly at once: '
-        + ', '.join(f'{k} {r[k]:.1f}' for k in stages)
-        + f'), all but the solve {r["rest"]:.0%}; peak {r["memory"]:.0f} MB; of a smaller one '
-        f'{r["short"]:.0f} MB, ten times as long {r["long"]:.0f} MB'
+        + ', '.join(f'{k} {r[k]:.1f}' for k in busy)
+        + f'), all but the solve {r["rest"]:.0%}; peak of both processes {r["memory"]:.0f} MB; '
+        f'sweeps of a fifth of the points {r["short"]:.0f} MB; the same, ten times as long '
+        f'{r["long"]:.0f} MB, {r["faster, long"]:.1f} times, all but the solve '
+        f'{r["rest, long"]:.0%}'
     )
     return '\n'.join(lines)

@@ -31,11 +31,9 @@ def rotation_derivatives(rpy: Tensor) -> tuple[Tensor, Tensor]:
 def _rotation(cos: Tensor, sin: Tensor) -> list[Tensor]:
     """Return the nine entries of R, row by row."""
     (cr, cp, cy), (sr, sp, sy) = cos.unbind(-1), sin.unbind(-1)
-    return [
-        *(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        *(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        *(-sp, cp * sr, cp * cr),
-    ]
+    x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
+    y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
+    return [*x, *y, -sp, cp * sr, cp * cr]
 
 
 def wrap_angle(angle: Tensor) -> Tensor:

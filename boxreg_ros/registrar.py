@@ -1,7 +1,7 @@
 """The one stateful object of the core: sweeps and boxes in, refined boxes out, nothing else."""
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from math import dist, inf
 
@@ -16,6 +16,9 @@ from boxreg_ros.window import Memory, Window
 import numpy as np
 import torch
 
+Awaited = Callable[[], list[Estimate | None]]
+Begin = Callable[[list[Window], Config, InputModel], Awaited]
+
 
 class BoxRegistrar:
     """
@@ -28,6 +31,15 @@ class BoxRegistrar:
     order of the input, stamps ascending but for what came late. With `estimate` 'early' or
     'final' it comes back once more before that, with ``is_final=False``, as soon as it is paired.
 
+    Parameters
+    ----------
+    config : Config
+        Settings.
+    begin : callable, optional
+        Begins `register` elsewhere, with the arguments of that, and returns what waits for its
+        estimates. With `estimate` 'track' more is taken meanwhile; what comes back is the same,
+        but comes when the next windows are full.
+
     Attributes
     ----------
     config : Config
@@ -38,24 +50,28 @@ class BoxRegistrar:
 
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, begin: Begin | None = None) -> None:
         try:
             torch.zeros(1, device=config.device)
         except (AssertionError, RuntimeError) as error:  # torch says it in either way
             wanted = "device: expected one that torch can use here, such as 'cpu', got "
             raise ConfigError(f'{wanted}{config.device!r}: {str(error).splitlines()[0]}') from None
-        self.config = config
+        self.config, self._begin = config, begin
         self.counts: Counter[str] = Counter()
         self.reset()
 
     def reset(self) -> None:
         """Forget everything but the counts."""
-        self._matcher = StampMatcher(self.config, self.counts)
+        self._matcher, window = StampMatcher(self.config, self.counts), self.config.window
+        # The ends of a window are its weakest part: of whole tracks an eighth waits for the next
+        # window, which sees another eighth of settled ones before it.
+        eighth, is_track = self.config.track_window // 8, self.config.estimate == 'track'
+        self._keep, self._wait = (2 * eighth, eighth) if is_track else (window - 1, window)
         self._tracks, self._ticks = dict[str, _TrackBuffer](), deque[_Tick]()
-        self._newest_ns = -inf
-        self._model = InputModel(self.config.faces)
-        self._ended: list[_TrackBuffer] = []
-        self._count = 0
+        self._newest_ns, self._model = -inf, InputModel(self.config.faces)
+        self._ended, self._count = list[_TrackBuffer](), 0
+        self._work = list[tuple[_TrackBuffer, list[_Entry], bool]]()
+        self._result: Awaited = list
 
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
         """Take a sweep; return what has become ready."""
@@ -88,11 +104,10 @@ class BoxRegistrar:
                 lag = min(self.config.lag, self.config.window - 1)
                 for old in [t for t in self._ticks if t.is_paired][::-1][lag:]:
                     old.waiting = 0
-            elif self._count >= full // 2 and len(self._ticks) >= full - full // 8:
-                # A track may have filled its window. Those that are half full are solved with it:
+            elif self._count >= full or any(len(t.entries) >= full for t in self._tracks.values()):
+                # Tracks that are half full are solved with those that are full, or have ended:
                 # the more at once, the better they tell the errors of the input.
                 self._solve([t for t in self._tracks.values() if len(t.entries) > full // 2])
-                self._count = 0
             yield from self._settled()
 
     def _open(self, pair: Pair) -> '_Tick':
@@ -132,21 +147,33 @@ class BoxRegistrar:
         self._ended += [self._tracks.pop(name) for name in names]
 
     def _solve(self, tracks: list['_TrackBuffer']) -> None:
-        """Register windows, ended ones too, and write the estimates to the ticks they are of."""
+        """Register windows, ended ones too: when it begins elsewhere, go on until it is needed."""
+        self._finish()
         tracks = self._ended + tracks
+        asked = [track.window() for track in tracks], self.config, self._model
+        self._result = self._begin(*asked) if self._begin else lambda: register(*asked)
+        self._work = [(track, track.entries, track in self._ended) for track in tracks]
+        for track in tracks:
+            track.entries = track.entries[-self._keep :]
+        self._ended, self._count = [], 0
+        if self.config.estimate != 'track' or not (self._begin and self._tracks):
+            self._finish()
+
+    def _finish(self) -> None:
+        """Write the estimates, when they have come, to the ticks they are of."""
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # tensors are small: threads of torch would wait, not work
         try:
-            estimates = register([track.window() for track in tracks], self.config, self._model)
+            estimates = self._result()
         finally:
             torch.set_num_threads(threads)
-        for track, estimate in zip(tracks, estimates, strict=True):
+        for (track, entries, is_ended), estimate in zip(self._work, estimates, strict=True):
             if estimate is not None:
-                track.write(estimate)
-            track.slide(self.config)
-        for track in self._ended:
-            track.settle(len(track.entries))
-        self._ended = []
+                track.write(estimate, entries)
+            for entry in entries if is_ended else entries[: -self._wait]:
+                entry.tick.waiting -= not entry.is_settled
+                entry.is_settled = True
+        self._work, self._result = [], list
 
     def _settled(self) -> Iterator[RefinedBoxes]:
         while self._ticks and self._ticks[0].waiting <= 0:
@@ -228,37 +255,21 @@ class _TrackBuffer:
             away = dist(seen.box[:2], (latest.box + late * velocity)[:2])
             if away < latest.box[LENGTH] / 2 + 10.0 * late * 1e-9:  # nothing swerves by 10 m/s
                 return None
-        self.entries, moved = self.entries[:-2], self.entries[-2:]
-        moved[0].estimate = None
+        moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
+        del self.entries[-2:]
         return _TrackBuffer(self.track_id, self.class_name, moved)
 
     def velocity(self, box: Floats, stamp_ns: int) -> Floats:
-        """Return that of the centre over the last stamps to `box`, the newest [m/s]."""
+        """Return that of the input centre over the last stamps to `box`, the newest [m/s]."""
         if not self.entries:
             return np.zeros(3)
-        first = self.entries[-4:][0]
-        before = first.observation.box if first.estimate is None else first.estimate
-        return (box - before)[X : Z + 1] / (stamp_ns - first.observation.stamp_ns) * 1e9
+        first = self.entries[-4:][0].observation
+        return (box - first.box)[X : Z + 1] / (stamp_ns - first.stamp_ns) * 1e9
 
-    def write(self, estimate: Estimate) -> None:
+    def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
         self.memory = estimate.memory
-        for entry, box, status, reason, spread in zip(self.entries, *estimate[:4], strict=True):
+        for entry, box, status, reason, spread in zip(entries, *estimate[:4], strict=True):
             entry.estimate, tick, i = box, entry.tick, entry.index
             if not entry.is_settled:
                 tick.refined[i], tick.status[i], tick.reasons[i] = box, status, reason
                 tick.covariances[i] = spread
-
-    def settle(self, count: int) -> None:
-        for entry in self.entries[:count]:
-            entry.tick.waiting -= not entry.is_settled
-            entry.is_settled = True
-
-    def slide(self, config: Config) -> None:
-        """Settle and forget what the next window does not need."""
-        keep = config.window - 1
-        if config.estimate == 'track':
-            # The ends of a window are its weakest part: an eighth waits for the next window,
-            # which sees another eighth of settled ones before it.
-            keep = 2 * (overlap := config.track_window // 8)
-            self.settle(max(0, len(self.entries) - overlap))
-        del self.entries[: max(0, len(self.entries) - keep)]

@@ -23,6 +23,7 @@ from boxreg_ros import __version__
 from boxreg_ros.ahead import ahead
 from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
 from boxreg_ros.arrivals import Arrival, Arrivals
+from boxreg_ros.beside import solver
 from boxreg_ros.labelled import add_label_arguments, LabelledRecording
 from boxreg_ros.labels import is_written, Options
 from boxreg_ros.recording import Recording
@@ -74,9 +75,13 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
 
     """
     clock = Stopwatch()
-    registrar = BoxRegistrar(request.config)
     fingerprint = request.fingerprint()  # of what is read from here on
-    with request.recording() as recording, whole_folder(out, request.inputs()) as folder:
+    with (
+        request.recording() as recording,
+        solver(request.config, clock) as begin,
+        whole_folder(out, request.inputs()) as folder,
+    ):
+        registrar = BoxRegistrar(request.config, begin)
         with clock('read'):
             arrivals = Arrivals(recording, request, clock)
         passes = 2 if request.report else 1

@@ -15,8 +15,8 @@ class Stopwatch:
     """
     Adds up what each stage takes [s].
 
-    Two threads use it, for different stages; as their work overlaps, stages may add up to more
-    than the total.
+    Two threads use it, for different stages, and a process beside them; as their work overlaps,
+    stages may add up to more than the total.
 
     """
 
@@ -29,7 +29,11 @@ class Stopwatch:
         """Count what the block takes to a stage."""
         begun = time.perf_counter()
         yield
-        self._seconds[stage] += time.perf_counter() - begun  # type: ignore[assignment]
+        self.add(stage, time.perf_counter() - begun)
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Count what was measured elsewhere to a stage."""
+        self._seconds[stage] += seconds  # type: ignore[assignment]
 
     def each(self, stage: str, items: Iterator[_T]) -> Iterator[_T]:
         """Yield `items`, adding up what it takes to get them."""

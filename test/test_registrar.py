@@ -135,7 +135,7 @@ def test_finals_are_better_than_early_estimates():
 
 
 def test_a_window_of_the_whole_track_comes_back_in_parts():
-    # With windows of 12, a track is solved when 11 boxes wait; the last one then waits on.
+    # With windows of 12, a track is solved when it has as many; the last one then waits on.
     stream = stream_of([track_of(drive(40), np.random.default_rng(0))])
     registrar = BoxRegistrar(setup('track', track_window=12))
     held = []
@@ -457,10 +457,10 @@ def test_a_window_that_fails_is_forgotten(estimate):
 
 
 def test_tracks_are_solved_together_when_a_window_is_full(monkeypatch):
-    # A window of 12 is full when 11 boxes wait: an eighth, one, is its overlap with the last.
-    # Tick 11: the track of 11 and the one that has ended; with 6, half a window, one may wait.
-    # Tick 17, half a window later, 12 boxes wait: 6 more and the overlap on either side, 8.
-    # Tick 27: 11 boxes wait, and 12 with the settled half of the overlap. The rest at the end.
+    # Tick 12: the track whose window of 12 is full, the one that has ended, and the one that has
+    # 7, more than half a window. An eighth of a window, one box, waits for the next one, and one
+    # that is settled stays: with 2 of 12 left, both are full again 10 ticks later. The rest, 8
+    # ticks and the same 2, at the end.
     rng = np.random.default_rng(0)
     long, short, late = (
         cut(track_of(drive(30, start=(5.0, y, 0.2)), rng, name), part)
@@ -478,10 +478,9 @@ def test_tracks_are_solved_together_when_a_window_is_full(monkeypatch):
     registrar = BoxRegistrar(setup('track', track_window=12, max_gap=0.3))
     results = fed(registrar, stream_of([long, short, late])) + registrar.flush()
     assert calls == [
-        {'long': 11, 'short': 4},
-        {'long': 8, 'late': 12},
+        {'short': 4, 'long': 12, 'late': 7},
         {'long': 12, 'late': 12},
-        {'long': 5, 'late': 5},
+        {'long': 10, 'late': 10},
     ]
     assert len(results) == 30
 

@@ -120,7 +120,7 @@ def test_output_folder_holds_what_the_design_says(tmp_path):
     assert summary['fixed_frame'] == 'odom'
     assert set(summary['versions']) >= {'boxreg_ros', 'torch', 'numpy', 'rosbags'}
     assert set(summary['seconds']) == {
-        'read', 'decode', 'transform', 'registrar', 'write', 'total',
+        'read', 'decode', 'transform', 'registrar', 'solve', 'write', 'total',
     }  # fmt: skip
     label = json.loads((out / 'openlabel' / 'labels.json').read_text())['openlabel']
     assert len(label['frames']) == 4

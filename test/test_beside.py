@@ -1,0 +1,163 @@
+"""Windows registered in a process beside this one: the same boxes, and no process left over."""
+
+from multiprocessing import active_children
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from boxreg_ros import beside
+from boxreg_ros.beside import solver
+from boxreg_ros.errors import BoxregError
+from boxreg_ros.registrar import BoxRegistrar
+from boxreg_ros.relabel import relabel, Request
+from boxreg_ros.stopwatch import Stopwatch
+import numpy as np
+import pytest
+from ros_messages import Drive
+from scenes import drive, stream_of, track_of
+from test_registrar import assert_equal, cut, fed, setup
+
+ROOT = Path(__file__).resolve().parents[1]
+SHORT = setup('track', track_window=24, max_gap=0.3)
+
+
+@pytest.fixture(scope='module')
+def stream():
+    """Return three cars of which one ends early, one comes late, and two swap their ids."""
+    rng = np.random.default_rng(0)
+    long, other = (drive(60, start=(5.0, y, 0.2)) for y in (6.0, -6.0))
+    tracks = [track_of(long, rng, 'a'), track_of(other, rng, 'b')]
+    tracks += [cut(track_of(drive(60, start=(25.0, 0.0, 0.2)), rng, 'late'), slice(9, 60))]
+    tracks += [cut(track_of(drive(60, start=(-9.0, 0.0, 0.2)), rng, 'short'), slice(5))]
+    stream = stream_of(tracks)
+    # Tick 24 fills the windows with the first boxes of the other object, before that is told.
+    names = [('b', 'a') if i >= 23 else ('a', 'b') for i in range(60)]
+    return [
+        (s, type(b)(b.stamp_ns, b.frame_id, (*pair, *b.track_ids[2:]), b.class_names, b.scores,
+                    b.boxes))
+        for (s, b), pair in zip(stream, names, strict=True)
+    ]  # fmt: skip
+
+
+def there():
+    """Return the processes that register windows."""
+    return [child for child in active_children() if child.daemon]
+
+
+@pytest.mark.parametrize('offset_ns', [0, 30_000_000])
+def test_the_same_boxes_as_without(stream, offset_ns):
+    stream = [(type(s)(s.stamp_ns + offset_ns, s.frame_id, s.points), b) for s, b in stream]
+    known = BoxRegistrar(SHORT)
+    expected = fed(known, stream) + known.flush()
+    clock = Stopwatch()
+    with solver(SHORT, clock) as begin:
+        registrar = BoxRegistrar(SHORT, begin)
+        early = fed(registrar, stream)
+        assert 0 < len(early) < len(stream)  # a part comes back before the end
+        assert_equal(early + registrar.flush(), expected)
+        assert registrar.counts == known.counts
+        # What the model learnt there is here: another stream begins anew all the same.
+        registrar.reset()
+        assert_equal(fed(registrar, stream) + registrar.flush(), expected)
+        assert len(there()) == 1
+    assert not there()
+    assert clock.seconds()['solve'] > 0
+
+
+def test_more_is_taken_while_windows_are_registered(stream, monkeypatch):
+    """What is begun is not waited for before the next windows are full, or the end has come."""
+    events = []
+
+    def begin(windows, config, model):
+        events.append('begin')
+        estimates = beside.register(windows, config, model)
+        return lambda: events.append('wait') or estimates
+
+    registrar = BoxRegistrar(SHORT, begin)
+    for tick, pair in enumerate(stream):
+        events.append(tick)
+        fed(registrar, [pair])
+    registrar.flush()
+    # Windows of 24, which keep 6: the first are full at tick 24, the next every 18 ticks, where
+    # those before are waited for. What is left at the end has nothing to go on beside it.
+    expected = [*range(24), 'begin']
+    for tick in (24, 42):
+        expected += [*range(tick, tick + 18), 'wait', 'begin']
+    assert events == [*expected, 'wait', 'begin', 'wait']
+
+
+@pytest.mark.parametrize('changes', [{'estimate': 'final'}, {'device': 'meta'}])
+def test_where_it_does_not_pay_there_is_none(changes):
+    with solver(SHORT.updated(changes), Stopwatch()) as begin:
+        assert begin is None
+        assert not there()
+
+
+def test_relabel_gives_the_same_files(tmp_path, monkeypatch):
+    request = Request((Drive(sweeps=30).write(tmp_path / 'drive'),), config=SHORT)
+    summary = relabel(request, tmp_path / 'beside')
+    assert 0 < summary['seconds']['solve'] < summary['seconds']['total']
+    monkeypatch.setattr(beside, 'get_context', None)  # no process is to be made
+    whole = SHORT.updated({'device': 'cpu:0'})
+    relabel(Request(request.recordings, config=whole), tmp_path / 'within')
+    within, next_to_it = (tmp_path / name / 'boxes.csv' for name in ('within', 'beside'))
+    assert next_to_it.read_bytes() == within.read_bytes()
+
+
+def test_an_error_there_is_raised_here(stream):
+    def fail(windows, config, model):
+        raise ValueError('no such window')
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(beside, 'register', fail)  # the fork has it too
+        with solver(SHORT, Stopwatch()) as begin:
+            registrar = BoxRegistrar(SHORT, begin)
+            with pytest.raises(ValueError, match='no such window') as caught:
+                fed(registrar, stream)
+    assert 'in fail' in caught.value.__notes__[0]
+    assert not there()
+
+
+def test_a_process_that_is_killed_is_an_error_with_a_remedy(tmp_path, monkeypatch):
+    recording = Drive(sweeps=20).write(tmp_path / 'drive')
+    packed = beside._packed
+
+    def killing(windows):
+        os.kill(there()[0].pid, signal.SIGKILL)  # as the kernel does when memory runs out
+        return packed(windows)
+
+    monkeypatch.setattr(beside, '_packed', killing)
+    with pytest.raises(BoxregError, match='not enough memory: choose a smaller track_window'):
+        relabel(Request((recording,), config=SHORT), tmp_path / 'out')
+    assert sorted(item.name for item in tmp_path.iterdir()) == ['drive']
+
+
+def children_of(pid):
+    """Return the processes whose parent is `pid`."""
+    found = []
+    for path in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            number, _, rest = path.read_text().partition(' (')
+        except OSError:
+            continue
+        if int(rest.rpartition(') ')[2].split()[1]) == pid:
+            found.append(int(number))
+    return found
+
+
+def test_none_is_left_when_this_one_is_killed(tmp_path):
+    recording = Drive(sweeps=200).write(tmp_path / 'drive')
+    command = [sys.executable, '-m', 'boxreg_ros.cli', 'relabel', str(recording)]
+    process = subprocess.Popen([*command, '-o', str(tmp_path / 'out')], cwd=ROOT)
+    deadline = time.monotonic() + 60
+    while not (children := children_of(process.pid)) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert len(children) == 1
+    process.kill()
+    process.wait()
+    while Path(f'/proc/{children[0]}').exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f'/proc/{children[0]}').exists()
