@@ -159,11 +159,9 @@ def _two_loop(gradient: Tensor, pairs: list[Pair], rows: Tensor, metric: Metric 
 
 
 def select(part: Any, rows: Tensor) -> Any:
-    """Return `rows`, ascending, of tensors (B, ...) in tuples, lists and dicts; all: no copy."""
+    """Return `rows`, ascending, of tensors (B, ...) in tuples and lists; all: no copy."""
     if isinstance(part, Tensor):
         return part[rows] if len(rows) < len(part) else part
-    if isinstance(part, dict):
-        return {name: select(inner, rows) for name, inner in part.items()}
     if isinstance(part, tuple | list):
         parts = [select(inner, rows) for inner in part]
         return type(part)(*parts) if hasattr(part, '_fields') else type(part)(parts)

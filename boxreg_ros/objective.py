@@ -8,10 +8,11 @@ W, adding r' W r / 2; W holds the expected deviations and the robust weights of 
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import cast, NamedTuple
 
 from boxreg_ros.chain import Chain, cholesky, Factor, LINK, product
-from boxreg_ros.config import PaperConfig
+from boxreg_ros.config import ClassConfig, PaperConfig
 from boxreg_ros.geometry import face_distances, rotation_derivatives, rotation_from_rpy, wrap_angle
 from boxreg_ros.lbfgs import select
 from boxreg_ros.structures import POSE
@@ -20,6 +21,7 @@ from torch import Tensor
 from torch.linalg import solve_triangular
 from torch.nn.functional import pad
 
+DEVIATIONS = [item.name for item in fields(ClassConfig)[1:]]
 EPSILON = 1e-9  # inside roots, so that the paper's norms have a gradient at zero
 
 
@@ -51,10 +53,10 @@ class Problem(NamedTuple):
         oldest poses and what is shared, and its curvature.
     seen : Tensor, shape (B, 4)
         Sum of the input extents that have left, and their number.
+    deviations : Tensor, shape (B, D)
+        The numbers of each window's `ClassConfig`, in the order of `DEVIATIONS`.
     openness : Tensor, shape (B, N, 6)
         How openly the sensor sees each face of the input, see `aspect`.
-    deviations : dict of Tensors, shape (B,)
-        The numbers of each window's `ClassConfig`.
 
     """
 
@@ -70,8 +72,8 @@ class Problem(NamedTuple):
     recalled: Tensor
     information: Tensor
     seen: Tensor
+    deviations: Tensor
     openness: Tensor
-    deviations: dict[str, Tensor]
 
     @property
     def pose(self) -> Tensor:
@@ -80,7 +82,7 @@ class Problem(NamedTuple):
 
     def of(self, *names: str) -> Tensor:
         """Return deviations by name, (B, n)."""
-        return torch.stack([self.deviations[name] for name in names], -1)
+        return self.deviations[:, [DEVIATIONS.index(name) for name in names]]
 
     def thinned(self, enough: float) -> 'Problem':
         """Return the same with every n-th point, so that `enough` are left if there are."""
@@ -310,7 +312,7 @@ def remembered(terms: Sequence[Term], state: State) -> tuple[Tensor, Tensor, Ten
 
     """
     head = State(state.pose[:, :3], state.shared)
-    form = state.pose.new_zeros(len(state.pose), 3 * LINK + SHARED + 1, 3 * LINK + SHARED + 1)
+    rows, weighted = list[Tensor](), list[Tensor]()
     for term in terms:
         if term.function is not shared_prior:
             data = tuple(part[:, :3] for part in term.data)
@@ -318,7 +320,9 @@ def remembered(terms: Sequence[Term], state: State) -> tuple[Tensor, Tensor, Ten
             J, S = pad(J, (0, 3 * LINK - J.shape[-1])), pad(S, (0, SHARED - S.shape[-1]))
             # With the residual as a last column, one product gives curvature and gradient.
             A = torch.cat([J, S.expand(*J.shape[:-1], -1), r[..., None]], -1)[:, 0]
-            form += A.flatten(1, 2).mT @ (term.weight[:, 0] @ A).flatten(1, 2)
+            rows.append(A.flatten(1, 2))
+            weighted.append((term.weight[:, 0] @ A).flatten(1, 2))
+    form = torch.cat(rows, 1).mT @ torch.cat(weighted, 1)
     root = cholesky(form[:, :LINK, :LINK] + 1e-9 * torch.eye(LINK).to(form))
     across = solve_triangular(root, form[:, :LINK, LINK:], upper=False)
     form = form[:, LINK:, LINK:] - across.mT @ across

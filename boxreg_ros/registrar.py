@@ -195,17 +195,12 @@ class _Tick:
 
     def refuse(self, reason: str) -> None:
         """Give a reason to each box the core cannot take; `reason` holds for all if not empty."""
-        seen: set[str] = set()
-        for i, (name, box) in enumerate(zip(self.boxes.track_ids, self.boxes.boxes, strict=True)):
-            if not np.isfinite(box).all() or (box[3:6] <= 0).any():
-                self.reasons[i] = 'invalid_box'
-            elif not name:
-                self.reasons[i] = 'no_track_id'
-            elif name in seen:
-                self.reasons[i] = 'duplicate_track_id'
-            else:
-                self.reasons[i] = reason
-                seen.add(name)
+        boxes, seen = self.boxes.boxes, set[str]()
+        is_valid = np.isfinite(boxes).all(1) & (boxes[:, 3:6] > 0).all(1)
+        for i, (name, good) in enumerate(zip(self.boxes.track_ids, is_valid, strict=True)):
+            why = 'no_track_id' if not name else 'duplicate_track_id' if name in seen else reason
+            self.reasons[i] = why if good else 'invalid_box'
+            seen.update([name] if good else [])
 
     def result(self, is_final: bool) -> RefinedBoxes:
         boxes = replace(self.boxes, boxes=self.refined.copy())

@@ -383,7 +383,7 @@ def _parked(problem: Problem, heading: Tensor) -> Tensor:
     away = (where - where.nanmedian(1, keepdim=True).values)[..., :2].norm(dim=2)
     speed, seconds = rate[:, :2].square().sum(1).sqrt(), (t * valid).amax(1)
     moved = torch.maximum(speed * seconds, 2 * away.nanmedian(1).values)
-    turned = rate[:, 2].abs() * seconds / heading.maximum(problem.deviations['heading'])
+    turned = rate[:, 2].abs() * seconds / heading.maximum(problem.of('heading')[:, 0])
     is_slow = (speed < PARKED[0]) & (moved < PARKED[1]) & (turned < PARKED[2])
     five: Tensor = pad(where.mT, (5, 5), value=torch.nan).unfold(2, 5, 1).median(3).values
     step = five[..., 6:-1] - five[..., 1:-6]  # from five to the next five
@@ -396,7 +396,7 @@ def expected_shared(problem: Problem, rule: Rule) -> Tensor:
     total = (problem.boxes[..., 3:6] * problem.valid[..., None]).sum(1) + problem.seen[:, :3]
     mean = total / (problem.valid.sum(1, keepdim=True) + problem.seen[:, 3:])
     gaps = problem.of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
-    pivot = mean[:, :1] * problem.deviations['pivot'][:, None]
+    pivot = mean[:, :1] * problem.of('pivot')
     return torch.cat([mean, 0 * gaps, gaps + rule.gaps.to(mean), pivot, 0 * gaps], 1)
 
 

@@ -11,6 +11,7 @@ LEAST = 8  # points that make a surface
 FLATNESS = 3.0  # how much wider than thick a surface is, in squares
 MARGIN = 0.3  # points this far outside a box are part of the shape [m]
 SAY = 20.0  # points of one observation that err on their own
+PAIRS = [[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]]  # 10 products make a square
 
 
 def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
@@ -51,12 +52,13 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     cell, local = torch.where(near, cell.flatten(), 0), local.movedim(2, 0).flatten(1)
     p = torch.cat([torch.where(near, local, 0.0), near[None].to(local)])
     # Moments of the points in each cell, their number last; a plane through them.
-    sums = torch.stack([torch.bincount(cell, a * b, B * count) for a in p for b in p], 1)
+    products = (a * b for i, a in enumerate(p) for b in p[i:])
+    sums = torch.stack([torch.bincount(cell, values, B * count) for values in products], 1)
     number = sums[:, -1].clamp(min=1)
-    mean = (sums / number[:, None]).unflatten(1, (4, 4))
+    mean = (sums / number[:, None])[:, PAIRS]
     power, axes = torch.linalg.eigh(mean[:, :3, :3] - mean[:, :3, 3:] * mean[:, 3:, :3])
     plane = torch.cat([axes[..., 0], -(axes[..., :1].mT @ mean[:, :3, 3:])[..., 0]], 1)
-    rough = problem.deviations['shape'].to(p).repeat_interleave(count) ** 2
+    rough = problem.of('shape')[:, 0].to(p).repeat_interleave(count) ** 2
     thickness = power[:, 0].clamp(min=0) + rough
     is_surface = (power[:, 1] > FLATNESS * thickness) & (number >= LEAST)
     plane = plane.mT.index_select(1, cell)

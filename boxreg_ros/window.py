@@ -1,10 +1,10 @@
 """Windows of observations, and their batches as padded tensors."""
 
 from collections.abc import Sequence
-from dataclasses import astuple, fields
+from dataclasses import astuple
 from typing import Any, NamedTuple
 
-from boxreg_ros.config import ClassConfig, Config
+from boxreg_ros.config import Config
 from boxreg_ros.correspondence import aspect
 from boxreg_ros.objective import MEMORY, Problem, SHARED
 from boxreg_ros.sampling import Observation
@@ -136,14 +136,12 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     recalled = state + move
     recalled[:, ANGLES] += np.pi * turns
     information *= FADING * (turns % 2 == 0).all(1)[:, None, None]
-    names = [item.name for item in fields(ClassConfig)[1:]]
     rows = {k: astuple(config.class_config(k))[1:] for k in {w.class_name for w in windows}}
     numbers = np.array([rows[window.class_name] for window in windows], dtype=np.float64)
-    deviations = dict(zip(names, torch.from_numpy(numbers).to(device).unbind(1), strict=True))
     arrays: list[Any] = [boxes, start, valid, times, points, mask, delays, origins, ground]
-    arrays += [np.nan_to_num(recalled), information, seen]
+    arrays += [np.nan_to_num(recalled), information, seen, numbers]
     parts: list[Any] = [torch.from_numpy(array).to(device) for array in arrays]
-    problem = Problem(*[*parts, torch.empty(0), deviations])
+    problem = Problem(*[*parts, torch.empty(0)])
     return problem._replace(openness=aspect(problem)), base
 
 

@@ -57,7 +57,7 @@ def test_stack_pads():
             np.testing.assert_array_equal(problem.points[b, i][mask], observation.points)
             np.testing.assert_array_equal(problem.origins[b, i], observation.origin)
         assert not problem.mask[b, n:].any()
-    assert problem.deviations['position'].tolist() == [CONFIG.vehicle.position] * 4
+    assert problem.of('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
 
 
 def seconds(boxes):
