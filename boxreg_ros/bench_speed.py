@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import tee
 import json
@@ -18,7 +19,7 @@ from pathlib import Path
 import subprocess
 import sys
 import tempfile
-from time import perf_counter
+from time import perf_counter, sleep
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -48,18 +49,7 @@ PERIOD = 0.1  # of the sensor of a live stream [s]
 SPEED = 4.0  # of all traffic, the sensor included [m/s]
 REFERENCE_ITERATIONS = 100  # per round; more changes its final value by less than a percent
 FUSED = 0.16 / 64  # one evaluation of a window of 10 x 128 by a fused kernel on two cores [ms]
-# Relabels argv[1] to argv[2] and ends with the peak memory [kB] of its own and of the process that
-# solves beside it. What both share counts twice. Its own is not what a parent would be told of it:
-# that counts the memory they share before it runs a program of its own.
-RELABEL = """
-import resource
-import sys
-from boxreg_ros.cli import main
-code = main(['relabel', sys.argv[1], '-o', sys.argv[2]])
-peak = next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM'))
-print(peak, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
-sys.exit(code)
-"""
+CLI = 'boxreg_ros.cli'
 NO_OPEN3D = 'Open3D is not installed: pip install open3d'
 
 
@@ -313,9 +303,9 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
     ``total`` is what all of it takes [s], the stages are what each is busy; as reading goes on
     while windows are solved, they add up to more. ``faster`` is how much less than the recording
     lasts the total is, ``compressed`` the same where zstd has packed it, ``rest`` the part of the
-    total in which nothing is solved. ``memory`` is the peak of its two processes [MB], ``short``
-    and ``long`` those on recordings of this length and of ten times that, with sweeps of a fifth
-    of the points, ``faster, long`` and ``rest, long`` the same of the latter.
+    total in which nothing is solved. ``memory`` are the peaks of its processes [MB], ``short`` and
+    ``long`` those on recordings of this length and of ten times that, with sweeps of a fifth of
+    the points, ``faster, long`` and ``rest, long`` the same of the latter.
 
     """
     result: dict[str, float] = {}
@@ -337,13 +327,9 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
                 'odom',
                 is_compressed=case == 'compressed',
             )
-            command = [sys.executable, '-c', RELABEL, str(path), str(out)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode:
-                raise RuntimeError(f'boxreg relabel failed: {done.stdout}{done.stderr}')
+            result[case] = _peak([sys.executable, '-m', CLI, 'relabel', str(path), '-o', str(out)])
             spent = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['seconds']
             faster, rest = length / spent['total'], 1 - spent['solve'] / spent['total']
-            result[case] = sum(map(float, done.stdout.split()[-2:])) / 1024
             if case == 'memory':
                 result |= {**spent, 'faster': faster, 'rest': rest}
             elif case == 'compressed':
@@ -351,6 +337,29 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
             elif case == 'long':
                 result |= {'faster, long': faster, 'rest, long': rest}
     return result
+
+
+def _peak(command: list[str]) -> float:
+    """
+    Run a command and return the peak memory of its processes [MB].
+
+    The sum of what each has had at most: what they share, such as libraries, counts for each.
+
+    """
+    peaks: dict[str, int] = {}
+    with tempfile.TemporaryFile('w+') as said:
+        process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
+        while process.poll() is None:
+            with suppress(OSError, IndexError):  # one of them has just ended
+                children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text()
+                for pid in (str(process.pid), *children.split()):
+                    status = Path(f'/proc/{pid}/status').read_text()
+                    peaks[pid] = int(status.partition('VmHWM:')[2].split()[0])
+            sleep(0.02)
+        if process.returncode:
+            said.seek(0)
+            raise RuntimeError(f'{" ".join(command)} failed: {said.read()}')
+    return sum(peaks.values()) / 1024
 
 
 def reference(problem: objective.Problem, config: Config) -> State:
@@ -532,7 +541,7 @@ def _text(report: dict[str, Any]) -> str:
         f'relabel: {r["faster"]:.1f} times faster than the recording lasts ({r["total"]:.1f} s; '
         f'{r["compressed"]:.1f} times where it is compressed; busy, partly at once: '
         + ', '.join(f'{k} {r[k]:.1f}' for k in busy)
-        + f'), all but the solve {r["rest"]:.0%}; peak of both processes {r["memory"]:.0f} MB; '
+        + f'), all but the solve {r["rest"]:.0%}; peak of all processes {r["memory"]:.0f} MB; '
         f'sweeps of a fifth of the points {r["short"]:.0f} MB; the same, ten times as long '
         f'{r["long"]:.0f} MB, {r["faster, long"]:.1f} times, all but the solve '
         f'{r["rest, long"]:.0%}'

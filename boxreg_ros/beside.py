@@ -1,143 +1,152 @@
-"""Register windows in a process beside this one, which reads on meanwhile."""
+"""Processes beside this one: of the threads of one, the interpreter lets one at a time work."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from itertools import islice
-from multiprocessing import get_context
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+import os
 import pickle
 import signal
-import time
 from traceback import format_exc
-from typing import Any, cast
+from typing import Any
 
-from boxreg_ros.calibration import InputModel
-from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.registrar import Awaited, Begin
-from boxreg_ros.registration import Estimate, register
-from boxreg_ros.sampling import Observation
-from boxreg_ros.stopwatch import Stopwatch
-from boxreg_ros.window import Window
 import numpy as np
 import torch
 
-GONE = (
-    'the process that registers windows has ended before it was done; most often there is not '
-    'enough memory: choose a smaller track_window or sampling.points'
-)
+LARGE = 2**16  # arrays of so many bytes travel as they are, without being copied into a message
 
 
-@contextmanager
-def solver(config: Config, clock: Stopwatch) -> Iterator[Begin | None]:
+class Peer:
     """
-    Yield what begins `register` in a process of its own, for `BoxRegistrar`; or None.
-
-    That pays for whole tracks alone, as live windows are waited for, and no device but the CPU
-    outlives a fork. A thread would gain nothing: the interpreter lets one at a time work.
+    The process beside this one.
 
     Parameters
     ----------
-    config : Config
-        Settings.
-    clock : Stopwatch
-        Counts what is spent in `register`.
-
-    Raises
-    ------
-    BoxregError
-        When estimates are waited for, if the process has ended.
+    connection : Connection
+        To it.
+    purpose : str
+        What it does, as in 'reads the recording'.
 
     """
-    if config.estimate != 'track' or config.device != 'cpu':
-        yield None
-        return
-    context = get_context('fork')  # to import torch anew would cost what this saves
-    here, there = context.Pipe()
-    process = context.Process(target=_serve, args=(there, here), daemon=True)
-    process.start()
-    there.close()  # else nobody would notice when the process ends
 
-    def begin(windows: list[Window], config: Config, model: InputModel) -> Awaited:
-        if not windows:
-            return list
-        with _watched():
-            _send(here, (_packed(windows), config, model))
+    def __init__(self, connection: Connection, purpose: str) -> None:
+        self._connection = connection
+        self._purpose = purpose
 
-        def awaited() -> list[Estimate | None]:
-            with _watched():
-                answer = _receive(here)
-            if isinstance(answer, Exception):
-                raise answer
-            estimates, learnt, seconds = answer
-            vars(model).update(learnt)
-            clock.add('solve', seconds)
-            return cast(list[Estimate | None], estimates)
+    def send(self, item: Any) -> None:
+        """
+        Send what can be pickled.
 
-        return awaited
+        Raises
+        ------
+        BoxregError
+            If the process has ended.
 
-    try:
-        yield begin
-    finally:
-        process.kill()  # it has nothing to clean up
-        process.join()
-        here.close()
+        """
+        with self._alive():
+            _send(self._connection, item)
+
+    def receive(self) -> Any:
+        """
+        Wait for what it sends next.
+
+        Raises
+        ------
+        BoxregError
+            If it has ended.
+        Exception
+            That which ended what it did.
+
+        """
+        with self._alive():
+            item = _receive(self._connection)
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+    @contextmanager
+    def _alive(self) -> Iterator[None]:
+        try:
+            yield
+        except (EOFError, OSError):
+            raise BoxregError(
+                f'the process that {self._purpose} has ended before it was done; most often there '
+                f'is not enough memory: choose a smaller track_window or sampling.points'
+            ) from None
 
 
 @contextmanager
-def _watched() -> Iterator[None]:
+def beside(
+    serve: Callable[[Callable[[], Any], Callable[[Any], None]], None], purpose: str
+) -> Iterator[Peer]:
+    """
+    Run `serve` in a process of its own for as long as the block lasts, and yield that process.
+
+    It is forked: all there is now is known there, too, and it starts at once. So no other thread
+    should be at work that holds what it needs. It ends when this process does, however that ends.
+
+    Parameters
+    ----------
+    serve : callable
+        Given what waits for the next item sent here, and what sends one back. An error it raises
+        is sent back.
+    purpose : str
+        What it does, for the message of an error.
+
+    """
+    here, there = Pipe()
+    if not (pid := os.fork()):
+        here.close()
+        try:
+            _run(serve, there)
+        finally:
+            os._exit(0)  # whatever happened: what the other side cleans up is not done twice
+    there.close()  # else nobody would notice when the process ends
     try:
-        yield
-    except (EOFError, OSError):
-        raise BoxregError(GONE) from None
+        yield Peer(here, purpose)
+    finally:
+        here.close()
+        os.kill(pid, signal.SIGKILL)  # it has nothing to clean up
+        os.waitpid(pid, 0)
 
 
-def _serve(here: Connection, there: Connection) -> None:
-    """Answer until the other side is gone."""
-    there.close()
+def _run(
+    serve: Callable[[Callable[[], Any], Callable[[Any], None]], None], there: Connection
+) -> None:
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # what ends the other side ends this one
     torch.set_num_threads(1)
-    while True:
+    with suppress(EOFError, OSError):  # the other side is gone
         try:
-            packed, config, model = _receive(here)
-        except EOFError:
-            return
-        begun = time.perf_counter()
-        try:
-            estimates = register(_unpacked(*packed), config, model)
-            answer: Any = estimates, vars(model), time.perf_counter() - begun
+            serve(lambda: _receive(there), lambda item: _send(there, item))
         except Exception as error:
             error.add_note(format_exc())  # a traceback does not travel
-            answer = error
-        _send(here, answer)
+            _send(there, error)
 
 
 def _send(there: Connection, item: Any) -> None:
-    # A connection would have tensors shared, by files that both sides keep open.
-    there.send_bytes(pickle.dumps(item, pickle.HIGHEST_PROTOCOL))
+    # A connection's own pickling would have tensors shared, by files that both sides keep open.
+    large: list[pickle.PickleBuffer] = []
+
+    def is_small(array: pickle.PickleBuffer) -> bool:
+        if array.raw().nbytes >= LARGE:
+            large.append(array)
+            return False
+        return True
+
+    message = pickle.dumps(item, pickle.HIGHEST_PROTOCOL, buffer_callback=is_small)
+    there.send_bytes(pickle.dumps([array.raw().nbytes for array in large]))
+    there.send_bytes(message)
+    for array in large:
+        there.send_bytes(array.raw())
 
 
 def _receive(there: Connection) -> Any:
-    return pickle.loads(there.recv_bytes())
-
-
-def _packed(windows: Sequence[Window]) -> tuple[Any, ...]:
-    """Return windows with their observations by columns: few large arrays travel fast."""
-    counts = ([len(o.points) for o in window.observations] for window in windows)
-    heads = [w._replace(observations=cast(Any, n)) for w, n in zip(windows, counts, strict=True)]
-    every = zip(*(o for window in windows for o in window.observations), strict=True)
-    stamps, boxes, points, delays, origins, *others = every
-    large = np.array(boxes), np.concatenate(points), np.concatenate(delays), np.array(origins)
-    return heads, stamps, *large, *others
-
-
-def _unpacked(heads: list[Any], *columns: Any) -> list[Window]:
-    """Return what `_packed` was given."""
-    stamps, boxes, points, delays, *others = columns
-    ends = np.cumsum([count for head in heads for count in head.observations])[:-1]
-    cut = np.split(points, ends), np.split(delays, ends)
-    rows = map(Observation, stamps, boxes, *cut, *others)
-    return [w._replace(observations=list(islice(rows, len(w.observations)))) for w in heads]
+    sizes, message = pickle.loads(there.recv_bytes()), there.recv_bytes()
+    arrays = [np.empty(size, np.uint8) for size in sizes]
+    for array in arrays:
+        there.recv_bytes_into(array)
+    return pickle.loads(message, buffers=arrays)

@@ -196,8 +196,8 @@ class _Tick:
     def refuse(self, reason: str) -> None:
         """Give a reason to each box the core cannot take; `reason` holds for all if not empty."""
         boxes, seen = self.boxes.boxes, set[str]()
-        is_valid = np.isfinite(boxes).all(1) & (boxes[:, 3:6] > 0).all(1)
-        for i, (name, good) in enumerate(zip(self.boxes.track_ids, is_valid, strict=True)):
+        valid = np.ravel(np.isfinite(boxes).all(1) & (boxes[:, 3:6] > 0).all(1))
+        for i, (name, good) in enumerate(zip(self.boxes.track_ids, valid, strict=True)):
             why = 'no_track_id' if not name else 'duplicate_track_id' if name in seen else reason
             self.reasons[i] = why if good else 'invalid_box'
             seen.update([name] if good else [])

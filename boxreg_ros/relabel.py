@@ -20,18 +20,16 @@ import sys
 from typing import Any
 
 from boxreg_ros import __version__
-from boxreg_ros.ahead import ahead
 from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
-from boxreg_ros.arrivals import Arrival, Arrivals
-from boxreg_ros.beside import solver
-from boxreg_ros.labelled import add_label_arguments, LabelledRecording
+from boxreg_ros.arrivals import Arrival, Coming, reader
+from boxreg_ros.labelled import add_label_arguments
 from boxreg_ros.labels import is_written, Options
-from boxreg_ros.recording import Recording
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.report import REPORT, write_report
 from boxreg_ros.request import Request
 from boxreg_ros.results import CONFIG, earlier_summary, spare, SUMMARY, whole_folder
 from boxreg_ros.sink import Sink
+from boxreg_ros.solving import solver
 from boxreg_ros.stopwatch import Stopwatch
 from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, RefinedBoxes, Sweep
 import yaml
@@ -41,8 +39,6 @@ BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaini
 
 NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
 
-AHEAD = 20
-"""So many clouds and box arrays, mostly half of each, are made ready while the registrar works."""
 Progress = Callable[[float, float], None]
 
 
@@ -76,43 +72,35 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     """
     clock = Stopwatch()
     fingerprint = request.fingerprint()  # of what is read from here on
-    with (
-        request.recording() as recording,
-        solver(request.config, clock) as begin,
-        whole_folder(out, request.inputs()) as folder,
-    ):
+    with solver(request.config, clock) as begin, reader(request) as peer:
         registrar = BoxRegistrar(request.config, begin)
-        with clock('read'):
-            arrivals = Arrivals(recording, request, clock)
-        passes = 2 if request.report else 1
-        with (
-            Sink(folder, request, recording, arrivals, clock) as sink,
-            ahead(iter(arrivals), AHEAD) as coming,
-        ):
-            for arrival in coming:
-                if progress is not None:
-                    progress(arrival.seconds, passes * arrivals.seconds)
-                sink.expect(arrival)
+        coming = Coming(peer)
+        seconds, passes = coming.source.seconds, 2 if request.report else 1
+        with whole_folder(out, request.inputs()) as folder:
+            with Sink(folder, request, coming.source, clock) as sink:
+                for arrival in coming:
+                    if progress is not None:
+                        progress(arrival.seconds, passes * seconds)
+                    sink.expect(arrival)
+                    with clock('registrar'):
+                        ready = _registered(arrival, registrar)
+                    sink.take(ready)
                 with clock('registrar'):
-                    ready = _registered(arrival, registrar)
+                    ready = registrar.flush()
                 sink.take(ready)
-            with clock('registrar'):
-                ready = registrar.flush()
-            sink.take(ready)
-        summary = _summary(request, recording, arrivals, registrar.counts, sink)
-        summary['fingerprint'] = fingerprint
-        summary['seconds'] = clock.seconds()
-        if sink.changes is not None:
-            with clock('report'):
-                items = _again(request, progress)
-                line = closing_line(summary, out)
-                write_report(
-                    folder / REPORT, line, summary, request.config, sink.changes.tracks(), items
-                )
-            summary['seconds'] = clock.seconds()
-        settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
-        (folder / CONFIG).write_text(settings, encoding='utf-8')
-        (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+            summary = _summary(request, coming, registrar.counts, sink)
+            for stage, spent in coming.findings.seconds.items():
+                clock.add(stage, spent)
+            summary |= {'fingerprint': fingerprint, 'seconds': clock.seconds()}
+            if sink.changes is not None:
+                with clock('report'):
+                    line = closing_line(summary, out)
+                    items, tracks = _again(request, progress), sink.changes.tracks()
+                    write_report(folder / REPORT, line, summary, request.config, tracks, items)
+                summary['seconds'] = clock.seconds()
+            settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
+            (folder / CONFIG).write_text(settings, encoding='utf-8')
+            (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
     return summary
 
 
@@ -131,38 +119,32 @@ def _registered(arrival: Arrival, registrar: BoxRegistrar) -> list[RefinedBoxes]
 
 def _again(request: Request, progress: Progress | None) -> Iterator[Sweep | BoxArray]:
     """Yield the clouds and boxes of the recording once more, in the fixed frame."""
-    with request.recording() as recording:
-        arrivals = Arrivals(recording, request, Stopwatch())
-        for arrival in arrivals:
+    with reader(request) as peer:
+        coming = Coming(peer)
+        seconds = coming.source.seconds
+        for arrival in coming:
             if progress is not None:
-                progress(arrivals.seconds + arrival.seconds, 2 * arrivals.seconds)
+                progress(seconds + arrival.seconds, 2 * seconds)
             if arrival.moved is not None:
                 yield arrival.moved
 
 
 def _summary(
-    request: Request,
-    recording: Recording,
-    arrivals: Arrivals,
-    registered: Counter[str],
-    sink: Sink,
+    request: Request, coming: Coming, registered: Counter[str], sink: Sink
 ) -> dict[str, Any]:
-    """Return all of summary.json but the timings."""
+    """Return all of summary.json but the timings and the fingerprint."""
     if sink.missing():
         raise RuntimeError(f'{sink.missing()} of {sink.boxes_in} boxes did not come back')
-    counts = arrivals.counts
+    source, found = coming.source, coming.findings
+    counts = found.counts
     unused = {name: n for name, n in registered.items() if name.startswith(UNUSED)}
     unused['sweep_without_transform'] = counts['sweep_without_transform']
-    unused['unreadable'] = recording.unreadable.total()
+    unused['unreadable'] = found.unreadable
     return {
         'recordings': [str(path) for path in request.recordings],
-        'topics': {
-            'points': recording.points_topic,
-            'boxes': recording.boxes_topic or None,
-            'odometry': recording.odometry_topic,
-        },
-        'labels': _labels(request, recording),
-        'fixed_frame': arrivals.fixed_frame,
+        'topics': source.topics,
+        'labels': _labels(request, found.outside),
+        'fixed_frame': source.fixed_frame,
         'estimate': request.config.estimate,
         'sweeps': counts['sweeps'],
         'box_arrays': counts['box_arrays'],
@@ -171,13 +153,13 @@ def _summary(
         'status': dict(sink.status),
         'reasons': dict(sink.reasons.most_common()),
         'time_jumps': counts['time_jump'],
-        'recorded_apart': {t: round(late, 3) for t, late in recording.apart.items()},
+        'recorded_apart': {t: round(late, 3) for t, late in found.apart.items()},
         'heading_flips': sink.heading_flips,
         'dropped': {name: n for name, n in sorted(unused.items()) if n},
-        'first_missing_transform': arrivals.first_missing_transform,
-        'first_unreadable': '; '.join(map(str, recording.first_errors.values())),
-        'warning': arrivals.intake.finding or ('' if sink.boxes_in else NO_BOXES),
-        **arrivals.intake.facts,
+        'first_missing_transform': found.first_missing_transform,
+        'first_unreadable': found.first_unreadable,
+        'warning': found.warning or ('' if sink.boxes_in else NO_BOXES),
+        **found.facts,
         'left_out_of_labels': sink.left_out(),
         'frames_without_cloud': sink.without_cloud,
         'versions': {'boxreg_ros': __version__, 'python': platform.python_version()}
@@ -185,12 +167,12 @@ def _summary(
     }
 
 
-def _labels(request: Request, recording: Recording) -> dict[str, Any] | None:
+def _labels(request: Request, outside: int) -> dict[str, Any] | None:
     """Return where the boxes come from, if not from the recording."""
-    if request.labels is None or not isinstance(recording, LabelledRecording):
+    if request.labels is None:
         return None
     name, path = request.labels
-    return {'format': name, 'path': str(path), 'boxes_outside_part': recording.outside}
+    return {'format': name, 'path': str(path), 'boxes_outside_part': outside}
 
 
 def closing_line(summary: dict[str, Any], out: Path) -> str:

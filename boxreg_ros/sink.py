@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from boxreg_ros.arrivals import Arrival, Arrivals
+from boxreg_ros.arrivals import Arrival, Source
 from boxreg_ros.bridge import Bridge
 from boxreg_ros.changes import Changes
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
-from boxreg_ros.recording import Recording
 from boxreg_ros.request import Request
 from boxreg_ros.spool import Spool
 from boxreg_ros.stopwatch import Stopwatch
@@ -52,10 +51,8 @@ class Sink:
         Of results.
     request : Request
         The formats, and what else is to be kept of the results.
-    recording : Recording
-        What they are of.
-    arrivals : Arrivals
-        Knows the frames.
+    source : Source
+        What the results are of.
     clock : Stopwatch
         Counts the writing.
 
@@ -78,17 +75,16 @@ class Sink:
         self,
         folder: Path,
         request: Request,
-        recording: Recording,
-        arrivals: Arrivals,
+        source: Source,
         clock: Stopwatch,
     ) -> None:
         config, with_points = request.config, request.options.with_points
-        self._fixed_frame, self._sensor_frame = arrivals.fixed_frame, arrivals.sensor_frame
+        self._fixed_frame, self._sensor_frame = source.fixed_frame, source.sensor_frame
         self._is_early = config.estimate == 'early'
         self._clock = clock
         self._spool = Spool(folder, config) if with_points else None
         provenance = Provenance.of(request.recordings, config)
-        options = replace(request.options, recording=recording)
+        options = replace(request.options, recording=request.recording())
         self._writers = {
             name: writer_for(name, folder, provenance, options) for name in request.all_formats
         }

@@ -15,8 +15,8 @@ class Stopwatch:
     """
     Adds up what each stage takes [s].
 
-    Two threads use it, for different stages, and a process beside them; as their work overlaps,
-    stages may add up to more than the total.
+    What processes beside this one take is added; as their work overlaps, stages may add up to
+    more than the total.
 
     """
 
@@ -45,7 +45,10 @@ class Stopwatch:
                 return
             yield item  # type: ignore[misc]
 
+    def stages(self) -> dict[str, float]:
+        """Return what each stage took."""
+        return {name: round(seconds, 4) for name, seconds in self._seconds.items()}
+
     def seconds(self) -> dict[str, float]:
         """Return what each stage took, and the total since this was made."""
-        total = time.perf_counter() - self._begun
-        return {**{k: round(v, 4) for k, v in self._seconds.items()}, 'total': round(total, 4)}
+        return {**self.stages(), 'total': round(time.perf_counter() - self._begun, 4)}

@@ -1,6 +1,5 @@
-"""Windows registered in a process beside this one: the same boxes, and no process left over."""
+"""Work in processes beside this one: the same boxes, errors told here, no process left over."""
 
-from multiprocessing import active_children
 import os
 from pathlib import Path
 import signal
@@ -8,11 +7,12 @@ import subprocess
 import sys
 import time
 
-from boxreg_ros import beside
-from boxreg_ros.beside import solver
+from boxreg_ros import solving
+from boxreg_ros.beside import beside, LARGE
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.registrar import BoxRegistrar
 from boxreg_ros.relabel import relabel, Request
+from boxreg_ros.solving import solver
 from boxreg_ros.stopwatch import Stopwatch
 import numpy as np
 import pytest
@@ -42,9 +42,83 @@ def stream():
     ]  # fmt: skip
 
 
-def there():
-    """Return the processes that register windows."""
-    return [child for child in active_children() if child.daemon]
+def children_of(pid):
+    """Return the processes whose parent is `pid`."""
+    found = []
+    for path in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            number, _, rest = path.read_text().partition(' (')
+        except OSError:
+            continue
+        if int(rest.rpartition(') ')[2].split()[1]) == pid:
+            found.append(int(number))
+    return found
+
+
+@pytest.fixture(autouse=True)
+def none_left():
+    before = children_of(os.getpid())
+    yield
+    assert children_of(os.getpid()) == before
+
+
+# --- any work -----------------------------------------------------------------------------------
+
+
+def echo(receive, send):
+    while True:
+        send(receive())
+
+
+def test_what_is_sent_comes_back():
+    rng = np.random.default_rng(0)
+    size = LARGE // 4
+    with beside(echo, 'echoes') as peer:
+        for item in (
+            None,
+            {'a': (1, 'b')},
+            np.zeros(0),
+            rng.normal(size=(size, 3)),
+            rng.normal(size=(3, size)).T.astype(np.float32),  # by columns, and so it stays
+            rng.normal(size=(size, 6))[:, ::2],
+            [rng.integers(9, size=size), np.arange(size)],
+        ):
+            peer.send(item)
+            found = peer.receive()
+            np.testing.assert_equal(found, item)
+            if isinstance(item, np.ndarray) and item.size:
+                assert (found.dtype, found.flags.writeable) == (item.dtype, True)
+                if item.flags.f_contiguous:
+                    assert found.flags.f_contiguous
+
+
+def test_an_error_is_raised_here_with_where_it_came_from():
+    def fail(receive, send):
+        raise ValueError(f'not a {receive()}')
+
+    with beside(fail, 'fails') as peer:
+        peer.send('window')
+        with pytest.raises(ValueError, match='not a window') as caught:
+            peer.receive()
+        assert 'in fail' in caught.value.__notes__[0]
+        with pytest.raises(BoxregError, match='the process that fails has ended'):
+            peer.receive()
+
+
+def test_the_block_is_left_at_once_whatever_goes_on_there():
+    begun = time.monotonic()
+    with (
+        pytest.raises(KeyError),
+        beside(lambda receive, send: time.sleep(60), 'sleeps'),
+        beside(echo, 'waits'),
+        beside(lambda receive, send: [send(np.zeros(LARGE)) for _ in range(99)], 'pushes') as peer,
+    ):
+        peer.receive()
+        raise KeyError
+    assert time.monotonic() - begun < 10
+
+
+# --- windows ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('offset_ns', [0, 30_000_000])
@@ -62,8 +136,6 @@ def test_the_same_boxes_as_without(stream, offset_ns):
         # What the model learnt there is here: another stream begins anew all the same.
         registrar.reset()
         assert_equal(fed(registrar, stream) + registrar.flush(), expected)
-        assert len(there()) == 1
-    assert not there()
     assert clock.seconds()['solve'] > 0
 
 
@@ -73,7 +145,7 @@ def test_more_is_taken_while_windows_are_registered(stream, monkeypatch):
 
     def begin(windows, config, model):
         events.append('begin')
-        estimates = beside.register(windows, config, model)
+        estimates = solving.register(windows, config, model)
         return lambda: events.append('wait') or estimates
 
     registrar = BoxRegistrar(SHORT, begin)
@@ -93,59 +165,46 @@ def test_more_is_taken_while_windows_are_registered(stream, monkeypatch):
 def test_where_it_does_not_pay_there_is_none(changes):
     with solver(SHORT.updated(changes), Stopwatch()) as begin:
         assert begin is None
-        assert not there()
 
 
-def test_relabel_gives_the_same_files(tmp_path, monkeypatch):
+def test_relabel_gives_the_same_files(tmp_path):
     request = Request((Drive(sweeps=30).write(tmp_path / 'drive'),), config=SHORT)
     summary = relabel(request, tmp_path / 'beside')
     assert 0 < summary['seconds']['solve'] < summary['seconds']['total']
-    monkeypatch.setattr(beside, 'get_context', None)  # no process is to be made
     whole = SHORT.updated({'device': 'cpu:0'})
     relabel(Request(request.recordings, config=whole), tmp_path / 'within')
     within, next_to_it = (tmp_path / name / 'boxes.csv' for name in ('within', 'beside'))
     assert next_to_it.read_bytes() == within.read_bytes()
 
 
-def test_an_error_there_is_raised_here(stream):
+def test_an_error_there_ends_what_is_done_here(tmp_path, monkeypatch):
     def fail(windows, config, model):
         raise ValueError('no such window')
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(beside, 'register', fail)  # the fork has it too
-        with solver(SHORT, Stopwatch()) as begin:
-            registrar = BoxRegistrar(SHORT, begin)
-            with pytest.raises(ValueError, match='no such window') as caught:
-                fed(registrar, stream)
-    assert 'in fail' in caught.value.__notes__[0]
-    assert not there()
-
-
-def test_a_process_that_is_killed_is_an_error_with_a_remedy(tmp_path, monkeypatch):
-    recording = Drive(sweeps=20).write(tmp_path / 'drive')
-    packed = beside._packed
-
-    def killing(windows):
-        os.kill(there()[0].pid, signal.SIGKILL)  # as the kernel does when memory runs out
-        return packed(windows)
-
-    monkeypatch.setattr(beside, '_packed', killing)
-    with pytest.raises(BoxregError, match='not enough memory: choose a smaller track_window'):
+    recording = Drive(sweeps=30).write(tmp_path / 'drive')
+    monkeypatch.setattr(solving, 'register', fail)  # the fork has it too
+    with pytest.raises(ValueError, match='no such window'):
         relabel(Request((recording,), config=SHORT), tmp_path / 'out')
     assert sorted(item.name for item in tmp_path.iterdir()) == ['drive']
 
 
-def children_of(pid):
-    """Return the processes whose parent is `pid`."""
-    found = []
-    for path in Path('/proc').glob('[0-9]*/stat'):
-        try:
-            number, _, rest = path.read_text().partition(' (')
-        except OSError:
-            continue
-        if int(rest.rpartition(') ')[2].split()[1]) == pid:
-            found.append(int(number))
-    return found
+@pytest.mark.parametrize('which', ['registers windows', 'reads the recording'])
+def test_a_process_that_is_killed_is_an_error_with_a_remedy(tmp_path, monkeypatch, which):
+    recording = Drive(sweeps=30).write(tmp_path / 'drive')
+    added = []
+
+    def killing(self, boxes):
+        if not added:  # as the kernel does when memory runs out
+            pids = sorted(children_of(os.getpid()))
+            os.kill(pids[which == 'reads the recording'], signal.SIGKILL)
+        added.append(boxes)
+        return add(self, boxes)
+
+    add = BoxRegistrar.add_boxes
+    monkeypatch.setattr(BoxRegistrar, 'add_boxes', killing)
+    with pytest.raises(BoxregError, match=f'{which} has ended .*: choose a smaller track_window'):
+        relabel(Request((recording,), config=SHORT), tmp_path / 'out')
+    assert sorted(item.name for item in tmp_path.iterdir()) == ['drive']
 
 
 def test_none_is_left_when_this_one_is_killed(tmp_path):
@@ -153,11 +212,12 @@ def test_none_is_left_when_this_one_is_killed(tmp_path):
     command = [sys.executable, '-m', 'boxreg_ros.cli', 'relabel', str(recording)]
     process = subprocess.Popen([*command, '-o', str(tmp_path / 'out')], cwd=ROOT)
     deadline = time.monotonic() + 60
-    while not (children := children_of(process.pid)) and time.monotonic() < deadline:
+    while len(children := children_of(process.pid)) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert len(children) == 1
     process.kill()
     process.wait()
-    while Path(f'/proc/{children[0]}').exists() and time.monotonic() < deadline:
+    left = [Path(f'/proc/{child}') for child in children]
+    while any(path.exists() for path in left) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not Path(f'/proc/{children[0]}').exists()
+    assert len(left) == 2
+    assert not any(path.exists() for path in left)

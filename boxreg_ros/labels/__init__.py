@@ -208,7 +208,7 @@ class Options:
     swap_axes : bool
         Write extents where Datumaro and CVAT look for them, not where the format says.
     recording : Recording or None
-        What the boxes are of, for the formats that write it again.
+        What the boxes are of, open or not, for the formats that write it again.
 
     """
 

@@ -90,7 +90,7 @@ class Writer:
     """
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        if options.recording is None or not options.recording.boxes_topic:
+        if options.recording is None or not options.recording.has_boxes:
             raise ConfigError(
                 "format 'mcap' writes a recording again, with its boxes refined: expected one "
                 'with boxes, got labels from a file; choose another format'
