@@ -88,10 +88,12 @@ def aspect(problem: Problem) -> Tensor:
 
     """
     R = rotation_from_rpy(problem.pose[..., 3:])
-    weight = problem.mask.to(problem.points)[..., None]
-    mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
-    known = problem.origins.isfinite().all(-1, keepdim=True)
-    toward = (torch.where(known, problem.origins, 1e6 * mean)[..., None, :] @ R)[..., 0, :]
+    toward, known = problem.origins, problem.origins.isfinite().all(-1, keepdim=True)
+    if not known.all():
+        weight = problem.mask.to(problem.points)[..., None]
+        mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
+        toward = torch.where(known, toward, 1e6 * mean)
+    toward = (toward[..., None, :] @ R)[..., 0, :]
     outward = toward[..., [0, 0, 1, 1]] * FACE_SIGN[:4].to(R)
     half = problem.boxes[..., 3:6] / 2
     across = toward[..., [1, 1, 0, 0]].abs() - half[..., [1, 1, 0, 0]]

@@ -138,14 +138,13 @@ def _judged(
     found[..., :3] += base[:, None]
     arrays, estimates = [part.cpu().numpy() for part in left], []
     lasts = (finite.all(1) & left[1].isfinite().all(1)).tolist() if left else [False] * len(found)
-    for b, window in enumerate(windows):
+    for b, i in np.argwhere(problem.valid.cpu().numpy() & ~good).tolist():
+        found[b, i], spread[b, i] = windows[b].observations[i].box, np.eye(6)
+    status, reasons = np.where(good, REFINED, KEPT).tolist(), why.tolist()
+    for b, n in enumerate(len(window.observations) for window in windows):
         memory = Memory(base[b], *(a[b] for a in arrays)) if lasts[b] else None
-        n = len(window.observations)
-        own, error = found[b, :n].copy(), spread[b, :n].copy()
-        for i in np.flatnonzero(~good[b, :n]).tolist():
-            own[i], error[i] = window.observations[i].box, np.eye(6)
-        words = tuple(np.where(good[b, :n], REFINED, KEPT).tolist()), tuple(why[b, :n].tolist())
-        estimates.append(Estimate(own, *words, error, memory))
+        words = tuple(status[b][:n]), tuple(reasons[b][:n])
+        estimates.append(Estimate(found[b, :n], *words, spread[b, :n], memory))
     return estimates
 
 
