@@ -16,6 +16,7 @@ from boxreg_ros.errors import BoxregError
 import numpy as np
 import torch
 
+Serve = Callable[[Callable[[], Any], Callable[[Any], None]], None]
 LARGE = 2**16  # arrays of so many bytes travel as they are, without being copied into a message
 
 
@@ -79,9 +80,7 @@ class Peer:
 
 
 @contextmanager
-def beside(
-    serve: Callable[[Callable[[], Any], Callable[[Any], None]], None], purpose: str
-) -> Iterator[Peer]:
+def beside(serve: Serve, purpose: str) -> Iterator[Peer]:
     """
     Run `serve` in a process of its own for as long as the block lasts, and yield that process.
 
@@ -109,13 +108,12 @@ def beside(
         yield Peer(here, purpose)
     finally:
         here.close()
-        os.kill(pid, signal.SIGKILL)  # it has nothing to clean up
-        os.waitpid(pid, 0)
+        with suppress(ProcessLookupError, ChildProcessError):  # where nobody waits for children
+            os.kill(pid, signal.SIGKILL)  # it has nothing to clean up
+            os.waitpid(pid, 0)
 
 
-def _run(
-    serve: Callable[[Callable[[], Any], Callable[[Any], None]], None], there: Connection
-) -> None:
+def _run(serve: Serve, there: Connection) -> None:
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # what ends the other side ends this one
     torch.set_num_threads(1)

@@ -118,6 +118,20 @@ def test_the_block_is_left_at_once_whatever_goes_on_there():
     assert time.monotonic() - begun < 10
 
 
+def test_where_children_are_not_waited_for():
+    ours = signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # as some that start others leave it
+    try:
+        with beside(lambda receive, send: send(1), 'ends') as peer:
+            assert peer.receive() == 1
+            with pytest.raises(BoxregError):
+                peer.receive()
+        with beside(echo, 'echoes') as peer:
+            peer.send(2)
+            assert peer.receive() == 2
+    finally:
+        signal.signal(signal.SIGCHLD, ours)
+
+
 # --- windows ------------------------------------------------------------------------------------
 
 
