@@ -211,9 +211,8 @@ if __name__ == '__main__':
     publishers_for(player, everything)
     player.wait_until_connected()
     sys.stdin.readline()
-    time.sleep(
-        1.0
-    )  # a writer knows its reader before that knows the writer, on a busy machine long
+    # A writer may know its reader before that knows the writer; what is sent between gets lost.
+    time.sleep(1.0)
     for one in everything:
         play(player, [one])
         time.sleep(0.02)

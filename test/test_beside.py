@@ -153,7 +153,7 @@ def test_the_same_boxes_as_without(stream, offset_ns):
     assert clock.seconds()['solve'] > 0
 
 
-def test_more_is_taken_while_windows_are_registered(stream, monkeypatch):
+def test_more_is_taken_while_windows_are_registered(stream):
     """What is begun is not waited for before the next windows are full, or the end has come."""
     events = []
 
