@@ -110,7 +110,10 @@ class BoxregNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(STATUS_PERIOD, self._publish_status, clock=steady)
         best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._subscribe(PointCloud2, 'points', self._on_points, best_effort(depth=5))
+        # When this process is held up, what comes waits with DDS, which drops without a word: it
+        # must hold more than the inbox, which counts.
+        depth = 2 * self._inbox.capacity['points']
+        self._subscribe(PointCloud2, 'points', self._on_points, best_effort(depth=depth))
         self._subscribe(Odometry, 'odom', self._on_odometry, best_effort(depth=50))
         self._subscribe_to_tf()
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -252,7 +255,8 @@ class BoxregNode(Node):
 
     def _subscribe_to_boxes(self) -> Subscription:
         # What is best is settled now, by the publishers there are.
-        qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_AVAILABLE)
+        depth = 2 * self._inbox.capacity['boxes']  # as for clouds
+        qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         return self._subscribe(import_message(self._boxes_type), 'boxes', self._on_boxes, qos)
 
     def _listen_again(self) -> None:

@@ -271,7 +271,7 @@ def test_what_waited_for_transforms_is_not_the_solvers_fault(graph, tmp_path):
     # `backlog`; boxes come before the first cloud, by which the fixed frame is found.
     drive, records, early, final = thirty_stamps(graph, tmp_path)
     options = ['transform_timeout:=60.0', 'queue:=100', 'backlog:=0.02']
-    node = graph.start(*RELIABLE, *DEEP, *[part for text in options for part in ('-p', text)])
+    node = graph.start(*RELIABLE, *[part for text in options for part in ('-p', text)])
     graph.wait_until_connected()
     moving = [record for record in records if record.topic == '/tf']
     others = [record for record in records if record.topic != '/tf']
@@ -305,13 +305,6 @@ def test_markers_leave_with_an_array_without_boxes(graph, tmp_path):
     assert ended_cleanly(node)
 
 
-DEEP = tuple(
-    part
-    for name in ('points', 'boxes')
-    for part in ('-p', f'qos_overrides./{name}.subscription.depth:=100')
-)
-
-
 def thirty_stamps(graph, tmp_path):
     """Return a drive of 30 stamps, its records, and what will come of early and final boxes."""
     drive = Drive(sweeps=30)
@@ -335,7 +328,7 @@ def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
     drive, records, early, final = thirty_stamps(graph, tmp_path)
     slow = ['objective:=paper', 'paper.multiplier_rounds:=60', 'paper.iterations:=10000']
     options = [part for text in (*slow, 'backlog:=0.1') for part in ('-p', text)]
-    node = graph.start(*RELIABLE, *DEEP, *options)
+    node = graph.start(*RELIABLE, *options)
     graph.wait_until_connected()
     first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[3])
     play(graph, records[:first], early)
@@ -350,7 +343,7 @@ def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
 def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
     drive, records, early, final = thirty_stamps(graph, tmp_path)
     slow = ('-p', 'solver.rounds:=40', '-p', 'solver.iterations:=400')
-    node = graph.start(*RELIABLE, *DEEP, *slow, '-p', 'backlog:=0.2')
+    node = graph.start(*RELIABLE, *slow, '-p', 'backlog:=0.2')
     graph.wait_until_connected()
     play(graph, records)
     assert int(all_published(graph, early)['points_queue_full']) > 5
@@ -359,10 +352,28 @@ def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
 
 
+def test_what_comes_while_the_process_is_held_up_is_taken(graph, tmp_path):
+    """More clouds at once than a sensor's usual queue holds, none of which is in the way."""
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[14])
+    node = graph.start(*RELIABLE, '-p', 'transform_timeout:=20', '-p', 'backlog:=60.0')
+    graph.wait_until_connected()
+    node.popen.send_signal(signal.SIGSTOP)
+    play(graph, records[:first])
+    node.popen.send_signal(signal.SIGCONT)
+    graph.wait(lambda: len(early) == 15, 'boxes of the first half')
+    play(graph, records[first:], early)
+    counts = all_published(graph, early)
+    assert counts['points_received'] == counts['boxes_received'] == '30'
+    assert counts.get('boxes_without_sweep', '0') == '0'
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+
+
 def test_what_waits_when_the_node_ends_comes_out(graph, tmp_path):
     drive, records, early, final = thirty_stamps(graph, tmp_path)
     slow = ('-p', 'solver.rounds:=20', '-p', 'solver.iterations:=100', '-p', 'backlog:=60.0')
-    node = graph.start(*RELIABLE, *DEEP, *slow, '-p', 'queue:=100')
+    node = graph.start(*RELIABLE, *slow, '-p', 'queue:=100')
     graph.wait_until_connected()
     play(graph, records)
     graph.wait(lambda: len(early) >= 4, 'some boxes')
@@ -376,17 +387,9 @@ def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
     publishers_for(graph, records)
     early = graph.collect(DETECTIONS, '/refined_boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    endless = ('-p', 'solver.rounds:=100', '-p', 'solver.iterations:=10000', '-p', 'window:=30')
-    node = graph.start(
-        *RELIABLE,
-        *endless,
-        '-p',
-        'solver.tolerance:=0.0',
-        '-p',
-        'backlog:=60.0',
-        '-p',
-        'queue:=100',
-    )
+    slow = ['solver.rounds:=2', 'solver.iterations:=100', 'solver.tolerance:=0.0', 'window:=30']
+    options = [part for text in (*slow, 'backlog:=60.0', 'queue:=100') for part in ('-p', text)]
+    node = graph.start(*RELIABLE, *options)
     graph.wait_until_connected()
     play(graph, records)
     graph.wait(lambda: len(early) >= 4, 'some boxes')
