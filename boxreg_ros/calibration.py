@@ -84,10 +84,10 @@ class InputModel:
 
     The rule is the gap between a label's faces and the outermost points on them. Each track
     gives one sight per face, the mean over its observations of the gap less the one expected of
-    its class, and the median over tracks of all classes is weighed against no difference: boxes
-    that err by more than the gap still tell it if their error has no preferred direction. Faces
-    beyond 45 m tell how much further in points stand there; where the rule is stated, too, since
-    what all boxes err by does not matter for the difference.
+    its class, and the mean of the middle half of all tracks is weighed against no difference:
+    boxes that err by more than the gap still tell it if their error has no preferred direction.
+    Faces beyond 45 m tell how much further in points stand there; where the rule is stated, too,
+    since what all boxes err by does not matter for the difference.
 
     """
 
@@ -129,22 +129,23 @@ class InputModel:
         """Return the annotation rule to expect."""
         if self._rule is None:
             known = np.array(list(self._sights.values())).reshape(-1, 3, 3, 6)
-            gaps = self._median(known[:, 0], (0.0,) * 4)
-            depths = self._median(self._learn * known[:, 1], self._depths)
+            gaps = self._middle(known[:, 0], (0.0,) * 4)
+            depths = self._middle(self._learn * known[:, 1], self._depths)
             known[:, 2, 0] -= gaps.numpy() * known[:, 2, 1]
-            self._rule = Rule(self._learn * gaps, depths, self._median(known[:, 2], (0.0,) * 4))
+            self._rule = Rule(self._learn * gaps, depths, self._middle(known[:, 2], (0.0,) * 4))
         return self._rule
 
-    def _median(self, known: Floats, expected: Sequence[float]) -> Tensor:
-        """Weigh what is `expected` of each kind of face against the median over tracks."""
+    def _middle(self, known: Floats, expected: Sequence[float]) -> Tensor:
+        """Weigh what is `expected` of each kind of face against the middle of the tracks."""
         values = torch.zeros(6, dtype=torch.float64)
         for faces, value, deviation in zip(KINDS, expected, RULE_ERROR, strict=True):
             level, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
-            sights = level[count >= 3] / share[count >= 3]
-            if len(sights) >= 3:
-                middle = np.median(sights)
-                error = 1.25 * (1.48 * np.median(np.abs(sights - middle)) + 0.02)
-                trust = deviation**2 / (deviation**2 + error**2 / len(sights))
+            sights = np.sort(level[count >= 3] / share[count >= 3])
+            if (n := len(sights)) >= 3:
+                # The mean of the middle half errs by an eighth less than the median.
+                middle = sights[n // 4 : n - n // 4].mean()
+                error = 1.1 * (0.74 * (sights[n - 1 - n // 4] - sights[n // 4]) + 0.02)
+                trust = deviation**2 / (deviation**2 + error**2 / n)
                 value = value + trust * (middle - value)
             values[faces] = float(value)
         return values

@@ -26,8 +26,9 @@ class Chain(NamedTuple):
 
     Attributes
     ----------
-    links : Tensor, shape (B, N, 6, 30 + S)
+    links : Tensor, shape (B, N', 6, 30 + S)
         Rows of each link: columns of two links before, itself, two links after, and the border.
+        After the N links come empty ones that fill the last block.
     corner : Tensor, shape (B, S, S)
         The border with itself.
 
@@ -39,8 +40,9 @@ class Chain(NamedTuple):
     @classmethod
     def zeros(cls, like: Tensor, length: int) -> 'Chain':
         """Return zeros for `length` links and vectors as `like` (B, 6 N + S)."""
-        B, S = len(like), like.shape[1] - LINK * length
-        return cls(like.new_zeros(B, length, LINK, SPAN + S), like.new_zeros(B, S, S))
+        B, S, count = len(like), like.shape[1] - LINK * length, -(-length // BLOCK)
+        filled = count * -(-length // count)  # so that all blocks are of one size
+        return cls(like.new_zeros(B, filled, LINK, SPAN + S), like.new_zeros(B, S, S))
 
     def add(self, own: Tensor, across: Tensor, corner: Tensor) -> None:
         """
@@ -66,17 +68,15 @@ class Chain(NamedTuple):
 
         """
         S, N = self.corner.shape[1], self.links.shape[1]
-        chain, border = free[:, :-S].unflatten(1, (-1, LINK)), free[:, -S:]
-        near = pad(free[:, :-S], (NEXT, NEXT)).unfold(1, SPAN, LINK)
+        inner, border = pad(free[:, :-S], (0, LINK * N + S - free.shape[1])), free[:, -S:]
+        near = pad(inner, (NEXT, NEXT)).unfold(1, SPAN, LINK)
         around = torch.cat([near, border[:, None].expand(-1, N, -1)], -1)
+        chain = inner.unflatten(1, (-1, LINK))
         links = (self.links * chain[..., None]).mul_(around[:, :, None])
         links[..., NEXT : NEXT + LINK].diagonal(dim1=2, dim2=3).add_(1.0 - chain + 1e-9)
         corner = self.corner * border[..., None] * border[:, None]
         corner.diagonal(dim1=1, dim2=2).add_(1.0 - border + 1e-9)
-        count = -(-N // BLOCK)
-        size = -(-N // count)  # links of a block; the last ones are filled up with identities
-        links = pad(links, (0, 0, 0, 0, 0, count * size - N))
-        links[:, N:, :, NEXT : NEXT + LINK] = torch.eye(LINK).to(links)
+        size = N // (count := -(-N // BLOCK))  # links of a block
         wide = links.new_zeros(len(links), count, size, LINK, LINK * size + 2 * NEXT + S)
         wide[..., -S:] = links[..., SPAN:].unflatten(1, (count, size))
         for j in range(size):

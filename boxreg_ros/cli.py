@@ -14,6 +14,7 @@ from threading import current_thread, main_thread
 from typing import Any
 
 from boxreg_ros import __version__
+from boxreg_ros.allocation import keep_freed_memory
 from boxreg_ros.errors import BoxregError, ConfigError
 
 COMMANDS = {
@@ -100,6 +101,7 @@ def _run(arguments: list[str]) -> int:
     if command == 'node' and arguments[0] == 'node':  # its arguments are those of any ROS node
         return int(import_module('boxreg_ros.node').main(arguments[1:]) or DONE)
     args = parser(command).parse_args(arguments)
+    keep_freed_memory()
     return int(import_module(f'boxreg_ros.{args.command}').run(args))
 
 

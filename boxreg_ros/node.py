@@ -10,6 +10,7 @@ import sys
 from threading import Event, Thread
 import time
 
+from boxreg_ros.allocation import keep_freed_memory
 from boxreg_ros.errors import BoxregError, ConfigError
 
 NAME = 'boxreg_node'
@@ -38,6 +39,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except ImportError as error:
         return _fail(BoxregError(f'{error}: {WITHOUT_ROS}'), 1)
 
+    keep_freed_memory()
     arguments = list(sys.argv[1:] if args is None else args)
     failures: list[Exception] = []
     try:

@@ -146,10 +146,9 @@ def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
     return shared
 
 
-def dense(chain):
-    """Return the matrices (B, D, D) of a `Chain` as they are, zeros and all."""
-    B, N = chain.links.shape[:2]
-    D = LINK * N + chain.corner.shape[1]
+def dense(chain, N):
+    """Return the matrices (B, D, D) of a `Chain` of N links as they are, zeros and all."""
+    B, D = len(chain.links), LINK * N + chain.corner.shape[1]
     whole = chain.links.new_zeros(B, D, D)
     whole[:, LINK * N :, LINK * N :] = chain.corner
     for i in range(N):

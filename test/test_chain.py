@@ -38,7 +38,7 @@ def vectors(length):
 @pytest.mark.parametrize('length', LENGTHS)
 def test_stretches_are_summed_up(length):
     found, known = chain(length)
-    np.testing.assert_allclose(dense(found), known, atol=1e-12)
+    np.testing.assert_allclose(dense(found, length), known, atol=1e-12)
 
 
 @pytest.mark.parametrize('length', LENGTHS)

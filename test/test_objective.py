@@ -381,7 +381,7 @@ def test_value_gradient_and_curvature(names):
         for b in range(B):
             own = J[b, ..., b, :]
             curvature[b] += torch.einsum('nfrd,nfrs,nfse->de', own, term.weight[b], own)
-    np.testing.assert_allclose(dense(form), curvature, atol=1e-9 * float(curvature.abs().max()))
+    np.testing.assert_allclose(dense(form, N), curvature, atol=1e-9 * float(curvature.abs().max()))
 
 
 def test_a_sum_is_that_of_its_terms_anywhere():
@@ -408,7 +408,7 @@ def test_newton_takes_the_inverse_of_the_curvature():
     vector, form = variables(problem, seed=8), Chain.zeros(x, 6)
     objective.value_and_gradient(terms, x, 6, form)
     solved = found.newton(vector, torch.arange(3))
-    product = (dense(form) @ solved[..., None])[..., 0]
+    product = (dense(form, 6) @ solved[..., None])[..., 0]
     np.testing.assert_allclose(product, vector, atol=1e-6)
     rows = torch.tensor([2, 0])
     np.testing.assert_allclose(found.newton(vector[rows], rows), solved[rows], rtol=1e-9)
@@ -462,7 +462,7 @@ def least(terms, N):
     x = torch.zeros(len(terms[0].weight), 6 * N + SHARED, dtype=D)
     form = Chain.zeros(x, N)
     _, gradient = objective.value_and_gradient(terms, x, N, form)
-    return torch.linalg.solve(dense(form), -gradient)
+    return torch.linalg.solve(dense(form, N), -gradient)
 
 
 @pytest.mark.parametrize('N', [4, 7])
@@ -498,7 +498,7 @@ def test_the_memory_is_a_quadratic_form_of_all_terms_of_the_oldest():
             weight = torch.zeros_like(term.weight)
             weight[:, 0] = term.weight[:, 0]
             gradient += objective.value_and_gradient([term._replace(weight=weight)], x, N, form)[1]
-    H = dense(form)
+    H = dense(form, N)
     first, others = slice(0, 6), [*range(6, 18), *range(6 * N, 6 * N + SHARED)]
     across = torch.linalg.solve(H[:, first, first], H[:, first])
     known = (H - H[:, :, first] @ across)[:, others][:, :, others]
