@@ -20,7 +20,15 @@ from boxreg_ros.labelled import (
     LabelledRecording,
     pose_of,
 )
-from boxreg_ros.labels import frames_of, LabelFrame, module_of, Options, Provenance, writer_for
+from boxreg_ros.labels import (
+    check_options,
+    frames_of,
+    LabelFrame,
+    module_of,
+    Options,
+    Provenance,
+    writer_for,
+)
 from boxreg_ros.results import SUMMARY, whole_folder
 from boxreg_ros.spool import Spool
 from boxreg_ros.structures import Sweep
@@ -88,8 +96,7 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
         If the labels cannot be read, or a format has no place for any of them.
 
     """
-    for name in (request.given, *request.wanted):
-        module_of(name)
+    module_of(request.given)
     of_recording = (
         request.points, request.odometry, request.fixed_frame, request.label_frame,
     )  # fmt: skip
@@ -98,6 +105,7 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
             '--with-points, --points, --odometry, --fixed-frame, --label-frame: expected a '
             'recording that they are about, got none; give it with --recording'
         )
+    check_options(request.wanted, request.options)
     provenance = Provenance.of(request.recordings or (request.source,))
     counts: Counter[str] = Counter()
     inputs = (request.source, *request.recordings, request.options.camera)

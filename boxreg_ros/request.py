@@ -12,7 +12,7 @@ from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.labelled import LabelledRecording
-from boxreg_ros.labels import module_of, Options
+from boxreg_ros.labels import check_options, module_of, Options
 from boxreg_ros.recording import Recording
 from boxreg_ros.report import check_packages
 from msg_adapters.convention import Convention, STANDARD
@@ -89,8 +89,9 @@ class Request:
                 f'bridge: expected 0 to max_gap ({self.config.max_gap:g} s), after which an id is '
                 f'that of another track, got {self.bridge:g}'
             )
-        for name in (*self.formats, *(self.labels or ())[:1]):
-            module_of(str(name))
+        check_options(self.formats, self.options)
+        if self.labels is not None:
+            module_of(self.labels[0])
         if self.report:
             check_packages()
 

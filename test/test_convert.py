@@ -69,7 +69,7 @@ def test_labels_are_refined_as_the_same_boxes_of_a_topic_are(tmp_path, drive):
 def test_labels_of_every_frame_find_their_place(tmp_path, drive, camera, name):
     """The frames that labels call their own need not be those of the recording."""
     recording, table = drive
-    options = Options(camera=camera)
+    options = Options(camera=camera if name == 'kitti' else None)
     asked = Conversion(table, 'csv', (name,), options, (recording,))
     convert(asked, tmp_path / 'made')
     folder = tmp_path / 'made' / name
@@ -237,6 +237,11 @@ def test_convert_on_the_command_line(tmp_path, drive, capsys):
     [
         (['convert', '{csv}', '-o', '{out}', '--from', 'kiti', '--to', 'csv'], 2, 'one of csv'),
         (['convert', '{csv}', '-o', '{out}', '--from', 'csv', '--to', 'kitti'], 2, '--camera'),
+        (['convert', '{csv}', '-o', '{out}', '--from=csv', '--to=csv', '--camera', '{csv}'], 2,
+         '--camera: expected a format that uses it (kitti), got csv; add one, or leave it out'),
+        (['relabel', '{bag}', '-o', '{out}', '--formats', 'kitti', '--camera', '{csv}',
+          '--swap-axes'], 2, 'uses it (tracklets, datumaro), got kitti'),
+        (['relabel', '{bag}', '-o', '{out}', '--with-points'], 2, 'got csv, openlabel'),
         (['convert', '{out}', '-o', '{out}x', '--from', 'csv', '--to', 'csv'], 1, 'no such file'),
         (['relabel', '{bag}', '-o', '{out}', '--labels', 'csv'], 2, 'expected FORMAT:PATH'),
         (['relabel', '{bag}', '-o', '{out}', '--labels', 'kiti:{csv}'], 2, 'expected one of csv'),

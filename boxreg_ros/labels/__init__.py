@@ -10,7 +10,7 @@ files can be read back, ``read(path)`` yields the same frames.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 import hashlib
 from importlib import import_module
@@ -73,6 +73,8 @@ class Format:
         What the writer leaves in its folder.
     packages : tuple of str
         Packages of pip that are needed beyond those of boxreg_ros itself.
+    options : tuple of str
+        Those of `Options` that its writer acts on.
 
     """
 
@@ -84,6 +86,7 @@ class Format:
     rotation: str
     files: str
     packages: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,6 +270,28 @@ def module_of(name: str) -> ModuleType:
                 f'format {name!r} needs {package}: pip install {package} ({error})'
             ) from None
     return module
+
+
+def check_options(names: Sequence[str], options: Options) -> None:
+    """
+    Refuse options that none of the formats `names` acts on.
+
+    Raises
+    ------
+    ConfigError
+        Which names the formats that do, or as in `module_of`.
+
+    """
+    used = {option for name in names for option in module_of(name).FORMAT.options}
+    for option in ('camera', 'with_points', 'swap_axes'):
+        if getattr(options, option) and option not in used:
+            able = [
+                n for n, path in FORMATS.items() if option in import_module(path).FORMAT.options
+            ]
+            raise ConfigError(
+                f'--{option.replace("_", "-")}: expected a format that uses it '
+                f'({", ".join(able)}), got {", ".join(names)}; add one, or leave it out'
+            )
 
 
 def writer_for(

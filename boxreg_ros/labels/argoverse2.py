@@ -39,6 +39,7 @@ FORMAT = Format(
     rotation='quaternion w x y z',
     files='annotations.feather, city_SE3_egovehicle.feather, calibration/, sensors/',
     packages=('pyarrow',),
+    options=('with_points',),
 )
 POSE = dict.fromkeys(('qw', 'qx', 'qy', 'qz', 'tx_m', 'ty_m', 'tz_m'), 'double')
 EXTENT = dict.fromkeys(('length_m', 'width_m', 'height_m'), 'double')

@@ -27,6 +27,7 @@ FORMAT = Format(
     sizes='length width height (x y z); height width length with --swap-axes',
     rotation='angles x y z, R = Rx Ry Rz',
     files='annotations/default.json, point_clouds/default/STAMP.pcd',
+    options=('with_points', 'swap_axes'),
 )
 SUBSET = 'default'
 POINT_CLOUD = 6

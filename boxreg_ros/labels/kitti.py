@@ -30,6 +30,7 @@ FORMAT = Format(
     sizes='height width length',
     rotation="rotation_y about the camera's y; roll and pitch are lost",
     files='label_02/, calib/, velodyne/',
+    options=('camera', 'with_points'),
 )
 SEQUENCE = '0000'
 CLASSES = {

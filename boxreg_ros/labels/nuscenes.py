@@ -45,6 +45,7 @@ FORMAT = Format(
     sizes='width length height',
     rotation='quaternion w x y z',
     files='v1.0-boxreg/, samples/, maps/',
+    options=('with_points',),
 )
 STREAMED = ('sample', 'sample_data', 'sample_annotation', 'ego_pose')
 EMPTY_MAP = 'maps/empty.png'

@@ -37,6 +37,7 @@ FORMAT = Format(
     sizes='length width height (x y z)',
     rotation='angles x y z, R = Rx Ry Rz',
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
+    options=('with_points',),
 )
 EPISODE, CUBOID = 'episode', 'cuboid_3d'
 TAGS = ('track_id', 'status')

@@ -36,6 +36,7 @@ FORMAT = Format(
     sizes='length width height (x y z)',
     rotation='angles x y z, R = Rx Ry Rz',
     files='label/STAMP.json, lidar/STAMP.pcd, desc.json',
+    options=('with_points',),
 )
 
 

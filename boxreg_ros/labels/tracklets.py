@@ -46,6 +46,7 @@ FORMAT = Format(
     sizes='height width length, one per tracklet',
     rotation='rx ry rz, R = Rz Ry Rx',
     files='tracklet_labels.xml, velodyne_points/',
+    options=('with_points', 'swap_axes'),
 )
 FILE = 'tracklet_labels.xml'
 POSE = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz')

@@ -37,6 +37,7 @@ FORMAT = Format(
     sizes='length width height (x y z)',
     rotation='angles x y z, R = Rx Ry Rz',
     files='scene_1/result/STAMP.json, scene_1/lidar_point_cloud_0/STAMP.pcd',
+    options=('with_points',),
 )
 SCENE, CLOUDS, RESULT = 'scene_1', 'lidar_point_cloud_0', 'result'
 BOX = '3D_BOX'
