@@ -329,6 +329,8 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
                 'odom',
                 is_compressed=case == 'compressed',
             )
+            with path.open('rb') as file:
+                os.fsync(file.fileno())  # else the disk is busy with it while it is read
             result[case] = _peak([sys.executable, '-m', CLI, 'relabel', str(path), '-o', str(out)])
             spent = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['seconds']
             faster, rest = length / spent['total'], 1 - spent['solve'] / spent['total']

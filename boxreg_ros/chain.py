@@ -135,9 +135,8 @@ class Factor(NamedTuple):
         ahead = pad(torch.cholesky_inverse(self.corner), (NEXT, 0, NEXT, 0))
         found: list[Tensor] = []
         for L, V in reversed(self.blocks):
-            K = solve_triangular(L.mT, V, upper=True)
-            across = -(K @ ahead)
             root = solve_triangular(L, torch.eye(L.shape[1]).to(L).expand_as(L), upper=False)
+            across = -((K := root.mT @ V) @ ahead)
             own = root.mT @ root - across @ K.mT
             blocks = own.unflatten(1, (-1, LINK)).unflatten(3, (-1, LINK)).diagonal(dim1=1, dim2=3)
             found.insert(0, blocks.permute(0, 3, 1, 2))

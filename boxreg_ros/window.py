@@ -110,7 +110,8 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     boxes, times, ground = np.zeros((B, N, 9)), np.zeros((B, N)), np.full((B, N), np.nan)
     points, origins = np.full((*mask.shape, 3), AWAY, dtype=np.float32), np.zeros((B, N, 3))
     delays = np.zeros(mask.shape, dtype=np.float32)
-    boxes[valid], origins[valid] = [o.box for o in every], [o.origin for o in every]
+    boxes[valid] = np.concatenate([o.box for o in every]).reshape(-1, 9)
+    origins[valid] = np.concatenate([o.origin for o in every]).reshape(-1, 3)
     ground[valid] = [o.ground for o in every]
     begin = np.repeat([w.observations[0].stamp_ns for w in windows], lengths)
     times[valid] = (np.array([o.stamp_ns for o in every]) - begin) * 1e-9
