@@ -223,14 +223,14 @@ def traffic(tracks: int, points: int, count: int) -> Iterator[Instant]:
 
 def tick(config: Config, tracks: int, points: int) -> dict[str, float]:
     """
-    Return where one tick of a live stream goes [ms], the median of several full windows.
+    Return where one tick of a live stream goes [ms], the median of forty full windows.
 
     ``first`` is the first tick that solves anything, ``first full`` that with the first full
     window.
 
     """
     registrar, times = BoxRegistrar(config), []
-    for stamp, T, cloud, boxes in traffic(tracks, points, config.window + 12):
+    for stamp, T, cloud, boxes in traffic(tracks, points, config.window + 42):
         message = _message(cloud)
         marks = [perf_counter()]
         sweep = replace(pointcloud.from_msg(message), stamp_ns=stamp)
