@@ -199,6 +199,15 @@ def test_a_track_too_short_is_kept(estimate, n):
     assert refined.reasons == ('short_track',) * n
 
 
+@each_estimate
+def test_two_observations_are_enough_where_that_is_asked_for(estimate):
+    """Second differences need three: the terms that have them have none here."""
+    track, _ = a_track(n=2)
+    refined = only(track, Config(estimate=estimate).updated({'min_observations': 2}))
+    assert refined.status[-1] == 'refined'
+    assert np.isfinite(refined.boxes).all()
+
+
 def test_an_empty_track_and_no_tracks():
     track = Track('1', 'car', [], np.zeros((0, 9)), [])
     assert only(track).status == ()
