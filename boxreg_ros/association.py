@@ -38,10 +38,8 @@ class StampMatcher:
     def __init__(self, config: Config, counts: Counter[str]) -> None:
         self._tolerance_ns = round(config.tolerance * 1e9)
         self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
-        self._capacity = config.queue
-        self._counts = counts
-        self._sweeps, self._boxes = list[Sweep](), list[BoxArray]()
-        self._used: set[int] = set()
+        self._capacity, self._counts = config.queue, counts
+        self._sweeps, self._boxes, self._used = list[Sweep](), list[BoxArray](), set[int]()
         self._newest_ns = self._oldest_ns = -inf  # sweep that came, sweep that is still of use
 
     def add_sweep(self, sweep: Sweep) -> list[Pair]:

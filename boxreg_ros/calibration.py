@@ -15,7 +15,7 @@ from torch import Tensor
 KINDS = ([0, 1], [2, 3], [4], [5])  # ends, sides, top, bottom
 RULE_ERROR = (0.05, 0.05, 0.05, 0.15)  # how far a rule may be from the expected one [m]
 TRACKS, SCATTERS = 200, 100  # remembered: tracks, and observations of each
-LEAST = 20  # observations of a track, that it tells how its input errs
+LEAST = 14  # observations of a track, that it tells how its input errs
 HELD = 1e-3  # step of a box that only repeats the one before [m, rad]
 
 
@@ -57,8 +57,11 @@ class InputNoise(NamedTuple):
         # What never changes, such as an extent that a tracker holds, errs by the same all along;
         # one or two tracks cannot tell it from the gap of their faces.
         held = 1 - 2 / valid.any(1).sum()
-        correlation = torch.where(power > 1e-12, (first * second).sum(0) / power, held)
-        return cls(deviation, correlation.clamp(0.0, 0.9), offset, total / (total + LEAST))
+        slow = torch.where(power > 1e-12, (first * second).sum(0) / power, held).clamp(0.0, 0.9)
+        # The mean of a track takes part of what changes slowly along.
+        lost = (1 + slow) / (1 - slow) * valid.any(1).sum() / total
+        deviation = deviation / (1 - lost).clamp(min=0.3).sqrt()
+        return cls(deviation, slow, offset, total / (total + LEAST))
 
 
 def scatter(problem: Problem, state: State) -> Tensor:

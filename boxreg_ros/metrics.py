@@ -95,8 +95,7 @@ def _intersection(a: Floats, b: Floats) -> Floats:
     offsets = np.concatenate([half_a, half_a, half_b + shift, half_b - shift], axis=1)  # (n, 12)
 
     i, j = np.triu_indices(12, 1)
-    d_i, d_j = offsets[:, i], offsets[:, j]
-    dots = normals @ np.swapaxes(normals, 1, 2)
+    d_i, d_j, dots = offsets[:, i], offsets[:, j], normals @ np.swapaxes(normals, 1, 2)
     along = np.cross(normals[:, i], normals[:, j])  # (n, 66, 3)
     sine, cosine = np.linalg.norm(along, axis=2), dots[:, i, j]
     parallel = sine < 1e-12

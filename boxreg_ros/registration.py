@@ -24,13 +24,15 @@ PRIOR_OUTLIER = SWERVE = 3.0  # so many deviations off an input loses half its s
 USUAL = 0.385  # correlation of the errors of an input from one observation to the next
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
 TENTH = 0.1  # of a second, over which errors that are biased are correlated
-SETTLED = 0.2  # a window whose boxes move less, in errors of the input, is done
+HEARD = 2  # rounds that tell the noise: fits follow it, and would make it seem ever smaller
+KNOWN = 0.75  # of the way from the extents of the input to those found, a tick begins
+SETTLED = 0.1  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 2500  # observations a thread works on at once: fewer cost calls, more cost memory
-COARSE = 256  # points of a box that tell where it is but for the last round
-SHOWN = 64  # points of a box that show the shape of its track
+# Points of a box that tell where it is but for the last round, and that show its track's shape.
+COARSE, SHOWN = 256, 64
 APART = 0.5, 0.7  # tracks so far off are biased, and by no more than that [usual errors]
-CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
+CAREFUL = 0.4  # part of the usual error: boxes that scatter less were drawn with care
 MOTION = objective.acceleration, objective.slip
 # What is slower [m/s], moved less [m] and turned less [errors of a heading] is parked; it rests
 # where it is not faster for half a second [m/s].
@@ -96,8 +98,7 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
     for rows in groups:
         _learn(model, [windows[i] for i in rows], config)
     for rows in groups:
-        part = [windows[i] for i in rows]
-        problem, base = stack(part, config)
+        problem, base = stack(part := [windows[i] for i in rows], config)
         if config.objective == 'paper':
             solved = solve_paper(problem, config)
         else:
@@ -164,6 +165,8 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     enough = COARSE if rounds > 1 else torch.inf
     everyone = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), everyone.clone())
+    # A tick judges faces by the extents found before it, damped, for these may be wrong.
+    state.shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], KNOWN * (rounds == 1))
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
     unknown = torch.full_like(problem.recalled, torch.nan)
     seen = problem.seen + pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
@@ -173,8 +176,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     @torch.inference_mode()
     def improve(rows: Tensor) -> Tensor:
         """Take round `turn` with some windows, `enough` points; return those not done."""
-        part, here = select(problem.thinned(enough), rows), select(state, rows)
-        expected = everyone[rows]
+        part, here, expected = select((problem.thinned(enough), state, everyone), rows)
         here.shared[:, objective.ANCHOR] = 0.0
         sights = support(part, here, config.faces.outermost, rule)
         # `any` would take three times as long; of two boxes some terms have no weights at all.
@@ -184,8 +186,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         if turn > 0 and is_track:
             information, wanted = agreement(part.thinned(SHOWN), here)
             terms.append(Term(objective.shape, information[:, :, None], (here.pose, wanted)))
-        x = here.pack()
-        total = Sum(terms, x, length, free[rows])
+        total = Sum(terms, x := here.pack(), length, free[rows])
         best = State.unpack(minimize(total, x, *limits, total.newton).x, length)
         moved = ((best.pose - here.pose) / part.of(*ERRORS)[:, None]).square().mean(2).amax(1)
         state.pose[rows], state.shared[rows] = best  # `here` may be a view of it
@@ -205,7 +206,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
             n = min(len(rows), workers * int(1 + len(rows) / size / workers))
             ends = pool.map(improve, rows.tensor_split(n)) if len(rows) > size else [improve(rows)]
             rows, turn = torch.cat(list(ends)), turn + 1
-            if is_track:
+            if is_track and turn <= HEARD:
                 noise = InputNoise.measure(scatter(problem, state))
             if not len(rows) and 2 * enough <= problem.points.shape[2]:
                 rows, enough = every, torch.inf  # where few points lead to, all of them tell
@@ -413,10 +414,16 @@ def free_variables(problem: Problem, config: Config) -> Tensor:
 
 @torch.inference_mode()
 def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None:
-    """Show the model the fresh observations at their input boxes."""
+    """
+    Show the model the fresh observations at their input boxes, live turned as they were fitted.
+
+    The outermost points of a box given askew are its corners, which stand further out.
+
+    """
     if fresh := [window.fresh_part() for window in windows if window.fresh > 0]:
         problem, rule = stack(fresh, config)[0].thinned(COARSE), model.rule()
-        state = State(problem.pose, expected_shared(problem, rule))
+        pose = torch.cat([problem.boxes[..., :3], problem.start[..., 6:]], -1)
+        state = State(pose, expected_shared(problem, rule))
         sights = support(problem, state, config.faces.outermost, rule)
         model.learn_rule([window.track_id for window in fresh], sights, problem.valid, rule)
 

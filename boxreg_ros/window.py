@@ -79,9 +79,10 @@ class Window(NamedTuple):
         return self.fresh == 1 and len(self.start) == len(self.observations) - 1 > 1
 
     def fresh_part(self) -> 'Window':
-        """Return the window of the fresh observations alone, of very many an even part."""
-        observations = self.observations[-self.fresh :: 1 + self.fresh // TELLING]
-        return self._replace(observations=observations, start=np.zeros((0, 9)), memory=None)
+        """Return the window of what is fresh, of very many an even part, but for the newest."""
+        last = len(self.observations) - 1
+        part = slice(max(0, last - self.fresh), last, 1 + self.fresh // TELLING)
+        return Window(*self[:2], self.observations[part], self.fresh, self.start[part])
 
 
 def batches(windows: Sequence[Window], config: Config) -> list[list[int]]:

@@ -14,7 +14,7 @@ NAMES = list(INGREDIENTS)[1:]
 
 @pytest.fixture(scope='module')
 def scene():
-    # Long enough that noise is measured (20 boxes of a track), and full of neighbours.
+    # Long enough that noise is measured (14 boxes of a track), and full of neighbours.
     return simulate('street', seed=3, sweeps=24)
 
 

@@ -180,7 +180,7 @@ def test_kinds_have_errors_of_their_own():
 
 
 def test_short_tracks_tell_no_errors():
-    found = input_errors(noisy_drive(DEVIATION, n=19), Config())
+    found = input_errors(noisy_drive(DEVIATION, n=13), Config())
     assert found['vehicle.position'].tracks == 0
     assert calibrated(Config(), found) == {}
 

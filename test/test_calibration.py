@@ -69,7 +69,14 @@ def test_how_far_tracks_are_off_by_hand():
     values[5, LEAST - 1 :] = torch.nan
     noise = InputNoise.measure(values[..., None].repeat(1, 1, 9))
     np.testing.assert_allclose(noise.offset, 1.48 * 0.2)
-    np.testing.assert_allclose(noise.deviation, 1.48 * 0.3)
+    # A mean of n that are not correlated takes an n-th of their power.
+    np.testing.assert_allclose(noise.deviation, 1.48 * 0.3 / np.sqrt(1 - 1 / (2 * LEAST)))
+
+
+def test_short_tracks_tell_the_size_of_slow_errors_too():
+    # Correlated by 0.6, a mean of 14 takes some 1.6 / 0.4 / 14 = 0.29 of their power.
+    noise = InputNoise.measure(autoregressive(400, LEAST, np.ones(9), 0.6, seed=5))
+    np.testing.assert_allclose(noise.deviation, 1.0, rtol=0.12)
 
 
 def test_correlation_stays_in_its_bounds():
@@ -103,7 +110,7 @@ def test_short_tracks_do_not_tell_and_padding_does_not_count():
     found = InputNoise.measure(values)
     np.testing.assert_allclose(found.deviation, known.deviation)
     np.testing.assert_allclose(found.correlation, known.correlation)
-    assert found.trust == known.trust == 60 / 80
+    assert found.trust == known.trust == 60 / (60 + LEAST)
 
 
 def seen(problem):

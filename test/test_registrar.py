@@ -418,13 +418,13 @@ def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate):
 
 @pytest.mark.parametrize('estimate', ['early', 'final'])
 def test_a_new_track_of_a_known_id_remembers_nothing(estimate):
-    # Eleven boxes, a silence, then eleven under the same id, in windows of six; too few for the
+    # Eight boxes, a silence, then eight under the same id, in windows of six; too few for the
     # noise of the input to be measured. All that follow are as if nothing had been before.
     config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
-    whole = stream_of([track_of(drive(33), np.random.default_rng(0), 'a')])
+    whole = stream_of([track_of(drive(30), np.random.default_rng(0), 'a')])
     registrar = BoxRegistrar(config)
-    fed(registrar, whole[:11])
-    assert registrar._tracks['a'].memory.seen[3] == 6  # of 11, five are still in the window
+    fed(registrar, whole[:8])
+    assert registrar._tracks['a'].memory.seen[3] == 3  # of 8, five are still in the window
     results = fed(registrar, whole[22:23])
     assert registrar._tracks['a'].memory is None
     results += fed(registrar, whole[23:]) + registrar.flush()
@@ -556,7 +556,8 @@ def test_an_id_that_another_object_gets_begins_a_track(estimate):
 
     new, swapped = overlap('c', 'd'), overlap('a', 'b')
     assert swapped.mean() > new.mean() - 0.02
-    assert swapped.min() > new.min() - 0.1
+    # A window with one foreign box tells the oldest of it for good before two tell of the swap.
+    assert swapped.min() > new.min() - 0.12
 
 
 def test_torch_has_one_thread_meanwhile(stream, monkeypatch):

@@ -192,9 +192,13 @@ def test_a_solved_window_starts_where_it_was():
     known = np.zeros((4, 9))
     known[:3, 0] = 0.2
     np.testing.assert_allclose(problem.start[0] - problem.boxes[0], known, atol=1e-12)
+    # What was the newest when it was solved is learnt from now, as it was fitted.
     fresh = window.fresh_part()
-    assert fresh.observations == window.observations[3:]
-    np.testing.assert_array_equal(stack([fresh], CONFIG)[0].start, stack([fresh], CONFIG)[0].boxes)
+    assert fresh.observations == window.observations[2:3]
+    np.testing.assert_array_equal(fresh.start, solved[2:])
+    first = window._replace(fresh=4, start=solved[:0]).fresh_part()
+    assert first.observations == window.observations[:3]
+    np.testing.assert_array_equal(stack([first], CONFIG)[0].start, stack([first], CONFIG)[0].boxes)
 
 
 def test_batches_hold_every_window_that_is_long_enough_once():
