@@ -32,7 +32,7 @@ PART = 2500  # observations a thread works on at once: fewer cost calls, more co
 # Points of a box that tell where it is but for the last round, and that show its track's shape.
 COARSE, SHOWN = 256, 64
 APART = 0.5, 0.7  # tracks so far off are biased, and by no more than that [usual errors]
-CAREFUL = 0.4  # part of the usual error: boxes that scatter less were drawn with care
+CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
 MOTION = objective.acceleration, objective.slip
 # What is slower [m/s], moved less [m] and turned less [errors of a heading] is parked; it rests
 # where it is not faster for half a second [m/s].
