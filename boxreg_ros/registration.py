@@ -161,17 +161,17 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     """
     length, solver, is_track = problem.boxes.shape[1], config.solver, config.estimate == 'track'
     limits = solver.iterations, solver.history, solver.tolerance
-    rule, noise, turn = model.rule(), model.noise(), 0
+    rule, noise, turn, share = model.rule(), model.noise(), 0, KNOWN * (rounds == 1)
     enough = COARSE if rounds > 1 else torch.inf
     everyone = expected_shared(problem, rule)
     state = State(problem.start[..., POSE].clone(), everyone.clone())
-    # A tick judges faces by the extents found before it, damped, for these may be wrong.
-    state.shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], KNOWN * (rounds == 1))
+    free = free_variables(problem, config)
+    # A tick judges faces by extents found before it, if free: damped, for these may be wrong.
+    state.shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], share * free[:, -SHARED:][:, EXTENT])
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
     unknown = torch.full_like(problem.recalled, torch.nan)
     seen = problem.seen + pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
     left = unknown, unknown.clone(), problem.information.clone(), seen
-    free = free_variables(problem, config)
 
     @torch.inference_mode()
     def improve(rows: Tensor) -> Tensor:
