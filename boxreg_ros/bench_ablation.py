@@ -87,9 +87,9 @@ def _as_given(boxes: Floats, *_: NDArray[Any]) -> Floats:
     return np.unwrap(boxes[..., YAW])
 
 
-def _sharp(problem: Problem) -> Tensor:
+def _sharp(problem: Problem, openness: Tensor) -> Tensor:
     """Stand in for `retreat`: hidden faces are like open ones."""
-    return _retreat(problem) * torch.tensor([0.0, 1.0])[:, None, None, None]
+    return _retreat(problem, openness) * torch.tensor([0.0, 1.0])[:, None, None, None]
 
 
 _free_variables, _retreat = registration.free_variables, correspondence.retreat

@@ -101,16 +101,16 @@ def aspect(problem: Problem) -> Tensor:
     return torch.cat([sides, sides.new_tensor([9.0, -9.0]).expand(*sides.shape[:2], 2)], -1)
 
 
-def retreat(problem: Problem) -> Tensor:
+def retreat(problem: Problem, openness: Tensor) -> Tensor:
     """
     Return how much further in the outermost points of the faces stand, shape (2, B, N, 6).
 
-    As parts of what the rule tells: of its depths for how hidden a face is, since a body is round
-    at its edges, and of what it tells of distant ones, where fewer points reach the outermost
-    parts.
+    As parts of what the rule tells: of its depths for how hidden a face is by its `openness`
+    (B, N, 6), see `aspect`, since a body is round at its edges, and of what it tells of distant
+    ones, where fewer points reach the outermost parts.
 
     """
-    shifted = problem.openness + problem.openness.new_tensor(LEAD)
+    shifted = openness + openness.new_tensor(LEAD)
     hidden = 0.5 - 0.5 * shifted / (shifted.square() + TURN).sqrt()
     beyond = problem.origins[..., :2].norm(dim=-1, keepdim=True).nan_to_num() - DISTANCE[0]
     return torch.stack([hidden, (1 - hidden) * (beyond / DISTANCE[1]).clamp(0, 1.5)])
@@ -146,7 +146,7 @@ def support(problem: Problem, state: State, outermost: float, rule: Rule) -> Sup
     to the stamp of the box.
 
     """
-    points, shares = carried(problem, state), retreat(problem)
+    points, shares = carried(problem, state), retreat(problem, openness := aspect(problem))
     half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]
     distant = shares[1] * rule.distant.to(shares)
     inset = shares[0] * rule.depths.to(shares) + distant
@@ -174,7 +174,7 @@ def support(problem: Problem, state: State, outermost: float, rule: Rule) -> Sup
     best = pad(best, (0, 1), value=1.0)
     moments = product((best * weight[..., None]).flatten(3, 4).mT, best.flatten(3, 4))
     out = -(torch.where(chosen, depth, 0.0) * weight).sum((-1, -2))
-    trust = (number >= LEAST) * torch.where(problem.openness[..., :BOTTOM] > 0, 1.0, VEILED)
+    trust = (number >= LEAST) * torch.where(openness[..., :BOTTOM] > 0, 1.0, VEILED)
     trust = trust / (1 + (distant[..., :BOTTOM] / BLURRED) ** 2)
     # The bottom is where a point of the road is, under the centre of the box.
     shift = state.pose[..., :3] - problem.pose[..., :3]

@@ -10,31 +10,21 @@ FACE_SIGN = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
 
 def rotation_from_rpy(rpy: Tensor) -> Tensor:
     """Return R = Rz(yaw) Ry(pitch) Rx(roll), shape (..., 3, 3), of `rpy` (..., 3) [rad]."""
-    cos, sin = torch.cos(rpy := rpy.contiguous()), torch.sin(rpy)  # of a slice 9 times as slow
-    return torch.stack(_rotation(cos, sin), -1).view(*rpy.shape, 3)
+    rpy = rpy.contiguous()  # of a slice sines take 9 times as long
+    (cr, cp, cy), (sr, sp, sy) = rpy.cos().unbind(-1), rpy.sin().unbind(-1)
+    x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
+    y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
+    return torch.stack([*x, *y, -sp, cp * sr, cp * cr], -1).view(*rpy.shape, 3)
 
 
 def rotation_derivatives(rpy: Tensor) -> tuple[Tensor, Tensor]:
     """Return R (..., 3, 3) and its derivatives (..., 3, 3, 3) by roll, pitch and yaw, in front."""
-    cos, sin = torch.cos(rpy := rpy.contiguous()), torch.sin(rpy)
-    (cr, cp, cy), (sr, _, sy) = cos.unbind(-1), sin.unbind(-1)
-    entries = _rotation(cos, sin)
-    a, b, c, d, e, f, g, h, i = entries
-    o = torch.zeros_like(a)
+    R, cos, sin = rotation_from_rpy(rpy), rpy[..., 2:].cos(), rpy[..., 2:].sin()
     # Roll turns the y axis into z, yaw turns the rows of x into those of y: no products needed.
-    by_roll = [o, c, -b, o, f, -e, o, i, -h]
-    by_pitch = [cy * g, cy * h, cy * i, sy * g, sy * h, sy * i, -cp, g * sr, g * cr]
-    by_yaw = [-d, -e, -f, a, b, c, o, o, o]
-    every = torch.stack([*entries, *by_roll, *by_pitch, *by_yaw], -1).unflatten(-1, (4, 3, 3))
-    return every[..., 0, :, :], every[..., 1:, :, :]
-
-
-def _rotation(cos: Tensor, sin: Tensor) -> list[Tensor]:
-    """Return the nine entries of R, row by row."""
-    (cr, cp, cy), (sr, sp, sy) = cos.unbind(-1), sin.unbind(-1)
-    x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
-    y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
-    return [*x, *y, -sp, cp * sr, cp * cr]
+    (_, left, up), (x, y, z) = R.unbind(-1), R.unbind(-2)
+    by_roll = torch.stack([0 * up, up, -left], -1)
+    by_pitch = torch.stack([cos * z, sin * z, -cos * x - sin * y], -2)
+    return R, torch.stack([by_roll, by_pitch, torch.stack([-y, x, 0 * z], -2)], -3)
 
 
 def wrap_angle(angle: Tensor) -> Tensor:

@@ -1,7 +1,5 @@
 """How far boxes (n, 9) are from true ones, row by row in one frame: overlap and pose errors."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from boxreg_ros.geometry import rotation_from_rpy, wrap_angle

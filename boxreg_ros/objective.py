@@ -55,8 +55,6 @@ class Problem(NamedTuple):
         Sum of the input extents that have left, and their number.
     deviations : Tensor, shape (B, D)
         The numbers of each window's `ClassConfig`, in the order of `DEVIATIONS`.
-    openness : Tensor, shape (B, N, 6)
-        How openly the sensor sees each face of the input, see `aspect`.
 
     """
 
@@ -73,7 +71,6 @@ class Problem(NamedTuple):
     information: Tensor
     seen: Tensor
     deviations: Tensor
-    openness: Tensor
 
     @property
     def pose(self) -> Tensor:
@@ -396,13 +393,18 @@ def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:
     return Linearised(residual, by_pose, by_shared)
 
 
+def step(state: State, start: Tensor, axes: Tensor, part: slice) -> Linearised:
+    """Step of the poses from `start` along `axes`, less that `part` of what is shared [m, rad]."""
+    along = torch.eye(6).to(start).repeat(*start.shape[:2], 1, 1, 1)
+    along[..., :3, :3] = axes.mT[..., None, :, :]
+    residual = (along @ (state.pose - start)[..., None, :, None])[..., 0]
+    by_shared = -torch.eye(part.stop).to(start)[None, part]
+    return Linearised(residual - state.shared[:, None, None, part], along, by_shared)
+
+
 def prior(state: State, given: Tensor, axes: Tensor) -> Linearised:
     """Deviation of the poses from the `given` ones along `axes`, less the bias [m, rad]."""
-    along = torch.eye(6).to(given).repeat(*given.shape[:2], 1, 1, 1)
-    along[..., :3, :3] = axes.mT[..., None, :, :]
-    residual = (along @ (state.pose - given)[..., None, :, None])[..., 0]
-    by_shared = -torch.eye(BIAS.stop).to(given)[None, BIAS]
-    return Linearised(residual - state.shared[:, None, None, BIAS], along, by_shared)
+    return step(state, given, axes, BIAS)
 
 
 def shape(state: State, start: Tensor, wanted: Tensor) -> Linearised:
@@ -410,17 +412,11 @@ def shape(state: State, start: Tensor, wanted: Tensor) -> Linearised:
     Step of the poses from `start`, in box axes, less the step `wanted` [m, rad].
 
     The shape of a track is known up to where it stands in its box: all steps less the anchor.
+    Vehicles tilt so little that their turns are those of roll, pitch and yaw.
 
     """
-    cr, cp, _ = start[..., 3:].cos().unbind(-1)
-    sr, sp, _ = start[..., 3:].sin().unbind(-1)
-    along = torch.eye(6).to(start).repeat(*start.shape[:2], 1, 1, 1)
-    along[..., :3, :3] = rotation_from_rpy(start[..., None, 3:]).mT
-    along[..., 0, 3:, 4] = torch.stack([torch.zeros_like(cr), cr, -sr], -1)
-    along[..., 0, 3:, 5] = torch.stack([-sp, sr * cp, cr * cp], -1)
-    residual = (along @ (state.pose - start)[..., None, :, None])[..., 0] - wanted[..., None, :]
-    by_shared = -torch.eye(SHARED).to(start)[None, ANCHOR]
-    return Linearised(residual - state.shared[:, None, None, ANCHOR], along, by_shared)
+    r, J, S = step(state, start, rotation_from_rpy(start[..., 3:]), ANCHOR)
+    return Linearised(r - wanted[..., None, :], J, S)
 
 
 def acceleration(state: State, times: Tensor) -> Linearised:

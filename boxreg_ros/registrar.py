@@ -112,10 +112,9 @@ class BoxRegistrar:
 
     def _open(self, pair: Pair) -> '_Tick':
         """Start a tick: sort its boxes out and add an observation to the track of each."""
-        boxes, sweep = pair
+        boxes, sweep, now_ns = *pair, pair.boxes.stamp_ns
         tick = _Tick(boxes)
         self._ticks.append(tick)
-        now_ns = boxes.stamp_ns
         newest_ns, self._newest_ns = self._newest_ns, max(now_ns, self._newest_ns)
         late = '' if now_ns > newest_ns else 'late' if now_ns < newest_ns else 'duplicate_stamp'
         tick.is_paired = sweep is not None and not late

@@ -5,7 +5,6 @@ from dataclasses import astuple
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.correspondence import aspect
 from boxreg_ros.objective import MEMORY, Problem, SHARED
 from boxreg_ros.sampling import Observation
 from boxreg_ros.structures import Floats, ROLL, YAW
@@ -143,9 +142,7 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     numbers = np.array([rows[window.class_name] for window in windows], dtype=np.float64)
     arrays: list[Any] = [boxes, start, valid, times, points, mask, delays, origins, ground]
     arrays += [np.nan_to_num(recalled), information, seen, numbers]
-    parts: list[Any] = [torch.from_numpy(array).to(device) for array in arrays]
-    problem = Problem(*[*parts, torch.empty(0)])
-    return problem._replace(openness=aspect(problem)), base
+    return Problem(*(torch.from_numpy(array).to(device) for array in arrays)), base
 
 
 def one_heading(boxes: Floats, times: Floats, valid: NDArray[np.bool_], known: Floats) -> Floats:

@@ -2,7 +2,6 @@
 
 from boxreg_ros import objective
 from boxreg_ros.chain import LINK
-from boxreg_ros.correspondence import aspect
 from boxreg_ros.objective import DEVIATIONS, MEMORY, Problem, SHARED
 from boxreg_ros.sampling import observe
 from boxreg_ros.structures import BoxArray, Sweep
@@ -106,8 +105,7 @@ def problem_of(boxes, **changes):
     """
     Return the problem of `boxes` (B, N, 9), but for `changes`.
 
-    One every 0.1 s, without points or memory, faces as open as the origins say. `deviations` are
-    by name, those not given are NaN.
+    One every 0.1 s, without points or memory. `deviations` are by name, those not given are NaN.
 
     """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
@@ -127,14 +125,13 @@ def problem_of(boxes, **changes):
         'information': torch.zeros(B, MEMORY, MEMORY, dtype=torch.float64),
         'seen': torch.zeros(B, 4, dtype=torch.float64),
         'deviations': torch.full((B, len(DEVIATIONS)), torch.nan, dtype=torch.float64),
-        'openness': torch.empty(0),
     }
     for name, values in changes.pop('deviations', {}).items():
         given['deviations'][:, DEVIATIONS.index(name)] = torch.as_tensor(values)
     more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
     problem = Problem(**{**given, **more})
     problem.points[~problem.mask] = AWAY
-    return problem if 'openness' in changes else problem._replace(openness=aspect(problem))
+    return problem
 
 
 def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):

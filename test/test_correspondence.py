@@ -40,8 +40,8 @@ def test_without_a_sensor_the_centre_of_mass_tells_the_open_faces():
 
 def test_retreat_grows_as_a_face_turns_away():
     open_ = torch.linspace(-50, 50, 201, dtype=D)[None, :, None].expand(-1, -1, 6)
-    problem = problem_of([[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 201], openness=open_)
-    hidden, distant = retreat(problem)[:, 0]
+    problem = problem_of([[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 201])
+    hidden, distant = retreat(problem, open_)[:, 0]
     assert (hidden.diff(dim=0) <= 0).all()
     np.testing.assert_allclose(hidden[0], 1, atol=1e-4)
     np.testing.assert_allclose(hidden[-1], 0, atol=1e-4)
@@ -55,7 +55,8 @@ def test_points_of_what_is_far_stand_further_in(away, share):
     # From 20 m on by a part of what is learnt that grows to 1 in another 50 m, 1.5 at most; what
     # counts is the distance on the ground. The front and the roof are open, the back and the
     # bottom hidden: they stand further in for that alone.
-    hidden, distant = retreat(seen_from([0.6 * away, 0.8 * away, 5.0]))[:, 0, 0]
+    problem = seen_from([0.6 * away, 0.8 * away, 5.0])
+    hidden, distant = retreat(problem, aspect(problem))[:, 0, 0]
     np.testing.assert_allclose(distant, share * (1 - hidden))
     assert (hidden[[0, 2, 4]] < 0.2).all()
     assert (hidden[[1, 3, 5]] > 0.8).all()
