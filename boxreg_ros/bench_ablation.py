@@ -130,6 +130,9 @@ INGREDIENTS = {
     'memory': Ingredient(
         'live, what has left the window is forgotten', replaced=((window, 'FADING', 0.0),)
     ),
+    'extents of others': Ingredient(
+        'extents are expected as the input has them', replaced=((calibration, 'SLOPES', 1e-9),)
+    ),
     'one extent': Ingredient('each box keeps the extent of its input', {'extent': 'fixed'}),
     'ownership': Ingredient(
         "a neighbour's points count too", replaced=((registrar, 'observe', _each_alone),)

@@ -25,7 +25,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from boxreg_ros import objective, sampling
-from boxreg_ros.calibration import InputModel, InputNoise
+from boxreg_ros.calibration import expect, InputModel
 from boxreg_ros.config import Config
 from boxreg_ros.correspondence import support
 from boxreg_ros.lbfgs import minimize, Minimum, select
@@ -33,7 +33,7 @@ from boxreg_ros.metrics import iou_3d
 from boxreg_ros.objective import EXTENT, State, Sum, Term
 from boxreg_ros.recorder import write_recording
 from boxreg_ros.registrar import BoxRegistrar
-from boxreg_ros.registration import expected_shared, free_variables, Solution, solve, weigh
+from boxreg_ros.registration import free_variables, Solution, solve, weigh
 from boxreg_ros.sampling import observe
 from boxreg_ros.simulate import simulate
 from boxreg_ros.structures import BoxArray, Floats, POSE, Sweep
@@ -143,7 +143,7 @@ def fixed(problem: objective.Problem, config: Config, references: int) -> dict[s
     """
     rule, length = InputModel(config.faces).rule(), problem.boxes.shape[1]
     start, free = (
-        State(problem.pose, expected_shared(problem, rule)),
+        State(problem.pose, expect(problem, rule).shared),
         free_variables(problem, config),
     )
     terms, x = _terms(problem, start, config), start.pack()
@@ -376,7 +376,7 @@ def reference(problem: objective.Problem, config: Config) -> State:
     """Solve as `registration.solve` does, by `torch.optim.LBFGS` and automatic derivatives."""
     length, rule = problem.boxes.shape[1], InputModel(config.faces).rule()
     free = free_variables(problem, config)
-    state = State(problem.pose.clone(), expected_shared(problem, rule))
+    state = State(problem.pose.clone(), expect(problem, rule).shared)
     for _ in range(config.solver.rounds):
         terms = _terms(problem, state, config)
         x = _torch_minimum(terms, state.pack(), length, free, config)
@@ -409,7 +409,7 @@ def _torch_minimum(
 def _terms(problem: objective.Problem, state: State, config: Config) -> list[Term]:
     rule = InputModel(config.faces).rule()
     sights = support(problem, state, config.faces.outermost, rule)
-    return weigh(problem, state, sights, expected_shared(problem, rule), InputNoise(), config)
+    return weigh(problem, state, sights, expect(problem, rule), config)
 
 
 def _total(terms: Sequence[Term], state: State) -> Tensor:

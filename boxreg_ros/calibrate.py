@@ -17,7 +17,7 @@ from typing import Any
 
 from boxreg_ros.arguments import add_recording_arguments, config_from, convention_from
 from boxreg_ros.boxtable import BoxTable
-from boxreg_ros.calibration import InputModel, InputNoise, LEAST, scatter, TRACKS
+from boxreg_ros.calibration import expect, InputModel, InputNoise, LEAST, scatter, TRACKS
 from boxreg_ros.calibration import KINDS as FACE_KINDS
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.correspondence import Rule, support
@@ -25,7 +25,6 @@ from boxreg_ros.drive import Drive
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.objective import EXTENT, State
 from boxreg_ros.recording import Recording
-from boxreg_ros.registration import expected_shared
 from boxreg_ros.results import spare_file
 from boxreg_ros.sampling import Observation, observe
 from boxreg_ros.structures import Floats, LENGTH, ROLL
@@ -162,7 +161,7 @@ def _errors_of_kind(
     half_turns = torch.tensor([2.0, 2.0, 1.0]) * torch.pi
     pose[..., 3:] += half_turns * ((problem.pose - pose)[..., 3:] / half_turns).round()
     rule = Rule(*torch.zeros(3, 6))
-    extent = expected_shared(true, rule)
+    extent = expect(true, rule).shared
     off = scatter(problem, State(pose, extent))
     off = off[off.isfinite().all(2).sum(1) >= LEAST]  # the boxes of others were held
 
@@ -178,7 +177,7 @@ def _errors_of_kind(
         for name, value, spread in zip(ERRORS, deviations(slice(None)), spreads, strict=False):
             found[name] = Measured(float(value), spread, len(off))
     # What counts for the one extent of a track is the error of its mean.
-    error = (expected_shared(problem, rule) / extent)[:, EXTENT].numpy() - 1
+    error = (expect(problem, rule).shared / extent)[:, EXTENT].numpy() - 1
     size = 1.48 * np.median(np.abs(error), axis=1)
     found['extent'] = Measured(
         1.48 * float(np.median(np.abs(error))), _deviation(size - np.median(size)), len(tracks)
@@ -329,7 +328,7 @@ def _show(model: InputModel, windows: Sequence[Window], config: Config, rule: Ru
     for rows in batches(windows, config):
         part = [windows[i] for i in rows]
         problem, _ = stack(part, config)
-        state = State(problem.pose, expected_shared(problem, rule))
+        state = State(problem.pose, expect(problem, rule).shared)
         sights = support(problem, state, config.faces.outermost, rule)
         model.learn_rule([w.track_id for w in part], sights, problem.valid, rule)
 

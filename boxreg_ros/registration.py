@@ -6,12 +6,12 @@ from multiprocessing import cpu_count
 from typing import NamedTuple
 
 from boxreg_ros import objective
-from boxreg_ros.calibration import InputModel, InputNoise, scatter
+from boxreg_ros.calibration import expect, Expected, extents_told, InputModel, InputNoise, scatter
 from boxreg_ros.config import Config
 from boxreg_ros.correspondence import in_box_axes, Rule, Support, support
 from boxreg_ros.geometry import FACE_AXIS, rotation_from_rpy, wrap_angle
 from boxreg_ros.lbfgs import minimize, select
-from boxreg_ros.objective import ERRORS, EXTENT, Problem, remembered, SHARED, State, Sum, Term
+from boxreg_ros.objective import ERRORS, EXTENT, GAP, Problem, remembered, SHARED, State, Sum, Term
 from boxreg_ros.shape import agreement
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED, YAW
 from boxreg_ros.window import batches, Memory, stack, Window
@@ -21,18 +21,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 PRIOR_OUTLIER = SWERVE = 3.0  # so many deviations off an input loses half its say, motion 3/4
-USUAL = 0.385  # correlation of the errors of an input from one observation to the next
 GAP_OUTLIER = 2.0  # a gap this many deviations off has lost half its say
-TENTH = 0.1  # of a second, over which errors that are biased are correlated
 HEARD = 2  # rounds that tell the noise: fits follow it, and would make it seem ever smaller
-KNOWN = 0.75  # of the way from the extents of the input to those found, a tick begins
 SETTLED = 0.1  # a window whose boxes move less, in errors of the input, is done
 ROUNDING = 0.3  # of the paper's norms in the first round, squared [m^2]
 PART = 2500  # observations a thread works on at once: fewer cost calls, more cost memory
 # Points of a box that tell where it is but for the last round, and that show its track's shape.
 COARSE, SHOWN = 256, 64
-APART = 0.5, 0.7  # tracks so far off are biased, and by no more than that [usual errors]
-CAREFUL = 0.3  # part of the usual error: boxes that scatter less were drawn with care
 MOTION = objective.acceleration, objective.slip
 # What is slower [m/s], moved less [m] and turned less [errors of a heading] is parked; it rests
 # where it is not faster for half a second [m/s].
@@ -66,12 +61,15 @@ class Solution(NamedTuple):
         Of the poses: blocks of the inverse of the curvature.
     left : tuple of Tensor
         What full windows leave to `Memory`, its base excepted; NaN where they are not full.
+    told : Tensor, shape (B, 3, 3)
+        What the points tell of the extents, see `InputNoise`.
 
     """
 
     state: State
     covariances: Tensor
     left: tuple[Tensor, ...] = ()
+    told: Tensor = torch.zeros(0)
 
 
 def register(windows: list[Window], config: Config, model: InputModel) -> list[Estimate | None]:
@@ -103,11 +101,10 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
             solved = solve_paper(problem, config)
         else:
             solved = solve(problem, config, model, 1 if part[0].is_warm else config.solver.rounds)
-        if config.estimate != 'track':
             # The input scatters about what a window knows best, `lag` from its end.
             best = [max(0, len(window.observations) - 1 - config.lag) for window in part]
             known = scatter(problem, solved.state)[range(len(part)), best].cpu().numpy()
-            model.learn_noise([window.track_id for window in part], known)
+            model.learn_fits([w.track_id for w in part], known, solved.told.cpu().numpy())
         estimates.update(zip(rows, _judged(part, problem, base, solved, config), strict=True))
     return [estimates.get(i) for i in range(len(windows))]
 
@@ -124,7 +121,7 @@ def _judged(
     test the objective does not make.
 
     """
-    state, covariances, left = solved
+    state, covariances, left, _ = solved
     given = problem.boxes[..., 3:6]
     extent = given if config.extent == 'fixed' else state.shared[:, None, EXTENT].expand_as(given)
     boxes = torch.cat([state.pose[..., :3], extent, wrap_angle(state.pose[..., 3:])], -1)
@@ -161,13 +158,13 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     """
     length, solver, is_track = problem.boxes.shape[1], config.solver, config.estimate == 'track'
     limits = solver.iterations, solver.history, solver.tolerance
-    rule, noise, turn, share = model.rule(), model.noise(), 0, KNOWN * (rounds == 1)
-    enough = COARSE if rounds > 1 else torch.inf
-    everyone = expected_shared(problem, rule)
-    state = State(problem.start[..., POSE].clone(), everyone.clone())
+    rule, noise, turn, is_tick = model.rule(), (known := model.noise()), 0, rounds == 1
+    enough = torch.inf if is_tick else COARSE
+    state = State(problem.start[..., POSE].clone(), expect(problem, rule).shared)
+    told = pad(state.shared[:, None, EXTENT].log(), (0, 0, 0, 2))
     free = free_variables(problem, config)
-    # A tick judges faces by extents found before it, if free: damped, for these may be wrong.
-    state.shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], share * free[:, -SHARED:][:, EXTENT])
+    # A tick judges faces by the extents found before it, if free.
+    state.shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], is_tick * free[:, -SHARED:][:, EXTENT])
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
     unknown = torch.full_like(problem.recalled, torch.nan)
     seen = problem.seen + pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
@@ -176,12 +173,12 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     @torch.inference_mode()
     def improve(rows: Tensor) -> Tensor:
         """Take round `turn` with some windows, `enough` points; return those not done."""
-        part, here, expected = select((problem.thinned(enough), state, everyone), rows)
+        part, here, expected = select((problem.thinned(enough), state, expectation), rows)
         here.shared[:, objective.ANCHOR] = 0.0
         sights = support(part, here, config.faces.outermost, rule)
         # `any` would take three times as long; of two boxes some terms have no weights at all.
-        terms = [t for t in weigh(part, here, sights, expected, noise, config) if t.weight.norm()]
-        if turn > 0 or rounds == 1:  # where it begins, a cold window is as noisy as its input
+        terms = [t for t in weigh(part, here, sights, expected, config) if t.weight.norm()]
+        if turn > 0 or is_tick:  # where it begins, a cold window is as noisy as its input
             terms = [yielding(t, here) if t.function in MOTION else t for t in terms]
         if turn > 0 and is_track:
             information, wanted = agreement(part.thinned(SHOWN), here)
@@ -190,6 +187,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         best = State.unpack(minimize(total, x, *limits, total.newton).x, length)
         moved = ((best.pose - here.pose) / part.of(*ERRORS)[:, None]).square().mean(2).amax(1)
         state.pose[rows], state.shared[rows] = best  # `here` may be a view of it
+        told[rows, 1:] = extents_told(told[rows, 0], expected, best, total.factor)
         is_done = (moved <= SETTLED**2) & (turn > 0) | (turn + 1 >= rounds)
         done, leaves = is_done.nonzero()[:, 0], is_done & part.valid.all(1)
         covariances[rows[done]] = select(total.factor, done).inverse_of_links(length)
@@ -203,14 +201,16 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         rows = every = torch.arange(len(state.pose), device=free.device)
         size = (PART if rows.is_cpu else torch.inf) / length
         while len(rows):
+            expectation = expect(problem, rule, noise)
             n = min(len(rows), workers * int(1 + len(rows) / size / workers))
             ends = pool.map(improve, rows.tensor_split(n)) if len(rows) > size else [improve(rows)]
             rows, turn = torch.cat(list(ends)), turn + 1
-            if is_track and turn <= HEARD:
-                noise = InputNoise.measure(scatter(problem, state))
+            if is_track:
+                noise = InputNoise.measure(scatter(problem, state)) if turn <= HEARD else noise
+                noise = noise._replace(told=torch.cat([known.told, told.cpu()]))
             if not len(rows) and 2 * enough <= problem.points.shape[2]:
                 rows, enough = every, torch.inf  # where few points lead to, all of them tell
-    return Solution(state, covariances, left)
+    return Solution(state, covariances, left, told)
 
 
 def solve_paper(problem: Problem, config: Config) -> Solution:
@@ -227,7 +227,7 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
 
     """
     length, settings = problem.boxes.shape[1], config.paper
-    expected = expected_shared(problem, Rule(*torch.zeros(3, 6)))
+    expected = expect(problem, Rule(*torch.zeros(3, 6))).shared
     extent = expected[:, None, EXTENT].expand(-1, length, -1)
     free = free_variables(problem, config)[:, : 6 * length]
     x = problem.pose.flatten(1)
@@ -256,61 +256,40 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
 
 
 def weigh(
-    problem: Problem,
-    state: State,
-    sights: Support,
-    expected: Tensor,
-    noise: InputNoise,
-    config: Config,
+    problem: Problem, state: State, sights: Support, expected: Expected, config: Config
 ) -> list[Term]:
     """
     Return the terms of one round, weighted by expected deviations and by how far off they are.
 
     Notes
     -----
-    A face loses its say as the square of Cauchy's weight, the input as Cauchy's. The error of an
-    input is a part that is constant over its track, the bias, and one that changes slowly: the
-    correlation measured widens its deviation, and without correlation over a tenth of a second
-    there is no bias either. Input that scatters by less than `CAREFUL` of its usual error errs by
-    less than its scatter tells, and where that is below half of the usual its extents are held
-    more, too: it was drawn with care. But what a filter has smoothed scatters as little, and errs
-    by the same all along a track. Then the means of tracks are far off their fits, and bias and
-    extents stay free. A gap is unusual by how many deviations it is from the expected one, or the
-    points from where they are expected: those of a load, or of a branch above, are not to lift the
-    roof.
+    A face loses its say as the square of Cauchy's weight, the input as Cauchy's. A gap is unusual
+    by how many deviations it is from the expected one, or the points from where they are
+    expected: those of a load, or of a branch above, are not to lift the roof.
 
     """
     of, valid, faces, given = problem.of, problem.valid.to(state.pose), config.faces, problem.pose
 
-    # Closeness and enclosure: outermost points on their faces.
+    axes = rotation_from_rpy(state.pose[..., 3:])
+    astray = surprise(problem, axes)
+
+    # Closeness and enclosure: outermost points on their faces, unless metres from where a track
+    # leads: those are of another object.
     errors = [faces.ends] * 2 + [faces.sides] * 2 + [faces.top, faces.bottom]
     trust = sights.trust / (1 + (sights.outwardness / faces.outlier) ** 2) ** 2
-    trust = trust * valid[..., None] / torch.tensor(errors).to(trust) ** 2
+    own = valid / (1 + astray[..., :2].square().sum(2) ** 2) ** 2
+    trust = trust * own[..., None] / torch.tensor(errors).to(trust) ** 2
     # The input, its bias and its extents.
-    error = problem.of(*ERRORS)
-    correlation = USUAL + noise.trust * (noise.correlation.to(error) - USUAL)
-    ratio = noise.deviation[:6].to(error) / error
-    ratio = (ratio * (ratio / CAREFUL).square().clamp(max=1.0)).clamp(0.02, 4.0)
-    ratio = (1 + noise.trust * (ratio**2 - 1)).sqrt()
-    interval = (problem.times * valid).amax(1, keepdim=True) / (valid.sum(1, keepdim=True) - 1)
-    slow = ((correlation ** (TENTH / interval) - 0.15) / 0.3).clamp(0.1, 1.0)
-    means = noise.offset[[0, 1, 6]].to(error) / torch.cat([error[:, :2], of('extent')], 1)
-    apart = noise.trust * (means.mean(1, keepdim=True) / APART[0]).square().clamp(max=APART[1])
-    lasting = torch.cat([ratio[:, :3].maximum(apart), ratio[:, 3:]], 1).clamp(0.1, 2.0)
-    bias = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]) * slow[:, :6] * lasting
-    error, extent = error * ratio, of('extent') * slow[:, 6:] * (2 * lasting[:, :3]).clamp(max=1)
-    inflation = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
-    axes = rotation_from_rpy(state.pose[..., 3:])
+    wanted, spread, error, widened = expected
     input_off = objective.prior(state, given, axes)
-    off = (input_off.residual[:, :, 0].abs() + surprise(problem, axes)) / error[:, None]
-    hold = valid[..., None] / (error * inflation)[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
+    off = (input_off.residual[:, :, 0].abs() + astray) / error[:, None]
+    hold = valid[..., None] / widened[:, None] ** 2 / (1 + (off / PRIOR_OUTLIER) ** 2)
     # Points and the face of the input are apart by gap, bias and half the error of the extent.
-    wide = faces.spread**2 + (bias[:, :3] ** 2 + (expected[:, :3] * extent / 2) ** 2)[:, FACE_AXIS]
+    wide = faces.spread**2 + (spread[:, 3:6] ** 2 + (spread[:, EXTENT] / 2) ** 2)[:, FACE_AXIS]
     away = (sights.outwardness * trust).sum(1) / trust.sum(1).clamp(min=1e-9)
-    unusual = (state.shared - expected)[:, objective.GAP] ** 2 / faces.spread**2
+    unusual = (state.shared - wanted)[:, GAP] ** 2 / faces.spread**2
     gap = faces.spread * (1 + unusual.maximum(away**2 / wide) / GAP_OUTLIER**2).sqrt()
-    pivot, anchor = expected[:, :1] / 4, torch.ones_like(gap)
-    shared = torch.cat([expected[:, :3] * extent, bias, gap, pivot, anchor], 1) ** -2
+    shared = torch.cat([spread[:, : GAP.start], gap, spread[:, GAP.stop :]], 1) ** -2
     # Motion: smoothness, alignment, rest.
     change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2
     turn = input_off.by_pose[:, :, 0].mT
@@ -327,7 +306,7 @@ def weigh(
         Term(objective.acceleration, change[:, :, None], (problem.times,)),
         Term(objective.slip, diagonal(slip[:, None] * valid[:, 1:, None]), (problem.times,)),
         Term(objective.rest, diagonal(still[:, None] * _parked(problem, error[:, 5])[..., None])),
-        Term(objective.shared_prior, diagonal(shared[:, None]), (expected,)),
+        Term(objective.shared_prior, diagonal(shared[:, None]), (wanted,)),
         Term(objective.memory, problem.information[:, None, None], (problem.recalled[:, None],)),
     ]
 
@@ -357,15 +336,12 @@ def surprise(problem: Problem, axes: Tensor) -> Tensor:
     so much more of it than of the noise itself.
 
     """
-    own = given, t, _ = problem.pose, problem.times[..., None], problem.valid[..., None]
-    least = torch.full_like(given, torch.inf)
-    for i, j in ((-2, -1), (-1, 1), (1, 2)):
-        a, ta, va, b, tb, vb = (x.roll(-k, 1) for k in (i, j) for x in own)
-        off = given - a - (t - ta) / (tb - ta) * (b - a)
-        off = torch.cat([(axes.mT @ off[..., :3, None])[..., 0], off[..., 3:]], -1).abs()
-        real = va & vb & ((ta - t) * i > 0) & ((tb - t) * j > 0)  # not from the other end
-        least = torch.where(real, off, torch.inf).minimum(least)
-    return torch.where(least.isfinite(), least, 0.0) / 3
+    own = torch.cat([problem.pose, problem.times.where(problem.valid, torch.nan)[..., None]], 2)
+    five = pad(own.mT, (2, 2), value=torch.nan).unfold(2, 5, 1).transpose(1, 2)
+    a, b, here = five[..., [0, 1, 3]], five[..., [1, 3, 4]], five[..., 2:3]
+    off = here - a - (b - a) * (here - a)[..., 6:, :] / (b - a)[..., 6:, :]
+    off = torch.cat([axes.mT @ off[..., :3, :], off[..., 3:6, :]], 2).abs()
+    return off.nan_to_num(torch.inf).amin(3).nan_to_num(posinf=0.0) / 3
 
 
 def _parked(problem: Problem, heading: Tensor) -> Tensor:
@@ -392,15 +368,6 @@ def _parked(problem: Problem, heading: Tensor) -> Tensor:
     return valid[:, 1:] * is_slow[:, None] * torch.max_pool1d(drives, 9, 1, 4).eq(0)
 
 
-def expected_shared(problem: Problem, rule: Rule) -> Tensor:
-    """Return the expectation of what is shared (B, 22): mean extent, no bias, rule, pivot."""
-    total = (problem.boxes[..., 3:6] * problem.valid[..., None]).sum(1) + problem.seen[:, :3]
-    mean = total / (problem.valid.sum(1, keepdim=True) + problem.seen[:, 3:])
-    gaps = problem.of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
-    pivot = mean[:, :1] * problem.of('pivot')
-    return torch.cat([mean, 0 * gaps, gaps + rule.gaps.to(mean), pivot, 0 * gaps], 1)
-
-
 def free_variables(problem: Problem, config: Config) -> Tensor:
     """Return 1 for every variable (B, 6 N + 22) to be solved for, 0 for those that stay."""
     pose = problem.valid[..., None].to(problem.boxes).expand(-1, -1, 6).clone()
@@ -423,7 +390,7 @@ def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None
     if fresh := [window.fresh_part() for window in windows if window.fresh > 0]:
         problem, rule = stack(fresh, config)[0].thinned(COARSE), model.rule()
         pose = torch.cat([problem.boxes[..., :3], problem.start[..., 6:]], -1)
-        state = State(pose, expected_shared(problem, rule))
+        state = State(pose, expect(problem, rule).shared)
         sights = support(problem, state, config.faces.outermost, rule)
         model.learn_rule([window.track_id for window in fresh], sights, problem.valid, rule)
 

@@ -1,6 +1,9 @@
 """What is learnt of the input, from input whose rule and noise are known."""
 
 from boxreg_ros.calibration import (
+    Expected,
+    extent_factor,
+    extents_told,
     InputModel,
     InputNoise,
     LEAST,
@@ -9,6 +12,7 @@ from boxreg_ros.calibration import (
     SCATTERS,
     TRACKS,
 )
+from boxreg_ros.chain import Factor
 from boxreg_ros.config import Config, FaceConfig
 from boxreg_ros.correspondence import Support, support
 from boxreg_ros.objective import State
@@ -148,6 +152,11 @@ def test_boxes_that_a_tracker_holds_do_not_tell_how_it_errs():
         assert found.isfinite().all(2).tolist() == [[True] * 5 + [False]]
 
 
+def scattered(model, names, row):
+    """Show `model` what one observation of each track scatters, and nothing of extents."""
+    model.learn_fits(names, row.numpy(), np.zeros((len(names), 3, 3)))
+
+
 def test_noise_of_a_stream():
     # One observation after the other, tracks of different length, equals all at once.
     values = autoregressive(4, 40, np.ones(9), 0.5, seed=2)
@@ -156,7 +165,7 @@ def test_noise_of_a_stream():
     assert model.noise().trust == 0
     for i in range(40):
         alive = [b for b in range(4) if i < lengths[b]]
-        model.learn_noise([str(b) for b in alive], values[alive, i].numpy())
+        scattered(model, [str(b) for b in alive], values[alive, i])
         if i == LEAST - 2:
             assert model.noise().trust == 0
     is_there = torch.arange(40) < torch.tensor(lengths)[:, None]
@@ -171,7 +180,7 @@ def test_of_a_track_its_last_observations_count():
     values[:, :SCATTERS] *= 10.0
     model = InputModel(FACES)
     for row in values.unbind(1):
-        model.learn_noise(['a', 'b', 'c'], row.numpy())
+        scattered(model, ['a', 'b', 'c'], row)
     known = InputNoise.measure(values[:, SCATTERS:])
     np.testing.assert_allclose(model.noise().deviation, known.deviation)
     np.testing.assert_allclose(model.noise().correlation, known.correlation)
@@ -183,7 +192,7 @@ def test_noise_of_what_is_not_finite_is_left_out():
     values[0, 20] = np.nan
     model = InputModel(FACES)
     for row in values.unbind(1):
-        model.learn_noise(['a', 'b'], row.numpy())
+        scattered(model, ['a', 'b'], row)
     known = InputNoise.measure(values)
     np.testing.assert_allclose(model.noise().deviation, known.deviation)
     np.testing.assert_allclose(model.noise().correlation, known.correlation)
@@ -196,9 +205,116 @@ def test_scatters_of_the_tracks_seen_last_are_remembered():
     names = [[f'{kind} {b}' for b in range(TRACKS)] for kind in ('old', 'new')]
     for kind, values in zip(names, (old, new), strict=True):
         for row in values.unbind(1):
-            model.learn_noise(kind, row.numpy())
+            scattered(model, kind, row)
     known = InputNoise.measure(new)
     np.testing.assert_allclose(model.noise().deviation, known.deviation)
+
+
+# --- extents ------------------------------------------------------------------------------------
+
+
+def fitted(given, measured, own, part=0.05):
+    """
+    Return what a fit tells of extents that are expected as `given`, to a `part` of each.
+
+    Points say `measured` with deviations `own` [m]: the fit is the mean of both logarithms,
+    weighted by what they know.
+
+    """
+    given, measured, own = (torch.tensor([row], dtype=D) for row in (given, measured, own))
+    error, precision = part * given, torch.ones(1, 22, dtype=D)
+    precision[:, :3] = error**-2 + own**-2
+    spread = torch.cat([error, torch.ones(1, 19, dtype=D)], 1)
+    expected = Expected(shared_of(given[0].tolist()), spread, torch.ones(1, 6), torch.ones(1, 6))
+    known = own**-2 / precision[:, :3]
+    shared = shared_of((given * (measured / given) ** known)[0].tolist())
+    factor = Factor([], torch.diag_embed(precision.sqrt()))
+    return extents_told(given.log(), expected, State(torch.zeros(1, 1, 6), shared), factor)[0]
+
+
+def test_what_the_points_tell_of_extents_by_hand():
+    # Lengths are expected to 0.2 m and measured to 0.1 m: of what is known of them the points
+    # have 1 / (1 + 0.1^2 / 0.2^2) = 0.8. Corrections count by the squared error, 0.05^2.
+    correction, weight = fitted([4.0, 1.8, 1.5], [4.2, 1.8, 1.5], [0.1, 0.045, 0.0375])
+    known = np.log([4.2 / 4.0, 1.0, 1.0]) / 0.05**2
+    np.testing.assert_allclose(correction, known, atol=1e-4)  # shared_of has single precision
+    np.testing.assert_allclose(weight, 0.8 * 0.05**2, rtol=1e-6)
+
+
+@pytest.mark.parametrize('own', [0.5, np.nan, 1e9], ids=['vague', 'failed', 'not measured'])
+def test_points_that_do_not_tell_extents_have_no_weight(own):
+    # Of lengths measured to 0.5 m the points have 1 / (1 + 0.5^2 / 0.2^2) = 0.14.
+    told = fitted([4.0, 1.8, 1.5], [4.2, 1.9, 1.6], [own, 0.01, 0.01])
+    np.testing.assert_array_equal(told[:, 0], 0)
+    assert (told[1, 1:] > 0).all()
+
+
+def sizes(n, seed=0):
+    """Return logarithms of the extents of `n` cars, (n, 3)."""
+    middle = np.log([4.4, 1.8, 1.5])
+    return torch.from_numpy(np.random.default_rng(seed).normal(middle, [0.12, 0.05, 0.06], (n, 3)))
+
+
+def told_of(true, given, error=0.05, weight=0.8):
+    """Return what points tell that know the `true` extents (n, 3), logarithms as `given`."""
+    found = (true - given) / error**2
+    return torch.stack([given, found, torch.full_like(given, weight * error**2)], 1)
+
+
+@pytest.mark.parametrize('part', [0.5, 1.0, 1.5], ids=['shrunk', 'as they are', 'spread'])
+def test_extents_that_were_shrunk_are_expected_to_be_larger(part):
+    # The input has a `part` of what cars differ by in length, and all else as it is. What is
+    # expected of the slopes, 0.6 and half of that, is weaker than 400 cars; and an object that is
+    # 0.12 longer than most in logarithms has (0.12 / 0.5)^2 = 0.06 less of the correction.
+    true = sizes(401)
+    given = true.clone()
+    middle = true.median(0).values
+    given[:, 0] = middle[0] + part * (true - middle)[:, 0]
+    error = torch.full_like(given, 0.05)
+    found = extent_factor(told_of(true, given), given.exp(), error).log()
+    away = (given - middle).square().sum(1, keepdim=True) / 0.5**2
+    np.testing.assert_allclose(found, (true - given) / (1 + away), atol=0.003)
+
+
+def test_extents_drawn_with_care_are_left_as_they_are():
+    # What is true of an input that errs by 5 % is corrected by a hundredth of it where one errs
+    # by 0.5 %: by squares.
+    true = sizes(100)
+    given = 2 * true.median(0).values - true
+    told = told_of(true, given)
+    usual, careful = (
+        extent_factor(told, given.exp(), torch.full_like(given, error)).log()
+        for error in (0.05, 0.005)
+    )
+    np.testing.assert_allclose(careful, usual / 100, atol=1e-12)
+
+
+def test_cars_tell_nothing_of_trucks():
+    # Of what is four times as long, twice as wide and twice as high, 1 / (1 + 11.6) is said of
+    # what a regression would.
+    true = sizes(100)
+    given = true.median(0).values + 0.5 * (true - true.median(0).values)
+    truck = given.median(0).values + torch.tensor([[4.0, 2.0, 2.0]], dtype=D).log()
+    found = extent_factor(told_of(true, given), truck.exp(), torch.full((1, 3), 0.05, dtype=D))
+    assert 0 < found.log()[0, 0] < 0.12 * np.log(4.0)
+
+
+@pytest.mark.parametrize('told', [torch.zeros(1, 3, 3), torch.zeros(5, 3, 3)])
+def test_without_what_points_tell_extents_are_expected_as_given(told):
+    given = sizes(3).exp()
+    np.testing.assert_array_equal(extent_factor(told, given, torch.full_like(given, 0.05)), 1)
+
+
+def test_of_a_track_the_last_fit_tells_its_extents():
+    model = InputModel(FACES)
+    assert not model.noise().told.any()
+    nothing = np.full((2, 9), np.nan)
+    for value in (1.0, 2.0):
+        model.learn_fits(['a', 'b'], nothing, np.full((2, 3, 3), value))
+    np.testing.assert_array_equal(model.noise().told, np.full((2, 3, 3), 2.0))
+    for i in range(TRACKS):
+        model.learn_fits([str(i)], nothing[:1], np.zeros((1, 3, 3)))
+    np.testing.assert_array_equal(model.noise().told, np.zeros((TRACKS, 3, 3)))
 
 
 # --- rule ---------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from boxreg_ros import Config, refine, registration
+from boxreg_ros import calibration, Config, refine, registration
 from boxreg_ros.geometry import face_distances
 from boxreg_ros.metrics import iou_3d
 from boxreg_ros.registrar import BoxRegistrar
@@ -397,8 +397,14 @@ def test_short_tracks_and_boxes_without_points(stream, estimate):
 # --- tracks end ---------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def no_law(monkeypatch):
+    """Nothing is learnt of extents: one track more or less tells more or less of these."""
+    monkeypatch.setattr(calibration, 'SLOPES', 1e-9)
+
+
 @each_estimate
-def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate):
+def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate, no_law):
     # The same id, after 0.9 s or 1.1 s of silence: after the longer one the boxes that follow
     # are refined as if nothing had been before, but for what is learnt of the input.
     config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
@@ -417,7 +423,7 @@ def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate):
 
 
 @pytest.mark.parametrize('estimate', ['early', 'final'])
-def test_a_new_track_of_a_known_id_remembers_nothing(estimate):
+def test_a_new_track_of_a_known_id_remembers_nothing(estimate, no_law):
     # Eight boxes, a silence, then eight under the same id, in windows of six; too few for the
     # noise of the input to be measured. All that follow are as if nothing had been before.
     config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
@@ -555,9 +561,8 @@ def test_an_id_that_another_object_gets_begins_a_track(estimate):
         return np.array(found)
 
     new, swapped = overlap('c', 'd'), overlap('a', 'b')
-    assert swapped.mean() > new.mean() - 0.02
-    # A window with one foreign box tells the oldest of it for good before two tell of the swap.
-    assert swapped.min() > new.min() - 0.12
+    assert swapped.mean() > new.mean() - 0.01
+    assert swapped.min() > new.min() - 0.01
 
 
 def test_torch_has_one_thread_meanwhile(stream, monkeypatch):
