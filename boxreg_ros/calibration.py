@@ -107,7 +107,7 @@ class Expected(NamedTuple):
     shared : Tensor, shape (B, 22)
         What all observations of a window share, see `State`.
     spread : Tensor, shape (B, 22)
-        Deviations of that; those of gaps depend on what is seen, and are 1 here.
+        Deviations of that; for gaps, parts of what is expected of them.
     error, widened : Tensor, shape (B, 6)
         Deviation of the input poses along the axes of their boxes, their bias apart, and what
         counts for it where errors of neighbours are correlated [m, rad].
@@ -132,7 +132,8 @@ def expect(problem: Problem, rule: Rule, noise: InputNoise = NOTHING) -> Expecte
     usual error errs by less than its scatter tells, and where that is below half of the usual its
     extents are held more, too: it was drawn with care. But what a filter has smoothed scatters as
     little, and errs by the same all along a track. Then the means of tracks are far off their
-    fits, and bias and extents stay free.
+    fits, and bias and extents stay free. Gaps differ between objects by twice as much where boxes
+    were drawn with care: these tell of their own.
 
     """
     of, valid, count = problem.of, problem.valid, problem.valid.sum(1, keepdim=True)
@@ -150,11 +151,11 @@ def expect(problem: Problem, rule: Rule, noise: InputNoise = NOTHING) -> Expecte
     error, part = error * ratio, of('extent') * slow[:, 6:] * (2 * lasting[:, :3]).clamp(max=1)
     widened = error * ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
     total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1) + problem.seen[:, :3]
-    mean, unit = total / (count + problem.seen[:, 3:]), torch.ones_like(error)
-    extent = mean * extent_factor(noise.told, mean, part)
+    mean, one = total / (count + problem.seen[:, 3:]), torch.ones_like(error)
+    extent, loose = mean * extent_factor(noise.told, mean, part), (2 - 2 * lasting[:, :1]).clamp(1)
     gaps = of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
-    shared = [extent, 0 * unit, gaps + rule.gaps.to(error), mean[:, :1] * of('pivot'), 0 * unit]
-    spread = [extent * part, bias, unit, mean[:, :1] / 4, unit]
+    shared = [extent, 0 * one, gaps + rule.gaps.to(error), mean[:, :1] * of('pivot'), 0 * one]
+    spread = [extent * part, bias, one * loose, mean[:, :1] / 4, one]
     return Expected(torch.cat(shared, 1), torch.cat(spread, 1), error, widened)
 
 

@@ -287,8 +287,8 @@ def weigh(
     # Points and the face of the input are apart by gap, bias and half the error of the extent.
     wide = faces.spread**2 + (spread[:, 3:6] ** 2 + (spread[:, EXTENT] / 2) ** 2)[:, FACE_AXIS]
     away = (sights.outwardness * trust).sum(1) / trust.sum(1).clamp(min=1e-9)
-    unusual = (state.shared - wanted)[:, GAP] ** 2 / faces.spread**2
-    gap = faces.spread * (1 + unusual.maximum(away**2 / wide) / GAP_OUTLIER**2).sqrt()
+    odd = (state.shared - wanted)[:, GAP] ** 2 / faces.spread**2
+    gap = spread[:, GAP] * faces.spread * (1 + odd.maximum(away**2 / wide) / GAP_OUTLIER**2).sqrt()
     shared = torch.cat([spread[:, : GAP.start], gap, spread[:, GAP.stop :]], 1) ** -2
     # Motion: smoothness, alignment, rest.
     change = of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning') ** -2

@@ -350,6 +350,9 @@ def test_the_bias_of_what_scatters_little_by_hand(offset, lasting):
     np.testing.assert_allclose(found[:, objective.BIAS] / error, bias, rtol=1e-9)
     extents = found[:, objective.EXTENT] / state.shared[:, objective.EXTENT] / extent
     np.testing.assert_allclose(extents, np.full((1, 3), min(1.0, 2 * lasting)), rtol=1e-9)
+    # Gaps differ by up to twice as much where boxes were drawn with care.
+    loose = found[:, objective.GAP] / ALONE.faces.spread
+    np.testing.assert_allclose(loose, np.full((1, 6), max(1.0, 2 - 2 * lasting)), rtol=1e-9)
 
 
 def test_how_far_a_gap_may_be_off_by_hand():
