@@ -97,10 +97,9 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
     """
     windows, truth = make_windows(count, config.window, 128, config)
     problem, base = stack(windows, config)
-    rounds = config.solver.rounds
 
     def cold() -> Solution:
-        return solve(problem, config, InputModel(config.faces), rounds)
+        return solve(problem, config, InputModel(config.faces), is_warm=False)
 
     state = cold().state
     pose, extent = state.pose, state.shared[:, None, EXTENT].expand(-1, config.window, -1)
@@ -110,14 +109,14 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
     warm_problem = problem._replace(start=warm_start)
 
     def warm() -> Solution:
-        return solve(warm_problem, config, InputModel(config.faces), 1)
+        return solve(warm_problem, config, InputModel(config.faces), is_warm=True)
 
     result = {'cold': 1e3 * _time(cold, config) / count, 'warm': 1e3 * _time(warm, config) / count}
     part = [stack([window], config)[0] for window in windows[:references]]
     begin = perf_counter()
     ends = [reference(one, config) for one in part]
     result['reference'] = 1e3 * (perf_counter() - begin) / references
-    ours = [solve(one, config, InputModel(config.faces), rounds).state for one in part]
+    ours = [solve(one, config, InputModel(config.faces), is_warm=False).state for one in part]
     iou = {}
     for name, states in (('input', None), ('reference', ends), ('ours', ours)):
         boxes = [p.boxes[0].cpu().numpy().copy() for p in part]
@@ -188,7 +187,7 @@ def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
             problem, _ = stack(windows, config)
 
             def once(problem: objective.Problem = problem) -> object:
-                return solve(problem, config, InputModel(config.faces), config.solver.rounds)
+                return solve(problem, config, InputModel(config.faces), is_warm=False)
 
             table[name].append((x, 1e3 * _time(once, config) / count))
     return table

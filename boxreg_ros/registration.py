@@ -100,7 +100,7 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
         if config.objective == 'paper':
             solved = solve_paper(problem, config)
         else:
-            solved = solve(problem, config, model, 1 if part[0].is_warm else config.solver.rounds)
+            solved = solve(problem, config, model, part[0].is_warm)
             # The input scatters about what a window knows best, `lag` from its end.
             best = [max(0, len(window.observations) - 1 - config.lag) for window in part]
             known = scatter(problem, solved.state)[range(len(part)), best].cpu().numpy()
@@ -147,9 +147,9 @@ def _judged(
 
 
 @torch.inference_mode()
-def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> Solution:
+def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) -> Solution:
     """
-    Minimise the robust objective: rounds of correspondence, weighting and L-BFGS.
+    Minimise the robust objective: rounds of correspondence, weighting and L-BFGS, one if warm.
 
     The curvature is also the metric L-BFGS starts from in every round. A window whose boxes moved
     by less than `SETTLED` errors of its input takes no part in further rounds. Within a round
@@ -158,13 +158,13 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
     """
     length, solver, is_track = problem.boxes.shape[1], config.solver, config.estimate == 'track'
     limits = solver.iterations, solver.history, solver.tolerance
-    rule, noise, turn, is_tick = model.rule(), (known := model.noise()), 0, rounds == 1
-    enough = torch.inf if is_tick else COARSE
+    rounds, enough = (1, torch.inf) if is_warm else (solver.rounds, COARSE)
+    rule, noise, turn = model.rule(), (known := model.noise()), 0
     state = State(problem.start[..., POSE].clone(), expect(problem, rule).shared)
     told = pad(state.shared[:, None, EXTENT].log(), (0, 0, 0, 2))
     free = free_variables(problem, config)
-    # A tick judges faces by the extents found before it, if free.
-    state.shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], is_tick * free[:, -SHARED:][:, EXTENT])
+    # A warm window judges faces by the extents found before it, if free.
+    state.shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], is_warm * free[:, -SHARED:][:, EXTENT])
     covariances = state.pose.new_zeros((*state.pose.shape, 6))
     unknown = torch.full_like(problem.recalled, torch.nan)
     seen = problem.seen + pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
@@ -178,7 +178,7 @@ def solve(problem: Problem, config: Config, model: InputModel, rounds: int) -> S
         sights = support(part, here, config.faces.outermost, rule)
         # `any` would take three times as long; of two boxes some terms have no weights at all.
         terms = [t for t in weigh(part, here, sights, expected, config) if t.weight.norm()]
-        if turn > 0 or is_tick:  # where it begins, a cold window is as noisy as its input
+        if turn > 0 or is_warm:  # where it begins, a cold window is as noisy as its input
             terms = [yielding(t, here) if t.function in MOTION else t for t in terms]
         if turn > 0 and is_track:
             information, wanted = agreement(part.thinned(SHOWN), here)

@@ -495,14 +495,14 @@ def test_live_windows_are_solved_in_full_once_then_in_one_round(monkeypatch):
     """Three observations make the first window; what comes after goes on from its boxes."""
     asked = []
 
-    def note(problem, config, model, rounds):
-        asked.append((problem.boxes.shape[1], rounds))
-        return solve(problem, config, model, rounds)
+    def note(problem, config, model, is_warm):
+        asked.append((problem.boxes.shape[1], is_warm))
+        return solve(problem, config, model, is_warm)
 
     monkeypatch.setattr(registration, 'solve', note)
-    config = setup(**{'solver.rounds': 7})
+    config = setup()
     fed(BoxRegistrar(config), stream_of([track_of(drive(8), np.random.default_rng(0), 'a')]))
-    assert asked == [(3, 7), (4, 1), (5, 1), (6, 1), (6, 1), (6, 1)]
+    assert asked == [(3, False), (4, True), (5, True), (6, True), (6, True), (6, True)]
 
 
 def test_a_track_that_ends_comes_back_before_the_end():

@@ -487,25 +487,41 @@ def test_what_a_detector_shrank_grows_by_what_the_points_of_others_tell(monkeypa
     assert abs(known) < 0.75 * abs(alone)
 
 
-@pytest.mark.parametrize(
-    ('changes', 'held'), [({'extent': 'fixed'}, [0, 1, 2]), ({'mode': 'bev'}, [2]), ({}, [])]
-)
-def test_a_tick_judges_faces_by_what_was_found_or_is_held(monkeypatch, changes, held):
-    # What is not to be solved for is the mean of the input, the rest as the tick before left it.
-    config, seen, found = ALONE.updated(changes), [], [4.0, 2.0, 1.3]
-    whole = window(drive(6), extent=0.05)
-    start = given(whole)[:-1]
-    start[:, 3:6] = found
+@pytest.fixture
+def judged_by(monkeypatch):
+    """Collect the extents (3,) that faces of the first window are judged by, round by round."""
+    seen = []
 
     def noted(problem, state, *rest):
         seen.append(state.shared[0, objective.EXTENT].numpy().copy())
         return support(problem, state, *rest)
 
     monkeypatch.setattr(registration, 'support', noted)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ('changes', 'held'), [({'extent': 'fixed'}, [0, 1, 2]), ({'mode': 'bev'}, [2]), ({}, [])]
+)
+def test_a_tick_judges_faces_by_what_was_found_or_is_held(judged_by, changes, held):
+    # What is not to be solved for is the mean of the input, the rest as the tick before left it.
+    config, found = ALONE.updated(changes), [4.0, 2.0, 1.3]
+    whole = window(drive(6), extent=0.05)
+    start = given(whole)[:-1]
+    start[:, 3:6] = found
     register([whole._replace(fresh=1, start=start)], config, InputModel(config.faces))
-    assert len(seen) == 2  # to learn from it, and the one round of a tick
+    assert len(judged_by) == 2  # to learn from it, and the one round of a tick
     known = np.where(np.isin(np.arange(3), held), given(whole)[:, 3:6].mean(0), found)
-    np.testing.assert_allclose(seen[1], known)
+    np.testing.assert_allclose(judged_by[1], known)
+
+
+@pytest.mark.parametrize('rounds', [1, 2])
+def test_a_cold_window_judges_faces_by_the_mean_of_the_input(judged_by, rounds):
+    config = ALONE.updated({'solver.rounds': rounds})
+    whole = window(drive(6), extent=0.05)
+    register([whole], config, InputModel(config.faces))
+    assert len(judged_by) == 1 + rounds
+    np.testing.assert_allclose(judged_by[1], given(whole)[:, 3:6].mean(0))
 
 
 # --- what is remembered -------------------------------------------------------------------------
