@@ -269,7 +269,6 @@ def weigh(
 
     """
     of, valid, faces, given = problem.of, problem.valid.to(state.pose), config.faces, problem.pose
-
     axes = rotation_from_rpy(state.pose[..., 3:])
     astray = surprise(problem, axes)
 
