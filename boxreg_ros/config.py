@@ -60,7 +60,7 @@ class FaceConfig:
     outlier: float = setting(0.15, 'a face this far off its points loses its say', 'm', 1e-3, 10.0)
     depth_ends: float = setting(0.36, 'points further in, ends seen from behind', 'm', 0.0, 2.0)
     depth_sides: float = setting(0.18, 'points further in, sides seen from behind', 'm', 0.0, 2.0)
-    spread: float = setting(0.045, 'difference of gaps between objects', 'm', 1e-4, 1.0)
+    spread: float = setting(0.05, 'difference of gaps between objects', 'm', 1e-4, 1.0)
     learn: bool = setting(True, 'learn the gaps from the input as it comes')
 
 
