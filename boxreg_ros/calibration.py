@@ -136,13 +136,12 @@ def expect(problem: Problem, rule: Rule, noise: InputNoise = NOTHING) -> Expecte
     were drawn with care: these tell of their own.
 
     """
-    of, valid, count = problem.of, problem.valid, problem.valid.sum(1, keepdim=True)
-    error = of(*ERRORS)
+    of, valid, error = problem.of, problem.valid, problem.of(*ERRORS)
     correlation = USUAL + noise.trust * (noise.correlation.to(error) - USUAL)
     ratio = noise.deviation[:6].to(error) / error
     ratio = (ratio * (ratio / CAREFUL).square().clamp(max=1.0)).clamp(0.02, 4.0)
     ratio = (1 + noise.trust * (ratio**2 - 1)).sqrt()
-    interval = (problem.times * valid).amax(1, keepdim=True) / (count - 1).clamp(min=1)
+    interval = ((problem.times * valid).amax(1) / (valid.sum(1) - 1).clamp(1))[:, None]
     slow = ((correlation ** (TENTH / interval) - 0.15) / 0.3).clamp(0.1, 1.0)
     means = noise.offset[[0, 1, 6]].to(error) / torch.cat([error[:, :2], of('extent')], 1)
     apart = noise.trust * (means.mean(1, keepdim=True) / APART[0]).square().clamp(max=APART[1])
@@ -151,7 +150,7 @@ def expect(problem: Problem, rule: Rule, noise: InputNoise = NOTHING) -> Expecte
     error, part = error * ratio, of('extent') * slow[:, 6:] * (2 * lasting[:, :3]).clamp(max=1)
     widened = error * ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
     total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1) + problem.seen[:, :3]
-    mean, one = total / (count + problem.seen[:, 3:]), torch.ones_like(error)
+    mean, one = total / (valid.sum(1)[:, None] + problem.seen[:, 3:]), torch.ones_like(error)
     extent, loose = mean * extent_factor(noise.told, mean, part), (2 - 2 * lasting[:, :1]).clamp(1)
     gaps = of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
     shared = [extent, 0 * one, gaps + rule.gaps.to(error), mean[:, :1] * of('pivot'), 0 * one]

@@ -394,7 +394,12 @@ def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:
 
 
 def step(state: State, start: Tensor, axes: Tensor, part: slice) -> Linearised:
-    """Step of the poses from `start` along `axes`, less that `part` of what is shared [m, rad]."""
+    """
+    Step of the poses from `start` (B, N, 6) along `axes` (B, N, 3, 3) [m, rad].
+
+    Less a `part` of what is shared, six variables that stand for a step of all of them.
+
+    """
     along = torch.eye(6).to(start).repeat(*start.shape[:2], 1, 1, 1)
     along[..., :3, :3] = axes.mT[..., None, :, :]
     residual = (along @ (state.pose - start)[..., None, :, None])[..., 0]

@@ -159,7 +159,9 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     length, solver, is_track = problem.boxes.shape[1], config.solver, config.estimate == 'track'
     limits = solver.iterations, solver.history, solver.tolerance
     rounds, enough = (1, torch.inf) if is_warm else (solver.rounds, COARSE)
-    rule, noise, turn = model.rule(), (known := model.noise()), 0
+    rule, known, turn = model.rule(), model.noise(), 0
+    # Of whole tracks the model has one scatter a window, seconds apart: it tells no noise.
+    noise = InputNoise(told=known.told) if is_track else known
     state = State(problem.start[..., POSE].clone(), expect(problem, rule).shared)
     told = pad(state.shared[:, None, EXTENT].log(), (0, 0, 0, 2))
     free = free_variables(problem, config)
