@@ -3,7 +3,7 @@
 from glob import glob
 from xml.etree import ElementTree
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = 'boxreg_ros'
 manifest = ElementTree.parse('package.xml')
@@ -14,7 +14,7 @@ setup(
     description=' '.join(manifest.findtext('description', '').split()),
     author=manifest.findtext('maintainer'),
     license=manifest.findtext('license'),
-    packages=[NAME, f'{NAME}.labels', 'msg_adapters'],
+    packages=find_packages(include=[f'{NAME}*', 'msg_adapters']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'{NAME}/resource/{NAME}']),
         (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
@@ -22,7 +22,7 @@ setup(
     # Read by `boxreg bench node` and `relabel --report`, without an installation too.
     package_data={NAME: ['share/*']},
     entry_points={
-        'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.node:main']
+        'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.live.main:main']
     },
     # Where `ros2 run` looks. Only colcon installs by these commands; pip has its own place.
     options={

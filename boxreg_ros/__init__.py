@@ -6,7 +6,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
 
 if TYPE_CHECKING:
-    from boxreg_ros.tracks import refine, RefinedTrack, Track
+    from boxreg_ros.core.refine import refine, RefinedTrack, Track
 
 __version__ = '0.1.0'
 
@@ -16,7 +16,7 @@ __all__ = ['BoxregError', 'Config', 'RefinedTrack', 'Track', 'refine']
 def __getattr__(name: str) -> Any:
     """Import what needs torch when it is first asked for: it takes seconds."""
     if name in __all__:
-        from boxreg_ros import tracks
+        from boxreg_ros.core import refine as tracks
 
         return getattr(tracks, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

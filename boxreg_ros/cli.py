@@ -11,21 +11,30 @@ import os
 import signal
 import sys
 from threading import current_thread, main_thread
-from typing import Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
 from boxreg_ros import __version__
 from boxreg_ros.allocation import keep_freed_memory
 from boxreg_ros.errors import BoxregError, ConfigError
 
+
+class Command(NamedTuple):
+    """Where a subcommand is implemented, and what it does."""
+
+    module: str
+    summary: str
+
+
 COMMANDS = {
-    'relabel': 'refine the boxes of recordings and write label files',
-    'convert': 'write labels of one format in others',
-    'formats': 'list the label formats and their conventions',
-    'evaluate': 'compare boxes with true boxes',
-    'calibrate': 'learn the annotation rule from labelled tracks',
-    'simulate': 'make a recording with known truth',
-    'bench': 'measure accuracy and speed',
-    'node': 'run the live node (where there is no ros2 run)',
+    'relabel': Command('offline.relabel', 'refine the boxes of recordings and write label files'),
+    'convert': Command('offline.convert', 'write labels of one format in others'),
+    'formats': Command('offline.formats', 'list the label formats and their conventions'),
+    'evaluate': Command('offline.evaluate', 'compare boxes with true boxes'),
+    'calibrate': Command('offline.calibrate', 'learn the annotation rule from labelled tracks'),
+    'simulate': Command('simulation.simulate', 'make a recording with known truth'),
+    'bench': Command('bench.main', 'measure accuracy and speed'),
+    'node': Command('live.main', 'run the live node (where there is no ros2 run)'),
 }
 DONE, FAILED, WRONG_USAGE, SIGNALLED = 0, 1, 2, 128
 ENDING = signal.SIGTERM, signal.SIGHUP
@@ -99,10 +108,14 @@ def _run(arguments: list[str]) -> int:
     """Parse and hand over to the module of the subcommand."""
     command = next((item for item in arguments if not item.startswith('-')), None)
     if command == 'node' and arguments[0] == 'node':  # its arguments are those of any ROS node
-        return int(import_module('boxreg_ros.node').main(arguments[1:]) or DONE)
+        return int(_module('node').main(arguments[1:]) or DONE)
     args = parser(command).parse_args(arguments)
     keep_freed_memory()
-    return int(import_module(f'boxreg_ros.{args.command}').run(args))
+    return int(_module(args.command).run(args))
+
+
+def _module(command: str) -> ModuleType:
+    return import_module(f'boxreg_ros.{COMMANDS[command].module}')
 
 
 def parser(command: str | None) -> argparse.ArgumentParser:
@@ -113,11 +126,11 @@ def parser(command: str | None) -> argparse.ArgumentParser:
     whole.add_argument('--debug', action='store_true', help=argparse.SUPPRESS)
     whole.add_argument('--version', action='version', version=f'boxreg {__version__}')
     subparsers = whole.add_subparsers(dest='command', required=True, metavar='COMMAND')
-    for name, summary in COMMANDS.items():
+    for name, (_, summary) in COMMANDS.items():
         subparser = subparsers.add_parser(name, help=summary, description=f'{summary}.')
         subparser.add_argument('--debug', action='store_true', help=argparse.SUPPRESS)
         if name == command and name != 'node':
-            import_module(f'boxreg_ros.{name}').add_arguments(subparser)
+            _module(name).add_arguments(subparser)
     return whole
 
 

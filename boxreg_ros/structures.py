@@ -39,6 +39,12 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float
     return array
 
 
+def is_valid_box(boxes: Floats) -> NDArray[np.bool_]:
+    """Return which of `boxes` (..., 9) are finite with positive extents, shape (...)."""
+    is_finite = np.isfinite(boxes).all(axis=-1)
+    return np.asarray(is_finite & (boxes[..., LENGTH : HEIGHT + 1] > 0).all(axis=-1))
+
+
 @dataclass(frozen=True, slots=True)
 class Sweep:
     """

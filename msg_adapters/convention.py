@@ -7,9 +7,9 @@ from itertools import permutations
 from math import pi
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
 from boxreg_ros.structures import BoxArray, Floats, HEIGHT, LENGTH, ROLL, X, YAW, Z
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 REFERENCES = {
     'center': (0.0, 0.0, 0.0),
@@ -125,21 +125,18 @@ class Convention:
         offsets = self.reference * boxes[:, LENGTH : HEIGHT + 1]
         if not self.reference.any():
             return offsets
-        known = np.isfinite(boxes[:, ROLL : YAW + 1]).all(axis=1)
-        turns = Rotation.from_euler('ZYX', boxes[known, ROLL : YAW + 1][:, ::-1])
-        offsets[known] = turns.apply(offsets[known])
+        known = np.isfinite(boxes[:, ROLL:]).all(axis=1)
+        R = matrix_from_rpy(boxes[known, ROLL:])
+        offsets[known] = (R @ offsets[known, :, None])[..., 0]
         return offsets
 
     @staticmethod
     def _turned(boxes: Floats, angle: float) -> Floats:
         """Return a copy of boxes (n, 9), turned about their own z by `angle`."""
         changed = boxes.copy()
-        known = np.isfinite(boxes[:, ROLL : YAW + 1]).all(axis=1)
-        if angle and known.any():
-            turns = Rotation.from_euler('ZYX', boxes[known, ROLL : YAW + 1][:, ::-1])
-            turns = turns * Rotation.from_euler('Z', angle)
-            angles = turns.as_euler('ZYX', suppress_warnings=True)
-            changed[known, ROLL : YAW + 1] = angles[:, ::-1]
+        if angle:
+            turned = matrix_from_rpy(boxes[:, ROLL:]) @ matrix_from_rpy([0.0, 0.0, angle])
+            changed[:, ROLL:] = rpy_from_matrix(turned)
         return changed
 
 

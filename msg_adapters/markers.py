@@ -62,4 +62,4 @@ def to_msg(
 
 
 def _is_box(marker: Any) -> bool:
-    return marker.type == CUBE and marker.action == ADD
+    return bool(marker.type == CUBE and marker.action == ADD)

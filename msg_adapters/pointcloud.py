@@ -153,8 +153,8 @@ def _seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
             if origin * unit > LONGEST_SWEEP and (
                 max(abs(low - origin), abs(high - origin)) * unit <= LONGEST_SWEEP
             ):
-                return (raw.astype(np.float64) - origin) * unit
+                return np.asarray((raw.astype(np.float64) - origin) * unit)
     for unit in UNITS if floating else UNITS[1:]:
         if max(abs(low), abs(high)) * unit <= LONGEST_SWEEP:
-            return np.multiply(raw, unit, dtype=np.float64)
+            return np.asarray(np.multiply(raw, unit, dtype=np.float64))
     return None

@@ -8,9 +8,14 @@ from types import SimpleNamespace
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, YAW, Z
+from boxreg_ros.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rpy,
+    rpy_from_quaternion,
+)
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, Z
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 UNIT_TOLERANCE = 0.01
 """How far a squared quaternion norm may be from 1; what tf2 accepts."""
@@ -77,9 +82,7 @@ def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
     boxes[:, LENGTH : HEIGHT + 1] = [(s.x, s.y, s.z) if hasattr(s, 'x') else s for s in sizes]
     quaternions_xyzw = np.array([quaternion_of(pose) for pose in poses], dtype=np.float64)
     unit = _is_unit(quaternions_xyzw)
-    boxes[unit, ROLL : YAW + 1] = Rotation.from_quat(quaternions_xyzw[unit]).as_euler(
-        'ZYX', suppress_warnings=True
-    )[:, ::-1]
+    boxes[unit, ROLL:] = rpy_from_quaternion(quaternions_xyzw[unit])
     return boxes
 
 
@@ -91,11 +94,7 @@ def quaternion_of(pose: Any) -> tuple[float, float, float, float]:
 
 def quaternions_of(boxes: Floats) -> Floats:
     """Return quaternions (n, 4), x y z w with w >= 0, of boxes (n, 9); NaN stays NaN."""
-    quaternions_xyzw = np.full((len(boxes), 4), np.nan)
-    known = np.isfinite(boxes[:, ROLL : YAW + 1]).all(axis=1)
-    angles = boxes[known, ROLL : YAW + 1][:, ::-1]
-    quaternions_xyzw[known] = Rotation.from_euler('ZYX', angles).as_quat(canonical=True)
-    return quaternions_xyzw
+    return quaternion_from_rpy(boxes[:, ROLL:])
 
 
 def replaced(msg: Any, **fields: Any) -> Any:
@@ -223,7 +222,7 @@ def moved(pose: Any, T_out_in: Floats | None) -> Any:
     pose = with_position(pose, (R @ [p.x, p.y, p.z] + T_out_in[:3, 3]).tolist())
     if not _is_unit(np.array(q)):
         return pose
-    return with_orientation(pose, (Rotation.from_matrix(R) * Rotation.from_quat(q)).as_quat())
+    return with_orientation(pose, quaternion_from_matrix(R @ matrix_from_quaternion(q)).tolist())
 
 
 def forward_of(pose: Any) -> Floats:

@@ -10,13 +10,13 @@ import sys
 import time
 from typing import NamedTuple
 
-from boxreg_ros.boxreg_node import import_message
+from boxreg_ros.live.node import import_message
+from paths import ROOT
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 
-ROOT = Path(__file__).resolve().parents[1]
 PATIENCE = 90.0  # [s]; nodes start slowly on a busy machine
 RELIABLE = [
     part
@@ -40,7 +40,7 @@ class Graph:
         self.processes = []
         self.publishers = {}
 
-    def start(self, *ros_args, command=('-m', 'boxreg_ros.node')):
+    def start(self, *ros_args, command=('-m', 'boxreg_ros.live.main')):
         """Start the node; its arguments are those after --ros-args."""
         process = NodeProcess(self, [sys.executable, *command, '--ros-args', *ros_args])
         self.processes.append(process)

@@ -1,12 +1,12 @@
 """A car and what a sensor that stands still sees of it, known exactly; and problems by hand."""
 
-from boxreg_ros import objective
-from boxreg_ros.chain import LINK
-from boxreg_ros.objective import DEVIATIONS, MEMORY, Problem, SHARED
-from boxreg_ros.sampling import observe
+from boxreg_ros.core import objective
+from boxreg_ros.core.arrowhead import LINK
+from boxreg_ros.core.objective import DEVIATIONS, MEMORY, Problem, SHARED
+from boxreg_ros.core.observation import observe
+from boxreg_ros.core.refine import Track
+from boxreg_ros.core.window import AWAY, Window
 from boxreg_ros.structures import BoxArray, Sweep
-from boxreg_ros.tracks import Track
-from boxreg_ros.window import AWAY, Window
 import numpy as np
 from scipy.spatial.transform import Rotation
 import torch

@@ -1,7 +1,6 @@
 import fcntl
 import io
 import os
-from pathlib import Path
 import pty
 import signal
 import struct
@@ -12,11 +11,11 @@ import time
 
 from boxreg_ros import cli
 from boxreg_ros.config import Config
+from paths import ROOT
 import pytest
 from ros_messages import Drive
 
 QUICK = ['--set', 'solver.rounds=1', '--set', 'solver.iterations=3']
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def boxreg(capsys, *arguments):
@@ -147,7 +146,7 @@ def test_unexpected_errors_point_to_debug(tmp_path, capsys, monkeypatch):
     def broken(args):
         raise ZeroDivisionError('impossible')
 
-    from boxreg_ros import relabel
+    from boxreg_ros.offline import relabel
 
     monkeypatch.setattr(relabel, 'run', broken)
     status, _, err = boxreg(capsys, 'relabel', 'a', '-o', 'b')

@@ -1,13 +1,12 @@
 """Linters as tests: each has to be installed to run, and to find nothing."""
 
 import importlib.util
-from pathlib import Path
 import subprocess
 import sys
 
+from paths import ROOT
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ['boxreg_ros', 'msg_adapters', 'test', 'setup.py']
 
 

@@ -11,9 +11,8 @@ import time
 from xml.etree import ElementTree
 
 import boxreg_ros
+from paths import ROOT
 import pytest
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_version_is_one():

@@ -1,15 +1,14 @@
 """The README shows what is so; `python test/test_readme.py` writes its tables."""
 
-from pathlib import Path
 import re
 import shlex
 
 from boxreg_ros.cli import parser
 from boxreg_ros.config import settings
-from boxreg_ros.formats import HEAD, rows
+from boxreg_ros.offline.formats import HEAD, rows
 from boxreg_ros.reasons import REASONS
+from paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / 'README.md'
 
 
@@ -64,7 +63,7 @@ def test_tables_are_those_of_the_code():
 def test_every_reason_that_is_counted_is_explained():
     # Reasons are words in quotes: what is counted, refused, told as trouble, or kept for.
     found = set()
-    for path in (ROOT / 'boxreg_ros').glob('*.py'):
+    for path in (ROOT / 'boxreg_ros').rglob('*.py'):
         text = path.read_text(encoding='utf-8')
         for pattern in (
             r"counts\[f?'(\w+)'\]",
@@ -77,7 +76,7 @@ def test_every_reason_that_is_counted_is_explained():
     totals = {'sweeps', 'boxes', 'box_arrays', 'frames'}
     assert len(found) > 10
     assert sorted(found - totals - set(REASONS)) == []
-    files = {*(ROOT / 'boxreg_ros').glob('*.py')} - {ROOT / 'boxreg_ros' / 'reasons.py'}
+    files = {*(ROOT / 'boxreg_ros').rglob('*.py')} - {ROOT / 'boxreg_ros' / 'reasons.py'}
     source = ''.join(path.read_text(encoding='utf-8') for path in files)
     for name, reason in REASONS.items():
         ending = f"}}_{name.partition('_')[2]}'"  # of one that begins with the topic

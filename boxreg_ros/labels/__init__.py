@@ -23,12 +23,12 @@ from typing import Protocol, TYPE_CHECKING
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.structures import Floats, HEIGHT, Ints, LENGTH, RefinedBoxes, Sweep
-from boxreg_ros.transforms import boxes_to_frame, inverse
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.structures import Floats, Ints, is_valid_box, RefinedBoxes, Sweep
 import numpy as np
 
 if TYPE_CHECKING:
-    from boxreg_ros.recording import Recording
+    from boxreg_ros.io.recording import Recording
 
 FORMATS = {
     'csv': 'boxreg_ros.labels.csv',
@@ -141,8 +141,7 @@ class LabelFrame:
 
         """
         boxes = self.refined.boxes
-        is_finite = np.isfinite(boxes.boxes).all(axis=1)
-        rows = np.flatnonzero(is_finite & (boxes.boxes[:, LENGTH : HEIGHT + 1] > 0).all(axis=1))
+        rows = np.flatnonzero(is_valid_box(boxes.boxes))
         dropped['invalid_box'] += len(boxes.boxes) - len(rows)
         target = self.fixed_frame if frame == 'fixed' else self.sensor_frame
         if boxes.frame_id == target:

@@ -15,6 +15,7 @@ from itertools import groupby
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.transforms import matrix
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.arrow import read_rows, Table
 from boxreg_ros.labels.files import (
@@ -24,11 +25,10 @@ from boxreg_ros.labels.files import (
     to_json,
     write_origin,
 )
+from boxreg_ros.rotations import quaternion_from_matrix
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, X, Z
-from boxreg_ros.transforms import matrix
 from msg_adapters.poses import quaternions_of
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 FORMAT = Format(
     name='argoverse2',
@@ -136,8 +136,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
 def _pose(T: Floats) -> list[float]:
     """Return qw qx qy qz x y z of a pose (4, 4)."""
-    quaternion = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True, scalar_first=True)
-    return [*quaternion.tolist(), *T[:3, 3].tolist()]
+    qx, qy, qz, qw = quaternion_from_matrix(T[:3, :3]).tolist()
+    return [qw, qx, qy, qz, *T[:3, 3].tolist()]
 
 
 def _xyz_xyzw(row: dict[str, float]) -> Floats:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, PITCH, ROLL, X, YAW, Z
-from boxreg_ros.transforms import inverse
+from boxreg_ros.io.transforms import inverse
+from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, Z
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 import yaml
 
 Mask = NDArray[np.bool_]
@@ -122,7 +122,7 @@ class Camera:
 
         """
         T, P = self.T_rect_sensor, self.projection
-        turned = Rotation.from_euler('ZYX', boxes[:, [YAW, PITCH, ROLL]]).as_matrix()
+        turned = matrix_from_rpy(boxes[:, ROLL:])
         corners = (CORNERS * boxes[:, None, LENGTH : HEIGHT + 1]) @ turned.transpose(0, 2, 1)
         corners = (corners + boxes[:, None, X : Z + 1]) @ T[:3, :3].T + T[:3, 3]
         a, b = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]
@@ -152,7 +152,7 @@ class Camera:
         """
         T = self.T_rect_sensor
         centres = boxes[:, X : Z + 1] @ T[:3, :3].T + T[:3, 3]
-        turned = Rotation.from_euler('ZYX', boxes[:, [YAW, PITCH, ROLL]]).as_matrix()
+        turned = matrix_from_rpy(boxes[:, ROLL:])
         headings = turned[:, :, 0] @ T[:3, :3].T
         return centres, np.arctan2(-headings[:, 2], headings[:, 0])
 
@@ -163,7 +163,7 @@ class Camera:
         R_rect_box = np.array([[cos, sin, zero], [zero, zero, zero - 1], [-sin, cos, zero]])
         R_rect_box = R_rect_box.transpose(2, 0, 1)
         T = inverse(self.T_rect_sensor)
-        angles = Rotation.from_matrix(T[:3, :3] @ R_rect_box).as_euler('ZYX')[:, ::-1]
+        angles = rpy_from_matrix(T[:3, :3] @ R_rect_box)
         return np.hstack([centres @ T[:3, :3].T + T[:3, 3], extents, angles])
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import csv
 from pathlib import Path
 
-from boxreg_ros.boxtable import BoxTable, COLUMNS
+from boxreg_ros.io.box_table import BoxTable, COLUMNS
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.files import refined_boxes
 from boxreg_ros.structures import HEIGHT, LENGTH, X, Z

@@ -19,10 +19,10 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import absolute, INPUT, LabelFrame
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import read_timeline, refined_boxes, STAMPS, the_one
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, PITCH, RefinedBoxes, ROLL, X, YAW, Z
+from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, ROLL, X, Z
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 OURS = 'boxreg'
 """Key of what only we write and read beside a box; the tools pass over it."""
@@ -32,14 +32,14 @@ UPPER = np.triu_indices(6)
 
 
 def angles_of(boxes: Floats) -> Floats:
-    """Return the angles x y z (n, 3) of boxes (n, 9)."""
-    rotation = Rotation.from_euler('ZYX', boxes[:, [YAW, PITCH, ROLL]])
-    return rotation.as_euler('XYZ', suppress_warnings=True)
+    """Return angles x y z (n, 3) of boxes (n, 9), with R = Rx(x) Ry(y) Rz(z) [rad]."""
+    # The transpose of Rx(x) Ry(y) Rz(z) is Rz(-z) Ry(-y) Rx(-x).
+    return -rpy_from_matrix(matrix_from_rpy(boxes[:, ROLL:]).swapaxes(-1, -2))
 
 
 def box_of(position: ArrayLike, angles: ArrayLike, extent: ArrayLike) -> Floats:
     """Return a box (9,) from its centre, angles x y z and extent."""
-    rpy = Rotation.from_euler('XYZ', angles).as_euler('ZYX', suppress_warnings=True)[::-1]
+    rpy = rpy_from_matrix(matrix_from_rpy(-np.asarray(angles, float)).T)
     return np.concatenate([np.asarray(position, float), np.asarray(extent, float), rpy])
 
 

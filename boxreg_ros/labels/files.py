@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import INPUT, LabelFrame, Provenance
+from boxreg_ros.rotations import rpy_from_quaternion
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes
 import numpy as np
 from numpy.typing import ArrayLike
 import orjson
-from scipy.spatial.transform import Rotation
 
 STAMPS, POSES, ORIGIN = 'timestamps.txt', 'poses.txt', 'boxreg.json'
 FIRST_GIVEN_NUMBER = 10**6
@@ -84,7 +84,7 @@ def boxes_from(centres: ArrayLike, extents: ArrayLike, quaternions_xyzw: ArrayLi
     angles = np.full((len(centre), 3), np.nan)
     turned = np.linalg.norm(quaternion, axis=1) > 1e-6  # False for NaN
     if turned.any():
-        angles[turned] = Rotation.from_quat(quaternion[turned]).as_euler('ZYX')[:, ::-1]
+        angles[turned] = rpy_from_quaternion(quaternion[turned])
     return np.hstack([centre, extent, angles])
 
 

@@ -22,12 +22,12 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
-from boxreg_ros.intake import covariances_to_write
+from boxreg_ros.io.markers import MarkerBoard
+from boxreg_ros.io.recording import stock_types
+from boxreg_ros.io.session import covariances_to_write
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
-from boxreg_ros.recording import stock_types
 from boxreg_ros.structures import BoxArray, INTERPOLATED, RefinedBoxes
-from boxreg_ros.transforms import boxes_to_frame, inverse
-from boxreg_ros.visual import MarkerBoard
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from msg_adapters.poses import turned_covariances

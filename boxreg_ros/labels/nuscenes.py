@@ -20,6 +20,7 @@ from typing import Any
 import zlib
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.transforms import matrix
 from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import (
@@ -31,11 +32,10 @@ from boxreg_ros.labels.files import (
     the_one,
     write_origin,
 )
+from boxreg_ros.rotations import quaternion_from_matrix
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, WIDTH, X, Z
-from boxreg_ros.transforms import matrix
 from msg_adapters.poses import quaternions_of
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 FORMAT = Format(
     name='nuscenes',
@@ -103,9 +103,9 @@ class Writer:
             'fileformat': 'pcd.bin', 'is_key_frame': True, 'height': 0, 'width': 0,
             'filename': file, 'prev': '', 'next': '', 'is_valid': True,
         })  # fmt: skip
-        turn = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True, scalar_first=True)
+        qx, qy, qz, qw = quaternion_from_matrix(T[:3, :3]).tolist()
         self._lists['ego_pose'].append({
-            'token': pose, 'timestamp': stamp, 'rotation': turn.tolist(),
+            'token': pose, 'timestamp': stamp, 'rotation': [qw, qx, qy, qz],
             'translation': T[:3, 3].tolist(),
         })  # fmt: skip
         if frame.sweep is not None:

@@ -19,10 +19,10 @@ from typing import Any
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.files import from_json, refined_boxes, to_json
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, X, Z
+from boxreg_ros.rotations import rpy_from_quaternion
+from boxreg_ros.structures import Floats, HEIGHT, is_valid_box, LENGTH, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 FORMAT = Format(
     name='openlabel',
@@ -82,7 +82,7 @@ class Writer:
                 boxes.boxes[:, LENGTH : HEIGHT + 1],
             ]
         )
-        is_valid = np.isfinite(values).all(axis=1) & (values[:, 7:] > 0).all(axis=1)
+        is_valid = is_valid_box(boxes.boxes)
         self.dropped['invalid_box'] += int((~is_valid).sum())
         self._frame_ids.add(boxes.frame_id)
         covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS).tolist()
@@ -250,5 +250,4 @@ def _box(values: list[float]) -> Floats:
     """Return a box (9,) from nine or ten values of a cuboid."""
     if len(values) == 9:
         return np.array([*values[:3], *values[6:], *values[3:6]])
-    angles = Rotation.from_quat(values[3:7]).as_euler('ZYX')[::-1]
-    return np.array([*values[:3], *values[7:], *angles])
+    return np.array([*values[:3], *values[7:], *rpy_from_quaternion(values[3:7])])

@@ -16,8 +16,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.boxtable import COLUMNS
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.box_table import COLUMNS
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.arrow import read_table, Table
 from boxreg_ros.labels.files import boxes_from, refined_boxes, to_json

@@ -17,6 +17,7 @@ from pathlib import Path
 import re
 import shutil
 from tempfile import TemporaryFile
+from typing import cast
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape, unescape
 
@@ -24,19 +25,18 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import read_timeline, refined_boxes, Timeline, to_json
+from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     Floats,
     HEIGHT,
     INTERPOLATED,
     LENGTH,
-    PITCH,
     ROLL,
     X,
     YAW,
     Z,
 )
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 FORMAT = Format(
     name='tracklets',
@@ -190,7 +190,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
         is_swapped = SWAPPED in text[: text.find('<boost_serialization')]
         of_frame: dict[int, list[tuple[str, str, Floats]]] = {}
         for number, item in enumerate(tree.getroot().findall('tracklets/item')):
-            comments = [str(e.text) for e in item if e.tag is ElementTree.Comment]
+            comments = [str(e.text) for e in item if _is_comment(e)]
             named = [text for text in comments if text.startswith(TRACK)]
             name = _uncomment(named[0].removeprefix(TRACK)) if named else str(number)
             extent = [_number(item, key) for key in EXTENTS[is_swapped]]
@@ -221,9 +221,14 @@ def read(path: Path) -> Iterator[LabelFrame]:
         yield timeline.frame(index, refined)
 
 
+def _is_comment(element: ElementTree.Element) -> bool:
+    # Its tag is the function that makes comments, though annotated as text.
+    return cast(object, element.tag) is ElementTree.Comment
+
+
 def _shifted(boxes: Floats, shift: float) -> Floats:
     """Return centres (n, 3), moved along the boxes' own z."""
-    turned = Rotation.from_euler('ZYX', boxes[:, [YAW, PITCH, ROLL]]).as_matrix()
+    turned = matrix_from_rpy(boxes[:, ROLL:])
     return boxes[:, X : Z + 1] + shift * turned[:, :, 2]
 
 

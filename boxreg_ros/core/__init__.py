@@ -1,0 +1,1 @@
+"""The method: numpy and torch, no I/O, no ROS, no clock."""

@@ -1,0 +1,1 @@
+"""Recordings, transforms and the way in that both drivers share."""

@@ -1,0 +1,174 @@
+"""Tables of boxes: what ``boxes.csv`` and truth files hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.core.metrics import EXTENT
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
+from boxreg_ros.structures import BoxArray, Floats, Ints, ROLL
+import numpy as np
+
+COLUMNS = (
+    'stamp_ns', 'frame_id', 'track_id', 'class_name', 'score', 'x', 'y', 'z',
+    'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height', 'status', 'num_points',
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class BoxTable:
+    """
+    Boxes of many stamps, one row each, as in ``boxes.csv``.
+
+    Attributes
+    ----------
+    stamps_ns : array, shape (n,)
+        Header stamps [ns].
+    frame_id : str
+        Frame of all `boxes`; ``''`` when there are none.
+    track_ids, class_names, status : tuple of n str
+        Identity over time, category, and where the box comes from.
+    scores : array, shape (n,)
+        Detector confidence.
+    boxes : array, shape (n, 9)
+        As defined in `structures`.
+    num_points : array, shape (n,)
+        Returns of the object, or inside the box.
+
+    """
+
+    stamps_ns: Ints
+    frame_id: str
+    track_ids: tuple[str, ...]
+    class_names: tuple[str, ...]
+    scores: Floats
+    boxes: Floats
+    status: tuple[str, ...]
+    num_points: Ints
+
+    @classmethod
+    def from_arrays(cls, arrays: Sequence[BoxArray], status: str = 'input') -> BoxTable:
+        """
+        Return the rows of box arrays that share one frame, in their order.
+
+        Raises
+        ------
+        RecordingError
+            If the arrays are in several frames.
+
+        """
+        frame_ids = {array.frame_id for array in arrays}
+        if len(frame_ids) > 1:
+            raise RecordingError(
+                f'boxes: expected one frame, got {", ".join(sorted(frame_ids))}; relabel first'
+            )
+        count = sum(len(array.track_ids) for array in arrays)
+        return cls(
+            np.repeat([a.stamp_ns for a in arrays], [len(a.track_ids) for a in arrays]).astype(
+                np.int64
+            ),
+            frame_ids.pop() if frame_ids else '',
+            tuple(name for a in arrays for name in a.track_ids),
+            tuple(name for a in arrays for name in a.class_names),
+            np.concatenate([np.zeros(0)] + [a.scores for a in arrays]),
+            np.concatenate([np.zeros((0, 9))] + [a.boxes for a in arrays]),
+            (status,) * count,
+            np.zeros(count, np.int64),
+        )
+
+    @classmethod
+    def read(cls, path: str | Path) -> BoxTable:
+        """
+        Read a CSV file with the columns of ``boxes.csv``; others beside them are ignored.
+
+        Raises
+        ------
+        RecordingError
+            If the file cannot be read, a column is missing, a value is not what its column
+            needs, or the rows are in several frames.
+
+        """
+        tables = cls.read_frames(path)
+        if len(tables) > 1:
+            raise RecordingError(f'{path}: expected one frame, got {", ".join(sorted(tables))}')
+        return next(iter(tables.values()), cls.from_arrays([]))
+
+    @classmethod
+    def read_frames(cls, path: str | Path) -> dict[str, BoxTable]:
+        """Return a table per frame of a file, and raise as `read` does but for several frames."""
+        try:
+            with open(path, newline='', encoding='utf-8-sig') as file:  # spreadsheets add a BOM
+                reader = csv.DictReader(file)
+                missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+                if missing:
+                    raise RecordingError(
+                        f'{path}: not a table of boxes, columns missing: {", ".join(missing)}'
+                    )
+                rows = [(reader.line_num, row) for row in reader]
+        except OSError as error:
+            raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise RecordingError(f'{path}: cannot be read as CSV: {error}') from None
+        of_frame: dict[str, list[tuple[int, dict[str, str]]]] = {}
+        for line, row in rows:
+            of_frame.setdefault(row['frame_id'], []).append((line, row))
+        return {name: cls._parsed(path, name, part) for name, part in of_frame.items()}
+
+    @classmethod
+    def _parsed(
+        cls, path: str | Path, frame_id: str, numbered: list[tuple[int, dict[str, str]]]
+    ) -> BoxTable:
+        def column(name: str, kind: type[int] | type[float], empty: str = '') -> list[Any]:
+            values = []
+            for line, row in numbered:
+                try:
+                    value = kind(row[name] or empty)
+                    values.append(np.int64(value) if kind is int else value)
+                except (ValueError, OverflowError) as error:
+                    what = 'a whole number' if kind is int else 'a number'
+                    what += ' of 64 bits' * isinstance(error, OverflowError)
+                    raise RecordingError(
+                        f'{path}: line {line}, column {name}: expected {what}, got '
+                        f'{row[name] or "nothing"}'
+                    ) from None
+            return values
+
+        rows = [row for _, row in numbered]
+        stamps = np.array(column('stamp_ns', int), np.int64)
+        num_points = np.array(column('num_points', int), np.int64)
+        numbers = np.array([column(name, float, 'nan') for name in COLUMNS[4:15]]).T
+        boxes = np.full((len(rows), 9), np.nan)
+        boxes[:, :3], boxes[:, EXTENT] = numbers[:, 1:4], numbers[:, 8:11]
+        turned = (np.linalg.norm(numbers[:, 4:8], axis=1) > 1e-6) & np.isfinite(
+            numbers[:, 4:8]
+        ).all(axis=1)
+        if turned.any():
+            boxes[turned, ROLL:] = rpy_from_quaternion(numbers[turned, 4:8])
+        return cls(
+            stamps,
+            frame_id,
+            tuple(row['track_id'] for row in rows),
+            tuple(row['class_name'] for row in rows),
+            numbers[:, 0],
+            boxes,
+            tuple(row['status'] for row in rows),
+            num_points,
+        )
+
+    def write(self, path: str | Path) -> None:
+        """Write all rows as CSV, in the columns of ``boxes.csv``."""
+        quaternions = quaternion_from_rpy(self.boxes[:, ROLL:])
+        with open(path, 'w', newline='', encoding='utf-8') as file:
+            table = csv.writer(file, lineterminator='\n')
+            table.writerow(COLUMNS)
+            for i, box in enumerate(self.boxes):
+                numbers = (self.scores[i], *box[:3], *quaternions[i], *box[EXTENT])
+                table.writerow([
+                    self.stamps_ns[i], self.frame_id, self.track_ids[i], self.class_names[i],
+                    *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],
+                ])  # fmt: skip

@@ -1,0 +1,276 @@
+"""
+Bodies of road users as convex parts, and a spinning sensor's rays against them.
+
+A part is what lies inside its side view, its top view and its front view at once, so a ray meets
+it where it has entered all of the half-spaces. Views are drawn in parts of the extent: x and y
+from -0.5 to 0.5, z from 0 (road) to 1 (roof), counter-clockwise.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+from numpy.typing import NDArray
+
+PERIOD = 0.1  # [s] per revolution; the stamp is its middle
+ROAD = -1  # owner of returns from the road
+
+View = list[tuple[float, float]]
+
+
+def _top(half: View) -> View:
+    """Return a top view (x, y) from its right half, rear to front."""
+    return half + [(x, -y) for x, y in reversed(half)]
+
+
+def _front(half: View) -> View:
+    """Return a front view (y, z) from its left half, bottom to top."""
+    return half + [(-y, z) for y, z in reversed(half)]
+
+
+def _wheel(x: float, radius_x: float, radius_z: float) -> tuple[View, View, View]:
+    turns = np.arange(8) * np.pi / 4 + np.pi / 8
+    scale = 1 / np.cos(np.pi / 8)  # the flat of the octagon is on the road
+    side = [
+        (x + scale * radius_x * np.cos(a), radius_z + scale * radius_z * np.sin(a)) for a in turns
+    ]
+    return side, _top([(-0.5, -0.47), (0.5, -0.47)]), BLOCK
+
+
+ROUNDED = _top([
+    (-0.5, -0.34), (-0.46, -0.46), (-0.36, -0.5), (0.3, -0.5), (0.43, -0.45), (0.5, -0.28),
+])  # fmt: skip
+SQUARE = _top([(-0.5, -0.5), (0.5, -0.5)])
+BLOCK = _front([(0.5, 0.0), (0.5, 1.0)])
+TAPERED = _front([(0.44, 0.0), (0.5, 0.45), (0.35, 1.0)])
+OVAL = _top([(-0.5, -0.2), (-0.2, -0.5), (0.2, -0.5), (0.5, -0.2)])
+
+BODIES: dict[str, list[tuple[View, View, View]]] = {
+    'car': [
+        ([(-0.49, 0.2), (-0.4, 0.14), (0.42, 0.14), (0.49, 0.2), (0.5, 0.36), (0.45, 0.48),
+          (0.22, 0.58), (-0.44, 0.64), (-0.5, 0.5)], ROUNDED, BLOCK),
+        ([(-0.45, 0.5), (0.26, 0.5), (0.06, 0.94), (-0.03, 1.0), (-0.18, 1.0), (-0.3, 0.94)],
+         ROUNDED, TAPERED),
+        _wheel(0.31, 0.07, 0.21), _wheel(-0.3, 0.07, 0.21),
+    ],
+    'suv': [
+        ([(-0.5, 0.24), (-0.4, 0.15), (0.43, 0.15), (0.5, 0.24), (0.5, 0.42), (0.45, 0.54),
+          (0.2, 0.62), (-0.48, 0.64), (-0.5, 0.55)], ROUNDED, BLOCK),
+        ([(-0.49, 0.5), (0.25, 0.5), (0.1, 0.93), (0.0, 1.0), (-0.36, 1.0), (-0.43, 0.96)],
+         ROUNDED, TAPERED),
+        _wheel(0.3, 0.078, 0.21), _wheel(-0.3, 0.078, 0.21),
+    ],
+    'van': [
+        ([(-0.5, 0.2), (-0.42, 0.1), (0.44, 0.1), (0.5, 0.17), (0.5, 0.42), (0.4, 0.75),
+          (0.24, 1.0), (-0.46, 1.0), (-0.5, 0.94)], ROUNDED,
+         _front([(0.47, 0.0), (0.5, 0.3), (0.5, 0.5), (0.43, 1.0)])),
+        _wheel(0.32, 0.065, 0.165), _wheel(-0.29, 0.065, 0.165),
+    ],
+    'truck': [
+        ([(-0.5, 0.3), (0.26, 0.3), (0.26, 1.0), (-0.5, 1.0)], SQUARE, BLOCK),
+        ([(-0.48, 0.16), (0.4, 0.16), (0.4, 0.3), (-0.48, 0.3)],
+         SQUARE, _front([(0.4, 0.0), (0.4, 1.0)])),
+        ([(0.29, 0.12), (0.49, 0.12), (0.5, 0.2), (0.5, 0.42), (0.47, 0.78), (0.42, 0.84),
+          (0.29, 0.84)], SQUARE, _front([(0.48, 0.0), (0.48, 1.0)])),
+        _wheel(0.36, 0.062, 0.15), _wheel(-0.3, 0.062, 0.15),
+    ],
+    'pedestrian': [
+        ([(-0.3, 0.0), (0.3, 0.0), (0.2, 0.52), (-0.2, 0.52)],
+         OVAL, _front([(0.25, 0.0), (0.3, 0.52)])),
+        ([(-0.25, 0.45), (0.25, 0.45), (0.5, 0.6), (0.3, 0.85), (-0.3, 0.85), (-0.5, 0.6)],
+         OVAL, BLOCK),
+        ([(-0.28, 0.85), (0.28, 0.85), (0.28, 1.0), (-0.28, 1.0)],
+         OVAL, _front([(0.2, 0.0), (0.2, 1.0)])),
+    ],
+    'cyclist': [
+        ([(-0.5, 0.17), (-0.4, 0.0), (0.4, 0.0), (0.5, 0.17), (0.4, 0.36), (-0.4, 0.36)], SQUARE,
+         _front([(0.06, 0.0), (0.06, 1.0)])),
+        ([(-0.2, 0.15), (0.12, 0.15), (0.08, 0.6), (-0.15, 0.6)],
+         OVAL, _front([(0.35, 0.0), (0.35, 1.0)])),
+        ([(-0.2, 0.52), (0.1, 0.55), (0.25, 0.62), (0.12, 0.86), (0.0, 0.86)], SQUARE, BLOCK),
+        ([(-0.02, 0.84), (0.13, 0.84), (0.13, 1.0), (-0.02, 1.0)],
+         SQUARE, _front([(0.17, 0.0), (0.17, 1.0)])),
+    ],
+}  # fmt: skip
+
+
+def box_planes(extent: Floats) -> Floats:
+    """Return the half-spaces (6, 4) of a box of `extent` (3,) [m], in its own frame."""
+    return np.column_stack([np.concatenate([np.eye(3), -np.eye(3)]), np.tile(extent / 2, 2)])
+
+
+def body(shape: str, extent: Floats) -> list[Floats]:
+    """
+    Return the convex parts of a body that fills a box of `extent` (3,) [m].
+
+    Returns
+    -------
+    parts : list of arrays, shape (P, 4)
+        Half-spaces n.x <= d in the box frame, rows n and d.
+
+    """
+    length, width, height = extent
+    scales = {(0, 2): (length, height), (0, 1): (length, width), (1, 2): (width, height)}
+    parts = []
+    for views in BODIES[shape]:
+        planes = []
+        for view, axes in zip(views, [(0, 2), (0, 1), (1, 2)], strict=True):
+            corners = np.array(view) - [0.0, 0.5 * (axes[1] == 2)]  # z from the centre
+            corners *= scales[axes]
+            edges = np.roll(corners, -1, axis=0) - corners
+            normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            rows = np.zeros((len(view), 4))
+            rows[:, axes] = normals
+            rows[:, 3] = (normals * corners).sum(axis=1)
+            planes.append(rows)
+        parts.append(np.concatenate(planes))
+    return parts
+
+
+def cast(parts: list[Floats], origins: NDArray[Any], directions: Floats) -> Floats:
+    """Return how far rays (R, 3) travel until they enter one of `parts`, or inf, shape (R,)."""
+    nearest = np.full(len(origins), np.inf)
+    for planes in parts:
+        room = planes[:, 3] - origins @ planes[:, :3].T  # (R, P), negative: outside
+        speed = directions @ planes[:, :3].T
+        with np.errstate(divide='ignore', invalid='ignore'):
+            crossing = room / speed
+        entry = np.where(speed < 0, crossing, -np.inf).max(axis=1)
+        leave = np.where(speed > 0, crossing, np.inf).min(axis=1)
+        passes_by = ((speed == 0) & (room < 0)).any(axis=1)
+        hit = (entry < leave) & (entry > 0) & ~passes_by
+        nearest[hit] = np.minimum(nearest[hit], entry[hit])
+    return nearest
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Where something is over time: poses (G, 6) x y z roll pitch yaw at `times` (G,) [s]."""
+
+    times: NDArray[Any]
+    poses: NDArray[Any]
+
+    def at(self, times: NDArray[Any]) -> Floats:
+        """Return poses at `times` (n,) [s], linear between those given, shape (n, 6)."""
+        return np.stack([np.interp(times, self.times, column) for column in self.poses.T], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """One road user: `shape` is one of `raycast.BODIES`, `extent` (3,) its true box [m]."""
+
+    track_id: str
+    class_name: str
+    shape: str
+    extent: Floats
+    motion: Motion
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A spinning LiDAR: elevations of its beams [rad], columns per turn, reach and noise [m]."""
+
+    elevations: Floats
+    columns: int
+    reach: float = 70.0
+    noise: float = 0.02
+    dropout: float = 0.03
+
+
+def revolution(
+    actors: Sequence[Actor],
+    parts: Sequence[list[Floats]],
+    ego: Motion,
+    sensor: Sensor,
+    stamp: float,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats, Ints]:
+    """
+    Return one turn of a sensor on `ego`, on a plane road at z = 0, first hits only.
+
+    Parameters
+    ----------
+    actors, parts
+        Who stands around, and their bodies.
+    ego : Motion
+        Of the sensor.
+    sensor : Sensor
+        What it is able to.
+    stamp : float
+        The middle of the turn [s].
+    rng : Generator
+        Of noise and drop-outs.
+
+    Returns
+    -------
+    points : array, shape (M, 3)
+        In the fixed frame [m].
+    times : array, shape (M,)
+        When each ray left, after the stamp [s].
+    owners : array, shape (M,)
+        Row of the actor that was hit, or `ROAD`.
+
+    """
+    columns, beams = sensor.columns, len(sensor.elevations)
+    turned = (np.arange(columns) + 0.5) / columns - 0.5
+    azimuth, times = 2 * np.pi * turned, PERIOD * turned
+    poses = ego.at(stamp + times)
+    flat, rise = np.cos(sensor.elevations), np.sin(sensor.elevations)
+    rays = np.stack(
+        [
+            np.cos(azimuth)[:, None] * flat,
+            np.sin(azimuth)[:, None] * flat,
+            np.broadcast_to(rise, (columns, beams)),
+        ],
+        axis=2,
+    )
+    rays = np.einsum('cij,cbj->cbi', to_matrix(poses)[:, :3, :3], rays)
+    origins = poses[:, :3]
+    with np.errstate(divide='ignore'):
+        ranges = np.where(rays[..., 2] < 0, -origins[:, None, 2] / rays[..., 2], np.inf)
+    owner = np.full((columns, beams), ROAD)
+    for index, actor in enumerate(actors):
+        # First only rays that can meet the sphere around the body, 1 m wider for its motion.
+        center = actor.motion.at(np.array([stamp]))[0, :3]
+        offset = center - poses[columns // 2, :3]
+        distance, radius = np.hypot(*offset[:2]), np.linalg.norm(actor.extent) / 2 + 1
+        if distance - radius > sensor.reach:
+            continue
+        half = np.arcsin(radius / distance) if distance > radius else np.pi
+        bearing = np.arctan2(offset[1], offset[0]) - poses[columns // 2, 5]
+        cols = np.flatnonzero(np.abs(wrap_angle(azimuth - bearing)) <= half)
+        height = np.arctan2(offset[2], distance)
+        rows = np.flatnonzero(np.abs(sensor.elevations - height) <= half + 0.02)
+        T_body_fixed = np.linalg.inv(to_matrix(actor.motion.at(stamp + times[cols])))
+        R, start = T_body_fixed[:, :3, :3], T_body_fixed[:, :3, 3]
+        start = np.einsum('cij,cj->ci', R, origins[cols]) + start
+        start = np.repeat(start, len(rows), axis=0)
+        ahead = np.einsum('cij,cbj->cbi', R, rays[np.ix_(cols, rows)]).reshape(-1, 3)
+        found = cast([box_planes(actor.extent)], start, ahead)
+        inside = np.isfinite(found)
+        found[inside] = cast(parts[index], start[inside], ahead[inside])
+        found = found.reshape(len(cols), len(rows))
+        window = np.ix_(cols, rows)
+        closer = found < ranges[window]
+        ranges[window] = np.where(closer, found, ranges[window])
+        owner[window] = np.where(closer, index, owner[window])
+    kept = (ranges < sensor.reach) & (rng.random(ranges.shape) >= sensor.dropout)
+    ranges = ranges + rng.normal(0, sensor.noise, ranges.shape)
+    column = np.nonzero(kept)[0]
+    points = origins[column] + ranges[kept][:, None] * rays[kept]
+    return points, times[column], owner[kept]
+
+
+def to_matrix(poses: Floats) -> Floats:
+    """Return transforms (n, 4, 4) of poses (n, 6) x y z roll pitch yaw."""
+    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    T[:, :3, :3] = matrix_from_rpy(poses[:, 3:])
+    T[:, :3, 3] = poses[:, :3]
+    return T

@@ -1,0 +1,1 @@
+"""From refined tracks to whole tracks."""

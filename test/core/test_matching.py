@@ -1,0 +1,203 @@
+"""Pairing by stamp: every order of arrival, and what is dropped is counted."""
+
+from collections import Counter
+from itertools import permutations
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.matching import StampMatcher
+from boxreg_ros.structures import BoxArray, Sweep
+import numpy as np
+import pytest
+
+TOLERANCE_NS, REACH_NS = 20, 60
+
+
+def sweep(stamp_ns, is_lost=False):
+    return Sweep(stamp_ns, 'odom', np.zeros((0, 3)), is_lost=is_lost)
+
+
+def boxes(stamp_ns):
+    return BoxArray(stamp_ns, 'odom', (), (), np.zeros(0), np.zeros((0, 9)))
+
+
+class Feed:
+    """
+    A matcher that takes ``'s100'`` or ``'b105'`` and tells pairs as stamps.
+
+    ``'l100'`` is a sweep that is lost.
+
+    """
+
+    def __init__(self, capacity=10, reach=TOLERANCE_NS):
+        self.counts = Counter()
+        config = Config(tolerance=TOLERANCE_NS * 1e-9, reach=reach * 1e-9, queue=capacity)
+        self.matcher = StampMatcher(config, self.counts)
+
+    def add(self, *items):
+        pairs = []
+        for item in items:
+            stamp_ns = int(item[1:])
+            if item[0] in 'sl':
+                pairs += self.matcher.add_sweep(sweep(stamp_ns, is_lost=item[0] == 'l'))
+            else:
+                pairs += self.matcher.add_boxes(boxes(stamp_ns))
+        return told(pairs)
+
+    def flush(self):
+        return told(self.matcher.flush())
+
+
+def told(pairs):
+    return [
+        (pair.boxes.stamp_ns, None if pair.sweep is None else pair.sweep.stamp_ns)
+        for pair in pairs
+    ]
+
+
+@pytest.mark.parametrize('items', [('s100', 'b100'), ('b100', 's100')])
+def test_a_pair_leaves_when_it_is_complete(items):
+    feed = Feed()
+    assert feed.add(items[0]) == []
+    assert feed.add(items[1]) == [(100, 100)]
+    assert feed.flush() == []
+    assert feed.counts == {}
+
+
+@pytest.mark.parametrize('stamp, is_pair', [(80, True), (120, True), (79, False), (121, False)])
+@pytest.mark.parametrize('first', ['sweep', 'boxes'])
+def test_the_tolerance_holds_to_both_sides(stamp, is_pair, first):
+    feed = Feed()
+    items = [f's{stamp}', 'b100'][:: 1 if first == 'sweep' else -1]
+    pairs = feed.add(*items) + feed.flush()
+    assert pairs == [(100, stamp if is_pair else None)]
+    assert feed.counts['sweep_without_boxes'] == (not is_pair)
+
+
+def test_the_nearest_sweep_is_taken():
+    feed = Feed()
+    assert feed.add('s90', 's104', 's115', 'b100') == [(100, 104)]
+    assert feed.flush() == []
+    assert feed.counts == {'sweep_without_boxes': 2}
+
+
+def test_a_sweep_serves_all_boxes_near_it():
+    feed = Feed()
+    assert feed.add('s100', 'b95', 'b105') == [(95, 100), (105, 100)]
+    assert feed.flush() == []
+    assert feed.counts == {}
+
+
+@pytest.mark.parametrize('late', range(3))
+def test_between_sweeps_the_nearest_is_known_when_a_younger_one_has_come(late):
+    # 150 is 45 from 105, 55 from 205: within reach of both, the tolerance of neither.
+    items = ['s105', 's205']
+    items.insert(late, 'b150')
+    feed = Feed(reach=REACH_NS)
+    assert feed.add(*items) == [(150, 105)]
+    assert feed.add('b210') == [(210, 205)]
+    assert feed.add('b266') == []
+    assert feed.add('s305') == [(266, 305)]
+    assert feed.add('b366', 's466') == [(366, None)]  # 61 from 305
+    assert feed.flush() == []
+    assert feed.counts == {'sweep_without_boxes': 1}
+
+
+def test_boxes_at_twice_the_rate_share_sweeps():
+    feed = Feed(reach=REACH_NS)
+    pairs = feed.add('s100', 'b100', 'b150', 's200', 'b200', 'b250', 's300', 'b300')
+    assert pairs == [(100, 100), (150, 100), (200, 200), (250, 200), (300, 300)]
+    assert feed.counts == {}
+
+
+def test_the_boxes_of_a_lost_sweep_leave_alone():
+    feed = Feed(reach=REACH_NS)
+    assert feed.add('s100', 'l150', 'b150') == [(150, None)]  # at once, and not with 100
+    assert feed.add('b200', 'l200') == [(200, None)]
+
+
+def test_sweeps_that_come_twice_or_too_late_are_counted():
+    feed = Feed()
+    assert feed.add('s100', 's100', 's200', 'b200', 's100', 's179') == [(200, 200)]
+    assert feed.add('s180', 'b180') == [(180, 180)]
+    assert feed.counts == {'sweep_duplicate': 1, 'sweep_without_boxes': 1, 'sweep_late': 2}
+
+
+def test_any_order_loses_nothing():
+    # Whatever comes when: every box array comes back once, with its own sweep or none, and the
+    # sweeps without boxes are counted. In order if each kind comes in order.
+    for order in permutations(['s100', 's200', 's300', 'b100', 'b200', 'b300']):
+        feed = Feed()
+        pairs = feed.add(*order) + feed.flush()
+        assert sorted(stamp for stamp, _ in pairs) == [100, 200, 300], order
+        assert all(sweep in (stamp, None) for stamp, sweep in pairs), order
+        alone = sum(sweep is None for _, sweep in pairs)
+        assert feed.counts['sweep_without_boxes'] + feed.counts['sweep_late'] == alone, order
+        if [i for i in order if i[0] == 's'] == ['s100', 's200', 's300'] and (
+            [i for i in order if i[0] == 'b'] == ['b100', 'b200', 'b300']
+        ):
+            assert pairs == [(100, 100), (200, 200), (300, 300)], order
+
+
+def test_boxes_out_of_order_leave_in_order():
+    feed = Feed()
+    assert feed.add('b300', 'b100', 'b200') == []
+    assert feed.add('s100', 's200', 's300') == [(100, 100), (200, 200), (300, 300)]
+
+
+def test_boxes_wait_until_a_younger_sweep_has_come():
+    feed = Feed()
+    assert feed.add('b100', 'b200') == []
+    assert feed.add('s120') == [(100, 120)]
+    assert feed.add('s220') == [(200, 220)]
+    # 320 is within reach of a sweep at 340, not after one at 341 has come.
+    assert feed.add('b320') == []
+    assert feed.add('s341') == [(320, None)]
+
+
+def test_a_sweep_waits_for_boxes_that_come_late():
+    # A tracker is behind the sensor by a second: ten sweeps.
+    feed = Feed(capacity=20)
+    assert feed.add(*[f's{100 * i}' for i in range(1, 11)]) == []
+    assert feed.add('b100', 'b200', 'b300') == [(100, 100), (200, 200), (300, 300)]
+    assert feed.counts == {}
+
+
+def test_sweeps_beyond_capacity_are_dropped_oldest_first_and_counted():
+    feed = Feed(capacity=3)
+    assert feed.add('s100', 's200', 's300', 's400', 's500') == []
+    assert feed.counts == {'sweep_without_boxes': 2}
+    assert feed.add('b300') == [(300, 300)]
+    assert feed.add('b500') == [(500, 500)]
+    assert feed.counts == {'sweep_without_boxes': 3}  # 400 had no boxes
+
+
+def test_boxes_beyond_capacity_leave_alone_oldest_first():
+    feed = Feed(capacity=3)
+    assert feed.add('b100', 'b200', 'b300') == []
+    assert feed.add('b400') == [(100, None)]
+    assert feed.add('s200') == [(200, 200)]
+    assert feed.flush() == [(300, None), (400, None)]
+    assert feed.counts == {}
+
+
+def test_flush_returns_what_waits_and_forgets():
+    feed = Feed()
+    assert feed.add('b100', 's300', 'b310', 'b350', 's500') == [
+        (100, None),
+        (310, 300),
+        (350, None),
+    ]
+    assert feed.add('b600', 'b700') == []
+    assert feed.flush() == [(600, None), (700, None)]
+    assert feed.counts == {'sweep_without_boxes': 1}
+    assert feed.flush() == []
+
+
+def test_nothing_is_held_for_ever():
+    # Sweeps without boxes, boxes without sweeps, for a long time.
+    feed = Feed(capacity=5)
+    pairs = feed.add(*[f's{100 * i}' for i in range(100)], *[f'b{100 * i}' for i in range(200)])
+    pairs += feed.flush()
+    assert [boxes for boxes, _ in pairs] == [100 * i for i in range(200)]
+    assert [b for b, s in pairs if s is not None] == [9500, 9600, 9700, 9800, 9900]
+    assert feed.counts == {'sweep_without_boxes': 95}

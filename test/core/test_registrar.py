@@ -1,0 +1,583 @@
+"""Every box in comes back once, in order, with its status; the same calls give the same boxes."""
+
+from dataclasses import replace
+
+from boxreg_ros import Config, refine
+from boxreg_ros.core import input_model as calibration
+from boxreg_ros.core import registration
+from boxreg_ros.core.geometry import face_distances
+from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.core.registration import register, solve
+from boxreg_ros.structures import BoxArray, Sweep
+import numpy as np
+import pytest
+from scenes import drive, PERIOD_NS, stamps, stream_of, track_of
+import torch
+
+ESTIMATES = ['early', 'final', 'track']
+each_estimate = pytest.mark.parametrize('estimate', ESTIMATES)
+
+
+def cut(track, part):
+    """Return the observations `part` of a track."""
+    return replace(
+        track, stamps_ns=track.stamps_ns[part], boxes=track.boxes[part], points=track.points[part],
+        sensor_origins=track.sensor_origins[part],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def tracks():
+    """Return two cars that never meet, the second there from the third to the tenth stamp only."""
+    rng = np.random.default_rng(0)
+    first = track_of(drive(14), rng, 'a')
+    return [first, cut(track_of(drive(14, start=(-12.0, -6.0, 3.0)), rng, 'b'), slice(2, 10))]
+
+
+@pytest.fixture(scope='module')
+def stream(tracks):
+    return stream_of(tracks)
+
+
+def setup(estimate='final', **changes):
+    # Few points suffice here, and are fast.
+    base = {'estimate': estimate, 'window': 6, 'lag': 3, 'sampling.points': 64}
+    return Config().updated({**base, **changes})
+
+
+def fed(registrar, stream):
+    results = []
+    for sweep, boxes in stream:
+        results += registrar.add_sweep(sweep)
+        results += registrar.add_boxes(boxes)
+    return results
+
+
+def run(stream, config):
+    registrar = BoxRegistrar(config)
+    return fed(registrar, stream) + registrar.flush(), registrar.counts
+
+
+def finals(results):
+    return [result for result in results if result.is_final]
+
+
+def assert_equal(results, known, atol=0.0):
+    assert len(results) == len(known)
+    for a, b in zip(results, known, strict=True):
+        assert (a.boxes.stamp_ns, a.boxes.track_ids, a.is_final) == (
+            b.boxes.stamp_ns, b.boxes.track_ids, b.is_final,
+        )  # fmt: skip
+        np.testing.assert_allclose(a.boxes.boxes, b.boxes.boxes, rtol=0, atol=atol)
+        assert (a.status, a.reasons) == (b.status, b.reasons)
+
+
+# --- what comes back ----------------------------------------------------------------------------
+
+
+@each_estimate
+def test_every_box_comes_back_once_in_order(stream, estimate):
+    results, counts = run(stream, setup(estimate))
+    assert [r.boxes.stamp_ns for r in finals(results)] == [b.stamp_ns for _, b in stream]
+    for result, (sweep, given) in zip(finals(results), stream, strict=True):
+        n = len(given.track_ids)
+        boxes = result.boxes
+        assert (boxes.track_ids, boxes.class_names) == (given.track_ids, given.class_names)
+        assert boxes.frame_id == 'odom'
+        np.testing.assert_array_equal(boxes.scores, given.scores)
+        assert len(result.status) == len(result.reasons) == len(result.num_points) == n
+        assert result.covariances.shape == (n, 6, 6)
+        assert set(result.status) == {'refined'}
+        assert set(result.reasons) <= {''}
+        assert np.abs(boxes.boxes - given.boxes).max() > 1e-3
+        out = face_distances(torch.from_numpy(sweep.points), torch.from_numpy(given.boxes))
+        np.testing.assert_array_equal(result.num_points, (out <= 0).all(-1).sum(-1))
+    assert counts == {'sweeps': 14, 'boxes': 22, 'refined': 22}
+
+
+@each_estimate
+def test_early_estimates_come_at_once(stream, estimate):
+    registrar = BoxRegistrar(setup(estimate))
+    for sweep, boxes in stream:
+        assert registrar.add_sweep(sweep) == []
+        early = [r for r in registrar.add_boxes(boxes) if not r.is_final]
+        assert [r.boxes.stamp_ns for r in early] == [boxes.stamp_ns][: estimate != 'track']
+    assert all(r.is_final for r in registrar.flush())
+
+
+@pytest.mark.parametrize('lag', [0, 1, 3, 5, 9])
+@pytest.mark.parametrize('estimate', ['early', 'final'])
+def test_finals_come_lag_ticks_later(stream, estimate, lag):
+    registrar = BoxRegistrar(setup(estimate, lag=lag))
+    lag = min(lag, 5)  # by then it is the oldest of its window of 6, which says no more of it
+    order = [boxes.stamp_ns for _, boxes in stream]
+    for tick, (sweep, boxes) in enumerate(stream):
+        ready = finals(registrar.add_sweep(sweep) + registrar.add_boxes(boxes))
+        known = order[tick - lag : tick - lag + 1] if tick >= lag else []
+        assert [r.boxes.stamp_ns for r in ready] == known
+    assert [r.boxes.stamp_ns for r in registrar.flush()] == order[len(order) - lag :]
+    assert registrar.flush() == []
+
+
+def test_finals_are_better_than_early_estimates():
+    # Neighbours on both sides tell more than those before alone.
+    errors = []
+    for seed in range(4):
+        truth = drive(14)
+        track = track_of(truth, np.random.default_rng(seed))
+        results, _ = run(stream_of([track]), setup('final'))
+        boxes = [
+            np.array([r.boxes.boxes[0] for r in results if r.is_final == is_final])
+            for is_final in (False, True)
+        ]
+        errors.append([np.linalg.norm((b - truth)[:, :2], axis=1).mean() for b in boxes])
+    early, final = np.mean(errors, axis=0)
+    assert final < 0.9 * early
+
+
+def test_a_window_of_the_whole_track_comes_back_in_parts():
+    # With windows of 12, a track is solved when it has as many; the last one then waits on.
+    stream = stream_of([track_of(drive(40), np.random.default_rng(0))])
+    registrar = BoxRegistrar(setup('track', track_window=12))
+    held = []
+    results = []
+    for i, pair in enumerate(stream):
+        results += fed(registrar, [pair])
+        held.append(i + 1 - len(results))
+    assert max(held) <= 12
+    results += registrar.flush()
+    assert [r.boxes.stamp_ns for r in results] == [b.stamp_ns for _, b in stream]
+    assert {s for r in results for s in r.status} == {'refined'}
+
+
+@each_estimate
+def test_boxes_may_come_before_their_sweeps(stream, estimate):
+    known, counts = run(stream, setup(estimate))
+    registrar = BoxRegistrar(setup(estimate))
+    results = []
+    for _, boxes in stream[:5]:
+        results += registrar.add_boxes(boxes)
+    assert results == []
+    for sweep, _ in stream[:5]:
+        results += registrar.add_sweep(sweep)
+    for sweep, boxes in stream[5:]:
+        results += registrar.add_boxes(boxes) + registrar.add_sweep(sweep)
+    assert_equal(results + registrar.flush(), known)
+    assert registrar.counts == counts
+
+
+@each_estimate
+def test_sweeps_may_come_long_before_their_boxes(stream, estimate):
+    known, counts = run(stream, setup(estimate))
+    registrar = BoxRegistrar(setup(estimate))
+    for sweep, _ in stream:
+        assert registrar.add_sweep(sweep) == []
+    results = [result for _, boxes in stream for result in registrar.add_boxes(boxes)]
+    assert_equal(results + registrar.flush(), known)
+    assert registrar.counts == counts
+
+
+@each_estimate
+def test_points_measured_before_their_stamp(estimate):
+    # A car at 10 m/s whose points are all 20 ms old: 0.2 m behind. With `deskew` they count for
+    # where the car is at the stamp.
+    truth = drive(14, speed=10.0, turn=0.0, start=(-8.0, 6.0, 0.0))
+    errors = []
+    for seed in range(3):
+        late = [
+            (replace(s, points=s.points - [0.2, 0, 0], times=np.full(len(s.points), -0.02)), b)
+            for s, b in stream_of([track_of(truth, np.random.default_rng(seed))])
+        ]
+        for deskew in (False, True):
+            results, _ = run(late, setup(estimate, **{'sampling.deskew': deskew}))
+            boxes = np.array([r.boxes.boxes[0] for r in finals(results)])
+            errors.append(np.abs((boxes - truth)[2:, 0]).mean())
+    assert np.mean(errors[1::2]) < 0.5 * np.mean(errors[::2])
+
+
+@each_estimate
+@pytest.mark.parametrize('offset_ns', [-45_000_000, 45_000_000])
+def test_boxes_stamped_between_sweeps(estimate, offset_ns):
+    # A car at 15 m/s, which moves 0.68 m in these 45 ms: nearly as good as with equal stamps, but
+    # for a twenty-fifth of that, as its speed is told by its noisy boxes.
+    truth = drive(16, speed=15.0, turn=0.2, start=(-10.0, 6.0, 0.0))
+    there = np.array([[np.interp(t + offset_ns, stamps(16), x) for x in truth.T]
+                      for t in stamps(16)])  # fmt: skip
+    errors = []
+    for seed in (2, 1, 0):
+        exact = stream_of([track_of(truth, np.random.default_rng(seed))])
+        moved = [
+            (replace(s, stamp_ns=s.stamp_ns + offset_ns, points=s.points + here[:3] - box[:3]), b)
+            for (s, b), here, box in zip(exact, there, truth, strict=True)
+        ]
+        for stream in (exact, moved):
+            results, counts = run(stream[1:-1], setup(estimate))
+            boxes = np.array([r.boxes.boxes[0] for r in finals(results)])
+            errors.append(np.linalg.norm((boxes - truth[1:-1])[3:, :2], axis=1).mean())
+            assert counts['refined'] >= 13, counts
+    # Which of the two comes first makes no difference.
+    registrar = BoxRegistrar(setup(estimate))
+    swapped = [r for s, b in stream[1:-1] for r in registrar.add_boxes(b) + registrar.add_sweep(s)]
+    assert_equal(swapped + registrar.flush(), results)
+    exact, moved = np.mean(errors[::2]), np.mean(errors[1::2])
+    assert moved < exact + 0.68 / 25, (exact, moved)
+
+
+# --- determinism --------------------------------------------------------------------------------
+
+
+@each_estimate
+def test_the_same_calls_give_the_same_boxes(stream, estimate):
+    known, counts = run(stream, setup(estimate))
+    again, again_counts = run(stream, setup(estimate))
+    assert_equal(again, known)
+    assert again_counts == counts
+
+
+@each_estimate
+def test_reset_forgets_all_but_the_counts(stream, estimate):
+    known, counts = run(stream, setup(estimate))
+    registrar = BoxRegistrar(setup(estimate))
+    fed(registrar, stream[:7])
+    registrar.reset()
+    assert registrar.counts['sweeps'] == 7
+    registrar.counts.clear()
+    assert_equal(fed(registrar, stream) + registrar.flush(), known)
+    assert registrar.counts == counts
+
+
+@each_estimate
+def test_input_is_not_written_to(stream, estimate):
+    copies = [(sweep.points.copy(), boxes.boxes.copy()) for sweep, boxes in stream]
+    results, _ = run(stream, setup(estimate))
+    for result in results:
+        result.boxes.boxes[:] = np.nan  # nor does what comes back share memory with it
+    for (sweep, boxes), (points, values) in zip(stream, copies, strict=True):
+        np.testing.assert_array_equal(sweep.points, points)
+        np.testing.assert_array_equal(boxes.boxes, values)
+
+
+@pytest.mark.parametrize('estimate', ESTIMATES)
+def test_refine_gives_the_same(tracks, stream, estimate):
+    config = setup(estimate)
+    results, _ = run(stream, config)
+    wanted = [r for r in results if r.is_final == (estimate != 'early')]
+    for track, refined in zip(tracks, refine(tracks, config), strict=True):
+        known = [
+            r.boxes.boxes[r.boxes.track_ids.index(track.track_id)]
+            for r in wanted
+            if track.track_id in r.boxes.track_ids
+        ]
+        np.testing.assert_allclose(refined.boxes, known, rtol=0, atol=1e-9)
+
+
+# --- reasons ------------------------------------------------------------------------------------
+
+
+def named(*track_ids):
+    return lambda boxes: replace(boxes, track_ids=track_ids)
+
+
+def valued(column, value):
+    """Return what sets one number of the first box."""
+
+    def spoil(boxes):
+        values = boxes.boxes.copy()
+        values[0, column] = value
+        return replace(boxes, boxes=values)
+
+    return spoil
+
+
+@each_estimate
+@pytest.mark.parametrize(
+    'spoil, reasons',
+    [
+        (named('', 'b'), ('no_track_id', '')),
+        (named('a', 'a'), ('', 'duplicate_track_id')),
+        (valued(1, np.nan), ('invalid_box', '')),
+        (valued(8, np.inf), ('invalid_box', '')),
+        (valued(4, 0.0), ('invalid_box', '')),
+        (valued(3, -4.4), ('invalid_box', '')),
+    ],
+    ids=['no id', 'same id', 'nan', 'infinite', 'flat', 'negative'],
+)
+def test_boxes_that_cannot_be_refined_come_back_as_they_are(stream, estimate, spoil, reasons):
+    spoilt = list(stream)
+    spoilt[5] = (stream[5][0], spoil(stream[5][1]))
+    results, counts = run(spoilt, setup(estimate))
+    for result in (r for r in results if r.boxes.stamp_ns == spoilt[5][1].stamp_ns):
+        assert tuple(r if r != 'short_track' else '' for r in result.reasons) == reasons
+        row = next(i for i, reason in enumerate(reasons) if reason)
+        assert result.status[row] == 'kept'
+        np.testing.assert_array_equal(result.boxes.boxes[row], spoilt[5][1].boxes[row])
+        assert np.isfinite(result.covariances).all()
+    assert counts[next(filter(None, reasons))] == 1
+    assert counts['kept'] == 1
+    assert counts['kept'] + counts['refined'] == counts['boxes'] == 22
+    # The rest of the track goes on across it.
+    others = [r for r in finals(results) if r.boxes.stamp_ns != spoilt[5][1].stamp_ns]
+    assert {s for r in others for s in r.status} == {'refined'}
+
+
+@each_estimate
+def test_boxes_without_a_sweep(stream, estimate):
+    registrar = BoxRegistrar(setup(estimate))
+    results = []
+    for i, (sweep, boxes) in enumerate(stream):
+        if i != 5:
+            results += registrar.add_sweep(sweep)
+        results += registrar.add_boxes(boxes)
+    results += registrar.flush()
+    assert [r.boxes.stamp_ns for r in finals(results)] == [b.stamp_ns for _, b in stream]
+    alone = finals(results)[5]
+    assert alone.reasons == ('no_sweep', 'no_sweep')
+    assert alone.status == ('kept', 'kept')
+    np.testing.assert_array_equal(alone.boxes.boxes, stream[5][1].boxes)
+    assert registrar.counts['boxes_without_sweep'] == 1
+    assert registrar.counts['no_sweep'] == 2
+
+
+def test_a_sweep_without_boxes_is_counted(stream):
+    registrar = BoxRegistrar(setup())
+    for i, (sweep, boxes) in enumerate(stream):
+        registrar.add_sweep(sweep)
+        if i != 5:
+            registrar.add_boxes(boxes)
+    registrar.flush()
+    assert registrar.counts['sweep_without_boxes'] == 1
+    assert registrar.counts['sweeps'] == 14
+
+
+@each_estimate
+def test_an_empty_box_array_comes_back(stream, estimate):
+    sweep, boxes = stream[5]
+    empty = BoxArray(boxes.stamp_ns, 'odom', (), (), np.zeros(0), np.zeros((0, 9)))
+    results, counts = run([*stream[:5], (sweep, empty), *stream[6:]], setup(estimate))
+    assert [r.boxes.stamp_ns for r in finals(results)] == [b.stamp_ns for _, b in stream]
+    assert finals(results)[5].boxes.boxes.shape == (0, 9)
+    assert counts['refined'] == 20
+
+
+@each_estimate
+def test_late_boxes_come_back_as_they_are(stream, estimate):
+    # A box array that comes again after a younger one has been paired.
+    results, counts = run([*stream[:6], stream[3], *stream[6:]], setup(estimate))
+    assert counts['late'] == 2
+    late = [r for r in finals(results) if 'late' in r.reasons]
+    assert len(late) == 1
+    assert late[0].status == ('kept', 'kept')
+    np.testing.assert_array_equal(late[0].boxes.boxes, stream[3][1].boxes)
+    others = [r for r in finals(results) if r is not late[0]]
+    assert [r.boxes.stamp_ns for r in others] == [b.stamp_ns for _, b in stream]
+    assert {s for r in others for s in r.status} == {'refined'}
+
+
+@each_estimate
+def test_short_tracks_and_boxes_without_points(stream, estimate):
+    # The second car shows twice only; the first has no points at one stamp.
+    sweep, _ = stream[7]
+    nothing = Sweep(sweep.stamp_ns, 'odom', sweep.points[:0], None, sweep.origin)
+    part = [
+        (s, b if i < 4 else replace(
+            b, track_ids=('a',), class_names=('car',), scores=b.scores[:1], boxes=b.boxes[:1]
+        ))
+        for i, (s, b) in enumerate(stream)
+    ]  # fmt: skip
+    part[7] = (nothing, part[7][1])
+    results, counts = run(part, setup(estimate))
+    assert counts['short_track'] == 2
+    assert [r.reasons for r in finals(results)][2:4] == [('', 'short_track')] * 2
+    blind = finals(results)[7]
+    assert blind.status == ('refined',)
+    assert blind.num_points.tolist() == [0]
+    assert counts['kept'] == 2
+    assert counts['refined'] == 14
+
+
+# --- tracks end ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_law(monkeypatch):
+    """Nothing is learnt of extents: one track more or less tells more or less of these."""
+    monkeypatch.setattr(calibration, 'SLOPES', 1e-9)
+
+
+@each_estimate
+def test_a_silence_longer_than_max_gap_starts_a_new_track(estimate, no_law):
+    # The same id, after 0.9 s or 1.1 s of silence: after the longer one the boxes that follow
+    # are refined as if nothing had been before, but for what is learnt of the input.
+    config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
+    track = track_of(drive(28), np.random.default_rng(0))
+    whole = stream_of([track])
+    for gap, is_new in ((8, False), (9, False), (10, True)):
+        start = 8 + gap  # the tick after the silence is gap + 1 periods after the last before
+        results, _ = run(whole[:8] + whole[start : start + 8], config)
+        alone, _ = run(whole[start : start + 8], config)
+        found, known = (
+            next(r for r in rs if r.boxes.stamp_ns == whole[start][1].stamp_ns)
+            for rs in (results, alone)
+        )
+        difference = np.abs(found.boxes.boxes - known.boxes.boxes).max()
+        assert (difference < 1e-6) == is_new
+
+
+@pytest.mark.parametrize('estimate', ['early', 'final'])
+def test_a_new_track_of_a_known_id_remembers_nothing(estimate, no_law):
+    # Eight boxes, a silence, then eight under the same id, in windows of six; too few for the
+    # noise of the input to be measured. All that follow are as if nothing had been before.
+    config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
+    whole = stream_of([track_of(drive(30), np.random.default_rng(0), 'a')])
+    registrar = BoxRegistrar(config)
+    fed(registrar, whole[:8])
+    assert registrar._tracks['a'].memory.seen[3] == 3  # of 8, five are still in the window
+    results = fed(registrar, whole[22:23])
+    assert registrar._tracks['a'].memory is None
+    results += fed(registrar, whole[23:]) + registrar.flush()
+    first = whole[22][1].stamp_ns
+    known, _ = run(whole[22:], config)
+    assert_equal([r for r in results if r.boxes.stamp_ns >= first], known)
+
+
+@pytest.mark.parametrize('estimate', ['early', 'final'])
+def test_a_window_that_fails_is_forgotten(estimate):
+    # Stamps a nanosecond apart leave no curvature: their windows are kept. The track goes on
+    # without what they knew, and is refined again.
+    whole = stream_of([track_of(drive(24), np.random.default_rng(0), 'a')])
+    hasty = []
+    for i, (sweep, boxes) in enumerate(whole):
+        now_ns = boxes.stamp_ns if i < 8 else whole[8][1].stamp_ns + i
+        now_ns = boxes.stamp_ns if i >= 16 else now_ns
+        hasty.append((replace(sweep, stamp_ns=now_ns), replace(boxes, stamp_ns=now_ns)))
+    registrar, lasting, status = BoxRegistrar(setup(estimate, tolerance=0.0, reach=0.0)), [], []
+    for pair in hasty:
+        early = [r for r in fed(registrar, [pair]) if not r.is_final]
+        lasting.append(registrar._tracks['a'].memory is not None)
+        status += [(r.status[0], r.reasons[0]) for r in early]
+    registrar.flush()
+    failed = [i for i, (_, reason) in enumerate(status) if reason == 'not_finite']
+    assert failed
+    assert not any(lasting[i] for i in failed)
+    assert status[-1][0] == 'refined'
+    assert lasting[-1]
+
+
+def test_tracks_are_solved_together_when_a_window_is_full(monkeypatch):
+    # Tick 12: the track whose window of 12 is full, the one that has ended, and the one that has
+    # 7, more than half a window. An eighth of a window, one box, waits for the next one, and one
+    # that is settled stays: with 2 of 12 left, both are full again 10 ticks later. The rest, 8
+    # ticks and the same 2, at the end.
+    rng = np.random.default_rng(0)
+    long, short, late = (
+        cut(track_of(drive(30, start=(5.0, y, 0.2)), rng, name), part)
+        for y, name, part in (
+            (6.0, 'long', slice(30)), (-6.0, 'short', slice(4)), (20.0, 'late', slice(5, 30))
+        )
+    )  # fmt: skip
+    calls = []
+
+    def noted(windows, config, model):
+        calls.append({w.track_id: len(w.observations) for w in windows})
+        return register(windows, config, model)
+
+    monkeypatch.setattr('boxreg_ros.core.registrar.register', noted)
+    registrar = BoxRegistrar(setup('track', track_window=12, max_gap=0.3))
+    results = fed(registrar, stream_of([long, short, late])) + registrar.flush()
+    assert calls == [
+        {'short': 4, 'long': 12, 'late': 7},
+        {'long': 12, 'late': 12},
+        {'long': 10, 'late': 10},
+    ]
+    assert len(results) == 30
+
+
+def test_live_windows_are_solved_in_full_once_then_in_one_round(monkeypatch):
+    """Three observations make the first window; what comes after goes on from its boxes."""
+    asked = []
+
+    def note(problem, config, model, is_warm):
+        asked.append((problem.boxes.shape[1], is_warm))
+        return solve(problem, config, model, is_warm)
+
+    monkeypatch.setattr(registration, 'solve', note)
+    config = setup()
+    fed(BoxRegistrar(config), stream_of([track_of(drive(8), np.random.default_rng(0), 'a')]))
+    assert asked == [(3, False), (4, True), (5, True), (6, True), (6, True), (6, True)]
+
+
+def test_a_track_that_ends_comes_back_before_the_end():
+    # With estimate 'track' a track that has been silent for long must not hold up all others.
+    rng = np.random.default_rng(0)
+    short, long = track_of(drive(5), rng, 'short'), track_of(drive(60, speed=0, turn=0), rng, 'l')
+    registrar = BoxRegistrar(setup('track', track_window=12))
+    assert len(fed(registrar, stream_of([short, long]))) >= 60 - 12
+
+
+@each_estimate
+def test_memory_is_bounded(estimate):
+    # A parked car, a visitor with a new id at every third tick, and sweeps nobody asks for.
+    rng = np.random.default_rng(0)
+    parked = track_of(drive(20, speed=0, turn=0), rng)
+    config = setup(estimate, track_window=10, max_gap=0.3, **{'sampling.points': 16})
+    registrar = BoxRegistrar(config)
+    returned, held = 0, []
+    for i in range(60):
+        now_ns = int(stamps(1)[0]) + i * PERIOD_NS
+        points = parked.points[i % 20]
+        boxes = np.array([parked.boxes[i % 20], parked.boxes[0] + np.eye(9)[1] * 10])
+        array = BoxArray(now_ns, 'odom', ('p', f'v{i // 3}'), ('car',) * 2, np.ones(2), boxes)
+        registrar.add_sweep(Sweep(now_ns - PERIOD_NS // 2, 'odom', points))
+        results = registrar.add_sweep(Sweep(now_ns, 'odom', points)) + registrar.add_boxes(array)
+        returned += len(finals(results))
+        held.append(i + 1 - returned)
+        entries = sum(len(t.entries) for t in registrar._tracks.values())
+        entries += sum(len(t.entries) for t in registrar._ended)
+        assert entries <= 2 * 10 + 3 * 5
+        assert len(registrar._tracks) <= 4
+    # Ticks wait for the lag, or for the window of 10.
+    assert max(held) <= 15
+    assert max(held[40:]) <= max(held[:40])
+
+
+@each_estimate
+def test_an_id_that_another_object_gets_begins_a_track(estimate):
+    # Two cars 5 m apart swap their ids half-way. That is to be as good as new ids.
+    rng, early, late = np.random.default_rng(0), slice(12), slice(12, 24)
+    truths = [drive(24, turn=0, start=(5.0, y, 0.0)) for y in (6.0, 11.0)]
+    a, b = (track_of(truth, rng, name) for truth, name in zip(truths, 'ab', strict=True))
+
+    def overlap(of_b, of_a):
+        parts = [cut(a, early), cut(b, early)]
+        parts += [replace(cut(b, late), track_id=of_b), replace(cut(a, late), track_id=of_a)]
+        config = setup(estimate, **{'faces.learn': False})  # more ids would tell more of the rule
+        results, counts = run(stream_of(parts), config)
+        order = [('a', 'b'), (of_b, of_a)], [(0, 1), (1, 0)]
+        found = []
+        for i, result in enumerate(finals(results)):
+            assert result.boxes.track_ids == order[0][i // 12]
+            where = [truths[k][i] for k in order[1][i // 12]]
+            found.append(iou_3d(result.boxes.boxes, where))
+        assert counts['boxes'] == 48
+        return np.array(found)
+
+    new, swapped = overlap('c', 'd'), overlap('a', 'b')
+    assert swapped.mean() > new.mean() - 0.01
+    assert swapped.min() > new.min() - 0.01
+
+
+def test_torch_has_one_thread_meanwhile(stream, monkeypatch):
+    threads, before = [], torch.get_num_threads()
+
+    def noted(*args):
+        threads.append(torch.get_num_threads())
+        return register(*args)
+
+    monkeypatch.setattr('boxreg_ros.core.registrar.register', noted)
+    torch.set_num_threads(2)
+    try:
+        run(stream, setup())
+        assert ({*threads}, torch.get_num_threads()) == ({1}, 2)
+    finally:
+        torch.set_num_threads(before)

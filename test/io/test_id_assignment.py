@@ -1,0 +1,162 @@
+"""Ids by association: the same for the same object, whatever comes between."""
+
+from dataclasses import replace
+
+from boxreg_ros.config import Config
+from boxreg_ros.io.id_assignment import Tracker
+from boxreg_ros.io.session import Intake
+from boxreg_ros.structures import BoxArray
+from msg_adapters.convention import Convention, STANDARD
+import numpy as np
+from paths import SHARED
+import pytest
+from ros_messages import SECOND, START
+
+CAR, PERSON = (4.5, 1.9, 1.6), (0.6, 0.6, 1.75)
+
+
+def array_of(stamp_ns, *boxes):
+    """Return boxes of (x, y, extent)."""
+    rows = np.array([[x, y, 0.8, *extent, 0, 0, 0] for x, y, extent in boxes]).reshape(-1, 9)
+    n = len(boxes)
+    return BoxArray(stamp_ns, 'map', ('?',) * n, ('car',) * n, np.ones(n), rows)
+
+
+def ids_over_time(where, steps=30, period=0.1, noise=0.0, tracker=None):
+    """Return the ids (steps, n) of n objects that are `where(seconds)`, told in changing order."""
+    rng = np.random.default_rng(2)
+    tracker = tracker or Tracker(max_gap=1.0)
+    rows = []
+    for k in range(steps):
+        objects = where(k * period)
+        order = rng.permutation(len(objects))
+        jitter = rng.normal(0, noise, (len(objects), 2))
+        told = [objects[i] for i in order]
+        told = [(x + dx, y + dy, e) for (x, y, e), (dx, dy) in zip(told, jitter, strict=True)]
+        ids = tracker.identify(array_of(START + round(k * period * SECOND), *told)).track_ids
+        rows.append([ids[list(order).index(i)] for i in range(len(objects))])
+    return np.array(rows)
+
+
+def test_ids_stay_with_fast_slow_and_crossing_objects():
+    def where(t):
+        return [
+            (5.0 + 15 * t, 0.0, CAR),  # 15 m/s, overtaken by nobody
+            (60.0 - 15 * t, 3.5, CAR),  # comes towards it, one lane further
+            (30.0, 7.0, CAR),
+            (33.0, 7.0 + 1.2 * t, PERSON),  # walks by the parked car
+        ]
+
+    ids = ids_over_time(where, noise=0.15)
+    assert (ids == ids[0]).all()
+    assert sorted(ids[0]) == ['1', '2', '3', '4']
+
+
+def test_a_slow_detector_is_followed_once_the_speed_is_known():
+    """20 m/s at 2 Hz are steps of 10 m, farther than the gap between the cars."""
+
+    def where(t):
+        return [(20 * t, 0.0, CAR), (20 * t + 25.0, 0.0, CAR), (3.0, 9.0, CAR)]
+
+    ids = ids_over_time(where, steps=12, period=0.5, noise=0.1)
+    assert (ids == ids[0]).all()
+
+
+def test_boxes_that_come_and_go():
+    tracker = Tracker(max_gap=1.0)
+
+    def ids(tenths, *boxes):
+        stamp_ns = START + tenths * SECOND // 10
+        return tracker.identify(array_of(stamp_ns, *boxes)).track_ids
+
+    assert ids(0, (0, 0, CAR)) == ('1',)
+    assert ids(1, (10, 0, CAR), (0, 0, CAR)) == ('2', '1')  # another one
+    assert ids(2) == ()
+    assert ids(9, (0.2, 0, CAR)) == ('1',)  # hidden for 0.8 s
+    assert ids(25, (0.2, 0, CAR)) == ('3',)  # away for longer than max_gap
+    assert ids(26, (0.2, 0, PERSON)) == ('4',)  # no car turns into a person
+    assert ids(24, (0.2, 0, CAR), (50, 0, CAR)) == ('3', '5')  # late: finds, but changes nothing
+    assert ids(26, (50, 0, CAR)) == ('6',)
+    assert ids(27, (50, 0, CAR), (0.2, 0, CAR)) == ('7', '3')
+    assert ids(0, (0, 0, CAR)) == ('8',)  # played again from the beginning
+    assert ids(1, (0, 0, CAR)) == ('8',)
+    assert tracker.count == 8
+
+
+def test_neighbours_are_not_swapped_when_one_is_missing():
+    """Parked side by side, 2.4 m apart; one of them is not detected for a while."""
+    tracker = Tracker(max_gap=1.0)
+    row = [(0.0, 2.4 * k, CAR) for k in range(4)]
+    for k in range(5):
+        assert tracker.identify(array_of(START + k * SECOND // 10, *row)).track_ids == (
+            '1', '2', '3', '4',
+        )  # fmt: skip
+    for k in range(5, 9):
+        fewer = array_of(START + k * SECOND // 10, *row[:1], *row[2:])
+        assert tracker.identify(fewer).track_ids == ('1', '3', '4')
+
+
+def test_invalid_boxes_get_no_id_and_leave_the_others_alone():
+    tracker = Tracker(max_gap=1.0)
+    boxes = array_of(START, (0, 0, CAR), (np.nan, 0, CAR), (9, 0, (0, 1, 1)), (20, 0, CAR))
+    assert tracker.identify(boxes).track_ids == ('1', '', '', '2')
+
+
+def test_intake_gives_ids_where_they_are_wanted_and_says_so():
+    boxes = array_of(START, (0, 0, CAR))
+    intake = Intake(STANDARD, Config())
+    assert intake.take(boxes) is boxes
+    assert intake.facts == {'ids': 'of the input'}
+    intake = Intake(Convention(associate=True), Config())
+    assert intake.take(boxes).track_ids == ('1',)
+    assert intake.facts == {'ids': 'by association', 'associated_tracks': 1}
+
+
+def test_intake_begins_anew_with_new_ids_and_takes_another_gap():
+    intake = Intake(Convention(associate=True), Config(max_gap=0.5))
+    first, later = array_of(START, (0, 0, CAR)), array_of(START + 8 * 10**8, (0, 0, CAR))
+    assert intake.take(first).track_ids == ('1',)
+    intake.change(Config(max_gap=1.0))
+    assert intake.take(later).track_ids == ('1',)
+    intake.begin(Config(max_gap=0.5))
+    assert intake.take(first).track_ids == ('2',)
+    assert intake.take(later).track_ids == ('3',)
+
+
+def test_intake_tells_where_stamps_start_again():
+    intake = Intake(Convention(associate=True), Config())
+    ids, jumps = [], []
+    # A stray that is old is none; two in a row are a new beginning, and so is what follows it.
+    for seconds in (10.0, 10.1, 3.0, 10.2, 3.0, 3.1, 3.2):
+        boxes = array_of(START + round(seconds * SECOND), (5.0, 0.0, CAR))
+        jumps.append(intake.begins_anew(boxes))
+        ids.append(intake.take(boxes).track_ids[0])
+    assert jumps == [False] * 5 + [True, False]
+    assert ids[5] == ids[6] not in ids[:5]
+    # An array without boxes, stamp and frame is older than anything, and tells nothing.
+    nothing = replace(array_of(0), frame_id='')
+    assert not any(intake.begins_anew(nothing) for _ in range(3))
+
+
+def test_ids_of_a_real_drive():
+    """A drive past parked and moving cars, with the noise of a detector: no id changes."""
+    path = SHARED / 'data' / 'kitti_raw_0001.npz'
+    if not path.exists():
+        pytest.skip('the real data is not there')
+    data = np.load(path)
+    order = np.lexsort((data['obs_track'], data['obs_frame']))
+    rng = np.random.default_rng(4)
+    boxes = data['obs_box'] + rng.normal(0, 1, data['obs_box'].shape) * [0.2, 0.1, 0.1, *[0] * 6]
+    boxes[:, 3:6] *= np.exp(rng.normal(0, 0.06, (len(boxes), 3)))
+    tracker, given = Tracker(max_gap=1.0), {}
+    for frame in np.unique(data['obs_frame']):
+        rows = order[data['obs_frame'][order] == frame]
+        stamp_ns = START + round(data['obs_t'][rows[0]] * SECOND)
+        n = len(rows)
+        array = BoxArray(stamp_ns, 'map', ('',) * n, ('',) * n, np.ones(n), boxes[rows])
+        for track, track_id in zip(
+            data['obs_track'][rows], tracker.identify(array).track_ids, strict=True
+        ):
+            given.setdefault(int(track), set()).add(track_id)
+    assert all(len(ids) == 1 for ids in given.values()), given
+    assert len(set.union(*given.values())) == len(given) == 15

@@ -1,0 +1,205 @@
+"""What a pose and a size mean; worked out by hand, there and back."""
+
+from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.pose_check import ENOUGH, PoseCheck
+from boxreg_ros.structures import BoxArray, Sweep
+from msg_adapters import adapter_for
+from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
+from msg_adapters.poses import quaternions_of
+import numpy as np
+import pytest
+from ros_messages import DETECTIONS, Messages
+from scipy.spatial.transform import Rotation
+
+STAMP = 1_700_000_000_000_000_000
+QUARTER = np.pi / 2
+
+
+def array_of(*boxes, stamp_ns=STAMP):
+    n = len(boxes)
+    return BoxArray(stamp_ns, 'map', ('1',) * n, ('car',) * n, np.ones(n), np.array(boxes, float))
+
+
+@pytest.mark.parametrize(
+    ('settings', 'raw', 'center'),
+    [
+        # The bottom of an upright box of height 2: its centre is 1 m above.
+        ({'pose_reference': 'bottom'}, [5, 6, 0, 4, 2, 2, 0, 0, 0.3],
+         [5, 6, 1, 4, 2, 2, 0, 0, 0.3]),
+        # Heading along y, pose at the rear of a length of 4: the centre is 2 m further along y.
+        ({'pose_reference': 'rear'}, [5, 6, 1, 4, 2, 2, 0, 0, QUARTER],
+         [5, 8, 1, 4, 2, 2, 0, 0, QUARTER]),
+        # Rear axle on the ground: 0.3 of 4 m and half of 2 m.
+        ({'pose_reference': 'rear_axle_bottom'}, [5, 6, 0, 4, 2, 2, 0, 0, 0],
+         [6.2, 6, 1, 4, 2, 2, 0, 0, 0]),
+        # In own numbers: a quarter of the length before the centre, a half of the width right.
+        ({'pose_reference': '0.25,-0.5,0'}, [5, 6, 0, 4, 2, 2, 0, 0, 0],
+         [4, 7, 0, 4, 2, 2, 0, 0, 0]),
+        # A pitch of a quarter turn takes the box's z to x: half of the height 2.
+        ({'pose_reference': 'bottom'}, [5, 6, 0, 4, 2, 2, 0, QUARTER, 0],
+         [6, 6, 0, 4, 2, 2, 0, QUARTER, 0]),
+        ({'size_order': 'wlh'}, [5, 6, 1, 2, 4, 1.5, 0, 0, 0.3], [5, 6, 1, 4, 2, 1.5, 0, 0, 0.3]),
+        ({'size_order': 'hwl'}, [5, 6, 1, 1.5, 2, 4, 0, 0, 0], [5, 6, 1, 4, 2, 1.5, 0, 0, 0]),
+        # y points forward: the heading is a quarter turn further than the yaw of the pose.
+        ({'forward_axis': 'y+', 'size_order': 'wlh'}, [5, 6, 1, 2, 4, 1.5, 0, 0, 0.3],
+         [5, 6, 1, 4, 2, 1.5, 0, 0, 0.3 + QUARTER]),
+        ({'forward_axis': 'x-'}, [5, 6, 1, 4, 2, 1.5, 0, 0, -3],
+         [5, 6, 1, 4, 2, 1.5, 0, 0, np.pi - 3]),
+    ],
+)  # fmt: skip
+def test_by_hand(settings, raw, center):
+    convention = Convention(**settings)
+    np.testing.assert_allclose(convention.to_centers(array_of(raw)).boxes[0], center, atol=1e-12)
+    np.testing.assert_allclose(convention.from_centers(array_of(center)).boxes[0], raw, atol=1e-12)
+
+
+@pytest.mark.parametrize('pose_reference', REFERENCES)
+@pytest.mark.parametrize('forward_axis', FORWARD)
+def test_there_and_back(pose_reference, forward_axis):
+    boxes = array_of([5, 6, 1, 4, 2, 1.5, 0.1, -0.2, 0.3], [5, 6, 1, 4, 2, 1.5, 0, 0, np.nan])
+    for order in SIZE_ORDERS:
+        convention = Convention(pose_reference, order, forward_axis)
+        back = convention.from_centers(convention.to_centers(boxes)).boxes
+        np.testing.assert_allclose(back[0], boxes.boxes[0], atol=1e-12)
+        np.testing.assert_allclose(back[1, 3:6], boxes.boxes[1, 3:6])
+        assert np.isnan(back[1, 8])
+
+
+@pytest.mark.parametrize('forward_axis', ['x+', 'x-', 'y+', 'y-'])
+def test_covariance_is_that_of_the_reference(forward_axis):
+    """Against the spread of many boxes drawn about one."""
+    convention = Convention('rear_bottom', forward_axis=forward_axis)
+    box = np.array([5, 6, 1, 4, 2, 1.5, 0.05, -0.1, 2.0])
+    given = np.diag([0.1, 0.2, 0.1, 0.02, 0.03, 0.05]) ** 2
+    drawn = np.tile(box, (40000, 1))
+    pose = [0, 1, 2, 6, 7, 8]
+    drawn[:, pose] += np.random.default_rng(0).multivariate_normal(np.zeros(6), given, len(drawn))
+    seen = np.cov(convention.from_centers(array_of(*drawn)).boxes[:, pose].T)
+    (ours,) = convention.covariances_from_centers(array_of(box), given[None])
+    scale = np.sqrt(np.outer(np.diag(seen), np.diag(seen)))
+    assert np.abs((ours - seen) / scale).max() < 0.03
+    assert np.abs((given - seen) / scale).max() > 0.2  # it makes a difference
+
+
+@pytest.mark.parametrize(
+    ('settings', 'expected'),
+    [
+        ({'pose_reference': 'floor'}, 'pose_reference.*bottom.*floor'),
+        ({'pose_reference': '0,1'}, 'pose_reference.*three numbers'),
+        ({'pose_reference': '0,1,nan'}, 'pose_reference'),
+        ({'size_order': 'lw'}, 'size_order.*wlh'),
+        ({'forward_axis': 'z'}, 'forward_axis.*x-'),
+    ],
+)
+def test_what_is_refused(settings, expected):
+    with pytest.raises(ConfigError, match=expected):
+        Convention(**settings)
+
+
+def test_adapter_of_a_topic_reads_and_writes_its_convention():
+    m = Messages()
+    found = [('7', 'car', 0.9, (5, 6, 0), (0, 0, 0, 1), (2, 4, 1.5))]
+    message = m.detections(STAMP, 'map', found)
+    adapter = adapter_for(DETECTIONS, Convention('bottom', 'wlh'))
+    boxes = adapter.from_msg(message)
+    np.testing.assert_allclose(boxes.boxes, [[5, 6, 0.75, 4, 2, 1.5, 0, 0, 0]])
+    out = adapter.to_msg(message, boxes, np.eye(6)[None])
+    bbox = out.detections[0].bbox
+    assert (bbox.center.position.z, bbox.size.x, bbox.size.y) == (0, 2, 4)
+    # The bottom is half of 1.5 m below the centre: a roll of 1 rad moves it by 0.75 m sideways.
+    spread = out.detections[0].results[0].pose.covariance.reshape(6, 6)
+    assert spread[1, 1] == pytest.approx(1 + 0.75**2)
+    assert spread[1, 3] == pytest.approx(0.75)
+
+
+# The points know -------------------------------------------------------------------------------
+
+
+def scene(seed=3, count=16):
+    """Return boxes about the origin, and points on their two sides and their top."""
+    rng = np.random.default_rng(seed)
+    boxes = np.zeros((count, 9))
+    boxes[:, 0] = np.repeat([10, 20, 30, 40], count // 4)
+    boxes[:, 1] = np.tile([-12, -4, 4, 12], count // 4)
+    boxes[:, 2] = 0.8
+    boxes[:, 3:6] = rng.uniform([4, 1.7, 1.5], [5, 2.1, 1.7], (count, 3))
+    boxes[:, 8] = rng.uniform(-0.3, 0.3, count)
+    points = []
+    for box in boxes:
+        unit = rng.uniform(-0.5, 0.5, (90, 3))
+        for axis in range(3):
+            side = 0.5 if axis == 2 else -0.5
+            unit[axis * 30 : axis * 30 + 30, axis] = side
+        points.append(Rotation.from_euler('z', box[8]).apply(unit * box[3:6]) + box[:3])
+    ground = np.column_stack([rng.uniform([0, -20], [50, 20], (4000, 2)), np.zeros(4000)])
+    return boxes, np.concatenate([*points, ground])
+
+
+def checked(true, points, taken, meant):
+    """Return the finding about boxes of convention `meant` that are taken for `taken`."""
+    raw = meant.from_centers(array_of(*true))
+    check = PoseCheck(taken, tolerance=0.02)
+    for k in range(4):
+        sweep = Sweep(STAMP + k * 10**8, 'map', points)
+        boxes = taken.to_centers(array_of(*raw.boxes, stamp_ns=sweep.stamp_ns))
+        for item in (sweep, boxes) if k % 2 else (boxes, sweep):
+            assert not check.finding or k
+            check.add(item)
+    return check.finding
+
+
+@pytest.mark.parametrize(
+    ('taken', 'meant', 'words'),
+    [
+        ({}, {}, ()),
+        ({'pose_reference': 'bottom'}, {'pose_reference': 'bottom'}, ()),
+        ({'size_order': 'wlh'}, {'size_order': 'wlh'}, ()),
+        # Taken for bottoms, centres end up half a height too high, and the other way round.
+        ({'pose_reference': 'bottom'}, {}, ('hover 0.5 heights above', 'pose_reference:=center')),
+        ({}, {'pose_reference': 'bottom'}, ('0.5 heights below', 'pose_reference:=bottom')),
+        ({}, {'pose_reference': 'rear'}, ('0.5 lengths behind', '--pose-reference rear')),
+        ({}, {'size_order': 'wlh'}, ('size_order:=wlh', '--size-order wlh')),
+        # What is forward the points do not tell: both settings that fit are named.
+        ({}, {'forward_axis': 'y+'}, ('size_order:=wlh', 'or forward_axis:=y+ or y-')),
+        ({'forward_axis': 'y-'}, {}, ('size_order:=wlh', 'or forward_axis:=x+ or x-')),
+    ],
+)
+def test_poses_that_do_not_fit_their_points_are_reported(taken, meant, words):
+    finding = checked(*scene(), Convention(**taken), Convention(**meant))
+    assert bool(finding) == bool(words), finding
+    for word in words:
+        assert word in finding
+
+
+def test_noisy_boxes_are_not_accused():
+    boxes, points = scene()
+    rng = np.random.default_rng(8)
+    boxes[:, [0, 1, 2]] += rng.normal(0, 0.3, (len(boxes), 3))
+    boxes[:, 8] += rng.normal(0, 0.1, len(boxes))
+    assert not checked(boxes, points, STANDARD, STANDARD)
+
+
+def test_the_check_ends_and_takes_only_what_belongs_together():
+    boxes, points = scene()
+    check = PoseCheck(Convention('bottom'), tolerance=0.02)
+    wrong = Convention('bottom').to_centers(array_of(*boxes))
+    check.add(Sweep(STAMP + 10**8, 'map', points))
+    check.add(wrong)
+    assert not check.finding  # 0.1 s apart
+    check.add(Sweep(STAMP, 'map', points[:0]))
+    assert not check.finding  # no points, no opinion
+    for k in range(3):
+        few = BoxArray(
+            STAMP + k, 'map', ('',) * 4, ('',) * 4, np.ones(4), wrong.boxes[4 * k :][:4]
+        )
+        assert not check.finding
+        check.add(few)
+        check.add(Sweep(STAMP + k, 'map', points))
+    assert ENOUGH == 12 and check.finding
+    empty = np.full((2, 9), np.nan)
+    check = PoseCheck(STANDARD, tolerance=0.02)
+    for _ in range(5):
+        check.add(array_of(*empty))
+        check.add(Sweep(STAMP, 'map', points))
+    assert not check.finding
+    assert np.isnan(quaternions_of(empty)).all()

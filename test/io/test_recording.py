@@ -1,0 +1,368 @@
+import sqlite3
+
+from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.structures import BoxArray, Sweep
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
+import numpy as np
+import pytest
+from ros_messages import Drive, Messages, SECOND, START, write_recording
+
+M = Messages()
+
+
+def read(paths, tree=None, fixed_frame=None, **options):
+    """Return all sweeps and box arrays of recordings, and the fixed frame."""
+    tree = tree or TransformTree()
+    with Recording(paths if isinstance(paths, list) else [paths], **options) as recording:
+        fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
+        items = [recording.decode(record) for record in recording.records(tree)]
+    sweeps = [item for item in items if isinstance(item, Sweep)]
+    return sweeps, [item for item in items if isinstance(item, BoxArray)], fixed_frame
+
+
+def refused(paths, **options):
+    """Return the one-line message a recording is refused with."""
+    with pytest.raises((RecordingError, UnsupportedMessage)) as caught:
+        read(paths, **options)
+    text = str(caught.value)
+    assert '\n' not in text
+    return text
+
+
+@pytest.mark.parametrize('boxes', ['vision', 'markers'])
+@pytest.mark.parametrize('storage', ['mcap', 'mcap-folder', 'sqlite3', 'rosbag1'])
+def test_every_kind_of_recording_reads_alike(tmp_path, storage, boxes):
+    drive = Drive(boxes=boxes, ros1=storage == 'rosbag1')
+    sweeps, arrays, fixed_frame = read(drive.write(tmp_path / 'drive', storage))
+    assert fixed_frame == 'odom'
+    assert [sweep.stamp_ns for sweep in sweeps] == drive.stamps
+    assert [array.stamp_ns for array in arrays] == drive.stamps
+    assert {array.track_ids for array in arrays} == {('1', '2')}
+    assert all(sweep.points.shape == (240, 3) for sweep in sweeps)
+    if boxes == 'vision' and storage == 'mcap':
+        expected = drive.truth[START][:, :3] - [0, 0, 2]
+        np.testing.assert_allclose(arrays[0].boxes[:, :3], expected, atol=0.3)
+
+
+def test_single_db3_and_folder_without_metadata(tmp_path):
+    folder = Drive().write(tmp_path / 'drive', 'sqlite3')
+    (file,) = folder.glob('*.db3')
+    assert len(read(file)[0]) == 8
+    (folder / 'metadata.yaml').unlink()
+    assert len(read(folder)[0]) == 8
+
+
+def test_split_recordings_are_merged_by_time(tmp_path):
+    drive = Drive(sweeps=9)
+    parts = [drive.items[0::2], drive.items[1::2]]
+    paths = [
+        write_recording(tmp_path / f'part{i}', part, 'mcap', drive.messages)
+        for i, part in enumerate(parts)
+    ]
+    sweeps, arrays, _ = read(paths[::-1])
+    assert [sweep.stamp_ns for sweep in sweeps] == drive.stamps
+    assert [array.stamp_ns for array in arrays] == drive.stamps
+
+
+# Definitions -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('gone', ["'%Detection%'", "'%'"])
+def test_definitions_that_the_recording_lacks(tmp_path, gone):
+    folder = Drive().write(tmp_path / 'drive', 'sqlite3')
+    (file,) = folder.glob('*.db3')
+    with sqlite3.connect(file) as database:
+        count = database.execute('SELECT count(*) FROM message_definitions').fetchone()[0]
+        database.execute(f'DELETE FROM message_definitions WHERE topic_type LIKE {gone}')
+        assert database.execute('SELECT count(*) FROM message_definitions').fetchone()[0] < count
+    database.close()
+    _, arrays, _ = read(folder)
+    assert [array.track_ids for array in arrays] == [('1', '2')] * 8
+
+
+# Motion ----------------------------------------------------------------------------------------
+
+
+def test_transforms_are_read_ahead(tmp_path):
+    items = Drive(sweeps=8).items
+    late = [(t, stamp + SECOND // 2 * (t == '/tf'), message) for t, stamp, message in items]
+    path = write_recording(tmp_path / 'late', sorted(late, key=lambda item: item[1]))
+    tree = TransformTree()
+    with Recording([path]) as recording:
+        recording.choose_fixed_frame(tree)
+        found = {}
+        for record in recording.records(tree):
+            stamp = recording.decode(record).stamp_ns
+            found[stamp] = tree.lookup('odom', 'lidar', stamp)[0, 3]
+    assert found == {START + k * SECOND // 10: 0.5 * k for k in range(8)}
+
+
+def test_only_a_window_of_the_recording_is_held(tmp_path):
+    items = []
+    for k in range(200):
+        stamp = START + k * SECOND // 2
+        items.append(('/tf', stamp, M.tf(M.transform(stamp, 'odom', 'lidar', (k, 0, 0)))))
+        items.append(('/points', stamp, M.points(stamp, 'lidar', np.zeros((1, 3)))))
+        items.append(('/boxes', stamp, M.detections(stamp, 'lidar', [])))
+    path = write_recording(tmp_path / 'long', items)
+    tree = TransformTree()
+    with Recording([path]) as recording:
+        recording.choose_fixed_frame(tree)
+        for record in recording.records(tree):
+            assert tree.covers('odom', 'lidar', record.received_ns)
+            assert not tree.covers('odom', 'lidar', record.received_ns + 3 * SECOND)
+            assert not tree.covers('odom', 'lidar', record.received_ns - 40 * SECOND)
+
+
+def test_what_comes_before_a_long_pause_has_its_transforms(tmp_path):
+    pause = 3600 * SECOND
+    drives = [Drive(), Drive(start=START + pause)]
+    del drives[1].items[0]  # the first after the pause is a motion
+    paths = [drive.write(tmp_path / f'drive{k}') for k, drive in enumerate(drives)]
+    tree, found = TransformTree(), []
+    with Recording(paths) as recording:
+        recording.choose_fixed_frame(tree)
+        for record in recording.records(tree):
+            found.append(recording.decode(record).stamp_ns)
+            tree.lookup('odom', 'lidar', found[-1])
+    assert sorted(set(found)) == drives[0].stamps + drives[1].stamps
+
+
+def test_static_transforms_are_known_from_the_start(tmp_path):
+    drive = Drive()
+    topic, _, message = drive.items.pop(0)
+    drive.items.append((topic, drive.stamps[-1], message))
+    assert read(drive.write(tmp_path / 'drive'))[2] == 'odom'
+
+
+def test_odometry_serves_where_tf_does_not(tmp_path):
+    tree = TransformTree()
+    drive = Drive(motion='odometry')
+    assert read(drive.write(tmp_path / 'drive'), tree)[2] == 'odom'
+    T = tree.lookup('odom', 'lidar', drive.stamps[3])
+    np.testing.assert_allclose(T[:3, 3], [1.5, 0, 2])
+
+
+def test_odometry_of_the_sensor_itself_needs_no_tf(tmp_path):
+    drive = Drive(motion='none')
+    drive.items = [item for item in drive.items if item[0] != '/tf_static']
+    drive.items += [
+        ('/odom', stamp, M.odometry(stamp, 'world', 'lidar', (1, 2, 3))) for stamp in drive.stamps
+    ]
+    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    tree = TransformTree()
+    assert read(path, tree)[2] == 'world'
+    np.testing.assert_array_equal(tree.lookup('world', 'lidar', START)[:3, 3], [1, 2, 3])
+
+
+def test_odometry_of_something_else_is_named(tmp_path):
+    drive = Drive(motion='none')
+    drive.items.append(('/odom', START, M.odometry(START, 'world', 'trailer')))
+    text = refused(drive.write(tmp_path / 'drive'))
+    assert 'odometry: /odom (world -> trailer)' in text
+    assert 'base -> lidar' in text
+
+
+def test_odometry_that_starts_late_does_not_matter_beside_tf(tmp_path):
+    drive = Drive(sweeps=10, motion='tf')
+    stamp = drive.stamps[-1]
+    drive.items.append(('/odom', stamp, M.odometry(stamp, 'world', 'base')))
+    assert read(drive.write(tmp_path / 'drive'), end=0.5)[2] == 'odom'
+
+
+def test_tf_wins_over_odometry(tmp_path):
+    drive = Drive(motion='tf')
+    for stamp in drive.stamps:
+        drive.items.append(('/odom', stamp, M.odometry(stamp, 'wheels', 'base', (99, 0, 0))))
+        drive.items.append(('/odom2', stamp, M.odometry(stamp, 'wheels2', 'base', (99, 0, 0))))
+    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    assert read(path)[2] == 'odom'
+    assert read(path, odometry='/odom', fixed_frame='wheels')[2] == 'wheels'
+
+
+def test_several_odometries_are_listed(tmp_path):
+    drive = Drive(motion='odometry')
+    for stamp in drive.stamps:
+        drive.items.append(('/fused', stamp, M.odometry(stamp, 'map', 'base', (0, 0, 0))))
+        drive.items.append(('/other', stamp, M.odometry(stamp, 'map', 'wheel', (0, 0, 0))))
+    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    text = refused(path)
+    assert '/fused, /odom;' in text
+    assert '--odometry' in text
+    assert read(path, odometry='/fused')[2] == 'map'
+    assert read(path, odometry='/odom')[2] == 'odom'
+
+
+def test_odometry_that_moves_the_root_of_tf(tmp_path):
+    drive = Drive(motion='none')
+    for stamp in drive.stamps:
+        drive.items.append(('/tf', stamp, M.tf(M.transform(stamp, 'footprint', 'base'))))
+        drive.items.append(('/odom', stamp, M.odometry(stamp, 'odom', 'footprint')))
+    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    assert read(path)[2] == 'odom'
+
+
+def test_sensor_that_does_not_move_must_be_declared(tmp_path):
+    path = Drive(motion='none').write(tmp_path / 'drive')
+    text = refused(path)
+    assert "'lidar'" in text
+    assert '--fixed-frame lidar' in text
+    assert read(path, fixed_frame='lidar')[2] == 'lidar'
+    assert read(path, fixed_frame='base')[2] == 'base', 'static transforms lead there'
+
+
+def test_fixed_frame_that_is_not_there(tmp_path):
+    text = refused(Drive().write(tmp_path / 'drive'), fixed_frame='world')
+    assert "'world'" in text
+    assert 'odom -> base' in text
+    assert 'base -> lidar' in text
+
+
+# Parts -----------------------------------------------------------------------------------------
+
+
+def test_a_part_of_the_recording(tmp_path):
+    drive = Drive(sweeps=20)
+    path = drive.write(tmp_path / 'drive')
+    sweeps, arrays, _ = read(path, start=0.45, end=1.2)
+    assert [sweep.stamp_ns for sweep in sweeps] == drive.stamps[5:12]
+    assert [array.stamp_ns for array in arrays] == drive.stamps[5:12]
+    text = refused(path, start=5.0)
+    assert '1.9 s' in text
+    assert 'got 5 to the end' in text
+
+
+# What goes wrong -------------------------------------------------------------------------------
+
+
+def test_topics_that_are_not_there(tmp_path):
+    path = Drive().write(tmp_path / 'drive')
+    text = refused(path, points='/lidar')
+    assert "no topic '/lidar'" in text
+    assert 'topics with point clouds: /points' in text
+    assert 'topics with boxes: /boxes' in refused(path, boxes='/objects')
+    assert 'topics with odometry: none' in refused(path, odometry='/odom')
+
+
+def test_topic_of_another_type(tmp_path):
+    path = Drive().write(tmp_path / 'drive')
+    text = refused(path, boxes='/points')
+    assert "topic '/points'" in text
+    assert 'vision_msgs/msg/Detection3DArray' in text
+    assert 'got sensor_msgs/msg/PointCloud2' in text
+    assert 'got vision_msgs/msg/Detection3DArray' in refused(path, points='/boxes')
+
+
+@pytest.mark.parametrize(('gone', 'what'), [('/points', 'point clouds'), ('/boxes', 'boxes')])
+def test_no_clouds_or_no_boxes(tmp_path, gone, what):
+    drive = Drive()
+    drive.items = [item for item in drive.items if item[0] != gone]
+    text = refused(drive.write(tmp_path / 'drive'))
+    assert f'no {what}' in text
+    assert '/tf (tf2_msgs/msg/TFMessage)' in text
+
+
+def test_topics_without_messages_are_named(tmp_path):
+    drive = Drive()
+    empty = drive.messages.detections(START, 'lidar', [])
+    path = write_recording(
+        tmp_path / 'drive',
+        [*(item for item in drive.items if item[0] != '/boxes'), ('/late', START + SECOND, empty)],
+    )
+    (tmp_path / 'cut').mkdir()
+    cut = tmp_path / 'cut' / 'cut.mcap'
+    with path.open('rb') as source, cut.open('wb') as target:
+        reader, writer = make_reader(source), McapWriter(target)
+        writer.start('ros2')
+        channels = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            if channel.topic != '/late':
+                writer.add_message(
+                    channels[channel.topic], message.log_time, message.data, message.log_time
+                )
+        writer.finish()
+    assert 'no messages on /late' in refused(cut)
+
+
+def test_several_topics_fit(tmp_path):
+    drive = Drive()
+    drive.items += [
+        ('/rear', stamp, message) for t, stamp, message in drive.items if t == '/points'
+    ]
+    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    text = refused(path)
+    assert '/points, /rear' in text
+    assert '--points' in text
+    assert len(read(path, points='/rear')[0]) == 8
+
+
+def test_files_that_are_no_recordings(tmp_path):
+    assert 'no such recording' in refused(tmp_path / 'nothing.mcap')
+    for name in ('empty.mcap', 'empty.db3', 'empty.bag'):
+        (tmp_path / name).touch()
+        assert name in refused(tmp_path / name)
+    for name in ('text.mcap', 'text.db3', 'text.bag', 'text.csv'):
+        (tmp_path / name).write_text('this is no recording\n' * 100)
+        assert name in refused(tmp_path / name)
+    (tmp_path / 'folder').mkdir()
+    assert 'metadata.yaml' in refused(tmp_path / 'folder')
+    (tmp_path / 'folder' / 'metadata.yaml').write_text('rosbag2_bagfile_information: [')
+    assert 'folder' in refused(tmp_path / 'folder')
+
+
+def test_recording_that_was_cut_off(tmp_path):
+    path = Drive().write(tmp_path / 'drive')
+    path.write_bytes(path.read_bytes()[:-500])
+    assert 'expected a whole MCAP' in refused(path)
+    # Of several it is the one that is named.
+    whole = [Drive().write(tmp_path / name) for name in ('before', 'behind')]
+    assert refused([whole[0], path, whole[1]]).startswith(f'{path}: ')
+
+
+def test_recording_without_messages(tmp_path):
+    path = tmp_path / 'drive'
+    write_recording(path, [], 'sqlite3')
+    assert 'no point clouds' in refused(path)
+
+
+def test_ros1_and_ros2_together(tmp_path):
+    paths = [
+        Drive().write(tmp_path / 'two'),
+        Drive(ros1=True).write(tmp_path / 'one', 'rosbag1'),
+    ]
+    assert 'cannot be merged' in refused(paths)
+
+
+def test_message_that_does_not_follow_its_definition(tmp_path):
+    folder = Drive().write(tmp_path / 'drive', 'sqlite3')
+    (file,) = folder.glob('*.db3')
+    with sqlite3.connect(file) as database:
+        database.execute(
+            'UPDATE messages SET data = substr(data, 1, 40) WHERE topic_id = '
+            "(SELECT id FROM topics WHERE name = '/boxes')"
+        )
+    database.close()
+    assert "a message on '/boxes' is not a vision_msgs" in refused(folder)
+
+
+def test_message_that_cannot_be_used_names_its_topic(tmp_path):
+    drive = Drive()
+    drive.replace('/points', 2, lambda message: setattr(message, 'width', 10_000))
+    text = refused(drive.write(tmp_path / 'drive'))
+    assert text.startswith("topic '/points': PointCloud2:")
+    assert 'expected at least' in text
+
+
+def test_lookup_without_transform_says_what_is_known(tmp_path):
+    tree = TransformTree()
+    read(Drive().write(tmp_path / 'drive'), tree)
+    with pytest.raises(TransformUnavailable, match='base -> lidar, odom -> base'):
+        tree.lookup('map', 'lidar', START)

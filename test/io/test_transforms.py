@@ -1,0 +1,276 @@
+from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.transforms import (
+    boxes_to_frame,
+    FRAMES,
+    inverse,
+    Rewind,
+    sweep_to_frame,
+    TransformTree,
+)
+from boxreg_ros.structures import BoxArray, Sweep
+import numpy as np
+import pytest
+from ros_messages import Messages
+from scipy.spatial.transform import Rotation, Slerp
+
+S = 10**9
+M = Messages()
+LEFT = Rotation.from_euler('z', 90, degrees=True).as_quat()
+
+
+def rigid(position, quaternion_xyzw=(0, 0, 0, 1)):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
+    T[:3, 3] = position
+    return T
+
+
+def tree_of(*transforms, static=(), odometry=()):
+    tree = TransformTree()
+    tree.add_transforms(M.tf(*(M.transform(*t) for t in static)).transforms, is_static=True)
+    tree.add_transforms(M.tf(*(M.transform(*t) for t in transforms)).transforms)
+    for item in odometry:
+        tree.add_odometry(M.odometry(*item))
+    return tree
+
+
+def test_chain_of_any_depth_up_and_down():
+    tree = tree_of(
+        (S, 'map', 'odom', (100, 0, 0)),
+        (S, 'odom', 'base', (0, 10, 0), LEFT),
+        static=[(0, 'base', 'lidar', (1, 0, 2)), (0, 'base', 'camera', (0, 0, 1), LEFT)],
+    )
+    # The lidar sits 1 m ahead of a base that looks along +y.
+    np.testing.assert_allclose(tree.lookup('map', 'lidar', S)[:3, 3], [100, 11, 2], atol=1e-12)
+    T_camera_lidar = inverse(rigid((0, 0, 1), LEFT)) @ rigid((1, 0, 2))
+    np.testing.assert_allclose(tree.lookup('camera', 'lidar', S), T_camera_lidar, atol=1e-12)
+    back = tree.lookup('lidar', 'map', S) @ tree.lookup('map', 'lidar', S)
+    np.testing.assert_allclose(back, np.eye(4), atol=1e-12)
+
+
+def test_frame_to_itself_needs_no_transform():
+    np.testing.assert_array_equal(TransformTree().lookup('lidar', 'lidar', S), np.eye(4))
+
+
+def test_interpolation_is_linear_and_slerp():
+    first, second = Rotation.random(2, rng=7)
+    tree = tree_of(
+        (0, 'odom', 'base', (0, 0, 0), first.as_quat()),
+        (S, 'odom', 'base', (10, 4, -2), second.as_quat()),
+    )
+    for share in (0.0, 0.25, 0.7, 1.0):
+        T = tree.lookup('odom', 'base', round(share * S))
+        expected = Slerp([0, 1], Rotation.concatenate([first, second]))(share).as_matrix()
+        np.testing.assert_allclose(T[:3, :3], expected, atol=1e-12)
+        np.testing.assert_allclose(T[:3, 3], np.multiply([10, 4, -2], share), atol=1e-12)
+
+
+def test_interpolation_takes_the_short_way_between_opposite_quaternions():
+    turned = Rotation.from_euler('z', 10, degrees=True)
+    tree = tree_of(
+        (0, 'odom', 'base', (0, 0, 0), (0, 0, 0, 1)),
+        (S, 'odom', 'base', (0, 0, 0), -turned.as_quat()),
+    )
+    yaw = Rotation.from_matrix(tree.lookup('odom', 'base', S // 2)[:3, :3]).as_euler('ZYX')[0]
+    assert yaw == pytest.approx(np.radians(5))
+
+
+def test_samples_may_come_in_any_order():
+    stamps = [3, 1, 2, 5, 4]
+    tree = tree_of(*((s * S, 'odom', 'base', (s * s, 0, 0)) for s in stamps))
+    assert tree.lookup('odom', 'base', 3 * S // 2)[0, 3] == pytest.approx(2.5)
+    assert tree.lookup('odom', 'base', 9 * S // 2)[0, 3] == pytest.approx(20.5)
+
+
+def test_motion_is_carried_on_a_little_and_no_farther():
+    tree = tree_of((0, 'odom', 'base', (0, 0, 0)), (S, 'odom', 'base', (10, 0, 0)))
+    assert tree.lookup('odom', 'base', S + S // 10)[0, 3] == pytest.approx(11.0)
+    assert tree.lookup('odom', 'base', -S // 10)[0, 3] == pytest.approx(-1.0)
+    for stamp in (S + S // 4, -S // 4):
+        with pytest.raises(TransformUnavailable, match='odom -> base is known from 0 to'):
+            tree.lookup('odom', 'base', stamp)
+    patient = TransformTree(max_extrapolation=1.0)
+    patient.add_transforms([M.transform(0, 'odom', 'base', (3, 0, 0))])
+    assert patient.lookup('odom', 'base', 0)[0, 3] == 3.0
+    with pytest.raises(TransformUnavailable, match='odom -> base is known from 0 to 0'):
+        patient.lookup('odom', 'base', 1)  # one sample says nothing of motion
+
+
+def test_covers_tells_known_from_carried_on():
+    tree = tree_of(
+        (S, 'odom', 'base'), (2 * S, 'odom', 'base'), static=[(0, 'base', 'lidar', (1, 0, 0))]
+    )
+    assert tree.covers('odom', 'lidar', S)
+    assert tree.covers('odom', 'lidar', 2 * S)
+    assert not tree.covers('odom', 'lidar', 2 * S + 1)
+    assert not tree.covers('odom', 'lidar', S - 1)
+    assert not tree.covers('map', 'lidar', S)
+    assert tree.covers('base', 'lidar', 99 * S), 'static transforms hold always'
+
+
+def test_static_stays_static_when_published_on_both_topics():
+    tree = tree_of((5 * S, 'base', 'lidar', (1, 0, 0)), static=[(0, 'base', 'lidar', (1, 0, 0))])
+    assert tree.lookup('base', 'lidar', 0)[0, 3] == 1.0
+    tree.add_transforms([M.transform(9 * S, 'base', 'lidar', (2, 0, 0))])
+    assert tree.lookup('base', 'lidar', 0)[0, 3] == 2.0
+
+
+def test_tf_comes_before_odometry():
+    odometry = [(S, 'odom', 'base', (7, 0, 0))]
+    tree = tree_of((S, 'odom', 'base', (5, 0, 0)), odometry=odometry)
+    assert tree.lookup('odom', 'base', S)[0, 3] == 5.0
+    # TF hangs the base from another frame: only odometry leads to 'odom'.
+    tree = tree_of(
+        (S, 'map', 'base', (5, 0, 0)), static=[(0, 'base', 'lidar', (0, 0, 2))], odometry=odometry
+    )
+    np.testing.assert_array_equal(tree.lookup('odom', 'lidar', S)[:3, 3], [7, 0, 2])
+    np.testing.assert_array_equal(tree.lookup('map', 'lidar', S)[:3, 3], [5, 0, 2])
+
+
+def test_errors_name_frames_and_remedy():
+    tree = tree_of((S, 'odom', 'base'), static=[(0, 'vehicle', 'lidar')])
+    with pytest.raises(TransformUnavailable) as caught:
+        tree.lookup('odom', 'lidar', S)
+    text = str(caught.value)
+    assert "from 'lidar' to 'odom'" in text
+    assert 'vehicle -> lidar, odom -> base' in text
+    assert '/tf' in text
+    with pytest.raises(TransformUnavailable, match='known: none'):
+        TransformTree().lookup('odom', 'lidar', S)
+
+
+def test_bad_transforms_are_passed_over():
+    tree = tree_of(
+        (S, 'odom', 'base', (1, 0, 0)),
+        (2 * S, 'odom', 'base', (np.nan, 0, 0)),
+        (2 * S, '', 'base'),
+        (2 * S, 'odom', ''),
+        (2 * S, 'odom', 'base', (2, 0, 0), (0, 0, 0, 0)),
+    )
+    assert tree.frames() == ['base', 'odom']
+    assert not tree.covers('odom', 'base', 2 * S)
+    broken = tree_of((S, 'odom', 'base', (np.nan, 0, 0)))
+    with pytest.raises(TransformUnavailable, match='NaN'):
+        broken.lookup('odom', 'base', S)
+
+
+def test_slash_of_ros1_means_nothing():
+    tree = tree_of((S, '/odom', '/base', (1, 0, 0)))
+    assert tree.lookup('odom', '/base', S)[0, 3] == 1.0
+
+
+def test_old_samples_are_forgotten():
+    tree = tree_of(*((k * S, 'odom', 'base', (k, 0, 0)) for k in range(100)))
+    assert tree.lookup('odom', 'base', 69 * S + S // 2)[0, 3] == pytest.approx(69.5)
+    with pytest.raises(TransformUnavailable, match='is known from 69000000000 to 99000000000'):
+        tree.lookup('odom', 'base', 40 * S)
+    tree.add_transforms([M.transform(10_000 * S, 'odom', 'base', (10_000, 0, 0))])
+    assert tree.lookup('odom', 'base', 99 * S + S)[0, 3] == pytest.approx(100)
+
+
+def test_frames_of_objects_are_forgotten_those_of_the_car_are_not():
+    """Some trackers give every object a frame of its own: thousands in an hour."""
+    tree = tree_of(static=[(0, 'base', 'lidar', (0, 0, 2))])
+    for k in range(10 * FRAMES):
+        tree.add_transforms([M.transform(k * S, 'odom', 'base', (k, 0, 0))])
+        tree.add_transforms([M.transform(k * S, 'odom', f'object {k}')])
+        assert tree.lookup('odom', 'lidar', k * S)[0, 3] == k
+    assert len(tree.frames()) < 2 * FRAMES
+    assert tree.connects('odom', f'object {k}')
+
+
+def test_clear_forgets_all():
+    tree = tree_of((S, 'odom', 'base'))
+    assert tree.covers('odom', 'base', S)
+    tree.clear()
+    assert tree.frames() == []
+    assert not tree.covers('odom', 'base', S)
+
+
+def test_fixed_frame():
+    static = [(0, 'base', 'lidar')]
+    assert TransformTree().fixed_frame('lidar') is None
+    assert tree_of(static=static).fixed_frame('lidar') is None, 'TF knows no motion'
+    assert tree_of((S, 'odom', 'base'), static=static).fixed_frame('lidar') == 'odom'
+    moving = [(S, 'map', 'odom'), (S, 'odom', 'base')]
+    assert tree_of(*moving, static=static).fixed_frame('lidar') == 'map'
+    odometry = [(S, 'odom', 'base')]
+    assert tree_of(static=static, odometry=odometry).fixed_frame('lidar') == 'odom'
+    assert tree_of(*moving, static=static, odometry=odometry).fixed_frame('lidar') == 'map'
+    apart = [(S, 'odom', 'other')]
+    assert tree_of(static=static, odometry=apart).fixed_frame('lidar') is None
+    footprint = [(S, 'footprint', 'base')]  # TF moves, but below the odometry's child
+    tree = tree_of(*footprint, static=static, odometry=[(S, 'odom', 'footprint')])
+    assert tree.fixed_frame('lidar') == 'odom'
+    circle = [(S, 'a', 'b'), (S, 'b', 'a')]
+    assert tree_of(*circle).fixed_frame('a') in ('a', 'b')
+
+
+def test_sweep_moves_with_its_origin():
+    points = np.array([[1, 0, 0], [0, 2, 0]], np.float32)
+    sweep = Sweep(S, 'lidar', points, times=np.array([0.0, 0.1]))
+    moved = sweep_to_frame(sweep, rigid((10, 20, 1), LEFT), 'odom')
+    assert (moved.stamp_ns, moved.frame_id, moved.points.dtype) == (S, 'odom', np.float32)
+    np.testing.assert_allclose(moved.points, [[10, 21, 1], [8, 20, 1]], atol=1e-5)
+    np.testing.assert_allclose(moved.origin, [10, 20, 1])
+    np.testing.assert_array_equal(moved.times, sweep.times)
+    np.testing.assert_array_equal(sweep.points, points)
+
+
+def test_sweep_far_from_the_origin_keeps_its_resolution():
+    sweep = Sweep(S, 'lidar', np.array([[0.001, 0.002, 0.003]], np.float32))
+    moved = sweep_to_frame(sweep, rigid((500_000, 5_400_000, 0)), 'map')
+    np.testing.assert_allclose(moved.points, [[500_000.001, 5_400_000.002, 0.003]], atol=1e-8)
+
+
+def test_boxes_turn_about_all_axes():
+    rng = np.random.default_rng(3)
+    angles = rng.uniform([-3, -1.5, -3], [3, 1.5, 3], (20, 3))
+    boxes = np.hstack([rng.uniform(-50, 50, (20, 3)), rng.uniform(1, 5, (20, 3)), angles])
+    boxes[4, 1], boxes[5, 8] = np.nan, np.nan
+    array = BoxArray(S, 'lidar', ('a',) * 20, ('car',) * 20, np.ones(20), boxes)
+    T = rigid((5, -3, 1), Rotation.from_euler('ZYX', [2.0, 0.2, -0.1]).as_quat())
+    moved = boxes_to_frame(array, T, 'odom')
+    assert (moved.frame_id, moved.stamp_ns) == ('odom', S)
+    good = np.isfinite(boxes).all(axis=1)
+    corner = boxes[:, 3:6] / 2
+    for i in np.flatnonzero(good):
+        R_before = Rotation.from_euler('ZYX', boxes[i, :5:-1]).as_matrix()
+        R_after = Rotation.from_euler('ZYX', moved.boxes[i, :5:-1]).as_matrix()
+        before = T[:3, :3] @ (boxes[i, :3] + R_before @ corner[i]) + T[:3, 3]
+        np.testing.assert_allclose(moved.boxes[i, :3] + R_after @ corner[i], before, atol=1e-9)
+    np.testing.assert_array_equal(moved.boxes[:, 3:6], boxes[:, 3:6])
+    assert np.isnan(moved.boxes[4, :3]).any()
+    assert np.isnan(moved.boxes[5, 6:]).any()
+    assert np.isfinite(moved.boxes[good]).all()
+
+
+def test_stamps_that_start_again_replace_what_was_known():
+    static = [(0, 'base', 'lidar', (0, 0, 2))]
+    moves = [(100 * S + k * S // 10, 'odom', 'base', (k, 0, 0)) for k in range(50)]
+    tree = tree_of(*moves, static=static)
+    one = (90 * S, 'odom', 'base', (-1, 0, 0))  # a stray, 14.9 s old
+    tree.add_transforms(M.tf(M.transform(*one)).transforms)
+    np.testing.assert_allclose(tree.lookup('odom', 'lidar', 102 * S)[0, 3], 20)
+    assert tree.newest_ns() == 104_900_000_000
+    again = [(100 * S + k * S // 10, 'odom', 'base', (0, k, 0)) for k in range(4)]
+    for item in again:
+        tree.add_transforms(M.tf(M.transform(*item)).transforms)
+    T = tree.lookup('odom', 'lidar', 100 * S + 250_000_000)
+    np.testing.assert_allclose(T[:3, 3], [0, 2.5, 2])  # the second time, the mount still known
+    assert not tree.covers('odom', 'lidar', 102 * S)
+    assert not tree.covers('odom', 'lidar', 95 * S)
+    tree.rewind(98 * S)
+    with pytest.raises(TransformUnavailable, match='since time went back'):
+        tree.lookup('odom', 'lidar', 100 * S)
+    assert tree.connects('odom', 'lidar')
+
+
+def test_a_jump_is_told_by_two_stamps_that_are_far_back():
+    rewind = Rewind()
+    told = [
+        rewind.happened(t * S // 10) for t in (100, 110, 105, 101, 99, 111, 99, 98, 99, 85, 112)
+    ]
+    # 0.1 s more than a second back: 99 once after 110; then 99 and 98 after 111 are two. After
+    # that 98 is the newest: 85 is one again.
+    assert told == [False] * 7 + [True] + [False] * 3

@@ -1,0 +1,723 @@
+"""
+One tilted box far from the origin in every format, by hand; round trips; what consumers read.
+
+The sensor stands at (10, 2, 1) of the fixed frame, turned left by 90 degrees. The box has its
+centre at (13, 8, 2) and R = Rz(90) Ry(30) Rx(60). From the sensor to it d = (3, 6, 1), and
+Rz(-90) (x, y) = (y, -x): the sensor sees it at (6, -3, 1), with R = Ry(30) Rx(60) of the columns
+
+    heading  Ry(30) (1, 0, 0)                 = (cos30, 0, -sin30)
+    left     Ry(30) (0, cos60, sin60)         = (sin30 sin60, cos60, cos30 sin60)
+    up       Ry(30) (0, -sin60, cos60)        = (sin30 cos60, -sin60, cos30 cos60)
+
+As a quaternion x y z w, half angles multiplied: (c15 s30, s15 c30, -s15 s30, c15 c30); turned by
+90 degrees more for the fixed frame: sqrt(1/2) (x - y, y + x, z + w, w - z).
+"""
+
+from collections import Counter
+from dataclasses import replace
+import gc
+from itertools import product
+import json
+from math import atan2, cos, pi, radians, sin, sqrt
+from pathlib import Path
+import shutil
+import tracemalloc
+from xml.etree import ElementTree
+
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.box_table import COLUMNS
+from boxreg_ros.io.transforms import inverse
+from boxreg_ros.labels import (
+    arrow,
+    FORMATS,
+    frames_of,
+    is_written,
+    LabelFrame,
+    module_of,
+    Options,
+    Provenance,
+    writer_for,
+)
+from boxreg_ros.labels.camera import Camera
+from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
+from consumers import consumer
+import numpy as np
+import pyarrow
+from pyarrow import feather, parquet
+import pytest
+
+STAMP = 1_700_000_000_123_456_789
+EXTENT = [4.0, 2.0, 1.6]
+IN_FIXED = [13.0, 8.0, 2.0, *EXTENT, radians(60), radians(30), radians(90)]
+IN_SENSOR = [6.0, -3.0, 1.0, *EXTENT, radians(60), radians(30), 0.0]
+T_FIXED_SENSOR = np.array([[0, -1, 0, 10], [1, 0, 0, 2], [0, 0, 1, 1], [0, 0, 0, 1]], float)
+C30, S30 = cos(radians(30)), sin(radians(30))
+C60, S60 = cos(radians(60)), sin(radians(60))
+C15, S15 = cos(radians(15)), sin(radians(15))
+AXES = np.array([[C30, 0, -S30], [S30 * S60, C60, C30 * S60], [S30 * C60, -S60, C30 * C60]])
+XYZW_SENSOR = (C15 * S30, S15 * C30, -S15 * S30, C15 * C30)
+XYZW_FIXED = (sqrt(0.5) * S15, 0.5, 0.5, sqrt(0.5) * C15)
+HALVES = [0.5 * np.array(EXTENT) * signs for signs in product((-1, 1), repeat=3)]
+CORNERS = np.array([6.0, -3.0, 1.0]) + np.array(HALVES) @ AXES
+COVARIANCE = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.5
+# x right, y down, z forward: p_camera = (-y, -z, x) + (0.1, -0.2, -0.5).
+CALIBRATION = """P2: 200 0 600 0 0 200 180 0 0 0 1 0
+R_rect 1 0 0 0 1 0 0 0 1
+Tr_velo_cam 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.5
+"""
+OURS = (
+    'csv', 'parquet', 'openlabel', 'kitti', 'tracklets', 'nuscenes', 't4', 'argoverse2', 'waymo',
+    'sustechpoints', 'datumaro', 'supervisely', 'xtreme1',
+)  # fmt: skip
+LOSE_TILT = {'kitti', 'waymo'}
+POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, 0.25]], np.float32)
+
+
+def frame_of(
+    boxes=(IN_FIXED,), tracks=('7',), stamp_ns=STAMP, frame_id='odom', kind='Car', **changes
+):
+    n = len(tracks)
+    refined = RefinedBoxes(
+        BoxArray(
+            stamp_ns, frame_id, tuple(tracks), (kind,) * n, np.full(n, 0.75),
+            np.array(boxes, float).reshape(n, 9),
+        ),
+        ('refined',) * n, ('',) * n, np.arange(n) + 42, np.tile(COVARIANCE, (n, 1, 1)),
+    )  # fmt: skip
+    given = {'T_fixed_sensor': T_FIXED_SENSOR, 'sweep': None} | changes
+    return LabelFrame(refined, 'odom', 'lidar', **given)
+
+
+def options_in(folder, **more):
+    path = folder / 'camera.txt'
+    path.write_text(CALIBRATION)
+    return Options(camera=path, **more)
+
+
+def in_order(frame):
+    """Return the boxes of a frame read, in the fixed frame and sorted by track."""
+    refined = frame.moved('fixed').refined
+    order = sorted(range(len(refined.status)), key=lambda i: refined.boxes.track_ids[i])
+    boxes = refined.boxes
+    return LabelFrame(
+        RefinedBoxes(
+            BoxArray(
+                boxes.stamp_ns, boxes.frame_id, tuple(boxes.track_ids[i] for i in order),
+                tuple(boxes.class_names[i] for i in order), boxes.scores[order],
+                boxes.boxes[order],
+            ),
+            tuple(refined.status[i] for i in order), tuple(refined.reasons[i] for i in order),
+            refined.num_points[order], refined.covariances[order],
+        ),
+        frame.fixed_frame, frame.sensor_frame, frame.T_fixed_sensor,
+    )  # fmt: skip
+
+
+def written(name, folder, frames=None, **options):
+    """Write `frames`; return the writer and the folder of the format."""
+    provenance = Provenance(('drive.mcap',), 'cafe')
+    writer = writer_for(name, folder, provenance, options_in(folder, **options))
+    for frame in [frame_of()] if frames is None else frames:
+        writer.write(frame)
+    writer.close()
+    return writer, folder if name == 'csv' else folder / name
+
+
+def test_the_box_by_hand_is_the_box():
+    _, boxes = frame_of().placed('sensor', Counter())
+    np.testing.assert_allclose(boxes, [IN_SENSOR], atol=1e-12)
+
+
+# By hand ---------------------------------------------------------------------------------------
+
+
+def test_kitti(tmp_path):
+    _, folder = written('kitti', tmp_path)
+    words = (folder / 'label_02' / '0000.txt').read_text().split()
+    assert words[:5] == ['0', '7', 'Car', '0', '3']
+    alpha, left, top, right, bottom, *dimensions = map(float, words[5:13])
+    location, turn, score = list(map(float, words[13:16])), *map(float, words[16:])
+    assert dimensions == [1.6, 2.0, 4.0]
+    # The centre (6, -3, 1) is (3, -1, 6) + (0.1, -0.2, -0.5) for the camera; half a height lower.
+    np.testing.assert_allclose(location, [3.1, -1.2 + 0.8, 5.5], atol=1e-6)
+    # Yaw is 0: -(yaw + 90 degrees). The camera sees it by atan(x / z) to the right.
+    assert turn == pytest.approx(-pi / 2, abs=1e-6)
+    assert alpha == pytest.approx(-pi / 2 - atan2(3.1, 5.5), abs=1e-6)
+    assert score == 0.75
+    x, y, z = np.c_[-CORNERS[:, 1] + 0.1, -CORNERS[:, 2] - 0.2, CORNERS[:, 0] - 0.5].T
+    u, v = 200 * x / z + 600, 200 * y / z + 180
+    expected = [u.min(), v.min(), u.max(), v.max()]
+    np.testing.assert_allclose([left, top, right, bottom], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize('yaw', [-3.0, -1.2, 0.0, 0.4, 1.6, 3.1])
+def test_kitti_rotation_is_minus_yaw_minus_a_right_angle(tmp_path, yaw):
+    box = [8.0, 1.0, 0.0, *EXTENT, 0.0, 0.0, yaw]
+    _, folder = written('kitti', tmp_path, [frame_of([box], frame_id='lidar')])
+    turn = float((folder / 'label_02' / '0000.txt').read_text().split()[16])
+    assert -pi <= turn <= pi
+    assert (turn + yaw + pi / 2 + pi) % (2 * pi) - pi == pytest.approx(0.0, abs=1e-6)
+
+
+def test_kitti_centre_survives_a_tilted_camera(tmp_path):
+    """Whoever reads a line stands the box up along the camera's y: its centre must stay."""
+    T = np.eye(4)
+    tilt = np.array([[1, 0, 0], [0, C15, -S15], [0, S15, C15]])
+    T[:3, :3] = tilt @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    camera = Camera(np.eye(4)[:3], np.eye(3), T)
+    box = np.array([[8.0, 1.0, 0.5, *EXTENT, 0.0, 0.0, 0.3]])
+    centres, turns = camera.upright(box)
+    back = camera.from_upright(centres, turns, box[:, 3:6])
+    np.testing.assert_allclose(back[:, :6], box[:, :6], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('center', 'truncated', 'is_seen'),
+    [((8.0, 0.0, 0.0), 0, True), ((8.0, 24.0, 0.0), 1, True), ((8.0, 90.0, 0.0), 2, False),
+     ((-8.0, 0.0, 0.0), 2, False), ((0.5, 0.0, 0.0), 1, True)],
+)  # fmt: skip
+def test_kitti_keeps_boxes_that_the_camera_does_not_see(tmp_path, center, truncated, is_seen):
+    box = [*center, *EXTENT, 0.0, 0.0, 0.0]
+    writer, folder = written('kitti', tmp_path, [frame_of([box], frame_id='lidar')])
+    words = (folder / 'label_02' / '0000.txt').read_text().split()
+    left, top, right, bottom = map(float, words[6:10])
+    assert int(words[3]) == truncated
+    assert (left == top == right == bottom == -1) is not is_seen
+    if is_seen:
+        assert 0 <= left < right <= 1241
+        assert 0 <= top < bottom <= 374
+    assert not +writer.dropped
+
+
+def test_tracklets(tmp_path):
+    _, folder = written('tracklets', tmp_path)
+    root = ElementTree.parse(folder / 'tracklet_labels.xml').getroot()
+    (item,) = root.findall('tracklets/item')
+    assert [float(item.findtext(name)) for name in 'hwl'] == [1.6, 2.0, 4.0]
+    assert (item.findtext('objectType'), item.findtext('first_frame')) == ('Car', '0')
+    (pose,) = item.findall('poses/item')
+    # The bottom is half a height against `up`.
+    place = [float(pose.findtext(name)) for name in ('tx', 'ty', 'tz')]
+    np.testing.assert_allclose(
+        place, [6 - 0.8 * S30 * C60, -3 + 0.8 * S60, 1 - 0.8 * C30 * C60], atol=1e-9
+    )
+    angles = [float(pose.findtext(name)) for name in ('rx', 'ry', 'rz')]
+    np.testing.assert_allclose(angles, [radians(60), radians(30), 0], atol=1e-9)
+    assert root.findtext('tracklets/count') == '1'
+
+
+def test_tracklets_as_datumaro_and_cvat_read_them(tmp_path):
+    _, folder = written('tracklets', tmp_path, swap_axes=True)
+    (item,) = ElementTree.parse(folder / 'tracklet_labels.xml').findall('tracklets/item')
+    # Their scale x, y, z is h, w, l; their position is the centre.
+    assert [float(item.findtext(name)) for name in 'hwl'] == EXTENT
+    place = [float(item.find('poses/item').findtext(name)) for name in ('tx', 'ty', 'tz')]
+    np.testing.assert_allclose(place, [6, -3, 1], atol=1e-9)
+    (seen,) = consumer('datumaro', folder, 'kitti_raw')['found']
+    assert (seen['position'], seen['scale']) == ([6, -3, 1], EXTENT)
+    (frame,) = frames_of('tracklets', folder)
+    np.testing.assert_allclose(frame.refined.boxes.boxes, [IN_SENSOR], atol=1e-9)
+
+
+def test_tracklets_are_unbroken_runs_of_one_extent(tmp_path):
+    wide = [*IN_FIXED[:4], 3.0, *IN_FIXED[5:]]
+    seen = [(['a', 'b'], [IN_FIXED] * 2), (['a'], [IN_FIXED]), (['a', 'b'], [wide, IN_FIXED])]
+    frames = [frame_of(boxes, names, STAMP + i) for i, (names, boxes) in enumerate(seen)]
+    _, folder = written('tracklets', tmp_path, frames)
+    items = ElementTree.parse(folder / 'tracklet_labels.xml').findall('tracklets/item')
+    runs = sorted(
+        (int(item.findtext('first_frame')), len(item.findall('poses/item')), item.findtext('w'))
+        for item in items
+    )
+    assert runs == [(0, 1, '2.0'), (0, 3, '2.0'), (2, 1, '2.0')]
+
+
+@pytest.mark.parametrize(('name', 'version'), [('nuscenes', 'v1.0-boxreg'), ('t4', 'annotation')])
+def test_nuscenes(tmp_path, name, version):
+    _, folder = written(name, tmp_path)
+    (row,) = json.loads((folder / version / 'sample_annotation.json').read_text())
+    x, y, z, w = XYZW_FIXED
+    assert row['translation'] == [13.0, 8.0, 2.0]
+    assert row['size'] == [2.0, 4.0, 1.6]
+    np.testing.assert_allclose(row['rotation'], [w, x, y, z], atol=1e-9)
+    assert (row['num_lidar_pts'], row['status'], row['score']) == (42, 'refined', 0.75)
+    np.testing.assert_allclose(np.reshape(row['covariance'], (6, 6)), COVARIANCE)
+    (sample,) = json.loads((folder / version / 'sample.json').read_text())
+    assert sample['timestamp'] == 1_700_000_000_123_457
+    (pose,) = json.loads((folder / version / 'ego_pose.json').read_text())
+    assert pose['translation'] == [10.0, 2.0, 1.0]
+    np.testing.assert_allclose(pose['rotation'], [sqrt(0.5), 0, 0, sqrt(0.5)], atol=1e-9)
+
+
+def test_argoverse2(tmp_path):
+    _, folder = written('argoverse2', tmp_path)
+    (row,) = feather.read_table(folder / 'annotations.feather').to_pylist()
+    x, y, z, w = XYZW_SENSOR
+    assert (row['timestamp_ns'], row['track_uuid'], row['category']) == (STAMP, '7', 'Car')
+    assert [row[f'{side}_m'] for side in ('length', 'width', 'height')] == EXTENT
+    turn = [row[name] for name in ('qw', 'qx', 'qy', 'qz')]
+    np.testing.assert_allclose(turn, [w, x, y, z], atol=1e-9)
+    np.testing.assert_allclose([row[f't{axis}_m'] for axis in 'xyz'], [6, -3, 1], atol=1e-9)
+    assert (row['num_interior_pts'], row['status']) == (42, 'refined')
+    (pose,) = feather.read_table(folder / 'city_SE3_egovehicle.feather').to_pylist()
+    found = [pose[name] for name in ('qw', 'qx', 'qy', 'qz', 'tx_m', 'ty_m', 'tz_m')]
+    np.testing.assert_allclose(found, [sqrt(0.5), 0, 0, sqrt(0.5), 10, 2, 1], atol=1e-9)
+
+
+def test_waymo(tmp_path):
+    from pyarrow import parquet
+
+    box = [13.0, 8.0, 2.0, *EXTENT, 0.1, 0.2, radians(130)]  # the sensor is turned by 90
+    _, folder = written('waymo', tmp_path, [frame_of([box])])
+    (row,) = parquet.read_table(folder / 'lidar_box' / 'drive.parquet').to_pylist()
+    box = {k.removeprefix('[LiDARBoxComponent].'): v for k, v in row.items()}
+    assert (box['key.segment_context_name'], box['key.laser_object_id']) == ('drive', '7')
+    assert box['key.frame_timestamp_micros'] == 1_700_000_000_123_457
+    np.testing.assert_allclose([box[f'box.center.{a}'] for a in 'xyz'], [6, -3, 1], atol=1e-9)
+    assert [box[f'box.size.{axis}'] for axis in 'xyz'] == EXTENT
+    assert box['box.heading'] == pytest.approx(radians(40), abs=1e-9)
+    assert (box['type'], box['num_lidar_points_in_box'], box['speed.x']) == (1, 42, None)
+    (row,) = parquet.read_table(folder / 'vehicle_pose' / 'drive.parquet').to_pylist()
+    pose = row['[VehiclePoseComponent].world_from_vehicle.transform']
+    np.testing.assert_allclose(np.reshape(pose, (4, 4)), T_FIXED_SENSOR)
+
+
+def test_parquet(tmp_path):
+    from pyarrow import parquet
+
+    _, folder = written('parquet', tmp_path)
+    table = parquet.read_table(folder / 'boxes.parquet')
+    (row,) = table.to_pylist()
+    assert (row['stamp_ns'], row['frame_id'], row['track_id']) == (STAMP, 'odom', '7')
+    assert [row[name] for name in ('x', 'y', 'z')] == [13.0, 8.0, 2.0]
+    assert [row[name] for name in ('length', 'width', 'height')] == EXTENT
+    np.testing.assert_allclose([row[f'q{axis}'] for axis in 'xyzw'], XYZW_FIXED, atol=1e-9)
+    np.testing.assert_allclose(np.reshape(row['covariance'], (6, 6)), COVARIANCE)
+    origin = json.loads(table.schema.metadata[b'boxreg'])
+    assert (origin['tool'], origin['config_hash']) == ('boxreg_ros', 'cafe')
+
+
+@pytest.mark.parametrize('unit', ['int64', 'uint64', 'timestamp[ns]', 'timestamp[ns, tz=UTC]'])
+def test_parquet_of_other_writers(tmp_path, unit):
+    """As pandas makes it of boxes.csv: ids are numbers, and what is missing is null."""
+    numbers = {name: [1.0, 2.0] for name in COLUMNS}
+    zone = 'UTC' if 'tz' in unit else None
+    kind = pyarrow.timestamp('ns', zone) if 'stamp' in unit else pyarrow.type_for_alias(unit)
+    table = numbers | {
+        'stamp_ns': pyarrow.array([STAMP, STAMP], kind), 'frame_id': ['odom'] * 2,
+        'track_id': [7, 8], 'class_name': [None, None], 'status': ['truth', None],
+        'num_points': [None, 3.0], 'score': [None, 0.5],
+    }  # fmt: skip
+    path = tmp_path / 'boxes.parquet'
+    parquet.write_table(pyarrow.table(table), path)
+    (frame,) = frames_of('parquet', tmp_path)
+    found, boxes = frame.refined, frame.refined.boxes
+    assert boxes.stamp_ns == STAMP
+    assert (boxes.track_ids, boxes.class_names) == (('7', '8'), ('', ''))
+    assert (found.status, found.num_points.tolist()) == (('truth', 'input'), [0, 3])
+    np.testing.assert_array_equal(boxes.scores, [np.nan, 0.5])
+    for name in ('openlabel', 'tracklets', 'waymo', 'argoverse2', 'datumaro', 'kitti'):
+        placed = replace(frame, sensor_frame='odom', T_fixed_sensor=np.eye(4))
+        written(name, tmp_path, [placed])
+
+
+@pytest.mark.parametrize(
+    ('name', 'values', 'message'),
+    [
+        ('stamp_ns', [1.7e18], 'column stamp_ns: expected whole nanoseconds .* got double'),
+        ('stamp_ns', ['1700'], 'column stamp_ns: .* got string'),
+        ('stamp_ns', pyarrow.array([None], 'int64'), 'got int64, 1 of 1 empty'),
+        ('num_points', [1.5], 'column num_points: expected int64, got double'),
+        ('x', ['far'], 'column x: expected double, got string'),
+    ],
+)
+def test_parquet_that_is_no_table_of_boxes(tmp_path, name, values, message):
+    table = {key: [1] for key in COLUMNS} | {name: values}
+    parquet.write_table(pyarrow.table(table), tmp_path / 'boxes.parquet')
+    with pytest.raises(RecordingError, match=message):
+        list(frames_of('parquet', tmp_path))
+
+
+def test_openlabel_holds_the_pose_of_the_sensor(tmp_path):
+    checker = pytest.importorskip('openlabel_checker', reason='openlabel-checker not installed')
+    _, folder = written('openlabel', tmp_path)
+    report = checker.check_file(str(folder / 'labels.json'))
+    assert [issue for outcome in report.outcomes for issue in outcome.issues] == []
+    label = json.loads((folder / 'labels.json').read_text())['openlabel']
+    transform = label['frames']['0']['frame_properties']['transforms']['lidar_to_odom']
+    assert (transform['src'], transform['dst']) == ('lidar', 'odom')
+    # Of the standard: X_dst = matrix4x4 X_src.
+    matrix = np.reshape(transform['transform_src_to_dst']['matrix4x4'], (4, 4))
+    np.testing.assert_allclose(matrix @ [6, -3, 1, 1], [13, 8, 2, 1], atol=1e-9)
+    systems = label['coordinate_systems']
+    assert systems['lidar'] == {'type': 'sensor_cs', 'parent': 'odom', 'children': []}
+    assert systems['odom'] == {'type': 'scene_cs', 'parent': '', 'children': ['lidar']}
+    assert label['metadata']['config_hash'] == 'cafe'
+
+
+def test_openlabel_of_others(tmp_path):
+    """Nine values per cuboid, text stamps, objects by uid; what is null is no cuboid."""
+    values = [*IN_SENSOR[:3], radians(60), radians(30), 0.0, *EXTENT]
+    cuboids = [
+        {'name': 'shape', 'val': values, 'coordinate_system': 'top'},
+        {'name': 'gone', 'val': None},
+    ]
+    frame = {
+        'frame_properties': {'timestamp': '12.5'},
+        'objects': {'3': {'object_data': {'cuboid': cuboids}}},
+    }
+    objects = {'3': {'name': 'car number three', 'type': 'Car'}}
+    label = {'metadata': {'schema_version': '1.0.0'}, 'objects': objects, 'frames': {'4': frame}}
+    path = tmp_path / 'labels.json'
+    path.write_text(json.dumps({'openlabel': label}))
+    (found,) = frames_of('openlabel', path)
+    boxes = found.refined.boxes
+    assert (boxes.stamp_ns, boxes.frame_id) == (12_500_000_000, 'top')
+    assert (boxes.track_ids, boxes.class_names) == (('3',), ('Car',))
+    np.testing.assert_allclose(boxes.boxes, [IN_SENSOR])
+    assert (found.refined.status, found.refined.reasons) == (('input',), ('',))
+    assert np.isnan(boxes.scores).all()
+
+
+# Back again ------------------------------------------------------------------------------------
+
+
+def drive():
+    """Return frames of two tracks, one of them with a name, over a sensor that moves."""
+    rng, frames = np.random.default_rng(3), []
+    for i in range(4):
+        T = T_FIXED_SENSOR.copy()
+        T[0, 3] += i
+        boxes = np.c_[rng.uniform(5, 20, (2, 3)), [EXTENT] * 2, rng.uniform(-0.4, 0.4, (2, 3))]
+        boxes[:, 8] = rng.uniform(-3, 3, 2)
+        tracks = ('7', 'left one')[: 1 if i == 2 else 2]
+        stamp_ns = STAMP + i * 10**8
+        frames.append(frame_of(boxes[: len(tracks)], tracks, stamp_ns, T_fixed_sensor=T))
+    return frames
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_round_trip(tmp_path, name):
+    frames = drive()
+    _, folder = written(name, tmp_path, frames)
+    found = [in_order(frame) for frame in frames_of(name, folder)]
+    assert len(found) == len(frames)
+    for before, after in zip(frames, found, strict=True):
+        a, b = before.refined.boxes, after.refined.boxes
+        assert (b.stamp_ns, b.frame_id, b.track_ids) == (a.stamp_ns, 'odom', a.track_ids)
+        assert b.class_names == a.class_names
+        kept = [0, 1, 2, 3, 4, 5] if name in LOSE_TILT else list(range(9))
+        atol = 3e-6 if name == 'kitti' else 1e-9
+        np.testing.assert_allclose(b.boxes[:, kept], a.boxes[:, kept], atol=atol)
+        if name in LOSE_TILT:  # the heading itself is not lost: up to its foreshortening
+            turns = np.cos(b.boxes[:, 8] - a.boxes[:, 8])
+            assert (turns > cos(0.1)).all()
+        if name != 'tracklets':
+            np.testing.assert_allclose(b.scores, a.scores)
+        if name not in ('kitti', 'tracklets'):
+            assert after.refined.status == before.refined.status
+            assert (after.refined.num_points == before.refined.num_points).all()
+        if name not in ('csv', 'kitti', 'tracklets'):
+            np.testing.assert_allclose(after.refined.covariances, before.refined.covariances)
+        if name != 'csv':
+            np.testing.assert_allclose(after.T_fixed_sensor, before.T_fixed_sensor, atol=1e-9)
+            assert after.sensor_frame == 'lidar'
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_a_track_may_change_its_class(tmp_path, name):
+    kinds = ['Car', 'Car', 'Van', 'Car']
+    frames = [frame_of(stamp_ns=STAMP + i * 10**8, kind=kind) for i, kind in enumerate(kinds)]
+    _, folder = written(name, tmp_path, frames)
+    found = [frame.refined.boxes for frame in frames_of(name, folder)]
+    assert [(b.track_ids, b.class_names) for b in found] == [(('7',), (kind,)) for kind in kinds]
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_names_come_back_as_they_were(tmp_path, name):
+    names = ('a--b', 'a---', '-', '<i> & co', '&amp;', '&#45;', 'a - -b', 'a\x01\x1bb')
+    frames = [frame_of([IN_FIXED] * len(names), names)]
+    _, folder = written(name, tmp_path, frames)
+    (frame,) = frames_of(name, folder)
+    assert sorted(frame.refined.boxes.track_ids) == sorted(names)
+
+
+@pytest.mark.parametrize('name', [name for name in OURS if name != 'csv'])
+def test_boxes_without_a_place_are_counted(tmp_path, name):
+    flat, lost = [*IN_FIXED[:3], 4.0, 0.0, 1.6, 0, 0, 0], [np.nan, *IN_FIXED[1:]]
+    frames = [
+        frame_of([IN_FIXED, flat, lost], ['a', 'b', 'c']),
+        frame_of(frame_id='radar', stamp_ns=STAMP + 1, T_fixed_sensor=None),
+    ]
+    writer, folder = written(name, tmp_path, frames)
+    if name == 'parquet':
+        assert not +writer.dropped
+    elif name == 'openlabel':
+        assert +writer.dropped == {'invalid_box': 2}
+    else:
+        assert +writer.dropped == {'invalid_box': 2, 'no_transform': 1}
+        names = [f.refined.boxes.track_ids for f in frames_of(name, folder)]
+        assert [n for part in names for n in part] == ['a']
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_boxes_without_identity_stay_apart(tmp_path, name):
+    frames = [frame_of([IN_FIXED] * 3, ['', 'a', ''], STAMP + i) for i in range(2)]
+    _, folder = written(name, tmp_path, frames)
+    assert [len(f.refined.status) for f in frames_of(name, folder)] == [3, 3]
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_nothing_is_something_to_write(tmp_path, name):
+    _, folder = written(name, tmp_path, [])
+    assert list(frames_of(name, folder)) == []
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_what_is_gone_is_missed(tmp_path, name):
+    _, folder = written(name, tmp_path)
+    assert is_written(name, tmp_path)
+    for path in folder.rglob('*'):
+        if (path.is_file() and path.parent != tmp_path) or path.name == 'boxes.csv':
+            path.unlink()
+    assert not is_written(name, tmp_path)
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_broken_files_are_told_in_a_line(tmp_path, name):
+    _, folder = written(name, tmp_path)
+    for path in folder.rglob('*'):
+        if path.suffix in ('.txt', '.csv', '.json', '.xml', '.feather', '.parquet'):
+            path.write_bytes(b'<[broken\n\0')
+    with pytest.raises((RecordingError, ConfigError), match=str(tmp_path)):
+        list(frames_of(name, folder))
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_what_is_not_there_is_told_in_a_line(tmp_path, name):
+    with pytest.raises((RecordingError, ConfigError), match='nowhere'):
+        list(frames_of(name, tmp_path / 'nowhere'))
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_what_is_not_in_this_folder_is_told_in_a_line(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((RecordingError, ConfigError), match='nowhere'):
+        list(frames_of(name, Path('nowhere')))
+
+
+@pytest.mark.parametrize(
+    ('name', 'inside'),
+    [('kitti', 'label_02'), ('waymo', 'lidar_box'), ('nuscenes', 'v1.0-boxreg'), ('t4', '.')],
+)
+def test_labels_beside_the_working_folder(tmp_path, monkeypatch, name, inside):
+    _, folder = written(name, tmp_path)
+    monkeypatch.chdir(folder / inside)
+    path = next(Path().glob('*.[tp][xa][tr]*'), Path())  # a label file; tables are a folder
+    (frame,) = frames_of(name, path)
+    assert (frame.fixed_frame, frame.sensor_frame) == ('odom', 'lidar')
+    np.testing.assert_allclose(frame.T_fixed_sensor, T_FIXED_SENSOR, atol=1e-9)
+
+
+def test_one_of_several_sequences_of_kitti_is_named(tmp_path):
+    _, folder = written('kitti', tmp_path)
+    for part in ('label_02', 'calib'):
+        shutil.copy(folder / part / '0000.txt', folder / part / '0001.txt')
+    with pytest.raises(RecordingError, match=r'one sequence, .*, got 0000.txt, 0001.txt; name'):
+        list(frames_of('kitti', folder))
+    assert len(list(frames_of('kitti', folder / 'label_02' / '0001.txt'))) == 1
+
+
+@pytest.mark.parametrize('name', OURS)
+def test_folders_may_have_names_that_are_not_utf8(tmp_path, name):
+    out = tmp_path / 'caf\udce9'
+    out.mkdir()
+    _, folder = written(name, out, [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))],
+                        with_points=True)  # fmt: skip
+    assert len(list(frames_of(name, folder))) == 1
+
+
+def test_recordings_have_names_that_can_be_written(tmp_path, monkeypatch):
+    (tmp_path / 'drive').mkdir()
+    monkeypatch.chdir(tmp_path / 'drive')
+    link = tmp_path / 'link'
+    link.symlink_to('drive')
+    paths = (Path(), Path('..', 'drive', '.'), link, Path('caf\udce9.mcap'))
+    assert Provenance.of(paths).recordings == ('drive', 'drive', 'link', 'caf\\udce9.mcap')
+
+
+def test_timestamps_as_kitti_has_them(tmp_path):
+    from boxreg_ros.labels.files import read_stamps
+
+    path = tmp_path / 'timestamps.txt'
+    # 2011-09-26 13:02:25 UTC is 15243 days and 46945 s after the epoch.
+    path.write_text('2011-09-26 13:02:25.951199337\n1316955745951199337\n\n')
+    seconds = 15243 * 86400 + 46945
+    assert read_stamps(path) == [seconds * 10**9 + 951199337, 1316955745951199337]
+
+
+def test_missing_camera_and_package_are_told_with_the_remedy(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match='--camera FILE'):
+        writer_for('kitti', tmp_path, Provenance())
+    monkeypatch.setitem(__import__('sys').modules, 'pyarrow', None)
+    with pytest.raises(ConfigError, match='pip install pyarrow'):
+        module_of('parquet')
+
+
+def test_camera_of_ros_and_yaml(tmp_path):
+    path = tmp_path / 'camera.yaml'
+    path.write_text(
+        'image_width: 640\nimage_height: 480\n'
+        'projection_matrix: {data: [200, 0, 320, 0, 0, 200, 240, 0, 0, 0, 1, 0]}\n'
+        'T_camera_sensor: [0, -1, 0, 0.1, 0, 0, -1, -0.2, 1, 0, 0, -0.5]\n'
+    )
+    camera = Camera.read(path)
+    assert camera.size == (640, 480)
+    assert camera.projection[1, 2] == 240
+    np.testing.assert_allclose(camera.T_rect_sensor @ [6, -3, 1, 1], [3.1, -1.2, 5.5, 1])
+    path.write_text('projection_matrix: [1, 2]\n')
+    with pytest.raises(ConfigError, match='expected 12 or 16 numbers under one of Tr_velo_cam'):
+        Camera.read(path)
+
+
+# Consumers -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('name', 'version'), [('nuscenes', 'v1.0-boxreg'), ('t4', 'annotation')])
+def test_nuscenes_devkit_opens_it(tmp_path, name, version):
+    sweep = Sweep(STAMP, 'lidar', POINTS)
+    later = [14.0, *IN_FIXED[1:]]  # a metre on in half a second
+    frames = [frame_of(sweep=sweep), frame_of([later], stamp_ns=STAMP + 5 * 10**8)]
+    _, folder = written(name, tmp_path, frames, with_points=True)
+    first, second = consumer('nuscenes', folder, version)
+    assert first['channel'] == ('LIDAR_TOP' if name == 'nuscenes' else 'LIDAR_CONCAT')
+    assert (first['name'], first['num_points']) == ('Car', 42)
+    np.testing.assert_allclose(first['wlh'], [2.0, 4.0, 1.6])
+    np.testing.assert_allclose(first['local'], [6, -3, 1], atol=1e-9)
+    in_fixed = (T_FIXED_SENSOR @ np.c_[CORNERS, np.ones(8)].T).T[:, :3]
+    found = np.array(first['corners'])
+    assert np.abs(found[:, None] - in_fixed).max(axis=2).min(axis=1).max() < 1e-9
+    heading = T_FIXED_SENSOR[:3, :3] @ AXES[0]
+    np.testing.assert_allclose(np.array(first['matrix'])[:, 0], heading, atol=1e-9)
+    np.testing.assert_allclose(first['points'], POINTS)
+    assert first['track'] == second['track']
+    assert (bool(first['next']), first['prev'], second['next']) == (True, '', '')
+    np.testing.assert_allclose(first['velocity'], [2.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_t4_devkit_opens_it(tmp_path):
+    _, folder = written('t4', tmp_path)
+    found = consumer('t4', folder / 'annotation')
+    (row,) = found['sample_annotation']
+    np.testing.assert_allclose(row['size'], [2.0, 4.0, 1.6])
+    np.testing.assert_allclose(row['translation'], [13.0, 8.0, 2.0])
+    x, y, z, w = XYZW_FIXED
+    np.testing.assert_allclose(row['rotation'], [w, x, y, z], atol=1e-9)
+    assert found['instance'][0]['instance_name'] == '7'
+    assert found['visibility'][0]['level'] == 'unavailable'
+    assert found['sample_data'][0]['fileformat'] == 'pcd.bin'
+
+
+def test_av2_opens_it(tmp_path):
+    _, folder = written('argoverse2', tmp_path)
+    (cuboid,) = consumer('av2', folder / 'annotations.feather')
+    assert (cuboid['category'], cuboid['stamp_ns']) == ('Car', STAMP)
+    np.testing.assert_allclose(cuboid['center'], [6, -3, 1], atol=1e-9)
+    np.testing.assert_allclose(cuboid['lwh'], EXTENT)
+    np.testing.assert_allclose(np.array(cuboid['matrix']).T, AXES, atol=1e-9)
+    # Its first vertex is at the front, on the left, above.
+    np.testing.assert_allclose(cuboid['vertices'][0], CORNERS[7], atol=1e-9)
+
+
+def test_av2_finds_pose_and_sweep(tmp_path):
+    frames = [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))]
+    _, folder = written('argoverse2', tmp_path, frames, with_points=True)
+    found = consumer('av2_log', folder, STAMP)
+    np.testing.assert_allclose(found['points'], POINTS)
+    np.testing.assert_allclose(found['city_SE3_ego'], T_FIXED_SENSOR, atol=1e-9)
+    np.testing.assert_allclose(found['ego_SE3_lidar'], np.eye(4), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('given', 'written_'), [([0.0, 0.5, 1.0], [0, 127, 255]), ([0.0, 100.0, 300.0], [0, 100, 255])]
+)
+def test_av2_intensities_are_whole_numbers(tmp_path, given, written_):
+    points = np.arange(9, dtype=np.float32).reshape(3, 3)
+    sweep = Sweep(STAMP, 'lidar', points)
+    frames = [frame_of(sweep=sweep, intensities=np.array(given))]
+    _, folder = written('argoverse2', tmp_path, frames, with_points=True)
+    (file,) = folder.glob('sensors/lidar/*.feather')
+    assert feather.read_table(file)['intensity'].to_pylist() == written_
+
+
+def test_waymo_components_hold_it(tmp_path):
+    _, folder = written('waymo', tmp_path)
+    box, pose = consumer('waymo', folder / 'lidar_box' / 'drive.parquet',
+                         folder / 'vehicle_pose' / 'drive.parquet')  # fmt: skip
+    assert box['types_agree']
+    assert (box['id'], box['type'], box['points']) == ('7', 'TYPE_VEHICLE', 42)
+    np.testing.assert_allclose(box['box'], [6, -3, 1, *EXTENT, 0.0], atol=1e-9)
+    np.testing.assert_allclose(np.reshape(pose, (4, 4)), T_FIXED_SENSOR)
+
+
+def test_pykitti_finds_calibration_and_sweep(tmp_path):
+    frames = [frame_of(sweep=Sweep(STAMP, 'lidar', POINTS))]
+    _, folder = written('kitti', tmp_path, frames, with_points=True)
+    found = consumer('pykitti', folder)
+    np.testing.assert_allclose(np.reshape(found['P2'], (3, 4))[0], [200, 0, 600, 0])
+    np.testing.assert_allclose(np.reshape(found['Tr_velo_cam'], (3, 4))[:, 3], [0.1, -0.2, -0.5])
+    np.testing.assert_allclose(np.array(found['points'])[:, :3], POINTS)
+
+
+@pytest.mark.parametrize('name', ['parquet', 'csv'])
+def test_pandas_opens_it(tmp_path, name):
+    _, folder = written(name, tmp_path, drive())
+    found = consumer('pandas', folder / f'boxes.{name}')
+    expected = [frame.refined.boxes.boxes[0, 0] for frame in drive()]
+    assert found['x of 7'] == pytest.approx(expected)
+    assert found['stamps'] == [frame.refined.boxes.stamp_ns for frame in drive()]
+    assert found['kinds'] == {'stamp_ns': 'int64', 'x': 'float64', 'num_points': 'int64'}
+
+
+# Memory ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('name', [name for name in OURS if name != 'tracklets'])
+def test_writing_takes_no_memory_per_frame(tmp_path, name, monkeypatch):
+    """A tracklet is written when its track ends; all others, as their boxes come."""
+    monkeypatch.setattr(arrow, 'ROWS', 20)
+    writer = writer_for(name, tmp_path, Provenance(), options_in(tmp_path))
+    held = []
+    tracemalloc.start()
+    for i in range(120):
+        boxes, tracks = [IN_FIXED] * 20, [f'track {k}' for k in range(20)]
+        writer.write(frame_of(boxes, tracks, STAMP + i * 10**8))
+        if i in (59, 119):
+            gc.collect()
+            held.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    writer.close()
+    assert held[1] - held[0] < 60 * 20 * 72 / 2  # bytes; the boxes alone have 72 each
+
+
+# Any to any ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('source', [name for name in OURS if name not in {'csv', *LOSE_TILT}])
+@pytest.mark.parametrize('target', [name for name in OURS if name not in LOSE_TILT])
+def test_formats_feed_each_other(tmp_path, source, target):
+    frames = drive()
+    (tmp_path / 'a').mkdir()
+    (tmp_path / 'b').mkdir()
+    _, first = written(source, tmp_path / 'a', frames)
+    between = [frame.moved('fixed') for frame in frames_of(source, first)]
+    _, second = written(target, tmp_path / 'b', between)
+    for before, after in zip(frames, frames_of(target, second), strict=True):
+        after = in_order(after).refined.boxes
+        np.testing.assert_allclose(after.boxes, before.refined.boxes.boxes, atol=1e-8)
+        assert after.track_ids == before.refined.boxes.track_ids
+
+
+def test_every_format_of_this_list_is_one():
+    assert set(OURS) <= set(FORMATS)
+    assert np.allclose(inverse(T_FIXED_SENSOR) @ [13, 8, 2, 1], [6, -3, 1, 1])

@@ -1,0 +1,320 @@
+"""What happens to a node that runs for weeks: restarts, loops, rubbish, wishes at run time."""
+
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+from boxreg_ros.bench.node import vitals
+from boxreg_ros.config import Config
+from boxreg_ros.live.node import import_message
+from msg_adapters import vision
+import numpy as np
+import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_messages import DETECTIONS, Drive, POINTS, SECOND, START
+from std_srvs.srv import Trigger
+from test_node import DIAGNOSTICS, ended_cleanly, QUICK, values_of
+
+MARKERS = 'visualization_msgs/msg/MarkerArray'
+
+
+@pytest.fixture
+def graph(tmp_path):
+    with graph_in(tmp_path) as graph:
+        yield graph
+
+
+def shifted(drive, seconds):
+    """Return a drive, its stamps later."""
+    for _, _, message in drive.items:
+        for item in [
+            *getattr(message, 'transforms', [message]),
+            *getattr(message, 'detections', []),
+        ]:
+            item.header.stamp.sec += seconds
+    return drive
+
+
+def asked(graph, kind, name, request):
+    """Return the answer of a service of the node."""
+    client = graph.node.create_client(kind, f'/boxreg_node/{name}')
+    graph.wait(client.service_is_ready, name)
+    future = client.call_async(request)
+    graph.wait(future.done, f'an answer of {name}')
+    return future.result()
+
+
+def test_wishes_at_run_time(graph, tmp_path):
+    file = tmp_path / 'saved.yaml'
+    graph.publisher(POINTS, '/points', is_reliable=False)
+    graph.publisher(DETECTIONS, '/boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, '-p', f'config_file:={file}', '-p', 'window:=8')
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    graph.node.create_subscription(
+        import_message(DETECTIONS), '/refined_boxes_final', print, latched
+    )
+    graph.wait(lambda: values_of(diagnostics).get('qos_incompatible') == '2', 'both complaints')
+    output = node.output()
+    assert '/points: a publisher whose RELIABILITY' in output
+    assert 'qos_overrides' in output
+
+    def set_to(**values):
+        wishes = [Parameter(n.replace('__', '.'), value=v) for n, v in values.items()]
+        request = SetParameters.Request(parameters=[w.to_parameter_msg() for w in wishes])
+        return asked(graph, SetParameters, 'set_parameters', request).results
+
+    changes = {'solver__rounds': 2, 'transform_timeout': 0.5, 'vehicle__names': ['ute']}
+    assert all(result.successful for result in set_to(**changes))
+    for bad, words in [
+        ({'solver__rounds': 0}, ('solver.rounds', '1')),
+        ({'solver__rounds': 'many'}, ('INTEGER', 'STRING')),
+        ({'window': 5}, ('window', 'read-only')),
+        ({'vehicle__names': [1]}, ('STRING_ARRAY', 'INTEGER_ARRAY')),
+    ]:
+        (result,) = set_to(**bad)
+        assert not result.successful
+        assert all(word in result.reason for word in words), result.reason
+    answer = asked(graph, Trigger, 'save_config', Trigger.Request())
+    assert (answer.success, answer.message) == (True, str(file))
+    expected = {'solver.rounds': 2, 'vehicle.names': ['ute'], 'window': 8}
+    assert Config.from_yaml(file) == Config().updated(expected)
+    assert 'transform_timeout: 0.5' in file.read_text()
+    assert asked(graph, Trigger, 'reset', Trigger.Request()).success
+    (folder := tmp_path / 'folder').mkdir()
+    for bad_file in (tmp_path / 'missing' / 'saved.yaml', folder, Path('/')):
+        set_to(config_file=str(bad_file))
+        answer = asked(graph, Trigger, 'save_config', Trigger.Request())
+        assert not answer.success
+        assert 'config_file' in answer.message
+    assert not list(tmp_path.glob('.*.partial'))
+    assert ended_cleanly(node)
+    # What was saved starts a node, in another namespace too.
+    again = graph.start('--params-file', str(file), '-r', '__ns:=/front')
+    graph.wait(lambda: graph.node.count_publishers('/front/refined_markers'), 'the second node')
+    assert ended_cleanly(again)
+    assert 'no such parameters' not in again.output()
+
+
+def test_a_looping_recording_under_sim_time_and_silence(graph, tmp_path):
+    first, second = (
+        records_of(shifted(Drive(sweeps=8), seconds).write(tmp_path / f'drive{seconds}'))
+        for seconds in (30, 0)
+    )
+    publishers_for(graph, first)
+    clock = graph.publisher('rosgraph_msgs/msg/Clock', '/clock')
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'use_sim_time:=true', '-p', 'backlog:=60.0')
+    graph.wait_until_connected()
+    for records, sec in ((first, START // SECOND + 31), (second, START // SECOND + 1)):
+        message = import_message('rosgraph_msgs/msg/Clock')()
+        message.clock.sec = sec
+        clock.publish(message)
+        play(graph, records, early)
+    # The last ones are not held back for ever, and every message comes back once.
+    graph.wait(lambda: len(final) == 16, 'final boxes after a silence')
+    graph.wait(lambda: values_of(diagnostics).get('final_published') == '16', 'counters')
+    values = values_of(diagnostics)
+    assert values['time_jump'] == '1'
+    assert values['no_transform'] == '2'  # of the one box array that told
+    assert 0.0 < float(values['newest transform, age [s]']) < 1.0
+    stamps = [START + 30 * SECOND + k * SECOND // 10 for k in range(8)]
+    stamps += [stamp_ns - 30 * SECOND for stamp_ns in stamps]
+    assert sorted(stamp_of(message) for message in final) == sorted(stamps)
+    assert ended_cleanly(node)
+
+
+def test_a_node_that_is_killed_is_replaced(graph, tmp_path):
+    records = records_of(Drive(sweeps=12).write(tmp_path / 'drive'))
+    half = [i for i, record in enumerate(records) if record.topic == '/boxes'][5] + 1
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    shown = graph.collect(MARKERS, '/refined_markers')
+    node = graph.start(*RELIABLE, *QUICK)
+    graph.wait_until_connected()
+    play(graph, records[:half], early)
+    for _ in range(10):  # markers follow their boxes
+        graph.executor.spin_once(timeout_sec=0.05)
+    node.kill()
+    count = len(shown)
+    second = graph.start(*RELIABLE, *QUICK)
+    graph.wait(lambda: 'boxes are' in second.output(), 'the second node')
+    graph.wait(lambda: graph.publishers['/points'].get_subscription_count() >= 1, 'readers')
+    for _ in range(20):  # discovery in both directions
+        graph.executor.spin_once(timeout_sec=0.05)
+    play(graph, records[half:], early)
+    graph.wait(lambda: len(shown) > count, 'markers')
+    assert shown[count].markers[0].action == 3  # the first one's are removed
+    assert ended_cleanly(second)
+    assert [stamp_of(message) for message in early] == Drive(sweeps=12).stamps
+
+
+def test_a_lidar_that_stops_costs_half_a_second(graph, tmp_path):
+    records = records_of(Drive(sweeps=12).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK)
+    graph.wait_until_connected()
+    half = [i for i, record in enumerate(records) if record.topic == '/boxes'][5] + 1
+    play(graph, records[:half], early)
+    play(graph, [record for record in records[half:] if record.topic != '/points'])
+    graph.wait(lambda: len(early) == 12, 'boxes without their clouds', 2.5)  # silence: 3 s
+    graph.wait(lambda: values_of(diagnostics).get('no_sweep') == '12', 'counters')
+    slowest = [values_of([d]).get('latency most [ms]', 0) for d in diagnostics]
+    assert max(map(float, slowest)) >= 500.0
+    assert ended_cleanly(node)
+
+
+def rubbish():
+    """Yield (topic, message) that no sensor and no detector should send."""
+    drive = Drive(sweeps=1)
+    cloud_kind, boxes_kind = import_message(POINTS), import_message(DETECTIONS)
+    good = next(message for topic, _, message in drive.items if topic == '/points')
+    for name, value in [
+        ('width', 10**6), ('width', 2**32 - 1), ('height', 2**31), ('point_step', 0),
+        ('point_step', 3), ('row_step', 2**32 - 1), ('data', []), ('fields', []), ('fields', 'x'),
+        ('datatype', 0), ('datatype', 99), ('count', 4096), ('offset', 2**31), ('frame', ''),
+        ('values', np.nan), ('values', np.inf), ('values', 1e38),
+    ]:  # fmt: skip
+        cloud = cloud_kind(
+            height=good.height, width=good.width, point_step=good.point_step,
+            row_step=good.row_step,
+        )  # fmt: skip
+        cloud.header.frame_id = '' if name == 'frame' else 'lidar'
+        cloud.header.stamp.sec = START // SECOND
+        for field in good.fields:
+            item = import_message('sensor_msgs/msg/PointField')(
+                name=field.name, offset=field.offset, datatype=field.datatype, count=1
+            )
+            if name in ('datatype', 'count', 'offset'):
+                setattr(item, name, value)
+            cloud.fields.append(item)
+        data = good.data.tobytes()
+        if name == 'values':
+            data = np.full(len(data) // 4, value, np.float32).tobytes()
+        cloud.data.frombytes(data)
+        if name in ('width', 'height', 'point_step', 'row_step'):
+            setattr(cloud, name, value)
+        elif name == 'data':
+            cloud.data = value
+        elif name == 'fields':
+            cloud.fields = cloud.fields[: len(value)]
+        yield '/points', cloud
+    for number, value in enumerate([np.nan, np.inf, -1.0, 0.0, 1e300]):
+        boxes = boxes_kind()
+        boxes.header.frame_id = 'lidar' if number else 'nowhere'
+        boxes.header.stamp.sec, boxes.header.stamp.nanosec = START // SECOND, number
+        for row in range(3):
+            box = import_message('vision_msgs/msg/Detection3D')(id='' if row == 2 else 'same')
+            box.bbox.size.x = box.bbox.center.position.x = value
+            box.bbox.center.orientation.w = 1.0 if row else value
+            boxes.detections.append(box)
+        yield '/boxes', boxes
+    yield '/boxes', boxes_kind()
+
+
+def test_rubbish_does_no_harm_and_is_counted(graph, tmp_path):
+    drive = Drive(sweeps=6)
+    records = records_of(shifted(drive, 5).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    patient = ('-p', 'transform_timeout:=0.05', '-p', 'queue:=100')
+    node = graph.start(*RELIABLE, *QUICK, *patient)
+    graph.wait_until_connected()
+    play(graph, [record for record in records if record.topic.startswith('/tf')])
+    for topic, message in rubbish():
+        graph.publishers[topic].publish(message)
+        for _ in range(4):
+            graph.executor.spin_once(timeout_sec=0.02)
+    # A thousand ids at once, on the first of good clouds.
+    crowd = import_message(DETECTIONS)()
+    crowd.header.frame_id = 'lidar'
+    crowd.header.stamp.sec = START // SECOND + 4
+    for number in range(1000):
+        box = import_message('vision_msgs/msg/Detection3D')(id=str(number))
+        box.bbox.center.position.x = 2.0 * number
+        box.bbox.size.x = box.bbox.size.y = box.bbox.size.z = 1.0
+        crowd.detections.append(box)
+    cloud = import_message(POINTS)()
+    cloud.header = crowd.header
+    graph.publishers['/points'].publish(cloud)
+    graph.publishers['/boxes'].publish(crowd)
+    play(graph, [r for r in records if not r.topic.startswith('/tf')], early)
+    graph.wait(lambda: int(values_of(diagnostics).get('final_published', 0)) >= 12, 'counters')
+    values = {k: int(v) for k, v in values_of(diagnostics).items() if v.isdigit()}
+    assert values['unreadable'] > 8
+    assert 'failed' not in values, node.output()
+    assert values['refined'] > 0
+    assert ended_cleanly(node)
+    # Every message of boxes comes back once, rubbish too.
+    assert len(early) == len(final) == 6 + 6 + 1
+    ours = [m for m in final if stamp_of(m) >= START + 5 * SECOND]
+    for message in ours[2:]:
+        array = vision.from_msg(message)
+        k = drive.stamps.index(array.stamp_ns - 5 * SECOND)
+        error = array.boxes[:, :3] + [0.5 * k, 0, 2.0] - drive.truth[drive.stamps[k]][:, :3]
+        assert np.abs(error).max() < 0.4
+
+
+@pytest.fixture
+def domain():
+    """Return an environment with a domain of its own."""
+    return {**os.environ, 'ROS_DOMAIN_ID': str(101 + os.getpid() % 100)}
+
+
+BENCH = [sys.executable, '-m', 'boxreg_ros.cli', 'bench', 'node', '--tracks=3', '--points=3000']
+
+
+def test_bench_of_the_node_measures(domain):
+    done = subprocess.run(
+        [*BENCH, '--seconds=9', '--json'], cwd=ROOT, env=domain, capture_output=True, text=True,
+        timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report['box arrays sent'] == 40  # 9 s less 5 s of settling, at 10 Hz
+    assert report['early published [%]'] >= 97.5
+    assert 0.0 < report['latency p50 [ms]'] < 1000.0
+    assert report['exit status'] == 0
+    assert report['ending [s]'] < 2.0
+    for when in ('at the start', 'in the middle', 'at the end'):
+        assert 50.0 < report[f'memory {when} [MB]'] < 5000.0
+        assert 5 < report[f'handles {when}'] < 100
+    counters = report['counters']
+    assert counters['boxes_received'] >= 85
+    assert counters['refined'] > 100
+
+
+def test_a_publisher_that_is_killed_may_come_back(domain, graph, tmp_path):
+    domain['ROS_DOMAIN_ID'] = str(graph.domain)
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start('-p', 'window:=5', '-p', 'lag:=2')
+    command = [*BENCH, '--role=publish', f'--log={tmp_path / "sent"}', '--seconds=60']
+
+    def refined():
+        return int(values_of(diagnostics).get('refined', 0))
+
+    for _ in range(2):
+        before = refined()
+        publisher = subprocess.Popen(command, cwd=ROOT, env=domain)
+        try:
+            graph.wait(lambda n=before: refined() > n + 30, 'refined boxes')
+        finally:
+            publisher.send_signal(signal.SIGKILL)
+            publisher.wait()
+    graph.wait(lambda: 'nothing received' in diagnostics[-1].status[0].message, 'a warning')
+    _, handles, _, _ = vitals(node.popen.pid)
+    assert handles < 100
+    assert ended_cleanly(node)
+    assert Path(f'/proc/{node.popen.pid}').exists() is False

@@ -1,0 +1,599 @@
+"""The real node, a process of its own, over DDS."""
+
+from contextlib import ExitStack
+import signal
+import subprocess
+import sys
+from threading import Event, Thread
+import time
+
+from boxreg_ros.config import Config, settings
+from boxreg_ros.io.markers import MarkerBoard, NAMESPACES
+from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.live.node import import_message
+from boxreg_ros.offline.calibrate import calibrated, GAPS, Measured, write_settings
+from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
+from diagnostic_msgs.msg import DiagnosticStatus
+from msg_adapters import markers, vision
+import numpy as np
+import pytest
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
+from ros_graph import Graph, graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_messages import DETECTIONS, Drive, MARKERS, START
+
+DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
+QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=60.0')
+WITHOUT_TF2_MSGS, WITHOUT_TF2_ROS = (
+    f'import sys; sys.modules["{package}"] = None\n'
+    'from boxreg_ros.live.main import main\n'
+    'sys.exit(main())'
+    for package in ('tf2_msgs', 'tf2_ros')
+)
+
+
+@pytest.fixture
+def graph(tmp_path):
+    with graph_in(tmp_path) as graph:
+        yield graph
+
+
+def ended_cleanly(node, number=signal.SIGINT):
+    took = node.stop(number)
+    assert node.popen.returncode == 0, node.output()
+    assert 'Traceback' not in node.output()
+    assert took < 2.0
+    return True
+
+
+def values_of(diagnostics):
+    newest = diagnostics[-1].status[0].values if diagnostics else []
+    return {item.key: item.value for item in newest}
+
+
+def test_odometry_alone_is_enough(graph, tmp_path):
+    """Type from the graph, a best-effort publisher of boxes, no tf2_msgs; markers, diagnostics."""
+    drive = Drive(sweeps=6, boxes='markers', motion='odometry')
+    leaving = [item[2] for item in drive.items if item[0] == '/boxes'][4:]
+    for message in leaving:
+        del message.markers[1]
+    drive.items = [item for item in drive.items if item[0] != '/tf_static']
+    for _, _, message in drive.items:
+        if hasattr(message, 'child_frame_id'):
+            message.child_frame_id = 'lidar'
+            message.pose.pose.position.z = 2.0
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, [record for record in records if record.topic != '/boxes'])
+    graph.publisher(MARKERS, '/boxes', is_reliable=False)
+    early = graph.collect(MARKERS, '/refined_boxes')
+    shown = graph.collect(MARKERS, '/refined_markers')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK, command=('-c', WITHOUT_TF2_MSGS))
+    graph.wait_until_connected()
+    begun = time.monotonic()
+    play(graph, records[:3], early)
+    assert time.monotonic() - begun < 2.0
+    play(graph, records[3:], early)
+    graph.wait(lambda: len(shown) == 6, 'markers')
+    graph.wait(lambda: values_of(diagnostics).get('early_published') == '6', 'diagnostics')
+    assert values_of(diagnostics)['fixed_frame'] == 'odom'
+    assert int(values_of(diagnostics)['refined']) > 0
+    told = {message.status[0].message: message.status[0].level for message in diagnostics}
+    assert told['refining'] == DiagnosticStatus.OK
+    assert all(text == 'refining' or text.startswith('nothing received') for text in told), told
+    assert ended_cleanly(node)
+    assert "fixed frame is 'odom'" in node.output()
+    assert node.output().count('tf2_msgs') >= 1
+    assert node.output().count('WARN') == 1, node.output()
+
+    array = markers.from_msg(early[-1])
+    assert array.frame_id == 'lidar' and array.track_ids == ('1',)
+    added = [{m.ns for m in message.markers if m.action == 0} for message in shown[:6]]
+    assert added == [set(NAMESPACES)] * 6
+    colours = {(m.ns, m.color.g) for m in shown[3].markers if m.ns in ('input', 'refined')}
+    assert len({green for _, green in colours}) == 2
+    numbers = {m.text: m.id for m in shown[3].markers if m.ns == 'id'}
+    assert numbers.keys() == {'1', '2'}
+    deleted = [{m.id for m in message.markers if m.action == 2} for message in shown[:6]]
+    assert deleted == [set(), set(), set(), set(), {numbers['2']}, set()]
+    assert shown[-1].markers[0].action == 3  # all are removed when the node ends
+
+
+def test_transforms_may_come_late_and_bad_messages_do_no_harm(graph, tmp_path):
+    drive = Drive(sweeps=8)
+    drive.replace(
+        '/boxes', 3, lambda m: setattr(m.detections[0].bbox.center.position, 'x', np.nan)
+    )
+    drive.replace('/points', 4, lambda m: setattr(m, 'width', 10**6))
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=20')
+    graph.wait_until_connected()
+    moving = [record for record in records if record.topic == '/tf']
+    play(graph, [record for record in records if record.topic != '/tf'])
+    for _ in range(20):
+        graph.executor.spin_once(timeout_sec=0.02)
+    assert not early  # they wait
+    play(graph, moving)
+    graph.wait(lambda: len(early) == 8, 'early boxes')
+    graph.wait(lambda: values_of(diagnostics).get('unreadable') == '1', 'the unreadable cloud')
+    assert ended_cleanly(node, signal.SIGTERM)
+    assert 'unreadable' in node.output() and 'width' in node.output()
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+    # Kept as it came, in place; the detector's NaN is not made worse nor better.
+    assert [d.id for d in final[3].detections] == ['1', '2']
+    assert np.isnan(final[3].detections[0].bbox.center.position.x)
+    for message in final:
+        array = vision.from_msg(message)
+        assert array.frame_id == 'lidar'
+        ego = np.array([0.5 * drive.stamps.index(array.stamp_ns), 0, 2.0])
+        error = array.boxes[:, :3] + ego - drive.truth[array.stamp_ns][:, :3]
+        assert np.nanmax(np.abs(error)) < 0.4
+
+
+@pytest.mark.parametrize('package', ['tf2_ros', 'none'])
+def test_transforms_come_by_tf2_ros_where_it_is_installed(graph, tmp_path, package):
+    """With it and without it: the same transforms, the same boxes."""
+    if package == 'tf2_ros':
+        pytest.importorskip('tf2_ros', reason='tf2_ros is not installed', exc_type=ImportError)
+    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    command = ('-m', 'boxreg_ros.live.main') if package == 'tf2_ros' else ('-c', WITHOUT_TF2_ROS)
+    options = ('-p', 'transform_timeout:=20.0', '--log-level', 'boxreg_node:=debug')
+    node = graph.start(*RELIABLE, *QUICK, *options, command=command)
+    graph.wait_until_connected()
+    play(graph, records, early)
+    graph.wait(lambda: values_of(diagnostics).get('early_published') == '6', 'diagnostics')
+    values = values_of(diagnostics)
+    assert (values['fixed_frame'], values.get('no_transform')) == ('odom', None)
+    assert int(values['refined']) > 0
+    assert ended_cleanly(node)
+    assert ('transforms come by tf2_ros' in node.output()) == (package == 'tf2_ros')
+
+
+def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path):
+    drive = Drive(sweeps=4, boxes='vision', motion='none')
+    path = drive.write(tmp_path / 'drive')
+    records = records_of(path)
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=0.1')
+    graph.wait_until_connected()
+    play(graph, records, early)
+    graph.wait(lambda: len(final) == 4, 'final boxes')
+    given = [message for topic, _, message in drive.items if topic == '/boxes']
+    for before, after in zip(given, final, strict=True):
+        assert np.array_equal(vision.from_msg(before).boxes, vision.from_msg(after).boxes)
+    assert ended_cleanly(node)
+    assert 'fixed_frame:=lidar' in node.output()
+
+    early.clear()
+    final.clear()
+    settings = ('-p', 'fixed_frame:=lidar', '-p', f'boxes_type:={DETECTIONS}')
+    second = graph.start(*RELIABLE, *QUICK, *settings)
+    graph.wait_until_connected()
+    play(graph, records, early)
+    assert ended_cleanly(second)
+    assert len(final) == 4
+    assert 'WARN' not in second.output()
+    refined = np.array([vision.from_msg(message).boxes for message in final])
+    assert np.abs(refined - [vision.from_msg(message).boxes for message in given]).max() > 1e-4
+
+
+SLOW_EVENTS = """
+import sys, threading, time
+notify = threading.Condition.notify_all
+def slowly(self):
+    if threading.get_ident() == threading.main_thread().ident:
+        time.sleep(0.1)
+    notify(self)
+threading.Condition.notify_all = slowly
+from boxreg_ros.live.main import main
+sys.exit(main())
+"""
+
+
+def test_signals_in_quick_succession_end_it_cleanly_while_data_flow(graph, tmp_path):
+    records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    node = graph.start(*RELIABLE, *QUICK, command=('-c', SLOW_EVENTS))
+    graph.wait_until_connected()
+    is_over = Event()
+
+    def flow():
+        while not is_over.is_set():
+            play(graph, records)
+            time.sleep(0.01)
+
+    player = Thread(target=flow)
+    player.start()
+    time.sleep(0.5)
+    node.popen.send_signal(signal.SIGTERM)
+    time.sleep(0.05)
+    try:
+        assert ended_cleanly(node)
+    finally:
+        is_over.set()
+        player.join()
+
+
+def test_of_several_types_the_one_that_can_be_read_is_taken(graph, tmp_path):
+    """BoundingBox3DArray, the first by name, has no ids; other types that come later are told."""
+    with ExitStack() as stack:  # one participant cannot have several
+
+        def publish(type_name):
+            other = Graph(tmp_path, graph.domain)
+            stack.callback(other.close)
+            other.publisher(type_name, '/boxes')
+
+        publish('vision_msgs/msg/BoundingBox3DArray')
+        publish(DETECTIONS)
+        node = graph.start(*RELIABLE, *QUICK)
+        graph.wait(lambda: f'boxes are {DETECTIONS}' in node.output(), 'a choice')
+        assert 'set boxes_type' not in node.output()
+        publish(MARKERS)
+        graph.wait(lambda: f'{MARKERS}: set boxes_type' in node.output(), 'a warning')
+        assert ended_cleanly(node)
+    assert node.output().count('set boxes_type') == 1
+
+
+def test_boxes_of_another_type_than_before_are_told(graph):
+    graph.publisher(MARKERS, '/boxes')
+    node = graph.start('-p', f'boxes_type:={DETECTIONS}')
+    graph.wait(lambda: 'start the node anew' in node.output(), 'a warning')
+    assert f'expected boxes of type {DETECTIONS}, got {MARKERS}' in node.output()
+    assert ended_cleanly(node)
+
+
+def test_best_effort_boxes_are_heard_whenever_their_publisher_comes(graph, tmp_path):
+    """Which QoS fits is settled when a node subscribes, and then nobody publishes yet."""
+    records = records_of(Drive(sweeps=4).write(tmp_path / 'drive'))
+    publishers_for(graph, [record for record in records if record.topic != '/boxes'])
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    node = graph.start(*RELIABLE, *QUICK, '-p', f'boxes_type:={DETECTIONS}')
+    graph.wait(lambda: graph.node.count_subscribers('/boxes') > 0, 'a subscription')
+    graph.publisher(DETECTIONS, '/boxes', is_reliable=False)
+    graph.wait_until_connected()
+    play(graph, records, early)
+    assert len(early) == 4
+    assert ended_cleanly(node)
+    assert 'qos_incompatible' not in node.output()
+
+
+def test_what_waited_for_transforms_is_not_the_solvers_fault(graph, tmp_path):
+    # All clouds become ready at once, when the transforms come, and take longer to be solved than
+    # `backlog`; boxes come before the first cloud, by which the fixed frame is found.
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    options = ['transform_timeout:=60.0', 'queue:=100', 'backlog:=0.02']
+    node = graph.start(*RELIABLE, *[part for text in options for part in ('-p', text)])
+    graph.wait_until_connected()
+    moving = [record for record in records if record.topic == '/tf']
+    others = [record for record in records if record.topic != '/tf']
+    others.sort(key=lambda record: record.topic)  # boxes before points
+    play(graph, others)
+    deadline = time.monotonic() + 5.0
+    while time.monotonic() < deadline:
+        graph.executor.spin_once(timeout_sec=0.02)
+    assert not early
+    play(graph, moving)
+    values = all_published(graph, early)
+    assert int(values['refined']) > 30  # those held back for nine more are not counted yet
+    assert not {'points_queue_full', 'boxes_queue_full', 'no_transform'} & values.keys()
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+
+
+def test_markers_leave_with_an_array_without_boxes(graph, tmp_path):
+    """Markers carry the stamp: an empty array of them has none."""
+    records = records_of(Drive(sweeps=4, boxes='markers').write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(MARKERS, '/refined_boxes')
+    shown = graph.collect(MARKERS, '/refined_markers')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'max_gap:=1000.0')  # else they leave after a while
+    graph.wait_until_connected()
+    play(graph, records, early)
+    graph.wait(lambda: len(shown) == 4, 'markers')
+    graph.publishers['/boxes'].publish(import_message(MARKERS)())
+    graph.wait(lambda: len(shown) == 5, 'no markers')
+    assert [m.action for m in shown[-1].markers] == [3]
+    assert ended_cleanly(node)
+
+
+def thirty_stamps(graph, tmp_path):
+    """Return a drive of 30 stamps, its records, and what will come of early and final boxes."""
+    drive = Drive(sweeps=30)
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    found = (graph.collect(DETECTIONS, f'/refined_boxes{end}') for end in ('', '_final'))
+    return drive, records, *found
+
+
+def all_published(graph, early):
+    """Wait until all 30 early boxes are there and counted; return the counters."""
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    graph.wait(lambda: len(early) == 30, 'early boxes')
+    graph.wait(lambda: int(values_of(diagnostics).get('early_published', 0)) == 30, 'counters')
+    return values_of(diagnostics)
+
+
+def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
+    # Ten times the backlog is 1 s. With so many updates of its multipliers a window of the paper's
+    # objective takes some 2 s: the fifth stamp is solved while those after it wait.
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    slow = ['objective:=paper', 'paper.multiplier_rounds:=60', 'paper.iterations:=10000']
+    options = [part for text in (*slow, 'backlog:=0.1') for part in ('-p', text)]
+    node = graph.start(*RELIABLE, *options)
+    graph.wait_until_connected()
+    first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[3])
+    play(graph, records[:first], early)
+    play(graph, records[first:])
+    passed = int(all_published(graph, early)['boxes_queue_full'])
+    assert 0 < passed < 30
+    assert 'boxes_queue_full' in node.output()
+    assert ended_cleanly(node)
+    assert sorted(map(stamp_of, early)) == sorted(map(stamp_of, final)) == drive.stamps
+
+
+def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    slow = ('-p', 'solver.rounds:=40', '-p', 'solver.iterations:=400')
+    node = graph.start(*RELIABLE, *slow, '-p', 'backlog:=0.2')
+    graph.wait_until_connected()
+    play(graph, records)
+    assert int(all_published(graph, early)['points_queue_full']) > 5
+    assert 'points_queue_full' in node.output()
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+
+
+def test_what_comes_while_the_process_is_held_up_is_taken(graph, tmp_path):
+    """More clouds at once than a sensor's usual queue holds, none of which is in the way."""
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[14])
+    node = graph.start(*RELIABLE, '-p', 'transform_timeout:=20', '-p', 'backlog:=60.0')
+    graph.wait_until_connected()
+    node.popen.send_signal(signal.SIGSTOP)
+    play(graph, records[:first])
+    node.popen.send_signal(signal.SIGCONT)
+    graph.wait(lambda: len(early) == 15, 'boxes of the first half')
+    play(graph, records[first:], early)
+    counts = all_published(graph, early)
+    assert counts['points_received'] == counts['boxes_received'] == '30'
+    assert counts.get('boxes_without_sweep', '0') == '0'
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+
+
+def test_what_waits_when_the_node_ends_comes_out(graph, tmp_path):
+    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    slow = ('-p', 'solver.rounds:=20', '-p', 'solver.iterations:=100', '-p', 'backlog:=60.0')
+    node = graph.start(*RELIABLE, *slow, '-p', 'queue:=100')
+    graph.wait_until_connected()
+    play(graph, records)
+    graph.wait(lambda: len(early) >= 4, 'some boxes')
+    assert len(early) < 20
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+
+
+def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
+    records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    slow = ['solver.rounds:=2', 'solver.iterations:=100', 'solver.tolerance:=0.0', 'window:=30']
+    options = [part for text in (*slow, 'backlog:=60.0', 'queue:=100') for part in ('-p', text)]
+    node = graph.start(*RELIABLE, *options)
+    graph.wait_until_connected()
+    play(graph, records)
+    graph.wait(lambda: len(early) >= 4, 'some boxes')
+    graph.wait(lambda: len(diagnostics) >= 2, 'diagnostics beside the solver')
+    assert len(early) < 25
+    assert ended_cleanly(node)
+
+
+def test_a_calibrated_rule_is_taken_as_parameters(graph, tmp_path):
+    """What `boxreg calibrate` writes, of every type there is, reaches the running node."""
+    changes = {
+        'max_gap': 2, 'window': 8, 'solver.tolerance': 1e-5, 'sampling.deskew': True,
+        'mode': 'bev', 'vehicle.names': ['ute'],
+    }  # fmt: skip
+    gap = Measured(value=0.25, spread=0.01, tracks=9)
+    measured = {f'cyclist.{name}': gap for name in GAPS} | {'cyclist.position': gap}
+    values = calibrated(Config().updated(changes), measured)
+    rule = tmp_path / 'rule.yaml'
+    write_settings(rule, values, 'a test')
+    node = graph.start('--params-file', str(rule))
+    client = graph.node.create_client(GetParameters, '/boxreg_node/get_parameters')
+    graph.wait(client.service_is_ready, 'its parameters')
+    names = [item.name for item in settings()]
+    future = client.call_async(GetParameters.Request(names=names))
+    graph.wait(future.done, 'an answer')
+    answer = map(parameter_value_to_python, future.result().values)
+    defaults = {item.name: value for item, value in Config().items()}
+    expected = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in (defaults | values | {'estimate': 'final'}).items()
+    }
+    assert expected['cyclist.gap_ends'] == 0.25 and not expected['faces.learn']
+    assert dict(zip(names, answer, strict=True)) == expected
+    assert ended_cleanly(node)
+    assert 'WARN' not in node.output()
+
+
+@pytest.fixture(scope='module')
+def refused(tmp_path_factory):
+    """Start nodes with bad arguments side by side; return status and output of each."""
+    cases = {
+        'range': ['--ros-args', '-p', 'window:=2'],
+        'boxes': ['--ros-args', '-p', 'boxes_type:=std_msgs/msg/String'],
+        'type': ['--ros-args', '-p', 'boxes_type:=Detection3DArray'],
+        'device': ['--ros-args', '-p', 'device:=abacus'],
+        'file': ['--ros-args', '--params-file', 'missing.yaml'],
+        'qos': ['--ros-args', '-p', 'qos_overrides./points.subscription.depth:=deep'],
+        'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
+    }
+    started = {
+        name: subprocess.Popen(
+            [sys.executable, '-m', 'boxreg_ros.live.main', *arguments], cwd=ROOT,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )
+        for name, arguments in cases.items()
+    }  # fmt: skip
+    return {
+        name: (process.communicate(timeout=60)[0], process.returncode)
+        for name, process in started.items()
+    }
+
+
+@pytest.mark.parametrize(
+    'case, status, words',
+    [
+        ('range', 2, ('window', '3', 'got 2')),
+        ('boxes', 1, ('std_msgs/msg/String', 'Detection3DArray')),
+        ('type', 1, ("'Detection3DArray'", 'vision_msgs/msg/Detection3DArray')),
+        ('device', 2, ('device', 'abacus', 'cpu')),
+        ('file', 2, ('missing.yaml',)),
+        ('qos', 2, ('qos_overrides./points.subscription', 'depth')),
+        ('list', 2, ('vehicle.names', "['']")),
+    ],
+)
+def test_bad_arguments_are_told_in_one_line(refused, case, status, words):
+    output, returned = refused[case]
+    assert returned == status, output
+    ours = [line for line in output.splitlines() if '[rcl]' not in line]  # rcl adds its own
+    assert len(ours) == 1, output
+    for word in words:
+        assert word in ours[0]
+
+
+def boxes_of(*track_ids, x=0.0):
+    n = len(track_ids)
+    boxes = np.tile([x, 0, 0, 4, 2, 1.5, 0, 0, 0], (n, 1))
+    return BoxArray(START, 'odom', track_ids, ('car',) * n, np.ones(n), boxes)
+
+
+def refined_of(boxes, *status):
+    n = len(boxes.track_ids)
+    return RefinedBoxes(boxes, status, ('',) * n, np.zeros(n, int), np.tile(np.eye(6), (n, 1, 1)))
+
+
+def test_markers_stay_with_their_track():
+    board = MarkerBoard()
+    given = boxes_of('a', 'b', '', '')
+    assert not board.is_showing
+    first = board.update(given, refined_of(given, REFINED, KEPT, KEPT, KEPT)).markers
+    assert first.pop(0).action == 3  # what an earlier node may have left
+    assert len({(m.ns, m.id) for m in first}) == len(first) == 20
+    cubes = {m.id: m.color.r for m in first if m.ns == 'refined'}
+    assert cubes[0] != cubes[1]
+    given = boxes_of('c', 'b')
+    given.boxes[0, 0] = np.nan  # no viewer takes it
+    second = board.update(given, refined_of(given, KEPT, KEPT)).markers
+    assert {m.id for m in second if m.action == 0} == {1}
+    assert {(m.ns, m.id) for m in second if m.action == 2} == {
+        (ns, number) for ns in NAMESPACES for number in (0, 2, 3)
+    }
+    assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
+    assert board.is_showing and board.clear() and not board.is_showing
+    given.boxes[1, 4] = 0.0  # nor this
+    assert not board.update(given, refined_of(given, KEPT, KEPT)).markers
+
+
+def test_health_tells_the_worst_of_the_last_period():
+    health = Health()
+    health.count('points_received')
+    health.count('boxes_received')
+    health.add_latency(0.05)
+    status = health.status('node', {'fixed_frame': 'odom'})
+    assert status.level == DiagnosticStatus.OK
+    values = {item.key: item.value for item in status.values}
+    assert values['latency median [ms]'] == '50.0'
+    assert values['fixed_frame'] == 'odom'
+    assert health.status('node', {}).level == DiagnosticStatus.WARN  # nothing more came
+    health.count('no_sweep', 3)
+    health.count('boxes_received')
+    status = health.status('node', {})  # its remedy would lead astray
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.message == 'no box was refined; nothing received on points'
+    health.count('points_received')
+    health.set_counts({'no_sweep': 3, 'refined': 5})
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message.startswith('no_sweep') and 'stamp' in status.message
+    health.count('failed')
+    assert health.status('node', {}).level == DiagnosticStatus.ERROR
+    for name, level in (('refined', DiagnosticStatus.WARN), ('kept', DiagnosticStatus.ERROR)):
+        health.count('boxes_received')
+        health.count('late')
+        health.count(name)
+        assert health.status('node', {}).level == level
+    assert [line.split()[0] for line in health.complaints()] == ['failed', 'no_sweep', 'late']
+    health.count('late')
+    assert not list(health.complaints())  # at a limited rate
+    health.count('unreadable')
+    assert health.is_time_to_warn('unreadable') and not health.is_time_to_warn('unreadable')
+    health._warned.clear()  # as if the period were over
+    assert [line.split()[0] for line in health.complaints()] == ['late']  # told, not told again
+    assert health.is_time_to_warn('invalid_box')
+    health.status('node', {})
+    for name in ('points_received', 'boxes_received', 'no_points', 'no_gain', 'no_gain'):
+        health.count(name)
+    health.count('kept', 3)
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.WARN
+    assert 'no box was refined' in status.message and 'no_gain' in status.message
+
+
+def test_without_ros_the_remedy_is_told():
+    code = 'import sys; sys.modules["rclpy"] = None; from boxreg_ros.cli import main; '
+    process = subprocess.run(
+        [sys.executable, '-c', f'{code}sys.exit(main(["node"]))'], cwd=ROOT, capture_output=True,
+        text=True, timeout=60,
+    )  # fmt: skip
+    assert process.returncode == 1
+    (line,) = process.stderr.splitlines()
+    assert 'rclpy' in line and 'boxreg_ros[ros]' in line
+
+
+SIGNAL_IN_DESTRUCTOR = """
+import os, signal, sys
+class Last:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == 'rclpy.executors':
+            sys.meta_path.remove(self)
+            Last()
+sys.meta_path.insert(0, Finder())
+from boxreg_ros.live.main import main
+sys.exit(main())
+"""
+
+
+def test_a_signal_within_a_destructor_ends_it_too():
+    """Imports are full of them; what is raised in one is lost."""
+    process = subprocess.run(
+        [sys.executable, '-c', SIGNAL_IN_DESTRUCTOR], cwd=ROOT, capture_output=True, timeout=60,
+        text=True,
+    )  # fmt: skip
+    assert (process.returncode, process.stdout + process.stderr) == (0, '')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_starting_ends_it_quietly(number):
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'boxreg_ros.live.main'], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    time.sleep(0.8)
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=10)
+    assert (process.returncode, output) == (0, '')

@@ -1,0 +1,148 @@
+"""Every setting is a ROS parameter, with its meaning, unit and bounds."""
+
+from boxreg_ros.config import Config, settings
+from boxreg_ros.errors import ConfigError
+from boxreg_ros.live.params import (
+    AT_ONCE,
+    changed,
+    declare,
+    NODE_SETTINGS,
+    parameters_yaml,
+    READ_ONLY,
+)
+import pytest
+import rclpy
+from rclpy.parameter import Parameter
+import yaml
+
+
+@pytest.fixture(scope='module')
+def context():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def make_node(context):
+    nodes = []
+
+    def make(cli_args=None, **given):
+        node = rclpy.create_node(
+            'params', context=context, automatically_declare_parameters_from_overrides=True,
+            parameter_overrides=[Parameter(name, value=value) for name, value in given.items()],
+            cli_args=cli_args,
+        )  # fmt: skip
+        nodes.append(node)
+        return node
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+
+
+def test_every_setting_is_a_parameter(make_node):
+    node = make_node()
+    config, options = declare(node)
+    assert config == Config(estimate='final')
+    assert options.boxes_type == options.fixed_frame == options.output_frame == ''
+    for item in [*settings(), *NODE_SETTINGS]:
+        descriptor = node.describe_parameter(item.name)
+        assert descriptor.description.startswith(item.meaning)
+        assert not item.unit or f'[{item.unit}]' in descriptor.description
+        assert descriptor.read_only == (not item.name.startswith(AT_ONCE))
+        assert (READ_ONLY in descriptor.additional_constraints) == descriptor.read_only
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        assert [(r.from_value, r.to_value) for r in ranges] == (
+            [] if item.low is None else [(item.low, item.high)]
+        )
+        for choice in item.choices:
+            assert choice in descriptor.additional_constraints
+        value = node.get_parameter(item.name).value
+        default = 'final' if item.name == 'estimate' else item.default
+        assert (tuple(value) if isinstance(default, tuple) else value) == default
+
+
+def test_values_are_taken_and_kept_in_their_type(make_node):
+    node = make_node(
+        **{'sampling.margin': 1, 'window': 7, 'vehicle.names': ['ute'], 'transform_timeout': 2}
+    )
+    config, options = declare(node)
+    assert config == Config(estimate='final').updated(
+        {'sampling.margin': 1.0, 'window': 7, 'vehicle.names': ['ute']}
+    )
+    assert type(node.get_parameter('sampling.margin').value) is float
+    assert type(options.transform_timeout) is float
+    assert options.transform_timeout == 2.0
+
+
+def test_one_yaml_file_serves_node_and_recordings(make_node, tmp_path):
+    path = tmp_path / 'params.yaml'
+    values = {'window': 6, 'lag': 2, 'solver': {'rounds': 2}, 'faces': {'learn': False}}
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {**values, 'estimate': 'final'}}}))
+    config, _ = declare(make_node(cli_args=['--ros-args', '--params-file', str(path)]))
+    assert config == Config.from_yaml(path)
+    assert config.solver.rounds == 2 and not config.faces.learn
+
+
+@pytest.mark.parametrize(
+    'name, value, words',
+    [
+        ('window', 2, ('window', '3', '2')),
+        ('window', 'abc', ('window', 'int', 'abc')),
+        ('lag', 1000, ('lag', '999', '1000')),
+        ('mode', '4d', ('mode', 'bev', '4d')),
+        ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
+        ('backlog', 'x', ('backlog', 'float', 'x')),
+        ('boxes_type', 3, ('boxes_type', 'str', '3')),
+        ('faces.learn', 1, ('faces.learn', 'bool', '1')),
+    ],
+)
+def test_bad_values_are_refused_by_name(make_node, name, value, words):
+    with pytest.raises(ConfigError) as caught:
+        declare(make_node(**{name: value}))
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_parameters_cannot_be_changed_behind_the_node(make_node):
+    node = make_node()
+    declare(node)
+    (result,) = node.set_parameters([Parameter('window', value=5)])
+    assert not result.successful
+    assert 'read-only' in result.reason
+    assert node.get_parameter('window').value == Config().window
+
+
+def test_what_may_change_changes(make_node):
+    node = make_node()
+    settings_before = declare(node)
+    changes = [Parameter('solver.rounds', value=2), Parameter('transform_timeout', value=1.5)]
+    assert all(result.successful for result in node.set_parameters(changes))
+    config, options = changed(*settings_before, [*changes, Parameter('use_sim_time', value=True)])
+    assert config == settings_before[0].updated({'solver.rounds': 2})
+    assert options == settings_before[1]._replace(transform_timeout=1.5)
+    (result,) = node.set_parameters([Parameter('solver.rounds', value=0)])
+    assert not result.successful
+    for bad in (Parameter('solver.rounds', value=0), Parameter('transform_timeout', value='a')):
+        with pytest.raises(ConfigError, match=bad.name):
+            changed(*settings_before, [bad])
+
+
+def test_a_parameter_file_says_it_all_and_serves_both(make_node, tmp_path):
+    path = tmp_path / 'params.yaml'
+    config = Config(estimate='final').updated(
+        {'window': 7, 'vehicle.names': ['ute', 'car'], 'solver.tolerance': 1e-5, 'mode': 'bev'}
+    )
+    config = config.updated({'cyclist.names': []})
+    _, options = declare(make_node())
+    options = options._replace(fixed_frame='map', backlog=9.0)
+    path.write_text(parameters_yaml(config, options, '/**/params'))
+    again = declare(make_node(cli_args=['--ros-args', '--params-file', str(path)]))
+    assert again == (config, options)
+    read = Config.from_yaml(path)
+    assert read.cyclist.names == ('',)  # no class is named so
+    assert read.updated({'cyclist.names': []}) == config.updated({'estimate': 'track'})
+    for item in settings():
+        assert item.name == 'estimate' or item.meaning in path.read_text()

@@ -1,0 +1,82 @@
+"""What is installed beside the code; `python test/test_share.py` writes the parameter file."""
+
+import json
+import re
+from xml.etree import ElementTree
+
+from boxreg_ros.bench.node import PROFILE
+from boxreg_ros.config import Config
+from boxreg_ros.io.markers import NAMESPACES
+from boxreg_ros.live.params import declare, NODE_SETTINGS, parameters_yaml
+from paths import SHARE
+import pytest
+import rclpy
+import yaml
+
+PARAMETERS = SHARE / 'params.yaml'
+NODE = (SHARE.parent / 'boxreg_node.py').read_text(encoding='utf-8')
+
+
+def test_parameter_file_holds_the_defaults():
+    assert PARAMETERS.read_text(encoding='utf-8') == parameters_yaml(Config()), (
+        'run: python test/test_share.py'
+    )
+    assert Config.from_yaml(PARAMETERS) == Config()
+    context = rclpy.Context()
+    rclpy.init(context=context, args=['--ros-args', '--params-file', str(PARAMETERS)])
+    try:
+        node = rclpy.create_node(
+            'boxreg_node', context=context, automatically_declare_parameters_from_overrides=True
+        )
+        given = set(node.get_parameters_by_prefix(''))
+        assert {item.name for item in NODE_SETTINGS} < given
+        config, options = declare(node)
+        assert config == Config(estimate='final')
+        assert list(options) == [item.default for item in NODE_SETTINGS]
+        node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
+
+
+def test_launch_file_starts_the_node_with_its_topics():
+    launch = ElementTree.parse(SHARE / 'boxreg.launch.xml').getroot()
+    arguments = {item.get('name') for item in launch.iter('arg')}
+    node = next(item for item in launch.iter('node') if item.get('pkg') == 'boxreg_ros')
+    assert node.get('exec') == node.get('name') == 'boxreg_node'
+    assert {item.get('from') for item in node.iter('remap')} == {'points', 'boxes', 'odom'}
+    text = (SHARE / 'boxreg.launch.xml').read_text(encoding='utf-8')
+    assert set(re.findall(r'\$\(var (\w+)\)', text)) == arguments
+    for file in re.findall(r'find-pkg-share boxreg_ros\)/([\w.]+)', text):
+        assert (SHARE / file).is_file()
+
+
+@pytest.mark.parametrize('file', ['boxreg.rviz', 'foxglove.json'])
+def test_views_show_what_the_node_publishes(file):
+    text = (SHARE / file).read_text(encoding='utf-8')
+    view = json.loads(text) if file.endswith('json') else yaml.safe_load(text)
+    if file.endswith('json'):
+        panels = set(view['configById'])
+        assert set(re.findall(r'"(\w+!\w+)"', json.dumps(view['layout']))) == panels
+        topics = view['configById']['3D!boxes']['topics']
+        assert set(topics['/refined_markers']['namespaces']) == set(NAMESPACES)
+        names = {name.lstrip('/') for name in topics}
+    else:
+        displays = {item['Name']: item for item in view['Visualization Manager']['Displays']}
+        assert set(displays['Boxes']['Namespaces']) == set(NAMESPACES)
+        assert displays['Points']['Topic']['Reliability Policy'] == 'Best Effort'
+        names = {item['Topic']['Value'] for item in displays.values() if 'Topic' in item}
+    assert names == {'points', 'refined_markers'}
+    assert all(f"'{name}'" in NODE for name in names)
+
+
+def test_profile_has_room_for_several_large_clouds():
+    space = '{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}'
+    profile = ElementTree.parse(PROFILE).getroot()
+    (segment,) = (int(item.text) for item in profile.iter(f'{space}segment_size'))
+    assert segment >= 3 * 130_000 * 22  # bytes a point: x, y, z, intensity, ring, time
+    used = {item.text for item in profile.find(f'.//{space}userTransports')}
+    assert used == {item.text for item in profile.iter(f'{space}transport_id')}
+
+
+if __name__ == '__main__':
+    PARAMETERS.write_text(parameters_yaml(Config()), encoding='utf-8')

@@ -1,0 +1,356 @@
+"""Every family of box messages: the same bytes through every reader, and what survives."""
+
+from dataclasses import replace
+import sys
+from types import SimpleNamespace
+
+from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.transforms import TransformTree
+from msg_adapters import adapter_for, ADAPTERS, WITHOUT_IDS
+from msg_adapters.convention import Convention, STANDARD
+import numpy as np
+import pytest
+from ros_messages import (
+    BOXES,
+    DETECTED,
+    DETECTIONS,
+    JSK,
+    MARKERS,
+    Messages,
+    OBJECTS,
+    OBJECTS_WITH_COVARIANCE,
+    SCENE,
+    TRACKED,
+    write_recording,
+)
+from rosbags.typesys import get_types_from_msg
+from scipy.spatial.transform import Rotation
+
+STAMP = 1_700_000_000_123_456_789
+M = Messages()
+RPY = np.array([[0.0, 0.0, 0.0], [0.1, -0.2, 2.5]])
+POSITIONS = np.array([[10.0, -2.0, 0.5], [-20.0, 3.0, 1.5]])
+SIZES = np.array([[4.5, 1.8, 1.6], [8.0, 2.5, 3.0]])
+GIVEN = np.hstack([POSITIONS, SIZES, RPY])
+OWN = 0.5 * np.eye(6)
+"""The covariance that the messages come with."""
+WITH_COVARIANCE = (DETECTIONS, TRACKED, DETECTED, OBJECTS_WITH_COVARIANCE)
+
+
+def message_of(type_name, rpy=RPY):
+    turns = Rotation.from_euler('ZYX', rpy[:, ::-1]).as_quat()
+    found = [(n + 1, (POSITIONS[n], turns[n]), SIZES[n]) for n in range(2)]
+    return M.boxes(type_name, STAMP, 'lidar', found)
+
+
+def bytes_of(message, type_name):
+    return bytes(M.store.serialize_cdr(message, type_name))
+
+
+def moved(given, frame_id='lidar', boxes=None):
+    """Return other boxes in place of the given ones: a little longer and further left."""
+    step = np.array([0, 1.0, 0, 0.9, 0.36, 0, 0, 0, 0.01])
+    return replace(given, frame_id=frame_id, boxes=given.boxes + step if boxes is None else boxes)
+
+
+def covariances_of(message, type_name):
+    """Return the covariances (n, 6, 6) of a message."""
+    if type_name == DETECTIONS:
+        found = [d.results[0].pose.covariance for d in message.detections]
+    elif type_name == OBJECTS_WITH_COVARIANCE:
+        found = [o.pose.covariance for o in message.objects]
+    else:
+        found = [o.kinematics.pose_with_covariance.covariance for o in message.objects]
+    return np.array(found).reshape(-1, 6, 6)
+
+
+@pytest.mark.parametrize('type_name', ADAPTERS)
+def test_boxes_are_read(type_name):
+    boxes = adapter_for(type_name).from_msg(message_of(type_name))
+    assert (boxes.stamp_ns, boxes.frame_id) == (STAMP, 'lidar')
+    np.testing.assert_allclose(boxes.boxes, GIVEN, atol=1e-12)
+    ids = {TRACKED: ('0' * 31 + '1', '0' * 31 + '2'), **dict.fromkeys(WITHOUT_IDS, ('', ''))}
+    assert boxes.track_ids == ids.get(type_name, ('1', '2'))
+    classes = {BOXES: '', JSK: '3'}
+    assert boxes.class_names == (classes.get(type_name, 'car'),) * 2
+    # 204 of 255 is 0.8
+    scores = {OBJECTS: 0.8, OBJECTS_WITH_COVARIANCE: 0.8, DETECTIONS: 0.9, MARKERS: 1, BOXES: 1}
+    np.testing.assert_allclose(boxes.scores, scores.get(type_name, 0.75))
+
+
+@pytest.mark.parametrize('type_name', ADAPTERS)
+def test_what_is_not_refined_survives(type_name):
+    """Boxes that have not changed leave no byte changed; those that have, only their own."""
+    message = message_of(type_name, np.zeros((2, 3)))
+    before = bytes_of(message, type_name)
+    adapter = adapter_for(type_name)
+    boxes = adapter.from_msg(message)
+    nothing = np.full((2, 6, 6), np.nan)
+    assert bytes_of(adapter.to_msg(message, boxes, nothing), type_name) == before
+    out = adapter.to_msg(message, moved(boxes), np.stack([np.eye(6)] * 2))
+    assert bytes_of(message, type_name) == before, 'the input message is left alone'
+    back = adapter.from_msg(out)
+    np.testing.assert_allclose(back.boxes, moved(boxes).boxes, atol=1e-6)
+    again = adapter.to_msg(out, boxes, np.stack([OWN] * 2) if type_name != DETECTIONS else None)
+    if type_name == DETECTIONS:
+        again = adapter.to_msg(out, boxes, np.zeros((2, 6, 6)))
+    if type_name == DETECTED:  # it has become known
+        for item in again.objects:
+            assert item.kinematics.has_position_covariance
+            item.kinematics.has_position_covariance = False
+    assert bytes_of(again, type_name) == before
+
+
+@pytest.mark.parametrize('type_name', WITH_COVARIANCE)
+def test_kept_boxes_keep_the_covariance_of_the_detector(type_name):
+    message, adapter = message_of(type_name), adapter_for(type_name)
+    boxes = adapter.from_msg(message)
+    own = covariances_of(message, type_name)
+    ours = np.diag(np.arange(1.0, 7.0))
+    out = adapter.to_msg(message, boxes, np.stack([np.full((6, 6), np.nan), ours]))
+    np.testing.assert_array_equal(covariances_of(out, type_name), [own[0], ours])
+    if type_name == DETECTED:
+        assert [o.kinematics.has_position_covariance for o in out.objects] == [False, True]
+
+
+@pytest.mark.parametrize('type_name', WITH_COVARIANCE)
+def test_covariances_turn_into_another_frame_with_their_boxes(type_name):
+    message, adapter = message_of(type_name), adapter_for(type_name)
+    items = message.objects if hasattr(message, 'objects') else message.detections
+    for item in items:
+        posed = item.results[0].pose if hasattr(item, 'results') else getattr(item, 'pose', None)
+        posed = posed or item.kinematics.pose_with_covariance
+        posed.covariance = np.diag([4.0, 1.0, 0, 0, 0, 0]).reshape(36)
+    T = np.eye(4)
+    T[:2, :2] = [[0, -1], [1, 0]]  # a quarter turn: x becomes y
+    boxes = moved(adapter.from_msg(message), 'map')
+    out = adapter.to_msg(message, boxes, None, T)
+    for spread in covariances_of(out, type_name):
+        np.testing.assert_allclose(np.diag(spread)[:3], [1.0, 4.0, 0.0], atol=1e-12)
+
+
+def test_footprint_is_stretched_with_its_box():
+    adapter = adapter_for(TRACKED)
+    message = message_of(TRACKED)
+    out = adapter.to_msg(message, moved(adapter.from_msg(message)))
+    # 4.5 m and 1.8 m become 5.4 m and 2.16 m: the corner at half of each goes along.
+    corner, other = out.objects[0].shape.footprint.points
+    np.testing.assert_allclose([corner.x, corner.y, other.x, other.y], [2.7, 1.08, -2.7, 1.08])
+
+
+@pytest.mark.parametrize('type_name', [TRACKED, DETECTED])
+def test_twist_in_the_object_turns_around_with_its_heading(type_name):
+    adapter = adapter_for(type_name)
+    message = message_of(type_name)
+    boxes = adapter.from_msg(message)
+    turned = boxes.boxes + np.array([[0, 0, 0, 0, 0, 0, 0, 0, np.pi], np.zeros(9)])
+    out = adapter.to_msg(message, moved(boxes, boxes=turned))
+    first, second = (o.kinematics.twist_with_covariance.twist for o in out.objects)
+    assert (first.linear.x, first.linear.y, first.angular.z) == (-3.0, -0.5, 0.1)
+    assert (second.linear.x, second.linear.y) == (3.0, 0.5)
+    if type_name == TRACKED:
+        accel = out.objects[0].kinematics.acceleration_with_covariance.accel
+        assert accel.linear.x == -0.25
+
+
+def test_orientation_that_is_not_available_makes_no_box_but_a_cylinder():
+    message = message_of(TRACKED)
+    message.objects[0].kinematics.orientation_availability = 0
+    boxes = adapter_for(TRACKED).from_msg(message).boxes
+    assert np.isnan(boxes[0, 6:]).all() and np.isfinite(boxes[0, :6]).all()
+    np.testing.assert_allclose(boxes[1], GIVEN[1], atol=1e-12)
+    message.objects[0].shape.type = 1
+    assert np.isfinite(adapter_for(TRACKED).from_msg(message).boxes).all()
+    message.objects[0].kinematics.orientation_availability = 1  # its sign is not known
+    out = adapter_for(TRACKED).to_msg(message, adapter_for(TRACKED).from_msg(message))
+    assert out.objects[0].kinematics.orientation_availability == 1
+
+
+def test_a_cylinder_has_one_diameter():
+    message = message_of(TRACKED)
+    message.objects[0].shape.type = 1
+    adapter = adapter_for(TRACKED)
+    out = adapter.to_msg(message, moved(adapter.from_msg(message)))
+    # 4.5 m and 1.8 m become 5.4 m and 2.16 m, on average 3.78 m.
+    first, second = (o.shape.dimensions for o in out.objects)
+    np.testing.assert_allclose([first.x, first.y, first.z], [3.78, 3.78, 1.6])
+    assert second.x != second.y
+
+
+def test_all_that_is_in_the_frame_of_the_header_moves_with_it():
+    message = message_of(OBJECTS_WITH_COVARIANCE)
+    message.objects[0].twist.covariance = np.diag([9.0, 1, 1, 4, 1, 1]).ravel()
+    corner = M.make('geometry_msgs/msg/Point32', x=4.0, y=-1.0, z=0.5)
+    message.objects[0].polygon.points = [corner]
+    adapter = adapter_for(OBJECTS_WITH_COVARIANCE)
+    T = np.eye(4)
+    T[:2, :2], T[:3, 3] = [[0, -1], [1, 0]], [100.0, 200.0, 0.0]
+    out = adapter.to_msg(message, moved(adapter.from_msg(message), 'map'), None, T).objects[0]
+    spread = np.reshape(out.twist.covariance, (6, 6))
+    np.testing.assert_allclose(np.diag(spread), [1, 9, 1, 1, 4, 1], atol=1e-12)
+    # (4, -1) a quarter turn further is (1, 4).
+    (point,) = out.polygon.points
+    np.testing.assert_allclose([point.x, point.y, point.z], [101.0, 204.0, 0.5])
+
+
+def test_labels_that_came_later_and_ids_that_say_nothing():
+    message = message_of(TRACKED)
+    message.objects[0].classification[0].probability = 1.0
+    message.objects[0].classification[0].label = 8
+    message.objects[1].classification[1].label = 40
+    message.objects[1].object_id.uuid[:] = 0
+    boxes = adapter_for(TRACKED).from_msg(message)
+    assert boxes.class_names == ('animal', 'label_40')
+    assert boxes.track_ids == ('0' * 31 + '1', '')
+
+
+def test_objects_that_are_no_boxes_are_passed_over_and_move_with_their_frame():
+    message = message_of(OBJECTS)
+    message.objects[0].shape.type = 2
+    message.objects[0].shape.dimensions = np.array([0.5])
+    adapter = adapter_for(OBJECTS)
+    boxes = adapter.from_msg(message)
+    assert boxes.track_ids == ('2',)
+    T = np.eye(4)
+    T[:2, :2], T[:3, 3] = [[0, -1], [1, 0]], [100.0, 0.0, 0.0]
+    out = adapter.to_msg(message, moved(boxes, 'map'), None, T)
+    at, twist = out.objects[0].pose.position, out.objects[0].twist.linear
+    # (10, -2) a quarter turn further is (2, 10); 3 m/s along x become 3 m/s along y.
+    np.testing.assert_allclose([at.x, at.y, twist.x, twist.y], [102.0, 10.0, 0.0, 3.0], atol=1e-9)
+    assert {o.header.frame_id for o in out.objects} == {'map'}
+    np.testing.assert_allclose(adapter.from_msg(out).boxes, moved(boxes).boxes, atol=1e-9)
+
+
+def test_scene_with_several_cubes_and_none():
+    message = message_of(SCENE)
+    message.entities[0].cubes.append(message.entities[1].cubes[0])
+    message.entities[1].cubes = []
+    adapter = adapter_for(SCENE)
+    boxes = adapter.from_msg(message)
+    assert boxes.track_ids == ('1/0', '1/1')
+    T = np.eye(4)
+    T[0, 3] = 100.0
+    out = adapter.to_msg(message, moved(boxes, 'map'), None, T)
+    np.testing.assert_allclose(adapter.from_msg(out).boxes, moved(boxes).boxes, atol=1e-9)
+    assert out.entities[0].texts[0].pose.position.x == 110.0
+    assert [entity.frame_id for entity in out.entities] == ['map', 'lidar']
+    empty = adapter.from_msg(M.build(SCENE))
+    assert (empty.stamp_ns, empty.frame_id, empty.boxes.shape) == (0, '', (0, 9))
+    message.entities[0].metadata[1].value = 'high'
+    assert adapter.from_msg(message).scores.tolist() == [1.0, 1.0]
+
+
+def test_empty_ids_of_detections_are_filled_in():
+    message = message_of(DETECTIONS)
+    message.detections[0].id = ''
+    adapter = adapter_for(DETECTIONS)
+    boxes = adapter.from_msg(message)
+    known = replace(boxes, track_ids=('a', 'b'))
+    out = adapter.to_msg(message, known)
+    assert [d.id for d in out.detections] == ['a', '2']
+
+
+FORK = """std_msgs/Header header
+geometry_msgs/Pose pose
+geometry_msgs/Vector3 dimensions
+float32 value
+uint32 label
+int32[] histogram
+"""
+
+
+def test_variants_of_jsk_boxes_are_told_by_their_definition(tmp_path):
+    messages = Messages(ros1=True)
+    box = 'jsk_recognition_msgs/msg/BoundingBox'
+    for name in (box, JSK):
+        del messages.store.fielddefs[name], messages.store.types[name]
+    array = 'std_msgs/Header header\njsk_recognition_msgs/BoundingBox[] boxes'
+    messages.store.register(get_types_from_msg(FORK, box) | get_types_from_msg(array, JSK))
+    found = [(1, (POSITIONS[0], (0, 0, 0, 1)), SIZES[0])]
+    message = messages.boxes(JSK, STAMP, 'lidar', found)
+    message.boxes[0].histogram = np.array([1, 2, 3], np.int32)
+    cloud = messages.points(STAMP, 'lidar', np.ones((4, 3)))
+    items = [('/points', STAMP, cloud), ('/boxes', STAMP + 1, message)]
+    path = write_recording(tmp_path / 'fork', items, 'rosbag1', messages)
+    with pytest.raises(UnsupportedMessage, match='--associate'), Recording([path]):
+        pass
+    with Recording([path], convention=Convention(associate=True)) as recording:
+        _, record = recording.records(TransformTree())
+        boxes = recording.decode(record)
+        raw = recording._message(record)
+    np.testing.assert_allclose(boxes.boxes, GIVEN[:1], atol=1e-12)
+    out = adapter_for(JSK).to_msg(raw, moved(boxes))
+    assert out.boxes[0].histogram.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize('type_name', WITHOUT_IDS)
+def test_types_without_ids_are_refused_with_a_hint(type_name):
+    with pytest.raises(UnsupportedMessage, match=r'no ids.*associate:=true.*--associate'):
+        adapter_for(type_name, STANDARD)
+
+
+# The same bytes through all readers ------------------------------------------------------------
+
+
+def native(type_name, data):
+    pytest.importorskip('rclpy', reason='rclpy is not installed')
+    from rclpy.serialization import deserialize_message
+
+    package, _, name = type_name.split('/')
+    module = pytest.importorskip(f'{package}.msg', reason=f'{package} is not installed')
+    return deserialize_message(data, getattr(module, name))
+
+
+def from_mcap(type_name, data):
+    dynamic = pytest.importorskip('mcap_ros2._dynamic', reason='mcap-ros2-support is missing')
+    text, _ = M.store.generate_msgdef(type_name, ros_version=2)
+    return dynamic.generate_dynamic(type_name, text)[type_name](data)
+
+
+@pytest.mark.parametrize('type_name', ADAPTERS)
+def test_rclpy_rosbags_and_mcap_read_and_write_the_same(type_name):
+    data, adapter = bytes_of(message_of(type_name), type_name), adapter_for(type_name)
+    message = M.store.deserialize_cdr(data, type_name)
+    ours = adapter.from_msg(message)
+    covariances = np.stack([np.full((6, 6), np.nan), 2 * np.eye(6)])
+    T = np.eye(4)
+    T[:2, :2] = [[0, -1], [1, 0]]
+    written = adapter.to_msg(message, moved(ours, 'map'), covariances, T)
+    for reader in (native, from_mcap):
+        theirs = reader(type_name, data)
+        boxes = adapter.from_msg(theirs)
+        assert (boxes.stamp_ns, boxes.frame_id) == (ours.stamp_ns, ours.frame_id)
+        assert (boxes.track_ids, boxes.class_names) == (ours.track_ids, ours.class_names)
+        np.testing.assert_array_equal(boxes.scores, ours.scores)
+        np.testing.assert_array_equal(boxes.boxes, ours.boxes)
+        out = adapter.to_msg(theirs, moved(boxes, 'map'), covariances, T)
+        np.testing.assert_array_equal(adapter.from_msg(out).boxes, adapter.from_msg(written).boxes)
+        if reader is native:
+            from rclpy.serialization import serialize_message
+
+            again = M.store.deserialize_cdr(serialize_message(out), type_name)
+            assert bytes_of(again, type_name) == bytes_of(written, type_name)
+
+
+def test_a_package_that_is_not_installed_is_named(monkeypatch):
+    pytest.importorskip('rclpy', reason='rclpy is not installed')
+    from boxreg_ros.live.node import import_message
+
+    for type_name in ADAPTERS:
+        package = type_name.split('/')[0]
+        monkeypatch.setitem(sys.modules, f'{package}.msg', None)
+        with pytest.raises(UnsupportedMessage, match=f'ros-jazzy-{package.replace("_", "-")}'):
+            import_message(type_name)
+
+
+def test_times_of_any_encoding():
+    for stamp in (
+        SimpleNamespace(sec=7, nanosec=9),
+        SimpleNamespace(sec=7, nsec=9),
+        SimpleNamespace(seconds=7, nanos=9),
+    ):
+        message = message_of(SCENE)
+        for entity in message.entities:
+            entity.timestamp = stamp
+        assert adapter_for(SCENE).from_msg(message).stamp_ns == 7 * 10**9 + 9

@@ -1,0 +1,311 @@
+"""`boxreg calibrate`: rules and errors that are known are found again."""
+
+from dataclasses import replace
+
+from boxreg_ros import cli
+from boxreg_ros.config import Config
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.offline.calibrate import annotation_rule, calibrated, GAPS, input_errors, Measured
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.simulation.recorder import write_recording
+from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.structures import BoxArray
+import numpy as np
+import pytest
+from ros_messages import Drive as Recorded
+from scipy.spatial.transform import Rotation
+import yaml
+
+RULE = {'gap_ends': 0.12, 'gap_sides': 0.07, 'gap_top': 0.09, 'gap_bottom': 0.05}
+"""How far outside of the bodies' own boxes an annotator draws [m]."""
+
+
+def drawn(truth, rule=RULE):
+    """Return true boxes drawn by a rule."""
+    boxes = truth.boxes.copy()
+    up, down = rule['gap_top'], rule['gap_bottom']
+    boxes[:, 3:6] += 2 * rule['gap_ends'], 2 * rule['gap_sides'], up + down
+    axes = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()
+    boxes[:, :3] += axes[:, :, 2] * (up - down) / 2
+    return replace(truth, boxes=boxes)
+
+
+@pytest.fixture(scope='module')
+def scene():
+    return simulate('street', seed=6, sweeps=24)
+
+
+@pytest.fixture(scope='module')
+def plain(scene):
+    return annotation_rule(Drive.from_scene(scene), Config())
+
+
+def test_the_rule_of_a_simulated_recording_is_found(scene, plain):
+    # Bodies stand on the road, which is the bottom of their boxes. Elsewhere they reach these
+    # here and there, and of the noise of 0.02 m the outermost twentieth is 2 deviations out.
+    assert plain['vehicle.gap_bottom'].value == pytest.approx(0.0, abs=0.01)
+    assert all(-0.05 < plain[f'vehicle.{name}'].value < 0.15 for name in GAPS)
+    drive = Drive.from_scene(scene)
+    found = annotation_rule(replace(drive, truth=drawn(drive.truth)), Config())
+    for gap_name, gap in RULE.items():
+        name = f'vehicle.{gap_name}'
+        assert found[name].value - plain[name].value == pytest.approx(gap, abs=0.012), name
+        assert (
+            10 <= found[name].tracks <= 19
+        )  # vehicles of 22 tracks: half at least tell each face
+        assert found[name].spread < 0.1
+    # How round a body is does not change with how its box is drawn.
+    for name in ('faces.depth_ends', 'faces.depth_sides'):
+        assert found[name].value == pytest.approx(plain[name].value, abs=0.06)
+
+
+def test_kinds_have_rules_of_their_own(scene):
+    # Every other track is said to be a motorcycle, and those are drawn by `RULE`.
+    drive = Drive.from_scene(scene)
+    rides = np.array([int(name) % 2 == 1 for name in drive.truth.track_ids])
+    names = tuple('motorcycle' if ride else 'car' for ride in rides)
+    plain = replace(drive.truth, class_names=names)
+    boxes = np.where(rides[:, None], drawn(plain).boxes, plain.boxes)
+    before, found = (
+        annotation_rule(replace(drive, truth=truth), Config())
+        for truth in (plain, replace(plain, boxes=boxes))
+    )
+    assert not any(name.startswith('pedestrian') for name in found)
+    for name, gap in RULE.items():
+        change = {k: found[f'{k}.{name}'].value - before[f'{k}.{name}'].value
+                  for k in ('vehicle', 'cyclist')}  # fmt: skip
+        assert change['cyclist'] == pytest.approx(gap, abs=0.012), name
+        assert change['vehicle'] == pytest.approx(0, abs=0.005), name
+        assert found[f'cyclist.{name}'].tracks + found[f'vehicle.{name}'].tracks <= 22
+
+
+def test_the_rule_does_not_hang_on_where_it_begins(scene, plain):
+    begin = Config().updated(
+        {'vehicle.gap_ends': 0.3, 'vehicle.gap_top': -0.1, 'faces.learn': False}
+    )
+    found = annotation_rule(Drive.from_scene(scene), begin)
+    for name in (f'vehicle.{name}' for name in GAPS):
+        assert found[name].value == pytest.approx(plain[name].value, abs=0.01), name
+
+
+def test_few_tracks_tell_their_part(scene, plain):
+    drive = Drive.from_scene(scene)
+    keep = [i for i, name in enumerate(drive.truth.track_ids) if name in ('9', '10', '11', '12')]
+    few = replace(
+        drive.truth,
+        stamps_ns=drive.truth.stamps_ns[keep], boxes=drive.truth.boxes[keep],
+        scores=drive.truth.scores[keep], num_points=drive.truth.num_points[keep],
+        **{name: tuple(getattr(drive.truth, name)[i] for i in keep)
+           for name in ('track_ids', 'class_names', 'status')},
+    )  # fmt: skip
+    found = annotation_rule(replace(drive, truth=few), Config())
+    assert {found[f'vehicle.{name}'].tracks for name in GAPS} <= {3, 4}
+    known = plain['vehicle.gap_bottom'].value
+    assert found['vehicle.gap_bottom'].value == pytest.approx(known, abs=0.02)
+
+
+def noisy_drive(deviation, count=25, n=40, bias=0.0, class_name='car', turned=0.0):
+    """Return tracks with known errors: lon lat z [m], roll pitch yaw [rad], part of extents."""
+    rng = np.random.default_rng(7)
+    arrays, true = [], []
+    scale = rng.normal(0, deviation[6], (count, 3)) + 1  # of a whole track
+    for k in range(n):
+        boxes = np.zeros((count, 9))
+        boxes[:, :2] = np.arange(count)[:, None] * [9.0, 4.0] + 0.5 * k
+        boxes[:, 3:6] = 4.4, 1.8, 1.5
+        boxes[:, 8] = np.linspace(-3, 3, count) + 0.05 * k
+        axes = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()
+        noisy = boxes.copy()
+        shift = rng.normal(0, deviation[:3], (count, 3)) + bias
+        noisy[:, :3] += (axes @ shift[..., None])[..., 0]
+        noisy[:, 6:] += rng.normal(0, deviation[3:6], (count, 3))
+        noisy[:, 8] += np.pi * (rng.random(count) < turned)
+        noisy[:, 3:6] *= scale
+        ids, names = tuple(map(str, range(count))), (class_name,) * count
+        for rows, out in ((noisy, arrays), (boxes, true)):
+            out.append(BoxArray(k * 10**8, 'odom', ids, names, np.ones(count), rows))
+    return Drive((), tuple(arrays), BoxTable.from_arrays(true, 'truth'))
+
+
+DEVIATION = np.array([0.2, 0.1, 0.05, 0.03, 0.03, 0.06, 0.08])
+
+
+@pytest.mark.parametrize(('bias', 'turned'), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.1), (0.0, 1.0)])
+def test_errors_of_the_input_are_found(bias, turned):
+    found = input_errors(noisy_drive(DEVIATION, bias=bias, turned=turned), Config())
+    expected = {
+        'position': 0.2, 'lateral': 0.1, 'height': 0.05, 'tilt': 0.03, 'heading': 0.06,
+        'extent': 0.08,
+    }  # fmt: skip
+    assert set(found) == {f'vehicle.{name}' for name in expected}
+    for name, value in expected.items():
+        measured = found[f'vehicle.{name}']
+        # 1000 errors tell a deviation to 4 %; 75 extents to 15 %.
+        assert measured.value == pytest.approx(value, rel=0.25 if name == 'extent' else 0.1), name
+        assert measured.tracks == 25
+        assert 0 < measured.spread < value
+
+
+@pytest.mark.parametrize('held', [10, 25])
+def test_boxes_that_are_held_tell_the_errors_of_extents_only(held):
+    # Of 25 tracks some have the same box at all stamps.
+    drive = noisy_drive(DEVIATION)
+    first = drive.boxes[0].boxes[:held]
+    boxes = tuple(replace(a, boxes=np.r_[first, a.boxes[held:]]) for a in drive.boxes)
+    found = input_errors(replace(drive, boxes=boxes), Config())
+    assert found['vehicle.extent'].tracks == 25
+    assert found['vehicle.position'].tracks == 25 - held
+    if held < 25:
+        assert found['vehicle.position'].value == pytest.approx(0.2, rel=0.1)
+    else:
+        assert set(calibrated(Config(), found)) == {'vehicle.extent'}
+
+
+def test_kinds_have_errors_of_their_own():
+    drives = [noisy_drive(DEVIATION * k, class_name=c) for k, c in ((1, 'bus'), (2, 'person'))]
+    walkers = [replace(a, track_ids=tuple(f'p{n}' for n in a.track_ids)) for a in drives[1].boxes]
+    truth = [d.truth for d in drives]
+    both = Drive((), (*drives[0].boxes, *walkers), BoxTable(
+        np.concatenate([t.stamps_ns for t in truth]), 'odom',
+        truth[0].track_ids + tuple(f'p{n}' for n in truth[1].track_ids),
+        truth[0].class_names + truth[1].class_names, np.concatenate([t.scores for t in truth]),
+        np.concatenate([t.boxes for t in truth]), truth[0].status + truth[1].status,
+        np.concatenate([t.num_points for t in truth]),
+    ))  # fmt: skip
+    found = input_errors(both, Config())
+    assert found['vehicle.position'].value == pytest.approx(0.2, rel=0.1)
+    assert found['pedestrian.position'].value == pytest.approx(0.4, rel=0.1)
+    assert not any(name.startswith('cyclist') for name in found)
+
+
+def test_short_tracks_tell_no_errors():
+    found = input_errors(noisy_drive(DEVIATION, n=13), Config())
+    assert found['vehicle.position'].tracks == 0
+    assert calibrated(Config(), found) == {}
+
+
+def test_settings_that_come_out():
+    rule = {f'vehicle.{name}': Measured(gap, 0.01, 3) for name, gap in RULE.items()}
+    # Two tracks of a kind tell nothing of it, and do not keep that of others from being stated.
+    rule |= {f'cyclist.{name}': Measured(0.4, 0.01, 2) for name in RULE}
+    found = calibrated(Config(lag=4), rule)
+    known = {f'vehicle.{name}': gap for name, gap in RULE.items()}
+    assert found == known | {'lag': 4, 'faces.learn': False}
+    # One gap alone of a kind that is not known does, be the others of another kind or of its own.
+    rule['cyclist.gap_top'] = Measured(0.4, 0.01, 3)
+    assert calibrated(Config(), rule) == known | {'cyclist.gap_top': 0.4}
+    rule['cyclist.gap_top'] = rule['vehicle.gap_top'] = Measured(0.4, 0.01, 2)
+    assert calibrated(Config(), rule) == {k: v for k, v in known.items() if k[-4:] != '_top'}
+    # Values beyond what a setting may have; tilt that neither labels nor input have.
+    edges = {
+        'faces.depth_ends': Measured(-0.1, 0.01, 9), 'vehicle.tilt': Measured(0.0, 0.0, 9),
+        'vehicle.heading': Measured(0.0, 0.0, 9),
+    }  # fmt: skip
+    assert calibrated(Config(), edges) == {'faces.depth_ends': 0.0, 'vehicle.heading': 0.001}
+
+
+@pytest.fixture(scope='module')
+def street(tmp_path_factory, scene):
+    folder = tmp_path_factory.mktemp('street')
+    intensities = [np.zeros(len(owner)) for owner in scene.owners]
+    path = folder / 'street.mcap'
+    write_recording(
+        path, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, 'odom'
+    )
+    drawn(scene.truth).write(folder / 'truth.csv')
+    return path
+
+
+def test_what_is_written_is_what_relabel_reads(street, scene, tmp_path, capsys):
+    rule, out = tmp_path / 'rule.yaml', tmp_path / 'out'
+    truth = street.with_name('truth.csv')
+    arguments = ['calibrate', street, '--truth', truth, '-o', rule, '--set', 'solver.rounds=2']
+    assert cli.main([str(a) for a in arguments]) == 0
+    text = capsys.readouterr().out
+    assert 'vehicle.gap_bottom' in text
+    assert 'vehicle.position' in text
+    assert 'the rule is stated' in text
+    assert f'{len(set(scene.truth.track_ids))} labelled tracks' in text
+    config = Config.from_yaml(rule)
+    assert config.vehicle.gap_bottom == pytest.approx(RULE['gap_bottom'], abs=0.01)
+    assert config.pedestrian.gap_bottom == Config().pedestrian.gap_bottom  # only two walk
+    assert not config.faces.learn
+    assert config.solver.rounds == 2
+    # The form of ROS, which the node's --params-file needs: numbers are floats, but for counts.
+    group = yaml.safe_load(rule.read_text())['/**']['ros__parameters']
+    assert all(isinstance(v, float) for k, v in group['vehicle'].items())
+    assert cli.main(['relabel', str(street), '-o', str(out), '--config', str(rule)]) == 0
+    assert Config.from_yaml(out / 'config.yaml') == config
+
+
+def test_a_recording_without_boxes_has_a_rule(street, scene, tmp_path, capsys):
+    path = tmp_path / 'clouds.mcap'
+    nobody = [replace(a, track_ids=(), class_names=(), scores=a.scores[:0], boxes=a.boxes[:0])
+              for a in scene.detections]  # fmt: skip
+    intensities = [np.zeros(len(owner)) for owner in scene.owners]
+    write_recording(path, scene.sweeps, intensities, nobody, scene.T_fixed_sensor, 'odom')
+    truth = str(street.with_name('truth.csv'))
+    assert cli.main(['calibrate', str(path), '--truth', truth, '--no-boxes']) == 0
+    text = capsys.readouterr().out
+    assert 'vehicle.gap_ends' in text
+    assert 'vehicle.position' not in text
+
+
+def test_sweeps_without_labels_are_not_held(street, scene):
+    few = scene.truth.stamps_ns[[0, -1]]
+    truth = replace(scene.truth, stamps_ns=np.where(scene.truth.stamps_ns < few[1], *few))
+    drive = Drive.of(Recording([street]), truth, Config().tolerance)
+    assert [sweep.stamp_ns for sweep in drive.sweeps] == few.tolist()
+    assert len(drive.boxes) == len(scene.detections)
+
+
+def test_what_cannot_be_used_is_passed_over_and_told(tmp_path, capsys):
+    made = Recorded(sweeps=8)
+    made.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
+    made.replace('/boxes', 4, lambda m: setattr(m.detections[0].header, 'frame_id', 'camera'))
+    # TF begins at the fifth stamp; two before it are too far from that.
+    made.items = [i for i in made.items if i[0] != '/tf' or i[1] >= made.stamps[4]]
+    true = [
+        BoxArray(stamp, 'odom', ('1', '2'), ('car', 'car'), np.ones(2), boxes)
+        for stamp, boxes in made.truth.items()
+    ]
+    truth, path = BoxTable.from_arrays(true, 'truth'), made.write(tmp_path / 'drive')
+    drive = Drive.of(Recording([path]), truth)
+    assert [sweep.stamp_ns for sweep in drive.sweeps] == [*made.stamps[2:3], *made.stamps[4:]]
+    assert [array.stamp_ns for array in drive.boxes] == [*made.stamps[2:4], *made.stamps[5:]]
+    assert '2 messages could not be read, first: ' in drive.left_out
+    assert '4 messages had no transform, first: transform odom -> base is known' in drive.left_out
+    truth.write(tmp_path / 'truth.csv')
+    words = ['calibrate', str(path), '--truth', str(tmp_path / 'truth.csv')]
+    assert cli.main(words) == 0
+    assert '2 messages could not be read' in capsys.readouterr().err
+
+
+def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
+    truth = replace(scene.truth, stamps_ns=scene.truth.stamps_ns + 10**12)
+    truth.write(tmp_path / 'truth.csv')
+    arguments = ['calibrate', str(street), '--truth', str(tmp_path / 'truth.csv')]
+    assert cli.main(arguments) == 1
+    assert 'are stamps and frame those of the recording?' in capsys.readouterr().err
+    assert cli.main([*arguments, '-o', str(tmp_path / 'nowhere' / 'rule.yaml')]) == 2
+    assert 'in a folder that is there' in capsys.readouterr().err, 'before any work'
+    assert cli.main([*arguments, '-o', str(tmp_path)]) == 2
+    assert 'expected a file' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('given', ['{bag}', '{link}', '{truth}', '{folder}/rule.yaml'])
+def test_the_rule_is_not_written_over_what_it_is_measured_from(tmp_path, capsys, given):
+    folder = Recorded(sweeps=2).write(tmp_path / 'drive', 'sqlite3')
+    bag, truth, link = next(folder.glob('*.db3')), tmp_path / 'truth.csv', tmp_path / 'link'
+    BoxTable.from_arrays([]).write(truth)
+    link.symlink_to(bag)
+    before = {path: path.read_bytes() for path in (bag, truth)}
+    out = given.format(bag=bag, link=link, truth=truth, folder=folder)
+    for recording in (folder, bag):
+        if recording == folder or given != '{folder}/rule.yaml':
+            words = ['calibrate', str(recording), '--truth', str(truth), '-o', out]
+            assert cli.main(words) == 2
+            assert 'expected a file that is no input' in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in (bag, truth)} == before
+    assert not (folder / 'rule.yaml').exists()

@@ -1,0 +1,271 @@
+"""Labels in and out on the command line: `boxreg convert`, `formats`, `relabel --labels`."""
+
+import json
+
+from boxreg_ros import cli
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.recording import input_boxes
+from boxreg_ros.labels import FORMATS, frames_of, Options
+from boxreg_ros.offline.convert import Conversion, convert
+from boxreg_ros.offline.formats import HEAD, rows
+from boxreg_ros.offline.relabel import relabel, Request
+import numpy as np
+import pytest
+from ros_messages import Drive, SECOND
+from test_relabel import QUICK, rows_of
+
+# z forward of a camera that looks along the LiDAR's x.
+CALIBRATION = """P2: 700 0 621 0 0 700 187 0 0 0 1 0
+R_rect: 1 0 0 0 1 0 0 0 1
+Tr_velo_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
+"""
+
+
+@pytest.fixture
+def camera(tmp_path):
+    path = tmp_path / 'camera.txt'
+    path.write_text(CALIBRATION)
+    return path
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """Return a recording, and its boxes as they are in a table, in the fixed frame."""
+    recording = Drive(sweeps=7).write(tmp_path / 'drive')
+    table = tmp_path / 'input.csv'
+    BoxTable.from_arrays(input_boxes(recording)[0]).write(table)
+    return recording, table
+
+
+def compared(found, expected, atol):
+    assert [row['stamp_ns'] for row in found] == [row['stamp_ns'] for row in expected]
+    assert [row['track_id'] for row in found] == [row['track_id'] for row in expected]
+    assert {row['frame_id'] for row in found} == {'odom'}
+    for name in ('x', 'y', 'z', 'qz', 'qw', 'length', 'width', 'height'):
+        a, b = ([float(row[name]) for row in part] for part in (found, expected))
+        np.testing.assert_allclose(a, b, atol=atol, err_msg=name)
+
+
+def by_track(found):
+    return sorted(found, key=lambda row: (row['stamp_ns'], row['track_id']))
+
+
+# Boxes from label files ------------------------------------------------------------------------
+
+
+def test_labels_are_refined_as_the_same_boxes_of_a_topic_are(tmp_path, drive):
+    recording, table = drive
+    relabel(Request((recording,), config=QUICK), tmp_path / 'topic')
+    request = Request((recording,), config=QUICK, labels=('csv', table))
+    summary = relabel(request, tmp_path / 'labels')
+    assert summary['labels'] == {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0}
+    assert summary['topics']['boxes'] is None
+    assert (summary['boxes_in'], summary['status']['refined']) == (14, 14)
+    compared(rows_of(tmp_path / 'labels'), rows_of(tmp_path / 'topic'), 1e-5)
+
+
+@pytest.mark.parametrize('name', ['kitti', 'tracklets', 'nuscenes', 'argoverse2', 'openlabel'])
+def test_labels_of_every_frame_find_their_place(tmp_path, drive, camera, name):
+    """The frames that labels call their own need not be those of the recording."""
+    recording, table = drive
+    options = Options(camera=camera if name == 'kitti' else None)
+    asked = Conversion(table, 'csv', (name,), options, (recording,))
+    convert(asked, tmp_path / 'made')
+    folder = tmp_path / 'made' / name
+    if (folder / 'boxreg.json').exists():
+        (folder / 'boxreg.json').write_text('{"fixed_frame": "world", "sensor_frame": "top"}')
+    relabel(Request((recording,), config=QUICK, labels=('csv', table)), tmp_path / 'a')
+    relabel(Request((recording,), config=QUICK, labels=(name, folder)), tmp_path / 'b')
+    # Tracklets have one extent per track and KITTI six decimals: refined boxes move a little.
+    atol = {'kitti': 1e-3, 'tracklets': 1e-6}.get(name, 1e-6)
+    found, expected = (by_track(rows_of(tmp_path / out)) for out in 'ba')
+    compared(found, expected, atol)
+
+
+def test_labels_of_a_recording_without_boxes(tmp_path, drive):
+    _, table = drive
+    bare = Drive(sweeps=7)
+    bare.items = [item for item in bare.items if item[0] != '/boxes']
+    request = Request((bare.write(tmp_path / 'bare'),), config=QUICK, labels=('csv', table))
+    assert relabel(request, tmp_path / 'out')['boxes_out'] == 14
+
+
+def test_labels_outside_of_the_part_are_counted(tmp_path, drive):
+    recording, table = drive
+    part = {'start': 0.15, 'end': 0.45}
+    request = Request((recording,), config=QUICK, labels=('csv', table), **part)
+    summary = relabel(request, tmp_path / 'out')
+    stamps = {int(row['stamp_ns']) for row in rows_of(tmp_path / 'out')}
+    first = min(int(row['stamp_ns']) for row in rows_of_table(table))
+    assert {round((stamp - first) / SECOND, 1) for stamp in stamps} == {0.2, 0.3, 0.4}
+    assert summary['labels']['boxes_outside_part'] == 8
+
+
+def rows_of_table(path):
+    table = BoxTable.read(path)
+    return [{'stamp_ns': stamp} for stamp in table.stamps_ns]
+
+
+def test_labels_that_nothing_connects_are_kept_with_the_reason(tmp_path, drive):
+    recording, table = drive
+    text = table.read_text().replace(',odom,', ',mars,')
+    table.write_text(text)
+    request = Request((recording,), config=QUICK, labels=('csv', table))
+    assert relabel(request, tmp_path / 'out')['reasons'] == {'no_transform': 14}
+
+
+def test_a_label_frame_other_than_the_sensor(tmp_path, drive):
+    recording, _ = drive
+    options = {'config': QUICK, 'formats': ('argoverse2',), 'options': Options(with_points=True)}
+    for out, more in (('lidar', {}), ('base', {'label_frame': 'base'})):
+        relabel(Request((recording,), **options, **more), tmp_path / out)
+    a, b = (
+        list(frames_of('argoverse2', tmp_path / out / 'argoverse2')) for out in ('lidar', 'base')
+    )
+    for lidar, base in zip(a, b, strict=True):
+        assert (lidar.sensor_frame, base.sensor_frame) == ('lidar', 'base')
+        # The LiDAR is 2 m above the base.
+        moved = base.refined.boxes.boxes - lidar.refined.boxes.boxes
+        np.testing.assert_allclose(moved[:, :3], [[0, 0, 2]] * len(moved), atol=1e-6)
+        np.testing.assert_allclose(base.T_fixed_sensor[2, 3], 0.0, atol=1e-9)
+        clouds = [
+            cloud_of(tmp_path / out, lidar.refined.boxes.stamp_ns) for out in ('lidar', 'base')
+        ]
+        np.testing.assert_allclose(clouds[1] - clouds[0], [[0, 0, 2]] * len(clouds[0]), atol=1e-5)
+    with pytest.raises(RecordingError, match="label frame 'moon'"):
+        relabel(Request((recording,), config=QUICK, label_frame='moon'), tmp_path / 'moon')
+
+
+def cloud_of(out, stamp_ns):
+    from pyarrow import feather
+
+    path = out / 'argoverse2' / 'sensors' / 'lidar' / f'{stamp_ns}.feather'
+    table = feather.read_table(path)
+    return np.array([table[axis].to_numpy() for axis in 'xyz']).T
+
+
+def test_points_beside_labels_are_those_of_the_boxes(tmp_path, drive, camera):
+    recording, _ = drive
+    options = Options(with_points=True, camera=camera)
+    request = Request((recording,), config=QUICK, formats=('kitti', 'tracklets'), options=options)
+    relabel(request, tmp_path / 'out')
+    out = tmp_path / 'out'
+    assert not list(out.glob('.*'))
+    clouds = sorted((out / 'kitti' / 'velodyne' / '0000').glob('*.bin'))
+    assert [path.name for path in clouds] == [f'{i:06d}.bin' for i in range(7)]
+    assert len(list((out / 'tracklets' / 'velodyne_points' / 'data').glob('*.bin'))) == 7
+    for path, frame in zip(clouds, frames_of('kitti', out / 'kitti'), strict=True):
+        points = np.fromfile(path, '<f4').reshape(-1, 4)[:, :3]
+        for box in frame.refined.boxes.boxes:  # upright
+            cos, sin = np.cos(box[8]), np.sin(box[8])
+            local = (points - box[:3]) @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+            # Half of the cloud's points are on the surface of each of the two boxes.
+            assert (np.abs(local) < box[3:6] / 2 + 0.3).all(axis=1).sum() > 100
+
+
+def test_clouds_wait_until_their_boxes_are_ready_and_no_longer(tmp_path, drive, camera):
+    """Boxes of one track are ready together, at its end; the clouds are those of their stamps."""
+    recording, _ = drive
+    options = Options(with_points=True, camera=camera)
+    for estimate in ('early', 'track'):
+        config = QUICK.updated({'estimate': estimate, 'window': 4, 'lag': 2})
+        request = Request((recording,), config=config, formats=('kitti',), options=options)
+        relabel(request, tmp_path / estimate)
+    a, b = (tmp_path / name / 'kitti' / 'velodyne' / '0000' for name in ('early', 'track'))
+    for path in a.iterdir():
+        assert path.read_bytes() == (b / path.name).read_bytes()
+
+
+# Conversion ------------------------------------------------------------------------------------
+
+
+def test_convert_with_the_poses_and_clouds_of_a_recording(tmp_path, drive, camera):
+    recording, table = drive
+    options = Options(with_points=True, camera=camera)
+    wanted = ('kitti', 'nuscenes', 'argoverse2', 'csv')
+    asked = Conversion(table, 'csv', wanted, options, (recording,))
+    summary = convert(asked, tmp_path / 'out')
+    out = tmp_path / 'out'
+    assert sorted(item.name for item in out.iterdir()) == [
+        'argoverse2', 'boxes.csv', 'kitti', 'nuscenes', 'summary.json',
+    ]  # fmt: skip
+    assert json.loads((out / 'summary.json').read_text()) == summary
+    assert (summary['frames'], summary['boxes'], summary['left_out_of_labels']) == (7, 14, {})
+    truth = BoxTable.read(table)
+    assert BoxTable.read(out / 'boxes.csv').boxes == pytest.approx(truth.boxes, abs=1e-6)
+    assert len(list((out / 'nuscenes' / 'samples' / 'LIDAR_TOP').iterdir())) == 7
+
+
+def test_convert_needs_poses_where_labels_have_none(tmp_path, drive, camera):
+    _, table = drive
+    with pytest.raises(RecordingError, match=r"'kitti' has no place for any .* give --recording"):
+        convert(Conversion(table, 'csv', ('kitti',), Options(camera=camera)), tmp_path / 'out')
+    assert not (tmp_path / 'out').exists()
+    with pytest.raises(ConfigError, match='give it with --recording'):
+        convert(Conversion(table, 'csv', ('csv',), Options(with_points=True)), tmp_path / 'out')
+
+
+def test_convert_passes_over_clouds_that_cannot_be_read(tmp_path, drive, capsys):
+    _, table = drive
+    broken = Drive(sweeps=7)
+    broken.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
+    words = ['convert', table, '-o', tmp_path / 'out', '--from', 'csv', '--to', 'csv']
+    words += ['--recording', broken.write(tmp_path / 'broken')]
+    assert cli.main([str(word) for word in words]) == 0
+    told = capsys.readouterr().out
+    assert '14 boxes of 7 frames from csv to csv; 1 messages could not be read' in told
+
+
+def test_convert_on_the_command_line(tmp_path, drive, capsys):
+    recording, table = drive
+    made, again = tmp_path / 'made', tmp_path / 'again'
+    options = ['--from', 'csv', '--to', 'nuscenes,parquet', '--recording', recording]
+    assert cli.main(['convert', str(table), '-o', str(made), *map(str, options)]) == 0
+    options = ['--from', 'nuscenes', '--to', 'csv']
+    assert cli.main(['convert', str(made / 'nuscenes'), '-o', str(again), *options]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[1] == f'{again}: 14 boxes of 7 frames from nuscenes to csv'
+    found = by_track(rows_of(again))
+    expected = BoxTable.read(table)
+    assert [row['track_id'] for row in found] == list(expected.track_ids)
+    assert [float(row['x']) for row in found] == pytest.approx(list(expected.boxes[:, 0]))
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'status', 'message'),
+    [
+        (['convert', '{csv}', '-o', '{out}', '--from', 'kiti', '--to', 'csv'], 2, 'one of csv'),
+        (['convert', '{csv}', '-o', '{out}', '--from', 'csv', '--to', 'kitti'], 2, '--camera'),
+        (['convert', '{csv}', '-o', '{out}', '--from=csv', '--to=csv', '--camera', '{csv}'], 2,
+         '--camera: expected a format that uses it (kitti), got csv; add one, or leave it out'),
+        (['relabel', '{bag}', '-o', '{out}', '--formats', 'kitti', '--camera', '{csv}',
+          '--swap-axes'], 2, 'uses it (tracklets, datumaro), got kitti'),
+        (['relabel', '{bag}', '-o', '{out}', '--with-points'], 2, 'got csv, openlabel'),
+        (['convert', '{out}', '-o', '{out}x', '--from', 'csv', '--to', 'csv'], 1, 'no such file'),
+        (['relabel', '{bag}', '-o', '{out}', '--labels', 'csv'], 2, 'expected FORMAT:PATH'),
+        (['relabel', '{bag}', '-o', '{out}', '--labels', 'kiti:{csv}'], 2, 'expected one of csv'),
+        (['relabel', '{bag}', '-o', '{out}', '--labels', 'csv:{bag}'], 1, 'cannot be read as CSV'),
+        (['relabel', '{bag}', '-o', '{out}', '--labels', 'csv:{csv}', '--boxes', '/boxes'], 2,
+         'got both'),
+    ],
+)  # fmt: skip
+def test_what_goes_wrong_is_told_in_a_line(tmp_path, drive, capsys, arguments, status, message):
+    recording, table = drive
+    names = {'csv': table, 'out': tmp_path / 'out', 'bag': recording}
+    try:
+        found = cli.main([word.format(**names) for word in arguments])
+    except SystemExit as end:
+        found = end.code
+    assert found == status
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_formats_are_listed(capsys):
+    assert cli.main(['formats']) == 0
+    text = capsys.readouterr().out
+    for name in FORMATS:
+        assert f'\n{name}: ' in f'\n{text}'
+    assert 'pip install pyarrow' in text
+    assert {len(row) for row in rows()} == {len(HEAD)}

@@ -1,0 +1,261 @@
+"""Scores of boxes whose errors are known."""
+
+import argparse
+import codecs
+from dataclasses import replace
+import json
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.box_table import BoxTable, COLUMNS
+from boxreg_ros.offline import evaluate as cli
+from boxreg_ros.offline.evaluate import evaluate, groups, has_word, match, summarise
+from boxreg_ros.structures import BoxArray
+import numpy as np
+import pytest
+
+STEP = 100_000_000
+
+
+def truth_table(count=10):
+    """Return a car that drives at 5 m/s along x and a pedestrian who stands."""
+    arrays = []
+    for i in range(count):
+        boxes = [[0.5 * i, 0, 1, 4, 2, 1.5, 0, 0, 0], [0, 9, 1, 0.6, 0.6, 1.8, 0, 0, 2]]
+        arrays.append(
+            BoxArray(
+                i * STEP, 'odom', ('1', '2'), ('Car', 'pedestrian'), np.ones(2), np.array(boxes)
+            )
+        )
+    table = BoxTable.from_arrays(arrays, 'truth')
+    return replace(table, num_points=np.tile([200, 20], count))
+
+
+def rows(table, keep):
+    keep = np.asarray(keep)
+    arrays = ('stamps_ns', 'scores', 'boxes', 'num_points')
+    words = ('track_ids', 'class_names', 'status')
+    return replace(
+        table,
+        **{name: getattr(table, name)[keep] for name in arrays},
+        **{name: tuple(getattr(table, name)[i] for i in keep) for name in words},
+    )
+
+
+def run(*words):
+    parser = argparse.ArgumentParser()
+    cli.add_arguments(parser)
+    return cli.run(parser.parse_args([str(word) for word in words]))
+
+
+def test_truth_against_itself_is_perfect():
+    scores = evaluate(truth_table(), truth_table())
+    assert scores.iou_bev == scores.iou_3d == pytest.approx(1, abs=1e-8)
+    assert scores.recall_3d == scores.recall_bev == (1, 1, 1)
+    assert (scores.boxes, scores.missing, scores.unmatched) == (20, 0, 0)
+    assert scores.ate == scores.aoe == scores.flips == 0
+    assert scores.jitter == pytest.approx(0, abs=1e-9)
+
+
+def test_known_errors():
+    truth = truth_table()
+    boxes = truth.boxes.copy()
+    car = np.array(truth.class_names) == 'Car'
+    boxes[car, 0] += 1.0  # 3 of 4 m shared: IoU 3 / 5
+    boxes[np.flatnonzero(car)[:3], 8] += np.pi
+    scores = evaluate(replace(truth, boxes=boxes), truth, classes=['car'])
+    assert scores.boxes == 10
+    assert scores.iou_bev == scores.iou_3d == pytest.approx(0.6, abs=1e-8)
+    assert scores.recall_3d == (1, 0, 0)
+    assert scores.ate == pytest.approx(1)
+    assert scores.ase == pytest.approx(0, abs=1e-8)
+    assert scores.flips == pytest.approx(0.3)
+    assert scores.aoe == pytest.approx(0.3 * np.pi)
+    assert scores.aoe_median == 0
+
+
+def test_extent_error():
+    truth = truth_table()
+    boxes = truth.boxes.copy()
+    boxes[:, 3] *= 2
+    scores = evaluate(replace(truth, boxes=boxes), truth)
+    assert scores.ase == pytest.approx(0.5, abs=1e-8)
+    assert scores.ate == 0
+
+
+def test_jitter_is_the_second_difference():
+    truth = truth_table(5)
+    boxes = truth.boxes.copy()
+    boxes[4, 1] += 0.1  # the car, once, 0.1 m to the side: 10, 20, 10 m/s^2
+    boxes[4, 8] += 0.01
+    matches = match(replace(truth, boxes=boxes), truth, classes=['car'])
+    np.testing.assert_allclose(matches.jitter, [np.nan, 10, 20, 10, np.nan], atol=1e-9)
+    np.testing.assert_allclose(matches.turn_jitter, [np.nan, 1, 2, 1, np.nan], atol=1e-9)
+    np.testing.assert_allclose(matches.true_jitter, [np.nan, 0, 0, 0, np.nan], atol=1e-9)
+    assert summarise(matches).jitter == pytest.approx(40 / 3)
+
+
+def test_jitter_over_uneven_steps_and_gaps():
+    truth = rows(truth_table(30), np.flatnonzero(np.arange(60) % 2 == 0)[[0, 1, 3, 4, 20, 21]])
+    matches = match(truth, truth)  # constant velocity: no jitter whatever the steps
+    np.testing.assert_allclose(matches.jitter, [np.nan, 0, 0, np.nan, np.nan, np.nan], atol=1e-9)
+
+
+def test_missing_and_unmatched():
+    truth = truth_table()
+    predicted = rows(truth, np.arange(2, 20))  # the first stamp is not predicted
+    predicted = replace(predicted, track_ids=('ghost', *predicted.track_ids[1:]))
+    scores = evaluate(predicted, truth)
+    assert (scores.boxes, scores.missing, scores.unmatched) == (20, 3, 1)
+    assert scores.iou_3d == pytest.approx(1, abs=1e-8)
+    assert scores.recall_3d[2] == pytest.approx(17 / 20)
+    broken = predicted.boxes.copy()
+    broken[5] = np.nan
+    assert evaluate(replace(predicted, boxes=broken), truth).missing == 4
+
+
+def test_scope():
+    truth = truth_table()
+    assert evaluate(truth, truth, min_points=100).boxes == 10
+    assert evaluate(truth, truth, min_points=201).boxes == 0
+    assert np.isnan(evaluate(truth, truth, min_points=201).iou_3d)
+    assert has_word('Medium-sized Truck', ['car', 'truck'])
+    assert has_word('vehicle.car', ['Car'])
+    assert not has_word('Cart', ['car'])
+    grouped = groups(match(truth, truth))
+    assert set(grouped['by_class']) == {'Car', 'pedestrian'}
+    assert {name: scores.boxes for name, scores in grouped['by_points'].items()} == {
+        '10-29': 10, '100-299': 10,
+    }  # fmt: skip
+
+
+def test_refused():
+    truth = truth_table()
+    with pytest.raises(RecordingError, match="predicted boxes are in 'map', true ones in 'odom'"):
+        match(replace(truth, frame_id='map'), truth)
+    with pytest.raises(RecordingError, match="track '1' comes twice at stamp 0"):
+        match(truth, rows(truth, [0, 0]))
+    arrays = [
+        BoxArray(0, frame, ('1',), ('car',), np.ones(1), np.ones((1, 9))) for frame in ('a', 'b')
+    ]
+    with pytest.raises(RecordingError, match='one frame, got a, b'):
+        BoxTable.from_arrays(arrays)
+
+
+def test_table_round_trip(tmp_path):
+    truth = truth_table()
+    boxes = truth.boxes + np.random.default_rng(0).normal(0, 0.3, truth.boxes.shape)
+    boxes[:, :3] += 5e5
+    table = replace(truth, boxes=boxes)
+    table.write(tmp_path / 'boxes.csv')
+    again = BoxTable.read(tmp_path / 'boxes.csv')
+    np.testing.assert_allclose(again.boxes, boxes, atol=1e-8)
+    assert again.track_ids == table.track_ids
+    assert again.class_names == table.class_names
+    assert again.stamps_ns.dtype == np.int64
+    assert again.num_points.tolist() == table.num_points.tolist()
+    assert (tmp_path / 'boxes.csv').read_text().splitlines()[0] == ','.join(COLUMNS)
+    content = (tmp_path / 'boxes.csv').read_bytes()
+    (tmp_path / 'boxes.csv').write_bytes(codecs.BOM_UTF8 + content)
+    assert BoxTable.read(tmp_path / 'boxes.csv').track_ids == table.track_ids
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('stamp_ns,x\n1,2\n', 'columns missing: frame_id'),
+        ('', 'columns missing: stamp_ns'),
+        (','.join(COLUMNS) + '\n' + ','.join(['1'] * 6 + ['far'] + ['1'] * 10),
+         'line 2, column y: expected a number, got far'),
+        (','.join(COLUMNS) + '\n1,odom,1\n', 'line 2, column num_points: .*got nothing'),
+        (','.join(COLUMNS) + '\n' + '1,' * 16 + '1\n' + '1,' * 16 + '\n',
+         'line 3, column num_points: expected a whole number, got nothing'),
+        (','.join(COLUMNS) + '\n' + '9' * 25 + ',1' * 16,
+         'line 2, column stamp_ns: expected a whole number of 64 bits, got 99999'),
+    ],
+)  # fmt: skip
+def test_bad_table(tmp_path, text, message):
+    (tmp_path / 'boxes.csv').write_text(text)
+    with pytest.raises(RecordingError, match=message):
+        BoxTable.read(tmp_path / 'boxes.csv')
+
+
+def test_absent_or_binary_table(tmp_path):
+    (tmp_path / 'binary.csv').write_bytes(bytes(range(256)))
+    for name, reason in (('absent.csv', 'read: No such file'), ('binary.csv', 'read as CSV')):
+        with pytest.raises(RecordingError, match=f'cannot be {reason}'):
+            BoxTable.read(tmp_path / name)
+
+
+def test_command(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    rows(truth, np.arange(4, 20)).write(tmp_path / 'boxes.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--json') == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report['boxes'] == 20
+    assert report['missing'] == 4
+    assert report['iou_3d'] == pytest.approx(1, abs=1e-6)
+    assert report['by_class']['Car']['recall_3d'] == [0.8] * 3
+    assert run(tmp_path, tmp_path / 'truth.csv', '--json') == 0, 'the folder of a run'
+    assert json.loads(capsys.readouterr().out) == report
+    words = ('--min-points', 100, '--classes', 'car,van', 'truck')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', *words) == 0
+    text = capsys.readouterr().out
+    assert 'pedestrian' not in text
+    assert '10 true boxes, 2 missing' in text
+    with pytest.raises(RecordingError, match='none of 20 true boxes is in scope'):
+        run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'tank')
+
+
+def test_boxes_that_stayed_in_another_frame_are_missing(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    # Without a transform for most of the drive, as relabel leaves them.
+    replace(rows(truth, np.arange(14)), frame_id='lidar').write(tmp_path / 'boxes.csv')
+    rows(truth, np.arange(14, 20)).write(tmp_path / 'more.csv')
+    with (tmp_path / 'boxes.csv').open('a') as file:
+        file.writelines((tmp_path / 'more.csv').read_text().splitlines(keepends=True)[1:])
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    told = capsys.readouterr()
+    assert '20 true boxes, 14 missing, 0 predictions' in told.out
+    assert "14 predicted boxes in 'lidar' are left out" in told.err
+    replace(truth, frame_id='map').write(tmp_path / 'truth.csv')
+    with pytest.raises(RecordingError, match=r"boxes are in 'lidar', true ones in 'map'"):
+        run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv')
+
+
+def test_nothing_in_common_is_explained(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    replace(truth, stamps_ns=truth.stamps_ns + 10**12).write(tmp_path / 'boxes.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    assert (
+        '0 stamps and 2 track ids are in both; predicted boxes are of 1000.000 to 1000.900 s, '
+        'true ones of 0.000 to 0.900 s'
+    ) in capsys.readouterr().err
+
+
+def test_true_boxes_that_are_none_are_left_out_and_told(tmp_path, capsys):
+    truth = truth_table()
+    boxes = truth.boxes.copy()
+    boxes[3, 0], boxes[5, 4] = np.nan, 0
+    broken = replace(truth, boxes=boxes)
+    scores = evaluate(truth, broken)
+    assert (scores.boxes, scores.missing, scores.unmatched) == (18, 0, 0)
+    assert scores.iou_3d == pytest.approx(1, abs=1e-8)
+    truth.write(tmp_path / 'boxes.csv')
+    broken.write(tmp_path / 'truth.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    assert '2 of 20 true boxes are left out' in capsys.readouterr().err
+
+
+def test_predictions_that_are_all_invalid_are_explained(tmp_path, capsys):
+    truth = truth_table()
+    truth.write(tmp_path / 'truth.csv')
+    boxes = truth.boxes.copy()
+    boxes[:, 0] = np.inf
+    replace(truth, boxes=boxes).write(tmp_path / 'boxes.csv')
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'car') == 0
+    told = capsys.readouterr()
+    assert 'all 10 predicted boxes of the stamp and the track of a true one are' in told.err
+    assert '10 true boxes, 10 missing' in told.out

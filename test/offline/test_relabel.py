@@ -1,0 +1,695 @@
+from collections import Counter
+import csv
+import json
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+
+from boxreg_ros.cli import main
+from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.recording import input_boxes
+from boxreg_ros.labels import Options
+from boxreg_ros.offline.cloud_spool import Spool
+from boxreg_ros.offline.convert import Conversion, convert
+from boxreg_ros.offline.relabel import closing_line, notes, relabel, Request
+from boxreg_ros.structures import Sweep
+from msg_adapters.convention import Convention
+import numpy as np
+from paths import SHARED
+import pytest
+from ros_messages import Drive, JSK, Messages, SECOND, START, write_recording
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
+M = Messages()
+
+
+def run(recording, out, **options):
+    """Relabel quickly; return the summary and the rows of boxes.csv."""
+    config = QUICK.updated(options.pop('settings', {}))
+    summary = relabel(Request((Path(recording),), config=config, **options), Path(out))
+    return summary, rows_of(out)
+
+
+def rows_of(out):
+    with (Path(out) / 'boxes.csv').open(newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def keys(rows):
+    return [(int(row['stamp_ns']), row['track_id']) for row in rows]
+
+
+@pytest.mark.parametrize('estimate', ['track', 'final', 'early'])
+@pytest.mark.parametrize('boxes', ['vision', 'markers'])
+def test_every_box_comes_out_once_in_order(tmp_path, estimate, boxes):
+    drive = Drive(sweeps=7, boxes=boxes)
+    summary, rows = run(
+        drive.write(tmp_path / 'drive'),
+        tmp_path / 'out',
+        settings={'estimate': estimate, 'window': 4, 'lag': 2},
+    )
+    assert keys(rows) == [(stamp, track) for stamp in drive.stamps for track in ('1', '2')]
+    assert {row['frame_id'] for row in rows} == {'odom'}
+    assert (summary['sweeps'], summary['box_arrays']) == (7, 7)
+    assert (summary['boxes_in'], summary['boxes_out']) == (14, 14)
+    assert sum(summary['status'].values()) == 14
+    assert sum(summary['reasons'].values()) == summary['status'].get('kept', 0)
+    assert summary['status'].get('refined', 0) > 0
+
+
+def test_boxes_land_on_the_truth_in_the_fixed_frame(tmp_path):
+    drive = Drive(sweeps=7)
+    _, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    for row in rows:
+        true = drive.truth[int(row['stamp_ns'])][int(row['track_id']) - 1]
+        found = [float(row[name]) for name in ('x', 'y', 'z')]
+        np.testing.assert_allclose(found, true[:3], atol=0.35)
+    assert sum(int(row['num_points']) for row in rows) > 500
+
+
+def test_boxes_and_clouds_in_different_frames(tmp_path):
+    drive = Drive(sweeps=6)
+    plain = run(drive.write(tmp_path / 'plain'), tmp_path / 'plain_out')[1]
+    items = []
+    for topic, stamp, message in drive.items:
+        if topic == '/boxes':  # the same boxes, given in the frame of the base
+            message.header.frame_id = 'base'
+            for detection in message.detections:
+                detection.header.frame_id = 'base'
+                detection.bbox.center.position.z += 2.0
+        items.append((topic, stamp, message))
+    moved = run(write_recording(tmp_path / 'moved', items), tmp_path / 'moved_out')[1]
+    for before, after in zip(plain, moved, strict=True):
+        for name in ('x', 'y', 'z', 'qz', 'length'):
+            assert float(after[name]) == pytest.approx(float(before[name]), abs=1e-6)
+
+
+def test_several_recordings_are_one_drive(tmp_path):
+    drive = Drive(sweeps=6)
+    whole = run(drive.write(tmp_path / 'whole'), tmp_path / 'whole_out')[1]
+    half = len(drive.items) // 2
+    parts = tuple(
+        write_recording(tmp_path / f'part{i}', part)
+        for i, part in enumerate([drive.items[:half], drive.items[half:]])
+    )
+    relabel(Request(parts, config=QUICK), tmp_path / 'parts_out')
+    assert rows_of(tmp_path / 'parts_out') == whole
+
+
+def test_a_part_of_the_recording(tmp_path):
+    drive = Drive(sweeps=10)
+    rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out', start=0.25, end=0.75)[1]
+    assert sorted({stamp for stamp, _ in keys(rows)}) == drive.stamps[3:8]
+
+
+def test_output_folder_holds_what_the_design_says(tmp_path):
+    path = Drive(sweeps=4).write(tmp_path / 'drive')
+    summary, _ = run(path, tmp_path / 'out', settings={'solver.iterations': 2})
+    out = tmp_path / 'out'
+    assert sorted(item.name for item in out.iterdir()) == [
+        'boxes.csv', 'config.yaml', 'openlabel', 'summary.json',
+    ]  # fmt: skip
+    assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.iterations': 2})
+    assert json.loads((out / 'summary.json').read_text()) == summary
+    assert summary['topics'] == {'points': '/points', 'boxes': '/boxes', 'odometry': None}
+    assert summary['fixed_frame'] == 'odom'
+    assert set(summary['versions']) >= {'boxreg_ros', 'torch', 'numpy', 'rosbags'}
+    assert set(summary['seconds']) == {
+        'read', 'decode', 'transform', 'registrar', 'solve', 'write', 'total',
+    }  # fmt: skip
+    label = json.loads((out / 'openlabel' / 'labels.json').read_text())['openlabel']
+    assert len(label['frames']) == 4
+
+
+def test_csv_alone(tmp_path):
+    run(Drive(sweeps=3).write(tmp_path / 'drive'), tmp_path / 'out', formats=('csv',))
+    assert not (tmp_path / 'out' / 'openlabel').exists()
+    assert (tmp_path / 'out' / 'boxes.csv').exists()
+
+
+# What goes wrong -------------------------------------------------------------------------------
+
+
+def test_bad_boxes_come_back_as_they_are(tmp_path):
+    drive = Drive(sweeps=5)
+
+    def spoil(message):
+        good = message.detections[0]
+        m = drive.messages
+        stamp = good.header.stamp.sec * SECOND + good.header.stamp.nanosec
+        pose = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))
+        message.detections += m.detections(
+            stamp,
+            'lidar',
+            [
+                ('flat', 'car', 0.5, *pose, (4.0, 0.0, 1.5)),
+                ('inside out', 'car', 0.5, *pose, (4.0, -2.0, 1.5)),
+                ('nowhere', 'car', 0.5, (np.nan, 0.0, 0.0), pose[1], (4.0, 2.0, 1.5)),
+                ('unturned', 'car', 0.5, pose[0], (0.0, 0.0, 0.0, 0.0), (4.0, 2.0, 1.5)),
+                ('', 'car', 0.5, *pose, (4.0, 2.0, 1.5)),
+                ('1', 'car', 0.5, *pose, (4.0, 2.0, 1.5)),
+                ('once', 'car', 0.5, *pose, (4.0, 2.0, 1.5)),
+            ],
+        ).detections
+
+    drive.replace('/boxes', 2, spoil)
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    bad = {row['track_id']: row for row in rows if int(row['stamp_ns']) == drive.stamps[2]}
+    assert len(rows) == 17
+    assert [row['track_id'] for row in rows[4:13]] == [
+        '1', '2', 'flat', 'inside out', 'nowhere', 'unturned', '', '1', 'once',
+    ]  # fmt: skip
+    for name in ('flat', 'inside out', 'nowhere', 'unturned', '', 'once'):
+        assert bad[name]['status'] == 'kept', name
+    assert bad['nowhere']['x'] == ''
+    assert bad['unturned']['qw'] == ''
+    table = BoxTable.read(tmp_path / 'out' / 'boxes.csv')
+    assert np.isnan(table.boxes[8, 0])
+    assert np.isnan(table.boxes[9, 6:]).all()
+    assert np.isfinite(np.delete(table.boxes, [8, 9], axis=0)).all()
+    assert float(bad['inside out']['width']) == -2.0
+    reasons = summary['reasons']
+    assert reasons['invalid_box'] == 4
+    assert reasons['no_track_id'] == 1
+    assert reasons['duplicate_track_id'] == 1
+    assert summary['status']['kept'] == sum(reasons.values())
+    label = json.loads((tmp_path / 'out' / 'openlabel' / 'labels.json').read_text())
+    assert len(label['openlabel']['frames']['2']['objects']) == 5
+
+
+def test_missing_transforms_keep_the_boxes_in_their_frame(tmp_path):
+    drive = Drive(sweeps=10)
+    gone = drive.stamps[:4]
+    drive.items = [item for item in drive.items if item[0] != '/tf' or item[1] not in gone]
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    # Motion is carried on for 0.2 s: the stamps 0.2 and 0.3 s are still covered.
+    early = [row for row in rows if int(row['stamp_ns']) in drive.stamps[:2]]
+    assert {(row['frame_id'], row['status']) for row in early} == {('lidar', 'kept')}
+    assert {row['frame_id'] for row in rows[4:]} == {'odom'}
+    assert keys(rows) == [(stamp, track) for stamp in drive.stamps for track in ('1', '2')]
+    assert summary['reasons']['no_transform'] == 4
+    assert summary['dropped']['sweep_without_transform'] == 2
+    assert 'odom -> base is known from' in summary['first_missing_transform']
+    (note,) = notes(summary)
+    assert note.startswith('4 boxes and 2 clouds have no transform; first: transform odom -> base')
+    arrays, left_out = input_boxes(tmp_path / 'drive')
+    assert len(arrays) == 8
+    assert left_out.startswith('2 messages had no transform, first: transform odom -> base')
+
+
+def test_boxes_in_a_frame_that_nothing_connects(tmp_path):
+    drive = Drive(sweeps=3)
+    for topic, _, message in drive.items:
+        if topic == '/boxes':
+            message.header.frame_id = 'radar'
+            for detection in message.detections:
+                detection.header.frame_id = 'radar'
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert summary['reasons'] == {'no_transform': 6}
+    assert {row['frame_id'] for row in rows} == {'radar'}
+    assert "'radar'" in summary['first_missing_transform']
+
+
+def test_sweeps_and_boxes_that_miss_each_other(tmp_path):
+    drive = Drive(sweeps=6)
+    drive.items = [
+        item
+        for item in drive.items
+        if (item[0], item[1]) not in {('/points', drive.stamps[1]), ('/boxes', drive.stamps[4])}
+    ]
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert len(rows) == 10
+    assert {row['status'] for row in rows[2:4]} == {'kept'}
+    assert summary['reasons']['no_sweep'] == 2
+    assert summary['dropped']['sweep_without_boxes'] == 1
+
+
+@pytest.mark.parametrize(
+    ('storage', 'topic', 'late'),
+    [
+        ('mcap', '/boxes', 3600),
+        ('sqlite3', '/boxes', -3600),
+        ('rosbag1', '/boxes', 2),
+        ('mcap', '/tf', -3600),
+        ('rosbag1', '/tf', 3600),
+        ('mcap', '/odom', 3600),
+    ],
+)
+def test_a_topic_recorded_another_time_is_merged_by_stamp(tmp_path, storage, topic, late):
+    motion = 'odometry' if topic == '/odom' else 'tf'
+    drive = Drive(sweeps=12, motion=motion, ros1=storage == 'rosbag1')
+    whole = drive.write(tmp_path / 'whole', storage)
+    together, expected = run(whole, tmp_path / 'expected')
+    parts = (
+        [item for item in drive.items if item[0] != topic],
+        [(name, t + late * SECOND, m) for name, t, m in drive.items if name == topic],
+    )
+    paths = tuple(
+        write_recording(tmp_path / name, part, storage, drive.messages)
+        for name, part in zip('ab', parts, strict=True)
+    )
+    summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
+    assert rows_of(tmp_path / 'out') == expected
+    assert summary['status'] == {'refined': 24}
+    assert summary['recorded_apart'] == {topic: pytest.approx(late)}
+    assert together['recorded_apart'] == {}
+    # A part is one of the clouds' recording, whenever the rest was recorded.
+    options = {'start': 0.35, 'end': 0.75, 'config': QUICK}
+    relabel(Request(paths, **options), tmp_path / 'part')
+    relabel(Request((whole,), **options), tmp_path / 'part_expected')
+    assert rows_of(tmp_path / 'part') == rows_of(tmp_path / 'part_expected')
+
+
+def test_a_detector_that_falls_behind_loses_nothing(tmp_path):
+    """Its last boxes come 5.5 s late, which is more clouds than `queue` waits with."""
+    drive = Drive(sweeps=56)
+    expected = run(drive.write(tmp_path / 'punctual'), tmp_path / 'expected')[1]
+    slow = [
+        (topic, t + (t - drive.stamps[0]) * (topic == '/boxes'), m) for topic, t, m in drive.items
+    ]
+    path = write_recording(tmp_path / 'slow', sorted(slow, key=lambda item: item[1]))
+    summary, rows = run(path, tmp_path / 'out')
+    assert rows == expected
+    assert summary['recorded_apart'] == {'/boxes': pytest.approx(5.5)}
+    assert closing_line(summary, tmp_path).endswith('; merged by stamp: /boxes (+5.5 s)')
+
+
+def test_what_begins_before_the_clouds_and_ends_after_them_is_merged_by_stamp(tmp_path):
+    """Poses of the whole drive, worked out another day, and clouds of a part in its middle."""
+    whole, (begin, end) = Drive(sweeps=60), (20, 40)
+    stamps = whole.stamps[begin:end]
+    part = [item for item in whole.items if stamps[0] <= item[1] <= stamps[-1]]
+    part.insert(0, whole.items[0])  # /tf_static
+    expected = run(write_recording(tmp_path / 'part', part), tmp_path / 'expected')[1]
+    poses = [(topic, t + 3600 * SECOND, m) for topic, t, m in whole.items if topic == '/tf']
+    paths = (
+        write_recording(tmp_path / 'clouds', [item for item in part if item[0] != '/tf']),
+        write_recording(tmp_path / 'poses', poses),
+    )
+    summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
+    assert summary['recorded_apart'] == {'/tf': pytest.approx(3600)}
+    assert rows_of(tmp_path / 'out') == expected
+
+
+def test_ends_that_say_nothing_do_not_hide_what_was_recorded_apart(tmp_path):
+    """Trackers begin and end with empty arrays, which have no stamp where items carry it."""
+    drive = Drive(sweeps=30, boxes='markers')
+    for topic, _, message in drive.items:
+        if topic == '/boxes' and message.markers[0].header.stamp.nanosec % 10**9 in (0, 10**8):
+            message.markers = []
+    drive.replace('/points', 0, lambda cloud: setattr(cloud.header.stamp, 'sec', 0))
+    drive.replace('/points', 0, lambda cloud: setattr(cloud.header.stamp, 'nanosec', 0))
+    drive.replace('/boxes', -1, lambda message: setattr(message, 'markers', []))
+    expected = run(drive.write(tmp_path / 'whole'), tmp_path / 'expected')[1]
+    paths = tuple(
+        write_recording(tmp_path / name, part)
+        for name, part in (
+            ('a', [item for item in drive.items if item[0] != '/boxes']),
+            ('b', [(n, t + 3600 * SECOND, m) for n, t, m in drive.items if n == '/boxes']),
+        )
+    )
+    summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
+    assert rows_of(tmp_path / 'out') == expected
+    assert summary['status']['refined'] > 40
+
+
+def test_a_part_without_boxes_is_told(tmp_path, capsys):
+    drive = Drive(sweeps=10)
+    drive.items = [i for i in drive.items if i[0] != '/boxes' or i[1] < drive.stamps[5]]
+    path = drive.write(tmp_path / 'drive')
+    assert main(['relabel', str(path), '-o', str(tmp_path / 'out'), '--start', '0.55']) == 0
+    assert 'no boxes in this part' in capsys.readouterr().err
+
+
+def test_a_part_begins_with_the_clouds_whatever_else_is_in_the_files(tmp_path):
+    drive, day = Drive(sweeps=10), 86_400 * SECOND
+    expected = run(drive.write(tmp_path / 'drive'), tmp_path / 'expected', start=0.25, end=0.75)[1]
+    static = [(topic, t - day, m) for topic, t, m in drive.items if topic == '/tf_static']
+    other = [('/points2', t - day, m) for topic, t, m in drive.items if topic == '/points']
+    paths = (
+        write_recording(tmp_path / 'rest', [*static, *other]),
+        write_recording(tmp_path / 'main', [i for i in drive.items if i[0] != '/tf_static']),
+    )
+    request = Request(paths, points='/points', start=0.25, end=0.75, config=QUICK)
+    relabel(request, tmp_path / 'out')
+    assert rows_of(tmp_path / 'out') == expected
+
+
+def test_stamps_of_another_clock_are_no_order(tmp_path):
+    """Boxes stamped by a clock that the clouds know nothing of stay where they were received."""
+    drive = Drive(sweeps=12)
+    for topic, _, message in drive.items:
+        if topic == '/boxes':
+            for item in (message, *message.detections):
+                item.header.stamp.sec -= 10_000
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert summary['recorded_apart'] == {}
+    assert len(rows) == summary['boxes_in'] == 24
+    assert {row['status'] for row in rows} == {'kept'}
+
+
+def test_boxes_of_one_stamp_in_two_messages(tmp_path):
+    drive = Drive(sweeps=5)
+    extra = [item for item in drive.items if item[0] == '/boxes'][1]
+    drive.items.insert(drive.items.index(extra) + 1, extra)
+    for estimate in ('track', 'early', 'final'):
+        rows = run(
+            drive.write(tmp_path / estimate),
+            tmp_path / f'{estimate}_out',
+            settings={'estimate': estimate, 'window': 4, 'lag': 2},
+        )[1]
+        stamps = [stamp for stamp, _ in keys(rows)]
+        assert stamps == sorted(2 * [*drive.stamps, drive.stamps[1]])
+
+
+@pytest.mark.parametrize('pause', [0, 5])
+def test_a_recording_that_holds_a_loop_begins_anew(tmp_path, pause):
+    """Played in a loop while it was recorded: the second round is as good as the first."""
+    drive = Drive(sweeps=50)
+    length = 5 * SECOND + pause * SECOND
+    drive.items += [(topic, t + length, m) for topic, t, m in drive.items if topic != '/tf_static']
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert summary['time_jumps'] == 1
+    assert summary['boxes_out'] == len(rows) == 200
+    rounds = {}
+    for row in rows:
+        rounds.setdefault((row['stamp_ns'], row['track_id']), []).append(row)
+        if row['frame_id'] == 'odom':
+            true = drive.truth[int(row['stamp_ns'])][int(row['track_id']) - 1]
+            found = [float(row[name]) for name in ('x', 'y', 'z')]
+            np.testing.assert_allclose(found, true[:3], atol=0.35)
+    assert {len(both) for both in rounds.values()} == {2}
+    # One array and one cloud are spent on finding out that time has begun again. Without a pause
+    # the transforms of up to two seconds, that are read ahead, begin again before boxes do.
+    kept = sum(row['status'] == 'kept' for row in rows)
+    assert kept <= (4 if pause else 44)
+
+
+def test_empty_clouds_and_empty_arrays(tmp_path):
+    drive = Drive(sweeps=5, boxes='markers')
+    m = drive.messages
+    drive.items += [
+        ('/points', drive.stamps[-1] + 1, m.points(drive.stamps[-1] + 10**8, 'lidar', [])),
+        ('/boxes', drive.stamps[-1] + 2, m.markers([])),
+    ]
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
+    assert len(rows) == 10
+    assert (summary['sweeps'], summary['box_arrays']) == (6, 6)
+
+
+def test_boxes_that_never_have_points_and_lone_boxes(tmp_path):
+    drive = Drive(sweeps=4)
+    pose = ((-30.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    for topic, stamp, message in drive.items:
+        if topic == '/boxes':
+            more = drive.messages.detections(
+                stamp, 'lidar', [('empty', 'car', 0.5, *pose, (4.0, 2.0, 1.5))]
+            )
+            message.detections += more.detections
+    rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')[1]
+    assert len(rows) == 12
+    empty = [row for row in rows if row['track_id'] == 'empty']
+    assert all(row['num_points'] == '0' for row in empty)
+    assert all(np.isfinite(float(row['x'])) for row in empty)
+
+
+def truncated(path, out, sizes):
+    """Copy a recording; `sizes` has the bytes that are left of message k on a topic."""
+    count = Counter()
+    with (
+        AnyReader([path]) as reader,
+        Writer(out, version=9, storage_plugin=StoragePlugin.MCAP) as writer,
+    ):
+        types = reader.typestore
+        known = {
+            c.topic: writer.add_connection(c.topic, c.msgtype, typestore=types)
+            for c in reader.connections
+        }
+        for connection, received_ns, data in reader.messages():
+            key = connection.topic, count[connection.topic]
+            count[connection.topic] += 1
+            writer.write(known[connection.topic], received_ns, data[: sizes.get(key, len(data))])
+    return next(out.glob('*.mcap'))
+
+
+def test_unreadable_messages_are_passed_over_and_counted(tmp_path):
+    drive = Drive(sweeps=8)
+    drive.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
+    path = drive.write(tmp_path / 'whole')
+    # A cloud of which nothing is left but its stamp, the first that tells the frame; one of which
+    # half is left; boxes that end amid the first; a transform between two others.
+    sizes = {('/points', 0): 12, ('/points', 6): 1500, ('/boxes', 5): 60, ('/tf', 4): 30}
+    path = truncated(path, tmp_path / 'drive', sizes)
+    summary, rows = run(path, tmp_path / 'out', formats=('csv', 'mcap'))
+    dropped = {'boxes_without_sweep': 3, 'sweep_without_boxes': 1, 'unreadable': 5}
+    assert summary['dropped'] == dropped
+    assert (summary['sweeps'], summary['box_arrays'], summary['boxes_in']) == (5, 7, 14)
+    left = [stamp for k, stamp in enumerate(drive.stamps) if k != 5]
+    assert keys(rows) == [(stamp, track) for stamp in left for track in ('1', '2')]
+    lost = [drive.stamps[k] for k in (0, 3, 6)]
+    status = {int(row['stamp_ns']): row['status'] for row in rows}
+    assert status == {stamp: 'kept' if stamp in lost else 'refined' for stamp in left}
+    assert summary['reasons'] == {'no_sweep': 6}
+    assert "'/points' is not a sensor_msgs/msg/PointCloud2" in summary['first_unreadable']
+    assert "'/boxes' is not a vision_msgs/msg/Detection3DArray" in summary['first_unreadable']
+    assert "'/tf' is not a tf2_msgs/msg/TFMessage" in summary['first_unreadable']
+    assert '5 messages could not be read' in closing_line(summary, tmp_path / 'out')
+    # The overlay has them as they were; the refined topic has the others.
+    with AnyReader([tmp_path / 'out' / 'overlay.mcap']) as reader:
+        copied = Counter(c.topic for c, _, _ in reader.messages())
+    assert (copied['/points'], copied['/boxes'], copied['/boxes_refined']) == (8, 8, 7)
+
+
+@pytest.mark.parametrize('topic', ['/points', '/boxes'])
+def test_a_recording_of_which_nothing_is_readable_is_an_error(tmp_path, topic):
+    path = Drive(sweeps=3).write(tmp_path / 'whole')
+    path = truncated(path, tmp_path / 'drive', {(topic, k): 12 for k in range(3)})
+    with pytest.raises(UnsupportedMessage, match=f"on '{topic}' is not a "):
+        run(path, tmp_path / 'results' / 'out')
+    assert not (tmp_path / 'results').exists() or not list((tmp_path / 'results').iterdir())
+
+
+def test_failures_leave_nothing_behind(tmp_path):
+    drive = Drive(sweeps=6)
+    for k in range(6):
+        drive.replace('/points', k, lambda message: setattr(message, 'point_step', 2))
+    with pytest.raises(UnsupportedMessage, match=r"no message on '/points' can be read.*got 2"):
+        run(drive.write(tmp_path / 'drive'), tmp_path / 'results' / 'out')
+    assert list((tmp_path / 'results').iterdir()) == []
+
+
+def test_earlier_results_survive_a_failure_and_are_replaced_by_success(tmp_path):
+    good = Drive(sweeps=3).write(tmp_path / 'good')
+    run(good, tmp_path / 'out')
+    before = (tmp_path / 'out' / 'boxes.csv').read_bytes()
+    broken = Drive(sweeps=1)
+    broken.replace('/points', 0, lambda message: setattr(message, 'point_step', 2))
+    with pytest.raises(UnsupportedMessage):
+        run(broken.write(tmp_path / 'broken'), tmp_path / 'out')
+    assert (tmp_path / 'out' / 'boxes.csv').read_bytes() == before
+    (tmp_path / 'out' / 'old').touch()
+    os.utime(tmp_path / 'out' / 'old', (1, 1))  # no younger than the results
+    assert len(run(Drive(sweeps=5).write(tmp_path / 'more'), tmp_path / 'out')[1]) == 10
+    assert not (tmp_path / 'out' / 'old').exists()
+    assert not [item for item in tmp_path.iterdir() if item.name.startswith('.')]
+
+
+def test_clouds_beside_labels_are_those_the_boxes_are_paired_with(tmp_path):
+    spool = Spool(tmp_path, Config(tolerance=0.02, reach=0.06))
+    spool.add(Sweep(START, 'lidar', np.ones((1, 3))), np.eye(4))
+    assert spool.take(START - SECOND * 50 // 1000, 'lidar', np.eye(4))[0] is not None
+    assert spool.take(START - SECOND * 70 // 1000, 'lidar', np.eye(4))[0] is None
+
+
+def test_clouds_that_are_missing_beside_labels_are_told(tmp_path):
+    drive = Drive(sweeps=6)
+    gone = drive.stamps[2:4]
+    drive.items = [item for item in drive.items if item[0] != '/points' or item[1] not in gone]
+    path = drive.write(tmp_path / 'drive')
+    options = {'formats': ('sustechpoints',), 'options': Options(with_points=True)}
+    summary, _ = run(path, tmp_path / 'out', **options)
+    assert summary['frames_without_cloud'] == 2
+    assert list(notes(summary)) == ['2 of 6 box arrays have no cloud beside them']
+    assert list(notes(run(path, tmp_path / 'plain')[0])) == []
+
+
+def test_intensities_that_cannot_be_read_cost_no_cloud(tmp_path):
+    drive = Drive(sweeps=4)
+    field = drive.messages.build(
+        'sensor_msgs/msg/PointField', name='intensity', offset=0, datatype=7, count=2
+    )
+    for k in range(4):
+        drive.replace('/points', k, lambda message: message.fields.append(field))
+    options = {'formats': ('sustechpoints',), 'options': Options(with_points=True)}
+    summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out', **options)
+    assert {row['status'] for row in rows} == {'refined'}
+    assert summary['frames_without_cloud'] == 0
+    assert 'intensity' in summary['first_unreadable']
+
+
+@pytest.mark.parametrize('name', ['boxes.csv', 'mine/notes.txt'])
+def test_results_that_were_changed_by_hand_are_not_lost(tmp_path, name):
+    drive, file = Drive(sweeps=3).write(tmp_path / 'drive'), tmp_path / 'out' / name
+    run(drive, tmp_path / 'out')
+    file.parent.mkdir(exist_ok=True)
+    file.write_text('by hand')
+    with pytest.raises(RecordingError, match=rf"'{name}' changed or added since.*choose another"):
+        run(drive, tmp_path / 'out')
+    assert file.read_text() == 'by hand'
+
+
+@pytest.mark.parametrize('content', ['notes.txt', 'summary.json'])
+def test_folders_of_others_are_left_alone(tmp_path, content):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / content).write_text('{"mine": true}')
+    with pytest.raises(RecordingError, match='choose another'):
+        run(Drive(sweeps=3).write(tmp_path / 'drive'), out)
+    assert [item.name for item in out.iterdir()] == [content]
+    (tmp_path / 'file').write_text('mine')
+    with pytest.raises(RecordingError, match='choose another'):
+        run(tmp_path / 'drive' / 'drive.mcap', tmp_path / 'file')
+
+
+@pytest.mark.parametrize('given', ['{out}/drive.mcap', '{out}', '{link}', '{bag}'])
+def test_inputs_inside_of_the_output_survive(tmp_path, capsys, given):
+    out, link = tmp_path / 'out', tmp_path / 'link.mcap'
+    bag = Drive(sweeps=3).write(tmp_path / 'drive')
+    run(bag, out)
+    shutil.copy(bag, out / 'drive.mcap')
+    link.symlink_to(out / 'drive.mcap')
+    rule = out / 'rule.yaml'
+    rule.write_text('')
+    before = sorted(out.rglob('*'))
+    words = ['relabel', given.format(out=out, link=link, bag=bag), '-o', str(out)]
+    words += ['--config', str(rule)] if given == '{bag}' else []
+    assert main(words) == 2
+    assert 'choose another with -o' in capsys.readouterr().err
+    labels = 'csv', out / 'boxes.csv'
+    with pytest.raises(ConfigError, match=r"no input is in, got one with .*boxes\.csv'"):
+        run(bag, out, labels=labels)
+    conversion = Conversion(out, 'csv', ('openlabel',))
+    with pytest.raises(ConfigError, match='choose another'):
+        convert(conversion, out)
+    assert sorted(out.rglob('*')) == before
+
+
+def test_unknown_format_is_refused_at_once():
+    with pytest.raises(ConfigError, match="format 'kiti'"):
+        Request((Path('nothing'),), formats=('csv', 'kiti'))
+
+
+def test_fingerprint_tells_requests_apart(tmp_path):
+    path = Drive(sweeps=3).write(tmp_path / 'drive')
+    first = Request((path,)).fingerprint()
+    assert Request((path,)).fingerprint() == first
+    assert Request((path,), end=1.0).fingerprint() != first
+    assert Request((path,), config=QUICK).fingerprint() != first
+    path.write_bytes(path.read_bytes() + b'x')
+    assert Request((path,)).fingerprint() != first
+
+
+def test_boxes_are_read_as_they_are_meant(tmp_path, capsys):
+    """Bottoms and w, l, h in the messages: the same results once that is said."""
+    drive = Drive(sweeps=8)
+    command = ['relabel', '--formats=csv', '-o']
+    path = str(drive.write(tmp_path / 'drive'))
+    assert main([*command, str(tmp_path / 'expected'), path]) == 0
+    for topic, _, message in drive.items:
+        for detection in message.detections if topic == '/boxes' else ():
+            size, at = detection.bbox.size, detection.bbox.center.position
+            size.x, size.y, at.z = size.y, size.x, at.z - size.z / 2
+    path = str(drive.write(tmp_path / 'bottoms'))
+    meant = ['--pose-reference', 'bottom', '--size-order', 'wlh']
+    assert not capsys.readouterr().err
+    assert main([*command, str(tmp_path / 'half'), path, *meant[2:]]) == 0
+    assert 'pose_reference:=bottom' in capsys.readouterr().err
+    assert main([*command, str(tmp_path / 'meant'), path, *meant]) == 0
+    assert not capsys.readouterr().err
+    expected = rows_of(tmp_path / 'expected')
+    for row, other in zip(rows_of(tmp_path / 'meant'), expected, strict=True):
+        assert float(row['z']) == pytest.approx(float(other['z']), abs=1e-6)
+        assert float(row['length']) == pytest.approx(float(other['length']), abs=1e-6)
+    assert main([*command, str(tmp_path / 'x'), path, '--pose-reference', 'floor']) == 2
+    assert 'pose_reference' in capsys.readouterr().err
+    # The input is scored under the convention it is meant in; a table has its own.
+    truth = str(tmp_path / 'expected' / 'boxes.csv')
+    scores = []
+    for options in ([], meant):
+        assert main(['evaluate', path, truth, '--json', *options]) == 0
+        scores.append(json.loads(capsys.readouterr().out)['iou_3d'])
+    assert scores[0] < 0.5 < 0.75 < scores[1]
+    assert main(['evaluate', truth, truth, *meant]) == 2
+    assert 'expected a recording that they are about' in capsys.readouterr().err
+
+
+def test_topics_with_ids_go_before_those_without(tmp_path):
+    drive, other = Drive(sweeps=4), Drive(sweeps=4, boxes=JSK)
+    more = [('/clusters', *item[1:]) for item in other.items if item[0] == '/boxes']
+    drive.items += more
+    path = drive.write(tmp_path / 'drive')
+    summary, _ = run(path, tmp_path / 'out')
+    assert summary['topics']['boxes'] == '/boxes'
+    with pytest.raises(RecordingError, match='/boxes, /clusters'):
+        run(path, tmp_path / 'out', convention=Convention(associate=True))
+
+
+# The input as it is ----------------------------------------------------------------------------
+
+
+def test_input_boxes_are_those_of_the_recording_in_the_fixed_frame(tmp_path):
+    drive = Drive(sweeps=4)
+    arrays, left_out = input_boxes(drive.write(tmp_path / 'drive'))
+    assert not left_out
+    assert [array.stamp_ns for array in arrays] == drive.stamps
+    for array in arrays:
+        assert (array.frame_id, array.track_ids) == ('odom', ('1', '2'))
+        np.testing.assert_allclose(array.boxes, drive.truth[array.stamp_ns], atol=0.25)
+
+
+def test_what_evaluate_and_convert_ask_for_they_take(tmp_path, capsys):
+    drive = Drive(sweeps=4, motion='odometry')
+    for topic in ('/boxes', '/odom'):
+        drive.items += [(f'{topic}2', *item[1:]) for item in drive.items if item[0] == topic]
+    path, table = str(drive.write(tmp_path / 'drive')), str(tmp_path / 'input.csv')
+    topics = {'boxes': '/boxes2', 'odometry': '/odom2'}
+    BoxTable.from_arrays(input_boxes(Path(path), **topics)[0]).write(table)
+    assert main(['evaluate', path, table]) == 1
+    assert 'choose one with --boxes' in capsys.readouterr().err
+    words = ['--boxes', '/boxes2', '--odometry', '/odom2', '--fixed-frame', 'odom']
+    assert main(['evaluate', path, table, *words]) == 0
+    assert '8 true boxes, 0 missing' in capsys.readouterr().out
+    assert main(['evaluate', table, table, *words[:2]]) == 2
+    assert 'leave them out' in capsys.readouterr().err
+    words = ['--from', 'csv', '--to', 'nuscenes', '--recording', path, '-o', str(tmp_path / 'out')]
+    assert main(['convert', table, *words]) == 1
+    assert 'choose one with --odometry' in capsys.readouterr().err
+    assert main(['convert', table, *words, '--odometry', '/odom']) == 0
+
+
+# Real data -------------------------------------------------------------------------------------
+
+KITTI = SHARED / 'data' / 'kitti_raw_0001.npz'
+MAKER = SHARED / 'tools' / 'make_recording.py'
+
+
+@pytest.mark.skipif(not (KITTI.exists() and MAKER.exists()), reason='real data is not here')
+@pytest.mark.parametrize(('storage', 'boxes'), [('mcap', 'vision'), ('sqlite3', 'markers')])
+def test_real_boxes_come_back_each_once(tmp_path, storage, boxes):
+    command = [sys.executable, MAKER, KITTI, tmp_path, '--noise', 'real', '--seed', '7']
+    options = ['--storage', storage, '--boxes', boxes, '--max-sweeps', '15']
+    subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL)
+    recording = tmp_path / ('recording' if storage == 'sqlite3' else 'recording.mcap')
+    given = [
+        (array.stamp_ns, track) for array in input_boxes(recording)[0] for track in array.track_ids
+    ]
+    summary, rows = run(recording, tmp_path / 'out')
+    assert len(given) > 50
+    assert keys(rows) == given
+    assert summary['fixed_frame'] == 'odom'
