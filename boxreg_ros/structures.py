@@ -100,6 +100,9 @@ class BoxArray:
         Detector confidence.
     boxes : array, shape (n, 9)
         As defined in the module's docstring; may hold invalid boxes, which the core keeps out.
+    ticket : object
+        Whatever the caller wants back with the refined boxes of this array, which carry it
+        unchanged; never looked at.
 
     """
 
@@ -109,6 +112,7 @@ class BoxArray:
     class_names: tuple[str, ...]
     scores: Floats
     boxes: Floats
+    ticket: object = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check that all columns have one length."""
