@@ -86,26 +86,26 @@ class Writer:
         """Add a row per box, the pose and the cloud."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         refined = frame.refined
-        given = refined.boxes
+        array = refined.boxes
         quaternions_wxyz = quaternions_of(boxes)[:, [3, 0, 1, 2]].tolist()
         for row, box, quaternion in zip(rows, boxes.tolist(), quaternions_wxyz, strict=True):
             self._annotations.add(
-                given.stamp_ns,
-                given.track_ids[row],
-                given.class_names[row],
+                array.stamp_ns,
+                array.track_ids[row],
+                array.class_names[row],
                 *box[LENGTH : HEIGHT + 1],
                 *quaternion,
                 *box[X : Z + 1],
                 int(refined.num_points[row]),
                 refined.status[row],
                 refined.reasons[row],
-                finite_or_none(given.scores[row]),
+                finite_or_none(array.scores[row]),
                 refined.covariances[row].ravel().tolist(),
             )
         if frame.T_fixed_sensor is not None:
-            self._poses.add(given.stamp_ns, *_pose_values(frame.T_fixed_sensor))
+            self._poses.add(array.stamp_ns, *_pose_values(frame.T_fixed_sensor))
         if frame.sweep is not None:
-            path = self._clouds / f'{given.stamp_ns}.feather'
+            path = self._clouds / f'{array.stamp_ns}.feather'
             _write_cloud(path, frame.sweep.points, frame.intensities)
         self._provenance['fixed_frame'] = frame.fixed_frame
         self._provenance['sensor_frame'] = frame.sensor_frame

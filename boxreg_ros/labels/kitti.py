@@ -75,7 +75,7 @@ class Writer:
     def write(self, frame: LabelFrame) -> None:
         """Add the lines of a frame."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
-        given = frame.refined.boxes
+        array = frame.refined.boxes
         centres, rotations_y = self._camera.to_upright(boxes)
         rectangles, is_inside = self._camera.project(boxes)
         is_outside = np.isnan(rectangles).any(axis=1)
@@ -88,10 +88,10 @@ class Writer:
             size = box[[HEIGHT, WIDTH, LENGTH]]
             location = (x, y + box[HEIGHT] / 2, z)
             numbers = [alpha, *rectangles[i], *size, *location, rotations_y[i]]
-            if np.isfinite(given.scores[row]):
-                numbers.append(given.scores[row])
-            track = self._numbers.of(given.track_ids[row])
-            name = _kitti_class(given.class_names[row])
+            if np.isfinite(array.scores[row]):
+                numbers.append(array.scores[row])
+            track = self._numbers.of(array.track_ids[row])
+            name = _kitti_class(array.class_names[row])
             self._file.write(f'{self._frames} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')
             self._file.write(' '.join(f'{value:.6f}' for value in numbers) + '\n')
         if frame.sweep is not None:

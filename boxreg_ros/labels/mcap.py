@@ -75,7 +75,7 @@ STATIC_SUFFIX = 'tf_static'
 _T = TypeVar('_T')
 
 
-class Raw(NamedTuple):
+class RawMessage(NamedTuple):
     """An encoded message of the recording, with the fields of its MCAP channel."""
 
     topic: str
@@ -141,7 +141,7 @@ class Writer:
         for frames in self._waiting.values():
             self.dropped['no_message'] += sum(len(frame.refined.status) for frame in frames)
 
-    def _read(self, file: Path) -> Iterator[Raw]:
+    def _read(self, file: Path) -> Iterator[RawMessage]:
         """Yield the messages of a file; topics recorded apart get the time of their clouds."""
         start_ns, end_ns = self._recording.part_ns
         apart = self._recording.apart
@@ -167,7 +167,7 @@ class Writer:
                 self._add(item)
             self._next = next(self._messages, None)
 
-    def _refined(self, raw: Raw) -> list[Raw] | None:
+    def _refined(self, raw: RawMessage) -> list[RawMessage] | None:
         """Return the message with refined boxes, and its markers; None if they are missing."""
         try:
             message, given = self._recording.box_message(raw.data)
@@ -195,7 +195,7 @@ class Writer:
         markers = self._markers.encode(copied, given, refined)
         return [copied._replace(data=data), markers]
 
-    def _add(self, raw: Raw) -> None:
+    def _add(self, raw: RawMessage) -> None:
         """Write a message, and its channel before the first message on it."""
         key = (raw.topic, raw.schema, raw.encoding, raw.metadata)
         if key not in self._channels:
@@ -230,7 +230,7 @@ class _MarkerEncoder:
         makers = {name: partial(_new_message, self._store, kind) for name, kind in kinds.items()}
         self._board = MarkerBoard(SimpleNamespace(**makers))
 
-    def encode(self, raw: Raw, given: BoxArray, refined: RefinedBoxes) -> Raw:
+    def encode(self, raw: RawMessage, given: BoxArray, refined: RefinedBoxes) -> RawMessage:
         """Return the markers of boxes as a message with the times of `raw`."""
         encode = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
         return raw._replace(
@@ -293,7 +293,7 @@ def _storage_files(path: Path) -> list[Path]:
 
 def _read_mcap(
     path: Path, start_ns: int | None, end_ns: int | None, whole: Collection[str]
-) -> Iterator[Raw]:
+) -> Iterator[RawMessage]:
     """
     Yield the messages of an MCAP file from `start_ns` to `end_ns`.
 
@@ -309,7 +309,7 @@ def _read_mcap(
             for schema, channel, message in reader.iter_messages(
                 wanted, starting_at=begin, ending_before=end
             ):
-                yield Raw(
+                yield RawMessage(
                     channel.topic,
                     (schema.name, schema.encoding, schema.data) if schema else None,
                     channel.message_encoding,
@@ -323,7 +323,7 @@ def _read_mcap(
 
 def _read_bag(
     path: Path, start_ns: int | None, end_ns: int | None, whole: Collection[str]
-) -> Iterator[Raw]:
+) -> Iterator[RawMessage]:
     """Yield the same of other storages, which have one time per message and no sequence."""
     with AnyReader([path], default_typestore=stock_types()) as reader:
         uncut = [
@@ -333,7 +333,7 @@ def _read_bag(
         for interval in _intervals(reader.connections, uncut, start_ns, end_ns):
             for connection, time_ns, data in reader.messages(*interval):
                 channel = channels[connection.id, id(connection.owner)]
-                yield Raw(*channel, time_ns, time_ns, 0, bytes(data))
+                yield RawMessage(*channel, time_ns, time_ns, 0, bytes(data))
 
 
 def _intervals(

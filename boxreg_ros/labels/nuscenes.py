@@ -164,12 +164,12 @@ class Writer:
         self, frame: LabelFrame, sample: str, rows: list[int], boxes: Floats
     ) -> None:
         refined = frame.refined
-        given = refined.boxes
+        array = refined.boxes
         quaternions_wxyz = quaternions_of(boxes)[:, [3, 0, 1, 2]].tolist()
         keys_in_sample: set[str] = set()
         for row, box, quaternion in zip(rows, boxes, quaternions_wxyz, strict=True):
-            track_id = given.track_ids[row]
-            class_name = given.class_names[row]
+            track_id = array.track_ids[row]
+            class_name = array.class_names[row]
             key = f'{track_id}\0{class_name}'
             is_single = not track_id or key in keys_in_sample  # no identity
             if is_single:
@@ -192,9 +192,9 @@ class Writer:
                 'next': '',
                 'status': refined.status[row],
                 'reason': refined.reasons[row],
-                'score': finite_or_none(given.scores[row]),
+                'score': finite_or_none(array.scores[row]),
                 'covariance': refined.covariances[row].ravel().tolist(),
-                'stamp_ns': given.stamp_ns,
+                'stamp_ns': array.stamp_ns,
             }
             if is_single:
                 self._streams['sample_annotation'].append(annotation)

@@ -119,11 +119,11 @@ class Writer:
     def write(self, frame: LabelFrame) -> None:
         """Add a pose to the tracklets of this frame, and write those that have ended."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
-        given = frame.refined.boxes
+        array = frame.refined.boxes
         continued: dict[tuple[str, str], _Tracklet] = {}
         for row, box in zip(rows, boxes, strict=True):
-            track_id = given.track_ids[row]
-            class_name = given.class_names[row]
+            track_id = array.track_ids[row]
+            class_name = array.class_names[row]
             tracklet = _Tracklet(track_id, class_name, self._frames)
             key = (track_id, class_name)
             if not track_id or key in continued:  # no identity: a tracklet of one frame

@@ -92,23 +92,23 @@ class Writer:
         """Add a row per box, and the pose."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         refined = frame.refined
-        given = refined.boxes
-        key = (self._segment, round(given.stamp_ns / 1000))
+        array = refined.boxes
+        key = (self._segment, round(array.stamp_ns / 1000))
         for row, box in zip(rows, boxes.tolist(), strict=True):
             self._boxes.add(
                 *key,
-                given.track_ids[row],
+                array.track_ids[row],
                 *box[X : Z + 1],
                 *box[LENGTH : HEIGHT + 1],
                 float(wrap_angle(box[YAW])),
-                _type(given.class_names[row]),
+                _type(array.class_names[row]),
                 int(refined.num_points[row]),
                 *[None] * len(UNUSED_COLUMNS),
-                given.stamp_ns,
-                given.class_names[row],
+                array.stamp_ns,
+                array.class_names[row],
                 refined.status[row],
                 refined.reasons[row],
-                finite_or_none(given.scores[row]),
+                finite_or_none(array.scores[row]),
                 refined.covariances[row].ravel().tolist(),
             )
         if frame.T_fixed_sensor is not None:

@@ -44,9 +44,9 @@ class Conversion:
     ----------
     source : Path
         Label file or folder to read.
-    given : str
+    source_format : str
         Its format.
-    wanted : tuple of str
+    target_formats : tuple of str
         Formats to write.
     options : Options
         Settings of the formats to write.
@@ -59,8 +59,8 @@ class Conversion:
     """
 
     source: Path
-    given: str
-    wanted: tuple[str, ...]
+    source_format: str
+    target_formats: tuple[str, ...]
     options: Options = field(default_factory=Options)
     recordings: tuple[Path, ...] = ()
     points: str | None = None
@@ -102,7 +102,8 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
     inputs = (request.source, *request.recordings, request.options.camera)
     with whole_folder(out, inputs) as folder:
         writers = {
-            name: writer_for(name, folder, provenance, request.options) for name in request.wanted
+            name: writer_for(name, folder, provenance, request.options)
+            for name in request.target_formats
         }
         for frame in _read_frames(request, folder, counts):
             counts['frames'] += 1
@@ -116,8 +117,8 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
         summary = {
             'source': str(request.source),
             'recordings': [str(path) for path in request.recordings],
-            'from': request.given,
-            'to': list(request.wanted),
+            'from': request.source_format,
+            'to': list(request.target_formats),
             'frames': counts['frames'],
             'boxes': counts['boxes'],
             'unreadable': counts['unreadable'],
@@ -131,7 +132,7 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
 
 def _check(request: Conversion) -> None:
     """Raise `ConfigError` for settings that contradict each other."""
-    module_of(request.given)
+    module_of(request.source_format)
     recording_settings = (
         request.options.with_points,
         request.points,
@@ -144,7 +145,7 @@ def _check(request: Conversion) -> None:
             '--with-points, --points, --odometry, --fixed-frame, --label-frame: expected a '
             'recording to apply them to, got none; give it with --recording'
         )
-    check_options(request.wanted, request.options)
+    check_options(request.target_formats, request.options)
 
 
 def _require_boxes(
@@ -165,7 +166,7 @@ def _read_frames(request: Conversion, folder: Path, counts: Counter[str]) -> Ite
     if request.recordings:
         yield from _read_with_recording(request, folder, counts)
         return
-    for frame in frames_of(request.given, request.source):
+    for frame in frames_of(request.source_format, request.source):
         yield frame.moved('fixed')
 
 
@@ -174,7 +175,7 @@ def _read_with_recording(
 ) -> Iterator[LabelFrame]:
     """Yield the labels with poses and clouds of the recording; count unreadable messages."""
     tree = TransformTree()
-    labels = (request.given, request.source)
+    labels = (request.source_format, request.source)
     spool = Spool(folder, Config()) if request.options.with_points else None
     topics = {'points': request.points, 'odometry': request.odometry}
     with LabelledRecording(labels, request.recordings, **topics) as recording:
@@ -219,10 +220,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='folder of results; appears complete or not at all',
     )
     parser.add_argument(
-        '--from', dest='given', required=True, metavar='FORMAT', help='see `boxreg formats`'
+        '--from',
+        dest='source_format',
+        required=True,
+        metavar='FORMAT',
+        help='see `boxreg formats`',
     )
     parser.add_argument(
-        '--to', dest='wanted', required=True, metavar='FORMAT,...',
+        '--to', dest='target_formats', required=True, metavar='FORMAT,...',
         type=lambda text: tuple(dict.fromkeys(name.strip() for name in text.split(','))),
         help='formats to write',
     )  # fmt: skip
@@ -241,14 +246,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Convert, and print one line with the counts."""
     request = Conversion(
-        args.source, args.given, args.wanted,
+        args.source, args.source_format, args.target_formats,
         Options(args.with_points, args.camera, args.swap_axes), tuple(args.recording),
         args.points, args.fixed_frame, args.label_frame, args.odometry,
     )  # fmt: skip
     summary = convert(request, args.out)
     parts = [
         f'{args.out}: {summary["boxes"]:,} boxes of {summary["frames"]:,} frames from '
-        f'{args.given} to {", ".join(args.wanted)}'
+        f'{args.source_format} to {", ".join(args.target_formats)}'
     ]
     for name, counts in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in counts.items())

@@ -33,13 +33,13 @@ class Writer:
     def write(self, frame: LabelFrame) -> None:
         """Write the valid boxes in the fixed frame; the others are counted in `dropped`."""
         rows, boxes = frame.boxes_in('fixed', self.dropped)
-        given = frame.refined.boxes
+        array = frame.refined.boxes
         line = {
-            'stamp_ns': given.stamp_ns,
+            'stamp_ns': array.stamp_ns,
             'frame_id': frame.fixed_frame,
-            'track_ids': [given.track_ids[row] for row in rows],
-            'class_names': [given.class_names[row] for row in rows],
-            'scores': given.scores[rows].tolist(),
+            'track_ids': [array.track_ids[row] for row in rows],
+            'class_names': [array.class_names[row] for row in rows],
+            'scores': array.scores[rows].tolist(),
             'status': [frame.refined.status[row] for row in rows],
             'boxes': boxes.tolist(),
         }
