@@ -50,7 +50,7 @@ def from_msg(msg: Any) -> BoxArray:
     stamped = with_cubes or entities[:1]
     poses.require_fields('SceneUpdate', stamped, ENTITY_FIELDS)
     stamp_ns, frame_id = poses.common_stamp_and_frame(
-        'SceneUpdate', ((_time_ns(entity.timestamp), entity.frame_id) for entity in stamped)
+        'SceneUpdate', ((_time_ns(entity.timestamp), str(entity.frame_id)) for entity in stamped)
     )
     track_ids = []
     class_names = []

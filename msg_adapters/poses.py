@@ -285,4 +285,6 @@ def forward_of(pose: Any) -> Floats:
 
 def _is_unit(quaternions_xyzw: Floats) -> Any:
     """Return which of quaternions (..., 4) have unit length."""
-    return np.abs(np.square(quaternions_xyzw).sum(axis=-1) - 1.0) < UNIT_TOLERANCE
+    with np.errstate(over='ignore'):  # numbers of malformed messages may be of any size
+        squared_norms = np.square(quaternions_xyzw).sum(axis=-1)
+    return np.abs(squared_norms - 1.0) < UNIT_TOLERANCE

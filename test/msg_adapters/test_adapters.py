@@ -284,7 +284,7 @@ def test_marker_output_copies_other_markers():
     assert M.store.serialize_cdr(out, MARKERS)
 
 
-@pytest.mark.parametrize('bad', [(0, 0, 0, 0), (0, 0, 1, 1), (np.nan, 0, 0, 1)])
+@pytest.mark.parametrize('bad', [(0, 0, 0, 0), (0, 0, 1, 1), (1e200, 0, 0, 1), (np.nan, 0, 0, 1)])
 def test_quaternion_that_is_not_unit_makes_the_box_invalid(bad):
     message = vision_msg([bad, QUATERNIONS[1]])
     boxes = vision.from_msg(message)

@@ -395,6 +395,7 @@ def as_namespace(message):
         ('entities.0.timestamp.sec', 'noon', 'expected a timestamp of whole seconds'),
         ('entities.0.timestamp.sec', 10**12, 'expected a timestamp of whole seconds'),
         ('entities.0.metadata', [1], 'field key'),
+        ('entities.0.frame_id', 5, 'expected one frame and one stamp for all boxes'),
     ],
 )
 def test_malformed_json_scene_is_refused(path, value, expected):
