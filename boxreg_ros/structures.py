@@ -62,7 +62,7 @@ class Sweep:
         When each point was measured, relative to the stamp [s].
     origin : array, shape (3,)
         Where the sensor was at the stamp [m]; zero in the sensor's own frame.
-    is_lost : bool
+    is_dropped : bool
         True for one that is known to have been, while its points are not: nothing is to be
         waited for.
 
@@ -73,7 +73,7 @@ class Sweep:
     points: NDArray[np.floating]
     times: Floats | None = None
     origin: Floats = field(default_factory=lambda: np.zeros(3))
-    is_lost: bool = False
+    is_dropped: bool = False
 
     def __post_init__(self) -> None:
         """Check the shapes."""

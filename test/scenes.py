@@ -5,7 +5,7 @@ from boxreg_ros.core.arrowhead import LINK
 from boxreg_ros.core.objective import DEVIATIONS, MEMORY, Problem, SHARED
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.refine import Track
-from boxreg_ros.core.window import AWAY, Window
+from boxreg_ros.core.window import PADDING_POSITION, Window
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -110,14 +110,16 @@ def problem_of(boxes, **changes):
     """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
     B, N = boxes.shape[:2]
-    points = torch.as_tensor(changes.pop('points', np.full((B, N, 1, 3), AWAY))).clone()
+    points = torch.as_tensor(
+        changes.pop('points', np.full((B, N, 1, 3), PADDING_POSITION))
+    ).clone()
     given = {
         'boxes': boxes,
         'start': boxes,
         'valid': torch.ones(B, N, dtype=torch.bool),
         'times': 0.1 * torch.arange(N, dtype=torch.float64).expand(B, N),
         'points': points,
-        'mask': points[..., 0] != AWAY,
+        'mask': points[..., 0] != PADDING_POSITION,
         'delays': torch.zeros(points.shape[:3], dtype=torch.float64),
         'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
         'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
@@ -130,7 +132,7 @@ def problem_of(boxes, **changes):
         given['deviations'][:, DEVIATIONS.index(name)] = torch.as_tensor(values)
     more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
     problem = Problem(**{**given, **more})
-    problem.points[~problem.mask] = AWAY
+    problem.points[~problem.mask] = PADDING_POSITION
     return problem
 
 

@@ -12,8 +12,8 @@ import pytest
 TOLERANCE_NS, REACH_NS = 20, 60
 
 
-def sweep(stamp_ns, is_lost=False):
-    return Sweep(stamp_ns, 'odom', np.zeros((0, 3)), is_lost=is_lost)
+def sweep(stamp_ns, is_dropped=False):
+    return Sweep(stamp_ns, 'odom', np.zeros((0, 3)), is_dropped=is_dropped)
 
 
 def boxes(stamp_ns):
@@ -38,7 +38,7 @@ class Feed:
         for item in items:
             stamp_ns = int(item[1:])
             if item[0] in 'sl':
-                pairs += self.matcher.add_sweep(sweep(stamp_ns, is_lost=item[0] == 'l'))
+                pairs += self.matcher.add_sweep(sweep(stamp_ns, is_dropped=item[0] == 'l'))
             else:
                 pairs += self.matcher.add_boxes(boxes(stamp_ns))
         return told(pairs)

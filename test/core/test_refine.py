@@ -370,7 +370,7 @@ def test_what_has_left_the_window_is_of_use(monkeypatch, estimate):
     # of IoU (early) and 0.003 to 0.008 (final) were gained; a half of the least is asked for.
     scene = simulate('street', seed=0, sweeps=60)
     known = overlaps(scene, estimate).mean()
-    monkeypatch.setattr(window, 'FADING', 0.0)
+    monkeypatch.setattr(window, 'PRIOR_DECAY', 0.0)
     assert known - overlaps(scene, estimate).mean() > 0.001
 
 

@@ -432,9 +432,9 @@ def test_a_new_track_of_a_known_id_remembers_nothing(estimate, no_law):
     whole = stream_of([track_of(drive(30), np.random.default_rng(0), 'a')])
     registrar = BoxRegistrar(config)
     fed(registrar, whole[:8])
-    assert registrar._tracks['a'].memory.seen[3] == 3  # of 8, five are still in the window
+    assert registrar._tracks['a'].prior.seen[3] == 3  # of 8, five are still in the window
     results = fed(registrar, whole[22:23])
-    assert registrar._tracks['a'].memory is None
+    assert registrar._tracks['a'].prior is None
     results += fed(registrar, whole[23:]) + registrar.flush()
     first = whole[22][1].stamp_ns
     known, _ = run(whole[22:], config)
@@ -454,7 +454,7 @@ def test_a_window_that_fails_is_forgotten(estimate):
     registrar, lasting, status = BoxRegistrar(setup(estimate, tolerance=0.0, reach=0.0)), [], []
     for pair in hasty:
         early = [r for r in fed(registrar, [pair]) if not r.is_final]
-        lasting.append(registrar._tracks['a'].memory is not None)
+        lasting.append(registrar._tracks['a'].prior is not None)
         status += [(r.status[0], r.reasons[0]) for r in early]
     registrar.flush()
     failed = [i for i, (_, reason) in enumerate(status) if reason == 'not_finite']
@@ -533,7 +533,7 @@ def test_memory_is_bounded(estimate):
         returned += len(finals(results))
         held.append(i + 1 - returned)
         entries = sum(len(t.entries) for t in registrar._tracks.values())
-        entries += sum(len(t.entries) for t in registrar._ended)
+        entries += sum(len(t.entries) for t in registrar._ended_tracks)
         assert entries <= 2 * 10 + 3 * 5
         assert len(registrar._tracks) <= 4
     # Ticks wait for the lag, or for the window of 10.

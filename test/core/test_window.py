@@ -2,7 +2,13 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.objective import MEMORY
-from boxreg_ros.core.window import batches, FADING, Memory, one_heading, stack
+from boxreg_ros.core.window import (
+    group_windows,
+    MarginalisationPrior,
+    PRIOR_DECAY,
+    resolve_headings,
+    stack_windows,
+)
 from boxreg_ros.structures import POSE, ROLL, YAW
 import numpy as np
 import pytest
@@ -29,9 +35,11 @@ def remembering(window, yaw=0.0):
     shared = [*boxes[0, 3:6], *np.zeros(MEMORY - 15)]
     step = np.random.default_rng(3).normal(size=MEMORY)
     information = np.diag(1.0 + np.arange(MEMORY))
-    memory = Memory(base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1]))
+    memory = MarginalisationPrior(
+        base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1])
+    )
     start = boxes[:-1] + 0.01 * np.eye(9)[8]
-    return window._replace(fresh=1, start=start, memory=memory)
+    return window._replace(num_new=1, start=start, prior=memory)
 
 
 def turned(window):
@@ -44,7 +52,7 @@ def turned(window):
 def test_stack_pads():
     lengths = [10, 6, 8, 3]
     many = windows(lengths)
-    problem, base = stack(many, CONFIG)
+    problem, base = stack_windows(many, CONFIG)
     assert problem.valid.sum(1).tolist() == lengths
     np.testing.assert_allclose(problem.boxes[:, 0, :3], 0)
     assert (problem.times.diff(dim=1) > 0).all()
@@ -76,13 +84,13 @@ def seconds(boxes):
         ([2.0], [2.0]),
     ],
 )
-def test_one_heading(yaw, known):
+def test_resolve_headings(yaw, known):
     # Up to whole turns; steps are small whatever the input.
     # What is padded, here by half turns, has no say.
     boxes = np.zeros((1, len(yaw) + 9, 9))
     boxes[0, :, YAW] = yaw + [yaw[-1] + np.pi] * 9
     times, valid = seconds(boxes), np.arange(boxes.shape[1])[None] < len(yaw)
-    (found,) = one_heading(boxes, times, valid, np.array([np.nan]))[:, : len(yaw)]
+    (found,) = resolve_headings(boxes, times, valid, np.array([np.nan]))[:, : len(yaw)]
     np.testing.assert_allclose(np.cos(found - known), 1, atol=1e-12)
     assert (np.abs(np.diff(found)) < np.pi / 2).all()
 
@@ -91,7 +99,7 @@ def test_a_quarter_turn_takes_no_other_box_along():
     yaw = np.zeros(60)
     yaw[29:32] = -0.05, 1.54, -0.05  # nearer to -pi / 2 than to pi / 2, seen from the next one
     boxes = yaw[None, :, None] * np.eye(9)[YAW]
-    (found,) = one_heading(boxes, seconds(boxes), np.ones((1, 60), bool), np.array([np.nan]))
+    (found,) = resolve_headings(boxes, seconds(boxes), np.ones((1, 60), bool), np.array([np.nan]))
     np.testing.assert_allclose(np.delete(found, 30), np.delete(yaw, 30), atol=1e-12)
 
 
@@ -100,7 +108,7 @@ def test_a_half_turn_is_one_about_the_axis_of_the_box():
     truth = drive(9, turn=0) + np.array([0, 0, 0, 0, 0, 0, 0.1, -0.2, 0])
     track = track_of(truth, np.random.default_rng(0), position=0.0, heading=0.0)
     track.boxes[::3, ROLL:] = track.boxes[::3, ROLL:] * [-1, -1, 1] + [0, 0, np.pi]
-    problem, _ = stack([window_of(track, CONFIG)], CONFIG)
+    problem, _ = stack_windows([window_of(track, CONFIG)], CONFIG)
     np.testing.assert_allclose(problem.boxes[0, :, ROLL:YAW], truth[:, ROLL:YAW], atol=1e-9)
 
 
@@ -126,7 +134,7 @@ def test_a_known_heading_is_kept_until_three_quarters_say_otherwise(
     boxes, valid = np.zeros((1, 8, 9)), np.ones((1, 8), dtype=bool)
     boxes[0, :, YAW] = steps + np.pi * is_contrary
     for heading, base in ((np.nan, unknown), (0.02 + turns, known)):
-        (found,) = one_heading(boxes, seconds(boxes), valid, np.array([heading]))
+        (found,) = resolve_headings(boxes, seconds(boxes), valid, np.array([heading]))
         np.testing.assert_allclose(np.cos(found - steps - base), 1, atol=1e-12)
         assert (np.abs(np.diff(found)) < np.pi / 2).all()
 
@@ -141,31 +149,31 @@ def test_what_is_faster_than_anything_reverses_moves_forward(speed, heading):
     boxes[..., YAW] = 0.3
     boxes[..., :2] = speed * times[..., None] * [np.cos(0.3), np.sin(0.3)]
     boxes[0, -1, :2] -= 1000.0
-    found = one_heading(boxes, times, valid, np.array([heading]))
+    found = resolve_headings(boxes, times, valid, np.array([heading]))
     np.testing.assert_allclose(np.cos(found - 0.3), -1 if speed == -7.0 else 1)
 
 
 def test_what_has_left_is_stacked():
     one, other = windows([5, 4])
-    problem, base = stack([remembering(one), other], CONFIG)
-    memory = remembering(one).memory
+    problem, base = stack_windows([remembering(one), other], CONFIG)
+    memory = remembering(one).prior
     np.testing.assert_array_equal(base, [memory.base, given(other)[0, :3]])
     np.testing.assert_allclose(problem.boxes[:, 0, :3], [[1, 0, 0], [0, 0, 0]])
     np.testing.assert_allclose(problem.recalled[0], memory.state + memory.step, atol=1e-12)
-    np.testing.assert_allclose(problem.information[0], FADING * memory.information)
+    np.testing.assert_allclose(problem.information[0], PRIOR_DECAY * memory.information)
     np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1], [0, 0, 0, 0]])
     np.testing.assert_array_equal(problem.recalled[1], 0)
     np.testing.assert_array_equal(problem.information[1], 0)
     assert memory.information[3, 3] == 4  # nor is it written to
-    assert remembering(one).fresh_part().memory is None
+    assert remembering(one).learning_part().prior is None
 
 
 @pytest.mark.parametrize('turns', [2 * np.pi, -2 * np.pi, 6 * np.pi])
 def test_whole_turns_are_no_difference(turns):
     # What is remembered comes to where the search starts, however often it has turned since.
     (window,) = windows([5])
-    known, _ = stack([remembering(window)], CONFIG)
-    found, _ = stack([remembering(window, turns)], CONFIG)
+    known, _ = stack_windows([remembering(window)], CONFIG)
+    found, _ = stack_windows([remembering(window, turns)], CONFIG)
     for a, b in zip(found, known, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
 
@@ -174,11 +182,11 @@ def test_a_window_turned_against_its_memory_drops_it():
     # All boxes say otherwise: the form is of boxes that head elsewhere, and tells nothing now.
     (window,) = windows([5])
     for one in (turned(remembering(window)), remembering(window, np.pi)):
-        problem, _ = stack([one], CONFIG)
+        problem, _ = stack_windows([one], CONFIG)
         np.testing.assert_array_equal(problem.information, 0)
         assert problem.recalled.isfinite().all()
         np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1]])
-    kept, _ = stack([turned(remembering(window, np.pi))], CONFIG)
+    kept, _ = stack_windows([turned(remembering(window, np.pi))], CONFIG)
     assert (kept.information[0].diagonal() > 0).all()
 
 
@@ -186,29 +194,33 @@ def test_a_solved_window_starts_where_it_was():
     # The first three of four boxes were solved before, 0.2 m off and a whole turn away.
     (window,) = windows([4])
     solved = given(window)[:3] + np.array([0.2, 0, 0, 0, 0, 0, 0, 0, -2 * np.pi])
-    window = window._replace(fresh=1, start=solved)
+    window = window._replace(num_new=1, start=solved)
     assert window.is_warm
-    problem, _ = stack([window], CONFIG)
+    problem, _ = stack_windows([window], CONFIG)
     known = np.zeros((4, 9))
     known[:3, 0] = 0.2
     np.testing.assert_allclose(problem.start[0] - problem.boxes[0], known, atol=1e-12)
     # What was the newest when it was solved is learnt from now, as it was fitted.
-    fresh = window.fresh_part()
+    fresh = window.learning_part()
     assert fresh.observations == window.observations[2:3]
     np.testing.assert_array_equal(fresh.start, solved[2:])
-    first = window._replace(fresh=4, start=solved[:0]).fresh_part()
+    first = window._replace(num_new=4, start=solved[:0]).learning_part()
     assert first.observations == window.observations[:3]
-    np.testing.assert_array_equal(stack([first], CONFIG)[0].start, stack([first], CONFIG)[0].boxes)
+    np.testing.assert_array_equal(
+        stack_windows([first], CONFIG)[0].start, stack_windows([first], CONFIG)[0].boxes
+    )
 
 
 def test_batches_hold_every_window_that_is_long_enough_once():
     many = windows([10, 2, 6, 3, 1, 6])
-    rows = batches(many, CONFIG)
+    rows = group_windows(many, CONFIG)
     assert sorted(i for group in rows for i in group) == [0, 2, 3, 5]
 
 
 def test_batches_are_bounded_and_equally_warm(monkeypatch):
     many = windows([5, 6, 7, 8])
-    many[1] = many[1]._replace(fresh=1, start=given(many[1])[:5])
-    monkeypatch.setattr('boxreg_ros.core.window.BATCH_VALUES', 2 * 8 * CONFIG.sampling.points * 18)
-    assert batches(many, CONFIG) == [[0, 2], [3], [1]]
+    many[1] = many[1]._replace(num_new=1, start=given(many[1])[:5])
+    monkeypatch.setattr(
+        'boxreg_ros.core.window.MAX_BATCH_VALUES', 2 * 8 * CONFIG.sampling.points * 18
+    )
+    assert group_windows(many, CONFIG) == [[0, 2], [3], [1]]
