@@ -81,7 +81,7 @@ def _each_alone(
 
 
 def _no_road(heights: Floats, owner: Ints, n: int) -> Floats:
-    """Stand in for `_road`: none is seen."""
+    """Stand in for `_flat_heights`: none is seen."""
     return np.full(n, np.nan)
 
 
@@ -140,7 +140,9 @@ INGREDIENTS = {
     'ownership': Ingredient(
         "a neighbour's points count too", replaced=((registrar, 'observe', _each_alone),)
     ),
-    'road': Ingredient('the bottom is seen nowhere', replaced=((sampling, '_road', _no_road),)),
+    'road': Ingredient(
+        'the bottom is seen nowhere', replaced=((sampling, '_flat_heights', _no_road),)
+    ),
     'smoothness': Ingredient(
         'any acceleration is as likely',
         _every_kind(
