@@ -47,11 +47,6 @@ def rotation_derivatives(rpy: Tensor) -> tuple[Tensor, Tensor]:
     return R, torch.stack([by_roll, by_pitch, by_yaw], -3)
 
 
-def wrap_angle(angle: Tensor) -> Tensor:
-    """Return `angle` [rad] wrapped into [-pi, pi]."""
-    return torch.atan2(torch.sin(angle), torch.cos(angle))
-
-
 def face_distances(points: Tensor, boxes: Tensor) -> Tensor:
     """
     Return the signed distances of points from the planes of the six faces of their box.

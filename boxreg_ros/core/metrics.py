@@ -2,7 +2,8 @@
 
 from typing import NamedTuple
 
-from boxreg_ros.core.geometry import rotation_from_rpy, wrap_angle
+from boxreg_ros.core.geometry import rotation_from_rpy
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import checked, Floats, HEIGHT, LENGTH, ROLL
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,7 +29,7 @@ class PoseErrors(NamedTuple):
     translation, extent : array, shape (n, 3)
         Errors of the centre along the axes of the true box, and of length, width, height [m].
     rotation : array, shape (n, 3)
-        Errors of roll, pitch and yaw, each wrapped into half a turn to both sides [rad].
+        Errors of roll, pitch and yaw, each wrapped into [-pi, pi) [rad].
     is_flipped : array, shape (n,)
         True for the wrong heading sign: |yaw error| > pi / 2.
 
@@ -62,7 +63,7 @@ def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
     """
     a, b = _rows(boxes, truth)
     difference = a - b
-    rotation = wrap_angle(torch.from_numpy(difference[:, ROLL:])).numpy()
+    rotation = wrap_angle(difference[:, ROLL:])
     axes = rotation_from_rpy(torch.from_numpy(b[:, ROLL:])).numpy()
     translation = (difference[:, None, :3] @ axes)[:, 0]
     is_flipped = np.abs(rotation[:, 2]) > np.pi / 2

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core import objective
 from boxreg_ros.core.face_support import in_box_axes, Rule, Support, support
-from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy, wrap_angle
+from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
 from boxreg_ros.core.input_model import (
     expect,
     Expected,
@@ -31,6 +31,7 @@ from boxreg_ros.core.objective import (
 )
 from boxreg_ros.core.rigid_shape import agreement
 from boxreg_ros.core.window import group_windows, MarginalisationPrior, stack_windows, Window
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED, YAW
 import numpy as np
 import torch

@@ -6,7 +6,6 @@ from boxreg_ros.core.geometry import (
     FACE_SIGN,
     rotation_derivatives,
     rotation_from_rpy,
-    wrap_angle,
 )
 import numpy as np
 import pytest
@@ -47,23 +46,6 @@ def test_any_leading_dimensions(function):
     for index in np.ndindex(2, 4, 3):
         np.testing.assert_array_equal(many[index], function(rpy[index]))
     assert function(rpy[:0]).shape == (0, *many.shape[1:])
-
-
-@pytest.mark.parametrize(
-    'angle, wrapped',
-    [(0.0, 0.0), (3.5, 3.5 - 2 * np.pi), (-3.5, 2 * np.pi - 3.5), (7 * np.pi / 2, -np.pi / 2)],
-)
-def test_wrap_angle(angle, wrapped):
-    value = wrap_angle(torch.tensor(angle, dtype=torch.float64))
-    assert value.item() == pytest.approx(wrapped, abs=1e-14)
-
-
-def test_wrap_angle_turns_by_whole_turns_into_half_a_turn():
-    angle = torch.linspace(-50, 50, 1001, dtype=torch.float64)
-    wrapped = wrap_angle(angle)
-    turns = (angle - wrapped) / (2 * np.pi)
-    assert wrapped.abs().max() <= np.pi
-    np.testing.assert_allclose(turns, turns.round(), atol=1e-13)
 
 
 def test_face_distances_undo_scipy():
