@@ -31,8 +31,12 @@ Derived: the elements of R that give roll and yaw have this magnitude and roundi
 
 @overload
 def wrap_angle(angle: Tensor) -> Tensor: ...
+
+
 @overload
 def wrap_angle(angle: ArrayLike) -> Floats: ...
+
+
 def wrap_angle(angle: Any) -> Any:
     """
     Return angles wrapped into [-pi, pi).

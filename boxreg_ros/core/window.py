@@ -60,7 +60,7 @@ class MarginalisationPrior(NamedTuple):
         Minimum of the quadratic form minus `state`.
     information : array, shape (34, 34)
         Hessian of the quadratic form.
-    seen : array, shape (4,)
+    marginalised_extents : array, shape (4,)
         Sum of the input extents of marginalised observations [m], and their number.
 
     """
@@ -69,7 +69,7 @@ class MarginalisationPrior(NamedTuple):
     state: Floats
     step: Floats
     information: Floats
-    seen: Floats
+    marginalised_extents: Floats
 
     @classmethod
     def none(cls, base: Floats) -> 'MarginalisationPrior':
@@ -177,7 +177,9 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     boxes, times, origins, ground = _stack_observations(windows, valid)
     points, mask, delays = _stack_points(windows, valid)
     priors = [w.prior or MarginalisationPrior.none(w.observations[0].box[:3]) for w in windows]
-    base, state, step, information, seen = (np.array(part) for part in zip(*priors, strict=True))
+    base, state, step, information, extents = (
+        np.array(part) for part in zip(*priors, strict=True)
+    )
     boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, state[:, 5])
     start = _starting_boxes(windows, boxes)
     boxes[..., :3] -= base[:, None]
@@ -185,7 +187,7 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     minimum, is_usable = _prior_minimum(start, state, step)
     information = information * PRIOR_DECAY * is_usable[:, None, None]
     arrays = [boxes, start, valid, times, points, mask, delays, origins, ground]
-    arrays += [np.nan_to_num(minimum), information, seen, _deviations(windows, config)]
+    arrays += [np.nan_to_num(minimum), information, extents, _deviations(windows, config)]
     return Problem(*(torch.from_numpy(array).to(config.device) for array in arrays)), base
 
 

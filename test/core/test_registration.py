@@ -536,7 +536,7 @@ def test_full_windows_leave_what_they_know():
     memory, boxes = found[0].memory, found[0].boxes
     first = given(many[0])[0]
     np.testing.assert_array_equal(memory.base, first[:3])
-    np.testing.assert_array_equal(memory.seen, [*first[3:6], 1])
+    np.testing.assert_array_equal(memory.marginalised_extents, [*first[3:6], 1])
     left = boxes[1:3] - [*first[:3], *np.zeros(6)]
     np.testing.assert_allclose(memory.state[:12], left[:, objective.POSE].ravel(), atol=1e-9)
     np.testing.assert_allclose(memory.state[12:15], boxes[0, 3:6], atol=1e-9)
@@ -570,7 +570,7 @@ def test_memory_goes_on_and_on():
     for i, estimate in enumerate(estimates):
         np.testing.assert_array_equal(estimate.memory.base, boxes[0, :3])
         known = [*boxes[: i + 1, 3:6].sum(0), i + 1]
-        np.testing.assert_allclose(estimate.memory.seen, known)
+        np.testing.assert_allclose(estimate.memory.marginalised_extents, known)
     # What has left tells of the bias and the extent: without it, the same window knows less.
     last = whole._replace(
         observations=whole.observations[4:], num_new=1, start=estimates[3].boxes[1:]
