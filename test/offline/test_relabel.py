@@ -656,7 +656,7 @@ def test_convention_of_the_input_boxes(tmp_path, capsys):
         scores.append(json.loads(capsys.readouterr().out)['iou_3d'])
     assert scores[0] < 0.5 < 0.75 < scores[1]
     assert main(['evaluate', truth, truth, *meant]) == 2
-    assert 'expected a recording that they are about' in capsys.readouterr().err
+    assert 'expected with a recording only' in capsys.readouterr().err
 
 
 def test_box_topic_with_ids_is_preferred(tmp_path):
