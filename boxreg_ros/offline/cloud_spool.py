@@ -68,7 +68,7 @@ class Spool:
         Parameters
         ----------
         stamp_ns : int
-            Stamp of a box array [ns]; clouds before it are deleted, so arrays come by stamp.
+            Stamp of a box array [ns], not smaller than in the call before.
         frame_id : str
             Frame to return the points in.
         T_fixed_frame : array, shape (4, 4)

@@ -162,7 +162,9 @@ def select_tracks(tracks: Sequence[TrackChanges]) -> dict[str, str]:
             candidates.append(track)
     orders: list[list[tuple[float, str, str]]] = [[], [], [], []]  # (value, why, track id)
     for track in candidates:
-        shift, deviation, points = track.shift, track.deviation, median(track.num_points)
+        shift = track.shift
+        deviation = track.deviation
+        points = median(track.num_points)
         kept = int(((track.status == KEPT) & (track.num_points > 0)).sum())
         texts = (
             f'largest shift: mean {shift:.2f} m',

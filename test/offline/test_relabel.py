@@ -283,8 +283,8 @@ def test_boxes_of_a_slow_detector_are_merged_by_stamp(tmp_path):
 
 def test_topic_longer_than_the_clouds_is_merged_by_stamp(tmp_path):
     """Poses of the whole drive, computed later, and clouds of a part in its middle."""
-    whole, (begin, end) = Drive(sweeps=60), (20, 40)
-    stamps = whole.stamps[begin:end]
+    whole = Drive(sweeps=60)
+    stamps = whole.stamps[20:40]
     part = [item for item in whole.items if stamps[0] <= item[1] <= stamps[-1]]
     part.insert(0, whole.items[0])  # /tf_static
     expected = run(write_recording(tmp_path / 'part', part), tmp_path / 'expected')[1]
@@ -329,7 +329,8 @@ def test_part_without_boxes_is_a_warning(tmp_path, capsys):
 
 
 def test_start_counts_from_the_first_cloud(tmp_path):
-    drive, day = Drive(sweeps=10), 86_400 * SECOND
+    drive = Drive(sweeps=10)
+    day = 86_400 * SECOND
     expected = run(drive.write(tmp_path / 'drive'), tmp_path / 'expected', start=0.25, end=0.75)[1]
     static = [(topic, t - day, m) for topic, t, m in drive.items if topic == '/tf_static']
     other = [('/points2', t - day, m) for topic, t, m in drive.items if topic == '/points']
@@ -382,6 +383,8 @@ def test_results_are_written_to_their_array_by_ticket(tmp_path, monkeypatch):
     assert [row['track_id'] for row in expected[2:5]] == ['1', '2', '9']
 
     class ReversingRegistrar(BoxRegistrar):
+        """Return all results at the end, the last one first."""
+
         def add_sweep(self, sweep):
             held.extend(super().add_sweep(sweep))
             return []
@@ -565,7 +568,8 @@ def test_unreadable_intensities_drop_no_cloud(tmp_path):
 
 @pytest.mark.parametrize('name', ['boxes.csv', 'mine/notes.txt'])
 def test_result_changed_by_hand_is_not_replaced(tmp_path, name):
-    drive, file = Drive(sweeps=3).write(tmp_path / 'drive'), tmp_path / 'out' / name
+    drive = Drive(sweeps=3).write(tmp_path / 'drive')
+    file = tmp_path / 'out' / name
     run(drive, tmp_path / 'out')
     file.parent.mkdir(exist_ok=True)
     file.write_text('by hand')
@@ -589,7 +593,8 @@ def test_folder_with_other_files_is_not_replaced(tmp_path, content):
 
 @pytest.mark.parametrize('given', ['{out}/drive.mcap', '{out}', '{link}', '{bag}'])
 def test_output_that_contains_an_input_is_refused(tmp_path, capsys, given):
-    out, link = tmp_path / 'out', tmp_path / 'link.mcap'
+    out = tmp_path / 'out'
+    link = tmp_path / 'link.mcap'
     bag = Drive(sweeps=3).write(tmp_path / 'drive')
     run(bag, out)
     shutil.copy(bag, out / 'drive.mcap')
@@ -633,8 +638,9 @@ def test_convention_of_the_input_boxes(tmp_path, capsys):
     assert main([*command, str(tmp_path / 'expected'), path]) == 0
     for topic, _, message in drive.items:
         for detection in message.detections if topic == '/boxes' else ():
-            size, at = detection.bbox.size, detection.bbox.center.position
-            size.x, size.y, at.z = size.y, size.x, at.z - size.z / 2
+            size = detection.bbox.size
+            size.x, size.y = size.y, size.x
+            detection.bbox.center.position.z -= size.z / 2
     path = str(drive.write(tmp_path / 'bottoms'))
     meant = ['--pose-reference', 'bottom', '--size-order', 'wlh']
     assert not capsys.readouterr().err
@@ -660,7 +666,8 @@ def test_convention_of_the_input_boxes(tmp_path, capsys):
 
 
 def test_box_topic_with_ids_is_preferred(tmp_path):
-    drive, other = Drive(sweeps=4), Drive(sweeps=4, boxes=JSK)
+    drive = Drive(sweeps=4)
+    other = Drive(sweeps=4, boxes=JSK)
     more = [('/clusters', *item[1:]) for item in other.items if item[0] == '/boxes']
     drive.items += more
     path = drive.write(tmp_path / 'drive')
@@ -687,7 +694,8 @@ def test_evaluate_and_convert_accept_the_options_they_propose(tmp_path, capsys):
     drive = Drive(sweeps=4, motion='odometry')
     for topic in ('/boxes', '/odom'):
         drive.items += [(f'{topic}2', *item[1:]) for item in drive.items if item[0] == topic]
-    path, table = str(drive.write(tmp_path / 'drive')), str(tmp_path / 'input.csv')
+    path = str(drive.write(tmp_path / 'drive'))
+    table = str(tmp_path / 'input.csv')
     topics = {'boxes': '/boxes2', 'odometry': '/odom2'}
     BoxTable.from_arrays(input_boxes(Path(path), **topics)[0]).write(table)
     assert main(['evaluate', path, table]) == 1

@@ -79,13 +79,14 @@ def test_all_messages_are_copied_and_refined_boxes_added(tmp_path, storage, boxe
     assert summary['status']['refined'] > 0
     moved = 0.0
     for stamp_ns, message, original in refined:
-        found, was = adapter.from_msg(message), adapter.from_msg(original)
+        found = adapter.from_msg(message)
+        given = adapter.from_msg(original)
         assert (found.stamp_ns, found.frame_id) == (stamp_ns, 'lidar')
-        assert (found.track_ids, found.class_names) == (was.track_ids, was.class_names)
-        np.testing.assert_array_equal(found.scores, was.scores)
+        assert (found.track_ids, found.class_names) == (given.track_ids, given.class_names)
+        np.testing.assert_array_equal(found.scores, given.scores)
         expected = expected_boxes(tmp_path / 'out', drive, stamp_ns)
         np.testing.assert_allclose(found.boxes, expected, atol=1e-6)
-        moved = max(moved, np.abs(found.boxes - was.boxes).max())
+        moved = max(moved, np.abs(found.boxes - given.boxes).max())
     assert moved > 0.01
 
 
@@ -110,7 +111,8 @@ def test_markers_of_input_and_refined_boxes(tmp_path, storage):
 
 
 def test_boxes_recorded_at_another_time_get_the_time_of_their_clouds(tmp_path):
-    drive, day_ns = Drive(sweeps=8), 86_400 * 10**9
+    drive = Drive(sweeps=8)
+    day_ns = 86_400 * 10**9
     parts = (
         [item for item in drive.items if item[0] != '/boxes'],
         [(topic, t + day_ns, m) for topic, t, m in drive.items if topic == '/boxes'],

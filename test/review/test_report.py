@@ -301,7 +301,8 @@ def streamed(track, late_ns=()):
     """Yield sweeps and boxes of a `Track`, each box `late_ns` after its sweep."""
     for k, stamp in enumerate(track.stamps_ns.tolist()):
         yield Sweep(stamp, 'odom', track.points[k].astype(np.float32), None, np.zeros(3))
-        boxes, late = track.boxes[k : k + 1], int(late_ns[k]) if len(late_ns) else 0
+        boxes = track.boxes[k : k + 1]
+        late = int(late_ns[k]) if len(late_ns) else 0
         yield BoxArray(stamp + late, 'odom', ('7',), ('car',), np.ones(1), boxes)
 
 
@@ -320,7 +321,8 @@ def test_points_fill_fewer_cells_in_better_boxes(tmp_path):
 
 def test_points_are_motion_compensated_to_the_box_stamp(tmp_path):
     rng = np.random.default_rng(3)
-    truth, late_ns = drive(30, speed=15.0, turn=0.0), 20_000_000 * (np.arange(30) % 3)
+    truth = drive(30, speed=15.0, turn=0.0)
+    late_ns = 20_000_000 * (np.arange(30) % 3)
     track = track_of(truth, rng, '7')
     there = truth.copy()
     distance = 15.0 * late_ns[:, None] * 1e-9
@@ -342,7 +344,8 @@ def test_points_are_motion_compensated_by_their_times(tmp_path):
             times = rng.uniform(-0.05, 0.05, len(item.points))
             item = replace(item, points=item.points + 15.0 * times[:, None] * heading, times=times)
         late.append(item)
-    tracks, deskewing = changes_of(truth, truth), Config().updated({'sampling.deskew': True})
+    tracks = changes_of(truth, truth)
+    deskewing = Config().updated({'sampling.deskew': True})
     blurred, _ = cells_of(tmp_path, tracks, late)
     sharp, _ = cells_of(tmp_path, tracks, late, deskewing)
     exact, _ = cells_of(tmp_path, tracks, items)
@@ -373,7 +376,7 @@ def test_browser_renders_the_page(street, tmp_path):
     assert 'CONSOLE' not in done.stderr
     found = re.search(r'<title>(\d+),(-?\d+),(\w+)</title>', done.stdout)
     assert found, done.stderr
-    height, beside, has_pictures = found.groups()
+    height, overflow, has_pictures = found.groups()
     assert int(height) > 4000
-    assert int(beside) <= 0
+    assert int(overflow) <= 0
     assert has_pictures == 'true'
