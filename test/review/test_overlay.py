@@ -80,13 +80,13 @@ def test_all_messages_are_copied_and_refined_boxes_added(tmp_path, storage, boxe
     moved = 0.0
     for stamp_ns, message, original in refined:
         found = adapter.from_msg(message)
-        given = adapter.from_msg(original)
+        boxes_in = adapter.from_msg(original)
         assert (found.stamp_ns, found.frame_id) == (stamp_ns, 'lidar')
-        assert (found.track_ids, found.class_names) == (given.track_ids, given.class_names)
-        np.testing.assert_array_equal(found.scores, given.scores)
+        assert (found.track_ids, found.class_names) == (boxes_in.track_ids, boxes_in.class_names)
+        np.testing.assert_array_equal(found.scores, boxes_in.scores)
         expected = expected_boxes(tmp_path / 'out', drive, stamp_ns)
         np.testing.assert_allclose(found.boxes, expected, atol=1e-6)
-        moved = max(moved, np.abs(found.boxes - given.boxes).max())
+        moved = max(moved, np.abs(found.boxes - boxes_in.boxes).max())
     assert moved > 0.01
 
 
