@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
 import numpy as np
@@ -79,7 +80,10 @@ def _time_ns(time: Any) -> int:
     for seconds, rest in (('sec', 'nanosec'), ('sec', 'nsec'), ('seconds', 'nanos')):
         if hasattr(time, rest):
             return int(getattr(time, seconds)) * 10**9 + int(getattr(time, rest))
-    raise AttributeError(f'a timestamp has neither sec and nanosec nor seconds and nanos: {time}')
+    raise UnsupportedMessage(
+        f'SceneUpdate: expected a timestamp of sec and nanosec, sec and nsec, or seconds and '
+        f'nanos, got {time}'
+    )
 
 
 def _noted(entity: Any, keys: tuple[str, ...], default: str) -> str:

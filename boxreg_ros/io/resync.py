@@ -8,7 +8,7 @@ from functools import cached_property
 from heapq import merge
 from itertools import islice
 
-from boxreg_ros.io.foxglove_mcap import Item, Reader
+from boxreg_ros.io.message_files import EncodedMessage, Reader
 from rosbags.interfaces import Connection
 
 APART_NS = 10**9
@@ -55,7 +55,7 @@ class Timeline:
 
     def messages(
         self, connections: Collection[Connection], start_ns: int | None, end_ns: int | None
-    ) -> Iterator[Item]:
+    ) -> Iterator[EncodedMessage]:
         """Yield connection, time of receipt [ns] and bytes, in the order of these times."""
         apart = [c for c in connections if self._is_apart(c)]
         together = [c for c in connections if c not in apart]
@@ -70,7 +70,7 @@ class Timeline:
 
     def _by_stamp(
         self, connection: Connection, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[Item]:
+    ) -> Iterator[EncodedMessage]:
         last_ns = self._begin_ns
         for _, _, data in self._reader.messages([connection], None, None):
             due_ns = self._due_ns(self._stamp_of(connection, data))

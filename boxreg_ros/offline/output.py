@@ -10,7 +10,7 @@ from pathlib import Path
 
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline.cloud_spool import Spool
-from boxreg_ros.offline.reader import Arrival, Source
+from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.review.changes import Changes
@@ -99,7 +99,7 @@ class Sink:
         self.heading_flips = 0
         self.without_cloud = 0
 
-    def expect(self, arrival: Arrival) -> None:
+    def expect(self, arrival: ReadItem) -> None:
         """Keep a cloud that files need, or a place for boxes: those not moved stay as they are."""
         given = arrival.given
         if not isinstance(given, BoxArray):

@@ -21,17 +21,18 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.io.session import register
 from boxreg_ros.labels import is_written, Options
 from boxreg_ros.offline.arguments import add_recording_arguments, config_from, convention_from
 from boxreg_ros.offline.labelled_recording import add_label_arguments
 from boxreg_ros.offline.output import Sink
-from boxreg_ros.offline.reader import Arrival, Coming, reader
+from boxreg_ros.offline.reader import ReadAhead, reader
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare, SUMMARY, whole_folder
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.workers import solver
 from boxreg_ros.review.report import REPORT, write_report
-from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, RefinedBoxes, Sweep
+from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, Sweep
 import yaml
 
 UNUSED = 'sweep_', 'boxes_'  # reasons of what was not used begin so
@@ -74,7 +75,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     fingerprint = request.fingerprint()  # of what is read from here on
     with solver(request.config, clock) as begin, reader(request) as peer:
         registrar = BoxRegistrar(request.config, begin)
-        coming = Coming(peer)
+        coming = ReadAhead(peer)
         seconds, passes = coming.source.seconds, 2 if request.report else 1
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, coming.source, clock) as sink:
@@ -83,7 +84,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
                         progress(arrival.seconds, passes * seconds)
                     sink.expect(arrival)
                     with clock('registrar'):
-                        ready = _registered(arrival, registrar)
+                        ready = register(registrar, arrival.moved, arrival.restarts)
                     sink.take(ready)
                 with clock('registrar'):
                     ready = registrar.flush()
@@ -104,23 +105,10 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     return summary
 
 
-def _registered(arrival: Arrival, registrar: BoxRegistrar) -> list[RefinedBoxes]:
-    """Return what becomes ready with an arrival; tracks begin anew where stamps do."""
-    ready: list[RefinedBoxes] = []
-    if arrival.begins_anew:
-        ready = registrar.flush()
-        registrar.reset()
-    if isinstance(arrival.moved, Sweep):
-        ready += registrar.add_sweep(arrival.moved)
-    elif arrival.moved is not None:
-        ready += registrar.add_boxes(arrival.moved)
-    return ready
-
-
 def _again(request: Request, progress: Progress | None) -> Iterator[Sweep | BoxArray]:
     """Yield the clouds and boxes of the recording once more, in the fixed frame."""
     with reader(request) as peer:
-        coming = Coming(peer)
+        coming = ReadAhead(peer)
         seconds = coming.source.seconds
         for arrival in coming:
             if progress is not None:
@@ -130,7 +118,7 @@ def _again(request: Request, progress: Progress | None) -> Iterator[Sweep | BoxA
 
 
 def _summary(
-    request: Request, coming: Coming, registered: Counter[str], sink: Sink
+    request: Request, coming: ReadAhead, registered: Counter[str], sink: Sink
 ) -> dict[str, Any]:
     """Return all of summary.json but the timings and the fingerprint."""
     if sink.missing():
