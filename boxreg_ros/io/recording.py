@@ -587,22 +587,24 @@ class Recording:
             message = self._message(Record(connection, 0, data))
             if connection.topic == self.boxes_topic:
                 return self._content(connection.topic, message).stamp_ns or None
+            stamped = getattr(message, 'transforms', [message])
+            with _malformed(f'topic {connection.topic!r}'):
+                return poses.stamp_ns(stamped[0].header) or None if len(stamped) else None
         except UnsupportedMessage:
             return None
-        stamped = message.transforms if hasattr(message, 'transforms') else [message]
-        return poses.stamp_ns(stamped[0].header) or None if len(stamped) else None
 
     def _add_motion(self, tree: TransformTree, record: Record) -> None:
         topic = record.connection.topic
         try:
             message = self._message(record)
+            with _malformed(f'topic {topic!r}'):
+                if record.connection.msgtype == ODOMETRY_TYPE:
+                    tree.add_odometry(message)
+                else:
+                    is_static = topic in self._static_topics()
+                    tree.add_transforms(message.transforms, is_static)
         except UnsupportedMessage as error:
             self._count_unreadable(topic, error)
-            return
-        if record.connection.msgtype == ODOMETRY_TYPE:
-            tree.add_odometry(message)
-        else:
-            tree.add_transforms(message.transforms, is_static=topic in self._static_topics())
 
 
 def _fixed_frame(tree: TransformTree, frame: str, wish: str | None) -> str | None:
