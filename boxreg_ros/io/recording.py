@@ -1,7 +1,7 @@
 """
 Recordings: MCAP, rosbag2 (sqlite3 and mcap) and ROS 1 bags as one ordered stream.
 
-Message definitions come from the recording, so nothing of ROS need be installed.
+Message definitions are read from the recording, so ROS need not be installed.
 
 """
 
@@ -30,11 +30,11 @@ TF_TYPES = ('tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage')
 ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
 
 LOOKAHEAD_NS = 2 * 10**9
-"""Transforms are read this far ahead of the clouds and boxes that need them."""
-PATIENCE_NS = 10 * 10**9
-"""So long is TF given to connect the frames before odometry is taken."""
+"""Transforms are read this far ahead of clouds and boxes [ns]: publishers of TF are late."""
+TF_SEARCH_NS = 10 * 10**9
+"""Odometry is used if TF does not connect the frames in this first part of a recording [ns]."""
 
-# What recordings before ROS 2 Iron leave out, and rosbags does not know.
+# Definitions that recordings before ROS 2 Iron lack, and rosbags does not include.
 VISION_DEFINITIONS = {
     'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score',
     'vision_msgs/msg/ObjectHypothesisWithPose': (
@@ -146,34 +146,36 @@ class Recording:
     """
     One or several recordings of one drive, merged by receive time.
 
-    Receive time only orders the stream and cuts out the part between `start` and `end`; stamps
-    are those of the messages' headers. What was recorded apart from the clouds is merged by
-    stamp, see `Timeline`. Use as a context manager; a copy can be opened once more.
+    Receive times only order the stream and select the part between `start` and `end`; stamps
+    are those of the message headers. Topics that were recorded apart from the clouds are merged
+    by stamp, see `Timeline`. Use as a context manager; a copy can be opened again.
 
     Parameters
     ----------
     paths : sequence of Path
         MCAP files, rosbag2 folders, .db3 files, or ROS 1 bags.
     points, boxes, odometry : str, optional
-        Topics; found by type where only one fits.
+        Topics; found by type if only one topic has it.
     start, end : float, optional
         Part to read, from the beginning of the recording [s].
     convention : Convention
-        How the boxes are to be read.
+        Convention of the boxes, and whether ids will be assigned to them.
 
     Attributes
     ----------
     has_boxes : bool
-        Whether there have to be boxes; without them `boxes_topic` is ''.
+        Whether a topic of boxes is required; without, `boxes_topic` is empty.
+    points_topic, boxes_topic, odometry_topic, start_ns, end_ns, unreadable, first_errors, outside
+        See `ItemSource`.
     part_ns : tuple of int or None
-        Begin and end of the part that was asked for, in receive time [ns].
-    unreadable, first_errors : Counter and dict
-        How many messages of each topic were passed over, and the error of the first.
+        Begin and end of the part that was asked for, in receive time [ns]; None if it was not.
+    files : list of Path
+        Files and folders that are read.
 
     Raises
     ------
     RecordingError
-        On entering, if something cannot be read or found; the message lists what there is.
+        On entering, if a file or topic cannot be read or found; the message lists the topics.
 
     """
 
@@ -274,20 +276,37 @@ class Recording:
             if topic in self.data_topics and topic not in self._decoded_topics:
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
-    def left_out(self, unmoved: Sequence[str]) -> str:
-        """Return how many messages are not used, and why; `unmoved`: why some had no transform."""
-        unread = [str(error) for error in self.first_errors.values()]
-        return '; '.join(
-            f'{count} messages {what}, first: {reasons[0]}'
-            for count, what, reasons in (
-                (self.unreadable.total(), 'could not be read', unread),
-                (len(unmoved), 'had no transform', unmoved),
+    def left_out(self, missing_transforms: Sequence[str]) -> str:
+        """
+        Return how many messages are not used, and why, in one line; empty if all are.
+
+        Parameters
+        ----------
+        missing_transforms : sequence of str
+            Errors of the messages without a transform.
+
+        """
+        parts = []
+        if self.unreadable.total():
+            first = next(iter(self.first_errors.values()))
+            parts.append(f'{self.unreadable.total()} messages could not be read, first: {first}')
+        if missing_transforms:
+            parts.append(
+                f'{len(missing_transforms)} messages had no transform, first: '
+                f'{missing_transforms[0]}'
             )
-            if count
-        )
+        return '; '.join(parts)
 
     def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
-        """Return a message of the boxes' topic from its bytes, and its boxes; see `decode`."""
+        """
+        Return a message of the boxes' topic from its bytes, and its boxes.
+
+        Raises
+        ------
+        UnsupportedMessage
+            If it is malformed.
+
+        """
         connection = self._connections({self.boxes_topic})[0]
         message = self._message(Record(connection, 0, data))
         return message, cast(BoxArray, self._content(self.boxes_topic, message))
@@ -302,7 +321,7 @@ class Recording:
         return bytes(encode(replaced, kind))
 
     def received_ns(self, topic: str, received_ns: int, data: bytes) -> int:
-        """Return when a message on a topic of `apart` counts as received: with its clouds [ns]."""
+        """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
         return self._timeline.received_ns(self._connections({topic})[0], received_ns, data)
 
     @property
@@ -313,7 +332,7 @@ class Recording:
 
     @property
     def typestore(self) -> Typestore:
-        """Return the definitions of the messages in the recording."""
+        """Return the message definitions of the recording."""
         return self._reader.typestore
 
     @property
@@ -328,22 +347,22 @@ class Recording:
 
     def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
         """
-        Find out where the motion of the sensor comes from, and return the fixed frame.
+        Choose the source of the sensor's motion, and return the fixed frame.
 
-        TF where it connects the frames, else odometry. Without a wish it is the topmost frame
-        the cloud's frame moves in.
+        TF is used where it connects the frames, else odometry. The default is the topmost frame
+        that the frame of the clouds moves in.
 
         Parameters
         ----------
         tree : TransformTree
-            Empty; afterwards it holds the static transforms, and the first ones over time.
+            Empty; afterwards it holds the static and the first moving transforms.
         fixed_frame : str, optional
-            The frame wished for.
+            Frame to use instead.
 
         Raises
         ------
         RecordingError
-            If no motion is known, or the frame wished for is not connected to the cloud's.
+            If no motion is known, or no transforms connect `fixed_frame` with the clouds.
 
         """
         frame = self.sensor_frame()
@@ -354,8 +373,7 @@ class Recording:
         found = self._scout(tree, frame, fixed_frame)
         odometry: list[str] = []
         if found is None or fixed_frame is None:
-            # Odometry is needed where TF does not lead to a fixed frame, or where the root of
-            # TF is the very frame that odometry moves.
+            # Odometry is needed if TF has no motion, or if odometry moves the root of TF.
             relevant = {}
             for topic in self._candidates((ODOMETRY_TYPE,)):
                 message = self._first(topic)
@@ -382,9 +400,9 @@ class Recording:
             )
         if found is None:
             raise RecordingError(
-                f'{self}: neither /tf nor odometry tells how the frame of the clouds {frame!r} '
-                f'moves; TF: {tree}; odometry: {", ".join(odometry) or "none"}; if it does not '
-                f'move, say so with --fixed-frame {shlex.quote(frame)}'
+                f'{self}: neither /tf nor odometry has the motion of the frame of the clouds '
+                f'{frame!r}; TF: {tree}; odometry: {", ".join(odometry) or "none"}; if it does '
+                f'not move, set --fixed-frame {shlex.quote(frame)}'
             )
         return found
 
@@ -396,19 +414,19 @@ class Recording:
         return str(cloud.header.frame_id).lstrip('/')
 
     def _first(self, topic: str) -> Any:
-        """Return the first message on a topic, in the part that is read, that can be; or None."""
-        trouble: UnsupportedMessage | None = None
+        """Return the first readable message on a topic in the part that is read; None without."""
+        first_error: UnsupportedMessage | None = None
         for record in self._read(self._connections({topic}), self.start_ns, self.end_ns):
             try:
                 return self._message(record)
             except UnsupportedMessage as error:
-                trouble = trouble or error
-        if trouble is not None:
-            raise trouble
+                first_error = first_error or error
+        if first_error is not None:
+            raise first_error
         return None
 
     def _find(self) -> None:
-        """Settle topics and times, and complete the message definitions."""
+        """Find topics and times, and complete the message definitions."""
         self._topics = {
             c.topic: c.msgtype for c in sorted(self._reader.connections, key=lambda c: c.topic)
         }
@@ -475,7 +493,7 @@ class Recording:
         return candidates[0]
 
     def _box_types(self) -> tuple[str, ...]:
-        """Return the types of boxes; not those without ids where there are others to choose."""
+        """Return the types of boxes; those without ids only if there are no others."""
         with_ids = tuple(name for name in ADAPTERS if name not in WITHOUT_IDS)
         is_free = self._convention.associate or self._asked['boxes'] is not None
         return tuple(ADAPTERS) if is_free or not self._candidates(with_ids) else with_ids
@@ -486,18 +504,18 @@ class Recording:
             return [self.odometry_topic]
         return [t for t, kind in self._topics.items() if kind in types and t in self._filled]
 
-    def _scout(self, tree: TransformTree, frame: str, wish: str | None) -> str | None:
-        """Feed `tree` from TF until that leads to the fixed frame, and a little longer."""
-        found = _fixed_frame(tree, frame, wish)
+    def _scout(self, tree: TransformTree, frame: str, wanted: str | None) -> str | None:
+        """Read TF until it connects the fixed frame, and `LOOKAHEAD_NS` longer."""
+        found = _fixed_frame(tree, frame, wanted)
         begin = self.start_ns - LOOKAHEAD_NS
         until = self.end_ns
         if self._candidates((ODOMETRY_TYPE,)):
-            until = min(until, begin + PATIENCE_NS)
+            until = min(until, begin + TF_SEARCH_NS)
         for record in self._read(self._connections(self._tf_topics()), begin):
             if record.received_ns > until:
                 break
             self._add_motion(tree, record)
-            was_found, found = found, _fixed_frame(tree, frame, wish)
+            was_found, found = found, _fixed_frame(tree, frame, wanted)
             if was_found is None and found is not None:
                 until = record.received_ns + LOOKAHEAD_NS
         return found
@@ -607,15 +625,15 @@ class Recording:
             self._count_unreadable(topic, error)
 
 
-def _fixed_frame(tree: TransformTree, frame: str, wish: str | None) -> str | None:
+def _fixed_frame(tree: TransformTree, frame: str, wanted: str | None) -> str | None:
     """Return the fixed frame if `tree` connects `frame` with one."""
-    if wish is None:
+    if wanted is None:
         return tree.fixed_frame(frame)
-    return wish.lstrip('/') if tree.connects(wish, frame) else None
+    return wanted.lstrip('/') if tree.connects(wanted, frame) else None
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:
-    """Return what the reader can open; folders without metadata stand for the files in them."""
+    """Return the files and folders to open; of a folder without metadata, the files in it."""
     files = []
     for path in paths:
         if not path.exists():
