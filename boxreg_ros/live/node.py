@@ -15,9 +15,9 @@ from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.markers import MarkerBoard
-from boxreg_ros.io.session import says_nothing
+from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.live.driver import Arrival, LiveRegistrar, Outgoing, warm_up
+from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage, warm_up
 from boxreg_ros.live.inbox import Inbox, Message
 from boxreg_ros.live.params import changed, declare, parameters_yaml
 from boxreg_ros.reasons import REASONS
@@ -341,7 +341,7 @@ class BoxregNode(Node):
 
     def work(self) -> None:
         """Take arrivals until `stop`, each as soon as its transforms are there."""
-        item: Arrival | None = None
+        item: ReceivedMessage | None = None
         while True:
             self._inbox.news.clear()  # before the look at `_stopping`: `stop` sets both
             if self._stopping.is_set():
@@ -366,7 +366,7 @@ class BoxregNode(Node):
                 self._idle_at, self._waited = time.monotonic(), 0.0
         self._finish_work(item)
 
-    def _miss_clouds(self, item: Arrival | None) -> None:
+    def _miss_clouds(self, item: ReceivedMessage | None) -> None:
         """Let boxes go that wait for a cloud, if none is on its way."""
         is_cloud = item is not None and isinstance(item.message, PointCloud2)
         if not is_cloud and not self._inbox.sizes()['points_waiting']:
@@ -389,7 +389,7 @@ class BoxregNode(Node):
         self._drop(message)
         return None
 
-    def _finish_work(self, item: Arrival | None) -> None:
+    def _finish_work(self, item: ReceivedMessage | None) -> None:
         """Publish what is held, and pass what still waits through: nobody waits for the solver."""
         self._take_news()
         self._publish(self._guarded(self._live.flush))
@@ -421,7 +421,7 @@ class BoxregNode(Node):
                 self._live.tree.add_transforms(news, is_static=topic == '/tf_static')
         self._newest_motion_ns = self._live.tree.newest_ns()
 
-    def _decoded(self, message: Message | None) -> Arrival | None:
+    def _decoded(self, message: Message | None) -> ReceivedMessage | None:
         if message is None:
             return None
         reader: Any = pointcloud if message.topic == 'points' else self._live.adapter
@@ -432,19 +432,19 @@ class BoxregNode(Node):
             if message.topic == 'boxes':
                 self._publish(self._live.passed_through(message.content))
             return None
-        return Arrival(message.content, content, message.received)
+        return ReceivedMessage(message.content, content, message.received)
 
-    def _process(self, item: Arrival) -> None:
+    def _process(self, item: ReceivedMessage) -> None:
         ready = self._guarded(partial(self._live.process, item), item)
         if self._fixed_frame != self._live.fixed_frame:
             self._fixed_frame = self._live.fixed_frame
             self.get_logger().info(f'fixed frame is {self._fixed_frame!r}')
         self._publish(ready)
-        if says_nothing(item.content) and self._board.is_showing:
+        if is_placeholder(item.content) and self._board.is_showing:
             self._markers.publish(self._board.clear())
 
     def _guarded(
-        self, task: Callable[[], list[Outgoing]], item: Arrival | None = None
+        self, task: Callable[[], list[Outgoing]], item: ReceivedMessage | None = None
     ) -> list[Outgoing]:
         """Return what a task returns; one bad tick must not end weeks of running."""
         try:

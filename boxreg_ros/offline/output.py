@@ -10,7 +10,7 @@ from pathlib import Path
 
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline.cloud_spool import Spool
-from boxreg_ros.offline.reader import Arrival, Source
+from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.review.changes import Changes
@@ -91,22 +91,22 @@ class Sink:
         self.heading_flips = 0
         self.without_cloud = 0
 
-    def expect(self, arrival: Arrival) -> Arrival:
+    def expect(self, item: ReadItem) -> ReadItem:
         """
         Store a cloud that files need, or reserve the place of a box array.
 
         Returns
         -------
-        arrival : Arrival
+        item : ReadItem
             The same for the registrar; boxes carry a ticket.
 
         """
-        if isinstance(arrival.given, BoxArray):
-            return self._reserve(arrival, arrival.given)
-        if self._spool and arrival.given is not None and arrival.T_fixed_given is not None:
+        if isinstance(item.given, BoxArray):
+            return self._reserve(item, item.given)
+        if self._spool and item.given is not None and item.T_fixed_given is not None:
             with self._clock('write'):
-                self._spool.add(arrival.given, arrival.T_fixed_given, arrival.intensities)
-        return arrival
+                self._spool.add(item.given, item.T_fixed_given, item.intensities)
+        return item
 
     def take(self, ready: Sequence[RefinedBoxes]) -> None:
         """Take results of the registrar; write arrays up to the first one without a result."""
@@ -148,22 +148,22 @@ class Sink:
         """Return the number of input boxes that have not been written."""
         return self.boxes_in - (self.boxes_out - self.status[INTERPOLATED])
 
-    def _reserve(self, arrival: Arrival, given: BoxArray) -> Arrival:
+    def _reserve(self, item: ReadItem, given: BoxArray) -> ReadItem:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
-        if isinstance(arrival.moved, BoxArray):
-            slot = _Slot(arrival.moved, arrival.T_fixed_sensor, arrival.T_fixed_given)
+        if isinstance(item.moved, BoxArray):
+            slot = _Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
             self._last_ticket += 1
             self._by_ticket[self._last_ticket] = slot
-            moved = replace(arrival.moved, ticket=self._last_ticket)
-            arrival = arrival._replace(moved=moved)
+            moved = replace(item.moved, ticket=self._last_ticket)
+            item = item._replace(moved=moved)
         elif count:
-            slot = _Slot(given, arrival.T_fixed_sensor, arrival.T_fixed_given, _kept(given))
+            slot = _Slot(given, item.T_fixed_sensor, item.T_fixed_given, _kept(given))
         else:
-            return arrival
+            return item
         insort(self._by_stamp, slot, key=lambda slot: slot.stamp_ns)
-        return arrival
+        return item
 
     def _put(self, refined: RefinedBoxes, slot: _Slot) -> None:
         """Count the boxes of one array and write them in all formats."""

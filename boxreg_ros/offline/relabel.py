@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 
 from boxreg_ros import __version__
 from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.io.session import register
 from boxreg_ros.offline.output import Sink
-from boxreg_ros.offline.reader import Arrival, Coming, Findings, reader
+from boxreg_ros.offline.reader import Findings, ReadAhead, reader
 from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
@@ -28,7 +29,7 @@ from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.report import REPORT, write_report
-from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, RefinedBoxes, Sweep
+from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, Sweep
 import yaml
 
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
@@ -72,7 +73,7 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
     clock = Stopwatch()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
     with registration_worker(request.config, clock) as begin, reader(request) as process:
-        recording = Coming(process)
+        recording = ReadAhead(process)
         registrar = BoxRegistrar(request.config, begin)
         shown = _Progress(progress, recording.source.seconds, 2 if request.report else 1)
         with whole_folder(out, request.inputs()) as folder:
@@ -103,31 +104,22 @@ class _Progress(NamedTuple):
 
 
 def _register(
-    recording: Coming, registrar: BoxRegistrar, sink: Sink, clock: Stopwatch, progress: _Progress
+    recording: ReadAhead,
+    registrar: BoxRegistrar,
+    sink: Sink,
+    clock: Stopwatch,
+    progress: _Progress,
 ) -> None:
     """Read the recording, register its boxes and write them."""
-    for arrival in recording:
-        progress.show(arrival.seconds)
-        with_ticket = sink.expect(arrival)
+    for item in recording:
+        progress.show(item.seconds)
+        with_ticket = sink.expect(item)
         with clock('registrar'):
-            ready = _registered(with_ticket, registrar)
+            ready = register(registrar, with_ticket.moved, with_ticket.restarts)
         sink.take(ready)
     with clock('registrar'):
         ready = registrar.flush()
     sink.take(ready)
-
-
-def _registered(arrival: Arrival, registrar: BoxRegistrar) -> list[RefinedBoxes]:
-    """Add a cloud or boxes to the registrar; after a time jump it starts again."""
-    ready: list[RefinedBoxes] = []
-    if arrival.begins_anew:
-        ready = registrar.flush()
-        registrar.reset()
-    if isinstance(arrival.moved, Sweep):
-        ready += registrar.add_sweep(arrival.moved)
-    elif arrival.moved is not None:
-        ready += registrar.add_boxes(arrival.moved)
-    return ready
 
 
 def _report(
@@ -150,14 +142,14 @@ def _report(
 def _items(request: Request, progress: _Progress) -> Iterator[Sweep | BoxArray]:
     """Read the recording a second time; yield its clouds and boxes in the fixed frame."""
     with reader(request) as process:
-        for arrival in Coming(process):
-            progress.show(arrival.seconds, passes_done=1)
-            if arrival.moved is not None:
-                yield arrival.moved
+        for item in ReadAhead(process):
+            progress.show(item.seconds, passes_done=1)
+            if item.moved is not None:
+                yield item.moved
 
 
 def _summary(
-    request: Request, recording: Coming, registered: Counter[str], sink: Sink
+    request: Request, recording: ReadAhead, registered: Counter[str], sink: Sink
 ) -> dict[str, Any]:
     """Return the content of summary.json, without the fingerprint and the times."""
     if sink.missing():
