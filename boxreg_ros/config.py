@@ -21,6 +21,13 @@ import yaml
 
 _T = TypeVar('_T')
 
+NODE_OPTIONS = (
+    *('boxes_type', 'pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
+    *('output_frame', 'transform_timeout', 'backlog', 'config_file'),
+    *('use_sim_time', 'start_type_description_service', 'qos_overrides'),
+)
+"""Parameters of the node that parameter files of ROS may hold beside those of `Config`."""
+
 
 class Setting(NamedTuple):
     """One tunable as the outside sees it; `name` is dotted, as in ``solver.rounds``."""
@@ -159,6 +166,11 @@ class Config:
         """Check type and bounds of every value."""
         for item, value in self.items():
             _check(item, _cast(item.name, value, item.default))
+        if self.lag >= self.window:
+            raise ConfigError(
+                f'lag: expected less than window ({self.window}), got {self.lag}: a final box '
+                f'waits within its window; lower lag or raise window'
+            )
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
         """Yield every setting with its present value, groups flattened to dotted names."""
@@ -205,6 +217,8 @@ class Config:
         """
         Read a YAML file: plain, or as ROS writes it (``/**: ros__parameters: ...``, the first).
 
+        Of a parameter file of ROS the `NODE_OPTIONS` are ignored.
+
         Raises
         ------
         ConfigError
@@ -217,6 +231,12 @@ class Config:
                 inner = next(iter(values.values()), None)
                 if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
                     values = inner['ros__parameters']
+                    if isinstance(values, dict):
+                        values = {
+                            key: value
+                            for key, value in values.items()
+                            if str(key).partition('.')[0] not in NODE_OPTIONS
+                        }
             return cls.from_dict(values)
         except (OSError, UnicodeDecodeError, yaml.YAMLError, ConfigError) as error:
             reason = ' '.join(str(error).split())

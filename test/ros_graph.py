@@ -10,7 +10,7 @@ import sys
 import time
 from typing import NamedTuple
 
-from boxreg_ros.live.node import import_message
+from boxreg_ros.live.topics import import_message
 from paths import ROOT
 import rclpy
 from rclpy.executors import SingleThreadedExecutor

@@ -106,11 +106,10 @@ def test_early_estimates_come_at_once(stream, estimate):
     assert all(r.is_final for r in registrar.flush())
 
 
-@pytest.mark.parametrize('lag', [0, 1, 3, 5, 9])
+@pytest.mark.parametrize('lag', [0, 1, 3, 5])
 @pytest.mark.parametrize('estimate', ['early', 'final'])
 def test_finals_come_lag_ticks_later(stream, estimate, lag):
     registrar = BoxRegistrar(setup(estimate, lag=lag))
-    lag = min(lag, 5)  # by then it is the oldest of its window of 6, which says no more of it
     order = [boxes.stamp_ns for _, boxes in stream]
     for tick, (sweep, boxes) in enumerate(stream):
         ready = finals(registrar.add_sweep(sweep) + registrar.add_boxes(boxes))

@@ -9,7 +9,7 @@ import sys
 
 from boxreg_ros.bench.node import vitals
 from boxreg_ros.config import Config
-from boxreg_ros.live.node import import_message
+from boxreg_ros.live.topics import import_message
 from msg_adapters import vision
 import numpy as np
 import pytest
@@ -55,14 +55,15 @@ def test_wishes_at_run_time(graph, tmp_path):
     graph.publisher(POINTS, '/points', is_reliable=False)
     graph.publisher(DETECTIONS, '/boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    node = graph.start(*RELIABLE, '-p', f'config_file:={file}', '-p', 'window:=8')
+    node = graph.start(*RELIABLE, '-p', f'config_file:={file}', '-p', 'window:=8', '-p', 'lag:=7')
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     graph.node.create_subscription(
         import_message(DETECTIONS), '/refined_boxes_final', print, latched
     )
     graph.wait(lambda: values_of(diagnostics).get('qos_incompatible') == '2', 'both complaints')
     output = node.output()
-    assert '/points: a publisher whose RELIABILITY' in output
+    assert '/points: the publisher of /neighbour offers reliability best_effort' in output
+    assert 'requests durability transient_local, the publisher of this node' in output
     assert 'qos_overrides' in output
 
     def set_to(**values):
@@ -83,7 +84,7 @@ def test_wishes_at_run_time(graph, tmp_path):
         assert all(word in result.reason for word in words), result.reason
     answer = asked(graph, Trigger, 'save_config', Trigger.Request())
     assert (answer.success, answer.message) == (True, str(file))
-    expected = {'solver.rounds': 2, 'vehicle.names': ['ute'], 'window': 8}
+    expected = {'solver.rounds': 2, 'vehicle.names': ['ute'], 'window': 8, 'lag': 7}
     assert Config.from_yaml(file) == Config().updated(expected)
     assert 'transform_timeout: 0.5' in file.read_text()
     assert asked(graph, Trigger, 'reset', Trigger.Request()).success

@@ -10,7 +10,7 @@ import time
 from boxreg_ros.config import Config, settings
 from boxreg_ros.io.markers import MarkerBoard, NAMESPACES
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.live.node import import_message
+from boxreg_ros.live.topics import import_message
 from boxreg_ros.offline.calibrate import calibrated, GAPS, Measured, write_settings
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -153,7 +153,7 @@ def test_transforms_come_by_tf2_ros_where_it_is_installed(graph, tmp_path, packa
     assert (values['fixed_frame'], values.get('no_transform')) == ('odom', None)
     assert int(values['refined']) > 0
     assert ended_cleanly(node)
-    assert ('transforms come by tf2_ros' in node.output()) == (package == 'tf2_ros')
+    assert ('transforms are received by tf2_ros' in node.output()) == (package == 'tf2_ros')
 
 
 def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path):
@@ -246,8 +246,8 @@ def test_of_several_types_the_one_that_can_be_read_is_taken(graph, tmp_path):
 def test_boxes_of_another_type_than_before_are_told(graph):
     graph.publisher(MARKERS, '/boxes')
     node = graph.start('-p', f'boxes_type:={DETECTIONS}')
-    graph.wait(lambda: 'start the node anew' in node.output(), 'a warning')
-    assert f'expected boxes of type {DETECTIONS}, got {MARKERS}' in node.output()
+    graph.wait(lambda: 'restart the node' in node.output(), 'an error')
+    assert f'expected messages of type {DETECTIONS}, got {MARKERS}' in node.output()
     assert ended_cleanly(node)
 
 
@@ -402,7 +402,7 @@ def test_a_calibrated_rule_is_taken_as_parameters(graph, tmp_path):
     """What `boxreg calibrate` writes, of every type there is, reaches the running node."""
     changes = {
         'max_gap': 2, 'window': 8, 'solver.tolerance': 1e-5, 'sampling.deskew': True,
-        'mode': 'bev', 'vehicle.names': ['ute'],
+        'mode': 'bev', 'vehicle.names': ['ute'], 'lag': 7,
     }  # fmt: skip
     gap = Measured(value=0.25, spread=0.01, tracks=9)
     measured = {f'cyclist.{name}': gap for name in GAPS} | {'cyclist.position': gap}
@@ -507,7 +507,7 @@ def test_markers_stay_with_their_track():
 
 
 def test_health_tells_the_worst_of_the_last_period():
-    health = Health()
+    health = Health(get_logger('health'))
     health.count('points_received')
     health.count('boxes_received')
     health.add_latency(0.05)
@@ -523,7 +523,7 @@ def test_health_tells_the_worst_of_the_last_period():
     assert status.level == DiagnosticStatus.ERROR
     assert status.message == 'no box was refined; nothing received on points'
     health.count('points_received')
-    health.set_counts({'no_sweep': 3, 'refined': 5})
+    health.set_core_counts({'no_sweep': 3, 'refined': 5})
     status = health.status('node', {})
     assert status.level == DiagnosticStatus.WARN
     assert status.message.startswith('no_sweep') and 'stamp' in status.message
@@ -538,10 +538,10 @@ def test_health_tells_the_worst_of_the_last_period():
     health.count('late')
     assert not list(health.complaints())  # at a limited rate
     health.count('unreadable')
-    assert health.is_time_to_warn('unreadable') and not health.is_time_to_warn('unreadable')
+    assert health.is_due('unreadable') and not health.is_due('unreadable')
     health._warned.clear()  # as if the period were over
     assert [line.split()[0] for line in health.complaints()] == ['late']  # told, not told again
-    assert health.is_time_to_warn('invalid_box')
+    assert health.is_due('invalid_box')
     health.status('node', {})
     for name in ('points_received', 'boxes_received', 'no_points', 'no_gain', 'no_gain'):
         health.count(name)
