@@ -55,7 +55,8 @@ def test_each_qos_mismatch_is_reported_with_topic_policy_and_side(graph):
         ('/points: the publisher of /neighbour offers reliability best_effort',
          'requests reliable', 'qos_overrides./points.subscription.reliability to best_effort'),
         ('/refined_boxes_final: the subscription of /neighbour requests durability',
-         'transient_local', 'offers volatile', 'qos_overrides./refined_boxes_final.publisher.durability'),
+         'transient_local', 'offers volatile',
+         'qos_overrides./refined_boxes_final.publisher.durability'),
         ('/refined_markers: the subscription of /neighbour requests durability transient_local',
          'qos_overrides./refined_markers.publisher.durability to transient_local'),
     ):  # fmt: skip
