@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from threading import Event
@@ -14,6 +15,7 @@ from boxreg_ros.io.session import says_nothing
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import Arrival, LiveRegistrar, Outgoing
 from boxreg_ros.live.inbox import Inbox, Message
+from boxreg_ros.live.time_jumps import JumpConfirmation
 from boxreg_ros.reasons import REASONS
 from msg_adapters import Adapter, pointcloud
 from msg_adapters.poses import stamp_ns
@@ -97,6 +99,8 @@ class Worker:
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         self._stopping = Event()
+        self._jumps = JumpConfirmation()
+        self._confirmed: deque[Arrival] = deque()
 
     def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
         """Set what reads and writes boxes; to be called before boxes are subscribed to."""
@@ -152,17 +156,41 @@ class Worker:
             self._inbox.put_event('lost', stamp_ns(message.content.header))
 
     def _next(self) -> Arrival | None:
-        """Return the next message decoded, or None if there is none or it was passed through."""
+        """Return the next message decoded, or None if there is none to process now."""
+        if self._jumps.is_overdue(time.monotonic()):
+            late = self._jumps.release()
+            assert late is not None  # it is overdue
+            self._confirmed.append(late)
+        if not self._confirmed:
+            self._take_message()
+        return self._confirmed.popleft() if self._confirmed else None
+
+    def _take_message(self) -> None:
+        """Take the next message from the inbox and decode it, unless it passes through."""
         message = self._inbox.take()
         if message is None:
-            return None
+            return
         if message.topic == 'passing':
             self._publish(self._live.last(message.content))
-            return None
-        if self._is_overdue(message):
+        elif self._is_overdue(message):
             self.drop(message)
-            return None
-        return self._decoded(message)
+        else:
+            item = self._decoded(message)
+            if item is not None:
+                self._confirm_order(item)
+
+    def _confirm_order(self, item: Arrival) -> None:
+        """Queue an arrival for processing; after a time jump tracks and transforms start anew."""
+        if says_nothing(item.content):
+            self._confirmed.append(item)
+            return
+        items, has_jumped = self._jumps.add(item)
+        if has_jumped:
+            stamp_ns = items[0].content.stamp_ns
+            self._health.report('time_jump', f'stamps went back to {stamp_ns} ns')
+            self._publish(self._guarded(self._live.reset))
+            self._live.tree.rewind(stamp_ns)
+        self._confirmed.extend(items)
 
     def _is_overdue(self, message: Message) -> bool:
         """Return whether a message has waited too long for the solver."""
@@ -190,14 +218,15 @@ class Worker:
 
     def _pause(self) -> None:
         """Wait for messages, and release what is held if none arrive for long."""
-        if any(self._inbox.sizes().values()):
+        if self._confirmed or any(self._inbox.sizes().values()):
             return
         now = time.monotonic()
         if self._live.is_silent(now):
             self._publish(self._guarded(self._live.flush))
         if self._board.is_showing and self._live.has_ceased(now):
             self._markers.publish(self._board.clear())
-        self._inbox.wake_up.wait(HELD_PERIOD if self._live.is_holding else IDLE_PERIOD)
+        is_holding = self._live.is_holding or self._jumps.is_holding
+        self._inbox.wake_up.wait(HELD_PERIOD if is_holding else IDLE_PERIOD)
         self._idle_at = time.monotonic()
         self._waited = 0.0
 
@@ -266,8 +295,9 @@ class Worker:
         """Publish what is held, and pass what still waits through without solving it."""
         self._take_events()
         self._publish(self._guarded(self._live.flush))
-        if item is not None and not isinstance(item.message, PointCloud2):
-            self._publish(self._live.passed_through(item.message))
+        for waiting in (item, *self._confirmed, self._jumps.release()):
+            if waiting is not None and not isinstance(waiting.message, PointCloud2):
+                self._publish(self._live.passed_through(waiting.message))
         message = self._inbox.take()
         while message is not None:
             if message.topic == 'boxes':
