@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from boxreg_ros.io.transforms import BACK
 from boxreg_ros.live.driver import Arrival
 from boxreg_ros.structures import BoxArray, Sweep
 
-TIME_JUMP = 1.0
-"""A stamp this far before the newest of its kind may follow a time jump [s]."""
 CONFIRMATION_TIME = 0.5
 """A message waits this long for the one that confirms a time jump [s]: five sweeps at 10 Hz."""
 
@@ -66,7 +65,7 @@ class JumpConfirmation:
         newest_ns = self._newest_ns.get(type(item.content))
         if newest_ns is None:
             return False
-        return item.content.stamp_ns < newest_ns - round(TIME_JUMP * 1e9)
+        return item.content.stamp_ns < newest_ns - round(BACK * 1e9)
 
     def _note(self, item: Arrival) -> None:
         kind = type(item.content)

@@ -8,11 +8,12 @@ from boxreg_ros.bench.node import PROFILE
 from boxreg_ros.config import Config
 from boxreg_ros.io.markers import NAMESPACES
 from boxreg_ros.live.params import declare, NODE_SETTINGS, parameters_yaml
-from paths import SHARE
+from paths import ROOT, SHARE
 import pytest
 import rclpy
 import yaml
 
+PAGE = ROOT / 'docs' / 'tasks' / 'run-on-a-robot.md'
 PARAMETERS = SHARE / 'params.yaml'
 NODE = (SHARE.parent / 'live' / 'node.py').read_text(encoding='utf-8')
 
@@ -57,6 +58,13 @@ def test_launch_file_starts_the_node_with_its_arguments():
     assert set(re.findall(r'\$\(var (\w+)\)', text)) == set(arguments)
     for file in re.findall(r'find-pkg-share boxreg_ros\)/([\w.]+)', text):
         assert (SHARE / file).is_file()
+
+
+def test_page_names_every_launch_argument():
+    launch = ElementTree.parse(SHARE / 'boxreg.launch.xml').getroot()
+    table = PAGE.read_text(encoding='utf-8').split('## Launch arguments')[1].split('\n## ')[0]
+    named = set(re.findall(r'`(\w+)`', '\n'.join(re.findall(r'^\|([^|]+)\|', table, re.M))))
+    assert named == {item.get('name') for item in launch.iter('arg')}
 
 
 @pytest.mark.parametrize('file', ['boxreg.rviz', 'foxglove.json'])
