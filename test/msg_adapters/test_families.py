@@ -342,7 +342,7 @@ def test_rclpy_rosbags_and_mcap_read_and_write_the_same(type_name):
 
 def test_missing_message_package_is_named(monkeypatch):
     pytest.importorskip('rclpy', reason='rclpy is not installed')
-    from boxreg_ros.live.node import import_message
+    from boxreg_ros.live.topics import import_message
 
     for type_name in ADAPTERS:
         package = type_name.split('/')[0]
