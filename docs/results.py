@@ -32,7 +32,7 @@ INTRODUCTION = """\
 # Results
 
 `docs/results.py` makes this page from the files in `docs/results/`. Each file is the output of the
-command above its table. No figure is written by hand.
+command above its table. No figure in a table is written by hand.
 
 Accuracy is measured against true boxes of vehicles with at least 100 points:
 

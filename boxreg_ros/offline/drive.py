@@ -15,7 +15,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import sweep_to_frame, to_fixed_frame, TransformTree
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.simulation.simulate import Scene
+from boxreg_ros.simulation.scene import Scene
 from boxreg_ros.structures import (
     BoxArray,
     Floats,
