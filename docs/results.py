@@ -109,6 +109,11 @@ def _number(value: float | None, digits: int = 3) -> str:
     return '-' if value is None else f'{value:.{digits}f}'
 
 
+def _signed(value: float, digits: int) -> str:
+    """Return a number with its sign, and zero without a minus."""
+    return f'{round(value, digits) + 0.0:+.{digits}f}'
+
+
 def _accuracy(results: Any) -> Iterable[str]:
     """Yield the table of scores of each recording, and 3D IoU by range and number of points."""
     for methods in results.values():
@@ -163,7 +168,7 @@ def _ablation(results: Any) -> Iterable[str]:
         for name, row in [whole, *ranked]:
             values = [row['iou_bev'], row['iou_3d'], row['recall_3d'][-1]]
             wholes = [best['iou_bev'], best['iou_3d'], best['recall_3d'][-1]]
-            losses = [f'{a - b + 0.0:+.3f}' for a, b in zip(wholes, values, strict=True)]
+            losses = [_signed(a - b, 3) for a, b in zip(wholes, values, strict=True)]
             rows.append([name, *map(_number, values), *losses])
         yield _table(header, rows)
 
@@ -185,7 +190,7 @@ def _sensitivity(results: Any) -> Iterable[str]:
         size = max(abs(loss['bev']), abs(loss['volume']))
         largest[name] = max(largest.get(name, 0.0), size)
         if size >= SHOWN_LOSS:
-            rows.append([*start, f'{loss["bev"]:+.4f}', f'{loss["volume"]:+.4f}'])
+            rows.append([*start, _signed(loss['bev'], 4), _signed(loss['volume'], 4)])
     yield _table(['setting or constant', 'factor', 'value', 'BEV loss', '3D loss'], rows)
     without = sorted(name for name, size in largest.items() if size < SHOWN_LOSS)
     yield f'Less than {SHOWN_LOSS} either way: {", ".join(without)}.'
