@@ -19,9 +19,9 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.session import Intake
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
 from boxreg_ros.offline.labelled_recording import label_frame_of, LabelledRecording, pose_of
-from boxreg_ros.offline.peer import beside, Peer
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.worker_process import run_in_worker, WorkerProcess
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 
 
@@ -213,9 +213,9 @@ class Arrivals:
         return pose_of(self._tree, self.source.fixed_frame, frame, stamp_ns)
 
 
-def reader(request: Request) -> AbstractContextManager[Peer]:
+def reader(request: Request) -> AbstractContextManager[WorkerProcess]:
     """Return, for a block, the process that reads a recording for `Coming`."""
-    return beside(partial(_read, request), 'reads the recording')
+    return run_in_worker(partial(_read, request), 'reads the recording')
 
 
 class Coming:
@@ -224,7 +224,7 @@ class Coming:
 
     Parameters
     ----------
-    peer : Peer
+    peer : WorkerProcess
         The process, from `reader`.
 
     Attributes
@@ -236,7 +236,7 @@ class Coming:
 
     """
 
-    def __init__(self, peer: Peer) -> None:
+    def __init__(self, peer: WorkerProcess) -> None:
         self._peer = peer
         self.source: Source = peer.receive()
         self.findings: Findings
