@@ -461,7 +461,8 @@ class Recording:
             end = 'the end' if self._end is None else f'{self._end:g}'
             raise RecordingError(
                 f'start and end: expected a part of the {(last_ns - begin_ns) * 1e-9:.1f} s of '
-                f'{self}, got {self._start or 0:g} to {end}'
+                f'{self}, got {self._start or 0:g} to {end}; '
+                f'choose a smaller --start, or leave it out'
             )
 
     def _topic(self, role: str, what: str, types: tuple[str, ...]) -> str:

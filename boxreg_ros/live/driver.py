@@ -230,7 +230,7 @@ class LiveRegistrar:
 
     def lose(self, stamp_ns: int) -> list[Outgoing]:
         """Release the boxes that wait for a cloud that was dropped."""
-        sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_lost=True)
+        sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_dropped=True)
         return self._outgoing(self._registrar.add_sweep(sweep))
 
     def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -123,23 +122,3 @@ def label_frame_of(
             f'{fixed_frame!r}; TF: {tree}'
         )
     return frame
-
-
-def add_label_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that label formats need, whoever writes them."""
-    parser.add_argument(
-        '--camera', type=Path, metavar='FILE',
-        help='calibration, for formats that look through a camera',
-    )  # fmt: skip
-    parser.add_argument(
-        '--swap-axes', action='store_true',
-        help='extents where Datumaro and CVAT look for them',
-    )  # fmt: skip
-    parser.add_argument(
-        '--with-points', action='store_true',
-        help='write the clouds that the label formats need beside their labels',
-    )  # fmt: skip
-    parser.add_argument(
-        '--label-frame', metavar='FRAME',
-        help='frame that stands for the sensor in label files (default: that of the clouds)',
-    )  # fmt: skip

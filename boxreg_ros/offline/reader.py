@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 from boxreg_ros.io.recording import Item, ItemSource
 from boxreg_ros.io.session import Admitted, Session
 from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
-from boxreg_ros.offline.peer import beside, Peer
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.worker_process import run_in_worker, WorkerProcess
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 
 
@@ -212,9 +212,9 @@ class RecordingReader:
         )  # fmt: skip
 
 
-def reader(request: Request) -> AbstractContextManager[Peer]:
+def reader(request: Request) -> AbstractContextManager[WorkerProcess]:
     """Return, for a block, the process that reads a recording for `ReadAhead`."""
-    return beside(partial(_read, request), 'reads the recording')
+    return run_in_worker(partial(_read, request), 'reads the recording')
 
 
 class ReadAhead:
@@ -223,8 +223,8 @@ class ReadAhead:
 
     Parameters
     ----------
-    peer : Peer
-        The process, from `reader`.
+    process : WorkerProcess
+        From `reader`.
 
     Attributes
     ----------
@@ -235,15 +235,15 @@ class ReadAhead:
 
     """
 
-    def __init__(self, peer: Peer) -> None:
-        self._peer = peer
-        self.source: Source = peer.receive()
+    def __init__(self, process: WorkerProcess) -> None:
+        self._process = process
+        self.source: Source = process.receive()
         self.findings: Findings
 
     def __iter__(self) -> Iterator[ReadItem]:
         """Yield clouds and boxes; an error of the process is raised at its place."""
         while True:
-            received = self._peer.receive()
+            received = self._process.receive()
             if isinstance(received, Findings):
                 self.findings = received
                 return
