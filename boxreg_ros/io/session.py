@@ -1,25 +1,28 @@
 """
 The way of sweeps and boxes to the registrar, the same for the live node and for recordings.
 
-A `Session` brings each item into the fixed frame, assigns ids where they are asked for, detects
-time jumps and checks the poses of the boxes. `register` hands the result to the registrar. The
-live node adds waiting for transforms and publishing; `boxreg relabel` adds reading and writing.
+`JumpConfirmation` detects time jumps, a `Session` brings each item into the fixed frame, assigns
+ids where they are asked for and checks the poses of the boxes, and `register` hands the result to
+the registrar. The live node adds waiting for transforms and publishing; `boxreg relabel` adds
+reading and writing.
 
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.id_assignment import Tracker
 from boxreg_ros.io.pose_check import PoseCheck
-from boxreg_ros.io.transforms import move_to_frame, TimeJumpDetector, TransformTree
+from boxreg_ros.io.transforms import move_to_frame, TIME_JUMP, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
+
+_T = TypeVar('_T')
 
 
 class Admitted(NamedTuple):
@@ -32,8 +35,6 @@ class Admitted(NamedTuple):
         The item in the fixed frame, boxes with their ids; None where no transform is known.
     T_fixed_item : array, shape (4, 4), or None
         Maps the frame of the item to the fixed frame.
-    restarts : bool
-        True if time went back before this item: tracks end and new ones begin.
     reason : str
         ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; else empty.
     detail : str
@@ -43,17 +44,73 @@ class Admitted(NamedTuple):
 
     moved: Sweep | BoxArray | None
     T_fixed_item: Floats | None
-    restarts: bool
     reason: str = ''
     detail: str = ''
+
+
+class JumpConfirmation(Generic[_T]):
+    """
+    Detect that time goes back: a recording in a loop, a simulation that is reset.
+
+    Two old stamps in a row, of sweeps or boxes, are a time jump; a single one is a late item. So
+    an item with an old stamp is held until the next one, and the first items after a jump are
+    not late.
+
+    """
+
+    def __init__(self) -> None:
+        self._newest_ns: dict[type[Sweep | BoxArray], int] = {}
+        self._held: tuple[_T, Sweep | BoxArray] | None = None
+
+    def add(self, item: _T, content: Sweep | BoxArray) -> tuple[list[_T], bool]:
+        """
+        Return the items to process now, in order, and whether time went back before them.
+
+        Parameters
+        ----------
+        item : object
+            The next one; anything that the caller wants back.
+        content : Sweep or BoxArray
+            Its content, with a stamp.
+
+        """
+        held = self._held
+        self._held = None
+        is_old = self._is_old(content)
+        if is_old and held is None:
+            self._held = item, content
+            return [], False
+        if is_old and held is not None:
+            self._newest_ns.clear()
+            self._note(held[1])
+        self._note(content)
+        return ([item] if held is None else [held[0], item]), is_old
+
+    def release(self) -> list[_T]:
+        """Return the item that is held, if any: no other confirms a jump, so it is late."""
+        held = self._held
+        self._held = None
+        return [] if held is None else [held[0]]
+
+    @property
+    def held(self) -> _T | None:
+        """Return the item that is held; None if there is none."""
+        return None if self._held is None else self._held[0]
+
+    def _is_old(self, content: Sweep | BoxArray) -> bool:
+        newest_ns = self._newest_ns.get(type(content), content.stamp_ns)
+        return content.stamp_ns < newest_ns - round(TIME_JUMP * 1e9)
+
+    def _note(self, content: Sweep | BoxArray) -> None:
+        newest_ns = self._newest_ns.get(type(content), content.stamp_ns)
+        self._newest_ns[type(content)] = max(newest_ns, content.stamp_ns)
 
 
 class Session:
     """
     Prepare sweeps and boxes for the registrar.
 
-    State: the transforms, the newest stamps, the tracks of id assignment, and the pose check.
-    Not thread-safe.
+    State: the transforms, the tracks of id assignment, and the pose check. Not thread-safe.
 
     Parameters
     ----------
@@ -64,10 +121,6 @@ class Session:
         `max_gap` and `tolerance` are used.
     fixed_frame : str
         Frame to refine in; empty to choose it with `require_fixed_frame`.
-    reads_ahead : bool
-        True if the tree receives transforms before the items that need them are admitted, as
-        from a recording. The tree has then detected a time jump itself, and holds transforms
-        after the jump that must stay.
 
     Attributes
     ----------
@@ -85,15 +138,12 @@ class Session:
         convention: Convention,
         config: Config,
         fixed_frame: str = '',
-        *,
-        reads_ahead: bool = False,
     ) -> None:
         self.tree = TransformTree()
         self.fixed_frame = fixed_frame.lstrip('/')
         self.sensor_frame = ''
         self._convention = convention
         self._config = config
-        self._reads_ahead = reads_ahead
         self._tracker = Tracker(config.max_gap) if convention.associate else None
         self.restart()
 
@@ -110,14 +160,13 @@ class Session:
 
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
-        self._jumps = {Sweep: TimeJumpDetector(), BoxArray: TimeJumpDetector()}
         self._pose_check = PoseCheck(self._convention, self._config.tolerance)
         if self._tracker is not None:
             self._tracker.forget()
 
     def admit(self, item: Sweep | BoxArray) -> Admitted:
         """
-        Return a sweep or boxes in the fixed frame, with ids, and whether time went back.
+        Return a sweep or boxes in the fixed frame, with ids.
 
         Parameters
         ----------
@@ -126,12 +175,7 @@ class Session:
 
         """
         if is_placeholder(item):
-            return Admitted(None, None, False)
-        restarts = self._jumps[type(item)].has_jumped(item.stamp_ns)
-        if restarts:
-            self.restart()
-            if not self._reads_ahead:
-                self.tree.rewind(item.stamp_ns)
+            return Admitted(None, None)
         try:
             T_fixed_item = self.tree.lookup(
                 self.require_fixed_frame(item), item.frame_id, item.stamp_ns
@@ -139,12 +183,12 @@ class Session:
         except TransformUnavailable as error:
             is_sweep = isinstance(item, Sweep)
             reason = 'sweep_without_transform' if is_sweep else 'no_transform'
-            return Admitted(None, None, restarts, reason, str(error))
+            return Admitted(None, None, reason, str(error))
         moved = move_to_frame(item, T_fixed_item, self.fixed_frame)
         self._pose_check.add(moved)
         if self._tracker is not None and isinstance(moved, BoxArray):
             moved = self._tracker.identify(moved)
-        return Admitted(moved, T_fixed_item, restarts)
+        return Admitted(moved, T_fixed_item)
 
     def require_fixed_frame(self, item: Sweep | BoxArray) -> str:
         """
@@ -197,8 +241,10 @@ def register(
     ----------
     registrar : BoxRegistrar
         If time went back, its tracks are flushed and it is reset before the item is added.
-    moved, restarts
+    moved : Sweep or BoxArray, or None
         As of `Admitted`; a caller may have put a ticket on the boxes.
+    restarts : bool
+        Whether time went back before it.
 
     Returns
     -------

@@ -246,12 +246,14 @@ class _Edge:
         self._poses: list[Floats] = []
         self._jump_detector = TimeJumpDetector()
         self._was_forgotten = False
+        self._last_added: tuple[int, Floats] | None = None
 
     def add(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
         """Add x y z qx qy qz qw; a second one of the same stamp replaces the first."""
         values = np.array(pose, dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[3:]):
             return  # no pose; the error of a lookup has the stamps that are known
+        self._last_added = stamp_ns, values
         if self._jump_detector.has_jumped(stamp_ns):
             self._forget()
             self._was_forgotten = True
@@ -266,10 +268,15 @@ class _Edge:
         del self.stamps[:old], self._poses[:old]
 
     def rewind(self, stamp_ns: int) -> None:
-        if not self.is_static and self.stamps and self.stamps[-1] > stamp_ns + TIME_JUMP * 1e9:
-            self._forget()
-            self._was_forgotten = stamp_ns > 0  # 0: the recording is read again, no time jump
-            self._jump_detector = TimeJumpDetector()
+        newest_ns = stamp_ns + round(TIME_JUMP * 1e9)
+        if self.is_static or not self.stamps or self.stamps[-1] <= newest_ns:
+            return
+        self._forget()
+        self._was_forgotten = stamp_ns > 0  # 0: the recording is read again, no time jump
+        self._jump_detector = TimeJumpDetector()
+        last_added = self._last_added
+        if last_added is not None and last_added[0] <= newest_ns:
+            self.add(last_added[0], tuple(last_added[1]))  # it arrived after time went back
 
     def _forget(self) -> None:
         self.stamps.clear()

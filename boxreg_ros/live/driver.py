@@ -5,13 +5,20 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros import refine, Track
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.session import covariances_to_write, is_placeholder, register, Session
+from boxreg_ros.io.session import (
+    covariances_to_write,
+    is_placeholder,
+    JumpConfirmation,
+    register,
+    Session,
+)
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
@@ -19,6 +26,8 @@ from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.poses import turned_covariances
 import numpy as np
 
+CONFIRMATION_TIME = 0.5
+"""A message waits this long for the one that confirms a time jump [s]: five sweeps at 10 Hz."""
 SETTLING_TIME = 0.3
 """
 Time for collecting transforms before the fixed frame is chosen among them [s].
@@ -147,6 +156,7 @@ class LiveRegistrar:
         self._trouble = trouble
         self._session = Session(convention, config, fixed_frame)
         self._registrar = BoxRegistrar(config)
+        self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
         self._made: list[Outgoing] = []  # survives an error while further messages are made
         self._choose_at: float | None = None
@@ -191,6 +201,36 @@ class LiveRegistrar:
         """Return the origin of the ids, for reports."""
         return self._session.facts
 
+    def confirm(self, item: ReceivedMessage) -> tuple[list[ReceivedMessage], list[Outgoing]]:
+        """
+        Confirm the order of stamps before a message is processed.
+
+        Returns
+        -------
+        confirmed : list of ReceivedMessage
+            The messages to process next, in order: none while this one is held.
+        ready : list of Outgoing
+            Everything that was held where time went back: tracks and transforms start anew.
+
+        """
+        if is_placeholder(item.content):
+            return [item], []
+        confirmed, has_jumped = self._jumps.add(item, item.content)
+        if not has_jumped:
+            return confirmed, []
+        stamp_ns = confirmed[0].content.stamp_ns
+        self._trouble('time_jump', f'stamps went back to {stamp_ns} ns', 1)
+        ready = self.reset()
+        self.tree.rewind(stamp_ns)
+        return confirmed, ready
+
+    def release(self, now: float = inf) -> list[ReceivedMessage]:
+        """Return the message that no other has confirmed in time, if any: it is late."""
+        held = self._jumps.held
+        if held is None or now < held.received + CONFIRMATION_TIME:
+            return []
+        return self._jumps.release()
+
     def is_ready(self, item: ReceivedMessage, now: float) -> bool:
         """Return whether the transforms of a message have arrived or are not waited for."""
         content = item.content
@@ -215,15 +255,13 @@ class LiveRegistrar:
         if is_placeholder(content):
             return self.passed_through(item.message)
         admitted = self._session.admit(content)
-        if admitted.restarts:
-            self._trouble('time_jump', f'stamps went back to {content.stamp_ns} ns', 1)
         if admitted.reason:
             self._report_missing_transform(content, admitted.reason, admitted.detail)
         moved = admitted.moved
         if isinstance(moved, BoxArray):
             assert isinstance(content, BoxArray) and admitted.T_fixed_item is not None
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
-        ready = self._outgoing(register(self._registrar, moved, admitted.restarts))
+        ready = self._outgoing(register(self._registrar, moved, restarts=False))
         if moved is None and isinstance(content, BoxArray):
             ready += self.passed_through(item.message)
         return ready
@@ -252,12 +290,12 @@ class LiveRegistrar:
 
     @property
     def is_holding(self) -> bool:
-        """Return whether boxes wait for a cloud or for further observations."""
-        return bool(self._held)
+        """Return whether messages wait for a cloud, further observations or confirmation."""
+        return bool(self._held) or self._jumps.held is not None
 
     def is_silent(self, now: float) -> bool:
         """Return whether boxes are held and no further ones have arrived for long."""
-        return self.is_holding and self.has_ceased(now)
+        return bool(self._held) and self.has_ceased(now)
 
     def has_ceased(self, now: float) -> bool:
         """Return whether no boxes have arrived for long."""

@@ -15,7 +15,6 @@ from boxreg_ros.io.session import is_placeholder
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
 from boxreg_ros.live.inbox import Inbox, Message
-from boxreg_ros.live.time_jumps import JumpConfirmation
 from boxreg_ros.reasons import REASONS
 from msg_adapters import Adapter, pointcloud
 from msg_adapters.poses import stamp_ns
@@ -99,7 +98,6 @@ class Worker:
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         self._stopping = Event()
-        self._jumps = JumpConfirmation()
         self._confirmed: deque[ReceivedMessage] = deque()
 
     def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
@@ -157,10 +155,7 @@ class Worker:
 
     def _next(self) -> ReceivedMessage | None:
         """Return the next message decoded, or None if there is none to process now."""
-        if self._jumps.is_overdue(time.monotonic()):
-            late = self._jumps.release()
-            assert late is not None  # it is overdue
-            self._confirmed.append(late)
+        self._confirmed.extend(self._live.release(time.monotonic()))
         if not self._confirmed:
             self._take_message()
         return self._confirmed.popleft() if self._confirmed else None
@@ -177,20 +172,13 @@ class Worker:
         else:
             item = self._decoded(message)
             if item is not None:
-                self._confirm_order(item)
+                self._publish(self._guarded(partial(self._confirm, item)))
 
-    def _confirm_order(self, item: ReceivedMessage) -> None:
-        """Queue an arrival for processing; after a time jump tracks and transforms start anew."""
-        if is_placeholder(item.content):
-            self._confirmed.append(item)
-            return
-        items, has_jumped = self._jumps.add(item)
-        if has_jumped:
-            stamp_ns = items[0].content.stamp_ns
-            self._health.report('time_jump', f'stamps went back to {stamp_ns} ns')
-            self._publish(self._guarded(self._live.reset))
-            self._live.tree.rewind(stamp_ns)
-        self._confirmed.extend(items)
+    def _confirm(self, item: ReceivedMessage) -> list[Outgoing]:
+        """Queue a message for processing; return what a time jump before it releases."""
+        confirmed, ready = self._live.confirm(item)
+        self._confirmed.extend(confirmed)
+        return ready
 
     def _is_overdue(self, message: Message) -> bool:
         """Return whether a message has waited too long for the solver."""
@@ -225,7 +213,7 @@ class Worker:
             self._publish(self._guarded(self._live.flush))
         if self._board.is_showing and self._live.has_ceased(now):
             self._markers.publish(self._board.clear())
-        is_holding = self._live.is_holding or self._jumps.is_holding
+        is_holding = self._live.is_holding
         self._inbox.wake_up.wait(HELD_PERIOD if is_holding else IDLE_PERIOD)
         self._idle_at = time.monotonic()
         self._waited = 0.0
@@ -295,7 +283,7 @@ class Worker:
         """Publish what is held, and pass what still waits through without solving it."""
         self._take_events()
         self._publish(self._guarded(self._live.flush))
-        for waiting in (item, *self._confirmed, self._jumps.release()):
+        for waiting in (item, *self._confirmed, *self._live.release()):
             if waiting is not None and not isinstance(waiting.message, PointCloud2):
                 self._publish(self._live.passed_through(waiting.message))
         message = self._inbox.take()

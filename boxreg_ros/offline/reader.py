@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from boxreg_ros.io.recording import Item, ItemSource
-from boxreg_ros.io.session import Admitted, Session
+from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
 from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
@@ -133,7 +133,8 @@ class RecordingReader:
         self._clock = clock
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
-        self._session = Session(request.convention, request.config, reads_ahead=True)
+        self._session = Session(request.convention, request.config)
+        self._jumps = JumpConfirmation[Item]()
         tree = self._session.tree
         with clock('read'):
             fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
@@ -163,11 +164,17 @@ class RecordingReader:
             self._session.tree, with_intensities=self._with_points, stage=self._clock
         )
         for item in items:
-            with self._clock('transform'):
-                admitted = self._session.admit(item.content)
-                self._count(item.content, admitted)
-                read_item = self._read_item(item, admitted)
-            yield read_item
+            confirmed, restarts = [item], False
+            if not is_placeholder(item.content):
+                confirmed, restarts = self._jumps.add(item, item.content)
+            if restarts:
+                # The tree, which is ahead of the items, has detected the jump itself.
+                self._session.restart()
+                self._counts['time_jump'] += 1
+            for ready in confirmed:
+                yield self._read_item(ready, restarts and ready is confirmed[0])
+        for late in self._jumps.release():
+            yield self._read_item(late, restarts=False)
         self._recording.check_readable()
 
     def findings(self) -> Findings:
@@ -188,26 +195,31 @@ class RecordingReader:
     def _count(self, given: Sweep | BoxArray, admitted: Admitted) -> None:
         is_sweep = isinstance(given, Sweep)
         self._counts['sweeps' if is_sweep else 'box_arrays'] += 1
-        self._counts['time_jump'] += admitted.restarts
         if admitted.detail:
             self._counts['sweep_without_transform'] += is_sweep
             self._first_missing_transform = self._first_missing_transform or admitted.detail
 
-    def _read_item(self, item: Item, admitted: Admitted) -> ReadItem:
-        """Return an item for the registrar, without what nobody reads: it is copied."""
+    def _read_item(self, item: Item, restarts: bool) -> ReadItem:
+        """Return an item in the fixed frame, without what nobody reads: it is copied."""
+        with self._clock('transform'):
+            admitted = self._session.admit(item.content)
+            self._count(item.content, admitted)
+            return self._trimmed(item, admitted, restarts)
+
+    def _trimmed(self, item: Item, admitted: Admitted, restarts: bool) -> ReadItem:
         given = item.content
         moved = admitted.moved
         if isinstance(moved, Sweep) and not self._with_times:
             moved = replace(moved, times=None)
         seconds = (item.received_ns - self._recording.start_ns) * 1e-9
         if isinstance(given, Sweep) and not self._with_points:
-            return ReadItem(seconds, admitted.restarts, None, moved, None, None, None)
+            return ReadItem(seconds, restarts, None, moved, None, None, None)
         fixed_frame = self.source.fixed_frame
         T_fixed_sensor = pose_of(
             self._session.tree, fixed_frame, self.source.sensor_frame, given.stamp_ns
         )
         return ReadItem(
-            seconds, admitted.restarts, given, moved, admitted.T_fixed_item, T_fixed_sensor,
+            seconds, restarts, given, moved, admitted.T_fixed_item, T_fixed_sensor,
             item.intensities,
         )  # fmt: skip
 

@@ -5,8 +5,10 @@ from dataclasses import replace
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.session import is_placeholder, register, Session
+from boxreg_ros.io.session import is_placeholder, JumpConfirmation, register, Session
+from boxreg_ros.offline.reader import RecordingReader
+from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import adapter_for, pointcloud
 from msg_adapters.convention import Convention, STANDARD
@@ -49,7 +51,7 @@ def test_items_are_moved_into_the_fixed_frame_with_their_transform():
         T = session.tree.lookup('odom', 'lidar', item.stamp_ns)
         np.testing.assert_array_equal(admitted.T_fixed_item, T)
         assert admitted.moved.frame_id == 'odom'
-        assert (admitted.restarts, admitted.reason, admitted.detail) == (False, '', '')
+        assert (admitted.reason, admitted.detail) == ('', '')
         if isinstance(item, Sweep):
             np.testing.assert_allclose(admitted.moved.origin, T[:3, 3])
         else:
@@ -102,69 +104,83 @@ def test_a_restart_assigns_new_ids_and_max_gap_may_change():
     assert session.admit(later).moved.track_ids == ('3',)
 
 
-def test_time_jumps_are_detected_and_assign_new_ids():
-    session = Session(ASSOCIATE, Config(), 'map')
-    ids, jumps = [], []
-    # One old stamp is an outlier; two in a row are a time jump.
-    for seconds in (10.0, 10.1, 3.0, 10.2, 3.0, 3.1, 3.2):
-        admitted = session.admit(array_of(START + round(seconds * SECOND)))
-        jumps.append(admitted.restarts)
-        ids.append(admitted.moved.track_ids[0])
-    assert jumps == [False] * 5 + [True, False]
-    assert ids[5] == ids[6] not in ids[:5]
+def sweep_at(seconds):
+    return Sweep(round(seconds * SECOND), 'lidar', np.zeros((0, 3)))
 
 
-def test_an_array_without_boxes_stamp_and_frame_is_no_time_jump():
+def boxes_at(seconds):
+    return array_of(round(seconds * SECOND))
+
+
+@pytest.fixture
+def jumps():
+    """Return a confirmation that has seen a sweep and boxes at 100 s."""
+    jumps = JumpConfirmation()
+    for content in (sweep_at(100), boxes_at(100)):
+        assert jumps.add('item', content) == (['item'], False)
+    return jumps
+
+
+@pytest.mark.parametrize(
+    'kinds', [(sweep_at, boxes_at), (boxes_at, sweep_at), (sweep_at, sweep_at)]
+)
+def test_two_old_stamps_in_a_row_are_a_time_jump(jumps, kinds):
+    first, second = (make(5 + 0.1 * k) for k, make in enumerate(kinds))
+    assert jumps.add('first', first) == ([], False)
+    assert jumps.add('second', second) == (['first', 'second'], True)
+    for content in (sweep_at(5.2), boxes_at(5.2)):
+        assert jumps.add('next', content) == (['next'], False)
+
+
+def test_a_single_old_stamp_is_late_and_keeps_its_order(jumps):
+    assert jumps.add('late', boxes_at(5)) == ([], False)
+    assert jumps.held == 'late'
+    assert jumps.add('following', sweep_at(100.1)) == (['late', 'following'], False)
+    assert jumps.held is None
+
+
+def test_a_late_item_can_be_released_without_another(jumps):
+    jumps.add('late', boxes_at(5))
+    assert jumps.release() == ['late']
+    assert jumps.release() == []
+
+
+def test_stamps_less_than_a_second_old_are_not_held(jumps):
+    assert jumps.add('item', boxes_at(99.1)) == (['item'], False)
+
+
+def test_an_array_without_boxes_stamp_and_frame_is_a_placeholder():
     session = Session(ASSOCIATE, Config(), 'map')
-    session.admit(array_of(START))
     empty = np.zeros((0, 9))
     placeholder = BoxArray(0, '', (), (), np.zeros(0), empty)
     assert is_placeholder(placeholder)
     for _ in range(3):
-        assert session.admit(placeholder) == (None, None, False, '', '')
+        assert session.admit(placeholder) == (None, None, '', '')
     assert not is_placeholder(replace(placeholder, stamp_ns=START, frame_id='map'))
 
 
-@pytest.mark.parametrize('is_live', [True, False])
-def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path, is_live):
+def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path):
     """A finding about the boxes before the jump does not hold for those after it."""
     wrong, right = Drive(sweeps=12, start=START + 100 * SECOND), Drive(sweeps=12)
     for _, _, message in wrong.items:
         for detection in getattr(message, 'detections', []):
             detection.bbox.center.position.z -= detection.bbox.size.z / 2
-    items = [*wrong.items, *right.items]
-    if is_live:
-        findings = list(findings_live(Session(STANDARD, Config(), 'odom'), items))
-    else:
-        day = 86_400 * SECOND
-        shifted = [
-            (t, at + (k >= len(wrong.items)) * day, m) for k, (t, at, m) in enumerate(items)
-        ]
-        findings = list(findings_offline(write_recording(tmp_path / 'drive', shifted)))
+    day = 86_400 * SECOND
+    later = [(topic, at + day, message) for topic, at, message in right.items]
+    path = write_recording(tmp_path / 'drive', [*wrong.items, *later])
+    findings = list(findings_of(path))
     jumps = [k for k, (restarts, _) in enumerate(findings) if restarts]
     assert len(jumps) == 1
     assert 'pose_reference' in findings[jumps[0] - 1][1]
     assert not any(finding for _, finding in findings[jumps[0] :])
 
 
-def findings_live(session, items):
-    readers = {'/points': pointcloud, '/boxes': adapter_for(DETECTIONS)}
-    for topic, _, message in items:
-        if topic in readers:
-            admitted = session.admit(readers[topic].from_msg(message))
-            yield admitted.restarts, session.finding
-        else:
-            session.tree.add_transforms(message.transforms, topic == '/tf_static')
-
-
-def findings_offline(path):
-    session = Session(STANDARD, Config(), reads_ahead=True)
-    with Recording([path]) as recording:
-        session.fixed_frame = recording.choose_fixed_frame(session.tree)
-        for item in recording.items(session.tree):
-            admitted = session.admit(item.content)
-            assert admitted.moved is not None, admitted.detail
-            yield admitted.restarts, session.finding
+def findings_of(path):
+    request = Request((path,))
+    with request.recording() as recording:
+        reading = RecordingReader(recording, request, Stopwatch())
+        for item in reading:
+            yield item.restarts, reading.findings().warning
 
 
 def test_register_flushes_and_resets_at_a_time_jump():
