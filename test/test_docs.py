@@ -14,7 +14,7 @@ import yaml
 
 DOCS = ROOT / 'docs'
 README = ROOT / 'README.md'
-PAGES = [README, *sorted(DOCS.rglob('*.md'))]
+PAGES = [README, ROOT / 'CONTRIBUTING.md', *sorted(DOCS.rglob('*.md'))]
 
 
 def page_name(path):
