@@ -9,6 +9,7 @@ import re
 from boxreg_ros.config import settings
 from boxreg_ros.offline import formats
 from boxreg_ros.reasons import REASONS
+from msg_adapters import registry
 
 DOCS = Path(__file__).resolve().parent
 COMMAND = 'python docs/generate.py'
@@ -42,6 +43,11 @@ def label_formats() -> str:
     return table(formats.HEAD, formats.rows())
 
 
+def messages() -> str:
+    """Return one row for each message type with boxes."""
+    return table(registry.HEAD, registry.rows())
+
+
 def counters() -> str:
     """Return one row for each reason why a box or a cloud is not used."""
     rows = [(name, *reason) for name, reason in REASONS.items()]
@@ -51,6 +57,7 @@ def counters() -> str:
 TABLES = {
     'parameters.md': parameters,
     'formats.md': label_formats,
+    'messages.md': messages,
     'troubleshooting.md': counters,
 }
 """The table that each page holds between its two marks."""

@@ -115,7 +115,8 @@ def test_anchors_exist(path):
         assert link[1] in anchors_of(target), link
 
 
-@pytest.mark.parametrize('path', PAGES, ids=page_name)
+# Pages in tasks/ also name files that their readers write.
+@pytest.mark.parametrize('path', [p for p in PAGES if p.parent.name != 'tasks'], ids=page_name)
 def test_named_files_exist(path):
     text = path.read_text(encoding='utf-8')
     named = set(re.findall(r'`((?:boxreg_ros|msg_adapters|test|bags|docs)/[\w./-]+)`', text))
