@@ -81,12 +81,12 @@ def _each_alone(
 
 
 def _no_road(heights: Floats, owner: Ints, n: int) -> Floats:
-    """Stand in for `_road`: none is seen."""
+    """Stand in for `_flat_heights`: none is seen."""
     return np.full(n, np.nan)
 
 
 def _as_given(boxes: Floats, *_: NDArray[Any]) -> Floats:
-    """Stand in for `one_heading`: headings keep their signs."""
+    """Stand in for `resolve_headings`: headings keep their signs."""
     return np.unwrap(boxes[..., YAW])
 
 
@@ -131,7 +131,7 @@ INGREDIENTS = {
         replaced=((registration, 'free_variables', _without_bias),),
     ),
     'memory': Ingredient(
-        'live, what has left the window is forgotten', replaced=((window, 'FADING', 0.0),)
+        'live, what has left the window is forgotten', replaced=((window, 'PRIOR_DECAY', 0.0),)
     ),
     'extents of others': Ingredient(
         'extents are expected as the input has them', replaced=((calibration, 'SLOPES', 1e-9),)
@@ -140,7 +140,9 @@ INGREDIENTS = {
     'ownership': Ingredient(
         "a neighbour's points count too", replaced=((registrar, 'observe', _each_alone),)
     ),
-    'road': Ingredient('the bottom is seen nowhere', replaced=((sampling, '_road', _no_road),)),
+    'road': Ingredient(
+        'the bottom is seen nowhere', replaced=((sampling, '_flat_heights', _no_road),)
+    ),
     'smoothness': Ingredient(
         'any acceleration is as likely',
         _every_kind(
@@ -157,7 +159,7 @@ INGREDIENTS = {
     ),
     'parked': Ingredient('what is parked moves like the rest', _every_kind(drift=1.0)),
     'heading sign': Ingredient(
-        'turned headings stay', replaced=((window, 'one_heading', _as_given),)
+        'turned headings stay', replaced=((window, 'resolve_headings', _as_given),)
     ),
     'robust weights': Ingredient(
         'outliers have their full say',

@@ -17,9 +17,9 @@ from boxreg_ros.core.geometry import (
     face_distances,
     rotation_derivatives,
     rotation_from_rpy,
-    wrap_angle,
 )
 from boxreg_ros.core.lbfgs import select
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor

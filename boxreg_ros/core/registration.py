@@ -8,7 +8,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core import objective
 from boxreg_ros.core.face_support import in_box_axes, Rule, Support, support
-from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy, wrap_angle
+from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
 from boxreg_ros.core.input_model import (
     expect,
     Expected,
@@ -30,7 +30,8 @@ from boxreg_ros.core.objective import (
     Term,
 )
 from boxreg_ros.core.rigid_shape import agreement
-from boxreg_ros.core.window import batches, Memory, stack, Window
+from boxreg_ros.core.window import group_windows, MarginalisationPrior, stack_windows, Window
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, KEPT, POSE, REFINED, YAW
 import numpy as np
 import torch
@@ -63,7 +64,7 @@ class Estimate(NamedTuple):
     status: tuple[str, ...]
     reasons: tuple[str, ...]
     covariances: Floats
-    memory: Memory | None = None
+    memory: MarginalisationPrior | None = None
 
 
 class Solution(NamedTuple):
@@ -77,7 +78,8 @@ class Solution(NamedTuple):
     covariances : Tensor, shape (B, N, 6, 6)
         Of the poses: blocks of the inverse of the curvature.
     left : tuple of Tensor
-        What full windows leave to `Memory`, its base excepted; NaN where they are not full.
+        What full windows leave to `MarginalisationPrior`, its base excepted; NaN where they are
+        not full.
     told : Tensor, shape (B, 3, 3)
         What the points tell of the extents, see `InputNoise`.
 
@@ -109,11 +111,11 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
 
     """
     estimates: dict[int, Estimate] = {}
-    groups = batches(windows, config)
+    groups = group_windows(windows, config)
     for rows in groups:
         _learn(model, [windows[i] for i in rows], config)
     for rows in groups:
-        problem, base = stack(part := [windows[i] for i in rows], config)
+        problem, base = stack_windows(part := [windows[i] for i in rows], config)
         if config.objective == 'paper':
             solved = solve_paper(problem, config)
         else:
@@ -157,7 +159,7 @@ def _judged(
         found[b, i], spread[b, i] = windows[b].observations[i].box, np.eye(6)
     status, reasons = np.where(good, REFINED, KEPT).tolist(), why.tolist()
     for b, n in enumerate(len(window.observations) for window in windows):
-        memory = Memory(base[b], *(a[b] for a in arrays)) if lasts[b] else None
+        memory = MarginalisationPrior(base[b], *(a[b] for a in arrays)) if lasts[b] else None
         words = tuple(status[b][:n]), tuple(reasons[b][:n])
         estimates.append(Estimate(found[b, :n], *words, spread[b, :n], memory))
     return estimates
@@ -405,8 +407,8 @@ def _learn(model: InputModel, windows: Sequence[Window], config: Config) -> None
     The outermost points of a box given askew are its corners, which stand further out.
 
     """
-    if fresh := [window.fresh_part() for window in windows if window.fresh > 0]:
-        problem, rule = stack(fresh, config)[0].thinned(COARSE), model.rule()
+    if fresh := [window.learning_part() for window in windows if window.num_new > 0]:
+        problem, rule = stack_windows(fresh, config)[0].thinned(COARSE), model.rule()
         pose = torch.cat([problem.boxes[..., :3], problem.start[..., 6:]], -1)
         state = State(pose, expect(problem, rule).shared)
         sights = support(problem, state, config.faces.outermost, rule)

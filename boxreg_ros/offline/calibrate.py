@@ -21,7 +21,7 @@ from boxreg_ros.core.input_model import expect, InputModel, InputNoise, LEAST, s
 from boxreg_ros.core.input_model import KINDS as FACE_KINDS
 from boxreg_ros.core.objective import EXTENT, State
 from boxreg_ros.core.observation import Observation, observe
-from boxreg_ros.core.window import batches, stack, Window
+from boxreg_ros.core.window import group_windows, stack_windows, Window
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
@@ -153,8 +153,10 @@ def _errors_of_kind(
     tracks = [track for track in tracks if len(track) >= LEAST]
     if not tracks:
         return dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
-    problem, base = stack([_bare([row[:2] for row in track]) for track in tracks], config)
-    true, true_base = stack([_bare([row[::2] for row in track]) for track in tracks], config)
+    problem, base = stack_windows([_bare([row[:2] for row in track]) for track in tracks], config)
+    true, true_base = stack_windows(
+        [_bare([row[::2] for row in track]) for track in tracks], config
+    )
     problem = problem._replace(mask=problem.valid[..., None])  # the truth tells, not points
     pose = true.pose + torch.nn.functional.pad(torch.from_numpy(true_base - base), (0, 3))[:, None]
     # Headings against those of the truth, whichever of the two directions a track is given in.
@@ -325,9 +327,9 @@ def _true_windows(drive: Drive, config: Config) -> list[Window]:
 
 def _show(model: InputModel, windows: Sequence[Window], config: Config, rule: Rule) -> None:
     """Show true boxes to a model as `registration` shows it input boxes."""
-    for rows in batches(windows, config):
+    for rows in group_windows(windows, config):
         part = [windows[i] for i in rows]
-        problem, _ = stack(part, config)
+        problem, _ = stack_windows(part, config)
         state = State(problem.pose, expect(problem, rule).shared)
         sights = support(problem, state, config.faces.outermost, rule)
         model.learn_rule([w.track_id for w in part], sights, problem.valid, rule)

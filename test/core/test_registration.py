@@ -12,7 +12,7 @@ from boxreg_ros.core.lbfgs import minimize, Minimum, select
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.objective import State
 from boxreg_ros.core.registration import register, solve_paper, weigh
-from boxreg_ros.core.window import stack
+from boxreg_ros.core.window import stack_windows
 import numpy as np
 import pytest
 from scenes import drive, EXTENT, problem_of, returns, track_of, window_of
@@ -181,7 +181,7 @@ def test_what_was_seen_before_is_not_learnt_again():
     known = model.rule().gaps
     assert (known - InputModel(config.faces).rule().gaps).abs().max() > 1e-4
     again = [
-        w._replace(fresh=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
+        w._replace(num_new=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
     ]
     register(again, config, model)
     np.testing.assert_array_equal(model.rule().gaps, known)
@@ -510,7 +510,7 @@ def test_a_tick_judges_faces_by_what_was_found_or_is_held(judged_by, changes, he
     whole = window(drive(6), extent=0.05)
     start = given(whole)[:-1]
     start[:, 3:6] = found
-    register([whole._replace(fresh=1, start=start)], config, InputModel(config.faces))
+    register([whole._replace(num_new=1, start=start)], config, InputModel(config.faces))
     assert len(judged_by) == 2  # to learn from it, and the one round of a tick
     known = np.where(np.isin(np.arange(3), held), given(whole)[:, 3:6].mean(0), found)
     np.testing.assert_allclose(judged_by[1], known)
@@ -536,7 +536,7 @@ def test_full_windows_leave_what_they_know():
     memory, boxes = found[0].memory, found[0].boxes
     first = given(many[0])[0]
     np.testing.assert_array_equal(memory.base, first[:3])
-    np.testing.assert_array_equal(memory.seen, [*first[3:6], 1])
+    np.testing.assert_array_equal(memory.marginalised_extents, [*first[3:6], 1])
     left = boxes[1:3] - [*first[:3], *np.zeros(6)]
     np.testing.assert_allclose(memory.state[:12], left[:, objective.POSE].ravel(), atol=1e-9)
     np.testing.assert_allclose(memory.state[12:15], boxes[0, 3:6], atol=1e-9)
@@ -553,7 +553,7 @@ def slid(whole, count, turns=0.0, config=ALONE):
     for first in range(count):
         observations = whole.observations[first : first + 10]
         one = whole._replace(
-            observations=observations, fresh=10 - len(start), start=start, memory=memory
+            observations=observations, num_new=10 - len(start), start=start, prior=memory
         )
         estimates += register([one], config, InputModel(config.faces))
         memory, start = estimates[-1].memory, estimates[-1].boxes[1:]
@@ -570,10 +570,10 @@ def test_memory_goes_on_and_on():
     for i, estimate in enumerate(estimates):
         np.testing.assert_array_equal(estimate.memory.base, boxes[0, :3])
         known = [*boxes[: i + 1, 3:6].sum(0), i + 1]
-        np.testing.assert_allclose(estimate.memory.seen, known)
+        np.testing.assert_allclose(estimate.memory.marginalised_extents, known)
     # What has left tells of the bias and the extent: without it, the same window knows less.
     last = whole._replace(
-        observations=whole.observations[4:], fresh=1, start=estimates[3].boxes[1:]
+        observations=whole.observations[4:], num_new=1, start=estimates[3].boxes[1:]
     )
     (forgetful,) = register([last], ALONE, InputModel(ALONE.faces))
     spread = [np.trace(e.covariances[-1][:2, :2]) for e in (estimates[4], forgetful)]
@@ -626,7 +626,7 @@ def oracle(function, start):
 def test_the_robust_objective_against_torch():
     # One round of terms: torch gets the sum of r' W r / 2 and its automatic gradient, ours gets
     # the written gradient and the Gauss-Newton curvature as metric, and all windows at once.
-    problem, _ = stack(windows(), ALONE)
+    problem, _ = stack_windows(windows(), ALONE)
     terms = robust_terms(problem)
     length = problem.valid.shape[1]
     shared = torch.cat([problem.boxes[:, 0, 3:6], torch.zeros(4, objective.SHARED - 3)], 1)
@@ -684,7 +684,7 @@ def robust_terms(problem):
 
 
 def paper_problem():
-    problem, _ = stack(windows(PAPER), PAPER)
+    problem, _ = stack_windows(windows(PAPER), PAPER)
     x = problem.pose.flatten(1)
     extent = problem.boxes[..., 3:6]
 
