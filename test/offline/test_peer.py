@@ -19,9 +19,9 @@ from paths import ROOT
 import pytest
 from ros_messages import Drive
 from scenes import drive, stream_of, track_of
-from test_registrar import assert_equal, cut, fed, setup
+from test_registrar import assert_equal, config_with, cut, fed
 
-SHORT = setup('track', track_window=24, max_gap=0.3)
+SHORT = config_with('track', track_window=24, max_gap=0.3)
 
 
 @pytest.fixture(scope='module')
