@@ -219,9 +219,7 @@ def test_recording_holds_the_scene(street, tmp_path):
     assert truth.num_points.tolist() == street.truth.num_points.tolist()
     tree = TransformTree()
     with Recording([path]) as recording:
-        items = []
-        for record in recording.records(tree):
-            items.append(recording.decode(record))
+        items = [item.content for item in recording.items(tree)]
     sweeps = [item for item in items if isinstance(item, Sweep)]
     arrays = [item for item in items if isinstance(item, BoxArray)]
     assert len(sweeps) == len(arrays) == 12
@@ -274,9 +272,6 @@ def test_sample_recording_is_the_street():
     assert truth.num_points.tolist() == first.truth.num_points.tolist()
     with Recording([path]) as recording:
         tree = TransformTree()
-        sweep = next(
-            item
-            for record in recording.records(tree)
-            if isinstance(item := recording.decode(record), Sweep)
-        )
+        contents = (item.content for item in recording.items(tree))
+        sweep = next(content for content in contents if isinstance(content, Sweep))
     np.testing.assert_array_equal(sweep.points, first.sweeps[0].points)
