@@ -12,13 +12,12 @@ import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import asdict, dataclass, field
-import json
 from math import inf
 import sys
 from types import ModuleType
 from typing import Any
 
-from boxreg_ros.bench.main import add_scope_arguments, in_scope, line
+from boxreg_ros.bench.common import add_scope_arguments, in_scope, line, print_json
 from boxreg_ros.config import Config
 from boxreg_ros.core import face_support as correspondence
 from boxreg_ros.core import input_model as calibration
@@ -27,7 +26,7 @@ from boxreg_ros.core import registrar, registration, window
 from boxreg_ros.core.objective import BIAS, Problem, SHARED
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import finite, Scores, summarise
+from boxreg_ros.offline.evaluate import Scores, summarise
 from boxreg_ros.structures import Floats, Ints, Sweep, YAW
 import numpy as np
 from numpy.typing import NDArray
@@ -205,7 +204,7 @@ def run(args: argparse.Namespace) -> int:
             folder: {name: asdict(scores) for name, scores in rows.items()}
             for folder, rows in report.items()
         }
-        print(json.dumps(finite(plain)))
+        print_json(plain)
         return 0
     for folder, rows in report.items():
         print(f'{folder}: {rows[WHOLE].boxes} true boxes')

@@ -16,7 +16,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.session import register
 from boxreg_ros.io.transforms import sweep_to_frame, to_fixed_frame, TransformTree
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.simulation.simulate import Scene
+from boxreg_ros.simulation.scene import Scene
 from boxreg_ros.structures import (
     BoxArray,
     Floats,

@@ -4,8 +4,8 @@ import json
 
 from boxreg_ros import cli
 from boxreg_ros.bench import ablation as bench_ablation
-from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE, without
+from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
@@ -22,7 +22,7 @@ def scene():
 
 @pytest.fixture(scope='module')
 def drive(scene):
-    return bench.Drive.from_scene(scene)
+    return Drive.from_scene(scene)
 
 
 @pytest.fixture(scope='module')
@@ -67,7 +67,7 @@ def test_what_it_costs_is_printed(tmp_path, scene, capsys):
     assert text.count('\none extent ') == 3  # both recordings, and their mean
     assert 'mean of 2 recordings' in text
     assert cli.main(['bench', 'ablation', folders[0], *options, '--json']) == 0
-    (rows,) = json.loads(capsys.readouterr().out).values()
+    (rows,) = json.loads(capsys.readouterr().out)['results'].values()
     assert set(rows) == {WHOLE, 'one extent'}
     assert 0.5 < rows[WHOLE]['iou_3d'] < 1
 
