@@ -40,7 +40,7 @@ def stream(tracks):
     return stream_of(tracks)
 
 
-def setup(estimate='final', **changes):
+def config_with(estimate='final', **changes):
     # Few points, for speed.
     base = {'estimate': estimate, 'window': 6, 'lag': 3, 'sampling.points': 64}
     return Config().updated({**base, **changes})
@@ -78,7 +78,7 @@ def assert_equal(results, known, atol=0.0):
 
 @each_estimate
 def test_every_box_is_returned_once_in_order(stream, estimate):
-    results, counts = run(stream, setup(estimate))
+    results, counts = run(stream, config_with(estimate))
     assert [r.boxes.stamp_ns for r in finals(results)] == [b.stamp_ns for _, b in stream]
     for result, (sweep, given) in zip(finals(results), stream, strict=True):
         n = len(given.track_ids)
@@ -98,7 +98,7 @@ def test_every_box_is_returned_once_in_order(stream, estimate):
 
 @each_estimate
 def test_early_estimates_are_returned_at_once(stream, estimate):
-    registrar = BoxRegistrar(setup(estimate))
+    registrar = BoxRegistrar(config_with(estimate))
     for sweep, boxes in stream:
         assert registrar.add_sweep(sweep) == []
         early = [r for r in registrar.add_boxes(boxes) if not r.is_final]
@@ -109,7 +109,7 @@ def test_early_estimates_are_returned_at_once(stream, estimate):
 @pytest.mark.parametrize('lag', [0, 1, 3, 5])
 @pytest.mark.parametrize('estimate', ['early', 'final'])
 def test_final_boxes_are_returned_lag_arrays_later(stream, estimate, lag):
-    registrar = BoxRegistrar(setup(estimate, lag=lag))
+    registrar = BoxRegistrar(config_with(estimate, lag=lag))
     order = [boxes.stamp_ns for _, boxes in stream]
     for tick, (sweep, boxes) in enumerate(stream):
         ready = finals(registrar.add_sweep(sweep) + registrar.add_boxes(boxes))
@@ -125,7 +125,7 @@ def test_final_boxes_are_more_accurate_than_early_boxes():
     for seed in range(4):
         truth = drive(14)
         track = track_of(truth, np.random.default_rng(seed))
-        results, _ = run(stream_of([track]), setup('final'))
+        results, _ = run(stream_of([track]), config_with('final'))
         boxes = [
             np.array([r.boxes.boxes[0] for r in results if r.is_final == is_final])
             for is_final in (False, True)
@@ -138,7 +138,7 @@ def test_final_boxes_are_more_accurate_than_early_boxes():
 def test_boxes_of_long_tracks_are_returned_in_parts():
     # With windows of 12, a track is solved when it has 12; the newest is solved again later.
     stream = stream_of([track_of(drive(40), np.random.default_rng(0))])
-    registrar = BoxRegistrar(setup('track', track_window=12))
+    registrar = BoxRegistrar(config_with('track', track_window=12))
     held = []
     results = []
     for i, pair in enumerate(stream):
@@ -152,8 +152,8 @@ def test_boxes_of_long_tracks_are_returned_in_parts():
 
 @each_estimate
 def test_boxes_may_be_added_before_their_sweeps(stream, estimate):
-    known, counts = run(stream, setup(estimate))
-    registrar = BoxRegistrar(setup(estimate))
+    known, counts = run(stream, config_with(estimate))
+    registrar = BoxRegistrar(config_with(estimate))
     results = []
     for _, boxes in stream[:5]:
         results += registrar.add_boxes(boxes)
@@ -168,8 +168,8 @@ def test_boxes_may_be_added_before_their_sweeps(stream, estimate):
 
 @each_estimate
 def test_sweeps_may_be_added_long_before_their_boxes(stream, estimate):
-    known, counts = run(stream, setup(estimate))
-    registrar = BoxRegistrar(setup(estimate))
+    known, counts = run(stream, config_with(estimate))
+    registrar = BoxRegistrar(config_with(estimate))
     for sweep, _ in stream:
         assert registrar.add_sweep(sweep) == []
     results = [result for _, boxes in stream for result in registrar.add_boxes(boxes)]
@@ -189,7 +189,7 @@ def test_deskew_compensates_points_measured_before_the_stamp(estimate):
             for s, b in stream_of([track_of(truth, np.random.default_rng(seed))])
         ]
         for deskew in (False, True):
-            results, _ = run(late, setup(estimate, **{'sampling.deskew': deskew}))
+            results, _ = run(late, config_with(estimate, **{'sampling.deskew': deskew}))
             boxes = np.array([r.boxes.boxes[0] for r in finals(results)])
             errors.append(np.abs((boxes - truth)[2:, 0]).mean())
     assert np.mean(errors[1::2]) < 0.5 * np.mean(errors[::2])
@@ -211,12 +211,12 @@ def test_points_are_motion_compensated_to_boxes_between_sweeps(estimate, offset_
             for (s, b), here, box in zip(exact, there, truth, strict=True)
         ]
         for stream in (exact, moved):
-            results, counts = run(stream[1:-1], setup(estimate))
+            results, counts = run(stream[1:-1], config_with(estimate))
             boxes = np.array([r.boxes.boxes[0] for r in finals(results)])
             errors.append(np.linalg.norm((boxes - truth[1:-1])[3:, :2], axis=1).mean())
             assert counts['refined'] >= 13, counts
     # The order of sweep and boxes makes no difference.
-    registrar = BoxRegistrar(setup(estimate))
+    registrar = BoxRegistrar(config_with(estimate))
     swapped = [r for s, b in stream[1:-1] for r in registrar.add_boxes(b) + registrar.add_sweep(s)]
     assert_equal(swapped + registrar.flush(), results)
     exact, moved = np.mean(errors[::2]), np.mean(errors[1::2])
@@ -228,16 +228,16 @@ def test_points_are_motion_compensated_to_boxes_between_sweeps(estimate, offset_
 
 @each_estimate
 def test_the_same_calls_return_the_same_boxes(stream, estimate):
-    known, counts = run(stream, setup(estimate))
-    again, again_counts = run(stream, setup(estimate))
+    known, counts = run(stream, config_with(estimate))
+    again, again_counts = run(stream, config_with(estimate))
     assert_equal(again, known)
     assert again_counts == counts
 
 
 @each_estimate
 def test_reset_discards_all_but_the_counts(stream, estimate):
-    known, counts = run(stream, setup(estimate))
-    registrar = BoxRegistrar(setup(estimate))
+    known, counts = run(stream, config_with(estimate))
+    registrar = BoxRegistrar(config_with(estimate))
     fed(registrar, stream[:7])
     registrar.reset()
     assert registrar.counts['sweeps'] == 7
@@ -249,7 +249,7 @@ def test_reset_discards_all_but_the_counts(stream, estimate):
 @each_estimate
 def test_input_is_not_written_to(stream, estimate):
     copies = [(sweep.points.copy(), boxes.boxes.copy()) for sweep, boxes in stream]
-    results, _ = run(stream, setup(estimate))
+    results, _ = run(stream, config_with(estimate))
     for result in results:
         result.boxes.boxes[:] = np.nan  # returned arrays share no memory with the input
     for (sweep, boxes), (points, values) in zip(stream, copies, strict=True):
@@ -259,7 +259,7 @@ def test_input_is_not_written_to(stream, estimate):
 
 @pytest.mark.parametrize('estimate', ESTIMATES)
 def test_refine_returns_the_same_boxes(tracks, stream, estimate):
-    config = setup(estimate)
+    config = config_with(estimate)
     results, _ = run(stream, config)
     wanted = [r for r in results if r.is_final == (estimate != 'early')]
     for track, refined in zip(tracks, refine(tracks, config), strict=True):
@@ -305,7 +305,7 @@ def valued(column, value):
 def test_boxes_that_cannot_be_refined_are_returned_unchanged(stream, estimate, spoil, reasons):
     spoilt = list(stream)
     spoilt[5] = (stream[5][0], spoil(stream[5][1]))
-    results, counts = run(spoilt, setup(estimate))
+    results, counts = run(spoilt, config_with(estimate))
     for result in (r for r in results if r.boxes.stamp_ns == spoilt[5][1].stamp_ns):
         assert tuple(r if r != 'short_track' else '' for r in result.reasons) == reasons
         row = next(i for i, reason in enumerate(reasons) if reason)
@@ -322,7 +322,7 @@ def test_boxes_that_cannot_be_refined_are_returned_unchanged(stream, estimate, s
 
 @each_estimate
 def test_boxes_without_a_sweep_are_returned_unchanged(stream, estimate):
-    registrar = BoxRegistrar(setup(estimate))
+    registrar = BoxRegistrar(config_with(estimate))
     results = []
     for i, (sweep, boxes) in enumerate(stream):
         if i != 5:
@@ -339,7 +339,7 @@ def test_boxes_without_a_sweep_are_returned_unchanged(stream, estimate):
 
 
 def test_a_sweep_without_boxes_is_counted(stream):
-    registrar = BoxRegistrar(setup())
+    registrar = BoxRegistrar(config_with())
     for i, (sweep, boxes) in enumerate(stream):
         registrar.add_sweep(sweep)
         if i != 5:
@@ -353,7 +353,7 @@ def test_a_sweep_without_boxes_is_counted(stream):
 def test_an_empty_box_array_is_returned(stream, estimate):
     sweep, boxes = stream[5]
     empty = BoxArray(boxes.stamp_ns, 'odom', (), (), np.zeros(0), np.zeros((0, 9)))
-    results, counts = run([*stream[:5], (sweep, empty), *stream[6:]], setup(estimate))
+    results, counts = run([*stream[:5], (sweep, empty), *stream[6:]], config_with(estimate))
     assert [r.boxes.stamp_ns for r in finals(results)] == [b.stamp_ns for _, b in stream]
     assert finals(results)[5].boxes.boxes.shape == (0, 9)
     assert counts['refined'] == 20
@@ -362,7 +362,7 @@ def test_an_empty_box_array_is_returned(stream, estimate):
 @each_estimate
 def test_late_boxes_are_returned_unchanged(stream, estimate):
     # A box array that is added again after younger ones have been paired.
-    results, counts = run([*stream[:6], stream[3], *stream[6:]], setup(estimate))
+    results, counts = run([*stream[:6], stream[3], *stream[6:]], config_with(estimate))
     assert counts['late'] == 2
     late = [r for r in finals(results) if 'late' in r.reasons]
     assert len(late) == 1
@@ -385,7 +385,7 @@ def test_short_tracks_are_kept_and_boxes_without_points_refined(stream, estimate
         for i, (s, b) in enumerate(stream)
     ]  # fmt: skip
     part[7] = (nothing, part[7][1])
-    results, counts = run(part, setup(estimate))
+    results, counts = run(part, config_with(estimate))
     assert counts['short_track'] == 2
     assert [r.reasons for r in finals(results)][2:4] == [('', 'short_track')] * 2
     blind = finals(results)[7]
@@ -408,7 +408,7 @@ def no_extent_law(monkeypatch):
 def test_a_gap_longer_than_max_gap_starts_a_new_track(estimate, no_extent_law):
     # The same id after a gap of 0.9 s or 1.1 s. After the longer one the following boxes are
     # refined as those of a new track; the input model keeps what it has learnt.
-    config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
+    config = config_with(estimate, max_gap=1.0, **{'faces.learn': False})
     track = track_of(drive(28), np.random.default_rng(0))
     whole = stream_of([track])
     for gap, is_new in ((8, False), (9, False), (10, True)):
@@ -427,7 +427,7 @@ def test_a_gap_longer_than_max_gap_starts_a_new_track(estimate, no_extent_law):
 def test_a_new_track_of_a_known_id_has_no_prior(estimate, no_extent_law):
     # Eight boxes, a gap, then eight with the same id, in windows of six; too few to measure the
     # noise of the input. The boxes after the gap equal those of the second part alone.
-    config = setup(estimate, max_gap=1.0, **{'faces.learn': False})
+    config = config_with(estimate, max_gap=1.0, **{'faces.learn': False})
     whole = stream_of([track_of(drive(30), np.random.default_rng(0), 'a')])
     registrar = BoxRegistrar(config)
     fed(registrar, whole[:8])
@@ -452,7 +452,7 @@ def test_a_window_that_fails_leaves_no_prior(estimate):
         now_ns = boxes.stamp_ns if i < 8 else whole[8][1].stamp_ns + i
         now_ns = boxes.stamp_ns if i >= 16 else now_ns
         with_tiny_steps.append((replace(sweep, stamp_ns=now_ns), replace(boxes, stamp_ns=now_ns)))
-    registrar = BoxRegistrar(setup(estimate, tolerance=0.0, reach=0.0))
+    registrar = BoxRegistrar(config_with(estimate, tolerance=0.0, reach=0.0))
     has_prior, status = [], []
     for pair in with_tiny_steps:
         early = [r for r in fed(registrar, [pair]) if not r.is_final]
@@ -485,7 +485,7 @@ def test_tracks_are_solved_together_when_a_window_is_full(monkeypatch):
         return register(windows, config, model)
 
     monkeypatch.setattr('boxreg_ros.core.registrar.register', noted)
-    registrar = BoxRegistrar(setup('track', track_window=12, max_gap=0.3))
+    registrar = BoxRegistrar(config_with('track', track_window=12, max_gap=0.3))
     results = fed(registrar, stream_of([long, short, late])) + registrar.flush()
     assert calls == [
         {'short': 4, 'long': 12, 'late': 7},
@@ -504,7 +504,7 @@ def test_live_windows_are_warm_after_the_first_one(monkeypatch):
         return solve(problem, config, model, is_warm)
 
     monkeypatch.setattr(registration, 'solve', note)
-    config = setup()
+    config = config_with()
     fed(BoxRegistrar(config), stream_of([track_of(drive(8), np.random.default_rng(0), 'a')]))
     assert asked == [(3, False), (4, True), (5, True), (6, True), (6, True), (6, True)]
 
@@ -513,7 +513,7 @@ def test_a_track_that_ends_does_not_hold_back_others():
     # With estimate 'track' a short track that has ended must not delay the boxes of others.
     rng = np.random.default_rng(0)
     short, long = track_of(drive(5), rng, 'short'), track_of(drive(60, speed=0, turn=0), rng, 'l')
-    registrar = BoxRegistrar(setup('track', track_window=12))
+    registrar = BoxRegistrar(config_with('track', track_window=12))
     assert len(fed(registrar, stream_of([short, long]))) >= 60 - 12
 
 
@@ -522,7 +522,7 @@ def test_memory_is_bounded(estimate):
     # A parked car, another one with a new id at every third stamp, and sweeps without boxes.
     rng = np.random.default_rng(0)
     parked = track_of(drive(20, speed=0, turn=0), rng)
-    config = setup(estimate, track_window=10, max_gap=0.3, **{'sampling.points': 16})
+    config = config_with(estimate, track_window=10, max_gap=0.3, **{'sampling.points': 16})
     registrar = BoxRegistrar(config)
     returned, held = 0, []
     for i in range(60):
@@ -553,7 +553,8 @@ def test_an_id_switch_starts_a_new_track(estimate):
     def overlap(of_b, of_a):
         parts = [cut(a, early), cut(b, early)]
         parts += [replace(cut(b, late), track_id=of_b), replace(cut(a, late), track_id=of_a)]
-        config = setup(estimate, **{'faces.learn': False})  # the number of ids affects learning
+        # The number of ids affects learning.
+        config = config_with(estimate, **{'faces.learn': False})
         results, counts = run(stream_of(parts), config)
         order = [('a', 'b'), (of_b, of_a)], [(0, 1), (1, 0)]
         found = []
@@ -579,7 +580,7 @@ def test_torch_uses_one_thread_while_registering(stream, monkeypatch):
     monkeypatch.setattr('boxreg_ros.core.registrar.register', noted)
     torch.set_num_threads(2)
     try:
-        run(stream, setup())
+        run(stream, config_with())
         assert ({*threads}, torch.get_num_threads()) == ({1}, 2)
     finally:
         torch.set_num_threads(before)

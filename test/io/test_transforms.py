@@ -53,7 +53,7 @@ def test_frame_to_itself_needs_no_transform():
 
 
 def test_interpolation_is_linear_and_slerp():
-    first, second = Rotation.random(2, rng=7)
+    first, second = Rotation.random(2, np.random.default_rng(7))
     tree = tree_of(
         (0, 'odom', 'base', (0, 0, 0), first.as_quat()),
         (S, 'odom', 'base', (10, 4, -2), second.as_quat()),

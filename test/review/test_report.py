@@ -20,11 +20,11 @@ from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
 from paths import BAGS
-from PIL import Image
 import pytest
 from ros_messages import Drive, JSK
 from scenes import drive, jittered, PERIOD_NS, START_NS, track_of
 
+Image = pytest.importorskip('PIL.Image')
 STREET = BAGS / 'street.mcap'
 QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
 SCRIPT = '<script>alert(1)</script>'
