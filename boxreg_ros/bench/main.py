@@ -19,6 +19,7 @@ import sys
 from typing import Any
 
 from boxreg_ros.bench.baselines import icp, l_shaped, smoothed, smoothed_live
+from boxreg_ros.bench.scope import add_scope_arguments, in_scope, line
 from boxreg_ros.config import Config
 from boxreg_ros.core.refine import Track
 from boxreg_ros.errors import BoxregError, ConfigError
@@ -317,27 +318,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     import_module('boxreg_ros.bench.node').add_arguments(node)
 
 
-def add_scope_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what to measure on, and which of its true boxes count."""
-    parser.add_argument(
-        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
-    )
-    parser.add_argument(
-        '--min-points', type=int, default=100, metavar='N',
-        help='leave out true boxes with fewer points (default: 100)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--classes', nargs='+', default=['car', 'van', 'truck'], metavar='WORD',
-        help='only true boxes whose class name holds one of these words (default: car van truck)',
-    )  # fmt: skip
-
-
-def in_scope(boxes: BoxTable, truth: BoxTable, args: argparse.Namespace) -> Matches:
-    """Compare boxes with those true boxes that `add_scope_arguments` leaves in."""
-    classes = [word for part in args.classes for word in part.split(',') if word]
-    return match(boxes, truth, args.min_points, classes)
-
-
 def run(args: argparse.Namespace) -> int:
     """Run one kind of bench and print its table."""
     if args.kind in ('ablation', 'speed', 'node'):
@@ -370,17 +350,6 @@ def _footprint(box: Floats) -> Floats:
 def _mean_row(found: Sequence[tuple[float, ...] | str]) -> tuple[float, ...] | str:
     rows = [row for row in found if not isinstance(row, str)]
     return tuple(np.mean(rows, axis=0).tolist()) if rows else str(found[0])
-
-
-def line(name: str, row: Sequence[float | str] | str) -> str:
-    """Return one line of a table."""
-    if isinstance(row, str):
-        return f'{name:22} {row}'
-    cells = (
-        value if isinstance(value, str) else '-' if math.isnan(value) else f'{value:.3f}'
-        for value in row
-    )
-    return f'{name:22}' + ''.join(f'{cell:>9}' for cell in cells)
 
 
 def _progress(args: argparse.Namespace, total: int) -> Any:

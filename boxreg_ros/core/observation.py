@@ -67,10 +67,14 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     beside = np.flatnonzero((aside > 0.05) & (depth < RING) & (np.abs(height) < 0.6))
     corner = np.hypot(half[:, 0], half[:, 1]) + RING  # the ring ends at an upright square
     beside = beside[np.abs(offset[:2].take(beside, 1)).max(0) < corner.take(owner.take(beside))]
-    road = _road(height.take(beside), owner.take(beside), n)
+    road = np.full(n, np.nan)
+    if config.ingredients.road:
+        road = _road(height.take(beside), owner.take(beside), n)
     nearest = np.full(len(sweep.points), np.inf)
     np.minimum.at(nearest, index, depth)
-    is_own = (depth < config.sampling.margin) & (depth <= nearest.take(index) + EITHER)
+    is_own = depth < config.sampling.margin
+    if config.ingredients.point_ownership:
+        is_own &= depth <= nearest.take(index) + EITHER
     own = np.flatnonzero(is_own & (height > (np.nan_to_num(road) + CLEARANCE).take(owner)))
     inside = np.bincount(owner.take(np.flatnonzero(depth <= 0)), minlength=n).tolist()
     owner, x = owner.take(own), offset[0].take(own)

@@ -5,7 +5,7 @@ from dataclasses import astuple
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.objective import MEMORY, Problem, SHARED
+from boxreg_ros.core.batch import PRIOR_SIZE, Problem, SHARED
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.structures import Floats, ROLL, YAW
 import numpy as np
@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 import torch
 
 FADING = 0.97  # of what is remembered, from stamp to stamp: no model holds forever
-NOTHING = np.full(MEMORY, np.nan), np.zeros(MEMORY), np.zeros((MEMORY, MEMORY)), np.zeros(4)
+NOTHING = (
+    np.full(PRIOR_SIZE, np.nan), np.zeros(PRIOR_SIZE), np.zeros((PRIOR_SIZE, PRIOR_SIZE)),
+    np.zeros(4),
+)  # fmt: skip
 ANGLES = [3, 4, 5, 9, 10, 11]  # of the two poses that are remembered
 AWAY = 1e6  # where points are that are not real: near no box [m]
 TELLING = 30  # observations of a track tell as much of its labels as many more
@@ -123,7 +126,9 @@ def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
     times += 0.1 * np.maximum(step - last, 0)
     known = zip(*(w.memory or (w.observations[0].box[:3], *NOTHING) for w in windows), strict=True)
     base, state, move, information, seen = (np.array(part) for part in known)
-    yaw = one_heading(boxes, times, valid, state[:, 5])
+    yaw = np.unwrap(boxes[..., YAW])
+    if config.ingredients.heading_sign:
+        yaw = one_heading(boxes, times, valid, state[:, 5])
     tilt = boxes[..., ROLL:YAW] * np.sign(np.cos(yaw - boxes[..., YAW]))[..., None]
     boxes[..., ROLL:YAW] = (tilt + np.pi) % (2 * np.pi) - np.pi
     boxes[..., YAW] = yaw

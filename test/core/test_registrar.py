@@ -402,7 +402,7 @@ def test_short_tracks_and_boxes_without_points(stream, estimate):
 @pytest.fixture
 def no_law(monkeypatch):
     """Nothing is learnt of extents: one track more or less tells more or less of these."""
-    monkeypatch.setattr(calibration, 'SLOPES', 1e-9)
+    monkeypatch.setattr(calibration, 'SLOPE_DEVIATION', 1e-9)
 
 
 @each_estimate

@@ -1,7 +1,7 @@
 """Windows of observations, and their batches as padded tensors."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.objective import MEMORY
+from boxreg_ros.core.batch import PRIOR_SIZE
 from boxreg_ros.core.window import batches, FADING, Memory, one_heading, stack
 from boxreg_ros.structures import POSE, ROLL, YAW
 import numpy as np
@@ -26,9 +26,9 @@ def remembering(window, yaw=0.0):
     base = boxes[0, :3] - [1.0, 0, 0]
     pose = boxes[:2, POSE] - [*base, 0, 0, 0]
     pose[:, 5] += yaw
-    shared = [*boxes[0, 3:6], *np.zeros(MEMORY - 15)]
-    step = np.random.default_rng(3).normal(size=MEMORY)
-    information = np.diag(1.0 + np.arange(MEMORY))
+    shared = [*boxes[0, 3:6], *np.zeros(PRIOR_SIZE - 15)]
+    step = np.random.default_rng(3).normal(size=PRIOR_SIZE)
+    information = np.diag(1.0 + np.arange(PRIOR_SIZE))
     memory = Memory(base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1]))
     start = boxes[:-1] + 0.01 * np.eye(9)[8]
     return window._replace(fresh=1, start=start, memory=memory)
@@ -57,7 +57,7 @@ def test_stack_pads():
             np.testing.assert_array_equal(problem.points[b, i][mask], observation.points)
             np.testing.assert_array_equal(problem.origins[b, i], observation.origin)
         assert not problem.mask[b, n:].any()
-    assert problem.of('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
+    assert problem.of_class('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
 
 
 def seconds(boxes):
@@ -151,11 +151,11 @@ def test_what_has_left_is_stacked():
     memory = remembering(one).memory
     np.testing.assert_array_equal(base, [memory.base, given(other)[0, :3]])
     np.testing.assert_allclose(problem.boxes[:, 0, :3], [[1, 0, 0], [0, 0, 0]])
-    np.testing.assert_allclose(problem.recalled[0], memory.state + memory.step, atol=1e-12)
-    np.testing.assert_allclose(problem.information[0], FADING * memory.information)
-    np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1], [0, 0, 0, 0]])
-    np.testing.assert_array_equal(problem.recalled[1], 0)
-    np.testing.assert_array_equal(problem.information[1], 0)
+    np.testing.assert_allclose(problem.prior_mean[0], memory.state + memory.step, atol=1e-12)
+    np.testing.assert_allclose(problem.prior_information[0], FADING * memory.information)
+    np.testing.assert_array_equal(problem.marginalised_extents, [[4, 2, 1, 1], [0, 0, 0, 0]])
+    np.testing.assert_array_equal(problem.prior_mean[1], 0)
+    np.testing.assert_array_equal(problem.prior_information[1], 0)
     assert memory.information[3, 3] == 4  # nor is it written to
     assert remembering(one).fresh_part().memory is None
 
@@ -175,11 +175,11 @@ def test_a_window_turned_against_its_memory_drops_it():
     (window,) = windows([5])
     for one in (turned(remembering(window)), remembering(window, np.pi)):
         problem, _ = stack([one], CONFIG)
-        np.testing.assert_array_equal(problem.information, 0)
-        assert problem.recalled.isfinite().all()
-        np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1]])
+        np.testing.assert_array_equal(problem.prior_information, 0)
+        assert problem.prior_mean.isfinite().all()
+        np.testing.assert_array_equal(problem.marginalised_extents, [[4, 2, 1, 1]])
     kept, _ = stack([turned(remembering(window, np.pi))], CONFIG)
-    assert (kept.information[0].diagonal() > 0).all()
+    assert (kept.prior_information[0].diagonal() > 0).all()
 
 
 def test_a_solved_window_starts_where_it_was():
