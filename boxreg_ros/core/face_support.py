@@ -353,7 +353,7 @@ def to_box_frame(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:
 
 def motion_compensated(problem: Problem, state: State) -> Tensor:
     """
-    Return the points (B, N, M, 3), each moved with its box to the stamp of that.
+    Return the points (B, N, M, 3), each moved with its box to the stamp of that (M12).
 
     The velocity of a box is the mean over the steps before and after it; a single observation has
     none.

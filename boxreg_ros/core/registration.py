@@ -179,7 +179,7 @@ def _failed_tests(
     problem: Problem, boxes: Tensor, pose: Tensor, extent: Tensor, covariances: Tensor
 ) -> NDArray[np.bool_]:
     """
-    Return the acceptance tests that each refined box fails, shape (3, B, N).
+    Return the acceptance tests that each refined box fails (M27), shape (3, B, N).
 
     In the order of `REASONS`: its window has points; box and covariance are finite and the extent
     is positive; it holds nearly as many points as its input box, which the objective does not
