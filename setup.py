@@ -20,7 +20,7 @@ setup(
         (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
     ],
     # Read by `boxreg bench node` and `relabel --report`, without an installation too.
-    package_data={NAME: ['share/*']},
+    package_data={NAME: ['share/*', 'py.typed'], 'msg_adapters': ['py.typed']},
     entry_points={
         'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.live.main:main']
     },

@@ -1,9 +1,8 @@
 """
-Every tunable: default, unit, bounds and meaning, once.
+Settings: default, unit, bounds and meaning of each.
 
-Node parameters, ``--set``, YAML files and the table in the README are all read off these
-dataclasses. Deviations are standard deviations: a term's residual is divided by its deviation,
-so doubling one halves the pull of that term.
+Node parameters, ``--set``, YAML files and the tables of the documentation are generated from
+these dataclasses. Deviations are standard deviations: each residual is divided by its own.
 
 """
 
@@ -29,7 +28,23 @@ RENAMED = {
 
 
 class Setting(NamedTuple):
-    """One tunable as the outside sees it; `name` is dotted, as in ``solver.rounds``."""
+    """
+    A setting as users see it.
+
+    Attributes
+    ----------
+    name : str
+        Dotted, as in ``solver.rounds``.
+    default : bool, int, float, str or tuple of str
+        Its type is the type of the setting.
+    meaning, unit : str
+        For tables and help texts.
+    low, high : float or None
+        Bounds, both included.
+    choices : tuple of str
+        Allowed values; empty for any.
+
+    """
 
     name: str
     default: bool | int | float | str | tuple[str, ...]
@@ -41,17 +56,19 @@ class Setting(NamedTuple):
 
 
 def setting(default: Any, *facts: Any, **more: Any) -> Any:
-    """Return a dataclass field that knows what a `Setting` is made of, its name excepted."""
+    """Return a dataclass field with the arguments of a `Setting` after the name as metadata."""
     return field(default=default, metadata={'of': Setting('', default, *facts, **more)})
 
 
 @dataclass(frozen=True, slots=True)
 class SamplingConfig:
-    """Which points an observation keeps."""
+    """Selection of the points of an observation."""
 
-    deskew: bool = setting(False, 'carry points by their times to where a moving object is')
-    margin: float = setting(0.6, 'points this far outside a box count', 'm', 0.05, 5.0)
-    points: int = setting(128, 'points kept per box', '', 8, 100000)
+    deskew: bool = setting(False, 'motion-compensate points to the stamp by their own times')
+    margin: float = setting(
+        0.6, 'points up to this distance outside a box are used', 'm', 0.05, 5.0
+    )
+    points: int = setting(128, 'maximum number of points per box', '', 8, 100000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,21 +252,50 @@ class Ingredients:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Everything that can be set, with defaults that suit road vehicles at 10 Hz."""
+    """All settings, with defaults for road vehicles at 10 Hz."""
 
-    objective: str = setting('robust', 'ours, or that of the paper', choices=('robust', 'paper'))
-    mode: str = setting('3d', 'free: x y z roll pitch yaw, or x y yaw', choices=('3d', 'bev'))
-    estimate: str = setting('track', 'how much is waited for', choices=('early', 'final', 'track'))
-    extent: str = setting('track', "one per track, or the input's", choices=('track', 'fixed'))
+    objective: str = setting(
+        'robust',
+        'objective function: robust (default), or Eq. 4-8 of the paper',
+        choices=('robust', 'paper'),
+    )
+    mode: str = setting(
+        '3d', 'optimised: x y z roll pitch yaw, or x y yaw only', choices=('3d', 'bev')
+    )
+    estimate: str = setting(
+        'track',
+        'box as newest of its window, `lag` later, or of the whole track',
+        choices=('early', 'final', 'track'),
+    )
+    extent: str = setting(
+        'track',
+        'extents: one estimate per track, or those of the input',
+        choices=('track', 'fixed'),
+    )
     window: int = setting(10, 'observations per sliding window', '', 3, 1000)
-    lag: int = setting(9, 'observations a final box waits for, within its window', '', 0, 999)
-    track_window: int = setting(130, "observations solved at once for 'track'", '', 10, 10000)
-    min_observations: int = setting(3, 'shorter windows keep their input', '', 2, 1000)
-    max_gap: float = setting(1.6, 'a longer silence ends a track', 's', 0.01, 1e4)
-    tolerance: float = setting(0.02, 'boxes and sweep belong together within this', 's', 0.0, 10.0)
-    reach: float = setting(0.06, 'a sweep this far off serves, moved along', 's', 0.0, 10.0)
-    queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)
-    device: str = setting('cpu', "where windows are solved: 'cpu', 'cuda', 'cuda:1', ...")
+    lag: int = setting(
+        9, 'later observations used for a final box, at most window - 1', '', 0, 999
+    )
+    track_window: int = setting(
+        130, "observations per window with estimate 'track'", '', 10, 10000
+    )
+    min_observations: int = setting(3, 'boxes of shorter windows are kept', '', 2, 1000)
+    max_gap: float = setting(1.6, 'time without observation that ends a track', 's', 0.01, 1e4)
+    tolerance: float = setting(
+        0.02, 'time offset up to which boxes and sweep are paired at once', 's', 0.0, 10.0
+    )
+    reach: float = setting(
+        0.06,
+        'maximum time offset between a box array and a sweep; points are motion-compensated to '
+        'the box stamp',
+        's',
+        0.0,
+        10.0,
+    )
+    queue: int = setting(
+        20, 'maximum number of unpaired sweeps, and of box arrays, held', '', 1, 10000
+    )
+    device: str = setting('cpu', "torch device of the solver: 'cpu', 'cuda', 'cuda:1', ...")
     sampling: SamplingConfig = SamplingConfig()
     faces: FaceConfig = FaceConfig()
     solver: SolverConfig = SolverConfig()
@@ -269,46 +315,54 @@ class Config:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        """Check type and bounds of every value."""
+        """Check types and bounds."""
         for item, value in self.items():
             _check(item, _cast(item.name, value, item.default))
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
-        """Yield every setting with its present value, groups flattened to dotted names."""
+        """Yield every setting with its value; names of groups are dotted."""
         for item in settings():
             yield item, attrgetter(item.name)(self)
 
     def class_config(self, class_name: str) -> ClassConfig:
-        """Return how objects of `class_name` move; unknown classes move like vehicles."""
+        """Return the group of settings for `class_name`; `vehicle` for unknown classes."""
         words = words_of(class_name)
-        kinds = (k for k in (self.cyclist, self.pedestrian) if words & {*map(str.lower, k.names)})
-        return next(kinds, self.vehicle)
+        for group in (self.cyclist, self.pedestrian):
+            if not words.isdisjoint(name.lower() for name in group.names):
+                return group
+        return self.vehicle
 
     def updated(self, changes: Mapping[str, Any]) -> Config:
         """
-        Return a copy with dotted names set, as in ``{'solver.rounds': 2}``.
+        Return a copy with some settings changed.
+
+        Parameters
+        ----------
+        changes : mapping
+            Values by dotted name, as in ``{'solver.rounds': 2}``.
 
         Raises
         ------
         ConfigError
-            For a name that does not exist, or a value of the wrong type or out of bounds.
+            For an unknown name, or a value of the wrong type or out of bounds.
 
         """
         values: dict[str, Any] = {}
         for name, value in changes.items():
             group, _, last = name.rpartition('.')
-            (values.setdefault(group, {}) if group else values)[last] = value
+            target = values.setdefault(group, {}) if group else values
+            target[last] = value
         return _filled(self, values, '')
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Config:
         """
-        Build from nested plain values; what is absent keeps its default.
+        Build from nested mappings of plain values; absent settings have their defaults.
 
         Raises
         ------
         ConfigError
-            For an unknown key, by name, or a value of the wrong type or out of bounds.
+            For an unknown key, or a value of the wrong type or out of bounds; names the setting.
 
         """
         return _filled(cls(), values, '')
@@ -316,12 +370,12 @@ class Config:
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
         """
-        Read a YAML file: plain, or as ROS writes it (``/**: ros__parameters: ...``, the first).
+        Read a YAML file: plain, or a ROS parameter file (its first node is used).
 
         Raises
         ------
         ConfigError
-            If the file cannot be read or holds what `from_dict` refuses.
+            If the file cannot be read, or `from_dict` refuses its content.
 
         """
         try:
@@ -342,7 +396,7 @@ def words_of(class_name: str) -> set[str]:
 
 
 def settings() -> Iterator[Setting]:
-    """Yield every setting of `Config` with its default, groups flattened to dotted names."""
+    """Yield every setting of `Config`; names of groups are dotted."""
     for item in fields(Config):
         if not is_dataclass(item.default):
             yield item.metadata['of']._replace(name=item.name)
@@ -350,16 +404,17 @@ def settings() -> Iterator[Setting]:
         for part in fields(item.default):
             if 'of' not in part.metadata:  # `Ingredients` are no settings
                 continue
-            name, default = f'{item.name}.{part.name}', getattr(item.default, part.name)
-            yield part.metadata['of']._replace(name=name, default=default)
+            yield part.metadata['of']._replace(
+                name=f'{item.name}.{part.name}', default=getattr(item.default, part.name)
+            )
 
 
 def _filled(default: _T, value: Any, name: str) -> _T:
-    """Return `value` as a setting, or a group of them where what is absent is `default`."""
+    """Return `value` as a setting like `default`, or as a group with `default` for absent ones."""
     if not is_dataclass(default):
         return _cast(name, value, default)  # type: ignore[no-any-return]
     if not isinstance(value, Mapping):
-        raise ConfigError(f'{name or "all"}: expected a group of settings, got {value!r}')
+        raise ConfigError(f'{name or "config"}: expected a group of settings, got {value!r}')
     known = {item.name: getattr(default, item.name) for item in fields(default)}
     prefix = f'{name}.' if name else ''
     for key in value:

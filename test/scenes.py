@@ -1,4 +1,4 @@
-"""A car seen by a sensor at rest, known exactly; and problems made by hand."""
+"""Scenes with known truth: a car, the points of a fixed sensor; and batches made by hand."""
 
 from boxreg_ros.core import batch, terms
 from boxreg_ros.core.arrowhead import LINK
@@ -6,7 +6,7 @@ from boxreg_ros.core.batch import CLASS_NUMBERS, PRIOR_SIZE, Problem, SHARED, St
 from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.refine import Track
-from boxreg_ros.core.window import AWAY, Window
+from boxreg_ros.core.window import PADDING_POSITION, Window
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,12 +15,13 @@ import torch
 EXTENT = np.array([4.4, 1.8, 1.5])
 PERIOD_NS = 10**8
 START_NS = 1_700_000_000 * 10**9
-# Labelling margins, the defaults of `ClassConfig`: front, back, left, right, top [m].
+# Labelling margin of front, back, left, right and top [m]: distance from the box face to the
+# outermost surface points, the defaults of `ClassConfig`.
 GAPS = np.array([0.05, 0.05, 0.03, 0.03, 0.05])
 
 
 def drive(n, speed=5.0, turn=0.3, start=(5.0, 6.0, 0.2), z=0.75):
-    """Return true boxes (n, 9), one every 0.1 s, of a car that moves where its rear axle heads."""
+    """Return true boxes (n, 9) at 10 Hz of a car whose rear axle does not slip."""
     t = np.arange(n) * PERIOD_NS * 1e-9
     yaw = start[2] + turn * t
     path = speed * t
@@ -35,7 +36,7 @@ def drive(n, speed=5.0, turn=0.3, start=(5.0, 6.0, 0.2), z=0.75):
 
 
 def returns(box, rng, count=300, origin=(0.0, 0.0, 1.5), noise=0.01):
-    """Return points (M, 3) on the faces of `box` visible from `origin`, inside by `GAPS`."""
+    """Return points (M, 3) on the faces of `box` visible from `origin`, `GAPS` behind them."""
     R = Rotation.from_euler('ZYX', box[[8, 7, 6]]).as_matrix()
     toward = (np.asarray(origin) - box[:3]) @ R
     half = box[3:6] / 2
@@ -51,7 +52,7 @@ def returns(box, rng, count=300, origin=(0.0, 0.0, 1.5), noise=0.01):
 
 
 def jittered(boxes, rng, position=0.15, heading=0.05, extent=0.0):
-    """Return `boxes` (n, 9) as a detector might give them."""
+    """Return `boxes` (n, 9) with the noise of a detector."""
     n = len(boxes)
     noisy = boxes.copy()
     noisy[:, :2] += position * rng.normal(size=(n, 2))
@@ -62,12 +63,12 @@ def jittered(boxes, rng, position=0.15, heading=0.05, extent=0.0):
 
 
 def stamps(n):
-    """Return `n` stamps [ns], one every 0.1 s."""
+    """Return `n` stamps at 10 Hz [ns]."""
     return START_NS + PERIOD_NS * np.arange(n)
 
 
 def track_of(truth, rng, name='1', **noise):
-    """Return a track along the true boxes `truth` (n, 9), its boxes jittered."""
+    """Return a track with noisy boxes along the true boxes `truth` (n, 9)."""
     n = len(truth)
     points = [returns(box, rng) for box in truth]
     boxes = jittered(truth, rng, **noise)
@@ -75,7 +76,7 @@ def track_of(truth, rng, name='1', **noise):
 
 
 def stream_of(tracks):
-    """Return one (Sweep, BoxArray) per stamp of `tracks`, points of all of them together."""
+    """Return one (Sweep, BoxArray) per stamp of `tracks`, with the points of all of them."""
     pairs = []
     for stamp_ns in sorted({int(s) for track in tracks for s in track.stamps_ns}):
         here = [(t, i) for t in tracks for i in np.flatnonzero(t.stamps_ns == stamp_ns)]
@@ -92,7 +93,7 @@ def stream_of(tracks):
 
 
 def window_of(track, config):
-    """Return the window of all observations of `track`, none of which was solved before."""
+    """Return the window of all observations of `track`, all of them new."""
     observations = [
         observe(sweep, boxes.boxes, boxes.stamp_ns, config)[0]
         for sweep, boxes in stream_of([track])
@@ -103,22 +104,23 @@ def window_of(track, config):
 
 def problem_of(boxes, **changes):
     """
-    Return the problem of `boxes` (B, N, 9), but for `changes`.
+    Return the problem of `boxes` (B, N, 9) with some fields changed.
 
-    One every 0.1 s, without points or marginalisation prior. `class_numbers` are by name, those
-    not given are NaN.
+    At 10 Hz, without points or prior. `class_numbers` are by name, those not given are NaN.
 
     """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
     B, N = boxes.shape[:2]
-    points = torch.as_tensor(changes.pop('points', np.full((B, N, 1, 3), AWAY))).clone()
+    points = torch.as_tensor(
+        changes.pop('points', np.full((B, N, 1, 3), PADDING_POSITION))
+    ).clone()
     given = {
         'boxes': boxes,
         'start': boxes,
         'valid': torch.ones(B, N, dtype=torch.bool),
         'times': 0.1 * torch.arange(N, dtype=torch.float64).expand(B, N),
         'points': points,
-        'mask': points[..., 0] != AWAY,
+        'mask': points[..., 0] != PADDING_POSITION,
         'delays': torch.zeros(points.shape[:3], dtype=torch.float64),
         'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
         'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
@@ -131,12 +133,12 @@ def problem_of(boxes, **changes):
         given['class_numbers'][:, CLASS_NUMBERS.index(name)] = torch.as_tensor(values)
     more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
     problem = Problem(**{**given, **more})
-    problem.points[~problem.mask] = AWAY
+    problem.points[~problem.mask] = PADDING_POSITION
     return problem
 
 
 def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
-    """Return shared variables (B, 22): `extent`, and others by the names of their slices."""
+    """Return shared parameters (B, 22): `extent`, and parts by the names of their slices."""
     shared = torch.zeros(B, SHARED, dtype=torch.float64)
     shared[:, :3] = torch.tensor(extent)
     for name, value in parts.items():
@@ -208,7 +210,7 @@ def random_variables(problem, seed=2):
 
 
 def dense(chain, N):
-    """Return the matrices (B, D, D) of a `Chain` of N links as they are, zeros and all."""
+    """Return the dense matrices (B, D, D) of a `Chain` of N links."""
     B, D = len(chain.links), LINK * N + chain.corner.shape[1]
     whole = chain.links.new_zeros(B, D, D)
     whole[:, LINK * N :, LINK * N :] = chain.corner

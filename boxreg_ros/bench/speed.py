@@ -36,7 +36,7 @@ from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.core.solver import solve
 from boxreg_ros.core.terms import Objective, Term
 from boxreg_ros.core.weights import weigh
-from boxreg_ros.core.window import stack, Window
+from boxreg_ros.core.window import stack_windows, Window
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, sweep_to_frame
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.recorder import write_recording
@@ -103,7 +103,7 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
 
     """
     windows, truth = make_windows(count, config.window, 128, config)
-    problem, base = stack(windows, config)
+    problem, base = stack_windows(windows, config)
 
     def cold() -> Solution:
         return solve(problem, config, InputModel(config.faces), is_warm=False)
@@ -119,7 +119,7 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
         return solve(warm_problem, config, InputModel(config.faces), is_warm=True)
 
     result = {'cold': 1e3 * _time(cold, config) / count, 'warm': 1e3 * _time(warm, config) / count}
-    part = [stack([window], config)[0] for window in windows[:references]]
+    part = [stack_windows([window], config)[0] for window in windows[:references]]
     begin = perf_counter()
     ends = [reference(one, config) for one in part]
     result['reference'] = 1e3 * (perf_counter() - begin) / references
@@ -193,7 +193,7 @@ def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
         for x, count, length, most in rows:
             windows, _ = make_windows(min(count, 64), length, most, config)
             windows = (windows * -(-count // len(windows)))[:count]
-            problem, _ = stack(windows, config)
+            problem, _ = stack_windows(windows, config)
 
             def once(problem: Problem = problem) -> object:
                 return solve(problem, config, InputModel(config.faces), is_warm=False)

@@ -9,9 +9,10 @@ is in `terms`; it shares no code with this one but the optimiser.
 from boxreg_ros.config import Config, PaperConfig
 from boxreg_ros.core.batch import EXTENT, free_variables, POSE_ERRORS, Problem, Solution, State
 from boxreg_ros.core.face_support import FaceOffsets
-from boxreg_ros.core.geometry import face_distances, rotation_from_rpy, wrap_angle
+from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
 from boxreg_ros.core.input_model import expect
 from boxreg_ros.core.lbfgs import minimize, select
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor

@@ -19,11 +19,11 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
 from boxreg_ros.core.face_support import observe_faces, to_box_frame
-from boxreg_ros.core.geometry import wrap_angle
 from boxreg_ros.core.input_model import expect, input_residuals, InputModel
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.solver import COARSE_POINTS, solve
-from boxreg_ros.core.window import batches, Memory, stack, Window
+from boxreg_ros.core.window import group_windows, MarginalisationPrior, stack_windows, Window
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, KEPT, REFINED
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +54,8 @@ class Estimate(NamedTuple):
         One of `REASONS` for kept boxes, '' for refined ones.
     covariances : array, shape (N, 6, 6)
         Of x y z roll pitch yaw [m, rad]; the identity for kept boxes.
-    memory : Memory or None
-        Marginalisation prior of the next window, if this one is full and was solved.
+    prior : MarginalisationPrior or None
+        For the next window, if this one is full and was solved.
 
     """
 
@@ -63,7 +63,7 @@ class Estimate(NamedTuple):
     status: tuple[str, ...]
     reasons: tuple[str, ...]
     covariances: Floats
-    memory: Memory | None = None
+    prior: MarginalisationPrior | None = None
 
 
 def register(windows: list[Window], config: Config, model: InputModel) -> list[Estimate | None]:
@@ -87,12 +87,12 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
 
     """
     estimates: dict[int, Estimate] = {}
-    groups = batches(windows, config)
+    groups = group_windows(windows, config)
     for rows in groups:
         _learn_offsets(model, [windows[i] for i in rows], config)
     for rows in groups:
         part = [windows[i] for i in rows]
-        problem, base = stack(part, config)
+        problem, base = stack_windows(part, config)
         if config.objective == 'paper':
             solution = solve_paper(problem, config)
         else:
@@ -112,16 +112,16 @@ def _learn_offsets(model: InputModel, windows: Sequence[Window], config: Config)
     box with a wrong yaw are its corners, further outside than its faces.
 
     """
-    fresh = [window.fresh_part() for window in windows if window.fresh > 0]
-    if not fresh:
+    new_parts = [window.learning_part() for window in windows if window.num_new > 0]
+    if not new_parts:
         return
-    problem, _ = stack(fresh, config)
+    problem, _ = stack_windows(new_parts, config)
     problem = problem.thinned(COARSE_POINTS)
     offsets = model.offsets()
     pose = torch.cat([problem.boxes[..., :3], problem.start[..., 6:]], -1)
     state = State(pose, expect(problem, offsets).shared)
     observations = observe_faces(problem, state, offsets, config)
-    track_ids = [window.track_id for window in fresh]
+    track_ids = [window.track_id for window in new_parts]
     model.add_face_observations(track_ids, observations, problem.valid, offsets)
 
 
@@ -166,12 +166,12 @@ def _accepted(
         covariances[b, i] = np.eye(6)
     is_solved = (boxes.isfinite().all(-1) & (extent > 0).all(-1)).all(1)
     is_solved &= solution.covariances.isfinite().all((1, 2, 3))
-    memories = _memories(base, solution, is_solved)
+    priors = _priors(base, solution, is_solved)
     estimates = []
     for b, window in enumerate(windows):
         n = len(window.observations)
         words = tuple(status[b, :n].tolist()), tuple(reasons[b, :n].tolist())
-        estimates.append(Estimate(found[b, :n], *words, covariances[b, :n], memories[b]))
+        estimates.append(Estimate(found[b, :n], *words, covariances[b, :n], priors[b]))
     return estimates
 
 
@@ -213,7 +213,9 @@ def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     return (outside < HELD_MARGIN).sum(-1)
 
 
-def _memories(base: Floats, solution: Solution, is_solved: Tensor) -> list[Memory | None]:
+def _priors(
+    base: Floats, solution: Solution, is_solved: Tensor
+) -> list[MarginalisationPrior | None]:
     """Return the marginalisation prior that each window leaves, if it leaves one."""
     if solution.prior is None or solution.marginalised_extents is None:
         return [None] * len(base)
@@ -221,6 +223,6 @@ def _memories(base: Floats, solution: Solution, is_solved: Tensor) -> list[Memor
     parts = (*solution.prior, solution.marginalised_extents)
     arrays = [part.cpu().numpy() for part in parts]
     return [
-        Memory(base[b], *(array[b] for array in arrays)) if has_prior[b] else None
+        MarginalisationPrior(base[b], *(array[b] for array in arrays)) if has_prior[b] else None
         for b in range(len(base))
     ]

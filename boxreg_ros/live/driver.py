@@ -204,7 +204,7 @@ class LiveRegistrar:
 
     def lose(self, stamp_ns: int) -> list[Outgoing]:
         """Have the boxes of a cloud that was dropped not wait for it."""
-        sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_lost=True)
+        sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_dropped=True)
         return self._outgoing(self._registrar.add_sweep(sweep))
 
     def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:

@@ -29,7 +29,7 @@ from boxreg_ros.core.input_model import (
     MIN_OBSERVATIONS_FOR_NOISE,
 )
 from boxreg_ros.core.observation import Observation, observe
-from boxreg_ros.core.window import batches, stack, Window
+from boxreg_ros.core.window import group_windows, stack_windows, Window
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
@@ -156,8 +156,10 @@ def _errors_of_kind(
     found = dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
     if not tracks:
         return found
-    problem, base = stack([_bare([row[:2] for row in track]) for track in tracks], config)
-    true, true_base = stack([_bare([row[::2] for row in track]) for track in tracks], config)
+    given = [_bare([row[:2] for row in track]) for track in tracks]
+    labelled = [_bare([row[::2] for row in track]) for track in tracks]
+    problem, base = stack_windows(given, config)
+    true, true_base = stack_windows(labelled, config)
     problem = problem._replace(mask=problem.valid[..., None])  # as if all boxes had points
     shift = torch.nn.functional.pad(torch.from_numpy(true_base - base), (0, 3))
     pose = true.pose + shift[:, None]
@@ -340,9 +342,9 @@ def _model_of(windows: Sequence[Window], config: Config) -> InputModel:
     """Return an input model with the face observations at the boxes of `windows`."""
     model = InputModel(config.faces)
     offsets = model.offsets()
-    for rows in batches(windows, config):
+    for rows in group_windows(windows, config):
         part = [windows[i] for i in rows]
-        problem, _ = stack(part, config)
+        problem, _ = stack_windows(part, config)
         state = State(problem.pose, expect(problem, offsets).shared)
         observations = observe_faces(problem, state, offsets, config)
         track_ids = [window.track_id for window in part]

@@ -11,7 +11,7 @@ from typing import Any, cast
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.observation import Observation
-from boxreg_ros.core.registrar import Awaited, Begin
+from boxreg_ros.core.registrar import GetEstimates, Submit
 from boxreg_ros.core.registration import Estimate, register
 from boxreg_ros.core.window import Window
 from boxreg_ros.offline.peer import beside
@@ -20,7 +20,7 @@ import numpy as np
 
 
 @contextmanager
-def solver(config: Config, clock: Stopwatch) -> Iterator[Begin | None]:
+def solver(config: Config, clock: Stopwatch) -> Iterator[Submit | None]:
     """
     Yield what begins `register` in a process of its own, for `BoxRegistrar`; or None.
 
@@ -40,7 +40,7 @@ def solver(config: Config, clock: Stopwatch) -> Iterator[Begin | None]:
         return
     with beside(_serve, 'registers windows') as peer:
 
-        def begin(windows: list[Window], config: Config, model: InputModel) -> Awaited:
+        def begin(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
             if not windows:
                 return list
             peer.send((_packed(windows), config, model))

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.metrics import EXTENT
-from boxreg_ros.core.observation import CLEARANCE, crop
+from boxreg_ros.core.observation import crop, GROUND_CLEARANCE
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.review.changes import known, mean, median, TrackChanges
@@ -252,7 +252,7 @@ def _pictured(track: TrackChanges, seen: Sequence[_Seen], begin_ns: int) -> dict
     before = _carried(seen, track.given, track.is_flipped)
     after = _carried(seen, track.boxes, np.zeros_like(track.is_flipped))
     given, boxes = (np.nanmedian(b[:, EXTENT], axis=0) for b in (track.given, track.boxes))
-    above = after[:, 2] > CLEARANCE - boxes[2] / 2  # what is lower may be road
+    above = after[:, 2] > GROUND_CLEARANCE - boxes[2] / 2  # what is lower may be road
     length, *reaches = np.maximum(given, boxes) / 2 + MARGIN
     figure = Figure((13, 4.2))
     grid = figure.add_gridspec(

@@ -14,7 +14,7 @@ from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.registration import register
 from boxreg_ros.core.terms import Objective, Term
 from boxreg_ros.core.weights import parked_steps, weigh
-from boxreg_ros.core.window import stack
+from boxreg_ros.core.window import stack_windows
 from boxreg_ros.structures import POSE
 import numpy as np
 import pytest
@@ -184,7 +184,7 @@ def test_observations_are_learnt_from_once():
     known = model.offsets().gap_correction
     assert (known - InputModel(config.faces).offsets().gap_correction).abs().max() > 1e-4
     again = [
-        w._replace(fresh=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
+        w._replace(num_new=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
     ]
     register(again, config, model)
     np.testing.assert_array_equal(model.offsets().gap_correction, known)
@@ -409,8 +409,8 @@ def test_the_number_of_threads_does_not_change_results(monkeypatch, estimate, pa
             assert (a.status, a.reasons) == (b.status, b.reasons)
             np.testing.assert_allclose(a.boxes, b.boxes, rtol=0, atol=1e-9)
             np.testing.assert_allclose(a.covariances, b.covariances, rtol=0, atol=1e-9)
-            assert (a.memory is None) == (b.memory is None)
-            for one, other in zip(a.memory or (), b.memory or (), strict=True):
+            assert (a.prior is None) == (b.prior is None)
+            for one, other in zip(a.prior or (), b.prior or (), strict=True):
                 np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
 
 
@@ -519,7 +519,7 @@ def test_a_warm_window_uses_the_extents_of_the_tick_before(extents_used, changes
     whole = window(drive(6), extent=0.05)
     start = given(whole)[:-1]
     start[:, 3:6] = found
-    register([whole._replace(fresh=1, start=start)], config, InputModel(config.faces))
+    register([whole._replace(num_new=1, start=start)], config, InputModel(config.faces))
     assert len(extents_used) == 2  # to learn from it, and the one round of a tick
     known = np.where(np.isin(np.arange(3), held), given(whole)[:, 3:6].mean(0), found)
     np.testing.assert_allclose(extents_used[1], known)
@@ -541,34 +541,34 @@ def test_full_windows_leave_a_marginalisation_prior():
     # Of ten, the length of a window, the first is to leave; shorter ones are to grow.
     many = windows()
     found = register(many, ALONE, InputModel(ALONE.faces))
-    assert [estimate.memory is not None for estimate in found] == [True, False, False, False]
-    memory, boxes = found[0].memory, found[0].boxes
+    assert [estimate.prior is not None for estimate in found] == [True, False, False, False]
+    prior, boxes = found[0].prior, found[0].boxes
     first = given(many[0])[0]
-    np.testing.assert_array_equal(memory.base, first[:3])
-    np.testing.assert_array_equal(memory.seen, [*first[3:6], 1])
+    np.testing.assert_array_equal(prior.base, first[:3])
+    np.testing.assert_array_equal(prior.marginalised_extents, [*first[3:6], 1])
     left = boxes[1:3] - [*first[:3], *np.zeros(6)]
-    np.testing.assert_allclose(memory.state[:12], left[:, POSE].ravel(), atol=1e-9)
-    np.testing.assert_allclose(memory.state[12:15], boxes[0, 3:6], atol=1e-9)
-    np.testing.assert_allclose(memory.information, memory.information.T, atol=1e-6)
-    assert np.linalg.eigvalsh(memory.information).min() > -1e-6 * memory.information.max()
+    np.testing.assert_allclose(prior.state[:12], left[:, POSE].ravel(), atol=1e-9)
+    np.testing.assert_allclose(prior.state[12:15], boxes[0, 3:6], atol=1e-9)
+    np.testing.assert_allclose(prior.information, prior.information.T, atol=1e-6)
+    assert np.linalg.eigvalsh(prior.information).min() > -1e-6 * prior.information.max()
     for config in (ALONE.updated({'estimate': 'track'}), BRIEF):
         found = register(windows(config), config, InputModel(config.faces))
-        assert {estimate.memory for estimate in found} == {None}
+        assert {estimate.prior for estimate in found} == {None}
 
 
 def slid(whole, count, turns=0.0, config=ALONE):
-    """Return the estimates of windows of ten of `whole`, one after the other; memory + `turns`."""
-    estimates, memory, start = [], None, np.zeros((0, 9))
+    """Return the estimates of windows of ten of `whole`, one after the other; prior + `turns`."""
+    estimates, prior, start = [], None, np.zeros((0, 9))
     for first in range(count):
         observations = whole.observations[first : first + 10]
         one = whole._replace(
-            observations=observations, fresh=10 - len(start), start=start, memory=memory
+            observations=observations, num_new=10 - len(start), start=start, prior=prior
         )
         estimates += register([one], config, InputModel(config.faces))
-        memory, start = estimates[-1].memory, estimates[-1].boxes[1:]
-        state = memory.state.copy()
+        prior, start = estimates[-1].prior, estimates[-1].boxes[1:]
+        state = prior.state.copy()
         state[[5, 11]] += turns
-        memory = memory._replace(state=state)
+        prior = prior._replace(state=state)
     return estimates
 
 
@@ -577,12 +577,12 @@ def test_marginalisation_prior_improves_the_newest_box():
     estimates = slid(whole, 5)
     boxes = given(whole)
     for i, estimate in enumerate(estimates):
-        np.testing.assert_array_equal(estimate.memory.base, boxes[0, :3])
+        np.testing.assert_array_equal(estimate.prior.base, boxes[0, :3])
         known = [*boxes[: i + 1, 3:6].sum(0), i + 1]
-        np.testing.assert_allclose(estimate.memory.seen, known)
+        np.testing.assert_allclose(estimate.prior.marginalised_extents, known)
     # The prior has information about bias and extent: without it, the covariance is larger.
     last = whole._replace(
-        observations=whole.observations[4:], fresh=1, start=estimates[3].boxes[1:]
+        observations=whole.observations[4:], num_new=1, start=estimates[3].boxes[1:]
     )
     (forgetful,) = register([last], ALONE, InputModel(ALONE.faces))
     spread = [np.trace(e.covariances[-1][:2, :2]) for e in (estimates[4], forgetful)]
@@ -604,9 +604,9 @@ def test_a_failed_window_leaves_no_prior():
     many[0] = many[0]._replace(observations=bad)
     failed, found = register(many, ALONE, InputModel(ALONE.faces))
     assert set(failed.reasons) == {'not_finite'}
-    assert failed.memory is None
+    assert failed.prior is None
     assert set(found.status) == {'refined'}
-    assert found.memory is not None
+    assert found.prior is not None
 
 
 # --- solver against torch's ---------------------------------------------------------------------
@@ -635,7 +635,7 @@ def oracle(function, start):
 def test_minimum_of_the_default_objective_against_torch():
     # One round of terms: torch gets the sum of r' W r / 2 and its automatic gradient, ours gets
     # the written gradient and the Gauss-Newton curvature as metric, and all windows at once.
-    problem, _ = stack(windows(), ALONE)
+    problem, _ = stack_windows(windows(), ALONE)
     terms = robust_terms(problem)
     length = problem.valid.shape[1]
     shared = torch.cat([problem.boxes[:, 0, 3:6], torch.zeros(4, batch.SHARED - 3)], 1)
@@ -693,7 +693,7 @@ def robust_terms(problem):
 
 
 def paper_problem():
-    problem, _ = stack(windows(PAPER), PAPER)
+    problem, _ = stack_windows(windows(PAPER), PAPER)
     x = problem.pose.flatten(1)
     extent = problem.boxes[..., 3:6]
 

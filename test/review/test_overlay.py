@@ -280,7 +280,7 @@ def test_an_overlay_can_be_relabelled_again(tmp_path):
 
 
 def test_labels_alone_make_no_overlay(tmp_path):
-    with pytest.raises(ConfigError, match=r"'mcap' writes a recording again.*another format"):
+    with pytest.raises(ConfigError, match=r"'mcap' copies a recording.*another format"):
         writer_for('mcap', tmp_path, Provenance())
     assert not list(tmp_path.iterdir())
 
