@@ -1,5 +1,5 @@
 """
-A batch of windows as padded tensors, what is estimated of it, and the result of solving it.
+A batch of windows as padded tensors, its estimated variables, and its solution.
 
 The estimated variables of a window of N observations are x = (p_1, ..., p_N, s): poses p_i of six
 numbers each and the shared variables s, the same for all observations, see `State`.
@@ -103,7 +103,7 @@ class Problem(NamedTuple):
 
 class State(NamedTuple):
     """
-    The estimated variables: the poses of a window, and what all its observations share.
+    The estimated variables: the poses of a window, and those shared by all its observations.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class Solution(NamedTuple):
     marginalised_extents : Tensor or None, shape (B, 4)
         `Problem.marginalised_extents` of the next window.
     extent_evidence : Tensor, shape (B, 3, 3)
-        What the points alone say of the extents, see `InputNoise`.
+        Evidence of the points alone about the extents, see `InputNoise`.
 
     """
 

@@ -20,7 +20,7 @@ from torch.nn.functional import embedding, pad
 # Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
 # each of them.
 BOTTOM = 5
-"""Index of the bottom face. The road stands for it, no points of the object."""
+"""Index of the bottom face. It is observed by the road, not by points of the object."""
 OUTSIDE_MARGIN = 0.35
 """Points up to this far outside a face are taken for points of the object [m]."""
 EDGE_MARGIN = 0.2
@@ -28,7 +28,7 @@ EDGE_MARGIN = 0.2
 INSIDE_EXTRA = 0.35
 """Points may be further inside a face than `OUTSIDE_MARGIN` by this much [m]."""
 MAX_DEPTH = 0.2
-"""Points further behind the outermost one of a face are on another surface, say a wheel [m]."""
+"""Points further behind the outermost one of a face are on another surface, e.g. a wheel [m]."""
 MIN_POINTS = 3
 """Fewest points that make a face observation, and that are taken from a strip. Three span a
 plane."""
@@ -54,7 +54,7 @@ RANGE_INSET_HALF_WEIGHT = 0.1
 MIN_ALONG = 0.5
 """Smallest distance along a face in the tangent of its visibility [m]."""
 FAR = 1e9
-"""Depth of what is no point of a face [m]."""
+"""Depth of points that are not on a face [m]."""
 
 
 class FaceOffsets(NamedTuple):
@@ -165,7 +165,7 @@ def observe_faces(
     offsets : FaceOffsets
         Where the points of each face are expected.
     config : Config
-        Settings; `faces.outermost` is the part of all points that stands for a face.
+        Settings; `faces.outermost` is the part of the points that makes one face observation.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def observe_faces(
     We take the outermost ones: the closest points of a face that is given too far inside may lie
     anywhere. On a face with a wrong yaw the outermost points are all at one end: each of three
     strips has its own, so that the face is turned as well. Points far behind the outermost one
-    belong to another surface, say a wheel or a hood. Points are motion-compensated to the stamp of
+    belong to another surface, e.g. a wheel or a hood. Points are motion-compensated to the stamp of
     their box.
 
     """

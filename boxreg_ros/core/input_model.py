@@ -107,12 +107,12 @@ class InputNoise(NamedTuple):
     offset : Tensor, shape (9,)
         Robust standard deviation of the means of the tracks about zero.
     weight : float
-        Weight of the estimate against what is expected: 0 where nothing is known, 1/2 after
+        Weight of the estimate against the settings: 0 without observations, 1/2 after
         `MIN_OBSERVATIONS_FOR_NOISE` observations, near 1 after many.
     extent_evidence : Tensor, shape (n, 3, 3)
-        What the points of n tracks say of their extents. Rows of length, width and height:
+        Evidence of the points of n tracks about their extents. Rows of length, width and height:
         logarithms of the input's; corrections to these, over the square of their expected error;
-        the weights of these, 0 where the points say too little.
+        the weights of these, 0 without enough evidence.
 
     """
 
@@ -148,7 +148,7 @@ class InputNoise(NamedTuple):
         first, second = bounded[:, :-1][both], bounded[:, 1:][both]
         power = (first.square() + second.square()).sum(0) / 2
         # A constant error, such as that of an extent that a tracker holds, is fully correlated;
-        # with one or two tracks it cannot be told from the labelling margin.
+        # with one or two tracks it cannot be distinguished from the labelling margin.
         constant = 1 - 2 / tracks
         ratio = torch.where(power > MIN_POWER, (first * second).sum(0) / power, constant)
         correlation = ratio.clamp(0.0, MAX_CORRELATION)
@@ -183,7 +183,7 @@ def input_residuals(problem: Problem, state: State) -> Tensor:
 
 class Expectation(NamedTuple):
     """
-    What is expected of a batch before its points are used.
+    Means and deviations of a batch before its points are used.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ def expect(
     problem: Problem, offsets: FaceOffsets, noise: InputNoise = UNKNOWN_NOISE
 ) -> Expectation:
     """
-    Return what is expected of a batch, given labelling margins and noise of the input (M15).
+    Return the expectation of a batch, given labelling margins and noise of the input (M15).
 
     Notes
     -----
@@ -275,7 +275,7 @@ def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
     Parameters
     ----------
     evidence : Tensor, shape (n, 3, 3)
-        What points say of the extents of n tracks, see `InputNoise`.
+        Evidence of the points of n tracks about their extents, see `InputNoise`.
     given : Tensor, shape (B, 3)
         Mean extents of the input [m].
     error : Tensor, shape (B, 3)
@@ -311,7 +311,9 @@ def evidence_of_extents(
     given: Tensor, expected: Expectation, state: State, factor: Factor
 ) -> Tensor:
     """
-    Return what the points alone say of the extents (M17): corrections, weights, (B, 2, 3).
+    Return the evidence of the points alone about the extents (M17), shape (B, 2, 3).
+
+    Corrections of the logarithms, and their weights, as in `InputNoise`.
 
     Parameters
     ----------
@@ -451,7 +453,7 @@ class InputModel:
         return means
 
     def _pooled(self, known: Floats, expected: Sequence[float]) -> Tensor:
-        """Weigh the tracks' sums (n, 3, 6) of a quantity against what is expected (M18), (6,)."""
+        """Weigh the tracks' sums (n, 3, 6) of a quantity against its prior (M18), (6,)."""
         values = torch.zeros(6, dtype=torch.float64)
         for faces, prior, deviation in zip(FACE_GROUPS, expected, GAP_DEVIATIONS, strict=True):
             total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)

@@ -214,7 +214,7 @@ def _pose_step(state: State, start: Tensor, axes: Tensor, offset: slice) -> Line
     """
     Return the step of the poses from `start` (B, N, 6) along `axes` (B, N, 3, 3) [m, rad].
 
-    Less six shared variables, `offset`, that stand for a common step of all poses.
+    The six shared variables `offset`, a common step of all poses, are subtracted.
 
     """
     along = torch.eye(6).to(start).repeat(*start.shape[:2], 1, 1, 1)  # (B, N, 1, 6, 6)
