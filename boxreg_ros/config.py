@@ -26,6 +26,17 @@ RENAMED = {
 }
 """Settings of earlier versions by their old names: the error names the new one."""
 
+NODE_OPTIONS = (
+    *('boxes_type', 'pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
+    *('output_frame', 'transform_timeout', 'backlog', 'config_file'),
+    *('use_sim_time', 'start_type_description_service', 'qos_overrides'),
+)
+"""Parameters of the node that parameter files of ROS may hold beside those of `Config`."""
+
+
+DEFAULT_LAG = 9
+"""The whole default window. It may exceed a shorter window, which then limits it."""
+
 
 class Setting(NamedTuple):
     """
@@ -274,7 +285,11 @@ class Config:
     )
     window: int = setting(10, 'observations per sliding window', '', 3, 1000)
     lag: int = setting(
-        9, 'later observations used for a final box, at most window - 1', '', 0, 999
+        DEFAULT_LAG,
+        'later observations used for a final box, less than window; the default shrinks with it',
+        '',
+        0,
+        999,
     )
     track_window: int = setting(
         130, "observations per window with estimate 'track'", '', 10, 10000
@@ -318,6 +333,11 @@ class Config:
         """Check types and bounds."""
         for item, value in self.items():
             _check(item, _cast(item.name, value, item.default))
+        if self.lag >= self.window and self.lag != DEFAULT_LAG:
+            raise ConfigError(
+                f'lag: expected less than window ({self.window}), got {self.lag}: a final box '
+                f'waits within its window; lower lag or raise window'
+            )
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
         """Yield every setting with its value; names of groups are dotted."""
@@ -372,6 +392,8 @@ class Config:
         """
         Read a YAML file: plain, or a ROS parameter file (its first node is used).
 
+        Of a parameter file of ROS the `NODE_OPTIONS` are ignored.
+
         Raises
         ------
         ConfigError
@@ -384,6 +406,12 @@ class Config:
                 inner = next(iter(values.values()), None)
                 if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
                     values = inner['ros__parameters']
+                    if isinstance(values, dict):
+                        values = {
+                            key: value
+                            for key, value in values.items()
+                            if str(key).partition('.')[0] not in NODE_OPTIONS
+                        }
             return cls.from_dict(values)
         except (OSError, UnicodeDecodeError, yaml.YAMLError, ConfigError) as error:
             reason = ' '.join(str(error).split())

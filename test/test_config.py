@@ -86,7 +86,7 @@ def test_unknown_keys_are_refused_by_name(values, name):
 
 
 def test_a_renamed_setting_is_refused_with_its_new_name():
-    with pytest.raises(ConfigError, match='set faces.inset_ends'):
+    with pytest.raises(ConfigError, match=r'set faces\.inset_ends'):
         Config().updated({'faces.depth_ends': 0.3})
 
 

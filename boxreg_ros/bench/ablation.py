@@ -10,15 +10,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-import json
 import sys
 from typing import Any
 
-from boxreg_ros.bench.scope import add_scope_arguments, in_scope, line
+from boxreg_ros.bench.common import add_scope_arguments, in_scope, line, print_json
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import finite, Scores, summarise
+from boxreg_ros.offline.evaluate import Scores, summarise
 import numpy as np
 from tqdm import tqdm
 
@@ -148,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
             folder: {name: asdict(scores) for name, scores in rows.items()}
             for folder, rows in report.items()
         }
-        print(json.dumps(finite(plain)))
+        print_json(plain)
         return 0
     for folder, rows in report.items():
         print(f'{folder}: {rows[WHOLE].boxes} true boxes')

@@ -24,6 +24,7 @@ from time import perf_counter, sleep
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from boxreg_ros.bench.common import print_json
 from boxreg_ros.config import Config
 from boxreg_ros.core import observation as sampling
 from boxreg_ros.core.batch import EXTENT, free_variables, Problem, Solution, State
@@ -91,7 +92,10 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         args.out.mkdir(parents=True, exist_ok=True)
         report['plot'] = str(_plot(report['scaling'], config, args.out / 'speed.png'))
-    print(json.dumps(report) if args.json else _text(report))
+    if args.json:
+        print_json(report)
+    else:
+        print(_text(report))
     return 0
 
 

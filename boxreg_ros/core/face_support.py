@@ -178,8 +178,8 @@ def observe_faces(
     We take the outermost ones: the closest points of a face that is given too far inside may lie
     anywhere. On a face with a wrong yaw the outermost points are all at one end: each of three
     strips has its own, so that the face is turned as well. Points far behind the outermost one
-    belong to another surface, e.g. a wheel or a hood. Points are motion-compensated to the stamp of
-    their box.
+    belong to another surface, e.g. a wheel or a hood. Points are motion-compensated to the stamp
+    of their box.
 
     """
     points = motion_compensated(problem, state)

@@ -1,80 +1,224 @@
-"""What sweeps and boxes pass on their way to the registrar, live and offline alike."""
+"""
+The way of sweeps and boxes to the registrar, the same for the live node and for recordings.
+
+A `Session` brings each item into the fixed frame, assigns ids where they are asked for, detects
+time jumps and checks the poses of the boxes. `register` hands the result to the registrar. The
+live node adds waiting for transforms and publishing; `boxreg relabel` adds reading and writing.
+
+"""
 
 from __future__ import annotations
 
-from typing import cast, TypeVar
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.id_assignment import Tracker
 from boxreg_ros.io.pose_check import PoseCheck
-from boxreg_ros.io.transforms import Rewind
+from boxreg_ros.io.transforms import move_to_frame, TimeJumpDetector, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
 
-_T = TypeVar('_T', bound=Sweep | BoxArray)
 
-
-class Intake:
+class Admitted(NamedTuple):
     """
-    Tell where stamps start again, give boxes ids where wanted, and look whether they fit.
+    A sweep or boxes on the way to the registrar.
 
-    Boxes fit that stand where their points are.
+    Attributes
+    ----------
+    moved : Sweep or BoxArray, or None
+        The item in the fixed frame, boxes with their ids; None where no transform is known.
+    T_fixed_item : array, shape (4, 4), or None
+        Maps the frame of the item to the fixed frame.
+    restarts : bool
+        True if time went back before this item: tracks end and new ones begin.
+    reason : str
+        ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; else empty.
+    detail : str
+        The transform that is missing; empty if none is.
 
     """
 
-    def __init__(self, convention: Convention, config: Config) -> None:
+    moved: Sweep | BoxArray | None
+    T_fixed_item: Floats | None
+    restarts: bool
+    reason: str = ''
+    detail: str = ''
+
+
+class Session:
+    """
+    Prepare sweeps and boxes for the registrar.
+
+    State: the transforms, the newest stamps, the tracks of id assignment, and the pose check.
+    Not thread-safe.
+
+    Parameters
+    ----------
+    convention : Convention
+        Convention of the box poses and sizes, and whether ids are to be assigned. Adapters have
+        applied the convention already; the pose check compares it with the others.
+    config : Config
+        `max_gap` and `tolerance` are used.
+    fixed_frame : str
+        Frame to refine in; empty to choose it with `require_fixed_frame`.
+    reads_ahead : bool
+        True if the tree receives transforms before the items that need them are admitted, as
+        from a recording. The tree has then detected a time jump itself, and holds transforms
+        after the jump that must stay.
+
+    Attributes
+    ----------
+    tree : TransformTree
+        To be fed by the caller.
+    fixed_frame : str
+        Frame to refine in; empty while it is not known.
+    sensor_frame : str
+        Frame of the point clouds, to be set by the caller; used to choose the fixed frame.
+
+    """
+
+    def __init__(
+        self,
+        convention: Convention,
+        config: Config,
+        fixed_frame: str = '',
+        *,
+        reads_ahead: bool = False,
+    ) -> None:
+        self.tree = TransformTree()
+        self.fixed_frame = fixed_frame.lstrip('/')
+        self.sensor_frame = ''
         self._convention = convention
+        self._config = config
+        self._reads_ahead = reads_ahead
         self._tracker = Tracker(config.max_gap) if convention.associate else None
-        self.begin(config)
+        self.restart()
 
-    def begin(self, config: Config) -> None:
-        """Forget what has been taken; ids that were given do not come again."""
-        self._check = PoseCheck(self._convention, config.tolerance)
-        self.change(config)
-        self._forget()
+    @property
+    def config(self) -> Config:
+        """Return the settings; `max_gap` may change at any time, `tolerance` at a restart."""
+        return self._config
 
-    def change(self, config: Config) -> None:
-        """Take over the setting that may change: how long a track may be unseen."""
+    @config.setter
+    def config(self, config: Config) -> None:
+        self._config = config
         if self._tracker is not None:
             self._tracker.max_gap = config.max_gap
 
-    def begins_anew(self, item: Sweep | BoxArray) -> bool:
-        """Tell whether stamps start again with the next sweep or boxes; then ids do, too."""
-        if says_nothing(item):
-            return False
-        if not self._rewinds[isinstance(item, BoxArray)].happened(item.stamp_ns):
-            return False
-        self._forget()
-        return True
+    def restart(self) -> None:
+        """Forget all but the transforms; ids that were assigned are not used again."""
+        self._jumps = {Sweep: TimeJumpDetector(), BoxArray: TimeJumpDetector()}
+        self._pose_check = PoseCheck(self._convention, self._config.tolerance)
+        if self._tracker is not None:
+            self._tracker.forget()
 
-    def take(self, item: _T) -> _T:
-        """Return a sweep or boxes, in the fixed frame, as the registrar is to have them."""
-        self._check.add(item)
-        if self._tracker is None or not isinstance(item, BoxArray):
-            return item
-        return cast(_T, self._tracker.identify(item))
+    def admit(self, item: Sweep | BoxArray) -> Admitted:
+        """
+        Return a sweep or boxes in the fixed frame, with ids, and whether time went back.
+
+        Parameters
+        ----------
+        item : Sweep or BoxArray
+            In the frame of its message.
+
+        """
+        if is_placeholder(item):
+            return Admitted(None, None, False)
+        restarts = self._jumps[type(item)].has_jumped(item.stamp_ns)
+        if restarts:
+            self.restart()
+            if not self._reads_ahead:
+                self.tree.rewind(item.stamp_ns)
+        try:
+            T_fixed_item = self.tree.lookup(
+                self.require_fixed_frame(item), item.frame_id, item.stamp_ns
+            )
+        except TransformUnavailable as error:
+            is_sweep = isinstance(item, Sweep)
+            reason = 'sweep_without_transform' if is_sweep else 'no_transform'
+            return Admitted(None, None, restarts, reason, str(error))
+        moved = move_to_frame(item, T_fixed_item, self.fixed_frame)
+        self._pose_check.add(moved)
+        if self._tracker is not None and isinstance(moved, BoxArray):
+            moved = self._tracker.identify(moved)
+        return Admitted(moved, T_fixed_item, restarts)
+
+    def require_fixed_frame(self, item: Sweep | BoxArray) -> str:
+        """
+        Return the fixed frame; choose it among the known transforms if it is not known yet.
+
+        Raises
+        ------
+        TransformUnavailable
+            If no motion of `sensor_frame` is known, or no point cloud has arrived.
+
+        """
+        if self.fixed_frame:
+            return self.fixed_frame
+        sensor_frame = self.sensor_frame
+        if not sensor_frame:
+            raise TransformUnavailable(
+                f'no point cloud has arrived, so the motion of the boxes in {item.frame_id!r} is '
+                f'not known; check the topic of the clouds and its QoS'
+            )
+        found = self.tree.fixed_frame(sensor_frame)
+        if found is None:
+            raise TransformUnavailable(
+                f'neither /tf nor odometry has the motion of the frame of the clouds '
+                f'{sensor_frame!r}; known: {self.tree}; if it does not move, set '
+                f'fixed_frame:={sensor_frame}'
+            )
+        self.fixed_frame = found
+        return found
 
     @property
     def finding(self) -> str:
-        """Return what is wrong with the poses and sizes; empty while nothing is known to be."""
-        return self._check.finding
+        """Return the fault that the pose check has found; empty if it has found none."""
+        return self._pose_check.finding
 
     @property
     def facts(self) -> dict[str, object]:
-        """Return what a report says about the ids."""
+        """Return the origin of the ids, for reports."""
         if self._tracker is None:
             return {'ids': 'of the input'}
         return {'ids': 'by association', 'associated_tracks': self._tracker.count}
 
-    def _forget(self) -> None:
-        self._rewinds = Rewind(), Rewind()
-        if self._tracker is not None:
-            self._tracker.forget()
+
+def register(
+    registrar: BoxRegistrar, moved: Sweep | BoxArray | None, restarts: bool
+) -> list[RefinedBoxes]:
+    """
+    Hand an admitted item to the registrar.
+
+    Parameters
+    ----------
+    registrar : BoxRegistrar
+        If time went back, its tracks are flushed and it is reset before the item is added.
+    moved, restarts
+        As of `Admitted`; a caller may have put a ticket on the boxes.
+
+    Returns
+    -------
+    ready : list of RefinedBoxes
+        Results that are ready now.
+
+    """
+    ready: list[RefinedBoxes] = []
+    if restarts:
+        ready += registrar.flush()
+        registrar.reset()
+    if isinstance(moved, Sweep):
+        ready += registrar.add_sweep(moved)
+    elif moved is not None:
+        ready += registrar.add_boxes(moved)
+    return ready
 
 
-def says_nothing(item: Sweep | BoxArray) -> bool:
-    """Tell whether this is an array without boxes, and without a stamp or a frame to wait for."""
+def is_placeholder(item: Sweep | BoxArray) -> bool:
+    """Return whether this is an array without boxes that has no stamp or no frame either."""
     is_empty = isinstance(item, BoxArray) and not item.track_ids
     return is_empty and not (item.frame_id and item.stamp_ns)
 
@@ -83,7 +227,7 @@ def covariances_to_write(refined: RefinedBoxes) -> Floats:
     """
     Return covariances (n, 6, 6) for messages, NaN where the box is kept.
 
-    About a box that stays as it was, the detector knows more than we do.
+    A kept box is the detector's own, and so is the covariance that its message carries.
 
     """
     is_kept = np.array([status == KEPT for status in refined.status], dtype=bool)

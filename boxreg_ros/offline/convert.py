@@ -13,7 +13,7 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.transforms import boxes_to_frame, TransformTree
 from boxreg_ros.labels import (
     check_options,
@@ -24,13 +24,9 @@ from boxreg_ros.labels import (
     Provenance,
     writer_for,
 )
+from boxreg_ros.offline.arguments import add_label_arguments
 from boxreg_ros.offline.cloud_spool import Spool
-from boxreg_ros.offline.labelled_recording import (
-    add_label_arguments,
-    label_frame_of,
-    LabelledRecording,
-    pose_of,
-)
+from boxreg_ros.offline.labelled_recording import label_frame_of, LabelledRecording, pose_of
 from boxreg_ros.offline.result_folder import SUMMARY, whole_folder
 from boxreg_ros.structures import Sweep
 
@@ -181,16 +177,12 @@ def _read_with_recording(
     with LabelledRecording(labels, request.recordings, **topics) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
-        for record in recording.records(tree):
-            try:
-                item = recording.decode(record)
-            except UnsupportedMessage as error:
-                recording.pass_over(record, error)
-                continue
+        for read in recording.items(tree, with_intensities=spool is not None):
+            item = read.content
             if isinstance(item, Sweep):
                 T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
                 if spool is not None and T_fixed_sweep is not None:
-                    spool.add(item, T_fixed_sweep, recording.intensities(record))
+                    spool.add(item, T_fixed_sweep, read.intensities)
                 continue
             T_fixed_boxes = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
             boxes = item
@@ -200,7 +192,8 @@ def _read_with_recording(
             sweep = intensities = None
             if spool is not None and T_fixed_sensor is not None:
                 sweep, intensities = spool.take(item.stamp_ns, sensor_frame, T_fixed_sensor)
-            refined = replace(recording.label.refined, boxes=boxes)
+            assert read.refined is not None  # boxes of label files have it
+            refined = replace(read.refined, boxes=boxes)
             yield LabelFrame(
                 refined, fixed_frame, sensor_frame, T_fixed_sensor, sweep, intensities
             )

@@ -73,7 +73,7 @@ def test_losses_are_printed(tmp_path, scene, capsys):
     assert text.count('\none extent ') == 3  # both recordings, and their mean
     assert 'mean of 2 recordings' in text
     assert cli.main(['bench', 'ablation', folders[0], *options, '--json']) == 0
-    (rows,) = json.loads(capsys.readouterr().out).values()
+    (rows,) = json.loads(capsys.readouterr().out)['results'].values()
     assert set(rows) == {WHOLE, 'one extent'}
     assert 0.5 < rows[WHOLE]['iou_3d'] < 1
 

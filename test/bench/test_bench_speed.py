@@ -9,7 +9,7 @@ STAGES = ('decode', 'transform', 'crop and sample', 'solve', 'encode')
 
 @pytest.fixture(scope='module')
 def report():
-    config = Config(estimate='final').updated({'window': 5, 'solver.rounds': 1})
+    config = Config(estimate='final').updated({'window': 5, 'lag': 4, 'solver.rounds': 1})
     return {
         'device': 'cpu',
         'load': 0.0,

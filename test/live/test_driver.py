@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.live.driver import Arrival, LiveRegistrar, refined_to_frame
+from boxreg_ros.live.driver import LiveRegistrar, ReceivedMessage, refined_to_frame
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
 from msg_adapters import adapter_for, pointcloud, vision
 from msg_adapters.convention import Convention, STANDARD
@@ -43,7 +43,7 @@ class Live(LiveRegistrar):
 
 def arrival(topic, message, now=0.0, adapter=vision):
     reader = pointcloud if topic == '/points' else adapter
-    return Arrival(message, reader.from_msg(message), now)
+    return ReceivedMessage(message, reader.from_msg(message), now)
 
 
 def items_of(drive, topic):

@@ -284,9 +284,8 @@ def test_forks_of_jsk_boxes_are_read_by_the_definition_in_the_recording(tmp_path
     with pytest.raises(UnsupportedMessage, match='--associate'), Recording([path]):
         pass
     with Recording([path], convention=Convention(associate=True)) as recording:
-        _, record = recording.records(TransformTree())
-        boxes = recording.decode(record)
-        raw = recording._message(record)
+        (record,) = recording._records(TransformTree(), {'/boxes'})
+        raw, boxes = recording.box_message(record.data)
     np.testing.assert_allclose(boxes.boxes, INPUT_BOXES[:1], atol=1e-12)
     out = adapter_for(JSK).to_msg(raw, moved_boxes(boxes))
     assert out.boxes[0].histogram.tolist() == [1, 2, 3]
@@ -343,7 +342,7 @@ def test_rclpy_rosbags_and_mcap_read_and_write_the_same(type_name):
 
 def test_missing_message_package_is_named(monkeypatch):
     pytest.importorskip('rclpy', reason='rclpy is not installed')
-    from boxreg_ros.live.node import import_message
+    from boxreg_ros.live.topics import import_message
 
     for type_name in ADAPTERS:
         package = type_name.split('/')[0]

@@ -1,0 +1,180 @@
+"""The way of items to the registrar, which the live node and `boxreg relabel` share."""
+
+from dataclasses import replace
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.session import is_placeholder, register, Session
+from boxreg_ros.structures import BoxArray, Sweep
+from msg_adapters import adapter_for, pointcloud
+from msg_adapters.convention import Convention, STANDARD
+import numpy as np
+import pytest
+from ros_messages import DETECTIONS, Drive, SECOND, START, write_recording
+
+ASSOCIATE = Convention(associate=True)
+
+
+def array_of(stamp_ns, x=5.0, frame_id='map'):
+    """Return one box of a car."""
+    box = np.array([[x, 0, 0.8, 4.5, 1.9, 1.6, 0, 0, 0]])
+    return BoxArray(stamp_ns, frame_id, ('?',), ('car',), np.ones(1), box)
+
+
+def contents(drive, convention=STANDARD):
+    """Return all clouds and boxes of a drive, and its transforms."""
+    adapter = adapter_for(DETECTIONS, convention)
+    readers = {'/points': pointcloud, '/boxes': adapter}
+    items = [
+        readers[topic].from_msg(message) for topic, _, message in drive.items if topic in readers
+    ]
+    transforms = [
+        (message.transforms, topic == '/tf_static')
+        for topic, _, message in drive.items
+        if topic.startswith('/tf')
+    ]
+    return items, transforms
+
+
+def test_items_are_moved_into_the_fixed_frame_with_their_transform():
+    drive = Drive(sweeps=3)
+    items, transforms = contents(drive)
+    session = Session(STANDARD, Config(), '/odom')
+    for transform in transforms:
+        session.tree.add_transforms(*transform)
+    for item in items:
+        admitted = session.admit(item)
+        T = session.tree.lookup('odom', 'lidar', item.stamp_ns)
+        np.testing.assert_array_equal(admitted.T_fixed_item, T)
+        assert admitted.moved.frame_id == 'odom'
+        assert (admitted.restarts, admitted.reason, admitted.detail) == (False, '', '')
+        if isinstance(item, Sweep):
+            np.testing.assert_allclose(admitted.moved.origin, T[:3, 3])
+        else:
+            expected = item.boxes[:, :3] @ T[:3, :3].T + T[:3, 3]
+            np.testing.assert_allclose(admitted.moved.boxes[:, :3], expected)
+
+
+def test_items_without_transform_have_a_reason():
+    drive = Drive(sweeps=1, motion='none')
+    items, _ = contents(drive)
+    session = Session(STANDARD, Config(), 'odom')
+    admitted = [session.admit(item) for item in items]
+    assert [a.reason for a in admitted] == ['sweep_without_transform', 'no_transform']
+    assert all(a.moved is None and "'odom'" in a.detail for a in admitted)
+
+
+def test_fixed_frame_is_chosen_when_the_motion_of_the_clouds_is_known():
+    drive = Drive(sweeps=2)
+    items, transforms = contents(drive)
+    session = Session(STANDARD, Config())
+    with pytest.raises(TransformUnavailable, match='no point cloud has arrived'):
+        session.require_fixed_frame(items[1])
+    session.sensor_frame = 'lidar'
+    with pytest.raises(TransformUnavailable, match='fixed_frame:=lidar'):
+        session.require_fixed_frame(items[1])
+    for transform in transforms:
+        session.tree.add_transforms(*transform)
+    assert session.require_fixed_frame(items[1]) == session.fixed_frame == 'odom'
+
+
+def test_ids_are_assigned_only_if_asked_for():
+    boxes = array_of(START)
+    session = Session(STANDARD, Config(), 'map')
+    assert session.admit(boxes).moved.track_ids == ('?',)
+    assert session.facts == {'ids': 'of the input'}
+    session = Session(ASSOCIATE, Config(), 'map')
+    assert session.admit(boxes).moved.track_ids == ('1',)
+    assert session.facts == {'ids': 'by association', 'associated_tracks': 1}
+
+
+def test_a_restart_assigns_new_ids_and_max_gap_may_change():
+    session = Session(ASSOCIATE, Config(max_gap=0.5), 'map')
+    first, later = array_of(START), array_of(START + 8 * SECOND // 10)
+    assert session.admit(first).moved.track_ids == ('1',)
+    session.config = Config(max_gap=1.0)
+    assert session.admit(later).moved.track_ids == ('1',)
+    session.config = Config(max_gap=0.5)
+    session.restart()
+    assert session.admit(first).moved.track_ids == ('2',)
+    assert session.admit(later).moved.track_ids == ('3',)
+
+
+def test_time_jumps_are_detected_and_assign_new_ids():
+    session = Session(ASSOCIATE, Config(), 'map')
+    ids, jumps = [], []
+    # One old stamp is an outlier; two in a row are a time jump.
+    for seconds in (10.0, 10.1, 3.0, 10.2, 3.0, 3.1, 3.2):
+        admitted = session.admit(array_of(START + round(seconds * SECOND)))
+        jumps.append(admitted.restarts)
+        ids.append(admitted.moved.track_ids[0])
+    assert jumps == [False] * 5 + [True, False]
+    assert ids[5] == ids[6] not in ids[:5]
+
+
+def test_an_array_without_boxes_stamp_and_frame_is_no_time_jump():
+    session = Session(ASSOCIATE, Config(), 'map')
+    session.admit(array_of(START))
+    empty = np.zeros((0, 9))
+    placeholder = BoxArray(0, '', (), (), np.zeros(0), empty)
+    assert is_placeholder(placeholder)
+    for _ in range(3):
+        assert session.admit(placeholder) == (None, None, False, '', '')
+    assert not is_placeholder(replace(placeholder, stamp_ns=START, frame_id='map'))
+
+
+@pytest.mark.parametrize('is_live', [True, False])
+def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path, is_live):
+    """A finding about the boxes before the jump does not hold for those after it."""
+    wrong, right = Drive(sweeps=12, start=START + 100 * SECOND), Drive(sweeps=12)
+    for _, _, message in wrong.items:
+        for detection in getattr(message, 'detections', []):
+            detection.bbox.center.position.z -= detection.bbox.size.z / 2
+    items = [*wrong.items, *right.items]
+    if is_live:
+        findings = list(findings_live(Session(STANDARD, Config(), 'odom'), items))
+    else:
+        day = 86_400 * SECOND
+        shifted = [
+            (t, at + (k >= len(wrong.items)) * day, m) for k, (t, at, m) in enumerate(items)
+        ]
+        findings = list(findings_offline(write_recording(tmp_path / 'drive', shifted)))
+    jumps = [k for k, (restarts, _) in enumerate(findings) if restarts]
+    assert len(jumps) == 1
+    assert 'pose_reference' in findings[jumps[0] - 1][1]
+    assert not any(finding for _, finding in findings[jumps[0] :])
+
+
+def findings_live(session, items):
+    readers = {'/points': pointcloud, '/boxes': adapter_for(DETECTIONS)}
+    for topic, _, message in items:
+        if topic in readers:
+            admitted = session.admit(readers[topic].from_msg(message))
+            yield admitted.restarts, session.finding
+        else:
+            session.tree.add_transforms(message.transforms, topic == '/tf_static')
+
+
+def findings_offline(path):
+    session = Session(STANDARD, Config(), reads_ahead=True)
+    with Recording([path]) as recording:
+        session.fixed_frame = recording.choose_fixed_frame(session.tree)
+        for item in recording.items(session.tree):
+            admitted = session.admit(item.content)
+            assert admitted.moved is not None, admitted.detail
+            yield admitted.restarts, session.finding
+
+
+def test_register_flushes_and_resets_at_a_time_jump():
+    registrar = BoxRegistrar(Config(estimate='final'))
+    sweep = Sweep(START, 'map', np.zeros((0, 3)))
+    assert register(registrar, sweep, restarts=False) == []
+    assert len(register(registrar, array_of(START), restarts=False)) == 1  # early
+    earlier = START - 60 * SECOND
+    ready = register(registrar, array_of(earlier), restarts=True)
+    assert [(r.boxes.stamp_ns, r.is_final) for r in ready] == [(START, True)]
+    ready = register(registrar, replace(sweep, stamp_ns=earlier), restarts=False)
+    assert [r.reasons for r in ready] != [('late',)]
+    assert register(registrar, None, restarts=True)[-1].boxes.stamp_ns == earlier
