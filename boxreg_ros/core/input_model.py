@@ -25,6 +25,8 @@ MAD_TO_DEVIATION = 1.48
 QUARTILES_TO_DEVIATION = 0.74
 """Standard deviation over interquartile range. Derived: 1 / 1.349 for a Gaussian."""
 
+FACE_GAPS = ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
+"""Settings of `ClassConfig` that are the expected margins of the six faces."""
 FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
 """Faces with one labelling margin: ends, sides, top, bottom."""
 GAP_DEVIATIONS = (0.05, 0.05, 0.05, 0.15)
@@ -248,24 +250,27 @@ def expect(
     bias = usual * usual.new_tensor([1, 1, 1, 1, 1, YAW_BIAS]) * slow[:, :6] * constant
 
     # Extents: the mean of the input, corrected by the population.
-    total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1)
-    total = total + problem.marginalised_extents[:, :3]
-    mean = total / (valid.sum(1)[:, None] + problem.marginalised_extents[:, 3:])
+    mean = _mean_input_extents(problem)
     part = usual_extent * slow[:, 6:] * (2 * constant[:, :3]).clamp(max=1)
     extent = mean * population_factor(noise.extent_evidence, mean, part)
 
     one = torch.ones_like(usual)
     length = mean[:, :1]
-    gaps = problem.of_class(
-        'gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom'
-    )
-    gaps = gaps + offsets.gap_correction.to(usual)
+    gaps = problem.of_class(*FACE_GAPS) + offsets.gap_correction.to(usual)
     loose = (2 - 2 * constant[:, :1]).clamp(1)
     shared = [extent, 0 * one, gaps, length * problem.of_class('pivot'), 0 * one]
     deviations = [extent * part, bias, one * loose, length * PIVOT_DEVIATION, one]
     return Expectation(
         torch.cat(shared, 1), torch.cat(deviations, 1), deviation, deviation * widening
     )
+
+
+def _mean_input_extents(problem: Problem) -> Tensor:
+    """Return the mean extents of the input, marginalised observations included, (B, 3) [m]."""
+    valid = problem.valid
+    total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1)
+    total = total + problem.marginalised_extents[:, :3]
+    return total / (valid.sum(1)[:, None] + problem.marginalised_extents[:, 3:])
 
 
 def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
