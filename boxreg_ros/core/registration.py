@@ -158,15 +158,16 @@ def _accepted(
     is_kept = failed.any(0)
     reasons = np.select(failed, REASONS, '')
     status = np.where(is_kept, KEPT, REFINED)
+    # Before input boxes are put in: on a CPU the arrays share memory with the tensors.
+    is_solved = (boxes.isfinite().all(-1) & (extent > 0).all(-1)).all(1)
+    is_solved &= solution.covariances.isfinite().all((1, 2, 3))
+    priors = _priors(base, solution, is_solved)
     found = boxes.cpu().numpy()
     found[..., :3] += base[:, None]
     covariances = solution.covariances.cpu().numpy()
     for b, i in np.argwhere(problem.valid.cpu().numpy() & is_kept).tolist():
         found[b, i] = windows[b].observations[i].box
         covariances[b, i] = np.eye(6)
-    is_solved = (boxes.isfinite().all(-1) & (extent > 0).all(-1)).all(1)
-    is_solved &= solution.covariances.isfinite().all((1, 2, 3))
-    priors = _priors(base, solution, is_solved)
     estimates = []
     for b, window in enumerate(windows):
         n = len(window.observations)
