@@ -20,6 +20,12 @@ import yaml
 
 _T = TypeVar('_T')
 
+RENAMED = {
+    'faces.depth_ends': 'faces.inset_ends',
+    'faces.depth_sides': 'faces.inset_sides',
+}
+"""Settings of earlier versions by their old names: the error names the new one."""
+
 NODE_OPTIONS = (
     *('boxes_type', 'pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
     *('output_frame', 'transform_timeout', 'backlog', 'config_file'),
@@ -78,39 +84,69 @@ class SamplingConfig:
 
 @dataclass(frozen=True, slots=True)
 class FaceConfig:
-    """How the outermost points of a face tell where it is."""
+    """Face observations: the outermost points on each face, and their errors."""
 
-    outermost: float = setting(0.05, 'part of the points that stands for a face', '', 1e-3, 1.0)
-    ends: float = setting(0.12, 'error of one sight of front or back', 'm', 1e-3, 10.0)
-    sides: float = setting(0.08, 'error of one sight of left or right', 'm', 1e-3, 10.0)
-    top: float = setting(0.08, 'error of one sight of the roof', 'm', 1e-3, 10.0)
-    bottom: float = setting(0.05, 'error of one sight of the road', 'm', 1e-3, 10.0)
-    outlier: float = setting(0.15, 'a face this far off its points loses its say', 'm', 1e-3, 10.0)
-    depth_ends: float = setting(0.36, 'points further in, ends seen from behind', 'm', 0.0, 2.0)
-    depth_sides: float = setting(0.18, 'points further in, sides seen from behind', 'm', 0.0, 2.0)
-    spread: float = setting(0.05, 'difference of gaps between objects', 'm', 1e-4, 1.0)
-    learn: bool = setting(True, 'learn the gaps from the input as it comes')
+    outermost: float = setting(
+        0.05, 'part of the points of a box that makes one face observation', '', 1e-3, 1.0
+    )
+    ends: float = setting(
+        0.12, 'standard deviation of one observation of the front or rear face', 'm', 1e-3, 10.0
+    )
+    sides: float = setting(
+        0.08, 'standard deviation of one observation of the left or right face', 'm', 1e-3, 10.0
+    )
+    top: float = setting(
+        0.08, 'standard deviation of one observation of the top face', 'm', 1e-3, 10.0
+    )
+    bottom: float = setting(
+        0.05, 'standard deviation of one observation of the road under the box', 'm', 1e-3, 10.0
+    )
+    outlier: float = setting(
+        0.15, 'distance of a face from its points at which its weight is 1/4', 'm', 1e-3, 10.0
+    )
+    inset_ends: float = setting(
+        0.36, 'expected inset of the surface behind an occluded front or rear face', 'm', 0.0, 2.0
+    )
+    inset_sides: float = setting(
+        0.18, 'expected inset of the surface behind an occluded left or right face', 'm', 0.0, 2.0
+    )
+    spread: float = setting(
+        0.05, 'standard deviation of the labelling margin between objects', 'm', 1e-4, 1.0
+    )
+    learn: bool = setting(
+        True, 'estimate the labelling margins from the input boxes while they come in'
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class SolverConfig:
-    """L-BFGS and the rounds around it."""
+    """L-BFGS, and the rounds of correspondence and weighting around it."""
 
-    rounds: int = setting(15, 'most rounds: outermost points and weights renewed', '', 1, 100)
+    rounds: int = setting(
+        15, 'most rounds; each renews the outermost points and the weights', '', 1, 100
+    )
     iterations: int = setting(1, 'most L-BFGS iterations per round', '', 1, 10000)
-    history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
-    threads: int = setting(0, 'parts of a batch solved at once; 0: as many as cores', '', 0, 256)
-    tolerance: float = setting(1e-4, 'a step that promises less ends a window', '', 0.0, 1.0)
+    history: int = setting(6, 'curvature pairs that L-BFGS keeps', '', 1, 100)
+    threads: int = setting(
+        0, 'threads that share the windows of a batch; 0: one per core', '', 0, 256
+    )
+    tolerance: float = setting(
+        1e-4, 'relative decrease of the objective that ends the search of a round', '', 0.0, 1.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class PaperConfig:
-    """Weights of the paper's objective (Eq. 8); read with ``objective: paper`` only."""
+    """Weights of the paper's objective (Eq. 8); used with ``objective: paper`` only."""
 
-    closeness: float = setting(0.1, 'weight of Eq. 4', '1/m^2', 0.0, 1e6)
-    enclosure: float = setting(3.0, 'weight of Eq. 5', '1/m', 0.0, 1e6)
-    smoothness: float = setting(0.1, 'weight of Eq. 6 and of its constraint', '', 0.0, 1e6)
-    alignment: float = setting(0.3, 'weight of Eq. 7 and of its constraint', '', 0.0, 1e6)
+    closeness: float = setting(0.1, 'weight of the closeness term, Eq. 4', '1/m^2', 0.0, 1e6)
+    enclosure: float = setting(3.0, 'weight of the enclosure term, Eq. 5', '1/m', 0.0, 1e6)
+    smoothness: float = setting(
+        0.1, 'weight of the smoothness constraint, Eq. 6, and its first multiplier', '', 0.0, 1e6
+    )
+    alignment: float = setting(
+        0.3, 'weight of the alignment constraint, Eq. 7, and its first multiplier', '', 0.0, 1e6
+    )
     nearest: int = setting(8, 'K, the closest points per visible face in Eq. 4', '', 1, 10000)
     multiplier_rounds: int = setting(5, 'updates of the two Lagrange multipliers', '', 1, 100)
     iterations: int = setting(60, 'most L-BFGS iterations per update', '', 1, 10000)
@@ -119,34 +155,110 @@ class PaperConfig:
 @dataclass(frozen=True, slots=True)
 class ClassConfig:
     """
-    How objects of one kind move, how their boxes err and how these are drawn.
+    Motion, input errors and labelling margins of the objects of one kind.
 
-    The gaps are the annotation rule: how far outside of its outermost points a label's face
-    stands. With ``faces.learn`` the input's own boxes shift them, those of all kinds together.
+    A labelling margin (``gap_*``) is the distance from the outermost surface points out to the
+    face of the label. With ``faces.learn`` the input boxes correct them, all kinds together.
 
     """
 
-    names: tuple[str, ...] = setting((), 'class names of this kind: any of these words, any case')
-    acceleration: float = setting(1.5, 'expected change of speed', 'm/s^2', 1e-3, 1e3)
-    cornering: float = setting(4.0, 'expected acceleration sideways', 'm/s^2', 1e-3, 1e3)
-    vertical: float = setting(1.0, 'expected vertical acceleration', 'm/s^2', 1e-3, 1e3)
-    turning: float = setting(0.8, 'expected change of turn rate', 'rad/s^2', 1e-3, 1e3)
-    tilting: float = setting(0.2, 'expected change of roll and pitch rate', 'rad/s^2', 1e-3, 1e3)
-    slip: float = setting(0.15, 'expected sideways velocity of the rear axle', 'm/s', 1e-3, 1e3)
-    climb: float = setting(0.25, 'expected velocity along its own z axis', 'm/s', 1e-3, 1e3)
-    pivot: float = setting(0.25, 'rear axle behind the centre, by length', '', 0.0, 0.5)
-    shape: float = setting(0.03, 'how far its surface is from rigid', 'm', 1e-3, 1.0)
-    drift: float = setting(0.02, 'step of a parked box: map and ego drift', 'm', 1e-4, 1.0)
-    position: float = setting(0.14, 'error of an input centre along the heading', 'm', 1e-3, 10.0)
-    lateral: float = setting(0.08, 'error of an input centre across the heading', 'm', 1e-3, 10.0)
-    height: float = setting(0.07, 'error of an input centre in z', 'm', 1e-3, 10.0)
-    heading: float = setting(0.04, 'error of an input yaw', 'rad', 1e-3, 3.2)
-    tilt: float = setting(0.02, 'error of an input roll and pitch', 'rad', 1e-4, 3.2)
-    extent: float = setting(0.05, 'error of the input extents, as part of each', '', 1e-3, 1.0)
-    gap_ends: float = setting(0.05, 'label outside the points, front and back', 'm', -2.0, 2.0)
-    gap_sides: float = setting(0.03, 'label outside the points, left and right', 'm', -2.0, 2.0)
-    gap_top: float = setting(0.05, 'label above the roof points', 'm', -2.0, 2.0)
-    gap_bottom: float = setting(0.0, 'label below the road', 'm', -2.0, 2.0)
+    names: tuple[str, ...] = setting(
+        (), 'class names of this kind: any of these words, in any case'
+    )
+    acceleration: float = setting(
+        1.5, 'standard deviation of the forward acceleration', 'm/s^2', 1e-3, 1e3
+    )
+    cornering: float = setting(
+        4.0, 'standard deviation of the sideways acceleration', 'm/s^2', 1e-3, 1e3
+    )
+    vertical: float = setting(
+        1.0, 'standard deviation of the vertical acceleration', 'm/s^2', 1e-3, 1e3
+    )
+    turning: float = setting(
+        0.8, 'standard deviation of the yaw acceleration', 'rad/s^2', 1e-3, 1e3
+    )
+    tilting: float = setting(
+        0.2, 'standard deviation of the roll and pitch acceleration', 'rad/s^2', 1e-3, 1e3
+    )
+    slip: float = setting(
+        0.15, 'standard deviation of the sideways velocity of the pivot', 'm/s', 1e-3, 1e3
+    )
+    climb: float = setting(
+        0.25, 'standard deviation of the velocity along the z axis of the box', 'm/s', 1e-3, 1e3
+    )
+    pivot: float = setting(
+        0.25, 'distance of the pivot (rear axle) behind the centre, as part of the length',
+        '', 0.0, 0.5,
+    )  # fmt: skip
+    shape: float = setting(
+        0.03, 'standard deviation of the surface from one rigid shape per track', 'm', 1e-3, 1.0
+    )
+    drift: float = setting(
+        0.02, 'standard deviation of the step of a parked box (drift of the fixed frame)',
+        'm', 1e-4, 1.0,
+    )  # fmt: skip
+    position: float = setting(
+        0.14, 'standard deviation of the input centre along the heading', 'm', 1e-3, 10.0
+    )
+    lateral: float = setting(
+        0.08, 'standard deviation of the input centre across the heading', 'm', 1e-3, 10.0
+    )
+    height: float = setting(
+        0.07, 'standard deviation of the height of the input centre', 'm', 1e-3, 10.0
+    )
+    heading: float = setting(0.04, 'standard deviation of the input yaw', 'rad', 1e-3, 3.2)
+    tilt: float = setting(0.02, 'standard deviation of the input roll and pitch', 'rad', 1e-4, 3.2)
+    extent: float = setting(
+        0.05, 'standard deviation of the input extents, as part of each', '', 1e-3, 1.0
+    )
+    gap_ends: float = setting(
+        0.05, 'labelling margin: front and rear face outside the surface points', 'm', -2.0, 2.0
+    )
+    gap_sides: float = setting(
+        0.03, 'labelling margin: left and right face outside the surface points', 'm', -2.0, 2.0
+    )
+    gap_top: float = setting(
+        0.05, 'labelling margin: top face above the roof points', 'm', -2.0, 2.0
+    )
+    gap_bottom: float = setting(
+        0.0, 'labelling margin: bottom face below the road', 'm', -2.0, 2.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Ingredients:
+    """
+    Parts of the method that `boxreg bench ablation` switches off, one at a time.
+
+    For measurement only: no settings, so neither parameters of the node nor part of a written
+    configuration. Each says what is done where it is True.
+
+    """
+
+    strips: bool = True
+    """Each of three strips of a face has outermost points of its own."""
+    occluded_faces: bool = True
+    """Faces turned away from the sensor have a weight."""
+    range_inset: bool = True
+    """Points are expected further inside the faces of distant objects."""
+    point_ownership: bool = True
+    """A point near two boxes belongs to the one it is deeper inside of."""
+    road: bool = True
+    """The road beside a box is an observation of its bottom face."""
+    noise_estimation: bool = True
+    """The noise of the input is estimated."""
+    input_bias: bool = True
+    """The errors of the input have a part that is constant over a track."""
+    population_extents: bool = True
+    """Extents of a track are expected by those of the others."""
+    marginalisation: bool = True
+    """Observations that leave a sliding window leave a prior."""
+    heading_sign: bool = True
+    """180° flips of the input are corrected."""
+    robust_motion: bool = True
+    """Motion residuals are down-weighted beyond three deviations."""
+    robust_weights: bool = True
+    """Input poses and labelling margins far from what is expected are down-weighted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +315,7 @@ class Config:
     faces: FaceConfig = FaceConfig()
     solver: SolverConfig = SolverConfig()
     paper: PaperConfig = PaperConfig()
+    ingredients: Ingredients = Ingredients()
     vehicle: ClassConfig = ClassConfig(
         names=('car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram')
     )
@@ -317,6 +430,8 @@ def settings() -> Iterator[Setting]:
             yield item.metadata['of']._replace(name=item.name)
             continue
         for part in fields(item.default):
+            if 'of' not in part.metadata:  # `Ingredients` are no settings
+                continue
             yield part.metadata['of']._replace(
                 name=f'{item.name}.{part.name}', default=getattr(item.default, part.name)
             )
@@ -332,6 +447,8 @@ def _filled(default: _T, value: Any, name: str) -> _T:
     prefix = f'{name}.' if name else ''
     for key in value:
         if key not in known:
+            if prefix + key in RENAMED:
+                raise ConfigError(f'{prefix}{key}: was renamed; set {RENAMED[prefix + key]}')
             names = ', '.join(sorted(known))
             raise ConfigError(f'{prefix}{key}: no such setting; expected one of {names}')
     changes = {key: _filled(known[key], inner, prefix + key) for key, inner in value.items()}

@@ -1,8 +1,9 @@
 """Scenes with known truth: a car, the points of a fixed sensor; and batches made by hand."""
 
-from boxreg_ros.core import objective
+from boxreg_ros.core import batch, terms
 from boxreg_ros.core.arrowhead import LINK
-from boxreg_ros.core.objective import DEVIATIONS, MEMORY, Problem, SHARED
+from boxreg_ros.core.batch import CLASS_NUMBERS, PRIOR_SIZE, Problem, SHARED, State
+from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.window import PADDING_POSITION, Window
@@ -105,7 +106,7 @@ def problem_of(boxes, **changes):
     """
     Return the problem of `boxes` (B, N, 9) with some fields changed.
 
-    At 10 Hz, without points or prior. `deviations` are by name, those not given are NaN.
+    At 10 Hz, without points or prior. `class_numbers` are by name, those not given are NaN.
 
     """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
@@ -123,13 +124,13 @@ def problem_of(boxes, **changes):
         'delays': torch.zeros(points.shape[:3], dtype=torch.float64),
         'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
         'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
-        'recalled': torch.zeros(B, MEMORY, dtype=torch.float64),
-        'information': torch.zeros(B, MEMORY, MEMORY, dtype=torch.float64),
-        'seen': torch.zeros(B, 4, dtype=torch.float64),
-        'deviations': torch.full((B, len(DEVIATIONS)), torch.nan, dtype=torch.float64),
+        'prior_mean': torch.zeros(B, PRIOR_SIZE, dtype=torch.float64),
+        'prior_information': torch.zeros(B, PRIOR_SIZE, PRIOR_SIZE, dtype=torch.float64),
+        'marginalised_extents': torch.zeros(B, 4, dtype=torch.float64),
+        'class_numbers': torch.full((B, len(CLASS_NUMBERS)), torch.nan, dtype=torch.float64),
     }
-    for name, values in changes.pop('deviations', {}).items():
-        given['deviations'][:, DEVIATIONS.index(name)] = torch.as_tensor(values)
+    for name, values in changes.pop('class_numbers', {}).items():
+        given['class_numbers'][:, CLASS_NUMBERS.index(name)] = torch.as_tensor(values)
     more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
     problem = Problem(**{**given, **more})
     problem.points[~problem.mask] = PADDING_POSITION
@@ -141,8 +142,71 @@ def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
     shared = torch.zeros(B, SHARED, dtype=torch.float64)
     shared[:, :3] = torch.tensor(extent)
     for name, value in parts.items():
-        shared[:, getattr(objective, name)] = torch.as_tensor(value, dtype=torch.float64)
+        shared[:, getattr(batch, name)] = torch.as_tensor(value, dtype=torch.float64)
     return shared
+
+
+def boxes_at(*poses, extent=(4.0, 2.0, 2.0)):
+    """Return boxes (1, N, 9) at poses (x, y, z, roll, pitch, yaw); what is left out is 0."""
+    full = [(*pose, *[0.0] * (6 - len(pose))) for pose in poses]
+    rows = [[*pose[:3], *extent, *pose[3:]] for pose in full]
+    return torch.tensor([rows], dtype=torch.float64)
+
+
+def random_problem(B=3, N=6, M=20, seed=0):
+    """Return a problem of random boxes of about 4 x 2 x 1.5 m and points, padded by up to two."""
+    rng = np.random.default_rng(seed)
+    boxes = rng.normal(size=(B, N, 9))
+    boxes[..., 3:6] = [4, 2, 1.5] + 0.1 * rng.random((B, N, 3))
+    boxes[..., 6:8] *= 0.1
+    valid = np.arange(N) < np.array([N, N - 1, N - 2])[:B, None]
+    return problem_of(
+        boxes,
+        valid=valid,
+        times=np.cumsum(rng.random((B, N)) + 0.05, 1),
+        points=rng.normal(size=(B, N, M, 3)),
+        mask=(rng.random((B, N, M)) < 0.8) & valid[..., None],
+    )
+
+
+def random_weights(rng, *shape):
+    """Return random symmetric positive definite weights (*shape, shape[-1])."""
+    root = torch.from_numpy(rng.normal(size=(*shape, shape[-1])))
+    return root @ root.mT
+
+
+def terms_of(problem, seed=1):
+    """Return every term of a problem by name, with random weights and data."""
+    rng = np.random.default_rng(seed)
+    B, N = problem.valid.shape
+    inset = torch.from_numpy(rng.random((B, N, 6)))
+    expected = torch.from_numpy(rng.normal(size=(B, SHARED)))
+    axes = rotation_from_rpy(problem.pose[..., 3:] + 0.1)
+    wanted = torch.from_numpy(rng.normal(size=(B, N, 6)))
+    mean = torch.from_numpy(rng.normal(size=(B, 1, PRIOR_SIZE)))
+    shapes = {  # of the weights, and the data
+        terms.faces: ((N, 6, 4), (problem.pose, inset)),
+        terms.input_pose: ((N, 1, 6), (problem.pose, axes)),
+        terms.rigid_shape: ((N, 1, 6), (0.9 * problem.pose, wanted)),
+        terms.acceleration: ((N - 2, 1, 6), (problem.times,)),
+        terms.zero_motion: ((N - 1, 1, 6), ()),
+        terms.slip: ((N - 1, 1, 2), (problem.times,)),
+        terms.shared_prior: ((1, 1, SHARED), (expected,)),
+        terms.marginalisation_prior: ((1, 1, PRIOR_SIZE), (mean,)),
+    }
+    return {
+        function.__name__: terms.Term(function, random_weights(rng, B, *shape), data)
+        for function, (shape, data) in shapes.items()
+    }
+
+
+def random_variables(problem, seed=2):
+    """Return variables (B, 6 N + 22) about the input poses of a problem."""
+    rng = np.random.default_rng(seed)
+    B, N = problem.valid.shape
+    pose = problem.pose + 0.1 * torch.from_numpy(rng.normal(size=(B, N, 6)))
+    shared = 3 + torch.from_numpy(rng.normal(size=(B, SHARED)))
+    return State(pose, shared).pack()
 
 
 def dense(chain, N):

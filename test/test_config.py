@@ -85,6 +85,11 @@ def test_unknown_keys_are_refused_by_name(values, name):
         Config.from_dict(values)
 
 
+def test_a_renamed_setting_is_refused_with_its_new_name():
+    with pytest.raises(ConfigError, match=r'set faces\.inset_ends'):
+        Config().updated({'faces.depth_ends': 0.3})
+
+
 @pytest.mark.parametrize('name', ['windw', 'solver.round', 'window.size', 'a.b.c'])
 def test_unknown_dotted_names_are_refused(name):
     with pytest.raises(ConfigError, match='window' if name == 'window.size' else name[0]):

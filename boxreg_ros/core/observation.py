@@ -114,10 +114,13 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     up = matrix_from_rpy(boxes[:, ROLL:])[:, :, 2]
     # Above the bottom of the box, along its z axis: also valid on a slope. (P,)
     height = (near.offset * up.T.take(near.owner, 1)).sum(0) + half[:, 2].take(near.owner)
-    road = _road_heights(near, height, depth, half)
+    road = np.full(n, np.nan)
+    if config.ingredients.road:
+        road = _road_heights(near, height, depth, half)
 
     is_own = depth < config.sampling.margin
-    is_own &= depth <= _least_depth(near, depth, len(sweep.points)) + OWNERSHIP_TOLERANCE
+    if config.ingredients.point_ownership:
+        is_own &= depth <= _least_depth(near, depth, len(sweep.points)) + OWNERSHIP_TOLERANCE
     is_own &= height > (np.nan_to_num(road) + GROUND_CLEARANCE).take(near.owner)
     rows, owner = _sampled(near, np.flatnonzero(is_own), sweep, n, config)
 

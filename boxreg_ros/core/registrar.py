@@ -429,7 +429,7 @@ class _Track:
 
     def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
         """Write the estimate of the window of `entries` to their box arrays."""
-        self.prior = estimate.memory
+        self.prior = estimate.prior
         columns = estimate.boxes, estimate.status, estimate.reasons, estimate.covariances
         for entry, *values in zip(entries, *columns, strict=True):
             entry.write(*values)

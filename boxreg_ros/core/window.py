@@ -5,7 +5,7 @@ from dataclasses import astuple
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.objective import MEMORY, Problem, SHARED
+from boxreg_ros.core.batch import PRIOR_SIZE, Problem, SHARED
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.structures import Floats, ROLL, YAW
 import numpy as np
@@ -74,9 +74,9 @@ class MarginalisationPrior(NamedTuple):
     @classmethod
     def none(cls, base: Floats) -> 'MarginalisationPrior':
         """Return a prior without information, NaN as its linearisation point."""
-        zeros = np.zeros(MEMORY)
-        information = np.zeros((MEMORY, MEMORY))
-        return cls(base, np.full(MEMORY, np.nan), zeros, information, np.zeros(4))
+        zeros = np.zeros(PRIOR_SIZE)
+        information = np.zeros((PRIOR_SIZE, PRIOR_SIZE))
+        return cls(base, np.full(PRIOR_SIZE, np.nan), zeros, information, np.zeros(4))
 
 
 class Window(NamedTuple):
@@ -180,14 +180,17 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     base, state, step, information, extents = (
         np.array(part) for part in zip(*priors, strict=True)
     )
-    boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, state[:, 5])
+    if config.ingredients.heading_sign:
+        boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, state[:, 5])
+    else:
+        boxes[..., YAW] = np.unwrap(boxes[..., YAW])
     start = _starting_boxes(windows, boxes)
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]
     minimum, is_usable = _prior_minimum(start, state, step)
     information = information * PRIOR_DECAY * is_usable[:, None, None]
     arrays = [boxes, start, valid, times, points, mask, delays, origins, ground]
-    arrays += [np.nan_to_num(minimum), information, extents, _deviations(windows, config)]
+    arrays += [np.nan_to_num(minimum), information, extents, _class_numbers(windows, config)]
     return Problem(*(torch.from_numpy(array).to(config.device) for array in arrays)), base
 
 
@@ -282,7 +285,7 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
     return minimum, np.asarray((half_turns % 2 == 0).all(1))
 
 
-def _deviations(windows: Sequence[Window], config: Config) -> Floats:
+def _class_numbers(windows: Sequence[Window], config: Config) -> Floats:
     """Return the numbers of each window's `ClassConfig`, in the order of its fields, (B, D)."""
     names = {window.class_name for window in windows}
     rows = {name: astuple(config.class_config(name))[1:] for name in names}

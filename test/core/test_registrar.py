@@ -401,7 +401,7 @@ def test_short_tracks_are_kept_and_boxes_without_points_refined(stream, estimate
 @pytest.fixture
 def no_extent_law(monkeypatch):
     """Turn off the extent law, which is learnt from all tracks."""
-    monkeypatch.setattr(calibration, 'SLOPES', 1e-9)
+    monkeypatch.setattr(calibration, 'SLOPE_DEVIATION', 1e-9)
 
 
 @each_estimate

@@ -1,7 +1,7 @@
 """Windows of observations, and batches of windows as padded tensors."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.objective import MEMORY
+from boxreg_ros.core.batch import PRIOR_SIZE
 from boxreg_ros.core.window import (
     group_windows,
     MarginalisationPrior,
@@ -32,9 +32,9 @@ def with_prior(window, yaw=0.0):
     base = boxes[0, :3] - [1.0, 0, 0]
     pose = boxes[:2, POSE] - [*base, 0, 0, 0]
     pose[:, 5] += yaw
-    shared = [*boxes[0, 3:6], *np.zeros(MEMORY - 15)]
-    step = np.random.default_rng(3).normal(size=MEMORY)
-    information = np.diag(1.0 + np.arange(MEMORY))
+    shared = [*boxes[0, 3:6], *np.zeros(PRIOR_SIZE - 15)]
+    step = np.random.default_rng(3).normal(size=PRIOR_SIZE)
+    information = np.diag(1.0 + np.arange(PRIOR_SIZE))
     prior = MarginalisationPrior(
         base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1])
     )
@@ -65,7 +65,7 @@ def test_windows_are_padded():
             np.testing.assert_array_equal(problem.points[b, i][mask], observation.points)
             np.testing.assert_array_equal(problem.origins[b, i], observation.origin)
         assert not problem.mask[b, n:].any()
-    assert problem.of('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
+    assert problem.of_class('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
 
 
 def seconds(boxes):
@@ -158,11 +158,11 @@ def test_priors_are_stacked():
     prior = with_prior(one).prior
     np.testing.assert_array_equal(base, [prior.base, given(other)[0, :3]])
     np.testing.assert_allclose(problem.boxes[:, 0, :3], [[1, 0, 0], [0, 0, 0]])
-    np.testing.assert_allclose(problem.recalled[0], prior.state + prior.step, atol=1e-12)
-    np.testing.assert_allclose(problem.information[0], PRIOR_DECAY * prior.information)
-    np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1], [0, 0, 0, 0]])
-    np.testing.assert_array_equal(problem.recalled[1], 0)
-    np.testing.assert_array_equal(problem.information[1], 0)
+    np.testing.assert_allclose(problem.prior_mean[0], prior.state + prior.step, atol=1e-12)
+    np.testing.assert_allclose(problem.prior_information[0], PRIOR_DECAY * prior.information)
+    np.testing.assert_array_equal(problem.marginalised_extents, [[4, 2, 1, 1], [0, 0, 0, 0]])
+    np.testing.assert_array_equal(problem.prior_mean[1], 0)
+    np.testing.assert_array_equal(problem.prior_information[1], 0)
     assert prior.information[3, 3] == 4  # the input is not changed
     assert with_prior(one).learning_part().prior is None
 
@@ -182,11 +182,11 @@ def test_a_prior_of_the_opposite_heading_is_dropped():
     (window,) = windows([5])
     for one in (flipped(with_prior(window)), with_prior(window, np.pi)):
         problem, _ = stack_windows([one], CONFIG)
-        np.testing.assert_array_equal(problem.information, 0)
-        assert problem.recalled.isfinite().all()
-        np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1]])
+        np.testing.assert_array_equal(problem.prior_information, 0)
+        assert problem.prior_mean.isfinite().all()
+        np.testing.assert_array_equal(problem.marginalised_extents, [[4, 2, 1, 1]])
     kept, _ = stack_windows([flipped(with_prior(window, np.pi))], CONFIG)
-    assert (kept.information[0].diagonal() > 0).all()
+    assert (kept.prior_information[0].diagonal() > 0).all()
 
 
 def test_a_solved_window_starts_from_its_estimates():
