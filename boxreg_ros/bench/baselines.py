@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from boxreg_ros.core.metrics import EXTENT
+from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.core.refine import Track
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix, wrap_angle
 from boxreg_ros.structures import Floats, HEIGHT, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
@@ -63,7 +63,7 @@ def smoothed_live(track: Track, lag: int) -> tuple[Floats, Floats]:
 
 def _smooth(stamps_ns: Ints, given: Floats) -> Floats:
     boxes = given.copy()
-    boxes[:, EXTENT] = np.median(boxes[:, EXTENT], axis=0)
+    boxes[:, BOX_EXTENT] = np.median(boxes[:, BOX_EXTENT], axis=0)
     boxes[:, YAW] = _without_flips(boxes[:, YAW])
     times = (stamps_ns - stamps_ns[0]) / 1e9
     columns = [0, 1, 2, ROLL, PITCH, YAW]
@@ -201,7 +201,7 @@ def icp(track: Track) -> Floats:
         R = matrix_from_rpy(box[ROLL:])
         local = (points - box[:3]) @ R
         sensor = R.T @ (_sensor_origin(track, i) - box[:3])
-        faces = small_gicp.PointCloud(_face_points(box[EXTENT], sensor))
+        faces = small_gicp.PointCloud(_face_points(box[BOX_EXTENT], sensor))
         T_box_points = small_gicp.align(
             faces,
             small_gicp.PointCloud(local),
@@ -239,7 +239,7 @@ def _body_points(track: Track, i: int) -> Floats:
     box = track.boxes[i]
     points = track.points[i]
     offsets = (points - box[:3]) @ matrix_from_rpy(box[ROLL:])
-    is_near = (np.abs(offsets) < box[EXTENT] / 2 + POINT_MARGIN).all(axis=1)
+    is_near = (np.abs(offsets) < box[BOX_EXTENT] / 2 + POINT_MARGIN).all(axis=1)
     is_above = offsets[:, 2] > ROAD_CLEARANCE - box[HEIGHT] / 2
     body: Floats = points[is_near & is_above]
     return body

@@ -33,7 +33,7 @@ PROFILE = Path(__file__).parents[1] / 'share' / 'fastdds.xml'
 CIRCLE_PERIOD = 5.0  # time until a car is back where it began [s]
 TRACK_LIFETIME = 200  # sweeps until a track gets a new id
 SETTLING_TIME = 5.0  # not measured at the beginning [s]
-EXTENT = (4.5, 1.9, 1.6)  # length, width and height of every car [m]
+CAR_EXTENT = (4.5, 1.9, 1.6)  # length, width and height of every car [m]
 CAR_SPACING = 14.0  # of the centres of the circles [m]
 CIRCLE_RADIUS = 4.0  # [m]
 POINTS_PER_CAR = 300
@@ -110,14 +110,14 @@ def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tupl
     boxes = np.zeros((args.tracks, 9))
     boxes[:, 0] = CAR_SPACING * (index % side - side / 2) + CIRCLE_RADIUS * np.sin(phase) + 5.0
     boxes[:, 1] = CAR_SPACING * (index // side - side / 2) - CIRCLE_RADIUS * np.cos(phase) + 5.0
-    boxes[:, LENGTH:ROLL] = EXTENT
+    boxes[:, LENGTH:ROLL] = CAR_EXTENT
     boxes[:, YAW] = phase
     local = rng.uniform(-0.5, 0.5, (args.tracks, POINTS_PER_CAR, 3))  # (n, points, xyz)
     near = -np.sign(boxes[:, :2])  # the end and the side that roughly face the sensor
     half = POINTS_PER_CAR // 2
     local[:, :half, 0] = 0.49 * near[:, :1]
     local[:, half:, 1] = 0.49 * near[:, 1:]
-    local *= np.array(EXTENT)
+    local *= np.array(CAR_EXTENT)
     cos = np.cos(phase)[:, None]
     sin = np.sin(phase)[:, None]
     x = cos * local[..., 0] - sin * local[..., 1]
@@ -125,7 +125,7 @@ def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tupl
     points = np.stack([x, y, local[..., 2]], axis=-1) + boxes[:, None, :3]
     rest = max(0, args.points - points[..., 0].size)
     road = rng.uniform(-ROAD_SIZE / 2, ROAD_SIZE / 2, (rest, 3))
-    road[:, 2] = -EXTENT[2] / 2
+    road[:, 2] = -CAR_EXTENT[2] / 2
     noisy = boxes + np.array(BOX_ERRORS) * rng.normal(0, 1, boxes.shape)
     return np.concatenate([points.reshape(-1, 3), road]), noisy
 

@@ -11,7 +11,7 @@ import torch
 
 MAX_PAIRS = 1000
 """Pairs whose intersection is computed at once; derived: about 100 MB of temporary arrays."""
-EXTENT = slice(LENGTH, HEIGHT + 1)
+BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
 """Columns of the extents."""
 FACE_OFFSET = 1e-9
 """The second box is larger by this on each side [m], so that no two faces are coplanar; derived:
@@ -67,7 +67,7 @@ def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
     axes = rotation_from_rpy(torch.from_numpy(b[:, ROLL:])).numpy()
     translation = (difference[:, None, :3] @ axes)[:, 0]
     is_flipped = np.abs(rotation[:, 2]) > np.pi / 2
-    return PoseErrors(translation, difference[:, EXTENT], rotation, is_flipped)
+    return PoseErrors(translation, difference[:, BOX_EXTENT], rotation, is_flipped)
 
 
 def iou_bev(boxes: ArrayLike, truth: ArrayLike) -> Floats:
@@ -123,7 +123,7 @@ def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
     count = 1 + len(a) // MAX_PAIRS
     parts = zip(np.array_split(a, count), np.array_split(b, count), strict=True)
     overlap = np.concatenate([_intersection(*part) for part in parts])
-    union = a[:, EXTENT].prod(axis=1) + b[:, EXTENT].prod(axis=1) - overlap
+    union = a[:, BOX_EXTENT].prod(axis=1) + b[:, BOX_EXTENT].prod(axis=1) - overlap
     is_valid = np.isfinite(overlap) & (overlap > 0)
     iou = np.divide(overlap, union, out=np.zeros(len(a)), where=is_valid)
     return np.asarray(iou).clip(0.0, 1.0)
@@ -181,7 +181,7 @@ def _half_spaces(a: Floats, b: Floats) -> tuple[Floats, Floats]:
     )
     normals = np.concatenate([axes_a, -axes_a, axes_b, -axes_b], axis=1)
     shift = np.einsum('nij,nj->ni', axes_b, b[:, :3] - a[:, :3])
-    half_a = a[:, EXTENT] / 2
-    half_b = b[:, EXTENT] / 2 + FACE_OFFSET
+    half_a = a[:, BOX_EXTENT] / 2
+    half_b = b[:, BOX_EXTENT] / 2 + FACE_OFFSET
     offsets = np.concatenate([half_a, half_a, half_b + shift, half_b - shift], axis=1)
     return normals, offsets

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.core.metrics import EXTENT
+from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
 from boxreg_ros.structures import BoxArray, Floats, Ints, ROLL
@@ -143,7 +143,7 @@ class BoxTable:
         num_points = np.array(column('num_points', int), np.int64)
         numbers = np.array([column(name, float, 'nan') for name in COLUMNS[4:15]]).T
         boxes = np.full((len(rows), 9), np.nan)
-        boxes[:, :3], boxes[:, EXTENT] = numbers[:, 1:4], numbers[:, 8:11]
+        boxes[:, :3], boxes[:, BOX_EXTENT] = numbers[:, 1:4], numbers[:, 8:11]
         turned = (np.linalg.norm(numbers[:, 4:8], axis=1) > 1e-6) & np.isfinite(
             numbers[:, 4:8]
         ).all(axis=1)
@@ -167,7 +167,7 @@ class BoxTable:
             table = csv.writer(file, lineterminator='\n')
             table.writerow(COLUMNS)
             for i, box in enumerate(self.boxes):
-                numbers = (self.scores[i], *box[:3], *quaternions[i], *box[EXTENT])
+                numbers = (self.scores[i], *box[:3], *quaternions[i], *box[BOX_EXTENT])
                 table.writerow([
                     self.stamps_ns[i], self.frame_id, self.track_ids[i], self.class_names[i],
                     *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.metrics import EXTENT
+from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import RecordingError, TransformUnavailable
@@ -30,7 +30,7 @@ from boxreg_ros.structures import (
 import numpy as np
 from numpy.typing import NDArray
 
-MARGIN = 1.0
+NEARBY_MARGIN = 1.0
 """Points up to this distance outside of a box are passed to the baselines [m]."""
 
 
@@ -176,10 +176,10 @@ class Drive:
 
 
 def _crop(points: NDArray[Any], box: Floats) -> NDArray[Any]:
-    """Return the points within `MARGIN` of a box."""
-    reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + 2 * MARGIN
+    """Return the points within `NEARBY_MARGIN` of a box."""
+    reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + 2 * NEARBY_MARGIN
     near = points[(np.abs(points[:, :2] - box[:2]) < reach).all(axis=1)]
     R = matrix_from_rpy(box[ROLL:])
-    inside = (np.abs((near - box[:3]) @ R) < box[EXTENT] / 2 + MARGIN).all(axis=1)
+    inside = (np.abs((near - box[:3]) @ R) < box[BOX_EXTENT] / 2 + NEARBY_MARGIN).all(axis=1)
     cropped: NDArray[Any] = near[inside]
     return cropped

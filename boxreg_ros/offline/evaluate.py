@@ -13,7 +13,7 @@ import sys
 from typing import Any
 
 from boxreg_ros.config import words_of
-from boxreg_ros.core.metrics import EXTENT, iou_3d, iou_bev, pose_errors
+from boxreg_ros.core.metrics import BOX_EXTENT, iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.arguments import add_topic_arguments, convention_from
@@ -443,7 +443,7 @@ def _spread(values: NDArray[Any], is_matched: Mask, absent: float = 0) -> NDArra
 def _scale_iou(boxes: Floats, true_boxes: Floats) -> Floats:
     """Return the 3D IoU (n,) after alignment of centre and heading."""
     aligned = true_boxes.copy()
-    aligned[:, EXTENT] = boxes[:, EXTENT]
+    aligned[:, BOX_EXTENT] = boxes[:, BOX_EXTENT]
     return iou_3d(aligned, true_boxes)
 
 

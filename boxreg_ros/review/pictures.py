@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Any
 
-from boxreg_ros.core.metrics import EXTENT
+from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.review.changes import known, median, TrackChanges
-from boxreg_ros.review.track_points import MARGIN
+from boxreg_ros.review.track_points import SHOWN_MARGIN
 from boxreg_ros.structures import (
     Floats,
     INTERPOLATED,
@@ -69,9 +69,9 @@ def _draw_points(
     track: TrackChanges, figure: Any, before: Floats, after: Floats, is_object: Mask
 ) -> None:
     """Draw points and the median box from above and from the side, before and after."""
-    given = np.nanmedian(track.given[:, EXTENT], axis=0)
-    refined = np.nanmedian(track.boxes[:, EXTENT], axis=0)
-    reach_x, *reaches = np.maximum(given, refined) / 2 + MARGIN
+    given = np.nanmedian(track.given[:, BOX_EXTENT], axis=0)
+    refined = np.nanmedian(track.boxes[:, BOX_EXTENT], axis=0)
+    reach_x, *reaches = np.maximum(given, refined) / 2 + SHOWN_MARGIN
     grid = figure.add_gridspec(
         2, 2, left=0.04, right=0.6, top=0.93, bottom=0.09, hspace=0.1, wspace=0.04,
         height_ratios=reaches,

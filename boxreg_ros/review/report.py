@@ -18,7 +18,7 @@ from string import ascii_uppercase
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.metrics import EXTENT
+from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason, REASONS
@@ -228,7 +228,7 @@ def _numbers(track: TrackChanges) -> dict[str, Any]:
 
 
 def _median_extents(boxes: Floats) -> list[float]:
-    return [median(values) for values in boxes[:, EXTENT].T]
+    return [median(values) for values in boxes[:, BOX_EXTENT].T]
 
 
 def _warnings(summary: Mapping[str, Any]) -> list[str]:

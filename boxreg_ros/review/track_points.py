@@ -15,7 +15,7 @@ from boxreg_ros.structures import BoxArray, Floats, ROLL, Sweep, X, Z
 import numpy as np
 from numpy.typing import NDArray
 
-MARGIN = 0.6
+SHOWN_MARGIN = 0.6
 """Points up to this far outside a box are shown [m]."""
 MAX_SWEEPS = 60
 """Sweeps of one track that are shown, spread over its duration."""
@@ -127,8 +127,8 @@ def _points_near(track: TrackChanges, row: int, sweep: Sweep, config: Config) ->
     delay = np.array([(sweep.stamp_ns - track.stamps_ns[row]) * 1e-9])
     both = np.array([track.given[row], track.boxes[row]])
     both[:, : Z + 1] -= _motion_to_stamp(track, row, delay)
-    index, _, _, outside = crop(sweep.points, both, MARGIN)
-    index = np.unique(index[outside.max(0) < MARGIN])
+    index, _, _, outside = crop(sweep.points, both, SHOWN_MARGIN)
+    index = np.unique(index[outside.max(0) < SHOWN_MARGIN])
     step = max(1, -(-len(index) // MAX_POINTS))
     index = index[::step]
     if config.sampling.deskew and sweep.times is not None:
