@@ -12,7 +12,7 @@ class Reason(NamedTuple):
     unit : str
         The thing counted: a box, a cloud, a message ...
     meaning : str
-        What has happened.
+        The event that the counter counts.
     remedy : str
         What the user can do; empty where the data allow no better.
 

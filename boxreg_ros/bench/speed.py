@@ -115,7 +115,7 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
     state = cold().state
     pose, extent = state.pose, state.shared[:, None, EXTENT].expand(-1, config.window, -1)
     solved = torch.cat([pose[..., :3], extent, pose[..., 3:]], -1)
-    # As in a stream: all but the newest box start from what was found before.
+    # As in a stream: all but the newest box start from earlier estimates.
     warm_start = torch.cat([solved[:, :-1], problem.boxes[:, -1:]], 1)
     warm_problem = problem._replace(start=warm_start)
 

@@ -56,7 +56,7 @@ class MarkerBoard:
 
     @property
     def is_showing(self) -> bool:
-        """Tell whether boxes are shown."""
+        """Return whether boxes are shown."""
         return bool(self._shown)
 
     def update(self, given: BoxArray, refined: RefinedBoxes) -> Any:
@@ -67,7 +67,7 @@ class MarkerBoard:
         ----------
         given, refined : BoxArray, RefinedBoxes
             The same boxes before and after, in one frame. Boxes that are not finite, or have
-            no volume, are not shown. Green is refined, orange kept as it was; grey is the input.
+            no volume, are not shown. Green is refined, orange is kept; grey is the input.
             The blue ellipse is the covariance of x and y of a refined box, 2 standard deviations.
 
         """

@@ -74,7 +74,7 @@ class BoxregNode(Node):
         self.add_post_set_parameters_callback(self._take_parameters)
         warm_up(config)
         gc.collect()
-        gc.freeze()  # a collection of what was imported would take 50 ms, several times a minute
+        gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
         self._health = Health(self.get_logger())
         self._inbox = Inbox(config.queue)
         self._topics = Topics(self, self._health)

@@ -205,7 +205,7 @@ class Worker:
         return None
 
     def _pause(self) -> None:
-        """Wait for messages, and release what is held if none arrive for long."""
+        """Wait for messages, and release held boxes if none arrive for long."""
         if self._confirmed or any(self._inbox.sizes().values()):
             return
         now = time.monotonic()
@@ -280,7 +280,7 @@ class Worker:
                 self._markers.publish(self._board.update(out.given, out.refined))
 
     def _finish(self, item: ReceivedMessage | None) -> None:
-        """Publish what is held, and pass what still waits through without solving it."""
+        """Publish held boxes, and pass waiting messages through unsolved."""
         self._take_events()
         self._publish(self._guarded(self._live.flush))
         for waiting in (item, *self._confirmed, *self._live.release()):
