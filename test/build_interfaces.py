@@ -2,8 +2,8 @@
 Build Python type support for the packages in ``test/interfaces`` into the running environment.
 
 The registries have no wheels of these message packages. The real rosidl generators build them
-from their field lists: the type hashes equal those of the originals, so the tests speak to nodes
-that use the originals. A package that is built already, in its present state, is left alone.
+from their field lists. The type hashes equal those of the originals, so tests communicate with
+nodes that use the originals. A package whose files have not changed since its build is skipped.
 
 """
 
@@ -43,7 +43,7 @@ ament_package()
 
 
 def main() -> None:
-    """Build what is not built yet, in the state that it has now."""
+    """Build the packages that are new or changed."""
     packages = [p for p in sorted(HERE.iterdir()) if p.is_dir() and not is_built(p)]
     compiler = os.environ.get('CXX', 'c++')
     if packages and shutil.which(compiler) is None:
@@ -51,31 +51,31 @@ def main() -> None:
     if packages:
         print(f'building message types of {", ".join(p.name for p in packages)} ...', flush=True)
     with ThreadPoolExecutor(2) as pool:  # one compiles while the next one generates
-        for package, trouble in zip(packages, pool.map(build, packages), strict=True):
-            if trouble:
-                sys.exit(f'{package.name}: {trouble}')
+        for package, error in zip(packages, pool.map(build, packages), strict=True):
+            if error:
+                sys.exit(f'{package.name}: {error}')
             stamp(package).write_text(digest(package))
 
 
 def stamp(package: Path) -> Path:
-    """Return the file that says what a package was built from."""
+    """Return the file with the digest of the files that a package was built from."""
     return PREFIX / 'share' / package.name / 'test_interfaces.sha256'
 
 
 def digest(package: Path) -> str:
-    """Return a digest of all that a package is built from."""
+    """Return a digest of the files that a package is built from."""
     files = [*sorted(package.glob('msg/*.msg')), HERE / 'fix_wheel_paths.cmake', Path(__file__)]
     return sha256(b''.join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
 
 
 def is_built(package: Path) -> bool:
-    """Tell whether a package is there in its present state."""
+    """Return whether the installed package was built from the present files."""
     return stamp(package).exists() and stamp(package).read_text() == digest(package)
 
 
 def build(package: Path) -> str:
-    """Configure, build and install one package; return what went wrong, if anything."""
-    # What python's own start has set for the ROS wheels is not for cmake or the generators.
+    """Configure, build and install one package; return an error message, or an empty one."""
+    # Variables that Python sets at its start for the ROS wheels break cmake and the generators.
     foreign = {'LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'PYTHONPATH'}
     environment = {key: value for key, value in os.environ.items() if key not in foreign}
     environment['PATH'] = f'{PREFIX / "bin"}{os.pathsep}{environment["PATH"]}'
@@ -105,7 +105,7 @@ def build(package: Path) -> str:
 
 
 def write_project(source: Path, name: str) -> None:
-    """Write what the generators want to see beside the field lists in ``source/msg``."""
+    """Write the manifest and the CMake project for the field lists in ``source/msg``."""
     files = sorted(source.glob('msg/*.msg'))
     used = {u for f in files for u in re.findall(r'^(\w+)/', f.read_text(), re.MULTILINE)}
     fields = {

@@ -1,4 +1,4 @@
-"""What every test has around it: ROS that stays on this machine, by itself, and is strict."""
+"""Environment of all tests: ROS on this machine only, in its own domain, with type checks."""
 
 import os
 from pathlib import Path
@@ -16,9 +16,9 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 # The wheels of ROS need it where ROS itself is not installed.
 os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
 
-# A shell without job control starts what runs behind it with interrupts ignored, and all that that
-# starts in turn: `boxreg` obeys, as it should, but the tests interrupt it.
+# A shell without job control starts background processes with SIGINT ignored, and their children
+# inherit this. `boxreg` then ignores SIGINT as well, but some tests send it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Small problems on few cores: threads cost more than they bring.
+# The problems of the tests are small: several threads are slower than one.
 torch.set_num_threads(1)

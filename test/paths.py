@@ -1,4 +1,4 @@
-"""Where things lie that tests need."""
+"""Folders that tests use."""
 
 from pathlib import Path
 
@@ -7,4 +7,4 @@ ROOT = TEST.parent
 BAGS = ROOT / 'bags'
 SHARE = ROOT / 'boxreg_ros' / 'share'
 SHARED = ROOT.parent / 'shared'
-"""Data that is not part of the project; tests that need it skip where it is not."""
+"""Data that is not part of the project; tests that need it are skipped without it."""

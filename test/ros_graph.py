@@ -1,4 +1,4 @@
-"""A ROS graph for tests: the node in a process of its own, and a node of the test beside it."""
+"""A ROS graph for tests: a node of the test, and processes of the node and of a player."""
 
 from contextlib import contextmanager
 import itertools
@@ -17,17 +17,20 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 
+DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 PATIENCE = 90.0  # [s]; nodes start slowly on a busy machine
 RELIABLE = [
     part
     for topic in ('/points', '/odom')
     for part in ('-p', f'qos_overrides.{topic}.subscription.reliability:=reliable')
 ]
+QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=60.0')
+"""Arguments for short windows; no box is dropped on a busy machine."""
 _domains = itertools.count(os.getpid())
 
 
 class Graph:
-    """A node of the test and the processes started beside it, in a ROS domain of their own."""
+    """A node of the test and the processes it has started, in a separate ROS domain."""
 
     def __init__(self, folder, domain=None):
         self.folder = folder
@@ -72,11 +75,13 @@ class Graph:
         self.node.create_subscription(kind, topic, received.append, QoSProfile(depth=100))
         return received
 
-    def wait(self, condition, what, seconds=PATIENCE):
-        """Spin until `condition` holds."""
+    def wait(self, condition, awaited, seconds=PATIENCE):
+        """Spin until `condition` holds; an error names `awaited`."""
         deadline = time.monotonic() + seconds
         while not condition():
-            assert time.monotonic() < deadline, f'waited {seconds} s for {what}; {self.outputs()}'
+            assert time.monotonic() < deadline, (
+                f'waited {seconds} s for {awaited}; {self.outputs()}'
+            )
             for process in self.processes:
                 assert process.popen.poll() is None or process.is_ending, self.outputs()
             self.executor.spin_once(timeout_sec=0.02)
@@ -103,7 +108,7 @@ class Graph:
 
 
 class NodeProcess:
-    """A process that was started; its output goes to a file."""
+    """A started process; its output is written to a file."""
 
     def __init__(self, graph, command):
         self._graph = graph
@@ -151,6 +156,21 @@ def graph_in(folder):
         graph.close()
 
 
+def ended_cleanly(node, number=signal.SIGINT):
+    """Stop the node and check exit status, output and duration."""
+    took = node.stop(number)
+    assert node.popen.returncode == 0, node.output()
+    assert 'Traceback' not in node.output()
+    assert took < 2.0
+    return True
+
+
+def values_of(diagnostics):
+    """Return the newest values of the node's status as a dict of texts."""
+    newest = diagnostics[-1].status[0].values if diagnostics else []
+    return {item.key: item.value for item in newest}
+
+
 def stamp_of(message):
     """Return the stamp of a box message [ns]."""
     if hasattr(message, 'header'):
@@ -163,7 +183,7 @@ def stamp_of(message):
 
 
 class Record(NamedTuple):
-    """A recorded message as bytes; box messages have their stamp beside it."""
+    """A recorded message as bytes; of a box message also the stamp."""
 
     topic: str
     type_name: str

@@ -1,4 +1,4 @@
-"""Messages and recordings for tests, made with rosbags alone."""
+"""Messages and recordings for tests, made with rosbags only."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ NUMBERS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 
 
 
 def typestore(stock=Stores.ROS2_JAZZY):
-    """Return a typestore with the packages in ``interfaces`` beside the stock types."""
+    """Return a typestore with the stock types and the packages in ``interfaces``."""
     store = get_typestore(stock)
     extra = {}
     for file in INTERFACES.glob('*/msg/*.msg'):

@@ -1,4 +1,4 @@
-"""Scenes with known truth: a car, the points of a fixed sensor; and batches made by hand."""
+"""Scenes with known truth: a car and the points of a stationary sensor; batches by hand."""
 
 from boxreg_ros.core import batch, terms
 from boxreg_ros.core.arrowhead import LINK
@@ -93,7 +93,7 @@ def stream_of(tracks):
 
 
 def window_of(track, config):
-    """Return the window of all observations of `track`, all of them new."""
+    """Return the window of all observations of `track`; all are new."""
     observations = [
         observe(sweep, boxes.boxes, boxes.stamp_ns, config)[0]
         for sweep, boxes in stream_of([track])
@@ -106,7 +106,7 @@ def problem_of(boxes, **changes):
     """
     Return the problem of `boxes` (B, N, 9) with some fields changed.
 
-    At 10 Hz, without points or prior. `class_numbers` are by name, those not given are NaN.
+    At 10 Hz, without points or prior. `class_numbers` are given by name; the others are NaN.
 
     """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
@@ -147,7 +147,7 @@ def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
 
 
 def boxes_at(*poses, extent=(4.0, 2.0, 2.0)):
-    """Return boxes (1, N, 9) at poses (x, y, z, roll, pitch, yaw); what is left out is 0."""
+    """Return boxes (1, N, 9) at poses (x, y, z, roll, pitch, yaw); missing values are 0."""
     full = [(*pose, *[0.0] * (6 - len(pose))) for pose in poses]
     rows = [[*pose[:3], *extent, *pose[3:]] for pose in full]
     return torch.tensor([rows], dtype=torch.float64)

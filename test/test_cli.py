@@ -52,7 +52,7 @@ def test_relabel_prints_one_closing_line(tmp_path, capsys):
     assert (out / 'boxes.csv').exists()
 
 
-def test_options_reach_the_run(tmp_path, capsys):
+def test_options_are_used_by_the_run(tmp_path, capsys):
     drive = Drive(sweeps=8, motion='odometry')
     recording = drive.write(tmp_path / 'drive')
     config = tmp_path / 'config.yaml'
@@ -74,7 +74,7 @@ def test_options_reach_the_run(tmp_path, capsys):
     assert not (out / 'openlabel').exists()
 
 
-def test_resume_repeats_nothing_with_the_same_settings(tmp_path, capsys):
+def test_resume_skips_a_run_with_the_same_settings(tmp_path, capsys):
     recording = Drive(sweeps=3).write(tmp_path / 'drive')
     command = ['relabel', recording, '-o', tmp_path / 'out', *QUICK, '--resume']
     assert ' boxes in' in boxreg(capsys, *command)[1]
@@ -122,7 +122,7 @@ def test_resume_with_results_inside_the_recording_or_missing_files(tmp_path, cap
         (['--fixedframe=map'], 2, '--fixedframe=map; did you mean --fixed-frame?'),
     ],
 )
-def test_failures_take_one_line(tmp_path, capsys, options, status, expected):
+def test_errors_are_printed_in_one_line(tmp_path, capsys, options, status, expected):
     recording = Drive(sweeps=2).write(tmp_path / 'drive')
     got, out, err = boxreg(capsys, 'relabel', recording, '-o', tmp_path / 'out', *options)
     assert (got, out) == (status, '')
@@ -204,7 +204,7 @@ def test_output_below_a_file_is_an_error(tmp_path, capsys):
     assert len(err.splitlines()) == 1
 
 
-def test_internal_exception_takes_one_line_and_debug_raises_it(tmp_path, capsys, monkeypatch):
+def test_an_internal_exception_is_one_line_and_is_raised_with_debug(tmp_path, capsys, monkeypatch):
     def broken(args):
         raise ZeroDivisionError('impossible')
 
@@ -239,9 +239,9 @@ def test_help_and_version(capsys):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_interrupt_leaves_nothing(tmp_path, number):
+def test_an_interrupted_run_leaves_no_files(tmp_path, number):
     recording = Drive(sweeps=60).write(tmp_path / 'drive')
-    before = signal.signal(number, signal.SIG_DFL)  # nohup would have it ignored
+    before = signal.signal(number, signal.SIG_DFL)  # under nohup it is ignored
     process = start(
         'relabel', recording, '-o', tmp_path / 'results' / 'out',
         '--set', 'solver.rounds=100', '--set', 'solver.iterations=10000',
@@ -262,7 +262,7 @@ def test_interrupt_leaves_nothing(tmp_path, number):
     assert list((tmp_path / 'results').iterdir()) == []
 
 
-def test_nohup_run_survives_a_hangup(tmp_path):
+def test_a_run_under_nohup_ignores_sighup(tmp_path):
     recording = Drive(sweeps=20).write(tmp_path / 'drive')
     command = ['nohup', sys.executable, '-m', 'boxreg_ros.cli', 'relabel', recording]
     silent = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
@@ -275,7 +275,7 @@ def test_nohup_run_survives_a_hangup(tmp_path):
     assert (tmp_path / 'out' / 'boxes.csv').exists()
 
 
-def test_file_names_that_the_output_cannot_encode(tmp_path):
+def test_file_names_that_stdout_cannot_encode_are_escaped(tmp_path):
     recording = Drive(sweeps=4).write(tmp_path / 'drive')
     process = start(
         'relabel', recording, '-o', tmp_path / 'ü', *QUICK, stdout=subprocess.PIPE,
@@ -286,7 +286,7 @@ def test_file_names_that_the_output_cannot_encode(tmp_path):
     assert '\\xfc: 8 boxes in' in out
 
 
-def test_closed_output_is_no_error(tmp_path):
+def test_a_closed_stdout_is_no_error(tmp_path):
     recording = Drive(sweeps=4).write(tmp_path / 'drive')
     process = start(
         'relabel', recording, '-o', tmp_path / 'out', *QUICK,
@@ -299,7 +299,7 @@ def test_closed_output_is_no_error(tmp_path):
     assert (tmp_path / 'out' / 'boxes.csv').exists()
 
 
-def test_progress_bar_on_a_terminal(tmp_path):
+def test_a_terminal_shows_a_progress_bar(tmp_path):
     recording = Drive(sweeps=4).write(tmp_path / 'drive')
     leader, follower = pty.openpty()
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 100, 0, 0))

@@ -21,7 +21,7 @@ import pytest
 import yaml
 
 
-def test_version_is_one():
+def test_all_files_state_the_same_version():
     manifest = ElementTree.parse(ROOT / 'package.xml')
     assert manifest.findtext('version') == boxreg_ros.__version__
     citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
@@ -34,7 +34,7 @@ def test_dependencies_are_pinned():
     try:
         needed = importlib.metadata.requires('boxreg_ros')
     except importlib.metadata.PackageNotFoundError:
-        pytest.skip('boxreg_ros is not installed: nothing says what it needs')
+        pytest.skip('boxreg_ros is not installed: its requirements are unknown')
     names = {re.match(r'[\w.-]+', requirement)[0].lower() for requirement in needed}
     pinned = set(re.findall(r'^([\w.-]+)==', (ROOT / 'constraints.txt').read_text(), re.MULTILINE))
     assert len(names) > 30
@@ -56,7 +56,7 @@ def imported_distributions():
 def test_rosdep_keys_cover_the_imports():
     manifest = ElementTree.parse(ROOT / 'package.xml')
     keys = {item.text for item in manifest.iter('exec_depend')}
-    # Without a rosdep key; the README says how to install it.
+    # mcap has no rosdep key; the README describes its installation.
     names = imported_distributions() - {'mcap'}
     other_keys = {'torch': 'python3-pytorch-pip', 'rosbags': 'python3-rosbags-pip'}
     wanted = {other_keys.get(name, name) for name in names}
@@ -98,7 +98,7 @@ def distributions(tmp_path_factory):
     return sdist, wheel
 
 
-def test_sdist_has_what_a_build_needs(distributions):
+def test_sdist_contains_all_files_of_a_build(distributions):
     sdist, _ = distributions
     with tarfile.open(sdist) as archive:
         names = {name.partition('/')[2] for name in archive.getnames()}
@@ -109,7 +109,7 @@ def test_sdist_has_what_a_build_needs(distributions):
 
 
 def new_environment(folder):
-    """Make an environment that finds what the running one has installed, but not boxreg_ros."""
+    """Make an environment with the packages of the running one, except boxreg_ros."""
     venv.create(folder, symlinks=True)
     packages = sysconfig.get_path('purelib', vars={'base': str(folder)})
     own = sysconfig.get_path('purelib')
@@ -148,6 +148,7 @@ def test_editable_install_is_a_plain_path(tmp_path):
 
 @pytest.fixture(scope='module', params=['plain', 'symlink'])
 def prefix(request, tmp_path_factory):
+    """Build with colcon; return the install prefix of the package."""
     pytest.importorskip('colcon_core', reason='colcon is not installed')
     workspace = tmp_path_factory.mktemp(request.param)
     command = [sys.executable, '-m', 'colcon', '--log-base', workspace / 'log', 'build']
@@ -172,7 +173,7 @@ def sourced(prefix, command, **options):
     )
 
 
-def test_colcon_installs_where_ros2_run_looks(prefix):
+def test_colcon_installs_executables_where_ros2_run_finds_them(prefix):
     for executable in ('boxreg', 'boxreg_node'):
         path = prefix / 'lib' / 'boxreg_ros' / executable
         assert os.access(path, os.X_OK), path
@@ -183,7 +184,7 @@ def test_colcon_installs_where_ros2_run_looks(prefix):
         assert (prefix / 'share/boxreg_ros' / file.name).read_bytes() == file.read_bytes()
 
 
-def test_every_module_is_installed_and_imported_from_there(prefix):
+def test_every_module_is_installed_and_imported_from_the_workspace(prefix):
     modules = [*ROOT.glob('boxreg_ros/**/*.py'), *ROOT.glob('msg_adapters/*.py')]
     names = sorted(str(path.relative_to(ROOT)) for path in modules)
     code = 'import boxreg_ros, sys; print(boxreg_ros.__path__[0])'

@@ -1,4 +1,4 @@
-"""One core, two drivers: the node's final boxes are those of `boxreg relabel`."""
+"""The final boxes of the node equal those of `boxreg relabel`."""
 
 import csv
 import json
@@ -30,7 +30,7 @@ def relabelled(path, out, *more):
 
 
 def as_published(messages, type_name):
-    """Return the same of messages."""
+    """Return (stamp, track) -> x y z qx qy qz qw length width height of messages."""
     found = {}
     for message in messages:
         array = adapter_for(type_name).from_msg(message)
@@ -60,7 +60,7 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
     records = records_of(path, boxes_topic)
     (type_name,) = {record.type_name for record in records if record.topic == boxes_topic}
     with graph_in(tmp_path) as graph:
-        # Patient, so that no transform is extrapolated because a machine is busy.
+        # Long timeouts, so that no transform is extrapolated on a busy machine.
         options = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=60.0']
         options += [f'{key}:={value}' for key, value in SETTINGS.items()]
         publishers_for(graph, records)
@@ -72,7 +72,7 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
         play(graph, records, early)
         node.stop()
         assert node.popen.returncode == 0, node.output()
-    # All of them, also those that the node still held when it was told to end.
+    # Boxes that the node held when it received the signal are included.
     found = as_published(final, type_name)
     assert found.keys() == expected.keys()
     keys = sorted(expected)
@@ -83,7 +83,7 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
 
 @pytest.mark.parametrize('type_name', [t for t in ADAPTERS if t not in (DETECTIONS, MARKERS)])
 def test_publisher_node_and_subscriber_of_every_family(tmp_path, type_name):
-    """Three processes; what is not in the messages, an id, is the same in node and `relabel`."""
+    """Publisher and node are processes. Associated ids are the same in node and `relabel`."""
     drive = Drive(sweeps=8, boxes=type_name)
     path = drive.write(tmp_path / 'drive')
     associate = type_name in WITHOUT_IDS

@@ -1,4 +1,4 @@
-"""Ids by association: the same for the same object, whatever comes between."""
+"""Ids by association: an object keeps its id through gaps, crossings and noise."""
 
 from boxreg_ros.io.id_assignment import Tracker
 from boxreg_ros.structures import BoxArray
@@ -17,47 +17,55 @@ def array_of(stamp_ns, *boxes):
     return BoxArray(stamp_ns, 'map', ('?',) * n, ('car',) * n, np.ones(n), rows)
 
 
-def ids_over_time(where, steps=30, period=0.1, noise=0.0, tracker=None):
-    """Return the ids (steps, n) of n objects that are `where(seconds)`, told in changing order."""
+def ids_over_time(objects_at, steps=30, period=0.1, noise=0.0, tracker=None):
+    """
+    Return the ids (steps, n) of n objects.
+
+    `objects_at(seconds)` returns them as (x, y, extent). The tracker gets them in random order.
+
+    """
     rng = np.random.default_rng(2)
     tracker = tracker or Tracker(max_gap=1.0)
     rows = []
     for k in range(steps):
-        objects = where(k * period)
+        objects = objects_at(k * period)
         order = rng.permutation(len(objects))
         jitter = rng.normal(0, noise, (len(objects), 2))
-        told = [objects[i] for i in order]
-        told = [(x + dx, y + dy, e) for (x, y, e), (dx, dy) in zip(told, jitter, strict=True)]
-        ids = tracker.identify(array_of(START + round(k * period * SECOND), *told)).track_ids
+        observed = []
+        for number, (dx, dy) in zip(order, jitter, strict=True):
+            x, y, extent = objects[number]
+            observed.append((x + dx, y + dy, extent))
+        stamp_ns = START + round(k * period * SECOND)
+        ids = tracker.identify(array_of(stamp_ns, *observed)).track_ids
         rows.append([ids[list(order).index(i)] for i in range(len(objects))])
     return np.array(rows)
 
 
-def test_ids_stay_with_fast_slow_and_crossing_objects():
-    def where(t):
+def test_fast_slow_and_oncoming_objects_keep_their_ids():
+    def objects_at(t):
         return [
-            (5.0 + 15 * t, 0.0, CAR),  # 15 m/s, overtaken by nobody
-            (60.0 - 15 * t, 3.5, CAR),  # comes towards it, one lane further
+            (5.0 + 15 * t, 0.0, CAR),  # 15 m/s
+            (60.0 - 15 * t, 3.5, CAR),  # oncoming, in the next lane
             (30.0, 7.0, CAR),
-            (33.0, 7.0 + 1.2 * t, PERSON),  # walks by the parked car
+            (33.0, 7.0 + 1.2 * t, PERSON),  # a pedestrian beside the parked car
         ]
 
-    ids = ids_over_time(where, noise=0.15)
+    ids = ids_over_time(objects_at, noise=0.15)
     assert (ids == ids[0]).all()
     assert sorted(ids[0]) == ['1', '2', '3', '4']
 
 
-def test_a_slow_detector_is_followed_once_the_speed_is_known():
-    """20 m/s at 2 Hz are steps of 10 m, farther than the gap between the cars."""
+def test_ids_are_kept_at_a_low_rate_by_prediction_with_the_velocity():
+    """At 20 m/s and 2 Hz a step is 10 m, more than the gap between the cars."""
 
-    def where(t):
+    def objects_at(t):
         return [(20 * t, 0.0, CAR), (20 * t + 25.0, 0.0, CAR), (3.0, 9.0, CAR)]
 
-    ids = ids_over_time(where, steps=12, period=0.5, noise=0.1)
+    ids = ids_over_time(objects_at, steps=12, period=0.5, noise=0.1)
     assert (ids == ids[0]).all()
 
 
-def test_boxes_that_come_and_go():
+def test_ids_of_objects_that_disappear_and_return():
     tracker = Tracker(max_gap=1.0)
 
     def ids(tenths, *boxes):
@@ -65,21 +73,21 @@ def test_boxes_that_come_and_go():
         return tracker.identify(array_of(stamp_ns, *boxes)).track_ids
 
     assert ids(0, (0, 0, CAR)) == ('1',)
-    assert ids(1, (10, 0, CAR), (0, 0, CAR)) == ('2', '1')  # another one
+    assert ids(1, (10, 0, CAR), (0, 0, CAR)) == ('2', '1')  # a second object
     assert ids(2) == ()
-    assert ids(9, (0.2, 0, CAR)) == ('1',)  # hidden for 0.8 s
-    assert ids(25, (0.2, 0, CAR)) == ('3',)  # away for longer than max_gap
-    assert ids(26, (0.2, 0, PERSON)) == ('4',)  # no car turns into a person
-    assert ids(24, (0.2, 0, CAR), (50, 0, CAR)) == ('3', '5')  # late: finds, but changes nothing
+    assert ids(9, (0.2, 0, CAR)) == ('1',)  # after a gap of 0.8 s
+    assert ids(25, (0.2, 0, CAR)) == ('3',)  # after a gap longer than max_gap
+    assert ids(26, (0.2, 0, PERSON)) == ('4',)  # the extent of another class
+    assert ids(24, (0.2, 0, CAR), (50, 0, CAR)) == ('3', '5')  # late: matched, state unchanged
     assert ids(26, (50, 0, CAR)) == ('6',)
     assert ids(27, (50, 0, CAR), (0.2, 0, CAR)) == ('7', '3')
-    assert ids(0, (0, 0, CAR)) == ('8',)  # played again from the beginning
+    assert ids(0, (0, 0, CAR)) == ('8',)  # after a time jump
     assert ids(1, (0, 0, CAR)) == ('8',)
     assert tracker.count == 8
 
 
 def test_neighbours_are_not_swapped_when_one_is_missing():
-    """Parked side by side, 2.4 m apart; one of them is not detected for a while."""
+    """Four cars are parked 2.4 m apart; one is not detected at four stamps."""
     tracker = Tracker(max_gap=1.0)
     row = [(0.0, 2.4 * k, CAR) for k in range(4)]
     for k in range(5):
@@ -91,17 +99,17 @@ def test_neighbours_are_not_swapped_when_one_is_missing():
         assert tracker.identify(fewer).track_ids == ('1', '3', '4')
 
 
-def test_invalid_boxes_get_no_id_and_leave_the_others_alone():
+def test_invalid_boxes_get_no_id_and_do_not_affect_the_others():
     tracker = Tracker(max_gap=1.0)
     boxes = array_of(START, (0, 0, CAR), (np.nan, 0, CAR), (9, 0, (0, 1, 1)), (20, 0, CAR))
     assert tracker.identify(boxes).track_ids == ('1', '', '', '2')
 
 
 def test_ids_of_a_real_drive():
-    """A drive past parked and moving cars, with the noise of a detector: no id changes."""
+    """Boxes of parked and moving cars with detector noise: no id changes."""
     path = SHARED / 'data' / 'kitti_raw_0001.npz'
     if not path.exists():
-        pytest.skip('the real data is not there')
+        pytest.skip('the real data is not available')
     data = np.load(path)
     order = np.lexsort((data['obs_track'], data['obs_frame']))
     rng = np.random.default_rng(4)

@@ -15,17 +15,16 @@ SOURCES = ('mcap', 'mcap-folder', 'sqlite3', 'rosbag1', 'protobuf', 'json', 'lab
 def source_of(name, folder):
     """Return a source with the same clouds, motion and boxes in any kind of files."""
     if name in ('protobuf', 'json'):
-        pytest.importorskip('foxglove_schemas_protobuf')
-        pytest.importorskip('mcap_protobuf')
-        from test_foxglove_mcap import write
+        from foxglove_recordings import write_foxglove_mcap
 
         encodings = dict.fromkeys(('/boxes', '/points', '/tf'), name)
-        return Recording([write(folder / 'drive.mcap', Drive(sweeps=6, boxes=SCENE), encodings)])
+        drive = Drive(sweeps=6, boxes=SCENE)
+        return Recording([write_foxglove_mcap(folder / 'drive.mcap', drive, encodings)])
     if name == 'labels':
         drive = Drive(sweeps=6).write(folder / 'drive')
         out = folder / 'out'
         # No window has enough observations: the labels are the input boxes, and the exit status
-        # says that none was refined.
+        # is 1 because no box was refined.
         config = ['--set=min_observations=50', '--set=window=50']
         assert main(['relabel', str(drive), '-o', str(out), '--formats=csv', *config]) == 1
         return LabelledRecording(('csv', out / 'boxes.csv'), [drive])
@@ -35,7 +34,7 @@ def source_of(name, folder):
 
 
 def read(source):
-    """Return what a source yields: kind and stamp, points, boxes in the fixed frame, ids."""
+    """Return the fixed frame, and kinds and stamps, points, boxes and ids of all items."""
     tree = TransformTree()
     kinds, points, boxes, ids = [], [], [], []
     with source:

@@ -1,4 +1,4 @@
-"""Malformed messages are unreadable; errors of our own code are faults."""
+"""Malformed messages are counted as unreadable; errors in this package are raised."""
 
 import copy
 import json
@@ -7,13 +7,13 @@ from boxreg_ros.cli import main
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.recording import Record, Recording
 from boxreg_ros.io.transforms import TransformTree
+from foxglove_recordings import write_foxglove_mcap
 from mcap.reader import make_reader
 from msg_adapters import ADAPTERS, pointcloud, vision
 from msg_adapters.convention import Convention
 import numpy as np
 import pytest
 from ros_messages import Drive, SCENE
-from test_foxglove_mcap import write
 
 BYTES = (0, 1, 127, 128, 255)
 
@@ -24,13 +24,15 @@ def corrupted(data, rng):
         return data[: rng.integers(len(data))]
     changed = bytearray(data)
     for _ in range(rng.integers(1, 6)):
-        end = len(data) if rng.random() < 0.5 else min(len(data), 200)  # sizes are at the front
+        end = (
+            len(data) if rng.random() < 0.5 else min(len(data), 200)
+        )  # sizes are in the first bytes
         changed[rng.integers(4, end)] = rng.choice(BYTES)
     return bytes(changed)
 
 
 def outcomes(recording, record, changed):
-    """Decode each of `changed` in place of a record; return how many could be."""
+    """Decode each of `changed` in place of a record; return the number of successes."""
     decoded = 0
     for data in changed:
         tampered = Record(record.connection, record.received_ns, data)
@@ -77,7 +79,7 @@ def tampered_json(value, rng):
 @pytest.mark.parametrize('topic', ['/boxes', '/points', '/tf'])
 def test_json_of_wrong_types_is_unreadable_or_decoded(tmp_path, topic):
     encodings = dict.fromkeys(('/boxes', '/points', '/tf'), 'json')
-    path = write(tmp_path / 'drive.mcap', Drive(sweeps=1, boxes=SCENE), encodings)
+    path = write_foxglove_mcap(tmp_path / 'drive.mcap', Drive(sweeps=1, boxes=SCENE), encodings)
     with path.open('rb') as file:
         raw = json.loads(next(make_reader(file).iter_messages(topic))[2].data)
     rng = np.random.default_rng(0)
@@ -89,7 +91,7 @@ def test_json_of_wrong_types_is_unreadable_or_decoded(tmp_path, topic):
 
 
 def own_fault(kind):
-    """Return an adapter function with a bug of ours."""
+    """Return an adapter function that raises an exception."""
 
     def from_msg(message):
         if kind is AttributeError:
@@ -103,7 +105,9 @@ def own_fault(kind):
 
 @pytest.mark.parametrize('kind', [AttributeError, TypeError, KeyError])
 @pytest.mark.parametrize('adapter', [vision, pointcloud])
-def test_an_error_of_our_own_is_not_unreadable(tmp_path, monkeypatch, capsys, adapter, kind):
+def test_an_error_in_an_adapter_is_raised_and_not_counted_as_unreadable(
+    tmp_path, monkeypatch, capsys, adapter, kind
+):
     path = Drive(sweeps=2).write(tmp_path / 'drive')
     monkeypatch.setattr(adapter, 'from_msg', own_fault(kind))
     recording = Recording([path])

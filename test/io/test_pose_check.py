@@ -1,4 +1,4 @@
-"""What a pose and a size mean; worked out by hand, there and back."""
+"""Conventions of pose and size: conversion by hand, round trips, and the check by points."""
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.pose_check import DECISIVE_BOXES, PoseCheck
@@ -32,7 +32,7 @@ def array_of(*boxes, stamp_ns=STAMP):
         # Rear axle on the ground: 0.3 of 4 m and half of 2 m.
         ({'pose_reference': 'rear_axle_bottom'}, [5, 6, 0, 4, 2, 2, 0, 0, 0],
          [6.2, 6, 1, 4, 2, 2, 0, 0, 0]),
-        # In own numbers: a quarter of the length before the centre, a half of the width right.
+        # Custom fractions: a quarter of the length ahead of the centre, half of the width right.
         ({'pose_reference': '0.25,-0.5,0'}, [5, 6, 0, 4, 2, 2, 0, 0, 0],
          [4, 7, 0, 4, 2, 2, 0, 0, 0]),
         # A pitch of a quarter turn takes the box's z to x: half of the height 2.
@@ -47,7 +47,7 @@ def array_of(*boxes, stamp_ns=STAMP):
          [5, 6, 1, 4, 2, 1.5, 0, 0, np.pi - 3]),
     ],
 )  # fmt: skip
-def test_by_hand(settings, raw, center):
+def test_conversion_by_hand(settings, raw, center):
     convention = Convention(**settings)
     np.testing.assert_allclose(convention.to_centers(array_of(raw)).boxes[0], center, atol=1e-12)
     np.testing.assert_allclose(convention.from_centers(array_of(center)).boxes[0], raw, atol=1e-12)
@@ -55,19 +55,19 @@ def test_by_hand(settings, raw, center):
 
 @pytest.mark.parametrize('pose_reference', REFERENCES)
 @pytest.mark.parametrize('forward_axis', FORWARD)
-def test_there_and_back(pose_reference, forward_axis):
+def test_conversion_round_trips(pose_reference, forward_axis):
     boxes = array_of([5, 6, 1, 4, 2, 1.5, 0.1, -0.2, 0.3], [5, 6, 1, 4, 2, 1.5, 0, 0, np.nan])
     for order in SIZE_ORDERS:
         convention = Convention(pose_reference, order, forward_axis)
-        back = convention.from_centers(convention.to_centers(boxes)).boxes
-        np.testing.assert_allclose(back[0], boxes.boxes[0], atol=1e-12)
-        np.testing.assert_allclose(back[1, 3:6], boxes.boxes[1, 3:6])
-        assert np.isnan(back[1, 8])
+        converted = convention.from_centers(convention.to_centers(boxes)).boxes
+        np.testing.assert_allclose(converted[0], boxes.boxes[0], atol=1e-12)
+        np.testing.assert_allclose(converted[1, 3:6], boxes.boxes[1, 3:6])
+        assert np.isnan(converted[1, 8])
 
 
 @pytest.mark.parametrize('forward_axis', ['x+', 'x-', 'y+', 'y-'])
-def test_covariance_is_that_of_the_reference(forward_axis):
-    """Against the spread of many boxes drawn about one."""
+def test_covariance_is_transformed_to_the_reference_point(forward_axis):
+    """The expected covariance is that of 40,000 random boxes after conversion."""
     convention = Convention('rear_bottom', forward_axis=forward_axis)
     box = np.array([5, 6, 1, 4, 2, 1.5, 0.05, -0.1, 2.0])
     given = np.diag([0.1, 0.2, 0.1, 0.02, 0.03, 0.05]) ** 2
@@ -78,7 +78,7 @@ def test_covariance_is_that_of_the_reference(forward_axis):
     (ours,) = convention.covariances_from_centers(array_of(box), given[None])
     scale = np.sqrt(np.outer(np.diag(seen), np.diag(seen)))
     assert np.abs((ours - seen) / scale).max() < 0.03
-    assert np.abs((given - seen) / scale).max() > 0.2  # it makes a difference
+    assert np.abs((given - seen) / scale).max() > 0.2  # the conversion changes the covariance
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_covariance_is_that_of_the_reference(forward_axis):
         ({'forward_axis': 'z'}, 'forward_axis.*x-'),
     ],
 )
-def test_what_is_refused(settings, expected):
+def test_invalid_conventions_are_refused(settings, expected):
     with pytest.raises(ConfigError, match=expected):
         Convention(**settings)
 
@@ -112,7 +112,7 @@ def test_adapter_of_a_topic_reads_and_writes_its_convention():
     assert spread[1, 3] == pytest.approx(0.75)
 
 
-# The points know -------------------------------------------------------------------------------
+# Check by points -------------------------------------------------------------------------------
 
 
 def scene(seed=3, count=16):
@@ -136,7 +136,7 @@ def scene(seed=3, count=16):
 
 
 def checked(true, points, taken, meant):
-    """Return the finding about boxes of convention `meant` that are taken for `taken`."""
+    """Return the finding about boxes written with `meant` and read with `taken`."""
     raw = meant.from_centers(array_of(*true))
     check = PoseCheck(taken, tolerance=0.02)
     for k in range(4):
@@ -154,24 +154,24 @@ def checked(true, points, taken, meant):
         ({}, {}, ()),
         ({'pose_reference': 'bottom'}, {'pose_reference': 'bottom'}, ()),
         ({'size_order': 'wlh'}, {'size_order': 'wlh'}, ()),
-        # Taken for bottoms, centres end up half a height too high, and the other way round.
+        # Centres read as bottoms are half a height too high, and vice versa.
         ({'pose_reference': 'bottom'}, {}, ('hover 0.5 heights above', 'pose_reference:=center')),
         ({}, {'pose_reference': 'bottom'}, ('0.5 heights below', 'pose_reference:=bottom')),
         ({}, {'pose_reference': 'rear'}, ('0.5 lengths behind', '--pose-reference rear')),
         ({}, {'size_order': 'wlh'}, ('size_order:=wlh', '--size-order wlh')),
-        # What is forward the points do not tell: both settings that fit are named.
+        # Points give no evidence of the forward direction: both settings that fit are named.
         ({}, {'forward_axis': 'y+'}, ('size_order:=wlh', 'or forward_axis:=y+ or y-')),
         ({'forward_axis': 'y-'}, {}, ('size_order:=wlh', 'or forward_axis:=x+ or x-')),
     ],
 )
-def test_poses_that_do_not_fit_their_points_are_reported(taken, meant, words):
+def test_conventions_that_contradict_the_points_are_reported(taken, meant, words):
     finding = checked(*scene(), Convention(**taken), Convention(**meant))
     assert bool(finding) == bool(words), finding
     for word in words:
         assert word in finding
 
 
-def test_noisy_boxes_are_not_accused():
+def test_noisy_boxes_give_no_finding():
     boxes, points = scene()
     rng = np.random.default_rng(8)
     boxes[:, [0, 1, 2]] += rng.normal(0, 0.3, (len(boxes), 3))
@@ -179,7 +179,7 @@ def test_noisy_boxes_are_not_accused():
     assert not checked(boxes, points, STANDARD, STANDARD)
 
 
-def test_the_check_ends_and_takes_only_what_belongs_together():
+def test_the_check_pairs_equal_stamps_and_ends_after_enough_boxes():
     boxes, points = scene()
     check = PoseCheck(Convention('bottom'), tolerance=0.02)
     wrong = Convention('bottom').to_centers(array_of(*boxes))
@@ -187,7 +187,7 @@ def test_the_check_ends_and_takes_only_what_belongs_together():
     check.add(wrong)
     assert not check.finding  # 0.1 s apart
     check.add(Sweep(STAMP, 'map', points[:0]))
-    assert not check.finding  # no points, no opinion
+    assert not check.finding  # no points, no evidence
     for k in range(3):
         few = BoxArray(
             STAMP + k, 'map', ('',) * 4, ('',) * 4, np.ones(4), wrong.boxes[4 * k :][:4]

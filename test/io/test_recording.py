@@ -1,3 +1,5 @@
+"""Recordings of every storage: items, definitions, motion, parts and errors."""
+
 import sqlite3
 
 from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
@@ -25,8 +27,8 @@ def read(paths, tree=None, fixed_frame=None, **options):
     return sweeps, [item for item in items if isinstance(item, BoxArray)], fixed_frame
 
 
-def refused(paths, **options):
-    """Return the one-line message a recording is refused with."""
+def error_of(paths, **options):
+    """Return the one-line message of the error that reading recordings raises."""
     with pytest.raises((RecordingError, UnsupportedMessage)) as caught:
         read(paths, **options)
     text = str(caught.value)
@@ -36,7 +38,7 @@ def refused(paths, **options):
 
 @pytest.mark.parametrize('boxes', ['vision', 'markers'])
 @pytest.mark.parametrize('storage', ['mcap', 'mcap-folder', 'sqlite3', 'rosbag1'])
-def test_every_kind_of_recording_reads_alike(tmp_path, storage, boxes):
+def test_every_storage_gives_the_same_items(tmp_path, storage, boxes):
     drive = Drive(boxes=boxes, ros1=storage == 'rosbag1')
     sweeps, arrays, fixed_frame = read(drive.write(tmp_path / 'drive', storage))
     assert fixed_frame == 'odom'
@@ -72,13 +74,13 @@ def test_split_recordings_are_merged_by_time(tmp_path):
 # Definitions -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('gone', ["'%Detection%'", "'%'"])
-def test_definitions_that_the_recording_lacks(tmp_path, gone):
+@pytest.mark.parametrize('pattern', ["'%Detection%'", "'%'"])
+def test_missing_definitions_are_replaced_by_known_ones(tmp_path, pattern):
     folder = Drive().write(tmp_path / 'drive', 'sqlite3')
     (file,) = folder.glob('*.db3')
     with sqlite3.connect(file) as database:
         count = database.execute('SELECT count(*) FROM message_definitions').fetchone()[0]
-        database.execute(f'DELETE FROM message_definitions WHERE topic_type LIKE {gone}')
+        database.execute(f'DELETE FROM message_definitions WHERE topic_type LIKE {pattern}')
         assert database.execute('SELECT count(*) FROM message_definitions').fetchone()[0] < count
     database.close()
     _, arrays, _ = read(folder)
@@ -102,7 +104,7 @@ def test_transforms_are_read_ahead(tmp_path):
     assert found == {START + k * SECOND // 10: 0.5 * k for k in range(8)}
 
 
-def test_only_a_window_of_the_recording_is_held(tmp_path):
+def test_transforms_are_buffered_for_a_bounded_time(tmp_path):
     items = []
     for k in range(200):
         stamp = START + k * SECOND // 2
@@ -119,12 +121,13 @@ def test_only_a_window_of_the_recording_is_held(tmp_path):
             assert not tree.covers('odom', 'lidar', item.received_ns - 40 * SECOND)
 
 
-def test_what_comes_before_a_long_pause_has_its_transforms(tmp_path):
+def test_items_before_a_long_pause_have_transforms(tmp_path):
     pause = 3600 * SECOND
     drives = [Drive(), Drive(start=START + pause)]
-    del drives[1].items[0]  # the first after the pause is a motion
+    del drives[1].items[0]  # static transform: /tf is the first message after the pause
     paths = [drive.write(tmp_path / f'drive{k}') for k, drive in enumerate(drives)]
-    tree, found = TransformTree(), []
+    tree = TransformTree()
+    found = []
     with Recording(paths) as recording:
         recording.choose_fixed_frame(tree)
         for item in recording.items(tree):
@@ -133,14 +136,14 @@ def test_what_comes_before_a_long_pause_has_its_transforms(tmp_path):
     assert sorted(set(found)) == drives[0].stamps + drives[1].stamps
 
 
-def test_static_transforms_are_known_from_the_start(tmp_path):
+def test_static_transforms_apply_before_they_are_received(tmp_path):
     drive = Drive()
     topic, _, message = drive.items.pop(0)
     drive.items.append((topic, drive.stamps[-1], message))
     assert read(drive.write(tmp_path / 'drive'))[2] == 'odom'
 
 
-def test_odometry_serves_where_tf_does_not(tmp_path):
+def test_odometry_replaces_missing_tf(tmp_path):
     tree = TransformTree()
     drive = Drive(motion='odometry')
     assert read(drive.write(tmp_path / 'drive'), tree)[2] == 'odom'
@@ -148,7 +151,7 @@ def test_odometry_serves_where_tf_does_not(tmp_path):
     np.testing.assert_allclose(T[:3, 3], [1.5, 0, 2])
 
 
-def test_odometry_of_the_sensor_itself_needs_no_tf(tmp_path):
+def test_odometry_of_the_sensor_frame_needs_no_tf(tmp_path):
     drive = Drive(motion='none')
     drive.items = [item for item in drive.items if item[0] != '/tf_static']
     drive.items += [
@@ -160,22 +163,22 @@ def test_odometry_of_the_sensor_itself_needs_no_tf(tmp_path):
     np.testing.assert_array_equal(tree.lookup('world', 'lidar', START)[:3, 3], [1, 2, 3])
 
 
-def test_odometry_of_something_else_is_named(tmp_path):
+def test_odometry_of_an_unconnected_frame_is_named_in_the_error(tmp_path):
     drive = Drive(motion='none')
     drive.items.append(('/odom', START, M.odometry(START, 'world', 'trailer')))
-    text = refused(drive.write(tmp_path / 'drive'))
+    text = error_of(drive.write(tmp_path / 'drive'))
     assert 'odometry: /odom (world -> trailer)' in text
     assert 'base -> lidar' in text
 
 
-def test_odometry_that_starts_late_does_not_matter_beside_tf(tmp_path):
+def test_odometry_after_the_requested_part_is_ignored_if_tf_is_complete(tmp_path):
     drive = Drive(sweeps=10, motion='tf')
     stamp = drive.stamps[-1]
     drive.items.append(('/odom', stamp, M.odometry(stamp, 'world', 'base')))
     assert read(drive.write(tmp_path / 'drive'), end=0.5)[2] == 'odom'
 
 
-def test_tf_wins_over_odometry(tmp_path):
+def test_tf_is_preferred_to_odometry(tmp_path):
     drive = Drive(motion='tf')
     for stamp in drive.stamps:
         drive.items.append(('/odom', stamp, M.odometry(stamp, 'wheels', 'base', (99, 0, 0))))
@@ -185,20 +188,20 @@ def test_tf_wins_over_odometry(tmp_path):
     assert read(path, odometry='/odom', fixed_frame='wheels')[2] == 'wheels'
 
 
-def test_several_odometries_are_listed(tmp_path):
+def test_several_odometry_topics_are_listed_in_the_error(tmp_path):
     drive = Drive(motion='odometry')
     for stamp in drive.stamps:
         drive.items.append(('/fused', stamp, M.odometry(stamp, 'map', 'base', (0, 0, 0))))
         drive.items.append(('/other', stamp, M.odometry(stamp, 'map', 'wheel', (0, 0, 0))))
     path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
-    text = refused(path)
+    text = error_of(path)
     assert '/fused, /odom;' in text
     assert '--odometry' in text
     assert read(path, odometry='/fused')[2] == 'map'
     assert read(path, odometry='/odom')[2] == 'odom'
 
 
-def test_odometry_that_moves_the_root_of_tf(tmp_path):
+def test_odometry_of_the_root_frame_of_tf(tmp_path):
     drive = Drive(motion='none')
     for stamp in drive.stamps:
         drive.items.append(('/tf', stamp, M.tf(M.transform(stamp, 'footprint', 'base'))))
@@ -207,17 +210,17 @@ def test_odometry_that_moves_the_root_of_tf(tmp_path):
     assert read(path)[2] == 'odom'
 
 
-def test_sensor_that_does_not_move_must_be_declared(tmp_path):
+def test_a_stationary_sensor_needs_the_fixed_frame_as_an_option(tmp_path):
     path = Drive(motion='none').write(tmp_path / 'drive')
-    text = refused(path)
+    text = error_of(path)
     assert "'lidar'" in text
     assert '--fixed-frame lidar' in text
     assert read(path, fixed_frame='lidar')[2] == 'lidar'
-    assert read(path, fixed_frame='base')[2] == 'base', 'static transforms lead there'
+    assert read(path, fixed_frame='base')[2] == 'base', 'connected by static transforms'
 
 
-def test_fixed_frame_that_is_not_there(tmp_path):
-    text = refused(Drive().write(tmp_path / 'drive'), fixed_frame='world')
+def test_an_unknown_fixed_frame_is_refused(tmp_path):
+    text = error_of(Drive().write(tmp_path / 'drive'), fixed_frame='world')
     assert "'world'" in text
     assert 'odom -> base' in text
     assert 'base -> lidar' in text
@@ -226,44 +229,44 @@ def test_fixed_frame_that_is_not_there(tmp_path):
 # Parts -----------------------------------------------------------------------------------------
 
 
-def test_a_part_of_the_recording(tmp_path):
+def test_start_and_end_select_a_part(tmp_path):
     drive = Drive(sweeps=20)
     path = drive.write(tmp_path / 'drive')
     sweeps, arrays, _ = read(path, start=0.45, end=1.2)
     assert [sweep.stamp_ns for sweep in sweeps] == drive.stamps[5:12]
     assert [array.stamp_ns for array in arrays] == drive.stamps[5:12]
-    text = refused(path, start=5.0)
+    text = error_of(path, start=5.0)
     assert '1.9 s' in text
     assert 'got 5 to the end' in text
 
 
-# What goes wrong -------------------------------------------------------------------------------
+# Errors ----------------------------------------------------------------------------------------
 
 
-def test_topics_that_are_not_there(tmp_path):
+def test_unknown_topics_are_refused(tmp_path):
     path = Drive().write(tmp_path / 'drive')
-    text = refused(path, points='/lidar')
+    text = error_of(path, points='/lidar')
     assert "no topic '/lidar'" in text
     assert 'topics with point clouds: /points' in text
-    assert 'topics with boxes: /boxes' in refused(path, boxes='/objects')
-    assert 'topics with odometry: none' in refused(path, odometry='/odom')
+    assert 'topics with boxes: /boxes' in error_of(path, boxes='/objects')
+    assert 'topics with odometry: none' in error_of(path, odometry='/odom')
 
 
-def test_topic_of_another_type(tmp_path):
+def test_a_topic_of_another_type_is_refused(tmp_path):
     path = Drive().write(tmp_path / 'drive')
-    text = refused(path, boxes='/points')
+    text = error_of(path, boxes='/points')
     assert "topic '/points'" in text
     assert 'vision_msgs/msg/Detection3DArray' in text
     assert 'got sensor_msgs/msg/PointCloud2' in text
-    assert 'got vision_msgs/msg/Detection3DArray' in refused(path, points='/boxes')
+    assert 'got vision_msgs/msg/Detection3DArray' in error_of(path, points='/boxes')
 
 
-@pytest.mark.parametrize(('gone', 'what'), [('/points', 'point clouds'), ('/boxes', 'boxes')])
-def test_no_clouds_or_no_boxes(tmp_path, gone, what):
+@pytest.mark.parametrize(('topic', 'kind'), [('/points', 'point clouds'), ('/boxes', 'boxes')])
+def test_a_recording_without_clouds_or_boxes_is_refused(tmp_path, topic, kind):
     drive = Drive()
-    drive.items = [item for item in drive.items if item[0] != gone]
-    text = refused(drive.write(tmp_path / 'drive'))
-    assert f'no {what}' in text
+    drive.items = [item for item in drive.items if item[0] != topic]
+    text = error_of(drive.write(tmp_path / 'drive'))
+    assert f'no {kind}' in text
     assert '/tf (tf2_msgs/msg/TFMessage)' in text
 
 
@@ -291,59 +294,59 @@ def test_topics_without_messages_are_named(tmp_path):
                     channels[channel.topic], message.log_time, message.data, message.log_time
                 )
         writer.finish()
-    assert 'no messages on /late' in refused(cut)
+    assert 'no messages on /late' in error_of(cut)
 
 
-def test_several_topics_fit(tmp_path):
+def test_several_topics_of_one_kind_are_listed_in_the_error(tmp_path):
     drive = Drive()
     drive.items += [
         ('/rear', stamp, message) for t, stamp, message in drive.items if t == '/points'
     ]
     path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
-    text = refused(path)
+    text = error_of(path)
     assert '/points, /rear' in text
     assert '--points' in text
     assert len(read(path, points='/rear')[0]) == 8
 
 
-def test_files_that_are_no_recordings(tmp_path):
-    assert 'no such recording' in refused(tmp_path / 'nothing.mcap')
+def test_files_that_are_no_recordings_are_refused(tmp_path):
+    assert 'no such recording' in error_of(tmp_path / 'nothing.mcap')
     for name in ('empty.mcap', 'empty.db3', 'empty.bag'):
         (tmp_path / name).touch()
-        assert name in refused(tmp_path / name)
+        assert name in error_of(tmp_path / name)
     for name in ('text.mcap', 'text.db3', 'text.bag', 'text.csv'):
         (tmp_path / name).write_text('this is no recording\n' * 100)
-        assert name in refused(tmp_path / name)
+        assert name in error_of(tmp_path / name)
     (tmp_path / 'folder').mkdir()
-    assert 'metadata.yaml' in refused(tmp_path / 'folder')
+    assert 'metadata.yaml' in error_of(tmp_path / 'folder')
     (tmp_path / 'folder' / 'metadata.yaml').write_text('rosbag2_bagfile_information: [')
-    assert 'folder' in refused(tmp_path / 'folder')
+    assert 'folder' in error_of(tmp_path / 'folder')
 
 
-def test_recording_that_was_cut_off(tmp_path):
+def test_a_truncated_recording_is_refused(tmp_path):
     path = Drive().write(tmp_path / 'drive')
     path.write_bytes(path.read_bytes()[:-500])
-    assert 'expected a whole MCAP' in refused(path)
-    # Of several it is the one that is named.
+    assert 'expected a whole MCAP' in error_of(path)
+    # The error names the truncated one of several recordings.
     whole = [Drive().write(tmp_path / name) for name in ('before', 'behind')]
-    assert refused([whole[0], path, whole[1]]).startswith(f'{path}: ')
+    assert error_of([whole[0], path, whole[1]]).startswith(f'{path}: ')
 
 
-def test_recording_without_messages(tmp_path):
+def test_a_recording_without_messages_is_refused(tmp_path):
     path = tmp_path / 'drive'
     write_recording(path, [], 'sqlite3')
-    assert 'no point clouds' in refused(path)
+    assert 'no point clouds' in error_of(path)
 
 
-def test_ros1_and_ros2_together(tmp_path):
+def test_ros1_and_ros2_recordings_cannot_be_merged(tmp_path):
     paths = [
         Drive().write(tmp_path / 'two'),
         Drive(ros1=True).write(tmp_path / 'one', 'rosbag1'),
     ]
-    assert 'cannot be merged' in refused(paths)
+    assert 'cannot be merged' in error_of(paths)
 
 
-def test_message_that_does_not_follow_its_definition(tmp_path):
+def test_a_message_that_contradicts_its_definition_is_refused(tmp_path):
     folder = Drive().write(tmp_path / 'drive', 'sqlite3')
     (file,) = folder.glob('*.db3')
     with sqlite3.connect(file) as database:
@@ -352,18 +355,18 @@ def test_message_that_does_not_follow_its_definition(tmp_path):
             "(SELECT id FROM topics WHERE name = '/boxes')"
         )
     database.close()
-    assert "a message on '/boxes' is not a vision_msgs" in refused(folder)
+    assert "a message on '/boxes' is not a vision_msgs" in error_of(folder)
 
 
-def test_message_that_cannot_be_used_names_its_topic(tmp_path):
+def test_the_error_of_an_unusable_message_names_the_topic(tmp_path):
     drive = Drive()
     drive.replace('/points', 2, lambda message: setattr(message, 'width', 10_000))
-    text = refused(drive.write(tmp_path / 'drive'))
+    text = error_of(drive.write(tmp_path / 'drive'))
     assert text.startswith("topic '/points': PointCloud2:")
     assert 'expected at least' in text
 
 
-def test_lookup_without_transform_says_what_is_known(tmp_path):
+def test_a_failed_lookup_lists_the_known_transforms(tmp_path):
     tree = TransformTree()
     read(Drive().write(tmp_path / 'drive'), tree)
     with pytest.raises(TransformUnavailable, match='base -> lidar, odom -> base'):

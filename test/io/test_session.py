@@ -1,4 +1,4 @@
-"""The way of items to the registrar, which the live node and `boxreg relabel` share."""
+"""The session that the live node and `boxreg relabel` share: transforms, ids, time jumps."""
 
 from dataclasses import replace
 
@@ -160,7 +160,7 @@ def test_an_array_without_boxes_stamp_and_frame_is_a_placeholder():
 
 
 def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path):
-    """A finding about the boxes before the jump does not hold for those after it."""
+    """A finding about the boxes before the jump does not apply to those after it."""
     wrong, right = Drive(sweeps=12, start=START + 100 * SECOND), Drive(sweeps=12)
     for _, _, message in wrong.items:
         for detection in getattr(message, 'detections', []):

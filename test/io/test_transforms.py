@@ -1,3 +1,5 @@
+"""Transforms: lookup, interpolation, odometry, forgetting, time jumps, sweeps and boxes."""
+
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.transforms import (
     boxes_to_frame,
@@ -34,21 +36,21 @@ def tree_of(*transforms, static=(), odometry=()):
     return tree
 
 
-def test_chain_of_any_depth_up_and_down():
+def test_chains_of_transforms_and_their_inverses():
     tree = tree_of(
         (S, 'map', 'odom', (100, 0, 0)),
         (S, 'odom', 'base', (0, 10, 0), LEFT),
         static=[(0, 'base', 'lidar', (1, 0, 2)), (0, 'base', 'camera', (0, 0, 1), LEFT)],
     )
-    # The lidar sits 1 m ahead of a base that looks along +y.
+    # The LiDAR is 1 m ahead of a base whose x axis points along +y.
     np.testing.assert_allclose(tree.lookup('map', 'lidar', S)[:3, 3], [100, 11, 2], atol=1e-12)
     T_camera_lidar = inverse(rigid((0, 0, 1), LEFT)) @ rigid((1, 0, 2))
     np.testing.assert_allclose(tree.lookup('camera', 'lidar', S), T_camera_lidar, atol=1e-12)
-    back = tree.lookup('lidar', 'map', S) @ tree.lookup('map', 'lidar', S)
-    np.testing.assert_allclose(back, np.eye(4), atol=1e-12)
+    product = tree.lookup('lidar', 'map', S) @ tree.lookup('map', 'lidar', S)
+    np.testing.assert_allclose(product, np.eye(4), atol=1e-12)
 
 
-def test_frame_to_itself_needs_no_transform():
+def test_lookup_of_a_frame_in_itself_is_the_identity():
     np.testing.assert_array_equal(TransformTree().lookup('lidar', 'lidar', S), np.eye(4))
 
 
@@ -58,14 +60,14 @@ def test_interpolation_is_linear_and_slerp():
         (0, 'odom', 'base', (0, 0, 0), first.as_quat()),
         (S, 'odom', 'base', (10, 4, -2), second.as_quat()),
     )
-    for share in (0.0, 0.25, 0.7, 1.0):
-        T = tree.lookup('odom', 'base', round(share * S))
-        expected = Slerp([0, 1], Rotation.concatenate([first, second]))(share).as_matrix()
+    for fraction in (0.0, 0.25, 0.7, 1.0):
+        T = tree.lookup('odom', 'base', round(fraction * S))
+        expected = Slerp([0, 1], Rotation.concatenate([first, second]))(fraction).as_matrix()
         np.testing.assert_allclose(T[:3, :3], expected, atol=1e-12)
-        np.testing.assert_allclose(T[:3, 3], np.multiply([10, 4, -2], share), atol=1e-12)
+        np.testing.assert_allclose(T[:3, 3], np.multiply([10, 4, -2], fraction), atol=1e-12)
 
 
-def test_interpolation_takes_the_short_way_between_opposite_quaternions():
+def test_interpolation_takes_the_shortest_path_for_opposite_quaternions():
     turned = Rotation.from_euler('z', 10, degrees=True)
     tree = tree_of(
         (0, 'odom', 'base', (0, 0, 0), (0, 0, 0, 1)),
@@ -75,14 +77,14 @@ def test_interpolation_takes_the_short_way_between_opposite_quaternions():
     assert yaw == pytest.approx(np.radians(5))
 
 
-def test_samples_may_come_in_any_order():
+def test_samples_may_be_added_in_any_order():
     stamps = [3, 1, 2, 5, 4]
     tree = tree_of(*((s * S, 'odom', 'base', (s * s, 0, 0)) for s in stamps))
     assert tree.lookup('odom', 'base', 3 * S // 2)[0, 3] == pytest.approx(2.5)
     assert tree.lookup('odom', 'base', 9 * S // 2)[0, 3] == pytest.approx(20.5)
 
 
-def test_motion_is_carried_on_a_little_and_no_farther():
+def test_motion_is_extrapolated_up_to_a_limit():
     tree = tree_of((0, 'odom', 'base', (0, 0, 0)), (S, 'odom', 'base', (10, 0, 0)))
     assert tree.lookup('odom', 'base', S + S // 10)[0, 3] == pytest.approx(11.0)
     assert tree.lookup('odom', 'base', -S // 10)[0, 3] == pytest.approx(-1.0)
@@ -93,10 +95,10 @@ def test_motion_is_carried_on_a_little_and_no_farther():
     patient.add_transforms([M.transform(0, 'odom', 'base', (3, 0, 0))])
     assert patient.lookup('odom', 'base', 0)[0, 3] == 3.0
     with pytest.raises(TransformUnavailable, match='odom -> base is known from 0 to 0'):
-        patient.lookup('odom', 'base', 1)  # one sample says nothing of motion
+        patient.lookup('odom', 'base', 1)  # one sample gives no velocity
 
 
-def test_covers_tells_known_from_carried_on():
+def test_covers_excludes_extrapolation():
     tree = tree_of(
         (S, 'odom', 'base'), (2 * S, 'odom', 'base'), static=[(0, 'base', 'lidar', (1, 0, 0))]
     )
@@ -105,21 +107,21 @@ def test_covers_tells_known_from_carried_on():
     assert not tree.covers('odom', 'lidar', 2 * S + 1)
     assert not tree.covers('odom', 'lidar', S - 1)
     assert not tree.covers('map', 'lidar', S)
-    assert tree.covers('base', 'lidar', 99 * S), 'static transforms hold always'
+    assert tree.covers('base', 'lidar', 99 * S), 'static transforms are valid at all times'
 
 
-def test_static_stays_static_when_published_on_both_topics():
+def test_a_static_transform_on_both_topics_stays_static():
     tree = tree_of((5 * S, 'base', 'lidar', (1, 0, 0)), static=[(0, 'base', 'lidar', (1, 0, 0))])
     assert tree.lookup('base', 'lidar', 0)[0, 3] == 1.0
     tree.add_transforms([M.transform(9 * S, 'base', 'lidar', (2, 0, 0))])
     assert tree.lookup('base', 'lidar', 0)[0, 3] == 2.0
 
 
-def test_tf_comes_before_odometry():
+def test_tf_has_priority_over_odometry():
     odometry = [(S, 'odom', 'base', (7, 0, 0))]
     tree = tree_of((S, 'odom', 'base', (5, 0, 0)), odometry=odometry)
     assert tree.lookup('odom', 'base', S)[0, 3] == 5.0
-    # TF hangs the base from another frame: only odometry leads to 'odom'.
+    # In TF the parent of the base is another frame: only odometry connects it to 'odom'.
     tree = tree_of(
         (S, 'map', 'base', (5, 0, 0)), static=[(0, 'base', 'lidar', (0, 0, 2))], odometry=odometry
     )
@@ -127,7 +129,7 @@ def test_tf_comes_before_odometry():
     np.testing.assert_array_equal(tree.lookup('map', 'lidar', S)[:3, 3], [5, 0, 2])
 
 
-def test_errors_name_frames_and_remedy():
+def test_errors_name_the_frames_and_the_remedy():
     tree = tree_of((S, 'odom', 'base'), static=[(0, 'vehicle', 'lidar')])
     with pytest.raises(TransformUnavailable) as caught:
         tree.lookup('odom', 'lidar', S)
@@ -139,7 +141,7 @@ def test_errors_name_frames_and_remedy():
         TransformTree().lookup('odom', 'lidar', S)
 
 
-def test_bad_transforms_are_passed_over():
+def test_invalid_transforms_are_skipped():
     tree = tree_of(
         (S, 'odom', 'base', (1, 0, 0)),
         (2 * S, 'odom', 'base', (np.nan, 0, 0)),
@@ -154,12 +156,12 @@ def test_bad_transforms_are_passed_over():
         broken.lookup('odom', 'base', S)
 
 
-def test_slash_of_ros1_means_nothing():
+def test_the_leading_slash_of_ros1_frames_is_ignored():
     tree = tree_of((S, '/odom', '/base', (1, 0, 0)))
     assert tree.lookup('odom', '/base', S)[0, 3] == 1.0
 
 
-def test_old_samples_are_forgotten():
+def test_old_samples_are_removed():
     tree = tree_of(*((k * S, 'odom', 'base', (k, 0, 0)) for k in range(100)))
     assert tree.lookup('odom', 'base', 69 * S + S // 2)[0, 3] == pytest.approx(69.5)
     with pytest.raises(TransformUnavailable, match='is known from 69000000000 to 99000000000'):
@@ -168,8 +170,8 @@ def test_old_samples_are_forgotten():
     assert tree.lookup('odom', 'base', 99 * S + S)[0, 3] == pytest.approx(100)
 
 
-def test_frames_of_objects_are_forgotten_those_of_the_car_are_not():
-    """Some trackers give every object a frame of its own: thousands in an hour."""
+def test_unused_frames_of_objects_are_removed():
+    """Some trackers publish a frame per object: thousands in an hour."""
     tree = tree_of(static=[(0, 'base', 'lidar', (0, 0, 2))])
     for k in range(10 * FRAMES_BEFORE_CLEANUP):
         tree.add_transforms([M.transform(k * S, 'odom', 'base', (k, 0, 0))])
@@ -179,7 +181,7 @@ def test_frames_of_objects_are_forgotten_those_of_the_car_are_not():
     assert tree.connects('odom', f'object {k}')
 
 
-def test_clear_forgets_all():
+def test_clear_removes_all_frames():
     tree = tree_of((S, 'odom', 'base'))
     assert tree.covers('odom', 'base', S)
     tree.clear()
@@ -187,26 +189,28 @@ def test_clear_forgets_all():
     assert not tree.covers('odom', 'base', S)
 
 
-def test_fixed_frame():
+def test_the_fixed_frame_is_the_root_of_the_moving_frames():
     static = [(0, 'base', 'lidar')]
     assert TransformTree().fixed_frame('lidar') is None
-    assert tree_of(static=static).fixed_frame('lidar') is None, 'TF knows no motion'
+    assert tree_of(static=static).fixed_frame('lidar') is None, (
+        'TF contains static transforms only'
+    )
     assert tree_of((S, 'odom', 'base'), static=static).fixed_frame('lidar') == 'odom'
     moving = [(S, 'map', 'odom'), (S, 'odom', 'base')]
     assert tree_of(*moving, static=static).fixed_frame('lidar') == 'map'
     odometry = [(S, 'odom', 'base')]
     assert tree_of(static=static, odometry=odometry).fixed_frame('lidar') == 'odom'
     assert tree_of(*moving, static=static, odometry=odometry).fixed_frame('lidar') == 'map'
-    apart = [(S, 'odom', 'other')]
-    assert tree_of(static=static, odometry=apart).fixed_frame('lidar') is None
-    footprint = [(S, 'footprint', 'base')]  # TF moves, but below the odometry's child
+    unconnected = [(S, 'odom', 'other')]
+    assert tree_of(static=static, odometry=unconnected).fixed_frame('lidar') is None
+    footprint = [(S, 'footprint', 'base')]  # moves, but below the child frame of the odometry
     tree = tree_of(*footprint, static=static, odometry=[(S, 'odom', 'footprint')])
     assert tree.fixed_frame('lidar') == 'odom'
     circle = [(S, 'a', 'b'), (S, 'b', 'a')]
     assert tree_of(*circle).fixed_frame('a') in ('a', 'b')
 
 
-def test_sweep_moves_with_its_origin():
+def test_points_and_sensor_origin_of_a_sweep_are_transformed():
     points = np.array([[1, 0, 0], [0, 2, 0]], np.float32)
     sweep = Sweep(S, 'lidar', points, times=np.array([0.0, 0.1]))
     moved = sweep_to_frame(sweep, rigid((10, 20, 1), LEFT), 'odom')
@@ -223,7 +227,7 @@ def test_sweep_far_from_the_origin_keeps_its_resolution():
     np.testing.assert_allclose(moved.points, [[500_000.001, 5_400_000.002, 0.003]], atol=1e-8)
 
 
-def test_boxes_turn_about_all_axes():
+def test_boxes_are_rotated_about_all_axes():
     rng = np.random.default_rng(3)
     angles = rng.uniform([-3, -1.5, -3], [3, 1.5, 3], (20, 3))
     boxes = np.hstack([rng.uniform(-50, 50, (20, 3)), rng.uniform(1, 5, (20, 3)), angles])
@@ -249,7 +253,7 @@ def test_samples_after_a_time_jump_replace_the_old_ones():
     static = [(0, 'base', 'lidar', (0, 0, 2))]
     moves = [(100 * S + k * S // 10, 'odom', 'base', (k, 0, 0)) for k in range(50)]
     tree = tree_of(*moves, static=static)
-    one = (90 * S, 'odom', 'base', (-1, 0, 0))  # a stray, 14.9 s old
+    one = (90 * S, 'odom', 'base', (-1, 0, 0))  # a single old sample: 14.9 s
     tree.add_transforms(M.tf(M.transform(*one)).transforms)
     np.testing.assert_allclose(tree.lookup('odom', 'lidar', 102 * S)[0, 3], 20)
     assert tree.newest_ns() == 104_900_000_000
@@ -257,7 +261,9 @@ def test_samples_after_a_time_jump_replace_the_old_ones():
     for item in again:
         tree.add_transforms(M.tf(M.transform(*item)).transforms)
     T = tree.lookup('odom', 'lidar', 100 * S + 250_000_000)
-    np.testing.assert_allclose(T[:3, 3], [0, 2.5, 2])  # the second time, the mount still known
+    np.testing.assert_allclose(
+        T[:3, 3], [0, 2.5, 2]
+    )  # of the second pass; the static transform is kept
     assert not tree.covers('odom', 'lidar', 102 * S)
     assert not tree.covers('odom', 'lidar', 95 * S)
     tree.rewind(98 * S)
@@ -266,12 +272,13 @@ def test_samples_after_a_time_jump_replace_the_old_ones():
     assert tree.connects('odom', 'lidar')
 
 
-def test_two_stamps_far_back_in_a_row_are_a_time_jump():
+def test_two_consecutive_old_stamps_are_a_time_jump():
     detector = TimeJumpDetector()
     jumps = [
         detector.has_jumped(t * S // 10)
         for t in (100, 110, 105, 101, 99, 111, 99, 98, 99, 85, 112)
     ]
-    # 0.1 s more than a second back: 99 once after 110; then 99 and 98 after 111 are two. After
-    # that 98 is the newest: 85 is one again.
+    # Stamps in units of 0.1 s are old if they are more than 1 s (10 units) before the newest. 99
+    # after 110 is a single old stamp. 99 and 98 after 111 are two: a time jump. The newest stamp
+    # is then 98, and 85 is a single old stamp again.
     assert jumps == [False] * 7 + [True] + [False] * 3

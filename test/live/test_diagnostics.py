@@ -33,7 +33,7 @@ def test_level_is_ok_while_boxes_are_refined_and_warn_in_silence():
     assert health.status('node', {}).level == DiagnosticStatus.WARN  # nothing more was received
 
 
-def test_level_and_message_are_those_of_the_gravest_reason_of_the_period():
+def test_level_and_message_are_those_of_the_most_severe_reason():
     health = Health(Log())
     health.count('no_sweep', 3)
     health.count('boxes_received')
@@ -78,7 +78,7 @@ def test_each_reason_is_logged_once_per_period():
     health.report('unreadable', 'points: no field x')
     health.report('unreadable', 'points: no field x')
     assert log.take() == [('warning', 'unreadable:')]
-    health._logged_at.clear()  # as if the period were over
+    health._logged_at.clear()  # ends the period
     health.log_counts()
     assert log.take() == [('warning', 'unreadable'), ('warning', 'late')]
 

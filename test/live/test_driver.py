@@ -1,4 +1,4 @@
-"""What the node does between its topics: waiting, moving, passing through, starting afresh."""
+"""The driver of the node, without ROS: waiting, transforms, unchanged boxes, restarts."""
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import matrix
@@ -12,22 +12,22 @@ from ros_messages import DETECTIONS, Drive, SECOND, START, TRACKED
 
 
 class Live(LiveRegistrar):
-    """Fed from a Drive."""
+    """A driver whose input is a `Drive`; `reports` are (reason, text, number)."""
 
     def __init__(
         self, fixed_frame='', output_frame='', timeout=1.0, convention=STANDARD, **settings
     ):
-        self.told = []
+        self.reports = []
         config = Config(estimate='final').updated({'window': 5, 'lag': 2} | settings)
         super().__init__(
             config, fixed_frame, output_frame, timeout,
-            lambda *words: self.told.append(words), convention,
+            lambda *report: self.reports.append(report), convention,
         )  # fmt: skip
         self.adapter = adapter_for(DETECTIONS, convention)
         self.cloud_frame = 'lidar'
 
     def feed(self, drive, now=0.0):
-        """Process all of a drive, as soon as it is ready; return what comes out."""
+        """Process all messages of a drive, each when it is ready; return the output."""
         out = []
         for topic, _, message in drive.items:
             if topic in ('/tf', '/tf_static'):
@@ -35,7 +35,7 @@ class Live(LiveRegistrar):
             elif topic == '/odom':
                 self.tree.add_odometry(message)
             else:
-                item = arrival(topic, message, now, self.adapter)
+                item = received(topic, message, now, self.adapter)
                 confirmed, ready = self.confirm(item)
                 out += ready
                 for each in confirmed:
@@ -44,7 +44,8 @@ class Live(LiveRegistrar):
         return out
 
 
-def arrival(topic, message, now=0.0, adapter=vision):
+def received(topic, message, now=0.0, adapter=vision):
+    """Return a message as the driver gets it, received at `now` [s]."""
     reader = pointcloud if topic == '/points' else adapter
     return ReceivedMessage(message, reader.from_msg(message), now)
 
@@ -53,7 +54,7 @@ def items_of(drive, topic):
     return [message for name, _, message in drive.items if name == topic]
 
 
-def test_every_message_comes_back_early_and_final_in_its_own_frame():
+def test_each_message_is_published_early_and_final_in_its_input_frame():
     drive = Drive(sweeps=6)
     live = Live()
     out = live.feed(drive) + live.flush()
@@ -69,10 +70,10 @@ def test_every_message_comes_back_early_and_final_in_its_own_frame():
             assert np.abs(array.boxes - given.boxes).max() < 0.5
     refined = [item for item in out if item.is_final]
     assert all(REFINED in item.refined.status for item in refined)
-    assert not live.told
+    assert not live.reports
 
 
-def test_output_frame_is_the_one_asked_for():
+def test_boxes_are_transformed_to_the_output_frame():
     drive = Drive(sweeps=5)
     out = Live(output_frame='odom').feed(drive)
     assert out
@@ -82,7 +83,7 @@ def test_output_frame_is_the_one_asked_for():
         assert np.abs(array.boxes[:, :3] - drive.truth[array.stamp_ns][:, :3]).max() < 0.5
 
 
-def test_kept_boxes_keep_their_covariance_and_refined_ones_get_ours():
+def test_kept_boxes_have_the_input_covariance_and_refined_ones_the_estimated():
     drive = Drive(sweeps=5)
     for message in items_of(drive, '/boxes'):
         for detection in message.detections:
@@ -92,7 +93,7 @@ def test_kept_boxes_keep_their_covariance_and_refined_ones_get_ours():
     for item in out:
         assert item.refined.status[1] == KEPT
         spread = [d.results[0].pose.covariance.reshape(6, 6) for d in item.message.detections]
-        # The output frame is a quarter turn away: the detector's 9 along x is 9 along y.
+        # The output frame is rotated by 90 degrees: a variance of 9 along x is 9 along y.
         np.testing.assert_allclose(np.diag(spread[1]), [4, 9, 1, 0, 0, 0], atol=1e-9)
         if item.refined.status[0] == REFINED:
             np.testing.assert_allclose(spread[0], item.refined.covariances[0])
@@ -100,7 +101,7 @@ def test_kept_boxes_keep_their_covariance_and_refined_ones_get_ours():
 
 
 class Turned:
-    """A drive with a frame that is a quarter turn away from odom."""
+    """A drive with a static frame rotated by 90 degrees against odom."""
 
     def __init__(self, drive):
         m = drive.messages
@@ -109,16 +110,16 @@ class Turned:
         self.items = [('/tf_static', START, m.tf(static)), *drive.items]
 
 
-def test_poses_that_do_not_fit_are_told_with_every_array():
+def test_a_wrong_pose_convention_is_reported_with_every_array():
     drive = Drive(sweeps=10)
     live = Live(convention=Convention('bottom'))
     live.feed(drive)
-    reasons = [reason for reason, *_ in live.told]
-    assert reasons == ['pose_reference'] * 5  # known after 12 boxes, six arrays
-    assert 'pose_reference:=center' in live.told[0][1]
+    reasons = [reason for reason, *_ in live.reports]
+    assert reasons == ['pose_reference'] * 5  # decided after 12 boxes: six arrays
+    assert 'pose_reference:=center' in live.reports[0][1]
 
 
-def test_ids_by_association_are_those_of_the_markers_and_of_the_messages():
+def test_associated_ids_are_the_same_in_markers_and_messages():
     drive = Drive(sweeps=4)
     for message in items_of(drive, '/boxes'):
         for detection in message.detections:
@@ -131,8 +132,8 @@ def test_ids_by_association_are_those_of_the_markers_and_of_the_messages():
     assert live.facts == {'ids': 'by association', 'associated_tracks': 2}
 
 
-def test_headings_of_unknown_sign_become_those_of_their_track_and_stay_unknown():
-    """Of five headings of each object one points backwards, and its twist with it."""
+def test_heading_signs_are_resolved_per_track_and_stay_marked_as_unknown():
+    """One of five headings of each object is flipped, and its twist must be as well."""
     drive = Drive(sweeps=5, boxes=TRACKED)
     for item in items_of(drive, '/boxes')[1].objects:
         turn = item.kinematics.pose_with_covariance.pose.orientation
@@ -155,25 +156,25 @@ def test_headings_of_unknown_sign_become_those_of_their_track_and_stay_unknown()
             assert written.kinematics.twist_with_covariance.twist.linear.x == sign * speed
 
 
-def test_arrivals_wait_until_transforms_cover_them_but_not_for_ever():
+def test_messages_wait_for_their_transforms_until_the_timeout():
     drive = Drive(sweeps=3)
     live = Live(timeout=1.0)
     static, *moving = [m for t, _, m in drive.items if t.startswith('/tf')]
-    clouds = [arrival('/points', m, 10.0) for m in items_of(drive, '/points')]
+    clouds = [received('/points', m, 10.0) for m in items_of(drive, '/points')]
     live.tree.add_transforms(static.transforms, is_static=True)
     assert not live.is_ready(clouds[0], 10.0)
     live.tree.add_transforms(moving[0].transforms)
     live.tree.add_transforms(moving[1].transforms)
-    assert not live.is_ready(clouds[1], 10.1)  # a fixed frame is not chosen in a hurry
+    assert not live.is_ready(clouds[1], 10.1)  # the fixed frame is chosen after 0.5 s
     assert live.is_ready(clouds[1], 10.5)
     assert live.fixed_frame == 'odom'
     assert not live.is_ready(clouds[2], 10.5)
-    assert live.is_ready(clouds[2], 11.0)  # 0.1 s further on a transform can be extrapolated
+    assert live.is_ready(clouds[2], 11.0)  # timeout: extrapolated by 0.1 s
     assert live.process(clouds[2]) == []
-    assert not live.told
+    assert not live.reports
 
 
-def test_final_boxes_come_in_the_order_of_the_input_where_some_pass_through():
+def test_final_boxes_keep_the_input_order_with_unchanged_ones_between():
     drive = Drive(sweeps=12)
     boxes = items_of(drive, '/boxes')
     for k in (5, 6, 11):
@@ -190,55 +191,55 @@ def test_final_boxes_come_in_the_order_of_the_input_where_some_pass_through():
     assert [item.message for item in live.passed_through('free')] == ['free', 'free']
 
 
-def test_boxes_without_transform_pass_through_with_the_remedy():
+def test_boxes_without_transform_are_published_unchanged_with_a_remedy():
     drive = Drive(sweeps=2, motion='none')
     live = Live()
     cloud, boxes = items_of(drive, '/points')[0], items_of(drive, '/boxes')[0]
-    assert not live.is_ready(arrival('/points', cloud), 0.9)
-    assert live.is_ready(arrival('/points', cloud), 1.0)
-    assert live.process(arrival('/points', cloud)) == []
-    out = live.process(arrival('/boxes', boxes))
+    assert not live.is_ready(received('/points', cloud), 0.9)
+    assert live.is_ready(received('/points', cloud), 1.0)
+    assert live.process(received('/points', cloud)) == []
+    out = live.process(received('/boxes', boxes))
     assert [item.is_final for item in out] == [False, True]
     assert all(item.message is boxes for item in out)
-    assert [(reason, number) for reason, _, number in live.told] == [
+    assert [(reason, number) for reason, _, number in live.reports] == [
         ('sweep_without_transform', 1), ('no_transform', 2),
     ]  # fmt: skip
-    assert all('fixed_frame:=lidar' in text for _, text, _ in live.told)
+    assert all('fixed_frame:=lidar' in text for _, text, _ in live.reports)
 
 
-def test_a_sensor_that_does_not_move_needs_no_transform():
+def test_a_stationary_sensor_needs_no_transform():
     live = Live(fixed_frame='lidar')
     out = live.feed(Drive(sweeps=4, motion='none'))
     assert sum(not item.is_final for item in out) == 4
-    assert not live.told
+    assert not live.reports
 
 
-def test_arrays_without_boxes_and_stamp_neither_wait_nor_warn():
+def test_empty_arrays_without_stamp_cause_no_wait_and_no_report():
     drive = Drive(sweeps=2)
     empty, stamped = items_of(drive, '/boxes')
     empty.detections, stamped.detections = [], []
     empty.header.stamp.sec = empty.header.stamp.nanosec = 0
     live = Live()
-    assert live.is_ready(arrival('/boxes', empty), 0.0)
-    assert not live.is_ready(arrival('/boxes', stamped), 0.0)
+    assert live.is_ready(received('/boxes', empty), 0.0)
+    assert not live.is_ready(received('/boxes', stamped), 0.0)
     for message in (empty, stamped):
-        out = live.process(arrival('/boxes', message))
+        out = live.process(received('/boxes', message))
         assert [item.message for item in out] == [message, message]
-    assert not live.told
+    assert not live.reports
 
 
-def test_boxes_before_any_cloud_say_what_is_missing():
+def test_boxes_before_the_first_cloud_are_reported():
     drive = Drive(sweeps=1)
     live = Live()
     live.cloud_frame = ''
-    out = live.process(arrival('/boxes', items_of(drive, '/boxes')[0]))
+    out = live.process(received('/boxes', items_of(drive, '/boxes')[0]))
     assert len(out) == 2
-    assert 'no point cloud' in live.told[0][1]
+    assert 'no point cloud' in live.reports[0][1]
 
 
-def test_after_a_fault_all_that_is_held_passes_through_once():
+def test_held_boxes_are_published_unchanged_once_after_a_fault():
     drive = Drive(sweeps=6)
-    faulty = arrival(*drive.items.pop()[::2])
+    faulty = received(*drive.items.pop()[::2])
     live = Live()
     before = live.feed(drive)
     after = live.abandon(faulty)
@@ -256,7 +257,7 @@ def test_after_a_fault_all_that_is_held_passes_through_once():
     assert len(live.feed(again) + live.flush()) == 12
 
 
-def test_what_was_made_before_a_fault_is_not_lost():
+def test_messages_made_before_a_fault_are_published():
     drive = Drive(sweeps=6)
     live = Live()
     made = [0]
@@ -274,7 +275,7 @@ def test_what_was_made_before_a_fault_is_not_lost():
     live.adapter = Faulty
     made[0] = -100
     out = live.feed(drive)
-    made[0] = 0  # the second of those that become final at the end fails
+    made[0] = 0  # conversion of the second final message fails
     with pytest.raises(ZeroDivisionError):
         live.flush()
     out += live.abandon(None)
@@ -286,7 +287,7 @@ def test_what_was_made_before_a_fault_is_not_lost():
 
 
 def moved(drive, seconds, south=0.0):
-    """Return a drive, its stamps later, all poses and boxes to the south."""
+    """Return a drive with later stamps, moved to the south by its transforms."""
     for _, _, message in drive.items:
         for item in getattr(message, 'transforms', [message]):
             item.header.stamp.sec += seconds
@@ -296,17 +297,16 @@ def moved(drive, seconds, south=0.0):
 
 
 @pytest.mark.parametrize('back', [1, 30])
-def test_a_recording_that_loops_starts_afresh(back):
-    # The same street again, 30 m to the south by its transforms: what was known of these stamps
-    # before must not count.
+def test_tracks_restart_at_a_time_jump(back):
+    # The second pass has the same stamps, but its transforms are 30 m to the south: transforms
+    # of the first pass must not be used.
     live = Live(timeout=0.4)
     before = live.feed(moved(Drive(sweeps=20), 60 + back))
     drive = moved(Drive(sweeps=20), 60, south=30.0)
     after = live.feed(drive) + live.flush()
     finals = [item for item in before + after if item.is_final]
     assert len(finals) == 40
-    told = [reason for reason, _, _ in live.told]
-    assert told == ['time_jump']
+    assert [reason for reason, _, _ in live.reports] == ['time_jump']
     for item in finals[-20:]:
         array = vision.from_msg(item.message)
         stamp_ns = array.stamp_ns - 60 * SECOND
@@ -315,16 +315,16 @@ def test_a_recording_that_loops_starts_afresh(back):
         assert np.abs(array.boxes[:, :3] + sensor - drive.truth[stamp_ns][:, :3]).max() < 0.3
 
 
-def test_after_a_gap_tracks_begin_anew():
+def test_tracks_restart_after_a_gap():
     live = Live()
     live.feed(Drive(sweeps=6))
     out = live.feed(moved(Drive(sweeps=6), 20)) + live.flush()
-    assert sum(item.is_final for item in out) == 8  # two were held back by the lag
-    assert not live.told
+    assert sum(item.is_final for item in out) == 8  # six, and two held for the lag
+    assert not live.reports
     assert live.counts['short_track'] == 0
 
 
-def test_a_pause_of_playback_changes_nothing_after_it():
+def test_a_pause_of_playback_does_not_change_later_boxes():
     finals = []
     for is_paused in (False, True):
         live = Live()
@@ -341,7 +341,7 @@ def test_a_pause_of_playback_changes_nothing_after_it():
     np.testing.assert_array_equal(*finals)
 
 
-def test_silence_ends_what_is_held():
+def test_held_boxes_are_published_after_silence():
     live = Live()
     out = live.feed(Drive(sweeps=6), now=10.0)
     assert not live.is_silent(12.9)
@@ -352,7 +352,7 @@ def test_silence_ends_what_is_held():
     assert sum(item.is_final for item in live.feed(moved(Drive(sweeps=6), 1)) + live.flush()) == 6
 
 
-def test_boxes_of_a_cloud_that_was_dropped_do_not_wait_for_it():
+def test_boxes_do_not_wait_for_a_dropped_cloud():
     drive = Drive(sweeps=6)
     drive.items = [i for i in drive.items if (i[0], i[1]) != ('/points', drive.stamps[3])]
     live = Live()
@@ -362,13 +362,13 @@ def test_boxes_of_a_cloud_that_was_dropped_do_not_wait_for_it():
     assert kept[4:] == [('', '')] * 2
     early = [vision.from_msg(item.message).stamp_ns for item in out if not item.is_final]
     assert early == drive.stamps
-    # Nothing of it is refined: it comes out as it is, which under load costs nothing.
+    # No box of this array is refined: the input message itself is published, without a copy.
     given, *others = items_of(drive, '/boxes')[3:]
     assert sum(item.message is given for item in out) == 2
     assert not any(item.message is other for item in out for other in others)
 
 
-def test_when_the_lidar_stops_boxes_do_not_wait_for_it():
+def test_boxes_do_not_wait_after_the_lidar_has_stopped():
     drive = Drive(sweeps=6)
     late = drive.stamps[3]
     drive.items = [i for i in drive.items if i[0] != '/points' or i[1] <= late]
@@ -384,22 +384,21 @@ def test_when_the_lidar_stops_boxes_do_not_wait_for_it():
     assert [set(item.refined.reasons) for item in early][4:] == [{'no_sweep'}] * 2
 
 
-def test_reset_returns_what_is_held_and_keeps_the_transforms():
+def test_reset_returns_held_boxes_and_keeps_the_transforms():
     drive = Drive(sweeps=6)
     live = Live()
     out = live.feed(drive) + live.reset()
     assert sum(item.is_final for item in out) == 6
-    again = [item for item in drive.items if item[0] in ('/points', '/boxes')]
-    drive.items = again
+    drive.items = [item for item in drive.items if item[0] in ('/points', '/boxes')]
     out = live.feed(drive) + live.reset()
     assert sum(item.is_final for item in out) == 6
-    assert not live.told
+    assert not live.reports
 
 
 @pytest.mark.parametrize('delay, shuffle', [(0.05, 0), (0.5, 0), (0.5, 3)])
-def test_boxes_may_come_late_and_out_of_order(delay, shuffle):
-    # 50 to 500 ms behind their clouds; out of order by up to `shuffle` stamps: as long as their
-    # clouds are kept, only those that come after younger ones pass unrefined, and are counted.
+def test_boxes_may_be_received_late_and_out_of_order(delay, shuffle):
+    # Boxes are received 50 or 500 ms after their clouds, out of order by up to `shuffle` stamps.
+    # Only boxes received after younger ones are published unrefined, and these are counted.
     drive = Drive(sweeps=20)
     order = np.random.default_rng(0).permutation
     boxes = [i for i in drive.items if i[0] == '/boxes']
@@ -418,7 +417,7 @@ def test_boxes_may_come_late_and_out_of_order(delay, shuffle):
     assert live.counts['no_sweep'] == 0
 
 
-def test_boxes_of_one_stamp_come_back_each_in_its_own_message():
+def test_each_of_two_messages_with_one_stamp_is_published():
     drive = Drive(sweeps=4)
     boxes = items_of(drive, '/boxes')
     boxes[2].header.stamp = boxes[1].header.stamp
@@ -430,7 +429,7 @@ def test_boxes_of_one_stamp_come_back_each_in_its_own_message():
 
 
 @pytest.mark.parametrize('yaw', [0.0, 0.7, 2.5])
-def test_covariances_turn_with_the_frame(yaw):
+def test_covariances_are_rotated_to_the_output_frame(yaw):
     stamp = START + SECOND
     spread = np.diag([4.0, 1.0, 0.25, 0.1, 0.2, 0.3])  # along x
     boxes = BoxArray(

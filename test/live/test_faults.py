@@ -16,10 +16,21 @@ import pytest
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_graph import (
+    DIAGNOSTICS,
+    ended_cleanly,
+    graph_in,
+    play,
+    publishers_for,
+    QUICK,
+    records_of,
+    RELIABLE,
+    ROOT,
+    stamp_of,
+    values_of,
+)
 from ros_messages import DETECTIONS, Drive, POINTS, SECOND, START
 from std_srvs.srv import Trigger
-from test_node import DIAGNOSTICS, ended_cleanly, QUICK, values_of
 
 MARKERS = 'visualization_msgs/msg/MarkerArray'
 
@@ -60,7 +71,7 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
     graph.node.create_subscription(
         import_message(DETECTIONS), '/refined_boxes_final', print, latched
     )
-    graph.wait(lambda: values_of(diagnostics).get('qos_incompatible') == '2', 'both complaints')
+    graph.wait(lambda: values_of(diagnostics).get('qos_incompatible') == '2', 'both QoS reports')
     output = node.output()
     assert '/points: the publisher of /neighbour offers reliability best_effort' in output
     assert 'requests durability transient_local, the publisher of this node' in output
@@ -73,13 +84,13 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
 
     changes = {'solver__rounds': 2, 'transform_timeout': 1, 'vehicle__names': ['ute']}
     assert all(result.successful for result in set_to(**changes))
-    for bad, words in [
+    for invalid, words in [
         ({'solver__rounds': 0}, ('solver.rounds', '1')),
         ({'solver__rounds': 'many'}, ('INTEGER', 'STRING')),
         ({'window': 5}, ('window', 'read-only')),
         ({'vehicle__names': [1]}, ('STRING_ARRAY', 'INTEGER_ARRAY')),
     ]:
-        (result,) = set_to(**bad)
+        (result,) = set_to(**invalid)
         assert not result.successful
         assert all(word in result.reason for word in words), result.reason
     answer = call(graph, Trigger, 'save_config', Trigger.Request())
@@ -88,9 +99,10 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
     assert Config.from_yaml(file) == Config().updated(expected)
     assert 'transform_timeout: 1.0' in file.read_text()  # an integer is accepted for a real
     assert call(graph, Trigger, 'reset', Trigger.Request()).success
-    (folder := tmp_path / 'folder').mkdir()
-    for bad_file in (tmp_path / 'missing' / 'saved.yaml', folder, Path('/')):
-        set_to(config_file=str(bad_file))
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    for invalid_file in (tmp_path / 'missing' / 'saved.yaml', folder, Path('/')):
+        set_to(config_file=str(invalid_file))
         answer = call(graph, Trigger, 'save_config', Trigger.Request())
         assert not answer.success
         assert 'config_file' in answer.message
@@ -106,7 +118,7 @@ def test_parameters_and_services_at_run_time(graph, tmp_path):
     assert 'unknown parameters' not in again.output()
 
 
-def test_looping_recording_with_sim_time_and_then_silence(graph, tmp_path):
+def test_time_jump_with_sim_time_and_silence_after_it(graph, tmp_path):
     first, second = (
         records_of(shifted(Drive(sweeps=8), seconds).write(tmp_path / f'drive{seconds}'))
         for seconds in (30, 0)
@@ -186,7 +198,7 @@ def test_second_node_continues_after_the_first_was_killed(graph, tmp_path):
     assert [stamp_of(message) for message in early] == Drive(sweeps=12).stamps
 
 
-def test_boxes_wait_half_a_second_for_clouds_of_a_lidar_that_stops(graph, tmp_path):
+def test_boxes_wait_half_a_second_for_clouds_after_the_lidar_stops(graph, tmp_path):
     records = records_of(Drive(sweeps=12).write(tmp_path / 'drive'))
     publishers_for(graph, records)
     early = graph.collect(DETECTIONS, '/refined_boxes')
@@ -196,7 +208,9 @@ def test_boxes_wait_half_a_second_for_clouds_of_a_lidar_that_stops(graph, tmp_pa
     half = [i for i, record in enumerate(records) if record.topic == '/boxes'][5] + 1
     play(graph, records[:half], early)
     play(graph, [record for record in records[half:] if record.topic != '/points'])
-    graph.wait(lambda: len(early) == 12, 'boxes without their clouds', 2.5)  # silence: 3 s
+    graph.wait(
+        lambda: len(early) == 12, 'boxes without their clouds', 2.5
+    )  # less than the 3 s of silence
     graph.wait(lambda: values_of(diagnostics).get('no_sweep') == '12', 'counters')
     slowest = [values_of([d]).get('latency most [ms]', 0) for d in diagnostics]
     assert max(map(float, slowest)) >= 500.0
@@ -258,8 +272,8 @@ def test_malformed_messages_are_counted_and_others_are_refined(graph, tmp_path):
     early = graph.collect(DETECTIONS, '/refined_boxes')
     final = graph.collect(DETECTIONS, '/refined_boxes_final')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
-    patient = ('-p', 'transform_timeout:=0.05', '-p', 'queue:=100')
-    node = graph.start(*RELIABLE, *QUICK, *patient)
+    parameters = ('-p', 'transform_timeout:=0.05', '-p', 'queue:=100')
+    node = graph.start(*RELIABLE, *QUICK, *parameters)
     graph.wait_until_connected()
     play(graph, [record for record in records if record.topic.startswith('/tf')])
     for topic, message in malformed_messages():
@@ -286,10 +300,10 @@ def test_malformed_messages_are_counted_and_others_are_refined(graph, tmp_path):
     assert 'failed' not in values, node.output()
     assert values['refined'] > 0
     assert ended_cleanly(node)
-    # Every message of boxes is published once, malformed ones too.
+    # Every box message is published once, malformed ones included.
     assert len(early) == len(final) == 6 + 6 + 1
-    ours = [m for m in final if stamp_of(m) >= START + 5 * SECOND]
-    for message in ours[2:]:
+    of_drive = [m for m in final if stamp_of(m) >= START + 5 * SECOND]
+    for message in of_drive[2:]:
         array = vision.from_msg(message)
         k = drive.stamps.index(array.stamp_ns - 5 * SECOND)
         error = array.boxes[:, :3] + [0.5 * k, 0, 2.0] - drive.truth[drive.stamps[k]][:, :3]
@@ -298,7 +312,7 @@ def test_malformed_messages_are_counted_and_others_are_refined(graph, tmp_path):
 
 @pytest.fixture
 def domain():
-    """Return an environment with its own ROS domain."""
+    """Return the environment with another ROS domain."""
     return {**os.environ, 'ROS_DOMAIN_ID': str(101 + os.getpid() % 100)}
 
 
@@ -325,7 +339,7 @@ def test_bench_node_reports_rates_latencies_and_resources(domain):
     assert counters['refined'] > 100
 
 
-def test_killed_publisher_may_start_again(domain, graph, tmp_path):
+def test_boxes_are_refined_after_the_publisher_was_killed_and_restarted(domain, graph, tmp_path):
     domain['ROS_DOMAIN_ID'] = str(graph.domain)
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     node = graph.start('-p', 'window:=5', '-p', 'lag:=2')

@@ -1,4 +1,4 @@
-"""The real node over DDS, as a process of its own."""
+"""The node as a process, over DDS."""
 
 from contextlib import ExitStack
 from importlib.util import find_spec
@@ -19,11 +19,22 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
-from ros_graph import Graph, graph_in, play, publishers_for, records_of, RELIABLE, ROOT, stamp_of
+from ros_graph import (
+    DIAGNOSTICS,
+    ended_cleanly,
+    Graph,
+    graph_in,
+    play,
+    publishers_for,
+    QUICK,
+    records_of,
+    RELIABLE,
+    ROOT,
+    stamp_of,
+    values_of,
+)
 from ros_messages import DETECTIONS, Drive, MARKERS, START
 
-DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
-QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=60.0')
 WITHOUT_TF2_MSGS, WITHOUT_TF2_ROS = (
     f'import sys; sys.modules["{package}"] = None\n'
     'from boxreg_ros.live.main import main\n'
@@ -38,21 +49,8 @@ def graph(tmp_path):
         yield graph
 
 
-def ended_cleanly(node, number=signal.SIGINT):
-    took = node.stop(number)
-    assert node.popen.returncode == 0, node.output()
-    assert 'Traceback' not in node.output()
-    assert took < 2.0
-    return True
-
-
-def values_of(diagnostics):
-    newest = diagnostics[-1].status[0].values if diagnostics else []
-    return {item.key: item.value for item in newest}
-
-
 def test_odometry_replaces_tf(graph, tmp_path):
-    """Type from the graph, best-effort boxes, no tf2_msgs installed; markers and diagnostics."""
+    """Without tf2_msgs; the type of the boxes is found in the graph. Markers, diagnostics."""
     drive = Drive(sweeps=6, boxes='markers', motion='odometry')
     leaving = [item[2] for item in drive.items if item[0] == '/boxes'][4:]
     for message in leaving:
@@ -99,7 +97,7 @@ def test_odometry_replaces_tf(graph, tmp_path):
     assert shown[-1].markers[0].action == 3  # all are deleted when the node ends
 
 
-def test_late_transforms_are_awaited_and_bad_messages_pass_through(graph, tmp_path):
+def test_late_transforms_are_awaited_and_invalid_boxes_are_unchanged(graph, tmp_path):
     drive = Drive(sweeps=8)
     drive.replace(
         '/boxes', 3, lambda m: setattr(m.detections[0].bbox.center.position, 'x', np.nan)
@@ -155,7 +153,7 @@ def test_transforms_are_received_with_and_without_tf2_ros(graph, tmp_path, packa
     assert ('transforms are received by tf2_ros' in node.output()) == (package == 'tf2_ros')
 
 
-def test_boxes_pass_through_without_a_fixed_frame(graph, tmp_path):
+def test_boxes_without_a_fixed_frame_are_published_unchanged(graph, tmp_path):
     drive = Drive(sweeps=4, boxes='vision', motion='none')
     path = drive.write(tmp_path / 'drive')
     records = records_of(path)
@@ -223,7 +221,7 @@ def test_two_signals_end_the_node_cleanly_under_load(graph, tmp_path):
 
 
 def test_first_readable_type_of_several_is_chosen(graph, tmp_path):
-    """BoundingBox3DArray, first by name, has no ids; a later readable type is reported."""
+    """BoundingBox3DArray, first by name, has no ids; a second readable type is reported."""
     with ExitStack() as stack:  # one participant cannot publish a topic with several types
 
         def publish(type_name):
@@ -321,7 +319,7 @@ def wait_for_thirty_early_boxes(graph, early):
     return values_of(diagnostics)
 
 
-def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
+def test_boxes_that_wait_too_long_are_published_unchanged(graph, tmp_path):
     # Boxes wait ten times the backlog, 1 s. With 60 multiplier updates a window of the paper's
     # objective takes about 2 s to solve, while the boxes after it wait.
     drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
@@ -392,7 +390,7 @@ def test_busy_solver_delays_neither_diagnostics_nor_shutdown(graph, tmp_path):
     graph.wait_until_connected()
     play(graph, records)
     graph.wait(lambda: len(early) >= 4, 'some boxes')
-    graph.wait(lambda: len(diagnostics) >= 2, 'diagnostics beside the solver')
+    graph.wait(lambda: len(diagnostics) >= 2, 'diagnostics while the solver runs')
     assert len(early) < 25
     assert ended_cleanly(node)
 
@@ -428,7 +426,7 @@ def test_calibrated_settings_are_read_as_parameters(graph, tmp_path):
 
 @pytest.fixture(scope='module')
 def refused(tmp_path_factory):
-    """Start nodes with bad arguments in parallel; return output and status of each."""
+    """Start nodes with invalid arguments in parallel; return output and status of each."""
     cases = {
         'range': ['--ros-args', '-p', 'window:=2'],
         'boxes': ['--ros-args', '-p', 'boxes_type:=std_msgs/msg/String'],
@@ -463,7 +461,7 @@ def refused(tmp_path_factory):
         ('list', 2, ('vehicle.names', "['']")),
     ],
 )
-def test_bad_arguments_are_reported_in_one_line(refused, case, status, words):
+def test_invalid_arguments_are_reported_in_one_line(refused, case, status, words):
     output, returned = refused[case]
     assert returned == status, output
     ours = [line for line in output.splitlines() if '[rcl]' not in line]  # rcl logs too
@@ -493,7 +491,7 @@ def test_markers_keep_one_id_per_track():
     cubes = {m.id: m.color.r for m in first if m.ns == 'refined'}
     assert cubes[0] != cubes[1]
     given = boxes_of('c', 'b')
-    given.boxes[0, 0] = np.nan  # viewers reject it
+    given.boxes[0, 0] = np.nan  # NaN: viewers reject it
     second = board.update(given, refined_of(given, KEPT, KEPT)).markers
     assert {m.id for m in second if m.action == 0} == {1}
     assert {(m.ns, m.id) for m in second if m.action == 2} == {
@@ -501,7 +499,7 @@ def test_markers_keep_one_id_per_track():
     }
     assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
     assert board.is_showing and board.clear() and not board.is_showing
-    given.boxes[1, 4] = 0.0  # and this
+    given.boxes[1, 4] = 0.0  # no width: viewers reject it
     assert not board.update(given, refined_of(given, KEPT, KEPT)).markers
 
 

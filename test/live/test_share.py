@@ -1,4 +1,4 @@
-"""Files installed beside the code; ``python test/live/test_share.py`` writes params.yaml."""
+"""Files installed with the code; ``python test/live/test_share.py`` writes params.yaml."""
 
 import json
 import re

@@ -5,9 +5,18 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
-from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE
+from ros_graph import (
+    DIAGNOSTICS,
+    ended_cleanly,
+    graph_in,
+    play,
+    publishers_for,
+    QUICK,
+    records_of,
+    RELIABLE,
+    values_of,
+)
 from ros_messages import DETECTIONS, Drive, MARKERS, POINTS
-from test_node import DIAGNOSTICS, ended_cleanly, QUICK, values_of
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -41,7 +50,7 @@ def reported(graph, node, diagnostics, *parts):
 
 
 def subscribe(graph, type_name, topic, qos):
-    """Subscribe without keeping what comes."""
+    """Subscribe and discard the messages."""
     graph.node.create_subscription(import_message(type_name), topic, lambda _: None, qos)
 
 
@@ -99,7 +108,7 @@ def test_wrong_message_type_is_reported(graph):
     assert ended_cleanly(node)
 
 
-def test_mistyped_remaps_are_reported_with_the_topics_there_are(graph):
+def test_mistyped_remaps_are_reported_with_the_existing_topics(graph):
     graph.publisher(POINTS, '/lidar/points')
     graph.publisher(DETECTIONS, '/tracker/boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
@@ -116,7 +125,7 @@ def test_mistyped_remaps_are_reported_with_the_topics_there_are(graph):
     assert ended_cleanly(node)
 
 
-def test_silent_publishers_are_reported_and_forgotten_once_they_speak(graph):
+def test_silent_publishers_are_reported_until_they_publish(graph):
     publisher = graph.publisher(POINTS, '/points')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     node = graph.start()
@@ -174,7 +183,7 @@ def test_internal_errors_while_decoding_count_as_failed(graph, tmp_path):
     options = ('--log-level', 'boxreg_node:=debug')
     node = graph.start(*RELIABLE, *QUICK, *options, command=('-c', ADAPTER_WITH_A_BUG))
     graph.wait_until_connected()
-    play(graph, records, early)  # boxes pass through
+    play(graph, records, early)  # boxes are published unchanged
     graph.wait(lambda: values_of(diagnostics).get('failed') == '4', 'counters')
     assert 'unreadable' not in values_of(diagnostics)
     node.stop()

@@ -13,8 +13,8 @@ from boxreg_ros.offline.formats import HEAD, rows
 from boxreg_ros.offline.relabel import relabel, Request
 import numpy as np
 import pytest
+from relabel_results import QUICK, rows_of
 from ros_messages import Drive, SECOND
-from test_relabel import QUICK, rows_of
 
 # A camera whose z axis is x of the LiDAR.
 CALIBRATION = """P2: 700 0 621 0 0 700 187 0 0 0 1 0

@@ -1,5 +1,4 @@
 from collections import Counter
-import csv
 import json
 import os
 from pathlib import Path
@@ -22,11 +21,11 @@ from msg_adapters.convention import Convention
 import numpy as np
 from paths import SHARED
 import pytest
+from relabel_results import QUICK, rows_of
 from ros_messages import Drive, JSK, Messages, SECOND, START, write_recording
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
 M = Messages()
 
 
@@ -35,11 +34,6 @@ def run(recording, out, **options):
     config = QUICK.updated(options.pop('settings', {}))
     summary = relabel(Request((Path(recording),), config=config, **options), Path(out))
     return summary, rows_of(out)
-
-
-def rows_of(out):
-    with (Path(out) / 'boxes.csv').open(newline='') as file:
-        return list(csv.DictReader(file))
 
 
 def keys(rows):

@@ -1,0 +1,15 @@
+"""Settings for quick runs of `boxreg relabel`, and the tables it writes."""
+
+import csv
+from pathlib import Path
+
+from boxreg_ros.config import Config
+
+QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
+"""Settings of a run that takes a fraction of a second."""
+
+
+def rows_of(out):
+    """Return the rows of boxes.csv in an output folder, as dicts."""
+    with (Path(out) / 'boxes.csv').open(newline='') as file:
+        return list(csv.DictReader(file))
