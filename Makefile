@@ -2,21 +2,36 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check
-INSTALL := $(PIP) install -qq --use-pep517 --no-build-isolation -c constraints.txt
+# Python 3.12 for `make test-jazzy`: the first of these that runs.
+PYTHON_JAZZY ?= $(firstword $(foreach python,python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python),\
+    $(shell $(python) -c 'import ensurepip, venv' 2>/dev/null && echo $(python))))
+VENV_JAZZY ?= .venv-jazzy
 
-# What another ROS set-up left in the shell must not shadow the packages of the environment.
+BIN := $(VENV)/bin
+QUIET := --disable-pip-version-check install -qq
+# A compat install puts a plain path into site-packages, which type checkers can follow.
+BUILD := --use-pep517 --no-build-isolation --config-settings editable_mode=compat
+INSTALL := $(BIN)/python -m pip $(QUIET) $(BUILD) -c constraints.txt
+
+# Another ROS installation that the shell has sourced must not shadow the environment's packages.
 unexport PYTHONPATH AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 version := $(shell $(PYTHON) -c 'import platform; print(platform.python_version())')
 runtime := $(VENV)/.runtime-$(version)
 tests := $(VENV)/.tests-$(version)
 consumers := .venv-consumers/.done-$(version)
+jazzy := $(VENV_JAZZY)/.done
 
-.PHONY: demo test lint format clean
+# Rooms without nodes, processes and pictures: the tests that depend on numpy, SciPy and pytest.
+JAZZY_TESTS := --ignore test/core/test_refine.py test/test_config.py test/core test/io test/msg_adapters \
+    test/labels/test_labels.py test/offline/test_evaluate.py test/offline/test_relabel.py test/live/test_driver.py
 
-demo: $(runtime)
+.PHONY: help demo test test-main test-jazzy lint format docs figures clean
+
+help: ## list the commands
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+
+demo: $(runtime) ## set up, refine the sample recording, print accuracy before and after
 	$(BIN)/boxreg relabel bags/street.mcap -o out/demo --report
 	@echo; echo 'Before:'
 	$(BIN)/boxreg evaluate bags/street.mcap bags/street_truth.csv
@@ -24,23 +39,39 @@ demo: $(runtime)
 	$(BIN)/boxreg evaluate out/demo/boxes.csv bags/street_truth.csv
 	@echo; echo 'Refined boxes: out/demo/boxes.csv    What was done, to look at: out/demo/report.html'
 
-test: $(tests) $(consumers)
-	$(BIN)/python -m pytest
+test: test-main test-jazzy ## set up, run the whole suite, and a part of it as on Ubuntu 24.04
 
-lint: $(tests)
+test-main: $(tests) $(consumers)
+	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered
+
+test-jazzy: $(if $(PYTHON_JAZZY),$(jazzy)) ## run a part of the suite with the versions of Ubuntu 24.04
+	@[ -n '$(PYTHON_JAZZY)' ] || { \
+	    echo 'NOT RUN: the tests with the versions of Ubuntu 24.04 need Python 3.12, and none was found.'; \
+	    echo 'Install it, or name it: make test-jazzy PYTHON_JAZZY=/path/to/python3.12'; }
+	$(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python -m pytest -q --durations=3 $(JAZZY_TESTS))
+
+lint: $(tests) ## run the linters alone
 	$(BIN)/python -m pytest test/test_lint.py
 
-format: $(tests)
+format: $(tests) ## sort imports, fix what ruff can fix, format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-clean:
-	rm -rf $(VENV) .venv-consumers build install log out
+docs: $(tests) ## write the generated pages and build the documentation into out/site
+	$(BIN)/python docs/generate.py
+	$(BIN)/mkdocs build --strict --quiet --site-dir out/site
+
+figures: $(tests) ## draw every picture again from runs of this machine (some minutes)
+	$(BIN)/boxreg bench paper --seeds 20 --methods smoothing paper ours -o out/bench
+	cp out/bench/paper.png bags/paper.png
+
+clean: ## remove environments and whatever builds and runs left
+	rm -rf $(VENV) $(VENV_JAZZY) .venv-consumers build dist install log out .coverage
 
 $(runtime): constraints.txt setup.py package.xml
 	@echo 'Setting up $(VENV): the first time takes some minutes'
 	[ "$$($(BIN)/python -V 2>&1)" = 'Python $(version)' ] || $(PYTHON) -m venv --clear $(VENV)
-	$(PIP) install -qq -c constraints.txt setuptools
+	$(BIN)/python -m pip $(QUIET) -c constraints.txt setuptools
 	$(INSTALL) -e '.[ros,report]'
 	@touch $@
 
@@ -51,5 +82,15 @@ $(tests): $(runtime) $(shell find test/interfaces test/build_interfaces.py -type
 
 $(consumers): test/consumers.txt
 	$(PYTHON) -m venv --clear .venv-consumers
-	.venv-consumers/bin/python -m pip --disable-pip-version-check install -qq --no-deps -r $<
+	.venv-consumers/bin/python -m pip $(QUIET) --no-deps -r $<
+	@touch $@
+
+$(jazzy): constraints.txt constraints-jazzy.txt setup.py package.xml
+	@echo 'Setting up $(VENV_JAZZY) with $(PYTHON_JAZZY)'
+	$(PYTHON_JAZZY) -m venv --clear $(VENV_JAZZY)
+	awk -F '==' '{name = tolower($$1)} FNR == NR {own[name]} FNR == NR || !(name in own)' \
+	    constraints-jazzy.txt constraints.txt > $(VENV_JAZZY)/constraints.txt
+	$(VENV_JAZZY)/bin/python -m pip $(QUIET) -c $(VENV_JAZZY)/constraints.txt setuptools
+	$(VENV_JAZZY)/bin/python -m pip $(QUIET) $(BUILD) -c $(VENV_JAZZY)/constraints.txt \
+	    -e '.[ros,report]' pytest shapely
 	@touch $@

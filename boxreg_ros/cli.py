@@ -1,13 +1,15 @@
-"""`boxreg`: one command, its subcommands imported only when used."""
+"""`boxreg`: the command line. The module of a subcommand is imported when that is used."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from importlib import import_module
 from io import TextIOWrapper
 import os
+import re
 import signal
 import sys
 from threading import current_thread, main_thread
@@ -20,57 +22,74 @@ from boxreg_ros.errors import BoxregError, ConfigError
 
 
 class Command(NamedTuple):
-    """Where a subcommand is implemented, and what it does."""
+    """A subcommand: the module with its `add_arguments` and `run`, and its help text."""
 
     module: str
     summary: str
 
 
 COMMANDS = {
-    'relabel': Command('offline.relabel', 'refine the boxes of recordings and write label files'),
-    'convert': Command('offline.convert', 'write labels of one format in others'),
+    'relabel': Command(
+        'offline.relabel_command', 'refine the boxes of recordings and write label files'
+    ),
+    'convert': Command('offline.convert', 'convert label files to other formats'),
     'formats': Command('offline.formats', 'list the label formats and their conventions'),
     'evaluate': Command('offline.evaluate', 'compare boxes with true boxes'),
-    'calibrate': Command('offline.calibrate', 'learn the annotation rule from labelled tracks'),
-    'simulate': Command('simulation.simulate', 'make a recording with known truth'),
+    'calibrate': Command(
+        'offline.calibrate', 'estimate the labelling margins from labelled tracks'
+    ),
+    'simulate': Command('simulation.simulate', 'make a recording with known true boxes'),
     'bench': Command('bench.main', 'measure accuracy and speed'),
     'node': Command('live.main', 'run the live node (where there is no ros2 run)'),
 }
-DONE, FAILED, WRONG_USAGE, SIGNALLED = 0, 1, 2, 128
-ENDING = signal.SIGTERM, signal.SIGHUP
+DONE = 0
+FAILED = 1
+WRONG_USAGE = 2
+SIGNALLED = 128
+"""Added to the number of the signal that ended a run, as shells do."""
+ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
-class _Ended(BaseException):
-    """One of `ENDING` came."""
+class _EndedBySignal(BaseException):
+    """One of `ENDING_SIGNALS` was received; its argument is the number."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Run a subcommand and return the exit status.
 
-    0 done, 1 the data or the run failed, 2 wrong usage, 128 and the number of the signal that
-    ended it; failures are told in one line on stderr.
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments; those of the process by default.
+
+    Returns
+    -------
+    status : int
+        0 done, 1 the data or the run failed, 2 wrong usage, 128 plus the number of the signal
+        that ended the run. A failure is reported in one line on stderr.
 
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     is_debug = '--debug' in arguments
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # names of files may be more than it can show
+        if isinstance(stream, TextIOWrapper):  # file names may have characters it cannot encode
             stream.reconfigure(errors='backslashreplace')
     try:
-        with _signals(arguments):
+        with _ended_by_signals(arguments):
             status = _run(arguments)
         sys.stdout.flush()
         return status
     except BrokenPipeError:
-        # Whoever read the output has seen enough; python must not complain when it flushes.
+        # The reader of the output has closed it. Python would fail again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except KeyboardInterrupt:
         return _fail('interrupted; nothing was written', SIGNALLED + signal.SIGINT)
-    except _Ended as end:
-        name = signal.Signals(end.args[0]).name
-        return _fail(f'ended by {name}; nothing was written', SIGNALLED + end.args[0])
+    except _EndedBySignal as end:
+        number = end.args[0]
+        name = signal.Signals(number).name
+        return _fail(f'ended by {name}; nothing was written', SIGNALLED + number)
     except (BoxregError, OSError) as error:
         if is_debug:
             raise
@@ -78,23 +97,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if is_debug:
             raise
-        text = f'{type(error).__name__}: {error}'
-        return _fail(f'unexpected {text} (--debug shows where)', FAILED)
+        text = f'unexpected {type(error).__name__}: {error}'
+        return _fail(
+            f'{text}; this is a fault of boxreg: please report it with the traceback, which '
+            f'--debug prints',
+            FAILED,
+        )
 
 
 @contextmanager
-def _signals(arguments: list[str]) -> Iterator[None]:
-    """Let the signals of `ENDING` end a run as Ctrl-C does; those of a node are its own matter."""
+def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
+    """Raise `_EndedBySignal` on `ENDING_SIGNALS` inside the block, so that files are removed."""
 
     def end(number: int, _: Any) -> None:
-        for one in ours:  # what is cleaned up after the first is not left to a second
+        for one in ours:  # a second signal must not interrupt the clean-up
             signal.signal(one, signal.SIG_IGN)
-        raise _Ended(number)
+        raise _EndedBySignal(number)
 
-    before = {one: signal.getsignal(one) for one in ENDING}
-    ours = [one for one, handler in before.items() if handler == signal.SIG_DFL]  # no nohup
+    before = {one: signal.getsignal(one) for one in ENDING_SIGNALS}
+    # A signal that is ignored stays so: nohup ignores SIGHUP.
+    ours = [one for one, handler in before.items() if handler == signal.SIG_DFL]
     if arguments[:1] == ['node'] or current_thread() is not main_thread():
-        ours = []
+        ours = []  # the node handles signals itself; only the main thread may set handlers
     try:
         for one in ours:
             signal.signal(one, end)
@@ -105,21 +129,44 @@ def _signals(arguments: list[str]) -> Iterator[None]:
 
 
 def _run(arguments: list[str]) -> int:
-    """Parse and hand over to the module of the subcommand."""
+    """Parse the arguments and run the subcommand."""
     command = next((item for item in arguments if not item.startswith('-')), None)
-    if command == 'node' and arguments[0] == 'node':  # its arguments are those of any ROS node
+    if command == 'node' and arguments[0] == 'node':  # takes the arguments of a ROS node
         return int(_module('node').main(arguments[1:]) or DONE)
-    args = parser(command).parse_args(arguments)
+    whole = parser(command)
+    if not arguments:
+        whole.print_help(sys.stderr)
+        return WRONG_USAGE
+    if command is not None and command not in COMMANDS:
+        names = ', '.join(COMMANDS)
+        proposal = _proposal([command], COMMANDS)
+        whole.error(f'COMMAND: expected one of {names}, got {command!r}{proposal}')
+    args, unknown = whole.parse_known_args(arguments)
+    if unknown:
+        options = re.findall(r'--[a-z-]+', args.subparser.format_usage())
+        proposal = _proposal(unknown, options)
+        args.subparser.error(f'unrecognized arguments: {" ".join(unknown)}{proposal}')
     keep_freed_memory()
     return int(_module(args.command).run(args))
 
 
+def _proposal(unknown: Iterable[str], known: Iterable[str]) -> str:
+    """Return '; did you mean ...?' with the known word most similar to an unknown one."""
+    names = list(known)
+    for word in unknown:
+        similar = get_close_matches(word.partition('=')[0], names, 1, cutoff=0.7)
+        if similar:
+            return f'; did you mean {similar[0]}?'
+    return ''
+
+
 def _module(command: str) -> ModuleType:
+    """Return the module of a subcommand."""
     return import_module(f'boxreg_ros.{COMMANDS[command].module}')
 
 
 def parser(command: str | None) -> argparse.ArgumentParser:
-    """Return the parser of `boxreg`, with the options of one `command` alone."""
+    """Return the parser of `boxreg`; only the subparser of `command` has its options."""
     whole = argparse.ArgumentParser(
         'boxreg', description='Register tracked 3D boxes to point clouds.'
     )
@@ -128,6 +175,7 @@ def parser(command: str | None) -> argparse.ArgumentParser:
     subparsers = whole.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for name, (_, summary) in COMMANDS.items():
         subparser = subparsers.add_parser(name, help=summary, description=f'{summary}.')
+        subparser.set_defaults(subparser=subparser)
         subparser.add_argument('--debug', action='store_true', help=argparse.SUPPRESS)
         if name == command and name != 'node':
             _module(name).add_arguments(subparser)
@@ -135,7 +183,8 @@ def parser(command: str | None) -> argparse.ArgumentParser:
 
 
 def _fail(message: str, status: int) -> int:
-    with suppress(OSError):  # a terminal that is gone
+    """Print a message in one line on stderr and return the exit status."""
+    with suppress(OSError):  # the terminal is closed
         print(f'boxreg: {" ".join(message.split())}', file=sys.stderr)
     return status
 

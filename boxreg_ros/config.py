@@ -1,9 +1,8 @@
 """
-Every tunable: default, unit, bounds and meaning, once.
+Settings: default, unit, bounds and meaning of each.
 
-Node parameters, ``--set``, YAML files and the table in the README are all read off these
-dataclasses. Deviations are standard deviations: a term's residual is divided by its deviation,
-so doubling one halves the pull of that term.
+Node parameters, ``--set``, YAML files and the tables of the documentation are generated from
+these dataclasses. Deviations are standard deviations: each residual is divided by its own.
 
 """
 
@@ -21,9 +20,42 @@ import yaml
 
 _T = TypeVar('_T')
 
+RENAMED = {
+    'faces.depth_ends': 'faces.inset_ends',
+    'faces.depth_sides': 'faces.inset_sides',
+}
+"""Settings of earlier versions by their old names: the error names the new one."""
+
+NODE_OPTIONS = (
+    *('boxes_type', 'pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
+    *('output_frame', 'transform_timeout', 'backlog', 'config_file'),
+    *('use_sim_time', 'start_type_description_service', 'qos_overrides'),
+)
+"""Parameters of the node that parameter files of ROS may hold beside those of `Config`."""
+
+
+DEFAULT_LAG = 9
+"""The whole default window. It may exceed a shorter window, which then limits it."""
+
 
 class Setting(NamedTuple):
-    """One tunable as the outside sees it; `name` is dotted, as in ``solver.rounds``."""
+    """
+    A setting as users see it.
+
+    Attributes
+    ----------
+    name : str
+        Dotted, as in ``solver.rounds``.
+    default : bool, int, float, str or tuple of str
+        Its type is the type of the setting.
+    meaning, unit : str
+        For tables and help texts.
+    low, high : float or None
+        Bounds, both included.
+    choices : tuple of str
+        Allowed values; empty for any.
+
+    """
 
     name: str
     default: bool | int | float | str | tuple[str, ...]
@@ -35,54 +67,86 @@ class Setting(NamedTuple):
 
 
 def setting(default: Any, *facts: Any, **more: Any) -> Any:
-    """Return a dataclass field that knows what a `Setting` is made of, its name excepted."""
+    """Return a dataclass field with the arguments of a `Setting` after the name as metadata."""
     return field(default=default, metadata={'of': Setting('', default, *facts, **more)})
 
 
 @dataclass(frozen=True, slots=True)
 class SamplingConfig:
-    """Which points an observation keeps."""
+    """Selection of the points of an observation."""
 
-    deskew: bool = setting(False, 'carry points by their times to where a moving object is')
-    margin: float = setting(0.6, 'points this far outside a box count', 'm', 0.05, 5.0)
-    points: int = setting(128, 'points kept per box', '', 8, 100000)
+    deskew: bool = setting(False, 'motion-compensate points to the stamp by their own times')
+    margin: float = setting(
+        0.6, 'points up to this distance outside a box are used', 'm', 0.05, 5.0
+    )
+    points: int = setting(128, 'maximum number of points per box', '', 8, 100000)
 
 
 @dataclass(frozen=True, slots=True)
 class FaceConfig:
-    """How the outermost points of a face tell where it is."""
+    """Face observations: the outermost points on each face, and their errors."""
 
-    outermost: float = setting(0.05, 'part of the points that stands for a face', '', 1e-3, 1.0)
-    ends: float = setting(0.12, 'error of one sight of front or back', 'm', 1e-3, 10.0)
-    sides: float = setting(0.08, 'error of one sight of left or right', 'm', 1e-3, 10.0)
-    top: float = setting(0.08, 'error of one sight of the roof', 'm', 1e-3, 10.0)
-    bottom: float = setting(0.05, 'error of one sight of the road', 'm', 1e-3, 10.0)
-    outlier: float = setting(0.15, 'a face this far off its points loses its say', 'm', 1e-3, 10.0)
-    depth_ends: float = setting(0.36, 'points further in, ends seen from behind', 'm', 0.0, 2.0)
-    depth_sides: float = setting(0.18, 'points further in, sides seen from behind', 'm', 0.0, 2.0)
-    spread: float = setting(0.05, 'difference of gaps between objects', 'm', 1e-4, 1.0)
-    learn: bool = setting(True, 'learn the gaps from the input as it comes')
+    outermost: float = setting(
+        0.05, 'part of the points of a box that makes one face observation', '', 1e-3, 1.0
+    )
+    ends: float = setting(
+        0.12, 'standard deviation of one observation of the front or rear face', 'm', 1e-3, 10.0
+    )
+    sides: float = setting(
+        0.08, 'standard deviation of one observation of the left or right face', 'm', 1e-3, 10.0
+    )
+    top: float = setting(
+        0.08, 'standard deviation of one observation of the top face', 'm', 1e-3, 10.0
+    )
+    bottom: float = setting(
+        0.05, 'standard deviation of one observation of the road under the box', 'm', 1e-3, 10.0
+    )
+    outlier: float = setting(
+        0.15, 'distance of a face from its points at which its weight is 1/4', 'm', 1e-3, 10.0
+    )
+    inset_ends: float = setting(
+        0.36, 'expected inset of the surface behind an occluded front or rear face', 'm', 0.0, 2.0
+    )
+    inset_sides: float = setting(
+        0.18, 'expected inset of the surface behind an occluded left or right face', 'm', 0.0, 2.0
+    )
+    spread: float = setting(
+        0.05, 'standard deviation of the labelling margin between objects', 'm', 1e-4, 1.0
+    )
+    learn: bool = setting(
+        True, 'estimate the labelling margins from the input boxes while they come in'
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class SolverConfig:
-    """L-BFGS and the rounds around it."""
+    """L-BFGS, and the rounds of correspondence and weighting around it."""
 
-    rounds: int = setting(15, 'most rounds: outermost points and weights renewed', '', 1, 100)
+    rounds: int = setting(
+        15, 'most rounds; each renews the outermost points and the weights', '', 1, 100
+    )
     iterations: int = setting(1, 'most L-BFGS iterations per round', '', 1, 10000)
-    history: int = setting(6, 'curvature pairs remembered', '', 1, 100)
-    threads: int = setting(0, 'parts of a batch solved at once; 0: as many as cores', '', 0, 256)
-    tolerance: float = setting(1e-4, 'a step that promises less ends a window', '', 0.0, 1.0)
+    history: int = setting(6, 'curvature pairs that L-BFGS keeps', '', 1, 100)
+    threads: int = setting(
+        0, 'threads that share the windows of a batch; 0: one per core', '', 0, 256
+    )
+    tolerance: float = setting(
+        1e-4, 'relative decrease of the objective that ends the search of a round', '', 0.0, 1.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class PaperConfig:
-    """Weights of the paper's objective (Eq. 8); read with ``objective: paper`` only."""
+    """Weights of the paper's objective (Eq. 8); used with ``objective: paper`` only."""
 
-    closeness: float = setting(0.1, 'weight of Eq. 4', '1/m^2', 0.0, 1e6)
-    enclosure: float = setting(3.0, 'weight of Eq. 5', '1/m', 0.0, 1e6)
-    smoothness: float = setting(0.1, 'weight of Eq. 6 and of its constraint', '', 0.0, 1e6)
-    alignment: float = setting(0.3, 'weight of Eq. 7 and of its constraint', '', 0.0, 1e6)
+    closeness: float = setting(0.1, 'weight of the closeness term, Eq. 4', '1/m^2', 0.0, 1e6)
+    enclosure: float = setting(3.0, 'weight of the enclosure term, Eq. 5', '1/m', 0.0, 1e6)
+    smoothness: float = setting(
+        0.1, 'weight of the smoothness constraint, Eq. 6, and its first multiplier', '', 0.0, 1e6
+    )
+    alignment: float = setting(
+        0.3, 'weight of the alignment constraint, Eq. 7, and its first multiplier', '', 0.0, 1e6
+    )
     nearest: int = setting(8, 'K, the closest points per visible face in Eq. 4', '', 1, 10000)
     multiplier_rounds: int = setting(5, 'updates of the two Lagrange multipliers', '', 1, 100)
     iterations: int = setting(60, 'most L-BFGS iterations per update', '', 1, 10000)
@@ -91,57 +155,167 @@ class PaperConfig:
 @dataclass(frozen=True, slots=True)
 class ClassConfig:
     """
-    How objects of one kind move, how their boxes err and how these are drawn.
+    Motion, input errors and labelling margins of the objects of one kind.
 
-    The gaps are the annotation rule: how far outside of its outermost points a label's face
-    stands. With ``faces.learn`` the input's own boxes shift them, those of all kinds together.
+    A labelling margin (``gap_*``) is the distance from the outermost surface points out to the
+    face of the label. With ``faces.learn`` the input boxes correct them, all kinds together.
 
     """
 
-    names: tuple[str, ...] = setting((), 'class names of this kind: any of these words, any case')
-    acceleration: float = setting(1.5, 'expected change of speed', 'm/s^2', 1e-3, 1e3)
-    cornering: float = setting(4.0, 'expected acceleration sideways', 'm/s^2', 1e-3, 1e3)
-    vertical: float = setting(1.0, 'expected vertical acceleration', 'm/s^2', 1e-3, 1e3)
-    turning: float = setting(0.8, 'expected change of turn rate', 'rad/s^2', 1e-3, 1e3)
-    tilting: float = setting(0.2, 'expected change of roll and pitch rate', 'rad/s^2', 1e-3, 1e3)
-    slip: float = setting(0.15, 'expected sideways velocity of the rear axle', 'm/s', 1e-3, 1e3)
-    climb: float = setting(0.25, 'expected velocity along its own z axis', 'm/s', 1e-3, 1e3)
-    pivot: float = setting(0.25, 'rear axle behind the centre, by length', '', 0.0, 0.5)
-    shape: float = setting(0.03, 'how far its surface is from rigid', 'm', 1e-3, 1.0)
-    drift: float = setting(0.02, 'step of a parked box: map and ego drift', 'm', 1e-4, 1.0)
-    position: float = setting(0.14, 'error of an input centre along the heading', 'm', 1e-3, 10.0)
-    lateral: float = setting(0.08, 'error of an input centre across the heading', 'm', 1e-3, 10.0)
-    height: float = setting(0.07, 'error of an input centre in z', 'm', 1e-3, 10.0)
-    heading: float = setting(0.04, 'error of an input yaw', 'rad', 1e-3, 3.2)
-    tilt: float = setting(0.02, 'error of an input roll and pitch', 'rad', 1e-4, 3.2)
-    extent: float = setting(0.05, 'error of the input extents, as part of each', '', 1e-3, 1.0)
-    gap_ends: float = setting(0.05, 'label outside the points, front and back', 'm', -2.0, 2.0)
-    gap_sides: float = setting(0.03, 'label outside the points, left and right', 'm', -2.0, 2.0)
-    gap_top: float = setting(0.05, 'label above the roof points', 'm', -2.0, 2.0)
-    gap_bottom: float = setting(0.0, 'label below the road', 'm', -2.0, 2.0)
+    names: tuple[str, ...] = setting(
+        (), 'class names of this kind: any of these words, in any case'
+    )
+    acceleration: float = setting(
+        1.5, 'standard deviation of the forward acceleration', 'm/s^2', 1e-3, 1e3
+    )
+    cornering: float = setting(
+        4.0, 'standard deviation of the sideways acceleration', 'm/s^2', 1e-3, 1e3
+    )
+    vertical: float = setting(
+        1.0, 'standard deviation of the vertical acceleration', 'm/s^2', 1e-3, 1e3
+    )
+    turning: float = setting(
+        0.8, 'standard deviation of the yaw acceleration', 'rad/s^2', 1e-3, 1e3
+    )
+    tilting: float = setting(
+        0.2, 'standard deviation of the roll and pitch acceleration', 'rad/s^2', 1e-3, 1e3
+    )
+    slip: float = setting(
+        0.15, 'standard deviation of the sideways velocity of the pivot', 'm/s', 1e-3, 1e3
+    )
+    climb: float = setting(
+        0.25, 'standard deviation of the velocity along the z axis of the box', 'm/s', 1e-3, 1e3
+    )
+    pivot: float = setting(
+        0.25, 'distance of the pivot (rear axle) behind the centre, as part of the length',
+        '', 0.0, 0.5,
+    )  # fmt: skip
+    shape: float = setting(
+        0.03, 'standard deviation of the surface from one rigid shape per track', 'm', 1e-3, 1.0
+    )
+    drift: float = setting(
+        0.02, 'standard deviation of the step of a parked box (drift of the fixed frame)',
+        'm', 1e-4, 1.0,
+    )  # fmt: skip
+    position: float = setting(
+        0.14, 'standard deviation of the input centre along the heading', 'm', 1e-3, 10.0
+    )
+    lateral: float = setting(
+        0.08, 'standard deviation of the input centre across the heading', 'm', 1e-3, 10.0
+    )
+    height: float = setting(
+        0.07, 'standard deviation of the height of the input centre', 'm', 1e-3, 10.0
+    )
+    heading: float = setting(0.04, 'standard deviation of the input yaw', 'rad', 1e-3, 3.2)
+    tilt: float = setting(0.02, 'standard deviation of the input roll and pitch', 'rad', 1e-4, 3.2)
+    extent: float = setting(
+        0.05, 'standard deviation of the input extents, as part of each', '', 1e-3, 1.0
+    )
+    gap_ends: float = setting(
+        0.05, 'labelling margin: front and rear face outside the surface points', 'm', -2.0, 2.0
+    )
+    gap_sides: float = setting(
+        0.03, 'labelling margin: left and right face outside the surface points', 'm', -2.0, 2.0
+    )
+    gap_top: float = setting(
+        0.05, 'labelling margin: top face above the roof points', 'm', -2.0, 2.0
+    )
+    gap_bottom: float = setting(
+        0.0, 'labelling margin: bottom face below the road', 'm', -2.0, 2.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Ingredients:
+    """
+    Parts of the method that `boxreg bench ablation` switches off, one at a time.
+
+    For measurement only: no settings, so neither parameters of the node nor part of a written
+    configuration. Each says what is done where it is True.
+
+    """
+
+    strips: bool = True
+    """Each of three strips of a face has outermost points of its own."""
+    occluded_faces: bool = True
+    """Faces turned away from the sensor have a weight."""
+    range_inset: bool = True
+    """Points are expected further inside the faces of distant objects."""
+    point_ownership: bool = True
+    """A point near two boxes belongs to the one it is deeper inside of."""
+    road: bool = True
+    """The road beside a box is an observation of its bottom face."""
+    noise_estimation: bool = True
+    """The noise of the input is estimated."""
+    input_bias: bool = True
+    """The errors of the input have a part that is constant over a track."""
+    population_extents: bool = True
+    """Extents of a track are expected by those of the others."""
+    marginalisation: bool = True
+    """Observations that leave a sliding window leave a prior."""
+    heading_sign: bool = True
+    """180° flips of the input are corrected."""
+    robust_motion: bool = True
+    """Motion residuals are down-weighted beyond three deviations."""
+    robust_weights: bool = True
+    """Input poses and labelling margins far from what is expected are down-weighted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Everything that can be set, with defaults that suit road vehicles at 10 Hz."""
+    """All settings, with defaults for road vehicles at 10 Hz."""
 
-    objective: str = setting('robust', 'ours, or that of the paper', choices=('robust', 'paper'))
-    mode: str = setting('3d', 'free: x y z roll pitch yaw, or x y yaw', choices=('3d', 'bev'))
-    estimate: str = setting('track', 'how much is waited for', choices=('early', 'final', 'track'))
-    extent: str = setting('track', "one per track, or the input's", choices=('track', 'fixed'))
+    objective: str = setting(
+        'robust',
+        'objective function: robust (default), or Eq. 4-8 of the paper',
+        choices=('robust', 'paper'),
+    )
+    mode: str = setting(
+        '3d', 'optimised: x y z roll pitch yaw, or x y yaw only', choices=('3d', 'bev')
+    )
+    estimate: str = setting(
+        'track',
+        'box as newest of its window, `lag` later, or of the whole track',
+        choices=('early', 'final', 'track'),
+    )
+    extent: str = setting(
+        'track',
+        'extents: one estimate per track, or those of the input',
+        choices=('track', 'fixed'),
+    )
     window: int = setting(10, 'observations per sliding window', '', 3, 1000)
-    lag: int = setting(9, 'observations a final box waits for, within its window', '', 0, 999)
-    track_window: int = setting(130, "observations solved at once for 'track'", '', 10, 10000)
-    min_observations: int = setting(3, 'shorter windows keep their input', '', 2, 1000)
-    max_gap: float = setting(1.6, 'a longer silence ends a track', 's', 0.01, 1e4)
-    tolerance: float = setting(0.02, 'boxes and sweep belong together within this', 's', 0.0, 10.0)
-    reach: float = setting(0.06, 'a sweep this far off serves, moved along', 's', 0.0, 10.0)
-    queue: int = setting(20, 'unpaired sweeps and box arrays waited with', '', 1, 10000)
-    device: str = setting('cpu', "where windows are solved: 'cpu', 'cuda', 'cuda:1', ...")
+    lag: int = setting(
+        DEFAULT_LAG,
+        'later observations used for a final box, less than window; the default shrinks with it',
+        '',
+        0,
+        999,
+    )
+    track_window: int = setting(
+        130, "observations per window with estimate 'track'", '', 10, 10000
+    )
+    min_observations: int = setting(3, 'boxes of shorter windows are kept', '', 2, 1000)
+    max_gap: float = setting(1.6, 'time without observation that ends a track', 's', 0.01, 1e4)
+    tolerance: float = setting(
+        0.02, 'time offset up to which boxes and sweep are paired at once', 's', 0.0, 10.0
+    )
+    reach: float = setting(
+        0.06,
+        'maximum time offset between a box array and a sweep; points are motion-compensated to '
+        'the box stamp',
+        's',
+        0.0,
+        10.0,
+    )
+    queue: int = setting(
+        20, 'maximum number of unpaired sweeps, and of box arrays, held', '', 1, 10000
+    )
+    device: str = setting('cpu', "torch device of the solver: 'cpu', 'cuda', 'cuda:1', ...")
     sampling: SamplingConfig = SamplingConfig()
     faces: FaceConfig = FaceConfig()
     solver: SolverConfig = SolverConfig()
     paper: PaperConfig = PaperConfig()
+    ingredients: Ingredients = Ingredients()
     vehicle: ClassConfig = ClassConfig(
         names=('car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram')
     )
@@ -156,46 +330,59 @@ class Config:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        """Check type and bounds of every value."""
+        """Check types and bounds."""
         for item, value in self.items():
             _check(item, _cast(item.name, value, item.default))
+        if self.lag >= self.window and self.lag != DEFAULT_LAG:
+            raise ConfigError(
+                f'lag: expected less than window ({self.window}), got {self.lag}: a final box '
+                f'waits within its window; lower lag or raise window'
+            )
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
-        """Yield every setting with its present value, groups flattened to dotted names."""
+        """Yield every setting with its value; names of groups are dotted."""
         for item in settings():
             yield item, attrgetter(item.name)(self)
 
     def class_config(self, class_name: str) -> ClassConfig:
-        """Return how objects of `class_name` move; unknown classes move like vehicles."""
+        """Return the group of settings for `class_name`; `vehicle` for unknown classes."""
         words = words_of(class_name)
-        kinds = (k for k in (self.cyclist, self.pedestrian) if words & {*map(str.lower, k.names)})
-        return next(kinds, self.vehicle)
+        for group in (self.cyclist, self.pedestrian):
+            if not words.isdisjoint(name.lower() for name in group.names):
+                return group
+        return self.vehicle
 
     def updated(self, changes: Mapping[str, Any]) -> Config:
         """
-        Return a copy with dotted names set, as in ``{'solver.rounds': 2}``.
+        Return a copy with some settings changed.
+
+        Parameters
+        ----------
+        changes : mapping
+            Values by dotted name, as in ``{'solver.rounds': 2}``.
 
         Raises
         ------
         ConfigError
-            For a name that does not exist, or a value of the wrong type or out of bounds.
+            For an unknown name, or a value of the wrong type or out of bounds.
 
         """
         values: dict[str, Any] = {}
         for name, value in changes.items():
             group, _, last = name.rpartition('.')
-            (values.setdefault(group, {}) if group else values)[last] = value
+            target = values.setdefault(group, {}) if group else values
+            target[last] = value
         return _filled(self, values, '')
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Config:
         """
-        Build from nested plain values; what is absent keeps its default.
+        Build from nested mappings of plain values; absent settings have their defaults.
 
         Raises
         ------
         ConfigError
-            For an unknown key, by name, or a value of the wrong type or out of bounds.
+            For an unknown key, or a value of the wrong type or out of bounds; names the setting.
 
         """
         return _filled(cls(), values, '')
@@ -203,12 +390,14 @@ class Config:
     @classmethod
     def from_yaml(cls, path: str | Path) -> Config:
         """
-        Read a YAML file: plain, or as ROS writes it (``/**: ros__parameters: ...``, the first).
+        Read a YAML file: plain, or a ROS parameter file (its first node is used).
+
+        Of a parameter file of ROS the `NODE_OPTIONS` are ignored.
 
         Raises
         ------
         ConfigError
-            If the file cannot be read or holds what `from_dict` refuses.
+            If the file cannot be read, or `from_dict` refuses its content.
 
         """
         try:
@@ -217,6 +406,12 @@ class Config:
                 inner = next(iter(values.values()), None)
                 if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
                     values = inner['ros__parameters']
+                    if isinstance(values, dict):
+                        values = {
+                            key: value
+                            for key, value in values.items()
+                            if str(key).partition('.')[0] not in NODE_OPTIONS
+                        }
             return cls.from_dict(values)
         except (OSError, UnicodeDecodeError, yaml.YAMLError, ConfigError) as error:
             reason = ' '.join(str(error).split())
@@ -229,26 +424,31 @@ def words_of(class_name: str) -> set[str]:
 
 
 def settings() -> Iterator[Setting]:
-    """Yield every setting of `Config` with its default, groups flattened to dotted names."""
+    """Yield every setting of `Config`; names of groups are dotted."""
     for item in fields(Config):
         if not is_dataclass(item.default):
             yield item.metadata['of']._replace(name=item.name)
             continue
         for part in fields(item.default):
-            name, default = f'{item.name}.{part.name}', getattr(item.default, part.name)
-            yield part.metadata['of']._replace(name=name, default=default)
+            if 'of' not in part.metadata:  # `Ingredients` are no settings
+                continue
+            yield part.metadata['of']._replace(
+                name=f'{item.name}.{part.name}', default=getattr(item.default, part.name)
+            )
 
 
 def _filled(default: _T, value: Any, name: str) -> _T:
-    """Return `value` as a setting, or a group of them where what is absent is `default`."""
+    """Return `value` as a setting like `default`, or as a group with `default` for absent ones."""
     if not is_dataclass(default):
         return _cast(name, value, default)  # type: ignore[no-any-return]
     if not isinstance(value, Mapping):
-        raise ConfigError(f'{name or "all"}: expected a group of settings, got {value!r}')
+        raise ConfigError(f'{name or "config"}: expected a group of settings, got {value!r}')
     known = {item.name: getattr(default, item.name) for item in fields(default)}
     prefix = f'{name}.' if name else ''
     for key in value:
         if key not in known:
+            if prefix + key in RENAMED:
+                raise ConfigError(f'{prefix}{key}: was renamed; set {RENAMED[prefix + key]}')
             names = ', '.join(sorted(known))
             raise ConfigError(f'{prefix}{key}: no such setting; expected one of {names}')
     changes = {key: _filled(known[key], inner, prefix + key) for key, inner in value.items()}

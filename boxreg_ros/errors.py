@@ -1,8 +1,8 @@
-"""Every error a caller may want to catch; each message names what, expected, actual, remedy."""
+"""Errors; each message names the argument, what was expected, the actual value and a remedy."""
 
 
 class BoxregError(Exception):
-    """Base of all errors raised on purpose; its text is fit for a user's eyes."""
+    """Base class of all errors of this package; the message is written for the user."""
 
 
 class ShapeError(BoxregError):
@@ -10,7 +10,7 @@ class ShapeError(BoxregError):
 
 
 class ConfigError(BoxregError):
-    """A setting is unknown, of the wrong type or out of its bounds."""
+    """A setting is unknown, of the wrong type or out of bounds."""
 
 
 class TransformUnavailable(BoxregError):
@@ -18,8 +18,8 @@ class TransformUnavailable(BoxregError):
 
 
 class UnsupportedMessage(BoxregError):
-    """A message type or layout that no adapter reads."""
+    """No adapter reads a message type or layout."""
 
 
 class RecordingError(BoxregError):
-    """A recording cannot be read, or does not hold what was asked for."""
+    """A recording cannot be read, or does not contain the data requested."""

@@ -1,19 +1,20 @@
-"""Why clouds and boxes are not used: every reason that is counted, and what helps."""
+"""Reasons why messages, sweeps and boxes are not used: meaning and remedy of every counter."""
 
 from typing import NamedTuple
 
 
 class Reason(NamedTuple):
     """
-    What a counter counts.
+    The documentation of a counter.
 
     Attributes
     ----------
     unit : str
-        What one count is: a box, a cloud, a message ...
-    meaning, remedy : str
-        What has happened, and what can be done about it; no remedy where it is in the nature of
-        the data.
+        The thing counted: a box, a cloud, a message ...
+    meaning : str
+        What has happened.
+    remedy : str
+        What the user can do; empty where the data allow no better.
 
     """
 
@@ -22,84 +23,114 @@ class Reason(NamedTuple):
     remedy: str = ''
 
 
-FASTER = (
-    'see the latencies; lower `window`, `solver.rounds` or `sampling.points`, fewer boxes, or '
-    'more cores and `solver.threads`'
+REDUCE_LOAD = (
+    'compare the latencies in `/diagnostics`; lower `window`, `solver.rounds` or '
+    '`sampling.points`, publish fewer boxes, or use more CPU cores (`solver.threads`)'
 )
-CARRIED = 'see "Large clouds"'
+ENLARGE_TRANSPORT = 'see "Large clouds"'
+CHECK_TRANSFORMS = 'see "Requirements of your TF tree and stamps"'
 FAULTS = ('failed', 'qos_incompatible')
-"""What must not be, however rarely."""
+"""Reasons that are an ERROR in `/diagnostics`, even when they occur once."""
 REASONS = {
     'failed': Reason(
         'message',
-        'a fault of boxreg_ros; what was held has passed through, tracks begin anew',
-        'please report it with the log',
+        'an internal error of boxreg_ros; boxes held were published unchanged and all tracks '
+        'were restarted',
+        'report it with the traceback in the log',
     ),
     'qos_incompatible': Reason(
         'publisher or subscriber',
-        'it asks for another QoS than the node: nothing arrives. The log names topic and policy',
-        "set the node's parameter `qos_overrides.TOPIC.subscription.POLICY` or change the other",
+        'its QoS is incompatible with that of the node, so no message is delivered; the log names '
+        'topic and policy',
+        'set the node parameter `qos_overrides.TOPIC.subscription.POLICY`, or change the QoS of '
+        'the other side',
     ),
     'unreadable': Reason(
         'message',
-        'cloud or boxes that contradict themselves, or in a layout that is not known; boxes pass '
-        'through, offline only in `overlay.mcap`',
-        'the log, or `summary.json`, has the reason: mend the publisher',
+        'the cloud or box array is inconsistent or its layout is not supported; boxes are '
+        'published unchanged (offline: in `overlay.mcap` only)',
+        'find the error in the log or in `summary.json`, and correct the publisher',
     ),
-    'points_queue_full': Reason('cloud', 'dropped: the solver is slower than the data', FASTER),
+    'points_queue_full': Reason(
+        'cloud', 'dropped because the solver is slower than the data', REDUCE_LOAD
+    ),
     'boxes_queue_full': Reason(
-        'message', 'passed through: the solver is slower than the data', FASTER
+        'message', 'published unchanged because the solver is slower than the data', REDUCE_LOAD
     ),
-    'points_lost': Reason('cloud', 'DDS lost it on the way', CARRIED),
-    'boxes_lost': Reason('message', 'DDS lost it on the way', CARRIED),
+    'points_lost': Reason('cloud', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
+    'boxes_lost': Reason('message', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
     'sweep_without_transform': Reason(
         'cloud',
-        'no transform at its stamp; the log has the frames',
-        'see "Requirements of your TF tree and stamps"',
+        'no transform to the fixed frame at its stamp; the log names the frames',
+        CHECK_TRANSFORMS,
     ),
     'no_transform': Reason(
         'box',
-        'no transform at its stamp; the log has the frames. Offline it is in its own frame',
-        'see "Requirements of your TF tree and stamps"',
+        'no transform to the fixed frame at its stamp; the log names the frames. Offline, the box '
+        'is written in its own frame',
+        CHECK_TRANSFORMS,
     ),
     'time_jump': Reason(
         'jump',
-        'stamps went back by more than a second: all starts afresh',
-        'as it should be where a recording loops; otherwise two clocks are at work on one topic',
+        'stamps went back by more than a second; tracks and transforms were reset',
+        'nothing, if a recording is played in a loop; otherwise let one clock set all stamps of '
+        'a topic',
     ),
     'no_sweep': Reason(
         'box',
-        'no cloud within `tolerance` and `reach` of its stamp',
-        'copy the stamp of the cloud to its boxes, and see the counters of clouds; raise `queue` '
-        'where boxes come later than so many clouds',
+        'no cloud within `tolerance` or `reach` of its stamp',
+        'copy the stamp of the cloud to its boxes; check the counters of clouds; raise `queue` if '
+        'boxes arrive more than `queue` clouds late',
     ),
     'sweep_late': Reason(
-        'cloud', 'came after younger boxes had left', 'publish clouds in order and before boxes'
+        'cloud',
+        'arrived after younger boxes had been processed',
+        'publish clouds in the order of their stamps and before their boxes',
     ),
     'sweep_duplicate': Reason(
-        'cloud', 'a second one of the same stamp', 'one cloud per stamp: merge those of sensors'
+        'cloud',
+        'a second cloud with the same stamp',
+        'publish one cloud per stamp: merge the clouds of several sensors',
     ),
-    'boxes_without_sweep': Reason('message', 'its boxes are those counted as `no_sweep`'),
+    'boxes_without_sweep': Reason(
+        'message', 'no cloud was found for it; its boxes are counted as `no_sweep`'
+    ),
     'pose_reference': Reason(
         'message',
-        'boxes do not stand where their points are; the log has the figures',
-        'set `pose_reference`, `size_order` or `forward_axis` as the log says',
+        'its boxes are displaced from their points; the log has the figures',
+        'set `pose_reference`, `size_order` or `forward_axis` as the log suggests',
     ),
     'late': Reason(
-        'box', 'younger boxes were there before', 'publish boxes in the order of their stamps'
+        'box',
+        'arrived after boxes with a younger stamp',
+        'publish boxes in the order of their stamps',
     ),
     'duplicate_stamp': Reason(
-        'box', 'a second message of the same stamp', 'one message per stamp: merge the detectors'
+        'box',
+        'a second message with the same stamp',
+        'publish one message per stamp: merge the outputs of several detectors',
     ),
-    'no_track_id': Reason('box', 'it has no id', 'set `associate`, or put a tracker before'),
+    'no_track_id': Reason(
+        'box', 'has no track id', 'set `associate`, or run a tracker before this node'
+    ),
     'duplicate_track_id': Reason(
-        'box', 'the id occurs twice in one message', 'ids must name objects'
+        'box',
+        'its track id occurs twice in one message',
+        'give each object an id of its own',
     ),
-    'invalid_box': Reason('box', 'NaN, or an extent that is not positive', 'check the detector'),
-    'not_finite': Reason('box', 'its window could not be solved', 'check stamps and coordinates'),
-    'sweep_without_boxes': Reason('cloud', 'no boxes came for it, or too late'),
-    'no_points': Reason('box', 'no returns near any box of its window: it is hidden or far away'),
-    'no_gain': Reason('box', 'the refined box would have lost the points of the input box'),
-    'short_track': Reason('box', 'fewer than `min_observations` in its window'),
+    'invalid_box': Reason(
+        'box', 'contains NaN, infinity or an extent that is not positive', 'check the detector'
+    ),
+    'not_finite': Reason(
+        'box',
+        'the solution of its window is not finite',
+        'check stamps and coordinates of the boxes',
+    ),
+    'sweep_without_boxes': Reason('cloud', 'no boxes arrived for it, or too late'),
+    'no_points': Reason('box', 'no points near any box of its window: occluded or too far away'),
+    'no_gain': Reason(
+        'box', 'the refined box contains far fewer of the points than the input box does'
+    ),
+    'short_track': Reason('box', 'its window has fewer than `min_observations` observations'),
 }
-"""The weightiest first; every box that is `kept`, and every cloud not used, has one."""
+"""By counter, most important first. Each `kept` box and each unused cloud has one reason."""

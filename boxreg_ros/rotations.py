@@ -1,24 +1,60 @@
 """
 Rotations of boxes and frames as arrays: angles, matrices, quaternions.
 
-R = Rz(yaw) Ry(pitch) Rx(roll) turns box axes (x forward, y left, z up, REP 103) into the frame
-the box is given in. Quaternions are x y z w. All functions take any number of leading
-dimensions, none and empty ones included, and NaN gives NaN.
+R = Rz(yaw) Ry(pitch) Rx(roll) maps box axes (x forward, y left, z up, REP 103) to the frame of
+the box. Quaternions are x y z w. All functions but `interpolate_rotation` accept any number of
+leading dimensions, also none and empty ones; NaN gives NaN.
 
 """
+
+from __future__ import annotations
+
+from typing import Any, overload, TYPE_CHECKING
 
 from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 GIMBAL_LOCK = 1e-9
-"""Below this cosine of the pitch, roll and yaw turn about one axis: roll is then zero."""
+"""
+Cosine of the pitch below which roll and yaw rotate about one axis; roll is then defined as zero.
+
+Derived: the elements of R that give roll and yaw have this magnitude and rounding errors of
+1e-16, so that above it their errors are below 1e-7 rad.
+
+"""
 
 
-def wrap_angle(angle: ArrayLike) -> Floats:
-    """Return `angle` wrapped into [-pi, pi) [rad]."""
-    return np.asarray((np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi)
+@overload
+def wrap_angle(angle: Tensor) -> Tensor: ...
+
+
+@overload
+def wrap_angle(angle: ArrayLike) -> Floats: ...
+
+
+def wrap_angle(angle: Any) -> Any:
+    """
+    Return angles wrapped into [-pi, pi).
+
+    Parameters
+    ----------
+    angle : array_like or Tensor, any shape
+        Angles [rad].
+
+    Returns
+    -------
+    wrapped : array or Tensor
+        Of the same shape [rad]. For a Tensor the derivative is 1.
+
+    """
+    if not hasattr(angle, 'dtype'):
+        angle = np.asarray(angle, float)
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def matrix_from_rpy(rpy: ArrayLike) -> Floats:
@@ -35,7 +71,12 @@ def matrix_from_rpy(rpy: ArrayLike) -> Floats:
 
 
 def rpy_from_matrix(R: ArrayLike) -> Floats:
-    """Return roll, pitch and yaw (..., 3) of R (..., 3, 3) [rad]; pitch is in [-pi/2, pi/2]."""
+    """
+    Return roll, pitch and yaw (..., 3) of R (..., 3, 3) [rad].
+
+    Pitch is in [-pi/2, pi/2], roll and yaw in [-pi, pi].
+
+    """
     R = np.asarray(R, float)
     cos_pitch = np.hypot(R[..., 0, 0], R[..., 1, 0])
     is_locked = cos_pitch < GIMBAL_LOCK
@@ -50,23 +91,31 @@ def rpy_from_matrix(R: ArrayLike) -> Floats:
 
 
 def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
-    """Return R (..., 3, 3) of quaternions (..., 4) of any length but zero."""
+    """
+    Return R (..., 3, 3) of quaternions (..., 4) of any norm.
+
+    Raises
+    ------
+    ValueError
+        If the norm of a quaternion is zero.
+
+    """
     q = np.asarray(quaternion_xyzw, float)
-    if not q.size:
-        return np.zeros((*q.shape[:-1], 3, 3))
-    matrices = np.asarray(Rotation.from_quat(q.reshape(-1, 4)).as_matrix())
-    return matrices.reshape(*q.shape[:-1], 3, 3)
+    is_finite = np.isfinite(q).all(-1)
+    R = np.full((*q.shape[:-1], 3, 3), np.nan)
+    if is_finite.any():  # versions of SciPy differ on empty arrays and on NaN
+        R[is_finite] = Rotation.from_quat(q[is_finite]).as_matrix()
+    return R
 
 
 def quaternion_from_matrix(R: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), x y z w with w >= 0, of R (..., 3, 3)."""
     R = np.asarray(R, float)
-    if not R.size:
-        return np.zeros((*R.shape[:-2], 4))
-    known = np.isfinite(R).all((-2, -1))
+    is_finite = np.isfinite(R).all((-2, -1))
     quaternions = np.full((*R.shape[:-2], 4), np.nan)
-    found = Rotation.from_matrix(R[known]).as_quat() if known.any() else np.zeros((0, 4))
-    quaternions[known] = np.where(found[:, 3:] < 0, -found, found)
+    if is_finite.any():  # versions of SciPy differ on empty arrays
+        found = Rotation.from_matrix(R[is_finite]).as_quat()
+        quaternions[is_finite] = np.where(found[..., 3:] < 0, -found, found)
     return quaternions
 
 
@@ -82,9 +131,19 @@ def quaternion_from_rpy(rpy: ArrayLike) -> Floats:
 
 def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: float) -> Floats:
     """
-    Return R (3, 3) on the shortest way between two quaternions (4,).
+    Return the rotation on the shortest path between two rotations.
 
-    `share` 0 is the first, 1 the second; beyond, the rotation goes on at the same rate.
+    Parameters
+    ----------
+    first_xyzw, second_xyzw : array, shape (4,)
+        Quaternions.
+    share : float
+        0 for the first, 1 for the second; outside, extrapolated at constant angular velocity.
+
+    Returns
+    -------
+    R : array, shape (3, 3)
+        Rotation matrix.
 
     """
     first, second = Rotation.from_quat(np.asarray([first_xyzw, second_xyzw], float))

@@ -1,13 +1,13 @@
 """
-What travels between the floors: plain, frozen, checked once on construction.
+Data that the packages exchange: frozen dataclasses, checked on construction.
 
 Shape letters of the whole package: ``B`` windows in a batch, ``N`` observations in a window,
 ``M`` points in an observation, ``K`` nearest points of Eq. 4, ``D`` optimised variables.
 
 A box is nine numbers ``x y z length width height roll pitch yaw``: geometric centre [m], full
-extents along its own axes [m], and R = Rz(yaw) Ry(pitch) Rx(roll) [rad] turning box axes
-(x forward, y left, z up) into the frame it is given in. Stamps are integer nanoseconds from the
-message header.
+extents along its own axes [m], and R = Rz(yaw) Ry(pitch) Rx(roll) [rad], which maps box axes
+(x forward, y left, z up) to the frame of the box. Stamps are integer nanoseconds from the message
+header.
 
 """
 
@@ -27,20 +27,42 @@ REFINED, KEPT, INTERPOLATED = 'refined', 'kept', 'interpolated'
 
 
 def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
-    """Return `value` as float64 of `shape` (None: any length), or raise ShapeError."""
-    wanted = str(shape).replace('None', 'N')
+    """
+    Return an array argument as float64, contiguous.
+
+    Parameters
+    ----------
+    name : str
+        Of the argument, for the error message.
+    value : array_like
+        The argument.
+    shape : tuple of int or None
+        Expected shape; None for any length.
+
+    Returns
+    -------
+    array : array of `shape`
+        A copy only where needed.
+
+    Raises
+    ------
+    ShapeError
+        If `value` has another shape or is not numeric.
+
+    """
+    expected = str(shape).replace('None', 'N')
     try:
         array = np.ascontiguousarray(value, dtype=np.float64)
-    except (RuntimeError, TypeError, ValueError) as error:  # torch says it its way
-        raise ShapeError(f'{name}: expected numbers of shape {wanted}: {error}') from None
-    fits = [want in (None, got) for want, got in zip(shape, array.shape, strict=False)]
-    if array.ndim != len(shape) or not all(fits):
-        raise ShapeError(f'{name}: expected shape {wanted}, got {array.shape}')
+    except (RuntimeError, TypeError, ValueError) as error:  # torch raises RuntimeError
+        raise ShapeError(f'{name}: expected numbers of shape {expected}: {error}') from None
+    lengths = zip(shape, array.shape, strict=False)
+    if array.ndim != len(shape) or any(want not in (None, got) for want, got in lengths):
+        raise ShapeError(f'{name}: expected shape {expected}, got {array.shape}')
     return array
 
 
 def is_valid_box(boxes: Floats) -> NDArray[np.bool_]:
-    """Return which of `boxes` (..., 9) are finite with positive extents, shape (...)."""
+    """Return for `boxes` (..., 9) whether they are finite with positive extents, shape (...)."""
     is_finite = np.isfinite(boxes).all(axis=-1)
     return np.asarray(is_finite & (boxes[..., LENGTH : HEIGHT + 1] > 0).all(axis=-1))
 
@@ -48,7 +70,7 @@ def is_valid_box(boxes: Floats) -> NDArray[np.bool_]:
 @dataclass(frozen=True, slots=True)
 class Sweep:
     """
-    One LiDAR revolution under one stamp.
+    A point cloud under one stamp: one revolution of a LiDAR, or several merged.
 
     Attributes
     ----------
@@ -57,14 +79,14 @@ class Sweep:
     frame_id : str
         Frame of `points` and `origin`.
     points : array, shape (M, 3)
-        Finite returns [m].
+        Finite points [m].
     times : array, shape (M,), or None
-        When each point was measured, relative to the stamp [s].
+        Time of measurement of each point relative to the stamp [s].
     origin : array, shape (3,)
-        Where the sensor was at the stamp [m]; zero in the sensor's own frame.
-    is_lost : bool
-        True for one that is known to have been, while its points are not: nothing is to be
-        waited for.
+        Position of the sensor at the stamp [m]; zero in the frame of the sensor; NaN where
+        unknown.
+    is_dropped : bool
+        True for a sweep whose points were lost: boxes of its stamp do not wait for another.
 
     """
 
@@ -73,7 +95,7 @@ class Sweep:
     points: NDArray[np.floating]
     times: Floats | None = None
     origin: Floats = field(default_factory=lambda: np.zeros(3))
-    is_lost: bool = False
+    is_dropped: bool = False
 
     def __post_init__(self) -> None:
         """Check the shapes."""
@@ -86,7 +108,7 @@ class Sweep:
 @dataclass(frozen=True, slots=True)
 class BoxArray:
     """
-    All boxes of one stamp; boxes without an identity carry the track id ``''``.
+    All boxes of one stamp; boxes without an identity have the track id ``''``.
 
     Attributes
     ----------
@@ -99,10 +121,9 @@ class BoxArray:
     scores : array, shape (n,)
         Detector confidence.
     boxes : array, shape (n, 9)
-        As defined in the module's docstring; may hold invalid boxes, which the core keeps out.
+        As defined in the docstring of the module; invalid boxes are allowed and returned as kept.
     ticket : object
-        Whatever the caller wants back with the refined boxes of this array, which carry it
-        unchanged; never looked at.
+        Any object of the caller; returned unchanged with the refined boxes, in their ``boxes``.
 
     """
 
@@ -126,22 +147,22 @@ class BoxArray:
 @dataclass(frozen=True, slots=True)
 class RefinedBoxes:
     """
-    What the core made of (some) boxes of one stamp, in the order of the input.
+    The refined boxes of one box array, in the order of the input.
 
     Attributes
     ----------
     boxes : BoxArray
-        Identity and refined boxes in the frame named there.
+        Refined boxes, otherwise as in the input: stamp, frame, ids, scores and ticket.
     status : tuple of n str
-        ``refined``, ``kept`` (the input box, evidence too weak) or ``interpolated``.
+        ``refined``, ``kept`` (the input box is returned unchanged) or ``interpolated``.
     reasons : tuple of n str
         Why a box was kept; empty for the others.
     num_points : array, shape (n,)
         Sweep points inside the input box.
     covariances : array, shape (n, 6, 6)
-        Of x y z roll pitch yaw; NaN-free, large where nothing is known.
+        Covariance of x y z roll pitch yaw [m, rad]; always finite, identity for kept boxes.
     is_final : bool
-        False for an early estimate (newest box of its window), True for a final one.
+        False for an early estimate (the newest box of its window), True for the last estimate.
 
     """
 

@@ -1,8 +1,8 @@
 """
 ``autoware_perception_msgs``: TrackedObjects, and DetectedObjects, which have no ids.
 
-The UUID in hexadecimal is the track, the likeliest label the class, `existence_probability` the
-score. The pose is the centre, `dimensions` are length, width and height.
+The track id is the UUID in hexadecimal, the class the most probable label, the score
+`existence_probability`. The pose is the centre, `dimensions` are length, width and height.
 
 """
 
@@ -14,26 +14,46 @@ from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, WIDTH, YAW
 from msg_adapters import poses
 import numpy as np
 
-LABELS = ('unknown', 'car', 'truck', 'bus', 'trailer', 'motorcycle', 'bicycle', 'pedestrian',
-          'animal', 'hazard', 'over_drivable', 'under_drivable')  # fmt: skip
-UNAVAILABLE, CYLINDER = 0, 1
+LABELS = (
+    'unknown', 'car', 'truck', 'bus', 'trailer', 'motorcycle', 'bicycle', 'pedestrian', 'animal',
+    'hazard', 'over_drivable', 'under_drivable',
+)  # fmt: skip
+"""Names of ``ObjectClassification.label``, by value."""
+ORIENTATION_UNAVAILABLE = 0
+CYLINDER = 1
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+"""Rotation by 180 degrees about z."""
+REQUIRED_FIELDS = (
+    'kinematics.pose_with_covariance.pose',
+    'kinematics.orientation_availability',
+    'shape.type',
+    'shape.dimensions',
+    'classification',
+    'existence_probability',
+)
 
 
 def from_msg(msg: Any) -> BoxArray:
     """
     Return the boxes of TrackedObjects or DetectedObjects.
 
-    An object whose orientation is not available has NaN angles, so that the core keeps it,
-    unless it is a cylinder. The sign of a heading is what its track agrees on.
+    An object without orientation gets NaN angles, so that its box is returned unchanged, unless
+    it is a cylinder. The sign of the heading is resolved per track later.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the definition of the message lacks a field.
 
     """
+    poses.require_fields('TrackedObjects', msg.objects[:1], REQUIRED_FIELDS)
     boxes = poses.boxes_of(
         [o.kinematics.pose_with_covariance.pose for o in msg.objects],
         [o.shape.dimensions for o in msg.objects],
     )
     for box, o in zip(boxes, msg.objects, strict=True):
-        if o.kinematics.orientation_availability == UNAVAILABLE and o.shape.type != CYLINDER:
+        has_orientation = o.kinematics.orientation_availability != ORIENTATION_UNAVAILABLE
+        if not has_orientation and o.shape.type != CYLINDER:
             box[ROLL : YAW + 1] = np.nan
     return BoxArray(
         poses.stamp_ns(msg.header),
@@ -51,36 +71,51 @@ def to_msg(
     """
     Return a copy with the boxes replaced; see `Adapter.to_msg`.
 
-    What is given in the object's own frame goes with it: the footprint is stretched like the
-    box, twist and acceleration are turned around where the heading is.
+    Fields in the frame of the object follow its box: the footprint is scaled, twist and
+    acceleration are rotated where the heading flips by 180 degrees.
 
     """
-    objects, quaternions_xyzw = [], poses.quaternions_of(boxes.boxes)
+    quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+    objects = []
     for i, (o, box) in enumerate(zip(msg.objects, boxes.boxes, strict=True)):
-        own = o.kinematics.pose_with_covariance
-        given = poses.moved(own.pose, T_out_in)
-        spread = None if covariances is None else covariances[i]
-        pose, size = poses.with_box(given, o.shape.dimensions, box, quaternions_xyzw[i])
+        covariance = None if covariances is None else covariances[i]
+        given_pose = poses.moved(o.kinematics.pose_with_covariance.pose, T_out_in)
+        pose, size = poses.with_box(given_pose, o.shape.dimensions, box, quaternions_xyzw[i])
         if o.shape.type == CYLINDER and np.isfinite(box).all():
-            across = float(box[LENGTH : WIDTH + 1].mean())  # it has one diameter
-            size = poses.replaced(size, x=across, y=across)
-        fields = {'pose_with_covariance': poses.with_covariance(own, pose, spread, T_out_in)}
-        if hasattr(o.kinematics, 'has_position_covariance'):
-            is_ours = spread is not None and bool(np.isfinite(spread).all())
-            fields['has_position_covariance'] = is_ours or o.kinematics.has_position_covariance
-        for name, inner in (('twist', 'twist'), ('acceleration', 'accel')):
-            motion = getattr(o.kinematics, f'{name}_with_covariance', None)
-            if motion is not None and poses.forward_of(given) @ poses.forward_of(pose) < 0:
-                fields[f'{name}_with_covariance'] = poses.turned_motion(motion, inner, HALF_TURN)
-        shape = poses.replaced(o.shape, dimensions=size, footprint=_stretched(o.shape, box))
-        kinematics = poses.replaced(o.kinematics, **fields)
+            diameter = float(box[LENGTH : WIDTH + 1].mean())
+            size = poses.replaced(size, x=diameter, y=diameter)
+        is_flipped = bool(poses.forward_of(given_pose) @ poses.forward_of(pose) < 0)
+        kinematics = _with_pose(o.kinematics, pose, covariance, T_out_in, is_flipped)
+        shape = poses.replaced(o.shape, dimensions=size, footprint=_scaled_footprint(o.shape, box))
         objects.append(poses.replaced(o, kinematics=kinematics, shape=shape))
     header = poses.with_frame(msg.header, boxes.frame_id)
     return poses.replaced(msg, header=header, objects=objects)
 
 
+def _with_pose(
+    kinematics: Any,
+    pose: Any,
+    covariance: Floats | None,
+    T_out_in: Floats | None,
+    is_flipped: bool,
+) -> Any:
+    """Return a copy of the kinematics with another pose and covariance."""
+    own = kinematics.pose_with_covariance
+    fields = {'pose_with_covariance': poses.with_covariance(own, pose, covariance, T_out_in)}
+    if hasattr(kinematics, 'has_position_covariance'):
+        is_estimated = covariance is not None and bool(np.isfinite(covariance).all())
+        fields['has_position_covariance'] = is_estimated or kinematics.has_position_covariance
+    if is_flipped:
+        for name, inner in (('twist', 'twist'), ('acceleration', 'accel')):
+            motion = getattr(kinematics, f'{name}_with_covariance', None)
+            if motion is not None:
+                rotated = poses.rotated_motion(motion, inner, HALF_TURN)
+                fields[f'{name}_with_covariance'] = rotated
+    return poses.replaced(kinematics, **fields)
+
+
 def _track_id(o: Any) -> str:
-    """Return the UUID in hexadecimal; without one, or with none but zeros, ''."""
+    """Return the UUID in hexadecimal; '' if there is none or it is zero."""
     uuid = bytes(o.object_id.uuid) if hasattr(o, 'object_id') else b''
     return uuid.hex() if any(uuid) else ''
 
@@ -92,11 +127,11 @@ def _class_name(o: Any) -> str:
     return LABELS[label] if label < len(LABELS) else f'label_{label}'
 
 
-def _stretched(shape: Any, box: Floats) -> Any:
-    """Return the footprint, its points moved as the sides of the box are."""
+def _scaled_footprint(shape: Any, box: Floats) -> Any:
+    """Return the footprint, scaled like length and width of the box."""
     old = np.array([shape.dimensions.x, shape.dimensions.y])
     if not (old > 0).all() or not np.isfinite(box[LENGTH : WIDTH + 1]).all():
         return shape.footprint
-    along, across = (box[LENGTH : WIDTH + 1] / old).tolist()
-    points = [poses.replaced(p, x=p.x * along, y=p.y * across) for p in shape.footprint.points]
+    scale_x, scale_y = (box[LENGTH : WIDTH + 1] / old).tolist()
+    points = [poses.replaced(p, x=p.x * scale_x, y=p.y * scale_y) for p in shape.footprint.points]
     return poses.replaced(shape.footprint, points=points)

@@ -1,4 +1,4 @@
-"""What pose and size of a box mean where a topic does not follow its type's own definition."""
+"""Meaning of pose and size for topics that do not follow the definition of their type."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from math import pi
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
-from boxreg_ros.structures import BoxArray, Floats, HEIGHT, LENGTH, ROLL, X, YAW, Z
+from boxreg_ros.structures import BoxArray, Floats, HEIGHT, LENGTH, PITCH, ROLL, X, YAW, Z
 import numpy as np
 
 REFERENCES = {
@@ -22,13 +22,13 @@ REFERENCES = {
     'rear_axle': (-0.3, 0.0, 0.0),
     'rear_axle_bottom': (-0.3, 0.0, -0.5),
 }
-"""Points of a box, from its centre in parts of length, width and height; axles are typical."""
+"""Points of a box relative to its centre, in units of length, width and height."""
 SIZE_ORDERS = tuple(''.join(order) for order in permutations('lwh'))
 FORWARD = {'x+': 0.0, 'y+': pi / 2, 'x-': pi, 'y-': -pi / 2}
 """
-The axis of a pose that points forward, and how far about z it is from x [rad].
+Axis of the pose that points forward -> its angle about z from x [rad].
 
-Spelt so that neither YAML takes one for a boolean nor a command line for an option.
+The sign follows the letter: YAML reads ``y`` as a boolean, a command line ``-y`` as an option.
 
 """
 
@@ -36,24 +36,24 @@ Spelt so that neither YAML takes one for a boolean nor a command line for an opt
 @dataclass(frozen=True, slots=True)
 class Convention:
     """
-    How the boxes of one topic are to be read.
+    Meaning of pose and size on one topic.
 
     Attributes
     ----------
     pose_reference : str
-        The point of the box that the pose is at, one of `REFERENCES`, or three numbers
-        ``'-0.28,0,-0.5'``: from the centre, in parts of length, width and height.
+        Point of the box at the position of the pose: one of `REFERENCES`, or three numbers
+        ``'-0.28,0,-0.5'`` relative to the centre, in units of length, width and height.
     size_order : str
-        What the size's x, y and z are: ``'lwh'`` length, width, height.
+        Meaning of x, y and z of the size: ``'lwh'`` is length, width, height.
     forward_axis : str
-        The axis of the pose that points forward, one of `FORWARD`.
+        Axis of the pose that points forward, one of `FORWARD`.
     associate : bool
-        Whether the boxes are given ids by association, whatever ids they come with.
+        Whether track ids are assigned by data association; ids of the messages are ignored.
 
     Raises
     ------
     ConfigError
-        If a value is none of these.
+        If a value is not one of these.
 
     """
 
@@ -73,12 +73,12 @@ class Convention:
 
     @property
     def is_standard(self) -> bool:
-        """Tell whether pose and size mean what the message type says."""
+        """Return whether pose and size follow the definition of the message type."""
         return replace(self, associate=False) == STANDARD
 
     @property
     def reference(self) -> Floats:
-        """Return the point (3,) the pose is at, from the centre in parts of the extents."""
+        """Return the reference point (3,) relative to the centre, in units of the extents."""
         known = REFERENCES.get(self.pose_reference)
         try:
             parts = known or tuple(float(part) for part in self.pose_reference.split(','))
@@ -92,63 +92,68 @@ class Convention:
         return np.array(parts)
 
     def to_centers(self, boxes: BoxArray) -> BoxArray:
-        """Return boxes read from messages of this convention as the core has them."""
-        changed = self._turned(boxes.boxes, FORWARD[self.forward_axis])
+        """Return boxes of this convention with the pose at their centre, as in `structures`."""
+        changed = self._rotated(boxes.boxes, FORWARD[self.forward_axis])
         changed[:, LENGTH : HEIGHT + 1] = boxes.boxes[:, self._columns]
         changed[:, X : Z + 1] -= self._offsets(changed)
         return replace(boxes, boxes=changed)
 
     def from_centers(self, boxes: BoxArray) -> BoxArray:
-        """Return boxes of the core as messages of this convention have them."""
-        changed = self._turned(boxes.boxes, -FORWARD[self.forward_axis])
+        """Return boxes with the pose at their centre in this convention."""
+        changed = self._rotated(boxes.boxes, -FORWARD[self.forward_axis])
         changed[:, X : Z + 1] += self._offsets(boxes.boxes)
         changed[:, self._columns] = boxes.boxes[:, LENGTH : HEIGHT + 1]
         return replace(boxes, boxes=changed)
 
     def covariances_from_centers(self, boxes: BoxArray, covariances: Floats) -> Floats:
-        """Return covariances (n, 6, 6) of the poses as messages of this convention have them."""
-        axes, angle = _axes(boxes.boxes), FORWARD[self.forward_axis]
-        J = np.tile(np.eye(6), (len(axes), 1, 1))
+        """Return covariances (n, 6, 6) of centre poses as those of this convention."""
+        axes = _rotation_axes(boxes.boxes)
+        angle = FORWARD[self.forward_axis]
+        J = np.tile(np.eye(6), (len(axes), 1, 1))  # (n, 6, 6) d(output pose) / d(centre pose)
         J[:, :3, 3:] = np.cross(axes, self._offsets(boxes.boxes)[:, None]).swapaxes(1, 2)
-        if angle:  # one small turn, by the angles of either
-            after = np.linalg.pinv(np.nan_to_num(_axes(self._turned(boxes.boxes, -angle))))
-            J[:, 3:, 3:] = (axes @ after).swapaxes(1, 2)
+        if angle:  # the same small rotation, expressed in the angles before and after
+            rotated_axes = _rotation_axes(self._rotated(boxes.boxes, -angle))
+            inverse = np.linalg.pinv(np.nan_to_num(rotated_axes))
+            J[:, 3:, 3:] = (axes @ inverse).swapaxes(1, 2)
         return J @ covariances @ J.swapaxes(1, 2)
 
     @property
     def _columns(self) -> list[int]:
-        """Return where, among the columns of a box, length, width and height are found."""
+        """Return the columns of length, width and height in a box of this convention."""
         return [LENGTH + self.size_order.index(name) for name in 'lwh']
 
     def _offsets(self, boxes: Floats) -> Floats:
-        """Return, for each box (n, 9), the way from its centre to the reference (n, 3) [m]."""
+        """Return the vectors (n, 3) from the centres of boxes (n, 9) to their references [m]."""
         offsets = self.reference * boxes[:, LENGTH : HEIGHT + 1]
         if not self.reference.any():
             return offsets
-        known = np.isfinite(boxes[:, ROLL:]).all(axis=1)
-        R = matrix_from_rpy(boxes[known, ROLL:])
-        offsets[known] = (R @ offsets[known, :, None])[..., 0]
+        has_angles = np.isfinite(boxes[:, ROLL:]).all(axis=1)
+        R = matrix_from_rpy(boxes[has_angles, ROLL:])
+        offsets[has_angles] = (R @ offsets[has_angles, :, None])[..., 0]
         return offsets
 
     @staticmethod
-    def _turned(boxes: Floats, angle: float) -> Floats:
-        """Return a copy of boxes (n, 9), turned about their own z by `angle`."""
+    def _rotated(boxes: Floats, angle: float) -> Floats:
+        """Return a copy of boxes (n, 9), rotated about z of the box by `angle` [rad]."""
         changed = boxes.copy()
         if angle:
-            turned = matrix_from_rpy(boxes[:, ROLL:]) @ matrix_from_rpy([0.0, 0.0, angle])
-            changed[:, ROLL:] = rpy_from_matrix(turned)
+            R = matrix_from_rpy(boxes[:, ROLL:]) @ matrix_from_rpy([0.0, 0.0, angle])
+            changed[:, ROLL:] = rpy_from_matrix(R)
         return changed
 
 
-def _axes(boxes: Floats) -> Floats:
-    """Return what roll, pitch and yaw of boxes (n, 9) turn about, a row of (n, 3, 3) for each."""
-    yaw, pitch = boxes[:, YAW], boxes[:, ROLL + 1]
-    axes = np.zeros((len(boxes), 3, 3))
+def _rotation_axes(boxes: Floats) -> Floats:
+    """Return the rotation axes (n, 3, 3) of roll, pitch and yaw of boxes (n, 9), as rows."""
+    yaw = boxes[:, YAW]
+    pitch = boxes[:, PITCH]
+    axes = np.zeros((len(boxes), 3, 3))  # (n, angle, axis)
     axes[:, 0] = np.stack([np.cos(yaw), np.sin(yaw), -np.tan(pitch)], 1)
     axes[:, 0] *= np.cos(pitch)[:, None]
-    axes[:, 1, 0], axes[:, 1, 1], axes[:, 2, 2] = -np.sin(yaw), np.cos(yaw), 1.0
+    axes[:, 1, 0] = -np.sin(yaw)
+    axes[:, 1, 1] = np.cos(yaw)
+    axes[:, 2, 2] = 1.0
     return axes
 
 
 STANDARD = Convention()
-"""Pose and size as the message types say."""
+"""Pose and size as the message types define them."""

@@ -1,93 +1,150 @@
 """
-``foxglove_msgs/SceneUpdate`` of ROS, protobuf and JSON: an entity's cube is a box.
+``foxglove_msgs/SceneUpdate`` of ROS, protobuf and JSON: the cube of an entity is a box.
 
-The entity's `id` is the track; its metadata give class and score. Entities without cubes and
-deletions are carried along; whatever else an entity draws stays where it was.
+The track id is the `id` of the entity; its metadata contain class and score. Entities without
+cubes and deletions are copied. Of the other primitives of an entity, only the frame is changed.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
 import numpy as np
 
 CLASS_KEYS = ('class', 'class_name', 'category', 'label', 'type', 'classification')
 SCORE_KEYS = ('score', 'confidence', 'probability')
-OTHERS = ('arrows', 'spheres', 'cylinders', 'lines', 'triangles', 'texts', 'models')
+OTHER_PRIMITIVES = ('arrows', 'spheres', 'cylinders', 'lines', 'triangles', 'texts', 'models')
+TIME_FIELDS = (('sec', 'nanosec'), ('sec', 'nsec'), ('seconds', 'nanos'))
+"""Names of seconds and nanoseconds in ROS, JSON and protobuf."""
+MAX_TIME_NS = 2**63
+"""Stamps are 64-bit integers."""
+ENTITY_FIELDS = ('id', 'frame_id', 'timestamp')
+CUBE_FIELDS = (
+    *('pose.position.x', 'pose.position.y', 'pose.position.z'),
+    *('pose.orientation.x', 'pose.orientation.y', 'pose.orientation.z', 'pose.orientation.w'),
+    *('size.x', 'size.y', 'size.z'),
+)
 
 
 def from_msg(msg: Any) -> BoxArray:
     """
-    Return the cubes of a SceneUpdate; several of one entity are told apart as ``id/0``, ...
+    Return the cubes of a SceneUpdate; several cubes of one entity are ``id/0``, ``id/1`` ...
 
-    The stamp and the frame are those of the entities. An update without any has neither: it
-    comes back with the stamp 0 and the frame ``''``.
+    Stamp and frame are those of the entities. An update without entities has the stamp 0 and the
+    frame ``''``.
 
     Raises
     ------
     UnsupportedMessage
-        If the entities with cubes disagree about frame or stamp.
+        If the entities with cubes have different frames or stamps, a field is missing, or a value
+        has the wrong type.
 
     """
-    entities = [entity for entity in msg.entities if _cubes(entity)]
-    origins = ((_time_ns(e.timestamp), e.frame_id) for e in entities or msg.entities[:1])
-    origin = poses.one_origin('SceneUpdate', origins)
-    track_ids, names, scores, cubes = [], [], [], []
-    for entity in entities:
-        for k, cube in enumerate(_cubes(entity)):
-            track_ids.append(entity.id if len(_cubes(entity)) == 1 else f'{entity.id}/{k}')
-            names.append(_noted(entity, CLASS_KEYS, ''))
-            scores.append(_number(_noted(entity, SCORE_KEYS, '1')))
+    entities = _items(msg, 'entities')
+    with_cubes = [entity for entity in entities if _items(entity, 'cubes')]
+    stamped = with_cubes or entities[:1]
+    poses.require_fields('SceneUpdate', stamped, ENTITY_FIELDS)
+    stamp_ns, frame_id = poses.common_stamp_and_frame(
+        'SceneUpdate', ((_time_ns(entity.timestamp), str(entity.frame_id)) for entity in stamped)
+    )
+    track_ids = []
+    class_names = []
+    scores = []
+    cubes = []
+    for entity in with_cubes:
+        own_cubes = _items(entity, 'cubes')
+        poses.require_fields('SceneUpdate', own_cubes, CUBE_FIELDS)
+        metadata = _metadata(entity)
+        for k, cube in enumerate(own_cubes):
+            track_ids.append(str(entity.id) if len(own_cubes) == 1 else f'{entity.id}/{k}')
+            class_names.append(_first_value(metadata, CLASS_KEYS, ''))
+            scores.append(_score(_first_value(metadata, SCORE_KEYS, '1')))
             cubes.append(cube)
-    boxes = poses.boxes_of([cube.pose for cube in cubes], [cube.size for cube in cubes])
-    return BoxArray(*origin, tuple(track_ids), tuple(names), np.array(scores), boxes)
+    return BoxArray(
+        stamp_ns,
+        frame_id,
+        tuple(track_ids),
+        tuple(class_names),
+        np.array(scores),
+        poses.boxes_of([cube.pose for cube in cubes], [cube.size for cube in cubes]),
+    )
 
 
 def to_msg(
     msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
-    """Return a copy with the cubes replaced; it has no place for covariances."""
+    """Return a copy with the cubes replaced; covariances are not written."""
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
-    entities, i = [], 0
-    for entity in msg.entities:
+    entities = []
+    i = 0  # index of the next box
+    for entity in _items(msg, 'entities'):
         cubes = []
-        for cube in _cubes(entity):
+        for cube in _items(entity, 'cubes'):
             pose, size = poses.with_box(cube.pose, cube.size, boxes.boxes[i], quaternions_xyzw[i])
             cubes.append(poses.replaced(cube, pose=pose, size=size))
             i += 1
         if cubes:
-            fields: dict[str, Any] = {'cubes': cubes, 'frame_id': boxes.frame_id}
-            for name in OTHERS if T_out_in is not None else ():
-                drawn = getattr(entity, name, ())
-                fields[name] = [
-                    poses.replaced(item, pose=poses.moved(item.pose, T_out_in)) for item in drawn
-                ]
-            entity = poses.replaced(entity, **fields)
+            entity = _with_cubes(entity, cubes, boxes.frame_id, T_out_in)
         entities.append(entity)
     return poses.replaced(msg, entities=entities)
 
 
-def _cubes(entity: Any) -> Any:
-    return getattr(entity, 'cubes', ())  # JSON may leave out what is empty
+def _with_cubes(entity: Any, cubes: list[Any], frame_id: str, T_out_in: Floats | None) -> Any:
+    """Return a copy of an entity with other cubes, in another frame if `T_out_in` is given."""
+    fields: dict[str, Any] = {'cubes': cubes, 'frame_id': frame_id}
+    if T_out_in is not None:
+        for name in OTHER_PRIMITIVES:
+            fields[name] = [
+                poses.replaced(item, pose=poses.moved(item.pose, T_out_in))
+                for item in _items(entity, name)
+            ]
+    return poses.replaced(entity, **fields)
+
+
+def _items(owner: Any, name: str) -> Sequence[Any]:
+    """Return a list of a message; JSON may omit empty ones or contain null."""
+    value = getattr(owner, name, None)
+    if value is None:
+        return ()
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise UnsupportedMessage(f'SceneUpdate: expected a list as {name}, got {value!r}')
+    return value
 
 
 def _time_ns(time: Any) -> int:
-    """Return a time as ROS, JSON or protobuf spell it [ns]."""
-    for seconds, rest in (('sec', 'nanosec'), ('sec', 'nsec'), ('seconds', 'nanos')):
-        if hasattr(time, rest):
-            return int(getattr(time, seconds)) * 10**9 + int(getattr(time, rest))
-    raise AttributeError(f'a timestamp has neither sec and nanosec nor seconds and nanos: {time}')
+    """Return a time of ROS, JSON or protobuf [ns]."""
+    for seconds, nanoseconds in TIME_FIELDS:
+        if hasattr(time, seconds) and hasattr(time, nanoseconds):
+            try:
+                time_ns = int(getattr(time, seconds)) * 10**9 + int(getattr(time, nanoseconds))
+            except (OverflowError, TypeError, ValueError):
+                break
+            if abs(time_ns) < MAX_TIME_NS:
+                return time_ns
+    raise UnsupportedMessage(
+        f'SceneUpdate: expected a timestamp of whole seconds and nanoseconds (sec and nsec), got '
+        f'{time}'
+    )
 
 
-def _noted(entity: Any, keys: tuple[str, ...], default: str) -> str:
-    noted = {item.key.lower(): str(item.value) for item in getattr(entity, 'metadata', ())}
-    return next((noted[key] for key in keys if key in noted), default)
+def _metadata(entity: Any) -> dict[str, str]:
+    """Return the metadata of an entity; keys are in lower case."""
+    items = _items(entity, 'metadata')
+    poses.require_fields('SceneUpdate', items, ('key', 'value'))
+    return {str(item.key).lower(): str(item.value) for item in items}
 
 
-def _number(text: str) -> float:
+def _first_value(metadata: dict[str, str], keys: tuple[str, ...], default: str) -> str:
+    return next((metadata[key] for key in keys if key in metadata), default)
+
+
+def _score(text: str) -> float:
+    """Return a score; 1 for text that is not a number."""
     try:
         return float(text)
     except ValueError:

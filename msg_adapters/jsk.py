@@ -1,8 +1,8 @@
 """
-``jsk_recognition_msgs/BoundingBoxArray``, of ROS 1 and its forks; it has no ids.
+``jsk_recognition_msgs/BoundingBoxArray`` of ROS 1 and its forks; it has no ids.
 
-`value` is the score and the number `label` the class. Fields that forks have put behind them
-are carried along: a recording brings its definition with it.
+The score is `value`, the class the number `label`. Additional fields of forks are copied, because
+a recording contains its message definitions.
 
 """
 
@@ -14,6 +14,8 @@ from boxreg_ros.structures import BoxArray, Floats
 from msg_adapters import poses
 import numpy as np
 
+REQUIRED_FIELDS = ('header', 'pose', 'dimensions', 'value', 'label')
+
 
 def from_msg(msg: Any) -> BoxArray:
     """
@@ -22,10 +24,11 @@ def from_msg(msg: Any) -> BoxArray:
     Raises
     ------
     UnsupportedMessage
-        If a box is in another frame than the array.
+        If a box is in another frame than the array, or the definition lacks a field.
 
     """
-    header = poses.one_header('BoundingBoxArray', msg.header, msg.boxes)
+    poses.require_fields('BoundingBoxArray', msg.boxes[:1], REQUIRED_FIELDS)
+    header = poses.common_header('BoundingBoxArray', msg.header, msg.boxes)
     return BoxArray(
         poses.stamp_ns(header),
         header.frame_id,
@@ -39,12 +42,12 @@ def from_msg(msg: Any) -> BoxArray:
 def to_msg(
     msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
-    """Return a copy with the boxes replaced; it has no place for covariances."""
-    found = []
-    for own, box, turn in zip(
-        msg.boxes, boxes.boxes, poses.quaternions_of(boxes.boxes), strict=True
-    ):
-        pose, size = poses.with_box(own.pose, own.dimensions, box, turn)
+    """Return a copy with the boxes replaced; covariances are not written."""
+    quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+    replaced = []
+    for i, own in enumerate(msg.boxes):
+        pose, size = poses.with_box(own.pose, own.dimensions, boxes.boxes[i], quaternions_xyzw[i])
         header = poses.with_frame(own.header, boxes.frame_id)
-        found.append(poses.replaced(own, header=header, pose=pose, dimensions=size))
-    return poses.replaced(msg, header=poses.with_frame(msg.header, boxes.frame_id), boxes=found)
+        replaced.append(poses.replaced(own, header=header, pose=pose, dimensions=size))
+    header = poses.with_frame(msg.header, boxes.frame_id)
+    return poses.replaced(msg, header=header, boxes=replaced)

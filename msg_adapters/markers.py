@@ -1,8 +1,7 @@
 """
-``visualization_msgs/MarkerArray``: a CUBE's `id` is the track and its `ns` the class.
+``visualization_msgs/MarkerArray``: the `id` of a CUBE is the track id, its `ns` the class.
 
-Markers of other types, and those that delete, are no boxes: they are passed over when reading
-and carried along unchanged when writing.
+Markers of other types and deletions are skipped when reading, and copied when writing.
 
 """
 
@@ -16,26 +15,31 @@ import numpy as np
 
 CUBE = 1
 ADD = 0
+REQUIRED_FIELDS = ('header', 'ns', 'id', 'type', 'action', 'pose', 'scale')
 
 
 def from_msg(msg: Any) -> BoxArray:
     """
-    Return the boxes of a MarkerArray; the score is 1 throughout.
+    Return the boxes of a MarkerArray, all with the score 1.
 
-    The stamp and the frame are those of the markers. An array without boxes and without any
-    marker has neither: it comes back with the stamp 0 and the frame ``''``.
+    Stamp and frame are those of the markers. An array without markers has the stamp 0 and the
+    frame ``''``.
 
     Raises
     ------
     UnsupportedMessage
-        If the boxes disagree about frame or stamp.
+        If the boxes have different frames or stamps, or the definition lacks a field.
 
     """
+    poses.require_fields('MarkerArray', msg.markers[:1], REQUIRED_FIELDS)
     cubes = [marker for marker in msg.markers if _is_box(marker)]
     headers = [marker.header for marker in cubes or msg.markers[:1]]
-    origin = poses.one_origin('MarkerArray', ((poses.stamp_ns(h), h.frame_id) for h in headers))
+    stamp_ns, frame_id = poses.common_stamp_and_frame(
+        'MarkerArray', ((poses.stamp_ns(header), header.frame_id) for header in headers)
+    )
     return BoxArray(
-        *origin,
+        stamp_ns,
+        frame_id,
         tuple(str(cube.id) for cube in cubes),
         tuple(str(cube.ns) for cube in cubes),
         np.ones(len(cubes)),
@@ -46,9 +50,10 @@ def from_msg(msg: Any) -> BoxArray:
 def to_msg(
     msg: Any, boxes: BoxArray, covariances: Floats | None = None, T_out_in: Floats | None = None
 ) -> Any:
-    """Return a copy of a MarkerArray with its boxes replaced; it has no place for covariances."""
+    """Return a copy with the boxes replaced; covariances are not written."""
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
-    markers, i = [], 0
+    markers = []
+    i = 0  # index of the next box
     for marker in msg.markers:
         if _is_box(marker):
             pose, scale = poses.with_box(

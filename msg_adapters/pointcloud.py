@@ -1,4 +1,4 @@
-"""``sensor_msgs/PointCloud2`` of any layout to a `Sweep`, without a copy of the raw bytes."""
+"""``sensor_msgs/PointCloud2`` of any layout to a `Sweep`, without copying the raw bytes."""
 
 from __future__ import annotations
 
@@ -11,83 +11,100 @@ from msg_adapters.poses import stamp_ns
 import numpy as np
 from numpy.typing import NDArray
 
-NUMBERS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
-"""``PointField.datatype`` as numpy spells it."""
+DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+"""``PointField.datatype`` -> dtype of numpy."""
 TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time')
-UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+TIME_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+"""Possible units of point times [s], coarsest first."""
 INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
-LONGEST_SWEEP = 1.0
-"""No point is measured farther than this from its stamp [s]."""
+MAX_TIME_OFFSET = 1.0
+"""Largest difference between the time of a point and the stamp [s]; one revolution is shorter."""
 
 
 def from_msg(msg: Any) -> Sweep:
     """
     Return the finite points of a PointCloud2, in its frame, with their times.
 
-    Points are float32, or float64 where the message needs it to be exact (float64 and 32-bit
-    integer coordinates).
+    Points are float32; float64 if the coordinates are float64 or 32-bit integers, to keep them
+    exact.
 
     Raises
     ------
     UnsupportedMessage
-        If there are no fields x, y, z, or the sizes in the message contradict each other.
+        If there are no fields x, y, z, a field has an unknown datatype, or the sizes in the
+        message contradict each other.
 
     Notes
     -----
     Times are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``.
-    Makers agree neither on unit nor on origin, so both are told by type and magnitude: absolute
-    where a float64 field lies within a second of the stamp in s, ms, us or ns (Hesai,
-    RoboSense, Livox); else relative to the stamp, in the coarsest of these units that keeps
-    all points within a second of it, seconds being for floats only (Velodyne: s, Ouster: ns).
-    Times that fit nothing are left out: ``times`` is None. A point whose own time is not finite
-    is taken for measured at the stamp.
+    Unit and origin differ between drivers, so both are derived from type and magnitude. A float64
+    field within 1 s of the stamp in s, ms, us or ns is absolute (Hesai, RoboSense, Livox). Other
+    fields are relative to the stamp, in the coarsest of these units in which all points are
+    within 1 s of it; seconds only for floats (Velodyne: s, Ouster: ns). If none fits, ``times``
+    is None. A point whose time is not finite gets the time of the stamp.
 
     """
     stamp = stamp_ns(msg.header)
     if not msg.width * msg.height:
         return Sweep(stamp, msg.header.frame_id, np.zeros((0, 3), np.float32))
-    fields = {field.name: field for field in msg.fields}
-    missing = [name for name in 'xyz' if name not in fields]
-    if missing:
-        raise UnsupportedMessage(
-            f'PointCloud2: expected fields x, y, z, got {", ".join(fields) or "none"}; '
-            f'publish Cartesian coordinates'
-        )
+    fields = _fields(msg)
     time_field = _first(TIME_FIELDS, fields)
-    table = _table(msg, [fields[name] for name in (*'xyz', time_field) if name])
+    names = ['x', 'y', 'z']
+    if time_field is not None:
+        names.append(time_field)
+    table = _table(msg, [fields[name] for name in names])
 
-    wanted = np.result_type(np.float32, *(table.dtype[name] for name in 'xyz'))
-    columns = np.empty((3, table.size), wanted.newbyteorder('='))  # what follows goes by columns
+    dtype = np.result_type(np.float32, *(table.dtype[name] for name in 'xyz'))
+    columns = np.empty((3, table.size), dtype.newbyteorder('='))  # contiguous per coordinate
     for column, name in zip(columns, 'xyz', strict=True):
         column[:] = table[name].reshape(-1)
-    good = np.isfinite(columns).all(0)
+    is_finite = np.isfinite(columns).all(0)
     times = None
     if time_field is not None:
-        raw = table[time_field].ravel()  # a copy without gaps: it is gone through several times
-        times = _seconds(raw if good.all() else raw[good], stamp)
-    if not good.all():
-        columns = columns[:, good]
+        raw_times = table[time_field].ravel()  # contiguous: it is read several times
+        times = _seconds(raw_times if is_finite.all() else raw_times[is_finite], stamp)
+    if not is_finite.all():
+        columns = columns[:, is_finite]
     return Sweep(stamp, msg.header.frame_id, columns.T, times)
 
 
 def intensities(msg: Any) -> Floats | None:
     """
-    Return what a message says of how bright its points are, in the units of its maker.
+    Return the intensities of the points, in the unit of the sensor.
 
     Returns
     -------
     intensities : array, shape (M,), or None
-        One for each point of `from_msg`; None if there is none of the fields ``intensity``,
-        ``i``, ``reflectivity``. What is not finite is 0.
+        One per point of `from_msg`; None if the message has none of the fields ``intensity``,
+        ``i``, ``reflectivity``. Values that are not finite are 0.
+
+    Raises
+    ------
+    UnsupportedMessage
+        As `from_msg`.
 
     """
-    fields = {field.name: field for field in msg.fields}
-    name = _first(INTENSITY_FIELDS, fields)
-    if name is None or not msg.width * msg.height:
+    if not msg.width * msg.height:
         return None
-    table = _table(msg, [fields[n] for n in (*'xyz', name)])
-    good = np.logical_and.reduce([np.isfinite(table[n].reshape(-1)) for n in 'xyz'])
-    return np.nan_to_num(table[name].reshape(-1)[good].astype(np.float64), posinf=0, neginf=0)
+    fields = _fields(msg)
+    name = _first(INTENSITY_FIELDS, fields)
+    if name is None:
+        return None
+    table = _table(msg, [fields[key] for key in (*'xyz', name)])
+    is_finite = np.logical_and.reduce([np.isfinite(table[key].reshape(-1)) for key in 'xyz'])
+    values = table[name].reshape(-1)[is_finite].astype(np.float64)
+    return np.nan_to_num(values, posinf=0, neginf=0)
+
+
+def _fields(msg: Any) -> dict[str, Any]:
+    """Return the fields of a message by name; x, y and z are among them."""
+    fields = {field.name: field for field in msg.fields}
+    if not fields.keys() >= {'x', 'y', 'z'}:
+        raise UnsupportedMessage(
+            f'PointCloud2: expected fields x, y, z, got {", ".join(fields) or "none"}; '
+            f'publish Cartesian coordinates'
+        )
+    return fields
 
 
 def _first(names: Sequence[str], fields: Mapping[str, Any]) -> str | None:
@@ -95,27 +112,33 @@ def _first(names: Sequence[str], fields: Mapping[str, Any]) -> str | None:
 
 
 def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
-    """Return a structured view (height, width) of the message's bytes with these fields only."""
+    """Return a structured view (height, width) of the raw bytes, with these fields only."""
+    sizes = (msg.width, msg.height, msg.point_step, msg.row_step)
+    if min(sizes) < 0:
+        raise UnsupportedMessage(
+            f'PointCloud2: expected width, height, point_step and row_step of at least 0, got '
+            f'{", ".join(map(str, sizes))}'
+        )
     data = np.frombuffer(msg.data, np.uint8)
-    used = msg.width * msg.point_step
-    row_step = msg.row_step if msg.height > 1 else used
-    needed = (msg.height - 1) * row_step + used
-    if row_step < used or len(data) < needed:
+    row_size = msg.width * msg.point_step
+    row_step = msg.row_step if msg.height > 1 else row_size
+    needed = (msg.height - 1) * row_step + row_size
+    if row_step < row_size or len(data) < needed:
         raise UnsupportedMessage(
             f'PointCloud2: {msg.height} x {msg.width} points of {msg.point_step} bytes in rows of '
-            f'{row_step}: expected at least {max(needed, msg.height * used)} bytes, got '
+            f'{row_step}: expected at least {max(needed, msg.height * row_size)} bytes, got '
             f'{len(data)}; the publisher fills in width, height, point_step or row_step wrongly'
         )
     order = '>' if msg.is_bigendian else '<'
     for field in fields:
-        kind = NUMBERS.get(field.datatype)
-        if kind is None or field.count > 1:
+        dtype = DTYPES.get(field.datatype)
+        if dtype is None or field.count > 1:
             raise UnsupportedMessage(
                 f'PointCloud2: field {field.name!r}: expected one number of datatype 1 to 8, got '
                 f'{field.count} of datatype {field.datatype}'
             )
-        end = field.offset + np.dtype(kind).itemsize
-        if end > msg.point_step:
+        end = field.offset + np.dtype(dtype).itemsize
+        if field.offset < 0 or end > msg.point_step:
             raise UnsupportedMessage(
                 f'PointCloud2: field {field.name!r} ends at byte {end}: expected at most '
                 f'point_step, got {msg.point_step}'
@@ -123,7 +146,7 @@ def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     layout = np.dtype(
         {
             'names': [field.name for field in fields],
-            'formats': [order + NUMBERS[field.datatype] for field in fields],
+            'formats': [order + DTYPES[field.datatype] for field in fields],
             'offsets': [field.offset for field in fields],
             'itemsize': msg.point_step,
         }
@@ -134,27 +157,35 @@ def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
 
 
 def _seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
-    """Return times relative to the stamp [s]; see the notes of `from_msg`."""
+    """Return point times (M,) relative to the stamp [s]; see the notes of `from_msg`."""
     if not raw.size:
         return np.zeros(0)
-    known = np.isfinite(raw)
-    if not known.all():
-        seconds = _seconds(raw[known], stamp) if known.any() else None
-        if seconds is None:
-            return None
-        times = np.zeros(raw.shape)
-        times[known] = seconds
-        return times
-    low, high = float(raw.min()), float(raw.max())
-    floating = raw.dtype.kind == 'f'
-    if floating and raw.dtype.itemsize == 8:
-        for unit in UNITS:
+    is_known = np.isfinite(raw)
+    if is_known.all():
+        return _known_seconds(raw, stamp)
+    if not is_known.any():
+        return None
+    known = _known_seconds(raw[is_known], stamp)
+    if known is None:
+        return None
+    times = np.zeros(raw.shape)
+    times[is_known] = known
+    return times
+
+
+def _known_seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
+    """Return finite point times (M,), M > 0, relative to the stamp [s]."""
+    low = float(raw.min())
+    high = float(raw.max())
+    is_float = raw.dtype.kind == 'f'
+    if is_float and raw.dtype.itemsize == 8:
+        for unit in TIME_UNITS:
             origin = stamp * 1e-9 / unit
-            if origin * unit > LONGEST_SWEEP and (
-                max(abs(low - origin), abs(high - origin)) * unit <= LONGEST_SWEEP
-            ):
+            offset = max(abs(low - origin), abs(high - origin)) * unit
+            # A stamp near 0 does not separate absolute from relative times.
+            if origin * unit > MAX_TIME_OFFSET and offset <= MAX_TIME_OFFSET:
                 return np.asarray((raw.astype(np.float64) - origin) * unit)
-    for unit in UNITS if floating else UNITS[1:]:
-        if max(abs(low), abs(high)) * unit <= LONGEST_SWEEP:
+    for unit in TIME_UNITS if is_float else TIME_UNITS[1:]:
+        if max(abs(low), abs(high)) * unit <= MAX_TIME_OFFSET:
             return np.asarray(np.multiply(raw, unit, dtype=np.float64))
     return None

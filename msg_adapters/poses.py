@@ -1,9 +1,10 @@
-"""Stamps, poses, covariances and copies that all box messages share."""
+"""Stamps, poses, covariances and copies, shared by the adapters of box messages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from copy import copy
+from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +19,7 @@ from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, Z
 import numpy as np
 
 UNIT_TOLERANCE = 0.01
-"""How far a squared quaternion norm may be from 1; what tf2 accepts."""
+"""Tolerance of a squared quaternion norm, the same as in tf2."""
 
 
 def stamp_ns(header: Any) -> int:
@@ -26,9 +27,42 @@ def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
-def one_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
+def require_fields(kind: str, items: Iterable[Any], names: Sequence[str]) -> None:
     """
-    Return the header of an array, or that of its items where the array's own is not filled in.
+    Check that messages have the fields that an adapter reads.
+
+    Recordings contain their own message definitions, and JSON has none, so a message of a known
+    name may lack a field.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the message type in errors.
+    items : iterable of messages
+        Messages to check. One is enough where all have the same definition.
+    names : sequence of str
+        Paths of attributes: ``'pose.position'``.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If a message lacks a field.
+
+    """
+    for item in items:
+        for name in names:
+            try:
+                attrgetter(name)(item)
+            except AttributeError:
+                raise UnsupportedMessage(
+                    f'{kind}: expected a message with the field {name}, got one without; '
+                    f'convert it to the current definition'
+                ) from None
+
+
+def common_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
+    """
+    Return the header of an array, or that of its items if the array has no frame.
 
     Raises
     ------
@@ -47,42 +81,51 @@ def one_header(kind: str, header: Any, items: Sequence[Any]) -> Any:
     return header
 
 
-def one_origin(kind: str, origins: Iterable[tuple[int, str]]) -> tuple[int, str]:
+def common_stamp_and_frame(kind: str, headers: Iterable[tuple[int, str]]) -> tuple[int, str]:
     """
-    Return stamp [ns] and frame of boxes that each have their own; 0 and '' if there are none.
+    Return the stamp [ns] and frame of boxes that have a header each; 0 and '' for no boxes.
 
     Raises
     ------
     UnsupportedMessage
-        If they disagree.
+        If they differ.
 
     """
-    known = set(origins)
-    if len(known) > 1:
+    found = set(headers)
+    if len(found) > 1:
+        names = ', '.join(f'{frame!r} at {stamp} ns' for stamp, frame in sorted(found))
         raise UnsupportedMessage(
-            f'{kind}: expected one frame and one stamp for all boxes, got '
-            f'{", ".join(f"{frame!r} at {stamp} ns" for stamp, frame in sorted(known))}; '
-            f'publish one array per frame and stamp'
+            f'{kind}: expected one frame and one stamp for all boxes, got {names}; publish one '
+            f'array per frame and stamp'
         )
-    return known.pop() if known else (0, '')
+    return found.pop() if found else (0, '')
 
 
 def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
     """
     Return boxes (n, 9) from ``geometry_msgs`` poses and full extents, vectors or sequences.
 
-    A quaternion that is not of unit length says nothing about the orientation: such a box gets
-    NaN angles, which the core recognises as an invalid box.
+    A box whose quaternion is not of unit length gets NaN angles, so that it is an invalid box.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If a value is not a number, or a size does not have three.
 
     """
     boxes = np.full((len(poses), 9), np.nan)
     if not len(poses):
         return boxes
-    boxes[:, X : Z + 1] = [(p.position.x, p.position.y, p.position.z) for p in poses]
-    boxes[:, LENGTH : HEIGHT + 1] = [(s.x, s.y, s.z) if hasattr(s, 'x') else s for s in sizes]
-    quaternions_xyzw = np.array([quaternion_of(pose) for pose in poses], dtype=np.float64)
-    unit = _is_unit(quaternions_xyzw)
-    boxes[unit, ROLL:] = rpy_from_quaternion(quaternions_xyzw[unit])
+    try:
+        boxes[:, X : Z + 1] = [(p.position.x, p.position.y, p.position.z) for p in poses]
+        boxes[:, LENGTH : HEIGHT + 1] = [(s.x, s.y, s.z) if hasattr(s, 'x') else s for s in sizes]
+        quaternions_xyzw = np.array([quaternion_of(pose) for pose in poses], dtype=np.float64)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise UnsupportedMessage(
+            f'boxes: expected numbers as position, orientation and size: {error}'
+        ) from None
+    is_unit = _is_unit(quaternions_xyzw)
+    boxes[is_unit, ROLL:] = rpy_from_quaternion(quaternions_xyzw[is_unit])
     return boxes
 
 
@@ -98,8 +141,8 @@ def quaternions_of(boxes: Floats) -> Floats:
 
 
 def replaced(msg: Any, **fields: Any) -> Any:
-    """Return a copy of `msg` with some fields set; the rest is shared, but with protobuf's."""
-    if hasattr(msg, 'CopyFrom'):  # protobuf: messages and lists are filled, not set
+    """Return a copy of `msg` with some fields set; other fields are shared, except protobuf's."""
+    if hasattr(msg, 'CopyFrom'):  # protobuf: fields of messages and lists cannot be assigned
         new = type(msg)()
         new.CopyFrom(msg)
         for name in fields:
@@ -107,7 +150,7 @@ def replaced(msg: Any, **fields: Any) -> Any:
         new.MergeFrom(type(msg)(**fields))
         return new
     new = copy(msg)
-    if isinstance(msg, SimpleNamespace):  # mcap's have slots that a copy leaves behind
+    if isinstance(msg, SimpleNamespace):  # mcap: a copy lacks the values of slots
         fields = {name: getattr(msg, name) for name in getattr(msg, '__slots__', ())} | fields
     for name, value in fields.items():
         setattr(new, name, value)
@@ -120,22 +163,23 @@ def with_frame(header: Any, frame_id: str) -> Any:
 
 
 def with_position(pose: Any, position: Sequence[float]) -> Any:
-    """Return a pose elsewhere, turned the same."""
+    """Return a copy of a pose with another position."""
     x, y, z = map(float, position)
     return replaced(pose, position=replaced(pose.position, x=x, y=y, z=z))
 
 
 def with_orientation(pose: Any, quaternion_xyzw: Sequence[float]) -> Any:
-    """Return a pose at the same place, turned otherwise."""
+    """Return a copy of a pose with another orientation."""
     x, y, z, w = map(float, quaternion_xyzw)
     return replaced(pose, orientation=replaced(pose.orientation, x=x, y=y, z=z, w=w))
 
 
 def with_box(pose: Any, size: Any, box: Floats, quaternion_xyzw: Floats) -> tuple[Any, Any]:
     """
-    Return copies of a pose and a size, a vector or a sequence, that hold `box`.
+    Return copies of a pose and a size, a vector or a sequence, with the values of `box`.
 
-    Parts of the box that are not finite keep what the message says: NaN is not sent out.
+    Where position, orientation or size is not finite, the message's own remains, so that no NaN
+    is published.
 
     """
     if np.isfinite(box[X : Z + 1]).all():
@@ -157,9 +201,9 @@ def with_covariance(
     posed: Any, pose: Any, covariance: Floats | None, T_out_in: Floats | None
 ) -> Any:
     """
-    Return a copy of a ``PoseWithCovariance`` with another pose and its covariance.
+    Return a copy of a ``PoseWithCovariance`` with another pose and covariance.
 
-    Where `covariance` (6, 6) is NaN, or there is none, the message's own stays.
+    If `covariance` (6, 6) is NaN or None, the message's own remains, rotated by `T_out_in`.
 
     """
     own = np.array(posed.covariance, dtype=np.float64).reshape(6, 6)
@@ -172,8 +216,8 @@ def turned_covariances(covariances: Floats, T_frame_boxes: Floats) -> Floats:
     """
     Return covariances (..., 6, 6) of x y z roll pitch yaw in another frame.
 
-    The part of roll, pitch and yaw stays as it is: that is exact for frames that differ by a
-    turn about z, and the tilt between those in use is small.
+    The covariance of roll, pitch and yaw is not changed. That is exact for frames that differ by
+    a rotation about z, and the tilt between frames in practice is small.
 
     """
     J = np.eye(6)
@@ -181,7 +225,7 @@ def turned_covariances(covariances: Floats, T_frame_boxes: Floats) -> Floats:
     return J @ covariances @ J.T
 
 
-def turned(vector: Any, T_out_in: Floats | None) -> Any:
+def rotated(vector: Any, T_out_in: Floats | None) -> Any:
     """Return a ``Vector3`` of the input frame in the output frame."""
     if T_out_in is None:
         return vector
@@ -201,24 +245,32 @@ def moved_polygon(polygon: Any, T_out_in: Floats | None) -> Any:
     return replaced(polygon, points=moved_points)
 
 
-def turned_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
-    """Return a twist or an accel, named so within one with covariance, as `turned` does."""
-    if hasattr(motion, 'covariance'):
-        inner, covariance = turned_motion(getattr(motion, name), name, T_out_in), motion.covariance
-        if T_out_in is not None:
-            J = np.kron(np.eye(2), T_out_in[:3, :3])
-            covariance = (J @ np.reshape(covariance, (6, 6)) @ J.T).ravel()
-        return replaced(motion, **{name: inner, 'covariance': covariance})
-    return replaced(
-        motion, linear=turned(motion.linear, T_out_in), angular=turned(motion.angular, T_out_in)
-    )
+def rotated_motion(motion: Any, name: str, T_out_in: Floats | None) -> Any:
+    """
+    Return a twist or an accel of the input frame in the output frame.
+
+    `motion` may be stamped with a covariance; `name` is then the field of the twist or accel in
+    it. Only the rotation is applied.
+
+    """
+    if not hasattr(motion, 'covariance'):
+        linear = rotated(motion.linear, T_out_in)
+        return replaced(motion, linear=linear, angular=rotated(motion.angular, T_out_in))
+    inner = rotated_motion(getattr(motion, name), name, T_out_in)
+    covariance = motion.covariance
+    if T_out_in is not None:
+        J = np.kron(np.eye(2), T_out_in[:3, :3])
+        covariance = (J @ np.reshape(covariance, (6, 6)) @ J.T).ravel()
+    return replaced(motion, **{name: inner, 'covariance': covariance})
 
 
 def moved(pose: Any, T_out_in: Floats | None) -> Any:
     """Return a pose of the input frame in the output frame."""
     if T_out_in is None:
         return pose
-    p, q, R = pose.position, quaternion_of(pose), T_out_in[:3, :3]
+    p = pose.position
+    q = quaternion_of(pose)
+    R = T_out_in[:3, :3]
     pose = with_position(pose, (R @ [p.x, p.y, p.z] + T_out_in[:3, 3]).tolist())
     if not _is_unit(np.array(q)):
         return pose
@@ -232,5 +284,7 @@ def forward_of(pose: Any) -> Floats:
 
 
 def _is_unit(quaternions_xyzw: Floats) -> Any:
-    """Tell of quaternions (..., 4) whether they are orientations."""
-    return np.abs(np.square(quaternions_xyzw).sum(axis=-1) - 1.0) < UNIT_TOLERANCE
+    """Return which of quaternions (..., 4) have unit length."""
+    with np.errstate(over='ignore'):  # numbers of malformed messages may be of any size
+        squared_norms = np.square(quaternions_xyzw).sum(axis=-1)
+    return np.abs(squared_norms - 1.0) < UNIT_TOLERANCE

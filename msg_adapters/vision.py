@@ -1,8 +1,8 @@
 """
 ``vision_msgs``: Detection3DArray, and BoundingBox3DArray, which has no ids and no classes.
 
-A detection's `id` is its track, its best hypothesis gives class and score. ``center`` is the
-box's pose, ``size`` its extents along its own x, y and z.
+The track id is the `id` of a detection; class and score are those of the hypothesis with the
+highest score. ``center`` is the pose of the box, ``size`` its extents along x, y and z of the box.
 
 """
 
@@ -23,31 +23,20 @@ def from_msg(msg: Any) -> BoxArray:
     Raises
     ------
     UnsupportedMessage
-        If a detection is in another frame than the array, or the message is laid out as before
+        If a detection is in another frame than the array, or the definition is older than
         vision_msgs 4.
 
     """
-    if not hasattr(msg, 'detections'):
-        n, header, found = len(msg.boxes), msg.header, list(msg.boxes)
-        track_ids, best = ('',) * n, [('', 1.0)] * n
-    else:
-        header = poses.one_header('Detection3DArray', msg.header, msg.detections)
-        found = [detection.bbox for detection in msg.detections]
-        try:
-            best = [_best_hypothesis(detection) for detection in msg.detections]
-            track_ids = tuple(str(detection.id) for detection in msg.detections)
-        except AttributeError as error:
-            raise UnsupportedMessage(
-                f'Detection3DArray: expected the fields of vision_msgs 4 (ROS 2 Galactic and '
-                f'later), got a message where {error}; convert the recording'
-            ) from None
+    if hasattr(msg, 'detections'):
+        return _from_detections(msg)
+    n = len(msg.boxes)
     return BoxArray(
-        poses.stamp_ns(header),
-        header.frame_id,
-        track_ids,
-        tuple(class_name for class_name, _ in best),
-        np.array([score for _, score in best], dtype=np.float64),
-        poses.boxes_of([box.center for box in found], [box.size for box in found]),
+        poses.stamp_ns(msg.header),
+        msg.header.frame_id,
+        ('',) * n,
+        ('',) * n,
+        np.ones(n),
+        poses.boxes_of([box.center for box in msg.boxes], [box.size for box in msg.boxes]),
     )
 
 
@@ -57,38 +46,62 @@ def to_msg(
     """
     Return a copy with the boxes replaced; see `Adapter.to_msg`.
 
-    The pose of every hypothesis becomes the box's centre, which is what the covariance
-    beside it speaks of. A detection without an id gets that of `boxes`.
+    The pose of every hypothesis becomes the centre of the box, because the covariance beside it
+    is that of the box. A detection without an id gets that of `boxes`.
 
     """
     header = poses.with_frame(msg.header, boxes.frame_id)
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
     if not hasattr(msg, 'detections'):
-        new = zip(msg.boxes, boxes.boxes, quaternions_xyzw, strict=True)
-        found = [_replaced(*item) for item in new]
-        return poses.replaced(msg, header=header, boxes=found)
+        pairs = zip(msg.boxes, boxes.boxes, quaternions_xyzw, strict=True)
+        return poses.replaced(msg, header=header, boxes=[_with_box(*pair) for pair in pairs])
     detections = []
     for i, detection in enumerate(msg.detections):
-        bbox = _replaced(detection.bbox, boxes.boxes[i], quaternions_xyzw[i])
-        spread = None if covariances is None else covariances[i]
-        results = [
-            poses.replaced(r, pose=poses.with_covariance(r.pose, bbox.center, spread, T_out_in))
-            for r in detection.results
-        ]
-        own = poses.with_frame(detection.header, boxes.frame_id)
-        track_id = detection.id or boxes.track_ids[i]
+        bbox = _with_box(detection.bbox, boxes.boxes[i], quaternions_xyzw[i])
+        covariance = None if covariances is None else covariances[i]
+        results = []
+        for result in detection.results:
+            pose = poses.with_covariance(result.pose, bbox.center, covariance, T_out_in)
+            results.append(poses.replaced(result, pose=pose))
         detections.append(
-            poses.replaced(detection, header=own, results=results, bbox=bbox, id=track_id)
+            poses.replaced(
+                detection,
+                header=poses.with_frame(detection.header, boxes.frame_id),
+                results=results,
+                bbox=bbox,
+                id=detection.id or boxes.track_ids[i],
+            )
         )
     return poses.replaced(msg, header=header, detections=detections)
 
 
-def _replaced(bbox: Any, box: Floats, quaternion_xyzw: Floats) -> Any:
+def _from_detections(msg: Any) -> BoxArray:
+    header = poses.common_header('Detection3DArray', msg.header, msg.detections)
+    try:
+        best = [_best_hypothesis(detection) for detection in msg.detections]
+        track_ids = tuple(str(detection.id) for detection in msg.detections)
+    except AttributeError as error:
+        raise UnsupportedMessage(
+            f'Detection3DArray: expected the fields of vision_msgs 4 (ROS 2 Galactic and '
+            f'later), got a message where {error}; convert the recording'
+        ) from None
+    boxes = [detection.bbox for detection in msg.detections]
+    return BoxArray(
+        poses.stamp_ns(header),
+        header.frame_id,
+        track_ids,
+        tuple(class_name for class_name, _ in best),
+        np.array([score for _, score in best], dtype=np.float64),
+        poses.boxes_of([box.center for box in boxes], [box.size for box in boxes]),
+    )
+
+
+def _with_box(bbox: Any, box: Floats, quaternion_xyzw: Floats) -> Any:
     center, size = poses.with_box(bbox.center, bbox.size, box, quaternion_xyzw)
     return poses.replaced(bbox, center=center, size=size)
 
 
 def _best_hypothesis(detection: Any) -> tuple[str, float]:
     """Return class and score of the hypothesis with the highest score."""
-    known = [(str(r.hypothesis.class_id), float(r.hypothesis.score)) for r in detection.results]
-    return max(known, key=lambda item: item[1], default=('', 1.0))
+    found = [(str(r.hypothesis.class_id), float(r.hypothesis.score)) for r in detection.results]
+    return max(found, key=lambda item: item[1], default=('', 1.0))

@@ -1,8 +1,8 @@
 """
-What the libraries of others make of our label files; `test/consumers.txt` says which.
+Read label files with third-party libraries, which `test/consumers.txt` lists.
 
-Run by their own environment as a program: the name of a function below and its arguments; prints
-what the function returns as JSON. Tests call `consumer`.
+The libraries have an environment of their own. Tests call `consumer`, which runs this file there
+with the name of a function below and its arguments; the program prints the result as JSON.
 
 """
 
@@ -15,11 +15,11 @@ HOME = Path(__file__).resolve().parents[1] / '.venv-consumers'
 
 
 def consumer(name, *arguments):
-    """Run a function below in the environment of consumers; return what it returns."""
+    """Run a function below in the environment of the libraries, and return its result."""
     import pytest
 
     if not (HOME / 'bin' / 'python').exists():
-        pytest.skip('.venv-consumers is not there: make test sets it up')
+        pytest.skip('.venv-consumers does not exist: make test creates it')
     command = [HOME / 'bin' / 'python', '-W', 'ignore', __file__, name, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -27,7 +27,7 @@ def consumer(name, *arguments):
 
 
 def nuscenes(folder, version):
-    """Return every annotation as the devkit gives it: globally, and in the LiDAR's frame."""
+    """Return every annotation as the devkit reads it: in the global and in the LiDAR frame."""
     from nuscenes.nuscenes import NuScenes
     from nuscenes.utils.data_classes import LidarPointCloud
 
@@ -39,13 +39,14 @@ def nuscenes(folder, version):
         points = None
         if Path(path).exists():
             points = LidarPointCloud.from_file(path).points[:3].T.tolist()
-        for there, name in zip(local, sample['anns'], strict=True):
-            row, box = data.get('sample_annotation', name), data.get_box(name)
+        for local_box, name in zip(local, sample['anns'], strict=True):
+            row = data.get('sample_annotation', name)
+            box = data.get_box(name)
             boxes.append({
                 'channel': channel, 'timestamp': sample['timestamp'], 'name': box.name,
                 'center': box.center.tolist(), 'wlh': box.wlh.tolist(),
                 'matrix': box.rotation_matrix.tolist(), 'corners': box.corners().T.tolist(),
-                'local': there.center.tolist(), 'points': points,
+                'local': local_box.center.tolist(), 'points': points,
                 'velocity': data.box_velocity(name).tolist(),
                 'track': row['instance_token'], 'num_points': row['num_lidar_pts'],
                 'next': row['next'], 'prev': row['prev'],
@@ -54,8 +55,8 @@ def nuscenes(folder, version):
 
 
 def t4(tables):
-    """Return all tables as the schema classes of the T4 devkit hold them."""
-    without_door('t4_devkit')  # imports a viewer
+    """Return all tables as the schema classes of the T4 devkit read them."""
+    skip_package_init('t4_devkit')  # imports a viewer
     from t4_devkit.schema import build_schema, SchemaName
 
     found = {}
@@ -66,8 +67,8 @@ def t4(tables):
     return json.loads(json.dumps(found, default=lambda value: getattr(value, 'q', value).tolist()))
 
 
-def without_door(name):
-    """Have a package imported without what its __init__ does: its parts need less."""
+def skip_package_init(name):
+    """Register a package without running its __init__, whose dependencies are not installed."""
     import importlib.util
     import types
 
@@ -96,7 +97,7 @@ def av2(path):
 
 
 def av2_log(folder, stamp_ns):
-    """Return a sweep, the pose of the vehicle and that of the LiDAR, as av2 reads them."""
+    """Return a sweep, the pose of the vehicle and the pose of the LiDAR."""
     from av2.utils.io import (
         read_city_SE3_ego,
         read_ego_SE3_sensor,
@@ -113,8 +114,8 @@ def av2_log(folder, stamp_ns):
 
 
 def waymo(boxes, poses):
-    """Return what the data set's own components make of the first row of two tables."""
-    without_door('waymo_open_dataset.v2')  # imports all of TensorFlow
+    """Return the first row of two tables, read by the components of the data set."""
+    skip_package_init('waymo_open_dataset.v2')  # imports all of TensorFlow
     from pyarrow import parquet
     from waymo_open_dataset.v2.perception.box import BoxType, LiDARBoxComponent
     from waymo_open_dataset.v2.perception.pose import VehiclePoseComponent
@@ -134,7 +135,7 @@ def waymo(boxes, poses):
 
 
 def pykitti(folder):
-    """Return what pykitti reads of a sequence: calibration and sweep."""
+    """Return calibration and sweep of a sequence."""
     from pykitti import utils
 
     folder = Path(folder)
@@ -160,7 +161,7 @@ def pandas(path):
 
 
 def datumaro(folder, form='datumaro'):
-    """Return every cuboid with its frame, and KITTI raw tracklets that Datumaro makes of them."""
+    """Return every cuboid with its frame, and the KITTI raw tracklets that Datumaro exports."""
     import tempfile
     from xml.etree import ElementTree
 
@@ -169,7 +170,7 @@ def datumaro(folder, form='datumaro'):
 
     data = Dataset.import_from(folder, form)
     labels = data.categories()[AnnotationType.label]
-    found = [
+    cuboids = [
         {
             'item': item.id, 'frame': item.attributes['frame'],
             'bytes': len(item.media.data or b'') if item.media else 0,
@@ -188,14 +189,14 @@ def datumaro(folder, form='datumaro'):
         for track in tree.getroot().iter('item')
         if track.find('objectType') is not None
     ]
-    return {'found': found, 'infos': data.infos(), 'tracklets': tracklets}
+    return {'cuboids': cuboids, 'infos': data.infos(), 'tracklets': tracklets}
 
 
 def supervisely(folder):
     """Return every figure of every frame of a project of point cloud episodes."""
     from importlib import import_module
 
-    without_door('supervisely')  # imports all of the platform
+    skip_package_init('supervisely')  # imports the whole platform
     package = sys.modules['supervisely']
     package.logger = import_module('supervisely.sly_logger').logger
     package.env = import_module('supervisely.io.env')

@@ -1,4 +1,4 @@
-"""A ROS graph for tests: the node as a process of its own, and this process as its neighbour."""
+"""A ROS graph for tests: the node in a process of its own, and a node of the test beside it."""
 
 from contextlib import contextmanager
 import itertools
@@ -10,7 +10,7 @@ import sys
 import time
 from typing import NamedTuple
 
-from boxreg_ros.live.node import import_message
+from boxreg_ros.live.topics import import_message
 from paths import ROOT
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -27,7 +27,7 @@ _domains = itertools.count(os.getpid())
 
 
 class Graph:
-    """One node in this process, and the processes started beside it, in a domain of their own."""
+    """A node of the test and the processes started beside it, in a ROS domain of their own."""
 
     def __init__(self, folder, domain=None):
         self.folder = folder
@@ -41,13 +41,13 @@ class Graph:
         self.publishers = {}
 
     def start(self, *ros_args, command=('-m', 'boxreg_ros.live.main')):
-        """Start the node; its arguments are those after --ros-args."""
+        """Start the node with arguments after --ros-args."""
         process = NodeProcess(self, [sys.executable, *command, '--ros-args', *ros_args])
         self.processes.append(process)
         return process
 
     def start_player(self, path, boxes_topic='/boxes'):
-        """Start a process that plays a recording once it is told to on its standard input."""
+        """Start a process that plays a recording when a line arrives on its standard input."""
         command = [sys.executable, __file__, str(path), boxes_topic, str(self.domain)]
         process = NodeProcess(self, command)
         process.is_ending = True
@@ -66,7 +66,7 @@ class Graph:
         return publisher
 
     def collect(self, type_name, topic):
-        """Return a list that fills with what is published."""
+        """Return a list that fills with the messages on a topic."""
         received = []
         kind = import_message(type_name)
         self.node.create_subscription(kind, topic, received.append, QoSProfile(depth=100))
@@ -82,12 +82,14 @@ class Graph:
             self.executor.spin_once(timeout_sec=0.02)
 
     def wait_until_connected(self):
-        """Wait until every publisher of ours has a subscriber, and every subscriber a writer."""
+        """Wait until each publisher here has a subscriber, and each subscription a publisher."""
         for topic, publisher in self.publishers.items():
-            self.wait(lambda p=publisher: p.get_subscription_count() > 0, f'readers of {topic}')
+            self.wait(
+                lambda p=publisher: p.get_subscription_count() > 0, f'subscribers of {topic}'
+            )
         for item in self.node.subscriptions:
             name = item.topic_name
-            self.wait(lambda n=name: self.node.count_publishers(n) > 0, f'a writer of {name}')
+            self.wait(lambda n=name: self.node.count_publishers(n) > 0, f'a publisher of {name}')
 
     def outputs(self):
         return [process.output() for process in self.processes]
@@ -101,7 +103,7 @@ class Graph:
 
 
 class NodeProcess:
-    """A node that was started; what it says goes to a file."""
+    """A process that was started; its output goes to a file."""
 
     def __init__(self, graph, command):
         self._graph = graph
@@ -122,13 +124,13 @@ class NodeProcess:
         return self._log.read_text()
 
     def stop(self, number=signal.SIGINT):
-        """Signal the node, spin until it has ended, and return how many seconds that took."""
+        """Send a signal, spin until the process has ended, and return the time it took [s]."""
         self.is_ending = True
         begun = time.monotonic()
         self.popen.send_signal(number)
         self._graph.wait(lambda: self.popen.poll() is not None, 'the node to end', 10.0)
         took = time.monotonic() - begun
-        for _ in range(20):  # what is on its way
+        for _ in range(20):  # for messages on their way
             self._graph.executor.spin_once(timeout_sec=0.01)
         return took
 
@@ -141,7 +143,7 @@ class NodeProcess:
 
 @contextmanager
 def graph_in(folder):
-    """Yield a Graph and clean up after it."""
+    """Yield a Graph and end its processes afterwards."""
     graph = Graph(folder)
     try:
         yield graph
@@ -150,7 +152,7 @@ def graph_in(folder):
 
 
 def stamp_of(message):
-    """Return the stamp of boxes [ns]."""
+    """Return the stamp of a box message [ns]."""
     if hasattr(message, 'header'):
         stamp = message.header.stamp
     elif hasattr(message, 'entities'):
@@ -161,7 +163,7 @@ def stamp_of(message):
 
 
 class Record(NamedTuple):
-    """A recorded message: its bytes, and, of boxes, the stamp."""
+    """A recorded message as bytes; box messages have their stamp beside it."""
 
     topic: str
     type_name: str
@@ -189,10 +191,10 @@ def publishers_for(graph, records):
 
 def play(graph, records, early=None):
     """
-    Publish records, byte by byte.
+    Publish records as recorded bytes.
 
-    With `early`, the list in which the node's early boxes arrive, as fast as they come back: the
-    next record is published when the boxes of the last stamp are there.
+    With `early`, a list that fills with the early boxes of the node, each record after a box
+    message waits until that message has been published by the node.
 
     """
     for record in records:
@@ -211,7 +213,7 @@ if __name__ == '__main__':
     publishers_for(player, everything)
     player.wait_until_connected()
     sys.stdin.readline()
-    # A writer may know its reader before that knows the writer; what is sent between gets lost.
+    # A publisher may find its subscriber before the reverse; messages sent in between are lost.
     time.sleep(1.0)
     for one in everything:
         play(player, [one])

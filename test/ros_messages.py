@@ -1,4 +1,4 @@
-"""Messages and recordings made in tests, with rosbags alone."""
+"""Messages and recordings for tests, made with rosbags alone."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ NUMBERS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 
 
 
 def typestore(stock=Stores.ROS2_JAZZY):
-    """Return a typestore that knows the packages in ``interfaces`` beside the stock types."""
+    """Return a typestore with the packages in ``interfaces`` beside the stock types."""
     store = get_typestore(stock)
     extra = {}
     for file in INTERFACES.glob('*/msg/*.msg'):
@@ -48,7 +48,7 @@ class Messages:
         return self.store.types[type_name](**fields)
 
     def build(self, type_name, /, **values):
-        """Return a message of these values, messages as dicts; what is not given is zero."""
+        """Return a message of these values, nested messages as dicts; other fields are zero."""
         fields = {
             name: self._value(node, values.pop(name, None))
             for name, node in self.store.fielddefs[type_name][1]
@@ -74,9 +74,9 @@ class Messages:
 
     def boxes(self, type_name, stamp_ns, frame_id, found):
         """
-        Return an array of any type that the adapters read, with all there is beside the boxes.
+        Return an array of any type that the adapters read, with its other fields filled.
 
-        `found` are (number of the track, (position, quaternion), size).
+        `found` are tuples (track number, (position, quaternion), size).
 
         """
         header = self.header(stamp_ns, frame_id)

@@ -1,11 +1,12 @@
-"""A car and what a sensor that stands still sees of it, known exactly; and problems by hand."""
+"""Scenes with known truth: a car, the points of a fixed sensor; and batches made by hand."""
 
-from boxreg_ros.core import objective
+from boxreg_ros.core import batch, terms
 from boxreg_ros.core.arrowhead import LINK
-from boxreg_ros.core.objective import DEVIATIONS, MEMORY, Problem, SHARED
+from boxreg_ros.core.batch import CLASS_NUMBERS, PRIOR_SIZE, Problem, SHARED, State
+from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.refine import Track
-from boxreg_ros.core.window import AWAY, Window
+from boxreg_ros.core.window import PADDING_POSITION, Window
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,13 +15,13 @@ import torch
 EXTENT = np.array([4.4, 1.8, 1.5])
 PERIOD_NS = 10**8
 START_NS = 1_700_000_000 * 10**9
-# How far inside of the box its outermost points stand, as the annotation rule expects by default:
-# front, back, left, right, top; see `ClassConfig`.
+# Labelling margin of front, back, left, right and top [m]: distance from the box face to the
+# outermost surface points, the defaults of `ClassConfig`.
 GAPS = np.array([0.05, 0.05, 0.03, 0.03, 0.05])
 
 
 def drive(n, speed=5.0, turn=0.3, start=(5.0, 6.0, 0.2), z=0.75):
-    """Return true boxes (n, 9), one every 0.1 s, of a car that moves where its rear axle heads."""
+    """Return true boxes (n, 9) at 10 Hz of a car whose rear axle does not slip."""
     t = np.arange(n) * PERIOD_NS * 1e-9
     yaw = start[2] + turn * t
     path = speed * t
@@ -35,7 +36,7 @@ def drive(n, speed=5.0, turn=0.3, start=(5.0, 6.0, 0.2), z=0.75):
 
 
 def returns(box, rng, count=300, origin=(0.0, 0.0, 1.5), noise=0.01):
-    """Return points (M, 3) on those faces of `box` that look at `origin`, as far in as `GAPS`."""
+    """Return points (M, 3) on the faces of `box` visible from `origin`, `GAPS` behind them."""
     R = Rotation.from_euler('ZYX', box[[8, 7, 6]]).as_matrix()
     toward = (np.asarray(origin) - box[:3]) @ R
     half = box[3:6] / 2
@@ -51,7 +52,7 @@ def returns(box, rng, count=300, origin=(0.0, 0.0, 1.5), noise=0.01):
 
 
 def jittered(boxes, rng, position=0.15, heading=0.05, extent=0.0):
-    """Return `boxes` (n, 9) as a detector might give them."""
+    """Return `boxes` (n, 9) with the noise of a detector."""
     n = len(boxes)
     noisy = boxes.copy()
     noisy[:, :2] += position * rng.normal(size=(n, 2))
@@ -62,12 +63,12 @@ def jittered(boxes, rng, position=0.15, heading=0.05, extent=0.0):
 
 
 def stamps(n):
-    """Return `n` stamps [ns], one every 0.1 s."""
+    """Return `n` stamps at 10 Hz [ns]."""
     return START_NS + PERIOD_NS * np.arange(n)
 
 
 def track_of(truth, rng, name='1', **noise):
-    """Return a track along the true boxes `truth` (n, 9), its boxes jittered."""
+    """Return a track with noisy boxes along the true boxes `truth` (n, 9)."""
     n = len(truth)
     points = [returns(box, rng) for box in truth]
     boxes = jittered(truth, rng, **noise)
@@ -75,7 +76,7 @@ def track_of(truth, rng, name='1', **noise):
 
 
 def stream_of(tracks):
-    """Return one (Sweep, BoxArray) per stamp of `tracks`, points of all of them together."""
+    """Return one (Sweep, BoxArray) per stamp of `tracks`, with the points of all of them."""
     pairs = []
     for stamp_ns in sorted({int(s) for track in tracks for s in track.stamps_ns}):
         here = [(t, i) for t in tracks for i in np.flatnonzero(t.stamps_ns == stamp_ns)]
@@ -92,7 +93,7 @@ def stream_of(tracks):
 
 
 def window_of(track, config):
-    """Return the window of all observations of `track`, none of which was solved before."""
+    """Return the window of all observations of `track`, all of them new."""
     observations = [
         observe(sweep, boxes.boxes, boxes.stamp_ns, config)[0]
         for sweep, boxes in stream_of([track])
@@ -103,48 +104,113 @@ def window_of(track, config):
 
 def problem_of(boxes, **changes):
     """
-    Return the problem of `boxes` (B, N, 9), but for `changes`.
+    Return the problem of `boxes` (B, N, 9) with some fields changed.
 
-    One every 0.1 s, without points or memory. `deviations` are by name, those not given are NaN.
+    At 10 Hz, without points or prior. `class_numbers` are by name, those not given are NaN.
 
     """
     boxes = torch.as_tensor(boxes, dtype=torch.float64)
     B, N = boxes.shape[:2]
-    points = torch.as_tensor(changes.pop('points', np.full((B, N, 1, 3), AWAY))).clone()
+    points = torch.as_tensor(
+        changes.pop('points', np.full((B, N, 1, 3), PADDING_POSITION))
+    ).clone()
     given = {
         'boxes': boxes,
         'start': boxes,
         'valid': torch.ones(B, N, dtype=torch.bool),
         'times': 0.1 * torch.arange(N, dtype=torch.float64).expand(B, N),
         'points': points,
-        'mask': points[..., 0] != AWAY,
+        'mask': points[..., 0] != PADDING_POSITION,
         'delays': torch.zeros(points.shape[:3], dtype=torch.float64),
         'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
         'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
-        'recalled': torch.zeros(B, MEMORY, dtype=torch.float64),
-        'information': torch.zeros(B, MEMORY, MEMORY, dtype=torch.float64),
-        'seen': torch.zeros(B, 4, dtype=torch.float64),
-        'deviations': torch.full((B, len(DEVIATIONS)), torch.nan, dtype=torch.float64),
+        'prior_mean': torch.zeros(B, PRIOR_SIZE, dtype=torch.float64),
+        'prior_information': torch.zeros(B, PRIOR_SIZE, PRIOR_SIZE, dtype=torch.float64),
+        'marginalised_extents': torch.zeros(B, 4, dtype=torch.float64),
+        'class_numbers': torch.full((B, len(CLASS_NUMBERS)), torch.nan, dtype=torch.float64),
     }
-    for name, values in changes.pop('deviations', {}).items():
-        given['deviations'][:, DEVIATIONS.index(name)] = torch.as_tensor(values)
+    for name, values in changes.pop('class_numbers', {}).items():
+        given['class_numbers'][:, CLASS_NUMBERS.index(name)] = torch.as_tensor(values)
     more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
     problem = Problem(**{**given, **more})
-    problem.points[~problem.mask] = AWAY
+    problem.points[~problem.mask] = PADDING_POSITION
     return problem
 
 
 def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
-    """Return what a window shares (B, 22): `extent`, and parts by the names of their slices."""
+    """Return shared parameters (B, 22): `extent`, and parts by the names of their slices."""
     shared = torch.zeros(B, SHARED, dtype=torch.float64)
     shared[:, :3] = torch.tensor(extent)
     for name, value in parts.items():
-        shared[:, getattr(objective, name)] = torch.as_tensor(value, dtype=torch.float64)
+        shared[:, getattr(batch, name)] = torch.as_tensor(value, dtype=torch.float64)
     return shared
 
 
+def boxes_at(*poses, extent=(4.0, 2.0, 2.0)):
+    """Return boxes (1, N, 9) at poses (x, y, z, roll, pitch, yaw); what is left out is 0."""
+    full = [(*pose, *[0.0] * (6 - len(pose))) for pose in poses]
+    rows = [[*pose[:3], *extent, *pose[3:]] for pose in full]
+    return torch.tensor([rows], dtype=torch.float64)
+
+
+def random_problem(B=3, N=6, M=20, seed=0):
+    """Return a problem of random boxes of about 4 x 2 x 1.5 m and points, padded by up to two."""
+    rng = np.random.default_rng(seed)
+    boxes = rng.normal(size=(B, N, 9))
+    boxes[..., 3:6] = [4, 2, 1.5] + 0.1 * rng.random((B, N, 3))
+    boxes[..., 6:8] *= 0.1
+    valid = np.arange(N) < np.array([N, N - 1, N - 2])[:B, None]
+    return problem_of(
+        boxes,
+        valid=valid,
+        times=np.cumsum(rng.random((B, N)) + 0.05, 1),
+        points=rng.normal(size=(B, N, M, 3)),
+        mask=(rng.random((B, N, M)) < 0.8) & valid[..., None],
+    )
+
+
+def random_weights(rng, *shape):
+    """Return random symmetric positive definite weights (*shape, shape[-1])."""
+    root = torch.from_numpy(rng.normal(size=(*shape, shape[-1])))
+    return root @ root.mT
+
+
+def terms_of(problem, seed=1):
+    """Return every term of a problem by name, with random weights and data."""
+    rng = np.random.default_rng(seed)
+    B, N = problem.valid.shape
+    inset = torch.from_numpy(rng.random((B, N, 6)))
+    expected = torch.from_numpy(rng.normal(size=(B, SHARED)))
+    axes = rotation_from_rpy(problem.pose[..., 3:] + 0.1)
+    wanted = torch.from_numpy(rng.normal(size=(B, N, 6)))
+    mean = torch.from_numpy(rng.normal(size=(B, 1, PRIOR_SIZE)))
+    shapes = {  # of the weights, and the data
+        terms.faces: ((N, 6, 4), (problem.pose, inset)),
+        terms.input_pose: ((N, 1, 6), (problem.pose, axes)),
+        terms.rigid_shape: ((N, 1, 6), (0.9 * problem.pose, wanted)),
+        terms.acceleration: ((N - 2, 1, 6), (problem.times,)),
+        terms.zero_motion: ((N - 1, 1, 6), ()),
+        terms.slip: ((N - 1, 1, 2), (problem.times,)),
+        terms.shared_prior: ((1, 1, SHARED), (expected,)),
+        terms.marginalisation_prior: ((1, 1, PRIOR_SIZE), (mean,)),
+    }
+    return {
+        function.__name__: terms.Term(function, random_weights(rng, B, *shape), data)
+        for function, (shape, data) in shapes.items()
+    }
+
+
+def random_variables(problem, seed=2):
+    """Return variables (B, 6 N + 22) about the input poses of a problem."""
+    rng = np.random.default_rng(seed)
+    B, N = problem.valid.shape
+    pose = problem.pose + 0.1 * torch.from_numpy(rng.normal(size=(B, N, 6)))
+    shared = 3 + torch.from_numpy(rng.normal(size=(B, SHARED)))
+    return State(pose, shared).pack()
+
+
 def dense(chain, N):
-    """Return the matrices (B, D, D) of a `Chain` of N links as they are, zeros and all."""
+    """Return the dense matrices (B, D, D) of a `Chain` of N links."""
     B, D = len(chain.links), LINK * N + chain.corner.shape[1]
     whole = chain.links.new_zeros(B, D, D)
     whole[:, LINK * N :, LINK * N :] = chain.corner

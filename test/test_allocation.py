@@ -1,4 +1,4 @@
-"""What is freed is there for the next array."""
+"""Freed memory is reused for the next arrays."""
 
 import platform
 import subprocess
@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-FAULTS = """
+PAGE_FAULTS = """
 import resource
 import sys
 from threading import Thread
@@ -17,20 +17,20 @@ if sys.argv[1] == 'kept':
     keep_freed_memory()
 
 
-def tick():
-    arrays = [np.ones(100_000) for _ in range(12)]  # all of them are there at once
+def step():
+    arrays = [np.ones(100_000) for _ in range(12)]  # all at the same time
     return sum(len(array) for array in arrays)
 
 
 def faults(count):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     for _ in range(count):
-        tick()
+        step()
     print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 def twice():
-    tick()
+    step()
     faults(20)
 
 
@@ -42,12 +42,12 @@ twice()
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='another C library')
-def test_arrays_of_one_tick_take_the_memory_of_the_last():
-    # 1.2 million numbers of 8 bytes are 2,343 pages of 4096; Python itself touches few.
+def test_arrays_of_one_step_reuse_the_memory_of_the_step_before():
+    # 1.2 million float64 are 2,343 pages of 4096 bytes; Python itself uses few.
     faults = {}
-    for case in ('given back', 'kept'):
-        command = [sys.executable, '-c', FAULTS, case]
+    for case in ('returned', 'kept'):
+        command = [sys.executable, '-c', PAGE_FAULTS, case]
         found = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         faults[case] = [int(number) for number in found.split()]
-    assert min(faults['given back']) > 20 * 2343 / 2
+    assert min(faults['returned']) > 20 * 2343 / 2
     assert max(faults['kept']) < 2343 / 2

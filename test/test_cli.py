@@ -1,3 +1,5 @@
+"""The command line: arguments, exit status, one line per failure, signals."""
+
 import fcntl
 import io
 import os
@@ -11,6 +13,7 @@ import time
 
 from boxreg_ros import cli
 from boxreg_ros.config import Config
+from boxreg_ros.reasons import REASONS
 from paths import ROOT
 import pytest
 from ros_messages import Drive
@@ -29,13 +32,13 @@ def boxreg(capsys, *arguments):
     return status, out, err
 
 
-def started(*arguments, **options):
-    """Start the command in a process of its own."""
+def start(*arguments, **options):
+    """Start the command in another process."""
     command = [sys.executable, '-m', 'boxreg_ros.cli', *map(str, arguments)]
     return subprocess.Popen(command, cwd=ROOT, text=True, **options)
 
 
-def test_relabel_says_in_one_line_what_was_done(tmp_path, capsys):
+def test_relabel_prints_one_closing_line(tmp_path, capsys):
     recording = Drive(sweeps=5).write(tmp_path / 'drive')
     out = tmp_path / 'out'
     status, text, err = boxreg(capsys, 'relabel', recording, '-o', out, *QUICK)
@@ -49,7 +52,7 @@ def test_relabel_says_in_one_line_what_was_done(tmp_path, capsys):
     assert (out / 'boxes.csv').exists()
 
 
-def test_all_options_reach_the_run(tmp_path, capsys):
+def test_options_reach_the_run(tmp_path, capsys):
     drive = Drive(sweeps=8, motion='odometry')
     recording = drive.write(tmp_path / 'drive')
     config = tmp_path / 'config.yaml'
@@ -71,23 +74,23 @@ def test_all_options_reach_the_run(tmp_path, capsys):
     assert not (out / 'openlabel').exists()
 
 
-def test_resume_does_what_is_left_to_do(tmp_path, capsys):
+def test_resume_repeats_nothing_with_the_same_settings(tmp_path, capsys):
     recording = Drive(sweeps=3).write(tmp_path / 'drive')
     command = ['relabel', recording, '-o', tmp_path / 'out', *QUICK, '--resume']
     assert ' boxes in' in boxreg(capsys, *command)[1]
     before = (tmp_path / 'out' / 'boxes.csv').stat().st_mtime_ns
-    assert 'already there' in boxreg(capsys, *command)[1]
+    assert 'up to date' in boxreg(capsys, *command)[1]
     assert (tmp_path / 'out' / 'boxes.csv').stat().st_mtime_ns == before
     assert ' boxes in' in boxreg(capsys, *command, '--set', 'max_gap=0.9')[1]
 
 
-def test_resume_where_results_lie_in_the_recording_or_are_gone(tmp_path, capsys):
+def test_resume_with_results_inside_the_recording_or_missing_files(tmp_path, capsys):
     folder = Drive(sweeps=3).write(tmp_path / 'drive', 'sqlite3')
     out = folder / 'out'
     formats = 'openlabel,mcap'
     command = ['relabel', folder, '-o', out, *QUICK, '--formats', formats, '--report', '--resume']
     assert ' boxes in' in boxreg(capsys, *command)[1]
-    assert 'already there' in boxreg(capsys, *command)[1]
+    assert 'up to date' in boxreg(capsys, *command)[1]
     for name in ('boxes.csv', 'overlay.mcap', 'report.html', 'openlabel/labels.json'):
         (out / name).unlink()
         assert ' boxes in' in boxreg(capsys, *command)[1], f'without {name}'
@@ -100,18 +103,23 @@ def test_resume_where_results_lie_in_the_recording_or_are_gone(tmp_path, capsys)
         (['--boxes', '/points'], 1, 'Detection3DArray'),
         (['--fixed-frame', 'world'], 1, "fixed frame 'world'"),
         (['--fixed-frame', 'world'], 1, 'leave --fixed-frame out to have one chosen'),
-        (['--start', '9'], 1, 'start and end'),
-        (['--start', 'nan'], 2, 'start: expected seconds from the beginning, got nan'),
-        (['--end', 'inf'], 2, 'end: expected seconds from the beginning, got inf'),
+        (['--start', '9'], 1, 'got 9 to the end; choose a smaller --start'),
+        (['--start', 'nan'], 2, 'start: expected seconds from the beginning of the recording'),
+        (['--start', '-0.5'], 2, '0 or more, got -0.5; leave --start out'),
+        (['--end', 'inf'], 2, '0 or more, got inf; leave --end out'),
+        (['--start', '1.5', '--end', '0.5'], 2, 'end: expected more than start (1.5 s), got 0.5;'),
+        (['--end', '0'], 2, 'end: expected more than start (0 s), got 0; choose a larger --end'),
         (['--set', 'windw=5'], 2, 'windw: no such setting'),
         (['--set', 'window=five'], 2, 'window: expected int'),
         (['--set', 'window=2'], 2, 'window: expected 3 to 1000'),
         (['--set', 'window'], 2, 'expected KEY=VALUE'),
-        (['--set', 'names=[a'], 2, 'not a YAML value'),
+        (['--set', 'names=[a'], 2, 'names: expected a YAML value'),
         (['--config', 'no_such.yaml'], 2, 'no_such.yaml'),
         (['--formats', 'csv,kiti'], 2, "format 'kiti'"),
         (['--workers', '-1'], 2, 'solver.threads'),
-        (['--frobnicate'], 2, '--frobnicate'),
+        (['--frobnicate'], 2, 'unrecognized arguments: --frobnicate\n'),
+        (['--reprot'], 2, 'unrecognized arguments: --reprot; did you mean --report?'),
+        (['--fixedframe=map'], 2, '--fixedframe=map; did you mean --fixed-frame?'),
     ],
 )
 def test_failures_take_one_line(tmp_path, capsys, options, status, expected):
@@ -125,16 +133,70 @@ def test_failures_take_one_line(tmp_path, capsys, options, status, expected):
     assert not (tmp_path / 'out').exists()
 
 
-def test_missing_file_and_missing_arguments(tmp_path, capsys):
+def test_missing_recording_and_missing_arguments(tmp_path, capsys):
     status, _, err = boxreg(capsys, 'relabel', tmp_path / 'none.mcap', '-o', tmp_path / 'out')
     assert status == 1
     assert 'no such recording' in err
     assert boxreg(capsys, 'relabel', tmp_path)[0] == 2
-    assert boxreg(capsys)[0] == 2
-    assert boxreg(capsys, 'relable')[0] == 2
 
 
-def test_folder_that_cannot_be_written(tmp_path, capsys):
+def test_no_argument_prints_the_help(capsys):
+    status, out, err = boxreg(capsys)
+    assert (status, out) == (2, '')  # argparse exits with 2 where a required argument is missing
+    assert err == boxreg(capsys, '--help')[1]
+
+
+def test_unknown_command_proposes_a_similar_one(capsys):
+    status, _, err = boxreg(capsys, 'relable', 'drive.mcap')
+    assert status == 2
+    assert err.endswith("got 'relable'; did you mean relabel?\n")
+    status, _, err = boxreg(capsys, 'frobnicate')
+    assert status == 2
+    assert 'COMMAND: expected one of relabel, ' in err
+    assert 'did you mean' not in err
+
+
+def test_run_that_refines_no_box_fails_and_keeps_the_result(tmp_path, capsys):
+    drive = Drive(sweeps=5)
+    drive.items = [item for item in drive.items if item[0] != '/points' or item[1] < 0]
+    first = Drive(sweeps=5).items[1:]
+    drive.items += [item for item in first if item[0] == '/points'][:1]
+    recording = drive.write(tmp_path / 'drive')
+    command = ['relabel', recording, '-o', tmp_path / 'out', *QUICK, '--resume']
+    status, out, err = boxreg(capsys, *command)
+    assert status == 1
+    assert ': 10 boxes in, 0 refined, 10 kept (no_sweep 8, short_track 2)' in out
+    (line,) = err.splitlines()
+    reason = REASONS['no_sweep']
+    assert line == (
+        f'boxreg: none of 10 boxes was refined; most frequent reason: no_sweep (8 boxes): '
+        f'{reason.meaning}; remedy: {reason.remedy}'
+    )
+    assert (tmp_path / 'out' / 'boxes.csv').exists()
+    status, out, _ = boxreg(capsys, *command)
+    assert status == 1
+    assert 'up to date' in out
+
+
+@pytest.mark.parametrize('command', [['--help'], [], ['relabel', '--help'], ['relable']])
+def test_parsing_imports_neither_torch_nor_rosbags(command):
+    code = (
+        'import sys\n'
+        'from boxreg_ros.cli import main\n'
+        'try:\n'
+        '    main(sys.argv[1:])\n'
+        'except SystemExit:\n'
+        '    pass\n'
+        "print(*sorted({'rosbags', 'torch'} & set(sys.modules)), file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code, *command], cwd=ROOT, capture_output=True, text=True
+    )
+    assert 'usage: boxreg' in done.stdout + done.stderr
+    assert done.stderr.splitlines()[-1] == ''
+
+
+def test_output_below_a_file_is_an_error(tmp_path, capsys):
     recording = Drive(sweeps=2).write(tmp_path / 'drive')
     (tmp_path / 'file').touch()
     status, _, err = boxreg(capsys, 'relabel', recording, '-o', tmp_path / 'file' / 'out')
@@ -142,16 +204,19 @@ def test_folder_that_cannot_be_written(tmp_path, capsys):
     assert len(err.splitlines()) == 1
 
 
-def test_unexpected_errors_point_to_debug(tmp_path, capsys, monkeypatch):
+def test_internal_exception_takes_one_line_and_debug_raises_it(tmp_path, capsys, monkeypatch):
     def broken(args):
         raise ZeroDivisionError('impossible')
 
-    from boxreg_ros.offline import relabel
+    from boxreg_ros.offline import relabel_command
 
-    monkeypatch.setattr(relabel, 'run', broken)
+    monkeypatch.setattr(relabel_command, 'run', broken)
     status, _, err = boxreg(capsys, 'relabel', 'a', '-o', 'b')
     assert status == 1
-    assert err == 'boxreg: unexpected ZeroDivisionError: impossible (--debug shows where)\n'
+    assert err == (
+        'boxreg: unexpected ZeroDivisionError: impossible; this is a fault of boxreg: please '
+        'report it with the traceback, which --debug prints\n'
+    )
     with pytest.raises(ZeroDivisionError):
         cli.main(['relabel', 'a', '-o', 'b', '--debug'])
     with pytest.raises(ZeroDivisionError):
@@ -176,28 +241,28 @@ def test_help_and_version(capsys):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupt_leaves_nothing(tmp_path, number):
     recording = Drive(sweeps=60).write(tmp_path / 'drive')
-    ours = signal.signal(number, signal.SIG_DFL)  # the suite itself may be run by nohup
-    process = started(
+    before = signal.signal(number, signal.SIG_DFL)  # nohup would have it ignored
+    process = start(
         'relabel', recording, '-o', tmp_path / 'results' / 'out',
         '--set', 'solver.rounds=100', '--set', 'solver.iterations=10000',
         '--set', 'solver.tolerance=0', '--set', 'estimate=early',
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
-    signal.signal(number, ours)
+    signal.signal(number, before)
     deadline = time.monotonic() + 60
     while not any((tmp_path / 'results').glob('.out.*')) and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(number)
     out, err = process.communicate(timeout=60)
-    # Started by -m, Python ends by the signal itself where that came amid an exec() of text, as
-    # of rosbags' generated readers; a shell shows 130 for both.
+    # Python that runs a module by -m may end by SIGINT itself if that is received in an exec()
+    # of source text, as rosbags does with its generated readers. A shell shows 130 for both.
     assert process.returncode in ((130, -number) if number == signal.SIGINT else (128 + number,))
-    how = 'interrupted' if number == signal.SIGINT else f'ended by {number.name}'
-    assert (out, err) == ('', f'boxreg: {how}; nothing was written\n')
+    cause = 'interrupted' if number == signal.SIGINT else f'ended by {number.name}'
+    assert (out, err) == ('', f'boxreg: {cause}; nothing was written\n')
     assert list((tmp_path / 'results').iterdir()) == []
 
 
-def test_a_hangup_does_not_end_what_is_run_by_nohup(tmp_path):
+def test_nohup_run_survives_a_hangup(tmp_path):
     recording = Drive(sweeps=20).write(tmp_path / 'drive')
     command = ['nohup', sys.executable, '-m', 'boxreg_ros.cli', 'relabel', recording]
     silent = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
@@ -210,20 +275,20 @@ def test_a_hangup_does_not_end_what_is_run_by_nohup(tmp_path):
     assert (tmp_path / 'out' / 'boxes.csv').exists()
 
 
-def test_names_that_a_terminal_cannot_show(tmp_path):
-    recording = Drive(sweeps=2).write(tmp_path / 'drive')
-    process = started(
+def test_file_names_that_the_output_cannot_encode(tmp_path):
+    recording = Drive(sweeps=4).write(tmp_path / 'drive')
+    process = start(
         'relabel', recording, '-o', tmp_path / 'ü', *QUICK, stdout=subprocess.PIPE,
         env=os.environ | {'PYTHONIOENCODING': 'ascii'},
     )  # fmt: skip
     out = process.communicate(timeout=60)[0]
     assert process.returncode == 0
-    assert '\\xfc: 4 boxes in' in out
+    assert '\\xfc: 8 boxes in' in out
 
 
-def test_reader_that_goes_away_is_no_error(tmp_path):
-    recording = Drive(sweeps=2).write(tmp_path / 'drive')
-    process = started(
+def test_closed_output_is_no_error(tmp_path):
+    recording = Drive(sweeps=4).write(tmp_path / 'drive')
+    process = start(
         'relabel', recording, '-o', tmp_path / 'out', *QUICK,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
@@ -234,23 +299,23 @@ def test_reader_that_goes_away_is_no_error(tmp_path):
     assert (tmp_path / 'out' / 'boxes.csv').exists()
 
 
-def test_progress_bar_only_for_people(tmp_path):
+def test_progress_bar_on_a_terminal(tmp_path):
     recording = Drive(sweeps=4).write(tmp_path / 'drive')
     leader, follower = pty.openpty()
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 100, 0, 0))
-    process = started(
+    process = start(
         'relabel', recording, '-o', tmp_path / 'out', *QUICK,
         stdout=subprocess.PIPE, stderr=follower,
     )  # fmt: skip
     os.close(follower)
-    seen = io.BytesIO()
+    shown = io.BytesIO()
     try:
         while chunk := os.read(leader, 4096):
-            seen.write(chunk)
-    except OSError:  # the other end is closed
+            shown.write(chunk)
+    except OSError:  # the process has closed its end
         pass
     os.close(leader)
     out = process.communicate(timeout=60)[0]
     assert process.returncode == 0
     assert len(out.splitlines()) == 1
-    assert b's of the recording' in seen.getvalue()
+    assert b's of the recording' in shown.getvalue()

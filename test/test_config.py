@@ -7,14 +7,14 @@ import pytest
 import yaml
 
 
-def test_defaults_are_their_own_settings():
+def test_settings_list_the_defaults():
     config = Config()
     assert [item for item, _ in config.items()] == list(settings())
     assert all(value == item.default for item, value in config.items() if '.' not in item.name)
     assert Config.from_dict({}) == config
 
 
-def test_every_setting_says_what_it_means():
+def test_every_setting_has_a_meaning_and_bounds():
     names = [item.name for item in settings()]
     assert len(names) == len(set(names)) > 30
     for item in settings():
@@ -25,7 +25,7 @@ def test_every_setting_says_what_it_means():
             assert item.low <= item.default <= item.high, item.name
 
 
-def test_dictionary_and_yaml_give_back_what_they_took(tmp_path):
+def test_dictionary_and_yaml_round_trip(tmp_path):
     config = Config.from_dict(
         {
             'objective': 'paper',
@@ -45,7 +45,7 @@ def test_dictionary_and_yaml_give_back_what_they_took(tmp_path):
 
 
 @pytest.mark.parametrize('node', ['/**', 'boxreg', '/robot/boxreg'])
-def test_parameter_files_of_ros_are_read(tmp_path, node):
+def test_ros_parameter_files_are_read(tmp_path, node):
     path = tmp_path / 'params.yaml'
     path.write_text(f'{node}:\n  ros__parameters:\n    window: 12\n    solver: {{rounds: 3}}\n')
     config = Config.from_yaml(path)
@@ -58,7 +58,7 @@ def test_empty_file_means_defaults(tmp_path):
     assert Config.from_yaml(path) == Config()
 
 
-def test_exponents_without_a_point_are_numbers(tmp_path):
+def test_exponents_without_a_decimal_point_are_numbers(tmp_path):
     path = tmp_path / 'config.yaml'
     path.write_text('solver: {tolerance: 1e-6}\n')
     assert Config.from_yaml(path).solver.tolerance == 1e-6
@@ -83,6 +83,11 @@ def test_dotted_names_update_a_copy():
 def test_unknown_keys_are_refused_by_name(values, name):
     with pytest.raises(ConfigError, match=rf'^{name}: no such setting; expected one of '):
         Config.from_dict(values)
+
+
+def test_a_renamed_setting_is_refused_with_its_new_name():
+    with pytest.raises(ConfigError, match=r'set faces\.inset_ends'):
+        Config().updated({'faces.depth_ends': 0.3})
 
 
 @pytest.mark.parametrize('name', ['windw', 'solver.round', 'window.size', 'a.b.c'])
@@ -137,24 +142,24 @@ def test_wrong_types_are_refused_by_name(name, value):
 @pytest.mark.parametrize(
     'text', ['- 1\n- 2\n', 'word\n', 'a: [\n', '/**:\n  ros__parameters: 3\n', 'window: 2\n']
 )
-def test_unfit_files_are_named(tmp_path, text):
-    path = tmp_path / 'unfit.yaml'
+def test_errors_of_invalid_files_name_the_file(tmp_path, text):
+    path = tmp_path / 'invalid.yaml'
     path.write_text(text)
-    with pytest.raises(ConfigError, match=r'unfit\.yaml') as caught:
+    with pytest.raises(ConfigError, match=r'invalid\.yaml') as caught:
         Config.from_yaml(path)
     assert '\n' not in str(caught.value)
 
 
-def test_missing_and_foreign_files_are_named(tmp_path):
-    foreign = tmp_path / 'foreign.yaml'
-    foreign.write_bytes(b'\xff\xfe\x00')
-    for path in (foreign, tmp_path / 'absent.yaml', Path(tmp_path)):
+def test_errors_of_unreadable_files_name_the_file(tmp_path):
+    binary = tmp_path / 'binary.yaml'
+    binary.write_bytes(b'\xff\xfe\x00')
+    for path in (binary, tmp_path / 'absent.yaml', Path(tmp_path)):
         with pytest.raises(BoxregError, match=path.name):
             Config.from_yaml(path)
 
 
 @pytest.mark.parametrize(
-    ('class_name', 'kind'),
+    ('class_name', 'group'),
     [
         ('car', 'vehicle'),
         ('Pedestrian', 'pedestrian'),
@@ -166,12 +171,12 @@ def test_missing_and_foreign_files_are_named(tmp_path):
         ('', 'vehicle'),
     ],
 )
-def test_class_names_find_their_kind(class_name, kind):
+def test_class_names_select_a_group(class_name, group):
     config = Config()
-    assert config.class_config(class_name) is getattr(config, kind)
+    assert config.class_config(class_name) is getattr(config, group)
 
 
-def test_names_of_a_kind_may_be_in_any_case():
+def test_names_of_a_group_may_be_in_any_case():
     config = Config().updated({'pedestrian.names': ['Fussgaenger']})
     for name in ('FUSSGAENGER', 'fussgaenger', 'human-Fussgaenger'):
         assert config.class_config(name) is config.pedestrian

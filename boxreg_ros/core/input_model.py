@@ -1,292 +1,489 @@
-"""What the input tells about itself: its annotation rule, and how it errs."""
+"""
+The input model: labelling margins, noise of the input boxes, population prior on extents.
+
+docs/method.md, section Input model, has the formulas (M14) to (M18).
+
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import FaceConfig
 from boxreg_ros.core.arrowhead import Factor
-from boxreg_ros.core.face_support import Rule, Support
+from boxreg_ros.core.batch import EXTENT, POSE_ERRORS, Problem, State
+from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
 from boxreg_ros.core.geometry import rotation_from_rpy
-from boxreg_ros.core.objective import ERRORS, EXTENT, Problem, State
 from boxreg_ros.structures import Floats
 import numpy as np
 import torch
 from torch import Tensor
 
-KINDS = ([0, 1], [2, 3], [4], [5])  # ends, sides, top, bottom
-RULE_ERROR = (0.05, 0.05, 0.05, 0.15)  # how far a rule may be from the expected one [m]
-TRACKS, SCATTERS = 200, 100  # remembered: tracks, and observations of each
-LEAST = 14  # observations of a track, that it tells how its input errs
-USUAL = 0.385  # correlation of the errors of an input from one observation to the next
-TENTH = 0.1  # of a second, over which errors that are biased are correlated
-APART = 0.5, 0.7  # tracks so far off are biased, and by no more than that [usual errors]
-CAREFUL = 0.4  # part of the usual error: boxes that scatter less were drawn with care
-UNLIKE = 0.5  # objects that differ by so much in logarithms of extents say half of each other
-# Corrections of extents over sizes, by squared errors: 0.6 where extents err by 5 % is usual, and
-# half of that over the sizes of the other two.
-SLOPES = 240.0
-HELD = 1e-3  # step of a box that only repeats the one before [m, rad]
+# Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
+# each of them.
+MAD_TO_DEVIATION = 1.48
+"""Standard deviation over median absolute deviation. Derived: 1 / 0.6745 for a Gaussian."""
+QUARTILES_TO_DEVIATION = 0.74
+"""Standard deviation over interquartile range. Derived: 1 / 1.349 for a Gaussian."""
+
+FACE_GAPS = ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
+"""Settings of `ClassConfig` that are the expected margins of the six faces."""
+FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
+"""Faces with one labelling margin: ends, sides, top, bottom."""
+GAP_DEVIATIONS = (0.05, 0.05, 0.05, 0.15)
+"""Prior deviation of the margin of each group from the one its class lets expect [m]."""
+MIN_TRACK_OBSERVATIONS = 3
+"""Fewest face observations of a track, and tracks, that a margin is learnt from."""
+MIN_GAP_DEVIATION = 0.02
+"""Added to the interquartile range of margins: few tracks may agree by chance [m]."""
+MIDMEAN_FACTOR = 1.1
+"""Error of the mean of the middle half over that of the mean. Derived: sqrt(1.2), the efficiency
+of the midmean of a Gaussian."""
+MAX_LEARNT_DISTANCE = 0.5
+"""No margin is learnt from points further than this from where they are expected [m]."""
+MIN_BOX_POINTS = 30
+"""No margin is learnt from near boxes with fewer points."""
+MAX_VISIBLE_SHARE = 0.25
+"""A face with a smaller share of the occlusion inset counts as visible."""
+MIN_OCCLUDED_SHARE = 0.5
+"""A face with a larger share of the occlusion inset counts as occluded."""
+MIN_DISTANT_SHARE = 0.5
+"""A face with a larger share of the range inset counts as distant: beyond 45 m."""
+
+MAX_TRACKS = 200
+"""Tracks that the model keeps, those seen last."""
+MAX_FITS_PER_TRACK = 100
+"""Fits of each track that the model keeps, the last ones."""
+
+MIN_OBSERVATIONS_FOR_NOISE = 14
+"""Fewest observations of a track that noise is estimated from. With as many in total the
+estimate has weight 1/2."""
+MAX_CORRELATION = 0.9
+"""Largest correlation of the errors of consecutive observations."""
+MIN_POWER = 1e-12
+"""Errors with a smaller variance do not change along a track [m^2, rad^2]."""
+TYPICAL_CORRELATION = 0.385
+"""Correlation of the errors of consecutive observations before any was estimated."""
+CORRELATION_INTERVAL = 0.1
+"""Time over which the errors of biased input are correlated [s]."""
+WHITE_CORRELATION = 0.15
+"""Input whose errors are correlated by less over that time has (nearly) no bias."""
+CORRELATION_SPAN = 0.3
+"""Above `WHITE_CORRELATION` by this much, the bias is as large as the error."""
+FILTERED_OFFSET = 0.5
+"""Input of tracks whose means are off by this multiple of its usual error has been filtered."""
+MAX_FILTERED_BIAS = 0.7
+"""Largest bias of filtered input, as a multiple of its usual error."""
+LOW_NOISE_RATIO = 0.4
+"""Input with less than this part of its usual error is low-noise input, such as human labels."""
+RATIO_BOUNDS = (0.02, 4.0)
+"""Bounds of estimated over expected error."""
+YAW_BIAS = 0.5
+"""Bias of the input yaw over that of the other variables, in deviations."""
+PIVOT_DEVIATION = 0.25
+"""Deviation of the pivot, as part of the length."""
+
+POPULATION_RADIUS = 0.5
+"""Distance in logarithms of extents at which objects have weight 1/2 for each other."""
+SLOPE_DEVIATION = 240.0
+"""Prior deviation of the slope of extent corrections, per squared error. Derived: 0.6 for input
+whose extents err by 5 %, 0.6 / 0.05^2."""
+CROSS_SLOPE_INFORMATION = 4.0
+"""Prior information of slopes over the other two extents: half the deviation of the own one."""
+MIN_EXTENT_GAIN = 0.2
+"""Fewest part of the information about an extent that must be of points to count as evidence."""
+REPEATED_BOX_TOLERANCE = 1e-3
+"""A box that differs from the one before by less repeats it [m, rad]."""
 
 
 class InputNoise(NamedTuple):
     """
-    How input poses and extents scatter about their fits.
+    Estimated errors of the input poses and extents.
 
     Attributes
     ----------
-    deviation, correlation, offset : Tensor, shape (9,)
-        Robust standard deviation along the box axes (lon lat z roll pitch yaw [m, rad], extents
-        as part of each) about the mean of a track, correlation from one observation to the next,
-        0 to 0.9, and robust standard deviation of the means of the tracks about zero.
-    trust : float
-        0 where nothing is known, a half after `LEAST` observations, near 1 after many.
-    told : Tensor, shape (n, 3, 3)
-        What the points of n tracks tell of their extents. Rows of length, width and height:
-        logarithms of those of the input, corrections to these in proportion to the square of
-        their expected error, and the weights of these; 0 where points tell too little.
+    deviation : Tensor, shape (9,)
+        Robust standard deviation about the mean of a track, along the box axes (lon lat z roll
+        pitch yaw [m, rad], extents as part of each).
+    correlation : Tensor, shape (9,)
+        Correlation from one observation to the next, 0 to 0.9.
+    offset : Tensor, shape (9,)
+        Robust standard deviation of the means of the tracks about zero.
+    weight : float
+        Weight of the estimate against the settings: 0 without observations, 1/2 after
+        `MIN_OBSERVATIONS_FOR_NOISE` observations, near 1 after many.
+    extent_evidence : Tensor, shape (n, 3, 3)
+        Evidence of the points of n tracks about their extents. Rows of length, width and height:
+        logarithms of the input's; corrections to these, over the square of their expected error;
+        the weights of these, 0 without enough evidence.
 
     """
 
     deviation: Tensor = torch.zeros(9, dtype=torch.float64)
     correlation: Tensor = torch.zeros(9, dtype=torch.float64)
     offset: Tensor = torch.zeros(9, dtype=torch.float64)
-    trust: float = 0.0
-    told: Tensor = torch.zeros(1, 3, 3, dtype=torch.float64)
+    weight: float = 0.0
+    extent_evidence: Tensor = torch.zeros(1, 3, 3, dtype=torch.float64)
 
     @classmethod
-    def measure(cls, scatter: Tensor) -> 'InputNoise':
-        """Pool the tracks (B, N, 9) that are long enough to tell; NaN tells nothing."""
-        valid, scatter = scatter.isfinite().all(2), scatter.nan_to_num()
-        valid &= valid.sum(1, keepdim=True) >= LEAST
-        if not (total := int(valid.sum())):
+    def estimate(cls, residuals: Tensor) -> 'InputNoise':
+        """
+        Estimate the noise of tracks (B, N, 9) from `input_residuals` (M14); NaN is left out.
+
+        Tracks with fewer than `MIN_OBSERVATIONS_FOR_NOISE` observations are left out too.
+
+        """
+        valid = residuals.isfinite().all(2)
+        valid &= valid.sum(1, keepdim=True) >= MIN_OBSERVATIONS_FOR_NOISE
+        residuals = residuals.nan_to_num()
+        total = int(valid.sum())
+        if not total:
             return cls()
+        tracks = valid.any(1).sum()
         count = valid.sum(1)[:, None, None].clamp(min=1)
-        mean = (scatter * valid[..., None]).sum(1, keepdim=True) / count
-        offset, scatter = 1.48 * mean[valid.any(1), 0].abs().median(0).values, scatter - mean
-        deviation = 1.48 * scatter[valid].abs().median(0).values
-        bounded = scatter.clamp(-3 * deviation, 3 * deviation)
+        mean = (residuals * valid[..., None]).sum(1, keepdim=True) / count
+        offset = MAD_TO_DEVIATION * mean[valid.any(1), 0].abs().median(0).values
+        centred = residuals - mean
+        deviation = MAD_TO_DEVIATION * centred[valid].abs().median(0).values
+        # Lag-one autocorrelation of errors clipped at three deviations.
+        bounded = centred.clamp(-3 * deviation, 3 * deviation)
         both = valid[:, 1:] & valid[:, :-1]
         first, second = bounded[:, :-1][both], bounded[:, 1:][both]
         power = (first.square() + second.square()).sum(0) / 2
-        # What never changes, such as an extent that a tracker holds, errs by the same all along;
-        # one or two tracks cannot tell it from the gap of their faces.
-        held = 1 - 2 / valid.any(1).sum()
-        slow = torch.where(power > 1e-12, (first * second).sum(0) / power, held).clamp(0.0, 0.9)
-        # The mean of a track takes part of what changes slowly along.
-        lost = (1 + slow) / (1 - slow) * valid.any(1).sum() / total
-        deviation = deviation / (1 - lost).clamp(min=0.3).sqrt()
-        return cls(deviation, slow, offset, total / (total + LEAST))
+        # A constant error, such as that of an extent that a tracker holds, is fully correlated;
+        # with one or two tracks it cannot be distinguished from the labelling margin.
+        constant = 1 - 2 / tracks
+        ratio = torch.where(power > MIN_POWER, (first * second).sum(0) / power, constant)
+        correlation = ratio.clamp(0.0, MAX_CORRELATION)
+        # The mean of a track removes part of the variance of correlated errors.
+        removed = (1 + correlation) / (1 - correlation) * tracks / total
+        deviation = deviation / (1 - removed).clamp(min=0.3).sqrt()
+        weight = total / (total + MIN_OBSERVATIONS_FOR_NOISE)
+        return cls(deviation, correlation, offset, weight)
 
 
-NOTHING = InputNoise()
+UNKNOWN_NOISE = InputNoise()
 
 
-def scatter(problem: Problem, state: State) -> Tensor:
+def input_residuals(problem: Problem, state: State) -> Tensor:
     """
-    Return input minus fit along the box axes, as `InputNoise` counts them, (B, N, 9).
+    Return input minus fit along the box axes, in the order of `InputNoise`, shape (B, N, 9).
 
-    NaN for boxes that repeat the one before, since what a tracker holds does not tell how it errs,
-    and for those without points: their fit follows the input.
+    NaN for boxes that repeat the one before, since boxes that a tracker holds have no new error,
+    and for those without points, since their fit follows the input.
 
     """
     difference = problem.pose - state.pose
-    along = (rotation_from_rpy(state.pose[..., 3:]).mT @ difference[..., :3, None])[..., 0]
+    axes = rotation_from_rpy(state.pose[..., 3:])
+    along = (axes.mT @ difference[..., :3, None])[..., 0]
     extent = problem.boxes[..., 3:6] / state.shared[:, None, EXTENT] - 1
-    found = torch.cat([along, difference[..., 3:], extent], -1)
-    # Before the first comes the last: of an object that is held all along it is the same box.
-    held = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1) < HELD
-    return torch.where((problem.mask.any(-1) & ~held)[..., None], found, torch.nan)
+    residuals = torch.cat([along, difference[..., 3:], extent], -1)
+    # The first box is compared with the last one: a track that is held throughout is left out.
+    change = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1)
+    is_new = problem.mask.any(-1) & ~(change < REPEATED_BOX_TOLERANCE)
+    return torch.where(is_new[..., None], residuals, torch.nan)
 
 
-class Expected(NamedTuple):
+class Expectation(NamedTuple):
     """
-    What is expected of a batch before its points are looked at.
+    Means and deviations of a batch before its points are used.
 
     Attributes
     ----------
     shared : Tensor, shape (B, 22)
-        What all observations of a window share, see `State`.
-    spread : Tensor, shape (B, 22)
-        Deviations of that; for gaps, parts of what is expected of them.
-    error, widened : Tensor, shape (B, 6)
-        Deviation of the input poses along the axes of their boxes, their bias apart, and what
-        counts for it where errors of neighbours are correlated [m, rad].
+        Mean of the shared variables, see `State`.
+    deviation : Tensor, shape (B, 22)
+        Their deviations; of labelling margins, multiples of `faces.spread`.
+    pose_deviation : Tensor, shape (B, 6)
+        Deviation of the input poses along the axes of their boxes, without their bias [m, rad].
+    widened_deviation : Tensor, shape (B, 6)
+        The same, widened for the correlation of the errors of neighbours [m, rad].
 
     """
 
     shared: Tensor
-    spread: Tensor
-    error: Tensor
-    widened: Tensor
+    deviation: Tensor
+    pose_deviation: Tensor
+    widened_deviation: Tensor
 
 
-def expect(problem: Problem, rule: Rule, noise: InputNoise = NOTHING) -> Expected:
+def expect(
+    problem: Problem, offsets: FaceOffsets, noise: InputNoise = UNKNOWN_NOISE
+) -> Expectation:
     """
-    Return what is expected of a batch, by what is known of how its input is drawn and errs.
+    Return the expectation of a batch, given labelling margins and noise of the input (M15).
 
     Notes
     -----
-    The error of an input is a part that is constant over its track, the bias, and one that
-    changes slowly: the correlation measured widens its deviation, and without correlation over a
-    tenth of a second there is no bias either. Input that scatters by less than `CAREFUL` of its
-    usual error errs by less than its scatter tells, and where that is below half of the usual its
-    extents are held more, too: it was drawn with care. But what a filter has smoothed scatters as
-    little, and errs by the same all along a track. Then the means of tracks are far off their
-    fits, and bias and extents stay free. Gaps differ between objects by twice as much where boxes
-    were drawn with care: these tell of their own.
+    The error of an input has a part that is constant over its track, the bias, and one that
+    changes. The correlation widens the deviation of the latter; without correlation over
+    `CORRELATION_INTERVAL` there is no bias. The estimated deviation of low-noise input is lowered
+    further, and its bias and extents are held, unless it has been filtered: filtered input has as
+    little scatter, but its errors are correlated along a whole track. Then the means of tracks are
+    far off their fits, and bias and extents stay free. Labelling margins of low-noise input differ
+    between objects by twice as much: human labels follow each object.
 
     """
-    of, valid, error = problem.of, problem.valid, problem.of(*ERRORS)
-    correlation = USUAL + noise.trust * (noise.correlation.to(error) - USUAL)
-    ratio = noise.deviation[:6].to(error) / error
-    ratio = (ratio * (ratio / CAREFUL).square().clamp(max=1.0)).clamp(0.02, 4.0)
-    ratio = (1 + noise.trust * (ratio**2 - 1)).sqrt()
-    interval = ((problem.times * valid).amax(1) / (valid.sum(1) - 1).clamp(1))[:, None]
-    slow = ((correlation ** (TENTH / interval) - 0.15) / 0.3).clamp(0.1, 1.0)
-    means = noise.offset[[0, 1, 6]].to(error) / torch.cat([error[:, :2], of('extent')], 1)
-    apart = noise.trust * (means.mean(1, keepdim=True) / APART[0]).square().clamp(max=APART[1])
-    lasting = torch.cat([ratio[:, :3].maximum(apart), ratio[:, 3:]], 1).clamp(0.1, 2.0)
-    bias = error * error.new_tensor([1, 1, 1, 1, 1, 0.5]) * slow[:, :6] * lasting
-    error, part = error * ratio, of('extent') * slow[:, 6:] * (2 * lasting[:, :3]).clamp(max=1)
-    widened = error * ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
-    total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1) + problem.seen[:, :3]
-    mean, one = total / (valid.sum(1)[:, None] + problem.seen[:, 3:]), torch.ones_like(error)
-    extent, loose = mean * extent_factor(noise.told, mean, part), (2 - 2 * lasting[:, :1]).clamp(1)
-    gaps = of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
-    shared = [extent, 0 * one, gaps + rule.gaps.to(error), mean[:, :1] * of('pivot'), 0 * one]
-    spread = [extent * part, bias, one * loose, mean[:, :1] / 4, one]
-    return Expected(torch.cat(shared, 1), torch.cat(spread, 1), error, widened)
+    valid = problem.valid
+    usual = problem.of_class(*POSE_ERRORS)
+    usual_extent = problem.of_class('extent')
+
+    # Deviations: the expected ones, and by the weight of the noise the estimated ones.
+    ratio = noise.deviation[:6].to(usual) / usual
+    low_noise = (ratio / LOW_NOISE_RATIO).square().clamp(max=1.0)
+    ratio = (ratio * low_noise).clamp(*RATIO_BOUNDS)
+    ratio = (1 + noise.weight * (ratio**2 - 1)).sqrt()
+    deviation = usual * ratio
+    correlation = noise.correlation.to(usual) - TYPICAL_CORRELATION
+    correlation = TYPICAL_CORRELATION + noise.weight * correlation
+    widening = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
+
+    # Bias: by the correlation over a fixed time, and by how large constant errors can be.
+    duration = (problem.times * valid).amax(1)
+    interval = (duration / (valid.sum(1) - 1).clamp(1))[:, None]
+    slow = correlation ** (CORRELATION_INTERVAL / interval) - WHITE_CORRELATION
+    slow = (slow / CORRELATION_SPAN).clamp(0.1, 1.0)
+    offsets_usual = torch.cat([usual[:, :2], usual_extent], 1)
+    filtered = noise.offset[[0, 1, 6]].to(usual) / offsets_usual
+    filtered = (filtered.mean(1, keepdim=True) / FILTERED_OFFSET).square()
+    filtered = noise.weight * filtered.clamp(max=MAX_FILTERED_BIAS)
+    constant = torch.cat([ratio[:, :3].maximum(filtered), ratio[:, 3:]], 1).clamp(0.1, 2.0)
+    bias = usual * usual.new_tensor([1, 1, 1, 1, 1, YAW_BIAS]) * slow[:, :6] * constant
+
+    # Extents: the mean of the input, corrected by the population.
+    mean = _mean_input_extents(problem)
+    part = usual_extent * slow[:, 6:] * (2 * constant[:, :3]).clamp(max=1)
+    extent = mean * population_factor(noise.extent_evidence, mean, part)
+
+    one = torch.ones_like(usual)
+    length = mean[:, :1]
+    gaps = problem.of_class(*FACE_GAPS) + offsets.gap_correction.to(usual)
+    loose = (2 - 2 * constant[:, :1]).clamp(1)
+    shared = [extent, 0 * one, gaps, length * problem.of_class('pivot'), 0 * one]
+    deviations = [extent * part, bias, one * loose, length * PIVOT_DEVIATION, one]
+    return Expectation(
+        torch.cat(shared, 1), torch.cat(deviations, 1), deviation, deviation * widening
+    )
 
 
-def extent_factor(told: Tensor, given: Tensor, error: Tensor) -> Tensor:
+def _mean_input_extents(problem: Problem) -> Tensor:
+    """Return the mean extents of the input, marginalised observations included, (B, 3) [m]."""
+    valid = problem.valid
+    total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1)
+    total = total + problem.marginalised_extents[:, :3]
+    return total / (valid.sum(1)[:, None] + problem.marginalised_extents[:, 3:])
+
+
+def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
     """
-    Return what true extents are expected to be, as parts of those of the input, (B, 3).
+    Return expected over given extents, by the population of tracks (M16), shape (B, 3).
 
     Parameters
     ----------
-    told : Tensor, shape (n, 3, 3)
-        What points tell of the extents of n tracks, see `InputNoise`.
-    given, error : Tensor, shape (B, 3)
-        Mean extents of the input [m], and how much they err, as parts of them.
+    evidence : Tensor, shape (n, 3, 3)
+        Evidence of the points of n tracks about their extents, see `InputNoise`.
+    given : Tensor, shape (B, 3)
+        Mean extents of the input [m].
+    error : Tensor, shape (B, 3)
+        Their expected error, as part of each.
 
     Notes
     -----
-    Detectors that learn shrink extents toward those of most objects, noise spreads them: tracks
-    whose points tell their extents show which, and by how much. A regression of these corrections
-    on how far all three extents are from the medians, in logarithms and in proportion to the
-    square of the error: what was drawn with care is left as it is. Of objects unlike most, trucks
-    among cars, it says little, and of the medians nothing: these are the annotation rule's.
+    Learnt detectors shrink extents toward those of the majority, noise spreads them. Tracks with
+    evidence about their extents show which, and by how much: a ridge regression of their
+    corrections on the distance of all three extents from the medians, in logarithms and in
+    proportion to the square of the error, so that low-noise input is left as it is. Objects
+    unlike the majority, trucks among cars, get little of it, and the medians none: those are up to
+    the labelling margin.
 
     """
-    log, found, weight = told.to(given).unbind(1)
-    off, own = (x - log.median(0).values for x in (log, given.log()))
-    near, here = (1 / (1 + (x / UNLIKE).square().sum(1, keepdim=True)) for x in (off, own))
-    A = near * off
-    weighted = weight.mT[..., None] * A
-    curvature = weighted.mT @ A + torch.diag_embed(4 - 3 * torch.eye(3).to(A)) / SLOPES**2
-    slopes = torch.linalg.solve(curvature, ((near * found).mT[:, None] @ weighted)[:, 0])
-    return torch.exp(error**2 * (here * own @ slopes.mT))
+    log, correction, weight = evidence.to(given).unbind(1)
+    median = log.median(0).values
+    off = log - median
+    own = given.log() - median
+    similarity = 1 / (1 + (off / POPULATION_RADIUS).square().sum(1, keepdim=True))
+    own_similarity = 1 / (1 + (own / POPULATION_RADIUS).square().sum(1, keepdim=True))
+    A = similarity * off
+    weighted = weight.mT[..., None] * A  # (3, n, 3)
+    others = CROSS_SLOPE_INFORMATION - 1
+    ridge = CROSS_SLOPE_INFORMATION - others * torch.eye(3).to(A)
+    curvature = weighted.mT @ A + torch.diag_embed(ridge) / SLOPE_DEVIATION**2
+    pull = ((similarity * correction).mT[:, None] @ weighted)[:, 0]
+    slopes = torch.linalg.solve(curvature, pull)
+    return torch.exp(error**2 * (own_similarity * own @ slopes.mT))
 
 
-def extents_told(given: Tensor, expected: Expected, state: State, factor: Factor) -> Tensor:
+def evidence_of_extents(
+    given: Tensor, expected: Expectation, state: State, factor: Factor
+) -> Tensor:
     """
-    Return what the points alone tell of extents, corrections and their weights, (B, 2, 3).
+    Return the evidence of the points alone about the extents (M17), shape (B, 2, 3).
+
+    Corrections of the logarithms, and their weights, as in `InputNoise`.
 
     Parameters
     ----------
     given : Tensor, shape (B, 3)
         Logarithms of the mean extents of the input.
-    expected : Expected
-        Of the fit: its part in that is taken off.
+    expected : Expectation
+        Prior of the fit: its part in that is removed.
     state, factor : State, Factor
-        The fit, and its curvature.
+        The fit, and the factor of its curvature.
 
     """
-    wanted, error = expected.shared[:, EXTENT], expected.spread[:, EXTENT]
+    mean = expected.shared[:, EXTENT]
+    deviation = expected.deviation[:, EXTENT]
     variance = torch.cholesky_inverse(factor.corner).diagonal(dim1=1, dim2=2)[:, EXTENT]
-    gain, power = 1 - variance / error**2, (error / wanted) ** 2
-    alone = (state.shared[:, EXTENT] / wanted).log() / gain + wanted.log()
-    tells = (gain > 0.2) & alone.isfinite()  # less says more of the prior
-    return torch.where(tells[:, None], torch.stack([(alone - given) / power, gain * power], 1), 0)
+    gain = 1 - variance / deviation**2
+    power = (deviation / mean) ** 2
+    by_points = (state.shared[:, EXTENT] / mean).log() / gain + mean.log()
+    is_evidence = (gain > MIN_EXTENT_GAIN) & by_points.isfinite()
+    both = torch.stack([(by_points - given) / power, gain * power], 1)
+    return torch.where(is_evidence[:, None], both, 0)
 
 
 class InputModel:
     """
-    The annotation rule and the noise of the input, learnt as it comes.
+    Labelling margins, noise and population of extents, learnt from the input of a stream.
 
-    The rule is the gap between a label's faces and the outermost points on them. Each track
-    gives one sight per face, the mean over its observations of the gap less the one expected of
-    its class, and the mean of the middle half of all tracks is weighed against no difference:
-    boxes that err by more than the gap still tell it if their error has no preferred direction.
-    Faces beyond 45 m tell how much further in points stand there; where the rule is stated, too,
-    since what all boxes err by does not matter for the difference.
+    A labelling margin is the gap between a face of the label and its outermost points. Each track
+    gives one value per face: the mean over its observations of the gap, less the one expected of
+    its class. The mean of the middle half of all tracks is weighed against a correction of zero
+    (M18). Errors of the boxes that exceed the margin do not matter if they have no preferred
+    direction. Faces beyond 45 m give the range inset; it is learnt even where the margins are
+    stated, since a common error of all boxes cancels in the difference.
+
+    Parameters
+    ----------
+    config : FaceConfig
+        Expected insets, and whether margins are learnt.
 
     """
 
     def __init__(self, config: FaceConfig) -> None:
-        self._learn, self._depths = config.learn, (config.depth_ends, config.depth_sides, 0.0, 0.0)
-        self._sights, self._scatter, self._extents = (dict[str, Floats]() for _ in range(3))
+        self._learns = config.learn
+        self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
+        # Of each track: sums over its face observations, see `add_face_observations`; its last
+        # input residuals; its extent evidence.
+        self._faces = dict[str, Floats]()
+        self._residuals = dict[str, Floats]()
+        self._evidence = dict[str, Floats]()
 
-    def learn_rule(self, names: Sequence[str], support: Support, new: Tensor, rule: Rule) -> None:
+    def add_face_observations(
+        self,
+        track_ids: Sequence[str],
+        observations: FaceObservations,
+        new: Tensor,
+        offsets: FaceOffsets,
+    ) -> None:
         """
-        Take the observations `new` (B, N) of tracks `names`, sighted at their input boxes.
+        Learn from face observations at input boxes.
 
-        `rule` is what `support` was made with.
+        Parameters
+        ----------
+        track_ids : sequence of B str
+            The tracks.
+        observations : FaceObservations
+            Of their windows.
+        new : Tensor, shape (B, N)
+            Which of them count.
+        offsets : FaceOffsets
+            What `observations` were made with.
 
         """
-        out, (hidden, distant) = support.outwardness, support.shares
-        rule = Rule(*(part.to(out) for part in rule))
-        hidden = hidden * (rule.depths > 0)  # the bottom is known by the road
-        is_open, is_far, many = hidden < 0.25, distant > 0.5, (support.points >= 30)[..., None]
-        tells = torch.stack([many & is_open & ~is_far, many & (hidden > 0.5), is_open & is_far])
-        tells &= (support.trust > 0) & (out.abs() < 0.5) & new[..., None]
-        levels = torch.stack([0 * hidden, hidden * rule.depths, distant * rule.distant]) - out
-        levels[::2] += rule.gaps  # a depth is counted from the gap of the moment
-        shares = torch.stack([torch.ones_like(out), hidden, distant])
-        sums = torch.stack([levels * tells, tells, shares * tells], 1).sum(3).movedim(2, 0)
-        for name, row in zip(names, sums.cpu().numpy(), strict=True):
-            _of(self._sights, name, np.zeros((3, 3, 6)))[:] += row
+        distance = observations.distance
+        gap_correction, occlusion_inset, range_inset = (part.to(distance) for part in offsets)
+        occluded, distant = observations.inset_shares
+        occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
+        is_visible = occluded < MAX_VISIBLE_SHARE
+        is_distant = distant > MIN_DISTANT_SHARE
+        has_points = (observations.num_points >= MIN_BOX_POINTS)[..., None]
+        # Three quantities: gap, occlusion inset, range inset; all (3, B, N, 6).
+        counts = torch.stack([
+            has_points & is_visible & ~is_distant,
+            has_points & (occluded > MIN_OCCLUDED_SHARE),
+            is_visible & is_distant,
+        ])  # fmt: skip
+        counts &= (observations.weight > 0) & (distance.abs() < MAX_LEARNT_DISTANCE)
+        counts &= new[..., None]
+        values = torch.stack([
+            0 * occluded, occluded * occlusion_inset, distant * range_inset
+        ]) - distance  # fmt: skip
+        values[::2] += gap_correction  # an occlusion inset is counted from the present gap
+        shares = torch.stack([torch.ones_like(distance), occluded, distant])
+        # (B, 3 quantities, 3 sums: value, count, share; 6 faces)
+        sums = torch.stack([values * counts, counts, shares * counts], 1).sum(3).movedim(2, 0)
+        for track_id, row in zip(track_ids, sums.cpu().numpy(), strict=True):
+            _of_track(self._faces, track_id, np.zeros((3, 3, 6)))[:] += row
 
-    def learn_fits(self, names: Sequence[str], scatters: Floats, told: Floats) -> None:
-        """Take what one more observation of tracks `names` scatters, (B, 9), and (B, 3, 3)."""
-        for name, row, extents in zip(names, scatters, told, strict=True):
-            known = _of(self._scatter, name, np.full((SCATTERS, 9), np.nan))
-            known[:-1], known[-1] = known[1:].copy(), row
-            _of(self._extents, name, extents)[:] = extents
+    def add_fits(self, track_ids: Sequence[str], residuals: Floats, evidence: Floats) -> None:
+        """Add one fit of each track: its `input_residuals` (B, 9), extent evidence (B, 3, 3)."""
+        for track_id, row, extents in zip(track_ids, residuals, evidence, strict=True):
+            known = _of_track(self._residuals, track_id, np.full((MAX_FITS_PER_TRACK, 9), np.nan))
+            known[:-1] = known[1:].copy()
+            known[-1] = row
+            _of_track(self._evidence, track_id, extents)[:] = extents
 
-    def rule(self) -> Rule:
-        """Return the annotation rule to expect."""
-        known = np.array(list(self._sights.values())).reshape(-1, 3, 3, 6)
-        gaps = self._middle(known[:, 0], (0.0,) * 4)
-        depths = self._middle(self._learn * known[:, 1], self._depths)
+    def offsets(self) -> FaceOffsets:
+        """Return the labelling margins and insets to expect."""
+        known = np.array(list(self._faces.values())).reshape(-1, 3, 3, 6)
+        none = (0.0,) * len(FACE_GROUPS)
+        gaps = self._pooled(known[:, 0], none)
+        occlusion_insets = self._pooled(self._learns * known[:, 1], self._occlusion_insets)
         known[:, 2, 0] -= gaps.numpy() * known[:, 2, 1]
-        return Rule(self._learn * gaps, depths, self._middle(known[:, 2], (0.0,) * 4))
+        range_insets = self._pooled(known[:, 2], none)
+        return FaceOffsets(self._learns * gaps, occlusion_insets, range_insets)
 
-    def _middle(self, known: Floats, expected: Sequence[float]) -> Tensor:
-        """Weigh what is `expected` of each kind of face against the middle of the tracks."""
-        values = torch.zeros(6, dtype=torch.float64)
-        for faces, value, deviation in zip(KINDS, expected, RULE_ERROR, strict=True):
-            level, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
-            sights = np.sort(level[count >= 3] / share[count >= 3])
-            if (n := len(sights)) >= 3:
-                # The mean of the middle half errs by an eighth less than the median.
-                middle = sights[n // 4 : n - n // 4].mean()
-                error = 1.1 * (0.74 * (sights[n - 1 - n // 4] - sights[n // 4]) + 0.02)
-                trust = deviation**2 / (deviation**2 + error**2 / n)
-                value = value + trust * (middle - value)
-            values[faces] = float(value)
-        return values
+    def gaps_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
+        """Return gap corrections of some `faces` [m], one array per track that has any."""
+        return self._means_of_tracks(0, faces)
+
+    def occlusion_insets_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
+        """Return occlusion insets of some `faces` [m], one array per track that has any."""
+        return self._means_of_tracks(1, faces)
 
     def noise(self) -> InputNoise:
-        """Return the noise of what `learn_fits` took."""
-        known = np.array(list(self._scatter.values())).reshape(-1, SCATTERS, 9)
-        told = np.array([*self._extents.values()] or [np.zeros((3, 3))])
-        return InputNoise.measure(torch.from_numpy(known))._replace(told=torch.from_numpy(told))
+        """Return the noise of all fits that were added."""
+        known = np.array(list(self._residuals.values())).reshape(-1, MAX_FITS_PER_TRACK, 9)
+        evidence = np.array([*self._evidence.values()] or [np.zeros((3, 3))])
+        noise = InputNoise.estimate(torch.from_numpy(known))
+        return noise._replace(extent_evidence=torch.from_numpy(evidence))
+
+    def _means_of_tracks(self, quantity: int, faces: Sequence[int]) -> list[Floats]:
+        means = []
+        for sums in self._faces.values():
+            total, count, share = sums[quantity][:, faces]
+            is_known = count >= MIN_TRACK_OBSERVATIONS
+            if is_known.any():
+                means.append(total[is_known] / share[is_known])
+        return means
+
+    def _pooled(self, known: Floats, expected: Sequence[float]) -> Tensor:
+        """Weigh the tracks' sums (n, 3, 6) of a quantity against its prior (M18), (6,)."""
+        values = torch.zeros(6, dtype=torch.float64)
+        for faces, prior, deviation in zip(FACE_GROUPS, expected, GAP_DEVIATIONS, strict=True):
+            total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
+            is_known = count >= MIN_TRACK_OBSERVATIONS
+            means = np.sort(total[is_known] / share[is_known])
+            values[faces] = _posterior_mean(means, prior, deviation)
+        return values
 
 
-def _of(known: dict[str, Floats], name: str, fresh: Floats) -> Floats:
+def _posterior_mean(means: Floats, prior: float, deviation: float) -> float:
+    """Weigh the midmean of sorted `means` against a prior with its deviation (M18)."""
+    n = len(means)
+    if n < MIN_TRACK_OBSERVATIONS:
+        return prior
+    middle = means[n // 4 : n - n // 4].mean()
+    spread = means[n - 1 - n // 4] - means[n // 4]
+    error = MIDMEAN_FACTOR * (QUARTILES_TO_DEVIATION * spread + MIN_GAP_DEVIATION)
+    weight = deviation**2 / (deviation**2 + error**2 / n)
+    return float(prior + weight * (middle - prior))
+
+
+def _of_track(known: dict[str, Floats], track_id: str, fresh: Floats) -> Floats:
     """Return the array of a track, `fresh` for a new one; forget the one seen longest ago."""
-    known[name] = found = known.pop(name, fresh)
-    if len(known) > TRACKS:
+    found = known.pop(track_id, fresh)
+    known[track_id] = found
+    if len(known) > MAX_TRACKS:
         del known[next(iter(known))]
     return found

@@ -1,8 +1,8 @@
 """
-L-BFGS for B independent problems at once; knows no boxes.
+L-BFGS for B independent problems at once, of any kind.
 
-Every row has its own curvature history, step length, stopping test and best point, so that a row
-behaves as if it were alone: a hard or broken one neither slows nor spoils its neighbours.
+Every row has its own curvature history, step length, stopping test and best point, so that its
+result does not depend on the other rows. See docs/decisions/batched-lbfgs.md.
 
 """
 
@@ -13,13 +13,23 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-SUFFICIENT = 1e-4  # part of the promised decrease that a step must bring (Armijo)
-CURVATURE = 1e-10  # a pair with s.y below this part of |s||y| is not remembered
-BACKTRACKS = 12
-PATIENCE = 4  # turns between questions to a device that must be waited for
+SUFFICIENT_DECREASE = 1e-4
+"""Part of the predicted decrease that a step must reach: c1 of Armijo's condition. Literature:
+Nocedal and Wright, Numerical Optimization, 2nd edition, section 3.1."""
+MIN_CURVATURE = 1e-10
+"""A pair with s'y below this part of |s||y| is left out of the history. Chosen: rounding."""
+STEP_BOUNDS = (0.1, 0.5)
+"""Bounds of a shortened step over the one before. Literature: Dennis and Schnabel, Numerical
+Methods for Unconstrained Optimization, section 6.3.2."""
+MAX_BACKTRACKS = 12
+"""Most trials of one direction. Chosen: the last step is 2^-11 of the first, or shorter."""
+SYNC_INTERVAL = 4
+"""Turns after which a GPU is asked for the number of running rows. Chosen: asking waits for it."""
 
+Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Metric = Callable[[Tensor, Tensor], Tensor]
-Pair = tuple[Tensor, Tensor, Tensor]  # step, change of the gradient, 1 / their product
+Pair = tuple[Tensor, Tensor, Tensor]
+"""A step s, the change y of the gradient over it, and 1 / s'y: (b, D), (b, D), (b,)."""
 
 
 class Status(IntEnum):
@@ -38,7 +48,7 @@ class Minimum(NamedTuple):
     Attributes
     ----------
     x, value : Tensor, shapes (B, D) and (B,)
-        Best point met and its value; that of the start if nothing better was found.
+        Best point and its value; those of the start if nothing better was found.
     status, iterations : Tensor, shape (B,)
         `Status` (RUNNING: the iterations ran out), and iterations taken.
 
@@ -50,8 +60,23 @@ class Minimum(NamedTuple):
     iterations: Tensor
 
 
+class _Search(NamedTuple):
+    """The state of the rows (b,) that are still in the batch."""
+
+    rows: Tensor
+    x: Tensor
+    value: Tensor
+    gradient: Tensor
+    direction: Tensor
+    slope: Tensor  # of the value along the direction
+    step: Tensor  # length to try next, in multiples of the direction
+    has_moved: Tensor  # whether the last trial was accepted: a new direction is needed
+    tries: Tensor  # of the present direction
+    pairs: list[Pair]
+
+
 def minimize(
-    function: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+    function: Function,
     start: Tensor,
     iterations: int,
     history: int,
@@ -66,11 +91,12 @@ def minimize(
     function : callable
         Maps points (b, D) and their rows (b,) to values (b,) and gradients (b, D).
     start : Tensor, shape (B, D)
-        Where each row starts.
+        Start of each row.
     iterations, history : int
-        Most iterations, and curvature pairs remembered.
+        Most iterations, and curvature pairs that are kept.
     tolerance : float
-        A row ends when its step promises to lower the value by less, as part of 1 + |value|.
+        A row has converged when the predicted decrease of its value is less, as part of
+        1 + |value|.
     metric : callable, optional
         Maps vectors (b, D) and their rows to the inverse of an approximate Hessian times them.
         Without it the usual scaled identity is used.
@@ -82,67 +108,114 @@ def minimize(
 
     Notes
     -----
-    Two-loop recursion, then backtracking from a full step by quadratic interpolation until the
-    Armijo condition holds. Every turn asks for one point per row: a row that accepts it goes on
-    from there while its neighbour still shortens its step. Ended rows leave the batch as soon as
-    they are half of it. A device that must be waited for is asked only every few turns.
+    Two-loop recursion (Nocedal and Wright, algorithm 7.4), then backtracking from a full step by
+    quadratic interpolation until Armijo's condition holds. Every turn evaluates one point per row:
+    a row that accepts it goes on from there while its neighbour still shortens its step. Ended
+    rows leave the batch as soon as they are half of it.
 
     """
     rows = torch.arange(len(start), device=start.device)
     value, gradient = function(start, rows)
-    finite = value.isfinite() & gradient.isfinite().all(1)
-    status = torch.where(finite, 0, int(Status.FAILED))
+    is_finite = value.isfinite() & gradient.isfinite().all(1)
+    status = torch.where(is_finite, 0, int(Status.FAILED))
     best = Minimum(start.clone(), value.clone(), status, torch.zeros_like(rows))
-    moved, tries, step, slope = finite, torch.zeros_like(rows), value, value
-    x, direction, gradient = start, start, torch.where(finite[:, None], gradient, 0.0)
-    pairs: list[Pair] = []
-    for turn in range(iterations * BACKTRACKS):
-        taken = best.iterations[rows]
-        running = (best.status[rows] == Status.RUNNING) & ((taken < iterations) | ~moved)
-        if turn % (1 if rows.is_cpu else PATIENCE) == 0:
-            if not (count := int(running.sum())):
+    gradient = torch.where(is_finite[:, None], gradient, 0.0)
+    zeros = torch.zeros_like(rows)
+    search = _Search(
+        rows, start, value, gradient, start, value, value, is_finite, zeros, list[Pair]()
+    )
+    for turn in range(iterations * MAX_BACKTRACKS):
+        taken = best.iterations[search.rows]
+        is_running = best.status[search.rows] == Status.RUNNING
+        running = is_running & ((taken < iterations) | ~search.has_moved)
+        if turn % (1 if rows.is_cpu else SYNC_INTERVAL) == 0:
+            count = int(running.sum())
+            if not count:
                 break
-            if count <= len(rows) // 2:
-                state = (rows, x, value, gradient, direction, slope, step, moved, tries, pairs)
-                state = select(state, running.nonzero()[:, 0])
-                rows, x, value, gradient, direction, slope, step, moved, tries, pairs = state
+            if count <= len(search.rows) // 2:
+                search = select(search, running.nonzero()[:, 0])
                 running = running[running]
-        # Rows that have moved need a new direction.
-        fresh, along = running & moved, -_two_loop(gradient, pairs, rows, metric)
-        promise = (gradient * along).sum(1)
-        uphill = ~(promise < 0)
-        along = torch.where(uphill[:, None], -gradient, along)
-        promise = torch.where(uphill, -gradient.square().sum(1), promise)
-        if metric is None and not pairs:  # nothing known of the scale yet
-            size = gradient.abs().sum(1).clamp(min=1.0)
-            along, promise = along / size[:, None], promise / size
-        converged = fresh & (-promise <= tolerance * (1 + value.abs()))
-        best.status[rows] += int(Status.CONVERGED) * converged
-        running, fresh = running & ~converged, fresh & ~converged
-        best.iterations[rows] += fresh
-        direction = torch.where(fresh[:, None], along, direction)
-        slope, step = torch.where(fresh, promise, slope), torch.where(fresh, 1.0, step)
-        tries = torch.where(fresh, 0, tries) + 1
-        # One trial.
-        trial, bent = function(x + step[:, None] * direction, rows)
-        good = running & bent.isfinite().all(1) & (trial <= value + SUFFICIENT * step * slope)
-        best.status[rows] += int(Status.STUCK) * (running & ~good & (tries == BACKTRACKS))
-        change = torch.where(good, step, 0.0)[:, None] * direction
-        bend = torch.where(good[:, None], bent - gradient, 0.0)
-        product = (change * bend).sum(1)
-        useful = product > CURVATURE * change.norm(dim=1) * bend.norm(dim=1)
-        pairs = [*pairs, (change, bend, torch.where(useful, 1 / product, 0.0))][-history:]
-        parabola = -slope * step.square() / (2 * (trial - value - slope * step))
-        step = torch.where(parabola.isfinite(), parabola, 0.1 * step).clamp(0.1 * step, 0.5 * step)
-        x, gradient, value = x + change, gradient + bend, torch.where(good, trial, value)
-        moved = good | (moved & ~running)
-        best.x[rows], best.value[rows] = x, value  # Armijo: never above the one before
+        search, running = _with_new_directions(search, running, best, metric, tolerance)
+        search = _after_trial(search, running, best, function, history)
     return best
+
+
+def _with_new_directions(
+    search: _Search, running: Tensor, best: Minimum, metric: Metric | None, tolerance: float
+) -> tuple[_Search, Tensor]:
+    """
+    Give a new direction to the rows that have moved; return those that still run, too.
+
+    Status and iterations of `best` are updated.
+
+    """
+    fresh = running & search.has_moved
+    direction = -_two_loop(search.gradient, search.pairs, search.rows, metric)
+    slope = (search.gradient * direction).sum(1)
+    is_uphill = ~(slope < 0)
+    direction = torch.where(is_uphill[:, None], -search.gradient, direction)
+    slope = torch.where(is_uphill, -search.gradient.square().sum(1), slope)
+    if metric is None and not search.pairs:  # the scale is unknown: a step of length 1 at most
+        size = search.gradient.abs().sum(1).clamp(min=1.0)
+        direction = direction / size[:, None]
+        slope = slope / size
+    converged = fresh & (-slope <= tolerance * (1 + search.value.abs()))
+    best.status[search.rows] += int(Status.CONVERGED) * converged
+    running = running & ~converged
+    fresh = fresh & ~converged
+    best.iterations[search.rows] += fresh
+    search = search._replace(
+        direction=torch.where(fresh[:, None], direction, search.direction),
+        slope=torch.where(fresh, slope, search.slope),
+        step=torch.where(fresh, 1.0, search.step),
+        tries=torch.where(fresh, 0, search.tries) + 1,
+    )
+    return search, running
+
+
+def _after_trial(
+    search: _Search, running: Tensor, best: Minimum, function: Function, history: int
+) -> _Search:
+    """
+    Evaluate one point per row; accept it, or shorten the step.
+
+    Point, value and status of `best` are updated.
+
+    """
+    rows, value, slope, step = search.rows, search.value, search.slope, search.step
+    trial, trial_gradient = function(search.x + step[:, None] * search.direction, rows)
+    has_decreased = trial <= value + SUFFICIENT_DECREASE * step * slope
+    is_good = running & trial_gradient.isfinite().all(1) & has_decreased
+    is_stuck = running & ~is_good & (search.tries == MAX_BACKTRACKS)
+    best.status[rows] += int(Status.STUCK) * is_stuck
+
+    s = torch.where(is_good, step, 0.0)[:, None] * search.direction
+    y = torch.where(is_good[:, None], trial_gradient - search.gradient, 0.0)
+    s_y = (s * y).sum(1)
+    is_curved = s_y > MIN_CURVATURE * s.norm(dim=1) * y.norm(dim=1)
+    pair = s, y, torch.where(is_curved, 1 / s_y, 0.0)
+
+    # The minimum of the parabola through value, slope and trial.
+    parabola = -slope * step.square() / (2 * (trial - value - slope * step))
+    least, most = STEP_BOUNDS
+    shorter = torch.where(parabola.isfinite(), parabola, least * step)
+    search = search._replace(
+        x=search.x + s,
+        value=torch.where(is_good, trial, value),
+        gradient=search.gradient + y,
+        step=shorter.clamp(least * step, most * step),
+        has_moved=is_good | (search.has_moved & ~running),
+        pairs=[*search.pairs, pair][-history:],
+    )
+    best.x[rows] = search.x  # by Armijo's condition never worse than before
+    best.value[rows] = search.value
+    return search
 
 
 def _two_loop(gradient: Tensor, pairs: list[Pair], rows: Tensor, metric: Metric | None) -> Tensor:
     """Return the inverse Hessian approximated by `pairs`, times `gradient`."""
-    q, alphas = gradient, []
+    q = gradient
+    alphas = []
     for s, y, rho in reversed(pairs):
         alpha = rho * (s * q).sum(1)
         q = q - alpha[:, None] * y
@@ -159,7 +232,12 @@ def _two_loop(gradient: Tensor, pairs: list[Pair], rows: Tensor, metric: Metric 
 
 
 def select(part: Any, rows: Tensor) -> Any:
-    """Return `rows`, ascending, of tensors (B, ...) in tuples and lists; all: no copy."""
+    """
+    Return `rows`, ascending, of all tensors (B, ...) in nested tuples and lists.
+
+    If `rows` are all B rows, the tensors themselves are returned, not copies.
+
+    """
     if isinstance(part, Tensor):
         return part[rows] if len(rows) < len(part) else part
     if isinstance(part, tuple | list):

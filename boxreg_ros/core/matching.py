@@ -1,4 +1,4 @@
-"""Which sweep belongs to which box array, by header stamp; the same online and offline."""
+"""Pairing of sweeps and box arrays by header stamp; the same live and offline."""
 
 from bisect import insort
 from collections import Counter
@@ -11,7 +11,7 @@ from boxreg_ros.structures import BoxArray, Sweep
 
 
 class Pair(NamedTuple):
-    """A box array and its sweep, or None where no sweep came."""
+    """A box array and its sweep, None where there is none."""
 
     boxes: BoxArray
     sweep: Sweep | None
@@ -19,31 +19,35 @@ class Pair(NamedTuple):
 
 class StampMatcher:
     """
-    Pair sweeps with box arrays; pairs leave in the order of their boxes' stamps.
+    Pair sweeps with box arrays; pairs are returned in the order of the box arrays' stamps.
 
-    A sweep within the tolerance is taken at once, one within reach when a sweep younger than the
-    boxes has come: then none can be closer, in whatever order the two kinds arrive. One sweep
-    may serve several box arrays. The boxes of a sweep that is lost leave alone at once. Neither
-    kind waits longer than for `queue` others.
+    A box array takes the nearest sweep within `tolerance` at once. A sweep within `reach` is taken
+    as soon as a younger sweep than the boxes is known: no later one can be nearer, whichever kind
+    arrives first. A sweep may serve several box arrays. A box array whose sweep was dropped is
+    returned without one. At most `queue` sweeps and `queue` box arrays are held.
 
     Parameters
     ----------
     config : Config
-        Read are `tolerance`, `reach` and `queue`.
+        Its `tolerance`, `reach` and `queue` are used.
     counts : Counter
-        Where what is dropped is counted by reason.
+        Counts dropped sweeps by reason.
 
     """
 
     def __init__(self, config: Config, counts: Counter[str]) -> None:
         self._tolerance_ns = round(config.tolerance * 1e9)
         self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
-        self._capacity, self._counts = config.queue, counts
-        self._sweeps, self._boxes, self._used = list[Sweep](), list[BoxArray](), set[int]()
-        self._newest_ns = self._oldest_ns = -inf  # sweep that came, sweep that is still of use
+        self._capacity = config.queue
+        self._counts = counts
+        self._sweeps: list[Sweep] = []  # ascending by stamp
+        self._boxes: list[BoxArray] = []  # ascending by stamp
+        self._used_ns: set[int] = set()  # stamps of held sweeps that served a box array
+        self._newest_ns = -inf  # of all sweeps added
+        self._oldest_ns = -inf  # sweeps before this one are late
 
     def add_sweep(self, sweep: Sweep) -> list[Pair]:
-        """Take a sweep; return the pairs that are complete now."""
+        """Add a sweep; return the pairs completed by it."""
         if sweep.stamp_ns < self._oldest_ns:
             self._counts['sweep_late'] += 1
         elif any(sweep.stamp_ns == other.stamp_ns for other in self._sweeps):
@@ -51,38 +55,48 @@ class StampMatcher:
         else:
             insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
         self._newest_ns = max(self._newest_ns, sweep.stamp_ns)
-        pairs = list(self._complete())
+        pairs = list(self._pop_pairs())
         if len(self._sweeps) > self._capacity:
-            self._forget_before(self._sweeps[1].stamp_ns)
+            self._discard_before(self._sweeps[1].stamp_ns)
         return pairs
 
     def add_boxes(self, boxes: BoxArray) -> list[Pair]:
-        """Take a box array; return the pairs that are complete now."""
+        """Add a box array; return the pairs completed by it."""
         insort(self._boxes, boxes, key=lambda item: item.stamp_ns)
-        return list(self._complete())
+        return list(self._pop_pairs())
 
     def flush(self) -> list[Pair]:
-        """Return what still waits, paired or not, and forget all sweeps."""
-        pairs = list(self._complete(hopeless=True))
-        self._forget_before(self._newest_ns + 1)
+        """Return all box arrays held, paired or not, and discard all sweeps."""
+        pairs = list(self._pop_pairs(is_flush=True))
+        self._discard_before(self._newest_ns + 1)
         return pairs
 
-    def _complete(self, hopeless: bool = False) -> Iterator[Pair]:
+    def _pop_pairs(self, is_flush: bool = False) -> Iterator[Pair]:
+        """Yield the oldest box arrays as long as no later sweep can be nearer to them."""
         while self._boxes:
             stamp_ns = self._boxes[0].stamp_ns
-            distances = [abs(sweep.stamp_ns - stamp_ns) for sweep in self._sweeps]
-            away = min(distances, default=self._reach_ns + 1)
-            is_open = away > self._tolerance_ns and self._newest_ns < stamp_ns and not hopeless
-            if is_open and len(self._boxes) <= self._capacity:
-                break
-            near = self._sweeps[distances.index(away)] if away <= self._reach_ns else None
-            self._used.update([near.stamp_ns] if near else [])
-            yield Pair(self._boxes.pop(0), None if near and near.is_lost else near)
-            self._forget_before(stamp_ns - self._reach_ns)
+            sweep = min(self._sweeps, key=lambda s: abs(s.stamp_ns - stamp_ns), default=None)
+            offset_ns = self._reach_ns + 1
+            if sweep is not None:
+                offset_ns = abs(sweep.stamp_ns - stamp_ns)
+            is_decided = offset_ns <= self._tolerance_ns or self._newest_ns >= stamp_ns
+            is_over_capacity = len(self._boxes) > self._capacity
+            if not (is_decided or is_over_capacity or is_flush):
+                return
+            if offset_ns > self._reach_ns:
+                sweep = None
+            if sweep is not None:
+                self._used_ns.add(sweep.stamp_ns)
+                if sweep.is_dropped:
+                    sweep = None
+            yield Pair(self._boxes.pop(0), sweep)
+            self._discard_before(stamp_ns - self._reach_ns)
 
-    def _forget_before(self, oldest_ns: float) -> None:
+    def _discard_before(self, oldest_ns: float) -> None:
+        """Discard older sweeps; count those that served no box array."""
         self._oldest_ns = max(self._oldest_ns, oldest_ns)
         while self._sweeps and self._sweeps[0].stamp_ns < oldest_ns:
             stamp_ns = self._sweeps.pop(0).stamp_ns
-            self._counts.update([] if stamp_ns in self._used else ['sweep_without_boxes'])
-            self._used.discard(stamp_ns)
+            if stamp_ns not in self._used_ns:
+                self._counts['sweep_without_boxes'] += 1
+            self._used_ns.discard(stamp_ns)

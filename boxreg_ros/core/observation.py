@@ -1,4 +1,4 @@
-"""From a sweep to what each box sees of it: crop, ownership, road, farthest point sampling."""
+"""Observations of boxes in a sweep: crop, ownership, height of the road, sampling."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -9,15 +9,48 @@ from boxreg_ros.structures import Floats, Ints, ROLL, Sweep
 import numpy as np
 from numpy.typing import NDArray
 
-Pairs = tuple[Ints, Ints, Floats, Floats]
-RING = 1.0  # how far beside a box the road is looked for [m]
-CLEARANCE = 0.2  # what is lower above the road may be road [m]
-EITHER = 0.2  # deeper in one of two boxes by less, a point may be of either [m]
+ROAD_SEARCH_WIDTH = 1.0
+"""How far beside a box the road is searched [m]; chosen: a lane has about as much free."""
+ROAD_SIDE_GAP = 0.05
+"""Road points are at least so far beside a box [m]; chosen: excludes points on its sides."""
+ROAD_HEIGHT_RANGE = 0.6
+"""Road points are less above or below the bottom of a box [m]; chosen: far above its noise."""
+ROAD_QUANTILES = (0.1, 0.3, 0.6)
+"""Low, representative and high part of the heights beside a box; chosen."""
+ROAD_FLATNESS = 0.15
+"""Most the high part is above the low one [m]; chosen: a kerb, a wall or a vehicle is higher."""
+MIN_ROAD_POINTS = 5
+"""Fewer points beside a box give no road height; chosen."""
+GROUND_CLEARANCE = 0.2
+"""Points less than this above the road may be of the road [m]; chosen: below most bumpers."""
+OWNERSHIP_TOLERANCE = 0.2
+"""A point less deep in one of two boxes, by less than this, belongs to both [m]; chosen."""
+
+
+class Crop(NamedTuple):
+    """
+    Pairs of a point and a box that are near each other, ascending by box.
+
+    Attributes
+    ----------
+    row, owner : array, shape (P,)
+        Row of the point in its sweep, and of the box.
+    offset : array, shape (3, P)
+        Point minus the centre of the box, axes of the fixed frame [m].
+    outside : array, shape (3, P)
+        Distance outside of the faces, along the axes of the box; negative inside [m].
+
+    """
+
+    row: Ints
+    owner: Ints
+    offset: Floats
+    outside: Floats
 
 
 class Observation(NamedTuple):
     """
-    One track at one stamp; everything is relative to the centre of its input box.
+    The points of one track at one stamp, relative to the centre of its input box.
 
     Attributes
     ----------
@@ -26,13 +59,13 @@ class Observation(NamedTuple):
     box : array, shape (9,)
         Input box in the fixed frame.
     points : array, shape (M, 3)
-        Returns near the box, above the road, minus its centre; axes of the fixed frame [m].
+        Points near the box and above the road, minus its centre; axes of the fixed frame [m].
     delays : array, shape (M,)
-        When each was measured, relative to the stamp [s]; 0 unless `deskew` asks for it.
+        Time of each point relative to the stamp [s]; 0 without `sampling.deskew`.
     origin : array, shape (3,)
         Sensor minus centre [m]; NaN where unknown.
     ground : float
-        Height of the road beside the box minus z of the centre [m]; NaN where none is seen.
+        Height of the road beside the box minus z of the centre [m]; NaN where not found.
     num_points : int
         Sweep points inside the input box.
 
@@ -49,83 +82,140 @@ class Observation(NamedTuple):
 
 def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[Observation]:
     """
-    Return what `boxes` (n, 9) see of `sweep`, one observation each.
+    Return the observation of each box in a sweep.
 
-    A point near several boxes belongs to the one it is deepest inside of (or least outside), so
-    that a neighbour's bumper is no evidence, and to those it is nearly as deep inside of: two
-    boxes of one object do not take each other's points away. Points lower than the road beside
-    the box plus a clearance are left out, and the road's height is kept instead.
+    A point near several boxes belongs to the box it is deepest inside of, or least outside, so
+    that a neighbour's bumper is no evidence. It also belongs to boxes it is nearly as deep inside
+    of: two boxes of one object do not take points from each other. Points less than
+    `GROUND_CLEARANCE` above the road beside the box are left out; the height of the road is kept.
 
-    All boxes are seen at once, as pairs of a point and a box.
+    Parameters
+    ----------
+    sweep : Sweep
+        In the fixed frame.
+    boxes : array, shape (n, 9)
+        Valid boxes in the fixed frame, at the stamp of the sweep.
+    stamp_ns : int
+        Stamp of the observations [ns].
+    config : Config
+        Settings.
 
-    """
-    centers, half, n = boxes[:, :3], boxes[:, 3:6] / 2, len(boxes)
-    index, owner, offset, outside = crop(sweep.points, boxes, max(RING, config.sampling.margin))
-    aside, depth = outside[:2].max(0), outside.max(0)
-    up = matrix_from_rpy(boxes[:, ROLL:])[:, :, 2]  # on a slope, too
-    height = (offset * up.T.take(owner, 1)).sum(0) + half[:, 2].take(owner)  # above the bottom
-    beside = np.flatnonzero((aside > 0.05) & (depth < RING) & (np.abs(height) < 0.6))
-    corner = np.hypot(half[:, 0], half[:, 1]) + RING  # the ring ends at an upright square
-    beside = beside[np.abs(offset[:2].take(beside, 1)).max(0) < corner.take(owner.take(beside))]
-    road = _road(height.take(beside), owner.take(beside), n)
-    nearest = np.full(len(sweep.points), np.inf)
-    np.minimum.at(nearest, index, depth)
-    is_own = (depth < config.sampling.margin) & (depth <= nearest.take(index) + EITHER)
-    own = np.flatnonzero(is_own & (height > (np.nan_to_num(road) + CLEARANCE).take(owner)))
-    inside = np.bincount(owner.take(np.flatnonzero(depth <= 0)), minlength=n).tolist()
-    owner, x = owner.take(own), offset[0].take(own)
-    rows = _by_x(index.take(own), owner, x / np.abs(x).max(initial=1.0), n)
-    kept = [_thinned(rows[part], sweep.points, config) for part in _parts(owner, n)]
-    rows, owner = np.concatenate(kept), np.repeat(np.arange(n), [len(part) for part in kept])
-    near = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
-    times = sweep.times if config.sampling.deskew else None
-    late = (np.zeros(len(rows)) if times is None else times[rows]).astype(np.float32)
-    ground = ((road - half[:, 2]) / up[:, 2].clip(0.1)).tolist()  # along z of the frame
-    origin, parts = sweep.origin - centers, _parts(owner, n)
-    columns = boxes, [near[p] for p in parts], [late[p] for p in parts], origin, ground, inside
-    return [Observation(stamp_ns, *row) for row in zip(*columns, strict=True)]
-
-
-def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Pairs:
-    """
-    Return all pairs of a point and a box (n, 9) within `margin` of each other, and some more [m].
-
-    The row of the point (P,) and that of the box (P,), ascending; the point minus the centre of
-    the box (3, P), and how far outside of its faces it is, along its axes (3, P).
+    Returns
+    -------
+    observations : list of n Observation
+        In the order of `boxes`.
 
     """
-    R, half = matrix_from_rpy(boxes[:, ROLL:]), boxes[:, 3:6] / 2
-    reach = (np.abs(R) @ (half + margin)[..., None])[..., 0]
+    n = len(boxes)
+    centers = boxes[:, :3]
+    half = boxes[:, 3:6] / 2
+    near = crop(sweep.points, boxes, max(ROAD_SEARCH_WIDTH, config.sampling.margin))
+    depth = near.outside.max(0)  # of the face the point is least inside of, (P,)
+    up = matrix_from_rpy(boxes[:, ROLL:])[:, :, 2]
+    # Above the bottom of the box, along its z axis: also valid on a slope. (P,)
+    height = (near.offset * up.T.take(near.owner, 1)).sum(0) + half[:, 2].take(near.owner)
+    road = np.full(n, np.nan)
+    if config.ingredients.road:
+        road = _road_heights(near, height, depth, half)
+
+    is_own = depth < config.sampling.margin
+    if config.ingredients.point_ownership:
+        is_own &= depth <= _least_depth(near, depth, len(sweep.points)) + OWNERSHIP_TOLERANCE
+    is_own &= height > (np.nan_to_num(road) + GROUND_CLEARANCE).take(near.owner)
+    rows, owner = _sampled(near, np.flatnonzero(is_own), sweep, n, config)
+
+    points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
+    delays = np.zeros(len(rows), np.float32)
+    if config.sampling.deskew and sweep.times is not None:
+        delays = sweep.times[rows].astype(np.float32)
+    ground = (road - half[:, 2]) / up[:, 2].clip(0.1)  # along z of the fixed frame
+    num_inside = np.bincount(near.owner.take(np.flatnonzero(depth <= 0)), minlength=n)
+    parts = _slices(owner, n)
+    columns = zip(
+        boxes,
+        [points[part] for part in parts],
+        [delays[part] for part in parts],
+        sweep.origin - centers,
+        ground.tolist(),
+        num_inside.tolist(),
+        strict=True,
+    )
+    return [Observation(stamp_ns, *values) for values in columns]
+
+
+def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
+    """
+    Return all pairs of a point and a box within `margin` of each other.
+
+    Some pairs that are farther apart are returned, too.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        Points of a sweep [m].
+    boxes : array, shape (n, 9)
+        Valid boxes in the frame of the points.
+    margin : float
+        Distance from the faces of the box [m].
+
+    Returns
+    -------
+    near : Crop
+        The pairs.
+
+    """
+    R = matrix_from_rpy(boxes[:, ROLL:])  # (n, 3, 3)
+    half = boxes[:, 3:6] / 2
+    reach = (np.abs(R) @ (half + margin)[..., None])[..., 0]  # half the upright bounding box
     index, owner = _pairs(points, boxes[:, :2], reach[:, :2])
     offset = points.T.take(index, 1).astype(np.float64) - boxes[:, :3].T.take(owner, 1)
     outside = np.empty_like(offset)
-    for axes, part in zip(R, _parts(owner, len(boxes)), strict=True):
+    for axes, part in zip(R, _slices(owner, len(boxes)), strict=True):
         np.matmul(axes.T, offset[:, part], out=outside[:, part])
     np.subtract(np.abs(outside, out=outside), half.T.take(owner, 1), out=outside)
-    return index, owner, offset, outside
+    return Crop(index, owner, offset, outside)
+
+
+def _least_depth(near: Crop, depth: Floats, num_points: int) -> Floats:
+    """Return for each pair the least `depth` (P,) of all pairs of its point, (P,) [m]."""
+    least = np.full(num_points, np.inf)
+    np.minimum.at(least, near.row, depth)
+    return least.take(near.row)
+
+
+def _sampled(near: Crop, own: Ints, sweep: Sweep, n: int, config: Config) -> tuple[Ints, Ints]:
+    """Return sweep row and box of the points that are kept, of the pairs `own`; (P,) each."""
+    owner = near.owner.take(own)
+    x = near.offset[0].take(own)
+    rows = _sorted_by_x(near.row.take(own), owner, x / np.abs(x).max(initial=1.0), n)
+    kept = [_thinned(rows[part], sweep.points, config) for part in _slices(owner, n)]
+    counts = [len(part) for part in kept]
+    return np.concatenate(kept), np.repeat(np.arange(n), counts)
 
 
 def _pairs(points: NDArray[np.floating], centers: Floats, reach: Floats) -> tuple[Ints, Ints]:
     """
-    Return point and box of all pairs that are within `reach` (n, 2) of each other, and of more.
+    Return point and box of all pairs within `reach` (n, 2) along x and y, and of some more.
 
-    The ground plane is a raster of 1 m whose 16-bit numbers run on from one row of cells to the
-    next, and start again after the last: no scene is too wide for it. What is as far off as to
-    share a number with a box is left for the caller to tell, like what is in the rim of a cell.
-    Points and edges are both cut to whole metres, which changes no order: none gets lost.
+    The ground plane is a raster of 1 m cells. The 16-bit number of a cell is 256 x + y, modulo
+    2^16, for any x and y: no scene is too wide. Pairs of cells that share a number although they
+    are far apart, and pairs in the rim of a cell, are left to the caller to reject. Points and
+    box edges are both truncated to whole metres, which keeps their order: no pair is lost.
 
     """
     low = (centers - reach).astype(int)
     nx, ny = ((centers + reach).astype(int) - low + 1).T
-    nx, ny = np.clip(nx + (ny - 1) // 256, 1, 256), np.clip(ny, 1, 256)  # long rows: as several
+    nx = np.clip(nx + (ny - 1) // 256, 1, 256)  # more than 256 cells along y: several rows
+    ny = np.clip(ny, 1, 256)
     owner = np.repeat(np.arange(len(centers)), nx)  # of each row of cells of a box
-    start, length = (_runs(low[:, 0], nx) * 256 + low[owner, 1]) % 2**16, ny[owner]
+    start = (_runs(low[:, 0], nx) * 256 + low[owner, 1]) % 2**16
+    length = ny[owner]
     is_touched = np.bincount(_runs(start, length) % 2**16, minlength=2**16) > 0
     x, y = (points[:, i].clip(-1e9, 1e9).astype(np.int32).astype(np.uint16) for i in (0, 1))
     cells = x * np.uint16(256) + y
     near = np.flatnonzero(is_touched.take(cells))
-    near = near.take(np.argsort(cells.take(near), kind='stable'))  # of 16 bits: by counting
-    cells = np.add.outer([0, 2**16], cells.take(near)).ravel()  # for rows that start again
+    near = near.take(np.argsort(cells.take(near), kind='stable'))  # 16 bits: a radix sort
+    cells = np.add.outer([0, 2**16], cells.take(near)).ravel()  # twice: rows may wrap around
     first, last = np.searchsorted(cells, [start, start + length])
     return near.take(_runs(first, last - first), mode='wrap'), np.repeat(owner, last - first)
 
@@ -135,32 +225,61 @@ def _runs(first: Ints, counts: Ints) -> Ints:
     return np.repeat(first - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
 
 
-def _parts(owner: Ints, n: int) -> list[slice]:
-    """Return where in `owner`, ascending, each of `n` boxes is."""
-    return [slice(a, b) for a, b in pairwise(np.searchsorted(owner, np.arange(n + 1)).tolist())]
+def _slices(owner: Ints, n: int) -> list[slice]:
+    """Return the slice of each of `n` boxes in `owner`, ascending."""
+    ends = np.searchsorted(owner, np.arange(n + 1)).tolist()
+    return [slice(first, last) for first, last in pairwise(ends)]
 
 
-def _road(heights: Floats, owner: Ints, n: int) -> Floats:
+def _road_heights(near: Crop, height: Floats, depth: Floats, half: Floats) -> Floats:
     """
-    Return the height of the road beside each of `n` boxes; NaN where that is not flat [m].
+    Return the height of the road beside each of n boxes, (n,); NaN where not found [m].
 
-    `heights` (P,) are between -1 and 1, above the bottoms of the boxes `owner` (P,).
+    The points beside a box lie in a ring around it, within an upright square.
+
+    Parameters
+    ----------
+    near : Crop
+        P pairs of a point and a box.
+    height : array, shape (P,)
+        Height of the point above the bottom of the box, along its z axis [m].
+    depth : array, shape (P,)
+        Distance outside of the box [m].
+    half : array, shape (n, 3)
+        Half the extents of the boxes [m].
 
     """
-    levels = np.append(np.sort(2.0 * owner + heights), np.nan)  # box after box
+    aside = near.outside[:2].max(0)
+    is_beside = (aside > ROAD_SIDE_GAP) & (depth < ROAD_SEARCH_WIDTH)
+    beside = np.flatnonzero(is_beside & (np.abs(height) < ROAD_HEIGHT_RANGE))
+    half_square = np.hypot(half[:, 0], half[:, 1]) + ROAD_SEARCH_WIDTH
+    distance = np.abs(near.offset[:2].take(beside, 1)).max(0)
+    beside = beside[distance < half_square.take(near.owner.take(beside))]
+    return _flat_heights(height.take(beside), near.owner.take(beside), len(half))
+
+
+def _flat_heights(heights: Floats, owner: Ints, n: int) -> Floats:
+    """
+    Return the representative height of each of `n` boxes, (n,) [m]; NaN where not flat.
+
+    `heights` (P,) are between -1 and 1 m, above the bottoms of the boxes `owner` (P,).
+
+    """
+    # Boxes are 2 m apart, heights within 2 m: one sort orders by box, then by height.
+    levels = np.append(np.sort(2.0 * owner + heights), np.nan)
     counts = np.bincount(owner, minlength=n)
     first = np.cumsum(counts) - counts
-    low, road, high = (levels[first + (part * counts).astype(int)] for part in (0.1, 0.3, 0.6))
-    # A wall, a kerb or a vehicle is not flat.
-    return np.where((counts >= 5) & (high - low < 0.15), road - 2.0 * np.arange(n), np.nan)
+    low, road, high = (levels[first + (part * counts).astype(int)] for part in ROAD_QUANTILES)
+    is_road = (counts >= MIN_ROAD_POINTS) & (high - low < ROAD_FLATNESS)
+    return np.where(is_road, road - 2.0 * np.arange(n), np.nan)
 
 
-def _by_x(rows: Ints, owner: Ints, x: Floats, n: int) -> Ints:
+def _sorted_by_x(rows: Ints, owner: Ints, x: Floats, n: int) -> Ints:
     """
-    Return `rows` of the sweep by `owner` (one of `n`), then `x` (-1 to 1), then row.
+    Return `rows` of the sweep sorted by `owner` (one of `n`), then `x` (-1 to 1), then row.
 
-    All three make one number: sorting numbers is several times faster than finding their order,
-    and no two are equal, so that every machine sorts them alike.
+    All three are packed into one integer: sorting integers is several times faster than finding
+    their order, and no two are equal, so that every machine sorts them alike.
 
     """
     bits = int(rows.max(initial=0)).bit_length()
@@ -169,22 +288,37 @@ def _by_x(rows: Ints, owner: Ints, x: Floats, n: int) -> Ints:
 
 
 def _thinned(rows: Ints, points: NDArray[np.floating], config: Config) -> Ints:
-    """Return the `rows` of `points` to keep: farthest ones for the paper, else every n-th."""
-    if config.objective != 'paper' or len(rows) <= config.sampling.points:
-        return rows[:: max(1, -(-len(rows) // config.sampling.points))]
-    return rows[farthest_point_sample(points[rows].astype(np.float64), config.sampling.points)]
+    """Return the `rows` of `points` to keep: farthest points for the paper, else every n-th."""
+    most = config.sampling.points
+    if config.objective == 'paper' and len(rows) > most:
+        return rows[farthest_point_sample(points[rows].astype(np.float64), most)]
+    return rows[:: max(1, -(-len(rows) // most))]
 
 
 def farthest_point_sample(points: Floats, count: int) -> Ints:
     """
-    Choose `count` of `points` (M, 3), at most M, that cover the cloud; return their rows.
+    Return the rows of `count` points that cover a cloud.
 
-    The first is the one farthest from the mean, each next one farthest from all before.
+    The first one is farthest from the mean, each next one farthest from all before.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        The cloud [m].
+    count : int
+        At most M.
+
+    Returns
+    -------
+    rows : array, shape (count,)
+        All different.
 
     """
-    gaps, picks = np.square(points - points.mean(0)).sum(1), np.empty(count, dtype=int)
+    gaps = np.square(points - points.mean(0)).sum(1)
+    picks = np.empty(count, dtype=int)
     for step in range(count):
         picks[step] = gaps.argmax()
-        gaps = np.minimum(gaps if step else np.inf, np.square(points - points[picks[step]]).sum(1))
-        gaps[picks[step]] = -1.0  # once is enough: minima stay below
+        to_pick = np.square(points - points[picks[step]]).sum(1)
+        gaps = np.minimum(gaps, to_pick) if step else to_pick
+        gaps[picks[step]] = -1.0  # below any distance, so that no point is picked twice
     return picks

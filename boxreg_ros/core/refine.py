@@ -1,7 +1,8 @@
-"""Whole tracks in, refined tracks out: the core without topics and files."""
+"""Refinement of whole tracks given as arrays: the API without topics and files."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
@@ -14,6 +15,7 @@ from boxreg_ros.structures import (
     INTERPOLATED,
     Ints,
     RefinedBoxes,
+    ROLL,
     Sweep,
 )
 import numpy as np
@@ -30,16 +32,22 @@ class Track:
     track_id, class_name : str
         Identity and category.
     stamps_ns : array, shape (N,)
-        Strictly increasing [ns]; datetime64 of any unit as well.
+        Strictly increasing [ns], or datetime64 of any unit.
     boxes : array, shape (N, 9)
-        Input boxes.
+        Input boxes in the fixed frame, as `boxreg_ros.structures` defines them [m, rad].
     points : sequence of N arrays, shape (M_i, 3)
-        Returns on and around the object [m]; M_i may be 0. Those of all tracks of a stamp make one
-        sweep: what several have counts as often.
+        Points on and around the object in the fixed frame [m]; M_i may be 0. The points of all
+        tracks at one stamp form one sweep: a point given with two tracks counts twice.
     sensor_origins : array, shape (N, 3), or None
-        Where the sensor was [m]; without it visible faces are told by the points' centre of mass.
+        Positions of the sensor [m]. Where unknown, the visible faces follow from the centre of
+        mass of the points.
     scores : array, shape (N,), or None
         Detector confidence.
+
+    Raises
+    ------
+    ShapeError
+        For an array of the wrong shape or type, or stamps that do not increase.
 
     """
 
@@ -53,56 +61,66 @@ class Track:
 
     def __post_init__(self) -> None:
         """Check shapes and order; convert lists to arrays."""
-        given = np.asarray(self.stamps_ns)
-        if given.dtype.kind == 'M':  # whatever its unit
-            given = given.astype('datetime64[ns]')
-        if given.size and given.dtype.kind not in 'iuM':
-            raise ShapeError(
-                f'stamps_ns of track {self.track_id!r}: expected whole numbers [ns], got '
-                f'{given.dtype}; of seconds: (seconds * 1e9).round().astype(int)'
-            )
-        stamps = given.astype(np.int64)
-        if stamps.ndim != 1 or (np.diff(stamps) <= 0).any():
-            raise ShapeError(
-                f'stamps_ns of track {self.track_id!r}: expected (N,) strictly increasing [ns], '
-                f'got shape {stamps.shape}; sort them, and leave repeated ones out'
-            )
         if not isinstance(self.class_name, str):
             raise ShapeError(
                 f"class_name of track {self.track_id!r}: expected text such as 'car', got "
                 f'{self.class_name!r}'
             )
-        n = len(stamps)
-        object.__setattr__(self, 'stamps_ns', stamps)
-        object.__setattr__(self, 'boxes', checked('boxes', self.boxes, (n, 9)))
+        stamps_ns = self._checked_stamps()
+        n = len(stamps_ns)
+        self._set('stamps_ns', stamps_ns)
+        self._set('boxes', checked('boxes', self.boxes, (n, 9)))
         if len(self.points) != n:
             raise ShapeError(
-                f'points of track {self.track_id!r}: expected {n}, got {len(self.points)}'
+                f'points of track {self.track_id!r}: expected {n} arrays, one per stamp, got '
+                f'{len(self.points)}'
             )
-        rows = [p if len(p) else np.zeros((0, 3)) for p in self.points]
-        points = tuple(checked(f'points[{i}]', p, (None, 3)) for i, p in enumerate(rows))
-        object.__setattr__(self, 'points', points)
-        for name, shape in (('sensor_origins', (n, 3)), ('scores', (n,))):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, checked(name, value, shape))
+        points = [array if len(array) else np.zeros((0, 3)) for array in self.points]
+        self._set(
+            'points',
+            tuple(checked(f'points[{i}]', array, (None, 3)) for i, array in enumerate(points)),
+        )
+        if self.sensor_origins is not None:
+            self._set('sensor_origins', checked('sensor_origins', self.sensor_origins, (n, 3)))
+        if self.scores is not None:
+            self._set('scores', checked('scores', self.scores, (n,)))
+
+    def _checked_stamps(self) -> Ints:
+        given = np.asarray(self.stamps_ns)
+        if given.dtype.kind == 'M':
+            given = given.astype('datetime64[ns]')
+        if given.size and given.dtype.kind not in 'iuM':
+            raise ShapeError(
+                f'stamps_ns of track {self.track_id!r}: expected whole numbers [ns], got '
+                f'{given.dtype}; convert seconds by (seconds * 1e9).round().astype(int)'
+            )
+        stamps_ns = given.astype(np.int64)
+        if stamps_ns.ndim != 1 or (np.diff(stamps_ns) <= 0).any():
+            raise ShapeError(
+                f'stamps_ns of track {self.track_id!r}: expected (N,) strictly increasing [ns], '
+                f'got shape {stamps_ns.shape}; sort them and remove repeated stamps'
+            )
+        return stamps_ns
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)  # the class is frozen
 
 
 @dataclass(frozen=True, slots=True)
 class RefinedTrack:
     """
-    What `refine` returns for one track, row by row with its input.
+    The refined boxes of one track, row by row with its input.
 
     Attributes
     ----------
     track_id : str
-        That of the input.
+        As in the input.
     boxes : array, shape (N, 9)
-        Refined boxes, fixed frame.
+        Refined boxes in the fixed frame [m, rad].
     status : tuple of N str
-        ``refined``, ``kept`` or ``interpolated``.
+        ``refined``, ``kept`` (the input box, unchanged) or ``interpolated`` (invalid input box).
     reasons : tuple of N str
-        Why a box was kept, or had to be put in; empty for those refined.
+        Why a box was kept or interpolated; empty for refined boxes.
     covariances : array, shape (N, 6, 6)
         Of x y z roll pitch yaw [m, rad].
 
@@ -115,88 +133,118 @@ class RefinedTrack:
     covariances: Floats
 
 
+class _Place(NamedTuple):
+    """An observation: index of its track, and its row in the track."""
+
+    track: int
+    row: int
+
+
 def refine(tracks: Iterable[Track], config: Config | None = None) -> list[RefinedTrack]:
     """
-    Refine whole tracks; the same core, and the same boxes, as node and recordings get.
+    Refine whole tracks by the core that the node and `boxreg relabel` use.
 
     Parameters
     ----------
     tracks : iterable of Track
         Objects over time in one fixed frame. Tracks that share a stamp share its sweep and its
-        sensor: they are fitted knowing each other's boxes.
+        sensor position: a point belongs to the box it is deepest inside of.
     config : Config, optional
-        Settings; `estimate` says which of the estimates of a box is returned.
+        Settings; `estimate` selects which estimate of a box is returned.
 
     Returns
     -------
     refined : list of RefinedTrack
-        In the order of `tracks`, rows as in the input. Never NaN: a box given with NaN or without
-        volume comes back interpolated between its neighbours.
+        In the order of `tracks`, rows as in the input. Never NaN: an invalid input box is
+        replaced by one interpolated between its neighbours.
 
     Raises
     ------
     ShapeError
-        If a track has no valid box at all, or two tracks the same id.
+        If a track has no valid box, or two tracks have the same id.
     ConfigError
         If `config` is no Config.
 
     """
-    tracks, config = list(tracks), Config() if config is None else config
+    tracks = list(tracks)
+    if config is None:
+        config = Config()
     if not isinstance(config, Config):
         raise ConfigError(f'config: expected a Config, got {config!r}; see Config.from_dict')
     names = [track.track_id for track in tracks]
     if len(set(names)) < len(names):
         raise ShapeError(f'tracks: expected different track ids, got {sorted(map(str, names))}')
-    at: dict[int, list[tuple[int, int]]] = {}
+    places: dict[int, list[_Place]] = {}  # by stamp
     for index, track in enumerate(tracks):
-        for row, stamp_ns in enumerate(track.stamps_ns):
-            at.setdefault(int(stamp_ns), []).append((index, row))
+        for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
+            places.setdefault(stamp_ns, []).append(_Place(index, row))
+
     registrar = BoxRegistrar(replace(config, tolerance=0.0))
     results: list[RefinedBoxes] = []
-    for stamp_ns, places in sorted(at.items()):
-        members = [tracks[index] for index, _ in places]
-        origins = [
-            track.sensor_origins[row]
-            for track, (_, row) in zip(members, places, strict=True)
-            if track.sensor_origins is not None and np.isfinite(track.sensor_origins[row]).all()
-        ]
-        origin = origins[0] if origins else np.full(3, np.nan)
-        boxes = np.array([tracks[index].boxes[row] for index, row in places])
-        points = np.concatenate([tracks[index].points[row] for index, row in places])
-        points = points[np.isfinite(points).all(1)]
-        results += registrar.add_sweep(Sweep(stamp_ns, '', points, None, origin))
-        ids, classes = [str(index) for index, _ in places], [t.class_name for t in members]
-        results += registrar.add_boxes(
-            BoxArray(stamp_ns, '', tuple(ids), tuple(classes), np.ones(len(ids)), boxes)
-        )
+    for stamp_ns in sorted(places):
+        results += registrar.add_sweep(_sweep(stamp_ns, tracks, places[stamp_ns]))
+        results += registrar.add_boxes(_box_array(stamp_ns, tracks, places[stamp_ns]))
     results += registrar.flush()
-    wanted = config.estimate != 'early'
-    by_stamp = {r.boxes.stamp_ns: r for r in results if r.is_final == wanted}
+
+    is_final = config.estimate != 'early'
+    by_stamp = {r.boxes.stamp_ns: r for r in results if r.is_final == is_final}
     rows: list[list[tuple[RefinedBoxes, int]]] = [[] for _ in tracks]
-    for stamp_ns, places in sorted(at.items()):
-        for column, (index, _) in enumerate(places):
-            rows[index].append((by_stamp[stamp_ns], column))
+    for stamp_ns in sorted(places):
+        for column, place in enumerate(places[stamp_ns]):
+            rows[place.track].append((by_stamp[stamp_ns], column))
     return [_refined_track(track, row) for track, row in zip(tracks, rows, strict=True)]
 
 
-def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> RefinedTrack:
-    boxes = np.array([r.boxes.boxes[i] for r, i in rows]).reshape(-1, 9)
-    status = [r.status[i] for r, i in rows]
-    valid = np.array([r.reasons[i] != 'invalid_box' for r, i in rows], dtype=bool)
-    if len(rows) and not valid.any():
-        raise ShapeError(f'boxes of track {track.track_id!r}: expected one finite box at least')
-    if not valid.all():
-        known = boxes[valid]
-        known[:, 6:9] = np.unwrap(known[:, 6:9], axis=0)
-        when, stamps = track.stamps_ns[~valid], track.stamps_ns[valid]
-        between = np.stack([np.interp(when, stamps, column) for column in known.T], 1)
-        between[:, 6:9] = wrap_angle(between[:, 6:9])
-        boxes[~valid] = between
-        status = [s if v else INTERPOLATED for s, v in zip(status, valid, strict=True)]
-    return RefinedTrack(
-        track.track_id,
-        boxes,
-        tuple(status),
-        tuple(r.reasons[i] for r, i in rows),
-        np.array([r.covariances[i] for r, i in rows]).reshape(-1, 6, 6),
+def _sweep(stamp_ns: int, tracks: Sequence[Track], places: Sequence[_Place]) -> Sweep:
+    """Return the points of all tracks of a stamp as one sweep; its origin is the first known."""
+    origin = np.full(3, np.nan)
+    for index, row in reversed(places):
+        origins = tracks[index].sensor_origins
+        if origins is not None and np.isfinite(origins[row]).all():
+            origin = origins[row]
+    points = np.concatenate([tracks[index].points[row] for index, row in places])
+    return Sweep(stamp_ns, '', points[np.isfinite(points).all(1)], None, origin)
+
+
+def _box_array(stamp_ns: int, tracks: Sequence[Track], places: Sequence[_Place]) -> BoxArray:
+    """Return the boxes of all tracks of a stamp; their ids are the indices of the tracks."""
+    return BoxArray(
+        stamp_ns,
+        '',
+        tuple(str(place.track) for place in places),
+        tuple(tracks[place.track].class_name for place in places),
+        np.ones(len(places)),
+        np.array([tracks[index].boxes[row] for index, row in places]),
     )
+
+
+def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> RefinedTrack:
+    """Collect the rows of a track; interpolate boxes whose input was invalid."""
+    boxes = np.array([result.boxes.boxes[i] for result, i in rows]).reshape(-1, 9)
+    status = [result.status[i] for result, i in rows]
+    reasons = [result.reasons[i] for result, i in rows]
+    covariances = np.array([result.covariances[i] for result, i in rows]).reshape(-1, 6, 6)
+    is_valid = np.array([reason != 'invalid_box' for reason in reasons], dtype=bool)
+    if rows and not is_valid.any():
+        raise ShapeError(
+            f'boxes of track {track.track_id!r}: expected one finite box with positive extents at '
+            'least, got none; remove the track'
+        )
+    if not is_valid.all():
+        stamps_ns = track.stamps_ns
+        boxes[~is_valid] = _interpolated(
+            stamps_ns[is_valid], boxes[is_valid], stamps_ns[~is_valid]
+        )
+        for row in np.flatnonzero(~is_valid):
+            status[row] = INTERPOLATED
+    return RefinedTrack(track.track_id, boxes, tuple(status), tuple(reasons), covariances)
+
+
+def _interpolated(stamps_ns: Ints, boxes: Floats, wanted_ns: Ints) -> Floats:
+    """Return `boxes` (N, 9) of `stamps_ns` (N,) interpolated linearly at `wanted_ns`."""
+    unwrapped = boxes.copy()
+    unwrapped[:, ROLL:] = np.unwrap(boxes[:, ROLL:], axis=0)
+    columns = [np.interp(wanted_ns, stamps_ns, column) for column in unwrapped.T]
+    found = np.stack(columns, axis=1)
+    found[:, ROLL:] = wrap_angle(found[:, ROLL:])
+    return found

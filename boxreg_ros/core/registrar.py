@@ -1,16 +1,19 @@
-"""The one stateful object of the core: sweeps and boxes in, refined boxes out, nothing else."""
+"""The stateful object of the core: sweeps and box arrays in, refined boxes out."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import dist, inf
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.registration import Estimate, register
-from boxreg_ros.core.window import Memory, Window
+from boxreg_ros.core.window import MarginalisationPrior, Window
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.structures import (
     BoxArray,
@@ -26,254 +29,442 @@ from boxreg_ros.structures import (
 import numpy as np
 import torch
 
-Awaited = Callable[[], list[Estimate | None]]
-Begin = Callable[[list[Window], Config, InputModel], Awaited]
+GetEstimates = Callable[[], list[Estimate | None]]
+"""Waits for the estimates of submitted windows, None for windows that are too short."""
+Submit = Callable[[list[Window], Config, InputModel], GetEstimates]
+"""Starts `register` with the same arguments, perhaps in another process."""
+
+VELOCITY_OBSERVATIONS = 4
+"""Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
+ID_SWITCH_OBSERVATIONS = 6
+"""
+Observations that an id switch is detected from, at least one less; chosen.
+
+The last two are tested against the velocity of those before.
+
+"""
+ID_SWITCH_SPEED = 10.0
+"""
+Least deviation from constant velocity that is an id switch [m/s].
+
+Derived: within the 0.2 s of two observations no road user changes its velocity by 10 m/s, which
+is 50 m/s^2.
+
+"""
 
 
 class BoxRegistrar:
     """
     Register the boxes of a stream to its sweeps.
 
-    Deterministic: the order of calls is its only input. It knows no clock, no topic, no file and
-    one frame, the fixed frame of all that is added. Not thread-safe.
+    The order of calls is the only input: a registrar reads no clock, no topic and no file, and
+    the same calls return the same boxes. All sweeps and boxes are in one fixed frame. Not
+    thread-safe.
 
-    Every box array added comes back exactly once with ``is_final=True``, all its boxes in the
-    order of the input, stamps ascending but for what came late. With `estimate` 'early' or
-    'final' it comes back once more before that, with ``is_final=False``, as soon as it is paired.
+    Each box array added is returned exactly once with ``is_final=True``, with all its boxes in
+    the order of the input. Stamps of returned arrays ascend, except for arrays that came late.
+    With `estimate` 'early' or 'final' an array is returned once more before that, with
+    ``is_final=False``, as soon as its sweep is known.
 
     Parameters
     ----------
     config : Config
         Settings.
-    begin : callable, optional
-        Begins `register` elsewhere, with the arguments of that, and returns what waits for its
-        estimates. With `estimate` 'track' more is taken meanwhile; what comes back is the same,
-        but comes when the next windows are full.
+    submit : callable, optional
+        Starts `register` elsewhere, with its arguments, and returns a callable that waits for
+        the estimates. With `estimate` 'track' the registrar goes on meanwhile: the boxes returned
+        are the same, but one call of `register` later. Default: `register` runs at once.
 
     Attributes
     ----------
     config : Config
-        May be replaced between calls; `sampling`, `solver`, `paper`, `max_gap`,
-        `min_observations` and how classes move have effect at once, the others after `reset`.
+        May be replaced between calls. `sampling`, `solver`, `paper`, `max_gap`,
+        `min_observations` and the groups of object classes take effect at once, other settings
+        after `reset`.
     counts : Counter
-        Sweeps and boxes taken, boxes by status, and everything dropped or kept by reason.
+        Sweeps and boxes added, boxes by status, and everything dropped or kept, by reason.
+
+    Raises
+    ------
+    ConfigError
+        If torch cannot use `config.device`.
+
+    Notes
+    -----
+    A **box array** passes through these states, in this order:
+
+    1. *Unpaired*: held by `StampMatcher` until its sweep is known, or known not to come.
+    2. *Pending*: each valid box is an observation of the track with its id. A box that cannot be
+       refined has a reason and is not waited for. Estimates overwrite each other until they are
+       settled.
+    3. *Settled*: no estimate changes any more. With 'early' and 'final' an array is settled when
+       `lag` younger arrays are paired. With 'track' it is settled when all its observations have
+       been estimated in a window where they are not among the newest eighth.
+    4. *Returned*: arrays are returned in the order they were paired, so a settled array waits for
+       the arrays before it.
+
+    A **track** starts with the first observation of its id. With 'early' and 'final' its window
+    (its last `window` observations) is estimated at each of its observations. With 'track' it is
+    estimated when some track has `track_window` observations, together with all tracks of more
+    than half as many. A track ends after `max_gap` without an observation, when its id is given
+    to another object, or, with 'track', at `flush`. It is then estimated a last time with the next
+    windows, which settles all its observations.
 
     """
 
-    def __init__(self, config: Config, begin: Begin | None = None) -> None:
-        try:
-            torch.zeros(1, device=config.device)
-        except (AssertionError, RuntimeError) as error:  # torch says it in either way
-            wanted = "device: expected one that torch can use here, such as 'cpu', got "
-            raise ConfigError(f'{wanted}{config.device!r}: {str(error).splitlines()[0]}') from None
-        self.config, self._begin = config, begin
+    def __init__(self, config: Config, submit: Submit | None = None) -> None:
+        _check_device(config.device)
+        self.config = config
         self.counts: Counter[str] = Counter()
+        self._submit = submit
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything but the counts."""
-        self._matcher, window = StampMatcher(self.config, self.counts), self.config.window
-        # The ends of a window are its weakest part: of whole tracks an eighth waits for the next
-        # window, which sees another eighth of settled ones before it.
-        eighth, is_track = self.config.track_window // 8, self.config.estimate == 'track'
-        self._keep, self._wait = (2 * eighth, eighth) if is_track else (window - 1, window)
-        self._tracks, self._ticks = dict[str, _TrackBuffer](), deque[_Tick]()
-        self._newest_ns, self._model = -inf, InputModel(self.config.faces)
-        self._ended, self._count = list[_TrackBuffer](), 0
-        self._work = list[tuple[_TrackBuffer, list[_Entry], bool]]()
-        self._result: Awaited = list
+        """Discard tracks and box arrays that are held; keep the counts."""
+        config = self.config
+        self._matcher = StampMatcher(config, self.counts)
+        self._input_model = InputModel(config.faces)
+        self._pending = deque[_PendingArray]()
+        self._newest_ns = -inf
+        self._tracks: dict[str, _Track] = {}
+        self._ended_tracks: list[_Track] = []
+        self._arrays_since_solve = 0
+        self._submitted: list[_SubmittedTrack] = []
+        self._get_estimates: GetEstimates = list
+        if config.estimate == 'track':
+            # The ends of a window are its weakest part. The newest eighth of its observations is
+            # estimated again in the next window, after another eighth that is settled.
+            eighth = config.track_window // 8
+            self._num_overlapping = 2 * eighth
+            self._num_unsettled = eighth
+        else:
+            self._num_overlapping = config.window - 1
+            self._num_unsettled = config.window
 
     def add_sweep(self, sweep: Sweep) -> list[RefinedBoxes]:
-        """Take a sweep; return what has become ready."""
-        self.counts['sweeps'] += not sweep.is_lost
-        return list(self._advance(self._matcher.add_sweep(sweep)))
+        """Add a sweep; return the box arrays that are completed by it."""
+        self.counts['sweeps'] += not sweep.is_dropped
+        return list(self._process(self._matcher.add_sweep(sweep)))
 
     def add_boxes(self, boxes: BoxArray) -> list[RefinedBoxes]:
-        """Take a box array; return what has become ready."""
+        """Add a box array; return the box arrays that are completed by it."""
         self.counts['boxes'] += len(boxes.track_ids)
-        return list(self._advance(self._matcher.add_boxes(boxes)))
+        return list(self._process(self._matcher.add_boxes(boxes)))
 
     def flush(self) -> list[RefinedBoxes]:
-        """Return everything still held; with `estimate` 'track' tracks end, else they go on."""
-        ready = list(self._advance(self._matcher.flush()))
-        if self.config.estimate == 'track':  # what is live is known already, and may be in haste
+        """Return all box arrays held. Tracks end with `estimate` 'track', else they go on."""
+        ready = list(self._process(self._matcher.flush()))
+        if self.config.estimate == 'track':
             self._end(list(self._tracks))
             self._solve([])
-        for tick in self._ticks:
-            tick.waiting = 0
-        return [*ready, *self._settled()]
+        for array in self._pending:
+            array.num_unsettled = 0
+        return [*ready, *self._pop_settled()]
 
-    def _advance(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
-        full = self.config.track_window
+    def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
         for pair in pairs:
-            tick = self._open(pair)
-            self._count += 1
-            if self.config.estimate != 'track':
-                self._solve([t for t in self._tracks.values() if t.entries[-1].tick is tick])
-                yield tick.result(is_final=False)
-                lag = min(self.config.lag, self.config.window - 1)
-                for old in [t for t in self._ticks if t.is_paired][::-1][lag:]:
-                    old.waiting = 0
-            elif self._count >= full or any(len(t.entries) >= full for t in self._tracks.values()):
-                # Tracks that are half full are solved with those that are full, or have ended:
-                # the more at once, the better they tell the errors of the input.
-                self._solve([t for t in self._tracks.values() if len(t.entries) > full // 2])
-            yield from self._settled()
+            array = self._open(pair)
+            if self.config.estimate == 'track':
+                self._solve_full_windows()
+            else:
+                self._solve([track for track in self._tracks.values() if track.is_in(array)])
+                yield array.result(is_final=False)
+                self._settle_after_lag()
+            yield from self._pop_settled()
 
-    def _open(self, pair: Pair) -> '_Tick':
-        """Start a tick: sort its boxes out and add an observation to the track of each."""
-        boxes, sweep, now_ns = *pair, pair.boxes.stamp_ns
-        tick = _Tick(boxes)
-        self._ticks.append(tick)
-        newest_ns, self._newest_ns = self._newest_ns, max(now_ns, self._newest_ns)
-        late = '' if now_ns > newest_ns else 'late' if now_ns < newest_ns else 'duplicate_stamp'
-        tick.is_paired = sweep is not None and not late
-        self.counts.update(['boxes_without_sweep'] if sweep is None else [])
-        tick.refuse(late or ('no_sweep' if sweep is None else ''))
-        admitted = [i for i, reason in enumerate(tick.reasons) if not reason]
-        due = now_ns - round(self.config.max_gap * 1e9)
-        self._end([k for k, t in self._tracks.items() if t.entries[-1].observation.stamp_ns < due])
-        if sweep is not None and admitted:
-            fresh = [_TrackBuffer(boxes.track_ids[i], boxes.class_names[i]) for i in admitted]
-            tracks = [self._tracks.setdefault(track.track_id, track) for track in fresh]
-            given, there = boxes.boxes[admitted], boxes.boxes[admitted]
-            if delay := (sweep.stamp_ns - now_ns) * 1e-9:
-                # Seen from the box, points are where they were at the stamp of the box.
-                moves = [t.velocity(box, now_ns) for t, box in zip(tracks, given, strict=True)]
-                there[:, X : Z + 1] += delay * np.array(moves)
-            seen = observe(sweep, there, now_ns, self.config)
-            for i, track, box, observation in zip(admitted, tracks, given, seen, strict=True):
-                tick.num_points[i], tick.reasons[i] = observation.num_points, 'short_track'
-                track.entries.append(_Entry(observation._replace(box=box), tick, i))
-                tick.waiting += 1
-                if other := track.parted():
-                    self._end([track.track_id])
-                    self._tracks[track.track_id] = other
-        return tick
+    def _open(self, pair: Pair) -> '_PendingArray':
+        """Make a box array pending: its valid boxes become observations of their tracks."""
+        boxes, sweep = pair
+        array = _PendingArray(boxes)
+        self._pending.append(array)
+        reason = ''
+        if boxes.stamp_ns < self._newest_ns:
+            reason = 'late'
+        elif boxes.stamp_ns == self._newest_ns:
+            reason = 'duplicate_stamp'
+        self._newest_ns = max(boxes.stamp_ns, self._newest_ns)
+        array.is_observed = sweep is not None and not reason
+        if sweep is None:
+            self.counts['boxes_without_sweep'] += 1
+            reason = reason or 'no_sweep'
+        array.set_reasons(reason)
+        self._end_silent_tracks(boxes.stamp_ns)
+        if sweep is not None:
+            self._observe(array, sweep)
+        return array
 
-    def _end(self, names: list[str]) -> None:
-        """Close tracks; they are solved once more, with the next ones."""
-        self._ended += [self._tracks.pop(name) for name in names]
+    def _observe(self, array: '_PendingArray', sweep: Sweep) -> None:
+        """Add an observation to the track of each box that has no reason not to be refined."""
+        boxes = array.input
+        rows = [row for row, reason in enumerate(array.reasons) if not reason]
+        if not rows:
+            return
+        for row in rows:
+            track_id = boxes.track_ids[row]
+            if track_id not in self._tracks:
+                self._tracks[track_id] = _Track(track_id, boxes.class_names[row])
+        tracks = [self._tracks[boxes.track_ids[row]] for row in rows]
+        given = boxes.boxes[rows]
+        at_sweep = given.copy()
+        offset = (sweep.stamp_ns - boxes.stamp_ns) * 1e-9  # [s]
+        if offset:
+            # The points are relative to the box: motion-compensated to the stamp of the box.
+            velocities = [
+                track.input_velocity(box, boxes.stamp_ns)
+                for track, box in zip(tracks, given, strict=True)
+            ]
+            at_sweep[:, X : Z + 1] += offset * np.array(velocities)
+        observations = observe(sweep, at_sweep, boxes.stamp_ns, self.config)
+        for row, track, box, observation in zip(rows, tracks, given, observations, strict=True):
+            array.num_points[row] = observation.num_points
+            array.reasons[row] = 'short_track'  # until there is an estimate
+            array.num_unsettled += 1
+            track.entries.append(_Entry(observation._replace(box=box), array, row))
+            successor = track.split_at_id_switch()
+            if successor is not None:
+                self._end([track.track_id])
+                self._tracks[track.track_id] = successor
 
-    def _solve(self, tracks: list['_TrackBuffer']) -> None:
-        """Register windows, ended ones too: when it begins elsewhere, go on until it is needed."""
-        self._finish()
-        tracks = self._ended + tracks
-        asked = [track.window() for track in tracks], self.config, self._model
-        self._result = self._begin(*asked) if self._begin else lambda: register(*asked)
-        self._work = [(track, track.entries, track in self._ended) for track in tracks]
+    def _end_silent_tracks(self, now_ns: int) -> None:
+        oldest_ns = now_ns - round(self.config.max_gap * 1e9)
+        self._end([name for name, track in self._tracks.items() if track.newest_ns < oldest_ns])
+
+    def _end(self, track_ids: list[str]) -> None:
+        """End tracks; they are estimated a last time with the next windows."""
+        self._ended_tracks += [self._tracks.pop(track_id) for track_id in track_ids]
+
+    def _settle_after_lag(self) -> None:
+        """Settle the arrays that have `lag` younger ones, which are in their windows."""
+        lag = min(self.config.lag, self.config.window - 1)
+        observed = [array for array in self._pending if array.is_observed]
+        for array in observed[: max(0, len(observed) - lag)]:
+            array.num_unsettled = 0
+
+    def _solve_full_windows(self) -> None:
+        """Solve when a window is full, together with tracks that fill more than half of one."""
+        self._arrays_since_solve += 1
+        full = self.config.track_window
+        lengths = [len(track.entries) for track in self._tracks.values()]
+        if self._arrays_since_solve >= full or any(length >= full for length in lengths):
+            # More tracks at once give a better estimate of the errors of the input.
+            tracks = self._tracks.values()
+            self._solve([track for track in tracks if len(track.entries) > full // 2])
+
+    def _solve(self, tracks: list['_Track']) -> None:
+        """Submit the windows of `tracks` and of ended tracks, after collecting those before."""
+        self._collect()
+        ended = self._ended_tracks
+        self._submitted = [_SubmittedTrack(track, track.entries, True) for track in ended]
+        self._submitted += [_SubmittedTrack(track, track.entries, False) for track in tracks]
+        windows = [track.window() for track in ended + tracks]
+        submit = self._submit or _submit_locally
+        self._get_estimates = submit(windows, self.config, self._input_model)
         for track in tracks:
-            track.entries = track.entries[-self._keep :]
-        self._ended, self._count = [], 0
-        if self.config.estimate != 'track' or not (self._begin and self._tracks):
-            self._finish()
+            track.entries = track.entries[-self._num_overlapping :]
+        self._ended_tracks = []
+        self._arrays_since_solve = 0
+        goes_on = self.config.estimate == 'track' and self._submit is not None
+        if not goes_on or not self._tracks:
+            self._collect()
 
-    def _finish(self) -> None:
-        """Write the estimates, when they have come, to the ticks they are of."""
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # tensors are small: threads of torch would wait, not work
-        try:
-            estimates = self._result()
-        finally:
-            torch.set_num_threads(threads)
-        for (track, entries, is_ended), estimate in zip(self._work, estimates, strict=True):
+    def _collect(self) -> None:
+        """Wait for the estimates of submitted windows; write them to the box arrays."""
+        with _one_torch_thread():
+            estimates = self._get_estimates()
+        for (track, entries, is_ended), estimate in zip(self._submitted, estimates, strict=True):
             if estimate is not None:
                 track.write(estimate, entries)
-            for entry in entries if is_ended else entries[: -self._wait]:
-                entry.tick.waiting -= not entry.is_settled
-                entry.is_settled = True
-        self._work, self._result = [], list
+            settled = entries if is_ended else entries[: -self._num_unsettled]
+            for entry in settled:
+                entry.settle()
+        self._submitted = []
+        self._get_estimates = list
 
-    def _settled(self) -> Iterator[RefinedBoxes]:
-        while self._ticks and self._ticks[0].waiting <= 0:
-            tick = self._ticks.popleft()
-            self.counts.update([*tick.status, *filter(None, tick.reasons)])
-            yield tick.result(is_final=True)
+    def _pop_settled(self) -> Iterator[RefinedBoxes]:
+        """Yield settled box arrays, up to the first one that is not."""
+        while self._pending and self._pending[0].num_unsettled <= 0:
+            array = self._pending.popleft()
+            self.counts.update(array.status)
+            self.counts.update(reason for reason in array.reasons if reason)
+            yield array.result(is_final=True)
 
 
-class _Tick:
-    """One box array on its way: the best known about each box, and how many still wait."""
+class _PendingArray:
+    """
+    A box array that is not yet returned, with the present estimate of each box.
+
+    Attributes
+    ----------
+    input : BoxArray
+        As added.
+    boxes, status, reasons, num_points, covariances
+        As in `RefinedBoxes`, row by row with the input.
+    num_unsettled : int
+        Boxes whose estimate may still change; the array is settled at 0 or less.
+    is_observed : bool
+        True where a sweep was found and the array is in order.
+
+    """
 
     def __init__(self, boxes: BoxArray) -> None:
         n = len(boxes.track_ids)
-        self.boxes, self.refined = boxes, boxes.boxes.copy()
-        self.status, self.reasons = [KEPT] * n, [''] * n
+        self.input = boxes
+        self.boxes = boxes.boxes.copy()
+        self.status = [KEPT] * n
+        self.reasons = [''] * n
         self.num_points = np.zeros(n, int)
         self.covariances = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()
-        self.waiting, self.is_paired = 0, False
+        self.num_unsettled = 0
+        self.is_observed = False
 
-    def refuse(self, reason: str) -> None:
-        """Give a reason to each box the core cannot take; `reason` holds for all if not empty."""
-        boxes, seen = self.boxes.boxes, set[str]()
-        valid = is_valid_box(boxes)
-        for i, (name, good) in enumerate(zip(self.boxes.track_ids, valid, strict=True)):
-            why = 'no_track_id' if not name else 'duplicate_track_id' if name in seen else reason
-            self.reasons[i] = why if good else 'invalid_box'
-            seen.update([name] if good else [])
+    def set_reasons(self, reason: str) -> None:
+        """Set the reason of each box that cannot be refined; `reason`, if any, holds for all."""
+        known = set[str]()
+        is_valid = is_valid_box(self.input.boxes)
+        for row, track_id in enumerate(self.input.track_ids):
+            if not is_valid[row]:
+                self.reasons[row] = 'invalid_box'
+            elif not track_id:
+                self.reasons[row] = 'no_track_id'
+            elif track_id in known:
+                self.reasons[row] = 'duplicate_track_id'
+            else:
+                self.reasons[row] = reason
+            if is_valid[row]:
+                known.add(track_id)
 
     def result(self, is_final: bool) -> RefinedBoxes:
-        boxes = replace(self.boxes, boxes=self.refined.copy())
-        outcome = tuple(self.status), tuple(self.reasons), self.num_points.copy()
-        return RefinedBoxes(boxes, *outcome, self.covariances.copy(), is_final)
+        """Return the present estimates as copies."""
+        return RefinedBoxes(
+            replace(self.input, boxes=self.boxes.copy()),
+            tuple(self.status),
+            tuple(self.reasons),
+            self.num_points.copy(),
+            self.covariances.copy(),
+            is_final,
+        )
 
 
 @dataclass(slots=True)
 class _Entry:
-    """An observation and the place its estimate belongs to."""
+    """An observation of a track, and the row of the box array its estimate is written to."""
 
     observation: Observation
-    tick: _Tick
-    index: int
+    array: _PendingArray
+    row: int
     estimate: Floats | None = None
     is_settled: bool = False
 
+    def write(self, box: Floats, status: str, reason: str, covariance: Floats) -> None:
+        """Write an estimate to the box array unless the present one is settled."""
+        self.estimate = box
+        if not self.is_settled:
+            self.array.boxes[self.row] = box
+            self.array.status[self.row] = status
+            self.array.reasons[self.row] = reason
+            self.array.covariances[self.row] = covariance
+
+    def settle(self) -> None:
+        """Let the estimate in the box array change no more."""
+        if not self.is_settled:
+            self.array.num_unsettled -= 1
+        self.is_settled = True
+
 
 @dataclass(eq=False, slots=True)
-class _TrackBuffer:
-    """The observations of one track that windows still need."""
+class _Track:
+    """The observations of a track that windows still need, oldest first."""
 
     track_id: str
     class_name: str
     entries: list[_Entry] = field(default_factory=list)
-    memory: Memory | None = None
+    prior: MarginalisationPrior | None = None
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest observation [ns]."""
+        return self.entries[-1].observation.stamp_ns
+
+    def is_in(self, array: _PendingArray) -> bool:
+        """Return whether the newest observation is of `array`."""
+        return self.entries[-1].array is array
 
     def window(self) -> Window:
+        """Return the window of all observations held."""
         observations = [entry.observation for entry in self.entries]
-        solved = [entry.estimate for entry in self.entries if entry.estimate is not None]
-        fresh, start = len(observations) - len(solved), np.array(solved).reshape(-1, 9)
-        return Window(self.track_id, self.class_name, observations, fresh, start, self.memory)
+        estimates = [entry.estimate for entry in self.entries if entry.estimate is not None]
+        num_new = len(observations) - len(estimates)
+        start = np.array(estimates).reshape(-1, 9)
+        return Window(self.track_id, self.class_name, observations, num_new, start, self.prior)
 
-    def parted(self) -> '_TrackBuffer | None':
+    def split_at_id_switch(self) -> '_Track | None':
         """
-        Return the last two entries as a track of their own, if another object has got their id.
+        Move the last two observations to a new track if they are of another object.
 
-        Then neither is where constant velocity leads; a single one may be an outlier.
+        They are if both are farther from the constant velocity prediction than half the length
+        of the object and `ID_SWITCH_SPEED`. A single one may be an outlier.
 
         """
-        if len(self.entries) < 5:
+        recent = [entry.observation for entry in self.entries[-ID_SWITCH_OBSERVATIONS:]]
+        if len(recent) < ID_SWITCH_OBSERVATIONS - 1:
             return None
-        first, *_, latest, last, new = (entry.observation for entry in self.entries[-6:])
-        velocity = (latest.box - first.box) / (latest.stamp_ns - first.stamp_ns)
-        for seen in (last, new):
-            late = seen.stamp_ns - latest.stamp_ns
-            away = dist(seen.box[:2], (latest.box + late * velocity)[:2])
-            if away < latest.box[LENGTH] / 2 + 10.0 * late * 1e-9:  # nothing swerves by 10 m/s
+        first, latest = recent[0], recent[-3]
+        velocity = (latest.box - first.box) / (latest.stamp_ns - first.stamp_ns)  # [m/ns]
+        for observation in recent[-2:]:
+            elapsed_ns = observation.stamp_ns - latest.stamp_ns
+            predicted = latest.box + elapsed_ns * velocity
+            gate = latest.box[LENGTH] / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
+            if dist(observation.box[:2], predicted[:2]) < gate:
                 return None
         moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
         del self.entries[-2:]
-        return _TrackBuffer(self.track_id, self.class_name, moved)
+        return _Track(self.track_id, self.class_name, moved)
 
-    def velocity(self, box: Floats, stamp_ns: int) -> Floats:
-        """Return that of the input centre over the last stamps to `box`, the newest [m/s]."""
+    def input_velocity(self, box: Floats, stamp_ns: int) -> Floats:
+        """Return the mean velocity (3,) of the input centre up to the newest `box` [m/s]."""
         if not self.entries:
             return np.zeros(3)
-        first = self.entries[-4:][0].observation
+        first = self.entries[-VELOCITY_OBSERVATIONS:][0].observation
         return (box - first.box)[X : Z + 1] / (stamp_ns - first.stamp_ns) * 1e9
 
     def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
-        self.memory = estimate.memory
-        for entry, box, status, reason, spread in zip(entries, *estimate[:4], strict=True):
-            entry.estimate, tick, i = box, entry.tick, entry.index
-            if not entry.is_settled:
-                tick.refined[i], tick.status[i], tick.reasons[i] = box, status, reason
-                tick.covariances[i] = spread
+        """Write the estimate of the window of `entries` to their box arrays."""
+        self.prior = estimate.prior
+        columns = estimate.boxes, estimate.status, estimate.reasons, estimate.covariances
+        for entry, *values in zip(entries, *columns, strict=True):
+            entry.write(*values)
+
+
+class _SubmittedTrack(NamedTuple):
+    """A track with the observations of its submitted window."""
+
+    track: _Track
+    entries: list[_Entry]
+    is_ended: bool
+
+
+def _submit_locally(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
+    return partial(register, windows, config, model)
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Run torch in one thread: for small tensors more threads only wait for each other."""
+    num_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(num_threads)
+
+
+def _check_device(device: str) -> None:
+    """Raise ConfigError if torch cannot use `device`."""
+    try:
+        torch.zeros(1, device=device)
+    except (AssertionError, RuntimeError) as error:  # torch raises either
+        reason = str(error).splitlines()[0]
+        raise ConfigError(
+            f"device: expected one that torch can use here, such as 'cpu', got {device!r}: "
+            f'{reason}'
+        ) from None

@@ -1,74 +1,133 @@
-"""One rigid shape per track: what all its observations say of it in the frame of its box."""
+"""
+One rigid shape per track: all its points in the frame of its box, as small planes.
+
+docs/method.md (M4) has the residual that comes of it.
+
+"""
 
 from boxreg_ros.core.arrowhead import product
-from boxreg_ros.core.face_support import carried, in_box_axes
-from boxreg_ros.core.objective import EXTENT, Problem, State
+from boxreg_ros.core.batch import EXTENT, Problem, State
+from boxreg_ros.core.face_support import motion_compensated, to_box_frame
 import torch
 from torch import Tensor
 
-CELLS = 8, 3, 3  # into which a box is cut, each a piece of surface
-LEAST = 8  # points that make a surface
-FLATNESS = 3.0  # how much wider than thick a surface is, in squares
-MARGIN = 0.3  # points this far outside a box are part of the shape [m]
-SAY = 20.0  # points of one observation that err on their own
-PAIRS = [[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]]  # 10 products make a square
+# All of these are chosen; `boxreg bench sensitivity` halves and doubles each of them.
+CELLS = (8, 3, 3)
+"""Cells into which a box is cut along x, y and z, each with one piece of surface."""
+MIN_CELL_POINTS = 8
+"""Fewest points that make a piece of surface."""
+MIN_FLATNESS = 3.0
+"""Smallest ratio of the second variance of a piece of surface to that across it."""
+SHAPE_MARGIN = 0.3
+"""Points up to this far outside a box are part of the shape [m]."""
+EFFECTIVE_POINTS = 20.0
+"""Points of one observation with independent errors; more add no information."""
+STEP_RIDGE = 1e-3
+"""Information added to that of a step: without points none is wanted."""
+MOMENT_INDEX = [[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]]
+"""Where the 10 products of (x, y, z, 1) are in their symmetric 4 x 4 matrix."""
 
 
 def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     """
-    Compare each observation with the shape that all of its track make together.
+    Compare each observation with the common shape of its track.
 
     Parameters
     ----------
     problem : Problem
         B windows of N observations.
     state : State
-        Where their boxes are in this round.
+        Boxes of this round.
 
     Returns
     -------
     information : Tensor, shape (B, N, 6, 6)
-        How well the shape pins x y z and the three rotations, in box axes.
+        Information of the shape about a step in x y z and the three rotations, in box axes.
     wanted : Tensor, shape (B, N, 6)
         The step of the pose after which the observation agrees best with the shape [m, rad].
 
     Notes
     -----
-    The returns of a whole track, carried into its box, fall into cells, and each cell that holds
-    a piece of surface tells a plane and how thick the observations smear it. Distances to these
-    planes are linear in a small step of the pose: their sums of squares are all that is kept.
+    The points of a whole track, transformed into its box, fall into cells. Each cell that holds a
+    piece of surface gives a plane and the thickness to which the observations smear it. Distances
+    from these planes are linear in a small step of the pose: their sums of squares are all that
+    is kept, as in point-to-plane ICP.
 
     """
-    local = in_box_axes(carried(problem, state), problem, state.pose)
+    local = to_box_frame(motion_compensated(problem, state), problem, state.pose)
     half = (state.shared[:, EXTENT] / 2).to(local)[:, None, :, None]
-    counts, (B, N, _, M) = local.new_tensor(CELLS)[:, None], local.shape
-    place = ((local / half + 1) * (counts / 2)).floor().clamp(counts * 0, counts - 1)
-    cell = (place * counts.new_tensor([[CELLS[1] * CELLS[2]], [CELLS[2]], [1]])).sum(2).long()
-    count = CELLS[0] * CELLS[1] * CELLS[2]
-    cell += count * torch.arange(B, device=cell.device)[:, None, None]
-    # What is not near the box, or not finite, counts as zeros in the first cell; coordinates go
-    # by columns. That is several times as fast as picking out rows.
-    near = ((local.abs() - half).amax(2) < MARGIN).flatten()
-    cell, local = torch.where(near, cell.flatten(), 0), local.movedim(2, 0).flatten(1)
-    p = torch.cat([torch.where(near, local, 0.0), near[None].to(local)])
-    # Moments of the points in each cell, their number last; a plane through them.
-    products = (a * b for i, a in enumerate(p) for b in p[i:])
-    sums = torch.stack([torch.bincount(cell, values, B * count) for values in products], 1)
-    number = sums[:, -1].clamp(min=1)
-    mean = (sums / number[:, None])[:, PAIRS]
-    power, axes = torch.linalg.eigh(mean[:, :3, :3] - mean[:, :3, 3:] * mean[:, 3:, :3])
-    plane = torch.cat([axes[..., 0], -(axes[..., :1].mT @ mean[:, :3, 3:])[..., 0]], 1)
-    rough = problem.of('shape')[:, 0].to(p).repeat_interleave(count) ** 2
-    thickness = power[:, 0].clamp(min=0) + rough
-    is_surface = (power[:, 1] > FLATNESS * thickness) & (number >= LEAST)
+    B, N, _, M = local.shape
+    # Points that are not near the box, or not finite, count as zeros in the first cell;
+    # coordinates are rows. That is several times as fast as selecting points.
+    is_near = ((local.abs() - half).amax(2) < SHAPE_MARGIN).flatten()
+    cell = torch.where(is_near, _cells(local, half).flatten(), 0)
+    local = local.movedim(2, 0).flatten(1)
+    p = torch.cat([torch.where(is_near, local, 0.0), is_near[None].to(local)])  # (4, B N M)
+    deviation = problem.of_class('shape')[:, 0].to(p)
+    plane, thickness, is_surface = _surface_planes(p, cell, deviation)
+
     plane = plane.mT.index_select(1, cell)
-    off = (plane * p).sum(0)
-    weight = ((is_surface[cell] & near) / (thickness[cell] + off**2)).view(B, N, 1, M)
-    # The levers of all points of an observation, and how far off each is.
-    found = torch.cat([plane[:3], torch.linalg.cross(p[:3], plane[:3], dim=0), off[None]])
-    lever = found.view(7, B, N, M).movedim(0, 2).contiguous()
-    weight = weight * SAY / (weight > 0).sum(3, keepdim=True).clamp(min=SAY)
-    # What torch makes of the product depends, on some processors, on how many windows there are.
-    total = product(lever * weight, lever.mT).to(state.pose)
-    information, pull = total[..., :6, :6], total[..., :6, 6]
-    return information, torch.linalg.solve(information + 1e-3 * torch.eye(6).to(pull), pull)
+    distance = (plane * p).sum(0)
+    weight = (is_surface[cell] & is_near) / (thickness[cell] + distance**2)
+    weight = weight.view(B, N, 1, M)
+    weight = (
+        weight * EFFECTIVE_POINTS / (weight > 0).sum(3, keepdim=True).clamp(min=EFFECTIVE_POINTS)
+    )
+    # Derivatives of the distances of all points by the step of the pose, and these distances.
+    moment_arm = torch.linalg.cross(p[:3], plane[:3], dim=0)
+    rows = torch.cat([plane[:3], moment_arm, distance[None]])
+    rows = rows.view(7, B, N, M).movedim(0, 2).contiguous()
+    # Torch's own product depends, on some processors, on the number of windows.
+    total = product(rows * weight, rows.mT).to(state.pose)  # (B, N, 7, 7)
+    information = total[..., :6, :6]
+    ridge = STEP_RIDGE * torch.eye(6).to(total)
+    return information, torch.linalg.solve(information + ridge, total[..., :6, 6])
+
+
+def _cells(local: Tensor, half: Tensor) -> Tensor:
+    """Return the index of the cell of each point, counted on over the windows, (B, N, M)."""
+    counts = local.new_tensor(CELLS)[:, None]
+    place = ((local / half + 1) * (counts / 2)).floor().clamp(counts * 0, counts - 1)
+    stride = counts.new_tensor([[CELLS[1] * CELLS[2]], [CELLS[2]], [1]])
+    cell = (place * stride).sum(2).long()
+    per_box = CELLS[0] * CELLS[1] * CELLS[2]
+    cell += per_box * torch.arange(len(local), device=cell.device)[:, None, None]
+    return cell
+
+
+def _surface_planes(p: Tensor, cell: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """
+    Fit a plane to the points of each cell.
+
+    Parameters
+    ----------
+    p : Tensor, shape (4, P)
+        Homogeneous points in box axes [m]; zeros are no points.
+    cell : Tensor, shape (P,)
+        The cell of each.
+    deviation : Tensor, shape (B,)
+        How far the surface of each window's object is from rigid [m].
+
+    Returns
+    -------
+    plane : Tensor, shape (C, 4)
+        Normal and offset.
+    thickness : Tensor, shape (C,)
+        Variance of the points across the plane [m^2].
+    is_surface : Tensor, shape (C,)
+        Whether the cell holds a piece of surface.
+
+    """
+    per_box = CELLS[0] * CELLS[1] * CELLS[2]
+    products = [a * b for i, a in enumerate(p) for b in p[i:]]
+    count = len(deviation) * per_box
+    sums = torch.stack([torch.bincount(cell, values, count) for values in products], 1)
+    number = sums[:, -1].clamp(min=1)
+    mean = (sums / number[:, None])[:, MOMENT_INDEX]
+    centre = mean[:, :3, 3:]
+    variance, axes = torch.linalg.eigh(mean[:, :3, :3] - centre * centre.mT)
+    offset = -(axes[..., :1].mT @ centre)[..., 0]
+    plane = torch.cat([axes[..., 0], offset], 1)
+    thickness = variance[:, 0].clamp(min=0) + deviation.repeat_interleave(per_box) ** 2
+    is_surface = (variance[:, 1] > MIN_FLATNESS * thickness) & (number >= MIN_CELL_POINTS)
+    return plane, thickness, is_surface

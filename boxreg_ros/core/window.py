@@ -1,41 +1,67 @@
-"""Windows of observations, and their batches as padded tensors."""
+"""Windows of observations, and batches of windows as padded tensors."""
 
 from collections.abc import Sequence
 from dataclasses import astuple
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.objective import MEMORY, Problem, SHARED
+from boxreg_ros.core.batch import PRIOR_SIZE, Problem, SHARED
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.structures import Floats, ROLL, YAW
 import numpy as np
 from numpy.typing import NDArray
 import torch
 
-FADING = 0.97  # of what is remembered, from stamp to stamp: no model holds forever
-NOTHING = np.full(MEMORY, np.nan), np.zeros(MEMORY), np.zeros((MEMORY, MEMORY)), np.zeros(4)
-ANGLES = [3, 4, 5, 9, 10, 11]  # of the two poses that are remembered
-AWAY = 1e6  # where points are that are not real: near no box [m]
-TELLING = 30  # observations of a track tell as much of its labels as many more
-REVERSE = 6.0  # nothing reverses faster [m/s]
-BATCH_VALUES = 3e7  # most point coordinates, or entries of the curvature, solved at once
+PRIOR_DECAY = 0.97
+"""
+Factor on the information of the marginalisation prior, per observation; chosen.
+
+An error model that is constant over a track holds for a limited time: 0.97 halves the information
+after 23 observations.
+
+"""
+PADDING_POSITION = 1e6
+"""Coordinate of padding points [m]; derived: near no box, and finite in float32."""
+PADDING_PERIOD = 0.1
+"""Time step of padding observations [s]; any positive number keeps times increasing."""
+LEARNING_OBSERVATIONS = 30
+"""Observations of a window that the labelling rule is learnt from; measured: 130 add nothing."""
+MAX_REVERSE_SPEED = 6.0
+"""A faster object moves forward [m/s]; chosen: no road vehicle reverses at 22 km/h."""
+KNOWN_FLIP_SHARE = 0.75
+"""
+Share of contrary headings above which a known heading sign is changed; chosen.
+
+Without a known sign the majority decides: a share of 0.5.
+
+"""
+MAX_BATCH_VALUES = 3e7
+"""Most point coordinates, or entries of the Hessian, in a batch; derived: 240 MB as float64."""
+VALUES_PER_POINT = 18
+"""Values held per point while a batch is solved; estimated from the temporary tensors."""
+PRIOR_ANGLES = [3, 4, 5, 9, 10, 11]
+"""Angles among the variables of the marginalisation prior: of its two poses."""
 
 
-class Memory(NamedTuple):
+class MarginalisationPrior(NamedTuple):
     """
-    What observations that have left a window still tell about those in it: a quadratic form.
+    Quadratic prior on a window from observations that have been marginalised.
+
+    Its variables are the poses of the two oldest observations and the parameters that all
+    observations of a track share (34 in all).
 
     Attributes
     ----------
     base : array, shape (3,)
-        What all positions of the track are relative to from now on [m].
-    state, step : array, shape (34,)
-        Poses of the two oldest observations and what is shared, when the last one left, and how
-        far from there the form is least.
+        Fixed origin of all positions of the track, in the fixed frame [m].
+    state : array, shape (34,)
+        Linearisation point: the variables when the last observation was marginalised.
+    step : array, shape (34,)
+        Minimum of the quadratic form minus `state`.
     information : array, shape (34, 34)
-        Its curvature.
-    seen : array, shape (4,)
-        Sum of the input extents that have left, and their number.
+        Hessian of the quadratic form.
+    marginalised_extents : array, shape (4,)
+        Sum of the input extents of marginalised observations [m], and their number.
 
     """
 
@@ -43,126 +69,277 @@ class Memory(NamedTuple):
     state: Floats
     step: Floats
     information: Floats
-    seen: Floats
+    marginalised_extents: Floats
+
+    @classmethod
+    def none(cls, base: Floats) -> 'MarginalisationPrior':
+        """Return a prior without information, NaN as its linearisation point."""
+        zeros = np.zeros(PRIOR_SIZE)
+        information = np.zeros((PRIOR_SIZE, PRIOR_SIZE))
+        return cls(base, np.full(PRIOR_SIZE, np.nan), zeros, information, np.zeros(4))
 
 
 class Window(NamedTuple):
     """
-    Observations of one track, in order.
+    Consecutive observations of one track.
 
     Attributes
     ----------
     track_id, class_name : str
         Identity and category.
     observations : sequence of N Observation
-        In the order of their stamps.
-    fresh : int
-        How many of them, the last ones, no window has had before.
-    start : array, shape (N - fresh, 9)
-        What the window before made of the others; empty where there was none.
-    memory : Memory or None
-        What has left.
+        Ascending by stamp.
+    num_new : int
+        Observations, the last ones, that have been in no window before.
+    start : array, shape (N - num_new, 9)
+        Boxes of the other observations as estimated in the window before; empty without one.
+    prior : MarginalisationPrior or None
+        From observations before the window.
 
     """
 
     track_id: str
     class_name: str
     observations: Sequence[Observation]
-    fresh: int
+    num_new: int
     start: Floats
-    memory: Memory | None = None
+    prior: MarginalisationPrior | None = None
 
     @property
     def is_warm(self) -> bool:
-        """Tell whether all but the newest observation have been solved before."""
-        return self.fresh == 1 and len(self.start) == len(self.observations) - 1 > 1
+        """Return whether all observations but the newest have an estimate to start from."""
+        return self.num_new == 1 and len(self.start) == len(self.observations) - 1 > 1
 
-    def fresh_part(self) -> 'Window':
-        """Return the window of what is fresh, of very many an even part, but for the newest."""
+    def learning_part(self) -> 'Window':
+        """
+        Return the observations to learn from, each of which is in one such part only.
+
+        The newest is left to the next window, which has an estimate to start from. Of many, every
+        n-th is taken so that about `LEARNING_OBSERVATIONS` remain.
+
+        """
         last = len(self.observations) - 1
-        part = slice(max(0, last - self.fresh), last, 1 + self.fresh // TELLING)
-        return Window(*self[:2], self.observations[part], self.fresh, self.start[part])
+        stride = 1 + self.num_new // LEARNING_OBSERVATIONS
+        part = slice(max(0, last - self.num_new), last, stride)
+        return Window(
+            self.track_id,
+            self.class_name,
+            self.observations[part],
+            self.num_new,
+            self.start[part],
+        )
 
 
-def batches(windows: Sequence[Window], config: Config) -> list[list[int]]:
-    """Return rows of windows to solve together: as warm, about as long, of bounded size."""
+def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
+    """
+    Return groups of rows of `windows` to solve together.
+
+    A group is either all warm or all cold, of similar lengths, and within `MAX_BATCH_VALUES`.
+    Windows shorter than `min_observations` are in no group.
+
+    """
     lengths = [len(window.observations) for window in windows]
-    rows = [i for i, n in enumerate(lengths) if n >= config.min_observations]
+    rows = [row for row, length in enumerate(lengths) if length >= config.min_observations]
+    rows.sort(key=lambda row: (windows[row].is_warm, lengths[row], row))
     groups: list[list[int]] = []
-    for i in sorted(rows, key=lambda i: (windows[i].is_warm, lengths[i], i)):
-        size = max((6 * lengths[i] + SHARED) ** 2, lengths[i] * config.sampling.points * 18)
-        is_full = not groups or (len(groups[-1]) + 1) * size > BATCH_VALUES
-        if is_full or windows[groups[-1][0]].is_warm != windows[i].is_warm:
+    for row in rows:
+        length = lengths[row]
+        hessian = (6 * length + SHARED) ** 2
+        points = length * config.sampling.points * VALUES_PER_POINT
+        is_full = not groups or (len(groups[-1]) + 1) * max(hessian, points) > MAX_BATCH_VALUES
+        if is_full or windows[groups[-1][0]].is_warm != windows[row].is_warm:
             groups.append([])
-        groups[-1].append(i)
+        groups[-1].append(row)
     return groups
 
 
-def stack(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
-    """Return padded tensors of `windows`, and the points (B, 3) their centres are relative to."""
-    lengths = np.array([len(w.observations) for w in windows])
-    B, N, device = len(windows), lengths.max(), config.device
-    every = [o for w in windows for o in w.observations]
-    counts = np.array([len(o.points) for o in every])
-    valid = np.arange(N) < lengths[:, None]
-    mask = np.zeros((B, N, max(1, counts.max())), dtype=bool)
-    mask[valid] = np.arange(mask.shape[2]) < counts[:, None]
-    boxes, times, ground = np.zeros((B, N, 9)), np.zeros((B, N)), np.full((B, N), np.nan)
-    points, origins = np.full((*mask.shape, 3), AWAY, dtype=np.float32), np.zeros((B, N, 3))
-    delays = np.zeros(mask.shape, dtype=np.float32)
-    boxes[valid] = np.concatenate([o.box for o in every]).reshape(-1, 9)
-    origins[valid] = np.concatenate([o.origin for o in every]).reshape(-1, 3)
-    ground[valid] = [o.ground for o in every]
-    begin = np.repeat([w.observations[0].stamp_ns for w in windows], lengths)
-    times[valid] = (np.array([o.stamp_ns for o in every]) - begin) * 1e-9
-    for axis, values in enumerate(np.concatenate([o.points for o in every]).T):
-        points[..., axis][mask] = values  # all three at once would take six times as long
-    delays[mask] = np.concatenate([o.delays for o in every])
-    row, step, last = np.arange(B)[:, None], np.arange(N), lengths[:, None] - 1
-    boxes, times = (part[row, np.minimum(step, last)] for part in (boxes, times))
-    times += 0.1 * np.maximum(step - last, 0)
-    known = zip(*(w.memory or (w.observations[0].box[:3], *NOTHING) for w in windows), strict=True)
-    base, state, move, information, seen = (np.array(part) for part in known)
-    yaw = one_heading(boxes, times, valid, state[:, 5])
-    tilt = boxes[..., ROLL:YAW] * np.sign(np.cos(yaw - boxes[..., YAW]))[..., None]
-    boxes[..., ROLL:YAW] = (tilt + np.pi) % (2 * np.pi) - np.pi
-    boxes[..., YAW] = yaw
-    start = boxes.copy()
-    for b, window in enumerate(windows):
-        start[b, : len(window.start)] = window.start
-    turns = np.pi * np.array([2, 2, 1])  # a box kept may have come turned around
-    start[..., 6:9] += turns * np.round((boxes[..., 6:9] - start[..., 6:9]) / turns)
+def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, Floats]:
+    """
+    Stack windows to padded tensors, see `Problem`.
+
+    Parameters
+    ----------
+    windows : sequence of B Window
+        Each with at least one observation.
+    config : Config
+        Settings.
+
+    Returns
+    -------
+    problem : Problem
+        Positions are relative to `base`.
+    base : array, shape (B, 3)
+        One origin per window in the fixed frame [m].
+
+    """
+    lengths = np.array([len(window.observations) for window in windows])
+    valid = np.arange(lengths.max()) < lengths[:, None]  # (B, N)
+    boxes, times, origins, ground = _stack_observations(windows, valid)
+    points, mask, delays = _stack_points(windows, valid)
+    priors = [w.prior or MarginalisationPrior.none(w.observations[0].box[:3]) for w in windows]
+    base, state, step, information, extents = (
+        np.array(part) for part in zip(*priors, strict=True)
+    )
+    if config.ingredients.heading_sign:
+        boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, state[:, 5])
+    else:
+        boxes[..., YAW] = np.unwrap(boxes[..., YAW])
+    start = _starting_boxes(windows, boxes)
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]
-    turns = np.rint((start[:, [0, 1 % N], 6:9].reshape(B, 6) - state[:, ANGLES]) / np.pi)
-    recalled = state + move
-    recalled[:, ANGLES] += np.pi * turns
-    information *= FADING * (turns % 2 == 0).all(1)[:, None, None]
-    rows = {k: astuple(config.class_config(k))[1:] for k in {w.class_name for w in windows}}
-    numbers = np.array([rows[window.class_name] for window in windows], dtype=np.float64)
-    arrays: list[Any] = [boxes, start, valid, times, points, mask, delays, origins, ground]
-    arrays += [np.nan_to_num(recalled), information, seen, numbers]
-    return Problem(*(torch.from_numpy(array).to(device) for array in arrays)), base
+    minimum, is_usable = _prior_minimum(start, state, step)
+    information = information * PRIOR_DECAY * is_usable[:, None, None]
+    arrays = [boxes, start, valid, times, points, mask, delays, origins, ground]
+    arrays += [np.nan_to_num(minimum), information, extents, _class_numbers(windows, config)]
+    return Problem(*(torch.from_numpy(array).to(config.device) for array in arrays)), base
 
 
-def one_heading(boxes: Floats, times: Floats, valid: NDArray[np.bool_], known: Floats) -> Floats:
+def _stack_observations(
+    windows: Sequence[Window], valid: NDArray[np.bool_]
+) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Return the yaw (B, N) of `boxes` (B, N, 9), unwrapped [rad], half turns undone.
+    Return input boxes, times, sensor origins and ground heights, padded.
 
-    Those are undone that are in the minority; where the heading of the first is `known` (B,),
-    not NaN, three quarters must say otherwise. What is faster than anything reverses moves
-    forward, whatever its boxes say; `times` (B, N) [s]. A box that is turned by a quarter does
-    not take those after it along.
+    Shapes (B, N, 9), (B, N), (B, N, 3) and (B, N). Padding repeats the last box of a window, at
+    later times.
 
     """
-    chain, near = boxes[..., YAW].copy(), boxes[:, 0, YAW]
-    for now in chain.T[1:]:
-        off = (now - near + np.pi / 2) % np.pi - np.pi / 2
-        now[:], near = near + off, near + off * 2 / 3
-    turned = ((np.cos(boxes[..., YAW] - chain) < 0) & valid).sum(1) / valid.sum(1)
-    limit = np.where(np.cos(known - chain[:, 0]) < 0, 0.25, np.where(np.isnan(known), 0.5, 0.75))
+    B, N = valid.shape
+    every = [observation for window in windows for observation in window.observations]
+    lengths = valid.sum(1)
+    boxes = np.zeros((B, N, 9))
+    boxes[valid] = np.concatenate([observation.box for observation in every]).reshape(-1, 9)
+    origins = np.zeros((B, N, 3))
+    sensors = np.concatenate([observation.origin for observation in every])
+    origins[valid] = sensors.reshape(-1, 3)
+    ground = np.full((B, N), np.nan)
+    ground[valid] = [observation.ground for observation in every]
+    first_ns = np.repeat([window.observations[0].stamp_ns for window in windows], lengths)
+    times = np.zeros((B, N))
+    times[valid] = (np.array([observation.stamp_ns for observation in every]) - first_ns) * 1e-9
+    row = np.arange(B)[:, None]
+    column = np.arange(N)
+    last = lengths[:, None] - 1
+    source = np.minimum(column, last)
+    times = times[row, source] + PADDING_PERIOD * np.maximum(column - last, 0)
+    return boxes[row, source], times, origins, ground
+
+
+def _stack_points(
+    windows: Sequence[Window], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """
+    Return points, which of them are valid, and their delays, padded.
+
+    Shapes (B, N, M, 3), (B, N, M) and (B, N, M), M the most points of an observation, at least 1.
+
+    """
+    every = [observation for window in windows for observation in window.observations]
+    counts = np.array([len(observation.points) for observation in every])
+    mask = np.zeros((*valid.shape, max(1, counts.max())), dtype=bool)
+    mask[valid] = np.arange(mask.shape[2]) < counts[:, None]
+    points = np.full((*mask.shape, 3), PADDING_POSITION, dtype=np.float32)
+    # One axis at a time: all three at once take six times as long.
+    for axis, values in enumerate(np.concatenate([o.points for o in every]).T):
+        points[..., axis][mask] = values
+    delays = np.zeros(mask.shape, dtype=np.float32)
+    delays[mask] = np.concatenate([observation.delays for observation in every])
+    return points, mask, delays
+
+
+def _resolved_angles(
+    boxes: Floats, times: Floats, valid: NDArray[np.bool_], known_yaw: Floats
+) -> Floats:
+    """Return roll, pitch and yaw (B, N, 3) of `boxes` (B, N, 9) with 180° flips corrected."""
+    yaw = resolve_headings(boxes, times, valid, known_yaw)
+    # A half turn about the z axis of the box changes the signs of roll and pitch.
+    is_same = np.sign(np.cos(yaw - boxes[..., YAW]))
+    tilt = boxes[..., ROLL:YAW] * is_same[..., None]
+    return np.concatenate([(tilt + np.pi) % (2 * np.pi) - np.pi, yaw[..., None]], axis=-1)
+
+
+def _starting_boxes(windows: Sequence[Window], boxes: Floats) -> Floats:
+    """Return where the search starts (B, N, 9): earlier estimates, else the input `boxes`."""
+    start = boxes.copy()
+    for row, window in enumerate(windows):
+        start[row, : len(window.start)] = window.start
+    # Whole turns, and half turns of yaw: a kept box is returned with the heading of its input.
+    period = np.pi * np.array([2, 2, 1])
+    start[..., ROLL:] += period * np.round((boxes[..., ROLL:] - start[..., ROLL:]) / period)
+    return start
+
+
+def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    Return the minimum of each prior (B, 34), and which priors fit the present headings (B,).
+
+    Angles are moved by half turns to those of `start` (B, N, 9). A prior that an odd number of
+    them is needed for holds for the other heading sign.
+
+    """
+    B, N = start.shape[:2]
+    angles = start[:, [0, 1 % N], ROLL:].reshape(B, len(PRIOR_ANGLES))
+    half_turns = np.rint((angles - state[:, PRIOR_ANGLES]) / np.pi)
+    minimum = state + step
+    minimum[:, PRIOR_ANGLES] += np.pi * half_turns
+    return minimum, np.asarray((half_turns % 2 == 0).all(1))
+
+
+def _class_numbers(windows: Sequence[Window], config: Config) -> Floats:
+    """Return the numbers of each window's `ClassConfig`, in the order of its fields, (B, D)."""
+    names = {window.class_name for window in windows}
+    rows = {name: astuple(config.class_config(name))[1:] for name in names}
+    return np.array([rows[window.class_name] for window in windows], dtype=np.float64)
+
+
+def resolve_headings(
+    boxes: Floats, times: Floats, valid: NDArray[np.bool_], known_yaw: Floats
+) -> Floats:
+    """
+    Return unwrapped yaw angles with one heading sign per window, 180° flips corrected.
+
+    The majority of a window decides on the sign; against a known sign, three quarters. An object
+    faster than `MAX_REVERSE_SPEED` heads where it moves. A single heading that is off by a
+    quarter turn does not affect those after it.
+
+    Parameters
+    ----------
+    boxes : array, shape (B, N, 9)
+        Input boxes [m, rad].
+    times : array, shape (B, N)
+        Increasing [s].
+    valid : array, shape (B, N)
+        False for padding.
+    known_yaw : array, shape (B,)
+        Heading of the first box as estimated before [rad]; NaN where unknown.
+
+    Returns
+    -------
+    yaw : array, shape (B, N)
+        Each within a whole number of half turns of the input [rad].
+
+    """
+    input_yaw = boxes[..., YAW]
+    chain = input_yaw.copy()
+    trend = boxes[:, 0, YAW]
+    for column in range(1, chain.shape[1]):
+        change = (chain[:, column] - trend + np.pi / 2) % np.pi - np.pi / 2
+        chain[:, column] = trend + change
+        trend = trend + change * 2 / 3  # an outlier of a quarter turn moves it by 60° only
+    is_contrary = (np.cos(input_yaw - chain) < 0) & valid
+    share = is_contrary.sum(1) / valid.sum(1)
+    limit = np.where(np.isnan(known_yaw), 0.5, KNOWN_FLIP_SHARE)
+    limit = np.where(np.cos(known_yaw - chain[:, 0]) < 0, 1 - KNOWN_FLIP_SHARE, limit)
+    speed = _median_forward_speed(boxes, times, valid, chain)
+    is_flipped = np.where(np.abs(speed) > MAX_REVERSE_SPEED, speed < 0, share > limit)
+    return np.where(is_flipped[:, None], chain + np.pi, chain)
+
+
+def _median_forward_speed(
+    boxes: Floats, times: Floats, valid: NDArray[np.bool_], yaw: Floats
+) -> Floats:
+    """Return the median speed of the centres along `yaw` (B, N), shape (B,) [m/s]."""
     dx, dy = np.moveaxis(np.diff(boxes[..., :2], axis=1, prepend=boxes[:, :1, :2]), 2, 0)
-    along = (dx * np.cos(chain) + dy * np.sin(chain)) / np.diff(times, prepend=-1.0)
-    speed = np.sort(np.where(valid, along, np.inf))[np.arange(len(boxes)), (valid.sum(1) - 1) // 2]
-    turned = np.where(np.abs(speed) > REVERSE, speed < 0, turned > limit)
-    return np.where(turned[:, None], chain + np.pi, chain)
+    along = (dx * np.cos(yaw) + dy * np.sin(yaw)) / np.diff(times, prepend=-1.0)
+    ascending = np.sort(np.where(valid, along, np.inf))
+    return np.asarray(ascending[np.arange(len(boxes)), (valid.sum(1) - 1) // 2])

@@ -1,17 +1,15 @@
 """
-MCAP files with channels that are not ROS: foxglove's schemas as protobuf and as JSON.
+MCAP files of Foxglove: its schemas as protobuf and as JSON, beside channels of ROS.
 
-Their clouds and transforms are handed over as the ROS messages they correspond to, their
-SceneUpdates as they are: adapters read by attribute.
+Clouds and transforms are converted to the corresponding ROS messages. A SceneUpdate stays as it
+is, because adapters read by attribute.
 
 """
 
 from __future__ import annotations
 
 from base64 import b64decode
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import closing, ExitStack
-from heapq import merge
+from collections.abc import Callable, Iterator, Sequence
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,15 +19,13 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Schema
-from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
     MessageDefinition,
     MessageDefinitionFormat,
 )
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
-from rosbags.typesys.store import Typestore
+from rosbags.typesys import get_types_from_msg
 
 ROS_ENCODINGS = ('ros2msg', 'ros2idl', 'omgidl', '')
 TYPES = {
@@ -38,84 +34,62 @@ TYPES = {
     'foxglove.FrameTransform': 'tf2_msgs/msg/TFMessage',
     'foxglove.FrameTransforms': 'tf2_msgs/msg/TFMessage',
 }
-NUMBERS = (0, 2, 1, 4, 3, 6, 5, 7, 8)
-"""``PointField.datatype`` of ROS by foxglove's number of the same type."""
+DATATYPES = (0, 2, 1, 4, 3, 6, 5, 7, 8)
+"""``PointField.datatype`` of ROS by Foxglove's number of the same type."""
 
-Item = tuple[Connection, int, bytes]
+MAX_INTEGER = 2**63 - 1
+
+_NUMBER = (int, float)
+_TIME = {'sec': int, 'nsec': int}
+_VECTOR = {'x': _NUMBER, 'y': _NUMBER, 'z': _NUMBER}
+_QUATERNION = _VECTOR | {'w': _NUMBER}
+_POSE = {'position': _VECTOR, 'orientation': _QUATERNION}
+_TRANSFORM = {
+    'timestamp': _TIME, 'parent_frame_id': str, 'child_frame_id': str,
+    'translation': _VECTOR, 'rotation': _QUATERNION,
+}  # fmt: skip
+_CUBE = {'pose': _POSE, 'size': _VECTOR}
+_ENTITY = {
+    'timestamp': _TIME, 'frame_id': str, 'id': str, 'cubes': [_CUBE],
+    'metadata': [{'key': str}],
+}  # fmt: skip
+_FIELD = {'name': str, 'offset': int, 'type': int}
+JSON_FIELDS: dict[str, Any] = {
+    'foxglove.SceneUpdate': {'entities': [_ENTITY]},
+    'foxglove.FrameTransform': _TRANSFORM,
+    'foxglove.FrameTransforms': {'transforms': [_TRANSFORM]},
+    'foxglove.PointCloud': {
+        'timestamp': _TIME, 'frame_id': str, 'pose?': _POSE, 'point_stride': int,
+        'fields': [_FIELD], 'data': str,
+    },
+}  # fmt: skip
+"""
+Fields that are read, with their types in JSON; a list holds the type of its items.
+
+A field whose name ends with ``?`` may be null.
+
+"""
 
 
-class Reader:
+class FoxgloveFile:
     """
-    Read recordings of all kinds as one, as an open `AnyReader` does.
+    An MCAP file with channels of Foxglove's schemas, as rosbags' readers offer theirs.
 
     Parameters
     ----------
-    paths : sequence of Path
-        Recordings; MCAP files with other encodings than ROS's are told by looking into them.
-    default_typestore : callable
-        Returns definitions for recordings that bring none; few do, and loading them takes a
-        tenth of a second.
+    path : Path
+        MCAP file with a summary.
+
+    Attributes
+    ----------
+    connections : list of Connection
+        One for each channel.
+    decoders : dict
+        Message type to the function that decodes its bytes; not for messages in CDR.
+    start_time, end_time : int
+        Receive times of the first message and behind the last [ns].
 
     """
-
-    def __init__(self, paths: Sequence[Path], default_typestore: Callable[[], Typestore]) -> None:
-        foreign = [path for path in paths if _is_foreign(path)]
-        ros = [path for path in paths if path not in foreign]
-        with ExitStack() as stack:
-            self._foreign = [stack.enter_context(closing(_Foreign(path))) for path in foreign]
-            self._ros = None
-            if ros:
-                try:
-                    self._ros = stack.enter_context(AnyReader(ros))
-                except AnyReaderError:  # whatever else is wrong comes again
-                    reader = AnyReader(ros, default_typestore=default_typestore())
-                    self._ros = stack.enter_context(reader)
-            self.is2 = self._ros is None or self._ros.is2
-            self.typestore = self._ros.typestore if self._ros else get_typestore(Stores.EMPTY)
-            for each in self._foreign:
-                known, types = self.typestore.fielddefs, each.ros_types()
-                self.typestore.register({k: v for k, v in types.items() if k not in known})
-            self.connections = [c for reader in self._readers for c in reader.connections]
-            self._opened = stack.pop_all()
-
-    def close(self) -> None:
-        """Close all files."""
-        self._opened.close()
-
-    @staticmethod
-    def span_ns(connection: Connection) -> tuple[int, int]:
-        """Return when the first message in the file of a connection came, and the end [ns]."""
-        about: Any = getattr(connection.owner, 'metadata', connection.owner)
-        return about.start_time, about.end_time
-
-    def messages(
-        self, connections: Collection[Connection], start: int | None, stop: int | None
-    ) -> Iterator[Item]:
-        """Yield connection, time of receipt [ns] and bytes of all messages on `connections`."""
-        streams = []
-        for reader in self._readers:
-            own = [c for c in reader.connections if c in connections]
-            if own:  # for the readers, none would mean all
-                streams.append(reader.messages(own, start, stop))
-        return merge(*streams, key=lambda item: item[1])
-
-    def deserialize(self, data: bytes, msgtype: str) -> Any:
-        """Return a message; how it is encoded shows from its first byte, or its being empty."""
-        if data[:1] != b'\0' and self.is2:
-            for reader in self._foreign:
-                if msgtype in reader.decoders:
-                    return reader.decoders[msgtype](data)
-        if self._ros is not None:
-            return self._ros.deserialize(data, msgtype)
-        return self.typestore.deserialize_cdr(data, msgtype)
-
-    @property
-    def _readers(self) -> list[Any]:
-        return [*filter(None, (self._ros,)), *self._foreign]
-
-
-class _Foreign:
-    """One MCAP file."""
 
     def __init__(self, path: Path) -> None:
         self.decoders: dict[str, Callable[[bytes], Any]] = {}
@@ -148,6 +122,7 @@ class _Foreign:
             )
 
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
     def ros_types(self) -> Any:
@@ -160,7 +135,8 @@ class _Foreign:
 
     def messages(
         self, connections: Sequence[Connection], start: int | None, stop: int | None
-    ) -> Iterator[Item]:
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield connection, receive time [ns] and bytes of the messages on `connections`."""
         by_id = {connection.id: connection for connection in connections}
         topics = {connection.topic for connection in connections}
         part = self._reader.iter_messages(topics, starting_at=start, ending_before=stop)
@@ -170,33 +146,84 @@ class _Foreign:
 
 
 class _Decoder:
-    """Makes messages of one schema, whether they are JSON or protobuf."""
+    """Decodes the messages of one channel; each may be JSON or protobuf."""
 
     def __init__(self, path: Path, topic: str, schema: Schema) -> None:
-        self._what = f'{path}: messages on {topic!r}'
+        self._origin = f'{path}: messages on {topic!r}'
         self._schema = schema
         self._decode: Callable[[bytes], Any] | None = None
 
     def __call__(self, data: bytes) -> Any:
         if data[:1] == b'{':
-            message = json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+            message = _from_json(data, self._schema.name)
         else:
-            self._decode = self._decode or self._protobuf()
+            if self._decode is None:
+                self._decode = self._protobuf()
             message = self._decode(data)
-        return CONVERTERS.get(self._schema.name, lambda same: same)(message)
+        if self._schema.name in CONVERTERS:
+            return CONVERTERS[self._schema.name](message)
+        return message
 
     def _protobuf(self) -> Callable[[bytes], Any]:
         try:
+            from google.protobuf.message import DecodeError
             from mcap_protobuf.decoder import DecoderFactory
         except ImportError:
             raise RecordingError(
-                f'{self._what} are protobuf, and the package that reads it is not installed: pip '
-                f'install mcap-protobuf-support'
+                f'{self._origin} are protobuf, and the package that reads it is not installed: '
+                f'pip install mcap-protobuf-support'
             ) from None
         decode = DecoderFactory().decoder_for('protobuf', self._schema)
         if decode is None:
-            raise RecordingError(f'{self._what}: expected a protobuf schema, got none')
-        return decode
+            raise RecordingError(f'{self._origin}: expected a protobuf schema, got none')
+
+        def decode_checked(data: bytes) -> Any:
+            try:
+                return decode(data)
+            except DecodeError as error:
+                raise UnsupportedMessage(str(error)) from None
+
+        return decode_checked
+
+
+def _from_json(data: bytes, schema_name: str) -> Any:
+    """Return a JSON object with attributes; UnsupportedMessage if it does not fit the schema."""
+    try:
+        message = json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+    # ValueError: JSONDecodeError and UnicodeDecodeError, also integers of too many digits.
+    except (ValueError, RecursionError) as error:
+        raise UnsupportedMessage(f'not JSON: {error}') from None
+    _check_types(message, JSON_FIELDS.get(schema_name, {}), schema_name)
+    return message
+
+
+def _check_types(value: Any, expected: Any, name: str) -> None:
+    """
+    Check the types of JSON fields, which no decoder has checked, unlike those of protobuf.
+
+    Fields that are missing or not in `expected` are left to those who read them.
+
+    """
+    if isinstance(expected, dict):
+        if not isinstance(value, SimpleNamespace):
+            raise UnsupportedMessage(f'{name}: expected an object, got {value!r:.40}')
+        for key, inner in expected.items():
+            field = key.removesuffix('?')
+            item = getattr(value, field, None)
+            may_be_absent = key.endswith('?') or not hasattr(value, field)
+            if item is not None or not may_be_absent:
+                _check_types(item, inner, f'{name}.{field}')
+    elif isinstance(expected, list):
+        if not isinstance(value, list):
+            raise UnsupportedMessage(f'{name}: expected a list, got {value!r:.40}')
+        for i, item in enumerate(value):
+            _check_types(item, expected[0], f'{name}[{i}]')
+    elif isinstance(value, int) and abs(value) > MAX_INTEGER:
+        raise UnsupportedMessage(f'{name}: expected a number of 64 bits, got a larger one')
+    elif isinstance(value, bool) or not isinstance(value, expected):
+        kinds = expected if isinstance(expected, tuple) else (expected,)
+        wanted = ' or '.join(kind.__name__ for kind in kinds)
+        raise UnsupportedMessage(f'{name}: expected {wanted}, got {value!r:.40}')
 
 
 def encoded(message: Any) -> bytes:
@@ -224,17 +251,32 @@ def _cloud(message: Any) -> Any:
                 'pose as a transform'
             )
     data = message.data
-    data = b64decode(data) if isinstance(data, str) else data
-    fields = [
-        SimpleNamespace(name=f.name, offset=f.offset, datatype=NUMBERS[f.type], count=1)
-        for f in message.fields
-    ]
+    if isinstance(data, str):
+        try:
+            data = b64decode(data)
+        except ValueError as error:
+            raise UnsupportedMessage(f'PointCloud.data: expected base64: {error}') from None
+    fields = [_field(field) for field in message.fields]
     header = SimpleNamespace(stamp=time_of(message.timestamp), frame_id=message.frame_id)
     stride = message.point_stride
+    if stride < 0:
+        raise UnsupportedMessage(f'PointCloud.point_stride: expected 0 or more, got {stride}')
     return SimpleNamespace(
         header=header, height=1, width=len(data) // stride if stride else 0, fields=fields,
         is_bigendian=False, point_step=stride, row_step=len(data), data=data, is_dense=False,
     )  # fmt: skip
+
+
+def _field(field: Any) -> Any:
+    """Return a PackedElementField as a PointField."""
+    if not 0 <= field.type < len(DATATYPES) or field.offset < 0:
+        raise UnsupportedMessage(
+            f'PointCloud: field {field.name!r}: expected a type from 1 to 8 at an offset from 0, '
+            f'got type {field.type} at {field.offset}'
+        )
+    return SimpleNamespace(
+        name=field.name, offset=field.offset, datatype=DATATYPES[field.type], count=1
+    )
 
 
 def _transforms(message: Any) -> Any:
@@ -258,14 +300,14 @@ CONVERTERS = {
 }
 
 
-def _is_foreign(path: Path) -> bool:
-    """Tell whether a file is MCAP and has schemas that are not ROS's."""
+def is_foxglove(path: Path) -> bool:
+    """Return whether a file is MCAP and has schemas that are not of ROS."""
     if path.suffix != '.mcap' or not path.is_file():
         return False
     try:
         with path.open('rb') as file:
             summary = make_reader(file).get_summary()
     except (McapError, OSError):
-        return False  # whoever reads it says what is wrong
+        return False  # reading it as a ROS recording reports the error
     schemas = summary.schemas.values() if summary else ()
     return any(schema.encoding not in ROS_ENCODINGS for schema in schemas)

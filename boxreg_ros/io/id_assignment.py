@@ -1,4 +1,4 @@
-"""Ids for boxes that have none: which box of now is which of before."""
+"""Assignment of ids to boxes: association of each box with a track, over time."""
 
 from __future__ import annotations
 
@@ -8,24 +8,29 @@ from boxreg_ros.structures import BoxArray, Floats, HEIGHT, is_valid_box, LENGTH
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-CENTER = 0.3
-"""Deviation of a detected centre [m]."""
-SPEED = 10.0
-"""Deviation of the speed of an object that is seen for the first time [m/s]."""
-ACCELERATION = 3.0
-"""Deviation of what a speed changes by in a second [m/s^2]."""
-EXTENT = 0.3
-"""Deviation of a detected extent, as the logarithm of its ratio to the one before."""
+CENTER_STD = 0.3
+"""Standard deviation of a detected centre [m]."""
+INITIAL_SPEED_STD = 10.0
+"""Standard deviation of the velocity of an object at its first detection [m/s], per axis."""
+ACCELERATION_STD = 3.0
+"""Standard deviation of the acceleration [m/s^2], constant between two detections."""
+LOG_EXTENT_STD = 0.3
+"""Standard deviation of the logarithm of the ratio of two detected extents."""
 GATE = 20.0
-"""Boxes whose squared deviations from a track add up to more are another object."""
+"""
+Largest squared distance of a box to its track, in standard deviations.
+
+Centre and extents have six degrees of freedom: chi-square has 99.7 % below 20.
+
+"""
 
 
 @dataclass(eq=False, slots=True)
 class _Track:
     """
-    A constant velocity filter on the centre, the same for each of the three axes.
+    A constant-velocity Kalman filter of the centre.
 
-    `spread` (2, 2) is the covariance of position and velocity along one axis.
+    All three axes have the same covariance (2, 2) of position and velocity.
 
     """
 
@@ -33,51 +38,50 @@ class _Track:
     stamp_ns: int
     center: Floats
     velocity: Floats
-    spread: Floats
+    covariance: Floats
     extent: Floats
 
     @classmethod
     def started(cls, track_id: str, stamp_ns: int, box: Floats) -> _Track:
-        spread = np.diag([CENTER**2, SPEED**2])
+        covariance = np.diag([CENTER_STD**2, INITIAL_SPEED_STD**2])
         extent = box[LENGTH : HEIGHT + 1]
-        return cls(track_id, stamp_ns, box[X : Z + 1], np.zeros(3), spread, extent)
+        return cls(track_id, stamp_ns, box[X : Z + 1], np.zeros(3), covariance, extent)
 
     def predicted(self, stamp_ns: int) -> tuple[Floats, Floats]:
         """Return centre (3,) and covariance (2, 2) at a stamp."""
         seconds = (stamp_ns - self.stamp_ns) * 1e-9
         F = np.array([[1.0, seconds], [0.0, 1.0]])
-        G = np.array([seconds**2 / 2, abs(seconds)]) * ACCELERATION
-        return self.center + seconds * self.velocity, F @ self.spread @ F.T + np.outer(G, G)
+        G = np.array([seconds**2 / 2, abs(seconds)]) * ACCELERATION_STD
+        return self.center + seconds * self.velocity, F @ self.covariance @ F.T + np.outer(G, G)
 
     def update(self, stamp_ns: int, box: Floats) -> None:
-        """Take a box as the newest of this track."""
-        center, spread = self.predicted(stamp_ns)
-        gain = spread[0] / (spread[0, 0] + CENTER**2)
-        surprise = box[X : Z + 1] - center
+        """Update the filter with the newest box of this track."""
+        center, covariance = self.predicted(stamp_ns)
+        gain = covariance[0] / (covariance[0, 0] + CENTER_STD**2)
+        innovation = box[X : Z + 1] - center
         self.stamp_ns = stamp_ns
-        self.center = center + gain[0] * surprise
-        self.velocity = self.velocity + gain[1] * surprise
-        self.spread = spread - np.outer(gain, spread[0])
+        self.center = center + gain[0] * innovation
+        self.velocity = self.velocity + gain[1] * innovation
+        self.covariance = covariance - np.outer(gain, covariance[0])
         self.extent = box[LENGTH : HEIGHT + 1]
 
 
 class Tracker:
     """
-    Give boxes ids that stay with the object, whatever ids they came with.
+    Assign ids that stay with the object; ids of the input are not used.
 
-    Deterministic: the order of calls is its only input. Gated assignment of least total cost
-    between the boxes and where constant velocity takes the tracks. A box that fits no track
-    starts one.
+    Boxes are assigned to the predictions of the tracks with least total cost, within a gate. A
+    box without a track starts one. The result depends on the order of calls only.
 
     Parameters
     ----------
     max_gap : float
-        A track that was not seen for longer is forgotten [s]; may change.
+        A track without a box for longer ends [s]; may change.
 
     Attributes
     ----------
     count : int
-        Ids given so far.
+        Number of ids assigned so far.
 
     """
 
@@ -87,22 +91,27 @@ class Tracker:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew; ids that were given do not come again."""
+        """End all tracks; ids that were assigned are not used again."""
         self._tracks: list[_Track] = []
         self._newest_ns: int | None = None
 
     def identify(self, boxes: BoxArray) -> BoxArray:
         """
-        Return the boxes, given in a fixed frame, with ids.
+        Return the boxes with ids.
 
-        Invalid boxes get the id ``''``. Boxes older than others before find the tracks, but
-        change none; one that finds none starts none, and its id comes once only. Where stamps
-        go back further than `max_gap`, all tracks are forgotten.
+        Invalid boxes get the id ``''``. Boxes with an older stamp than others before are
+        assigned to tracks but do not change them; without a track they get an id that is not
+        used again. If stamps go back further than `max_gap`, all tracks end.
+
+        Parameters
+        ----------
+        boxes : BoxArray
+            In a fixed frame.
 
         """
         stamp_ns, max_gap_ns = boxes.stamp_ns, round(self.max_gap * 1e9)
         if self._newest_ns is not None and stamp_ns < self._newest_ns - max_gap_ns:
-            self.forget()  # a recording that starts again
+            self.forget()  # a recording in a loop
         is_late = self._newest_ns is not None and stamp_ns <= self._newest_ns
         if not is_late:
             self._newest_ns = stamp_ns
@@ -111,7 +120,7 @@ class Tracker:
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
         costs = self._costs(stamp_ns, boxes.boxes[rows])
         ids = [''] * len(boxes.boxes)
-        # A pair beyond the gate costs as much as two that stay alone.
+        # Costs are cut off at the gate: a pair beyond it costs as much as no pair.
         pairs = zip(*linear_sum_assignment(np.minimum(costs, GATE)), strict=True)
         found = {int(rows[i]): self._tracks[k] for i, k in pairs if costs[i, k] < GATE}
         for row in rows.tolist():
@@ -127,11 +136,11 @@ class Tracker:
         return replace(boxes, track_ids=tuple(ids))
 
     def _costs(self, stamp_ns: int, boxes: Floats) -> Floats:
-        """Return the squared deviations (boxes, tracks) of each box from each track."""
+        """Return the squared distances (boxes, tracks) in standard deviations."""
         costs = np.zeros((len(boxes), len(self._tracks)))
         for k, track in enumerate(self._tracks):
-            center, spread = track.predicted(stamp_ns)
+            center, covariance = track.predicted(stamp_ns)
             away = np.square(boxes[:, X : Z + 1] - center).sum(axis=1)
             unlike = np.square(np.log(boxes[:, LENGTH : HEIGHT + 1] / track.extent)).sum(axis=1)
-            costs[:, k] = away / (spread[0, 0] + CENTER**2) + unlike / EXTENT**2
+            costs[:, k] = away / (covariance[0, 0] + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
         return costs

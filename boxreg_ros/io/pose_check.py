@@ -1,4 +1,4 @@
-"""Whether poses and sizes of a box topic mean what they are taken for: the points know."""
+"""Check of the convention of box poses and sizes against the points."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ from msg_adapters.convention import Convention, REFERENCES, SIZE_ORDERS
 import numpy as np
 from numpy.typing import NDArray
 
-ENOUGH = 12
-"""So many boxes with points decide."""
-PATIENCE = 300
-"""After so many boxes the check is over, decided or not."""
+DECISIVE_BOXES = 12
+"""Number of boxes with points that the result needs."""
+MAX_BOXES = 300
+"""After this number of boxes, with points or without, the check ends."""
 MIN_POINTS = 10
-MARGIN = 0.1
-"""Points this far outside a box are still its own [m]."""
-NEARLY = 0.85
-"""A convention that holds this part of the most is as good."""
-GAIN = 1.3
-"""Another convention has to hold this many times the points ..."""
-AGREEMENT = 0.7
-"""... and more points in this part of the boxes, to be believed."""
-WAYS = (
+"""Points that the best convention must have in a box for the box to be counted."""
+POINT_MARGIN = 0.1
+"""Points up to this distance outside of a box count as inside [m]: range noise and labels."""
+EQUIVALENT_SHARE = 0.85
+"""A convention with this share of the points of the best one counts as equal to it."""
+MIN_GAIN = 1.3
+"""Factor by which another convention must exceed the points of the present one."""
+MIN_AGREEMENT = 0.7
+"""Share of the boxes in which the other convention must have more points."""
+DIRECTIONS = (
     ('length', 'behind', 'before'),
     ('width', 'right of', 'left of'),
     ('height', 'below', 'above'),
@@ -42,23 +43,22 @@ WAYS = (
 
 class PoseCheck:
     """
-    Compare the first boxes with their points under every convention there is.
+    Compare the first boxes with their points under every convention.
 
-    All conventions give boxes of one volume about the same pose, so the one that is meant holds
-    most points. Sweeps and boxes come in any order, in one frame and under the convention they
-    are taken for.
+    All conventions give boxes of the same volume about the same pose, so the right one contains
+    most points. Sweeps and boxes arrive in any order, in one frame.
 
     Parameters
     ----------
     convention : Convention
-        The one they are taken for.
+        The convention that the boxes have been read with.
     tolerance : float
-        Stamps further apart do not belong together [s].
+        Largest time between boxes and their sweep [s].
 
     Attributes
     ----------
     finding : str
-        What is wrong and which setting mends it; empty while nothing is known to be.
+        Which setting is wrong and its right value; empty if none is known to be wrong.
 
     """
 
@@ -76,7 +76,7 @@ class PoseCheck:
         self.finding = ''
 
     def add(self, item: Sweep | BoxArray) -> None:
-        """Take a sweep or boxes, as they come."""
+        """Add the next sweep or boxes."""
         if self._is_over:
             return
         if isinstance(item, Sweep):
@@ -88,12 +88,12 @@ class PoseCheck:
         if abs(self._sweep.stamp_ns - self._boxes.stamp_ns) <= self._tolerance_ns:
             self._count(self._sweep.points, self._boxes)
             self._sweep = self._boxes = None
-            if len(self._counts) >= ENOUGH:
-                self.finding = self._verdict()
+            if len(self._counts) >= DECISIVE_BOXES:
+                self.finding = self._result()
 
     @property
     def _is_over(self) -> bool:
-        return len(self._counts) >= ENOUGH or self._seen >= PATIENCE
+        return len(self._counts) >= DECISIVE_BOXES or self._seen >= MAX_BOXES
 
     def _count(self, points: NDArray[np.floating], boxes: BoxArray) -> None:
         """Count the points in each box under each convention."""
@@ -112,39 +112,40 @@ class PoseCheck:
             if max(counts) >= MIN_POINTS:
                 self._counts.append(counts)
 
-    def _verdict(self) -> str:
-        """Return what is wrong, from the counts (boxes, conventions); the first is the own."""
-        counts = np.array(self._counts, dtype=float)
+    def _result(self) -> str:
+        """Return the finding from the counts; the first convention is the present one."""
+        counts = np.array(self._counts, dtype=float)  # (boxes, conventions)
         shares = counts / counts.max(axis=1, keepdims=True)
         own, others = shares[:, 0], shares[:, 1:]
         totals = others.sum(axis=0)
-        # Of those that hold about as many, the first, which are the common ones.
-        best = int((totals >= NEARLY * totals.max()).argmax())
+        # Of equal conventions the first: they are ordered by how common they are.
+        best = int((totals >= EQUIVALENT_SHARE * totals.max()).argmax())
         is_better = others[:, best] > own
-        if others[:, best].sum() < GAIN * own.sum() or is_better.mean() < AGREEMENT:
+        if others[:, best].sum() < MIN_GAIN * own.sum() or is_better.mean() < MIN_AGREEMENT:
             return ''
         return self._text(self._others[best], float(own.mean()))
 
     def _text(self, other: Convention, share: float) -> str:
-        """Return what is wrong, and the setting that makes it the `other` convention."""
+        """Return the finding that the `other` convention is the right one."""
         name, how = 'size_order', 'do not fit'
         if other.pose_reference != self._convention.pose_reference:
             name = 'pose_reference'
-            off = other.reference - self._convention.reference  # the boxes from where they are
+            # Offset of the present boxes from their points, in parts of the extents.
+            off = other.reference - self._convention.reference
             how = ' and '.join(
                 f'{"hover" if axis == "height" and part > 0 else "stand"} {abs(part):g} {axis}s '
                 f'{ways[int(part > 0)]}'
-                for part, (axis, *ways) in zip(off, WAYS, strict=True)
+                for part, (axis, *ways) in zip(off, DIRECTIONS, strict=True)
                 if part
             )
         wanted = getattr(other, name)
         instead = ''
         if name == 'size_order' and wanted[:2] in ('wl', 'lw'):
-            # The points of a box tell its length from its width, but not what is forward.
+            # Points distinguish length from width, but not which axis points forward.
             sideways = 'x+ or x-' if self._convention.forward_axis[0] == 'y' else 'y+ or y-'
             instead = f', or forward_axis:={sideways} if it is that axis which points forward'
         return (
-            f'boxes {how} their points, of which they hold {share:.0%}: expected {name} '
+            f'boxes {how} their points, of which they contain {share:.0%}: expected {name} '
             f'{wanted!r}, got {getattr(self._convention, name)!r}; set {name}:={wanted}{instead} '
             f'(boxreg relabel: --{name.replace("_", "-")} {wanted})'
         )
@@ -154,4 +155,4 @@ def _inside(points: NDArray[np.floating], box: Floats) -> int:
     """Count the points in a box, a margin around it included."""
     R = matrix_from_rpy(box[ROLL:])
     local = (points - box[X : Z + 1]) @ R
-    return int((np.abs(local) <= box[LENGTH : HEIGHT + 1] / 2 + MARGIN).all(axis=1).sum())
+    return int((np.abs(local) <= box[LENGTH : HEIGHT + 1] / 2 + POINT_MARGIN).all(axis=1).sum())

@@ -1,29 +1,25 @@
 """
 Recordings: MCAP, rosbag2 (sqlite3 and mcap) and ROS 1 bags as one ordered stream.
 
-Message definitions come from the recording, so nothing of ROS need be installed.
+Message definitions are read from the recording, so ROS need not be installed.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 import shlex
-from typing import Any, cast, NamedTuple, Self
+from typing import Any, cast, NamedTuple, Protocol, runtime_checkable, Self
 
-from boxreg_ros.errors import (
-    BoxregError,
-    RecordingError,
-    TransformUnavailable,
-    UnsupportedMessage,
-)
-from boxreg_ros.io.foxglove_mcap import encoded, Reader
+from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
+from boxreg_ros.io.foxglove_mcap import encoded
+from boxreg_ros.io.message_files import is_message, one_line, readable, Reader
 from boxreg_ros.io.resync import Timeline
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
-from boxreg_ros.structures import BoxArray, Floats, Sweep
+from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, poses, WITHOUT_IDS
 from msg_adapters.convention import Convention, STANDARD
 from rosbags.interfaces import Connection
@@ -34,11 +30,11 @@ TF_TYPES = ('tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage')
 ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
 
 LOOKAHEAD_NS = 2 * 10**9
-"""Transforms are read this far ahead of the clouds and boxes that need them."""
-PATIENCE_NS = 10 * 10**9
-"""So long is TF given to connect the frames before odometry is taken."""
+"""Transforms are read this far ahead of clouds and boxes [ns]: publishers of TF are late."""
+TF_SEARCH_NS = 10 * 10**9
+"""Odometry is used if TF does not connect the frames in this first part of a recording [ns]."""
 
-# What recordings before ROS 2 Iron leave out, and rosbags does not know.
+# Definitions that recordings before ROS 2 Iron lack, and rosbags does not include.
 VISION_DEFINITIONS = {
     'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score',
     'vision_msgs/msg/ObjectHypothesisWithPose': (
@@ -63,38 +59,123 @@ class Record(NamedTuple):
     data: bytes
 
 
+class Item(NamedTuple):
+    """
+    A decoded cloud or box array of a recording.
+
+    Attributes
+    ----------
+    received_ns : int
+        When it was received [ns].
+    content : Sweep or BoxArray
+        In the frame of its message.
+    intensities : array, shape (M,), or None
+        Of the points of a cloud; None unless asked for and recorded.
+    refined : RefinedBoxes or None
+        Status and covariances of boxes that come from label files; else None.
+
+    """
+
+    received_ns: int
+    content: Sweep | BoxArray
+    intensities: Floats | None = None
+    refined: RefinedBoxes | None = None
+
+
+Stage = Callable[[str], AbstractContextManager[object]]
+"""Measures the time of a ``with`` block under the name of a stage."""
+
+
+def not_measured(stage: str) -> AbstractContextManager[object]:
+    """Measure nothing."""
+    return nullcontext()
+
+
+@runtime_checkable
+class ItemSource(Protocol):
+    """
+    A source of clouds and boxes: bags, MCAP files of Foxglove, clouds with label files.
+
+    Attributes
+    ----------
+    points_topic, boxes_topic, odometry_topic
+        Topics; `boxes_topic` is empty if the boxes are not from a topic.
+    start_ns, end_ns
+        Part that is read, in receive time [ns].
+    unreadable, first_errors
+        Number of messages of each topic that could not be decoded, and the first error.
+    outside
+        Boxes that do not belong to the part that is read.
+
+    """
+
+    points_topic: str
+    boxes_topic: str
+    odometry_topic: str | None
+    start_ns: int
+    end_ns: int
+    unreadable: Counter[str]
+    first_errors: dict[str, UnsupportedMessage]
+    outside: int
+
+    @property
+    def apart(self) -> dict[str, float]:
+        """Return the topics that were recorded apart from the clouds, and by how much [s]."""
+
+    def sensor_frame(self) -> str:
+        """Return the frame of the first cloud."""
+
+    def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
+        """Return the frame to refine in; see `Recording.choose_fixed_frame`."""
+
+    def items(
+        self,
+        tree: TransformTree,
+        *,
+        with_clouds: bool = True,
+        with_intensities: bool = False,
+        stage: Stage = not_measured,
+    ) -> Iterator[Item]:
+        """Yield clouds and boxes in order while `tree` follows; see `Recording.items`."""
+
+    def check_readable(self) -> None:
+        """Raise UnsupportedMessage if none of the clouds, or of the boxes, was readable."""
+
+
 class Recording:
     """
     One or several recordings of one drive, merged by receive time.
 
-    Receive time only orders the stream and cuts out the part between `start` and `end`; stamps
-    are those of the messages' headers. What was recorded apart from the clouds is merged by
-    stamp, see `Timeline`. Use as a context manager; a copy can be opened once more.
+    Receive times only order the stream and select the part between `start` and `end`; stamps
+    are those of the message headers. Topics that were recorded apart from the clouds are merged
+    by stamp, see `Timeline`. Use as a context manager; a copy can be opened again.
 
     Parameters
     ----------
     paths : sequence of Path
         MCAP files, rosbag2 folders, .db3 files, or ROS 1 bags.
     points, boxes, odometry : str, optional
-        Topics; found by type where only one fits.
+        Topics; found by type if only one topic has it.
     start, end : float, optional
         Part to read, from the beginning of the recording [s].
     convention : Convention
-        How the boxes are to be read.
+        Convention of the boxes, and whether ids will be assigned to them.
 
     Attributes
     ----------
     has_boxes : bool
-        Whether there have to be boxes; without them `boxes_topic` is ''.
+        Whether a topic of boxes is required; without, `boxes_topic` is empty.
+    points_topic, boxes_topic, odometry_topic, start_ns, end_ns, unreadable, first_errors, outside
+        See `ItemSource`.
     part_ns : tuple of int or None
-        Begin and end of the part that was asked for, in receive time [ns].
-    unreadable, first_errors : Counter and dict
-        How many messages of each topic were passed over, and the error of the first.
+        Begin and end of the part that was asked for, in receive time [ns]; None if it was not.
+    files : list of Path
+        Files and folders that are read.
 
     Raises
     ------
     RecordingError
-        On entering, if something cannot be read or found; the message lists what there is.
+        On entering, if a file or topic cannot be read or found; the message lists the topics.
 
     """
 
@@ -117,10 +198,12 @@ class Recording:
         self.odometry_topic: str | None = None
         self.unreadable: Counter[str] = Counter()
         self.first_errors: dict[str, UnsupportedMessage] = {}
+        self.outside = 0
+        self._decoded_topics: set[str] = set()
 
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
-        with _readable(self):
+        with readable(str(self)):
             self.files = _files(self._paths)
             self._reader = _opened(self.files)
         try:
@@ -138,74 +221,92 @@ class Recording:
         """Return the paths."""
         return ', '.join(map(str, self._paths))
 
-    def records(self, tree: TransformTree) -> Iterator[Record]:
+    def items(
+        self,
+        tree: TransformTree,
+        *,
+        with_clouds: bool = True,
+        with_intensities: bool = False,
+        stage: Stage = not_measured,
+    ) -> Iterator[Item]:
         """
         Yield clouds and box arrays in the order they were received.
 
-        `tree` then holds the transforms received up to `LOOKAHEAD_NS` after each: a window
-        that moves along, so that memory does not grow with the recording.
+        Messages that cannot be decoded are counted in `unreadable` and left out.
+
+        Parameters
+        ----------
+        tree : TransformTree
+            At each item it holds the transforms received up to `LOOKAHEAD_NS` later. Older ones
+            are forgotten, so that memory does not grow with the recording.
+        with_clouds : bool
+            False yields box arrays only, and saves decoding the clouds.
+        with_intensities : bool
+            Decode the intensities of the points, too.
+        stage : callable, optional
+            Measures the stages ``read`` and ``decode``.
 
         """
-        tree.rewind(0)  # motions that were read to choose a frame come again
         self.unreadable.clear()
-        data = self._connections(self.data_topics)
-        motion_topics = self._motion_topics()
-        motion = self._connections(motion_topics)
-        held: deque[Record] = deque()
-        begin, end = self.part_ns
-        wide = begin and begin - LOOKAHEAD_NS, end and end + LOOKAHEAD_NS
-        for record in self._read([*data, *motion], *wide):
-            # First what needs no more transforms: those after a pause make the tree forget.
-            while held and held[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
-                yield held.popleft()
-            if record.connection.topic in motion_topics:
-                self._add_motion(tree, record)
-            elif (begin or 0) <= record.received_ns and (not end or record.received_ns < end):
-                held.append(record)
-        yield from held
+        self.first_errors.clear()
+        self._decoded_topics.clear()
+        topics = self.data_topics if with_clouds else {self.boxes_topic}
+        records = self._records(tree, topics)
+        while True:
+            with stage('read'):
+                record = next(records, None)
+            if record is None:
+                return
+            with stage('decode'):
+                item = self._item(record, with_intensities)
+            if item is not None:
+                yield item
 
-    def decode(self, record: Record) -> Sweep | BoxArray:
+    def check_readable(self) -> None:
         """
-        Return the sweep or the boxes of a record, in the frame they were recorded in.
+        Check after the last item that some of the clouds, and of the boxes, were readable.
 
         Raises
         ------
         UnsupportedMessage
-            If this message cannot be read: its bytes do not follow the definition in the
-            recording, or it contradicts itself, or its layout is none that is known.
-        RecordingError
-            If no message of its kind can be read here.
+            If all messages of either topic were unreadable.
 
         """
-        return self._content(record.connection.topic, self._message(record))
+        for topic, first in self.first_errors.items():
+            if topic in self.data_topics and topic not in self._decoded_topics:
+                raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
-    def pass_over(self, record: Record, error: UnsupportedMessage) -> None:
-        """Note a record that cannot be read."""
-        self.unreadable[record.connection.topic] += 1
-        self.first_errors.setdefault(record.connection.topic, error)
+    def left_out(self, missing_transforms: Sequence[str]) -> str:
+        """
+        Return how many messages are not used, and why, in one line; empty if all are.
 
-    def left_out(self, unmoved: Sequence[str]) -> str:
-        """Return how many messages are not used, and why; `unmoved`: why some had no transform."""
-        unread = [str(error) for error in self.first_errors.values()]
-        return '; '.join(
-            f'{count} messages {what}, first: {reasons[0]}'
-            for count, what, reasons in (
-                (self.unreadable.total(), 'could not be read', unread),
-                (len(unmoved), 'had no transform', unmoved),
+        Parameters
+        ----------
+        missing_transforms : sequence of str
+            Errors of the messages without a transform.
+
+        """
+        parts = []
+        if self.unreadable.total():
+            first = next(iter(self.first_errors.values()))
+            parts.append(f'{self.unreadable.total()} messages could not be read, first: {first}')
+        if missing_transforms:
+            parts.append(
+                f'{len(missing_transforms)} messages had no transform, first: '
+                f'{missing_transforms[0]}'
             )
-            if count
-        )
-
-    def intensities(self, record: Record) -> Floats | None:
-        """Return the intensities of a sweep's points; None if it has none that can be read."""
-        try:
-            return pointcloud.intensities(self._message(record))
-        except UnsupportedMessage as error:
-            self.pass_over(record, error)
-            return None
+        return '; '.join(parts)
 
     def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
-        """Return a message of the boxes' topic from its bytes, and its boxes; see `decode`."""
+        """
+        Return a message of the boxes' topic from its bytes, and its boxes.
+
+        Raises
+        ------
+        UnsupportedMessage
+            If it is malformed.
+
+        """
         connection = self._connections({self.boxes_topic})[0]
         message = self._message(Record(connection, 0, data))
         return message, cast(BoxArray, self._content(self.boxes_topic, message))
@@ -220,7 +321,7 @@ class Recording:
         return bytes(encode(replaced, kind))
 
     def received_ns(self, topic: str, received_ns: int, data: bytes) -> int:
-        """Return when a message on a topic of `apart` counts as received: with its clouds [ns]."""
+        """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
         return self._timeline.received_ns(self._connections({topic})[0], received_ns, data)
 
     @property
@@ -231,7 +332,7 @@ class Recording:
 
     @property
     def typestore(self) -> Typestore:
-        """Return the definitions of the messages in the recording."""
+        """Return the message definitions of the recording."""
         return self._reader.typestore
 
     @property
@@ -246,22 +347,22 @@ class Recording:
 
     def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
         """
-        Find out where the motion of the sensor comes from, and return the fixed frame.
+        Choose the source of the sensor's motion, and return the fixed frame.
 
-        TF where it connects the frames, else odometry. Without a wish it is the topmost frame
-        the cloud's frame moves in.
+        TF is used where it connects the frames, else odometry. The default is the topmost frame
+        that the frame of the clouds moves in.
 
         Parameters
         ----------
         tree : TransformTree
-            Empty; afterwards it holds the static transforms, and the first ones over time.
+            Empty; afterwards it holds the static and the first moving transforms.
         fixed_frame : str, optional
-            The frame wished for.
+            Frame to use instead.
 
         Raises
         ------
         RecordingError
-            If no motion is known, or the frame wished for is not connected to the cloud's.
+            If no motion is known, or no transforms connect `fixed_frame` with the clouds.
 
         """
         frame = self.sensor_frame()
@@ -272,8 +373,7 @@ class Recording:
         found = self._scout(tree, frame, fixed_frame)
         odometry: list[str] = []
         if found is None or fixed_frame is None:
-            # Odometry is needed where TF does not lead to a fixed frame, or where the root of
-            # TF is the very frame that odometry moves.
+            # Odometry is needed if TF has no motion, or if odometry moves the root of TF.
             relevant = {}
             for topic in self._candidates((ODOMETRY_TYPE,)):
                 message = self._first(topic)
@@ -300,9 +400,9 @@ class Recording:
             )
         if found is None:
             raise RecordingError(
-                f'{self}: neither /tf nor odometry tells how the frame of the clouds {frame!r} '
-                f'moves; TF: {tree}; odometry: {", ".join(odometry) or "none"}; if it does not '
-                f'move, say so with --fixed-frame {shlex.quote(frame)}'
+                f'{self}: neither /tf nor odometry has the motion of the frame of the clouds '
+                f'{frame!r}; TF: {tree}; odometry: {", ".join(odometry) or "none"}; if it does '
+                f'not move, set --fixed-frame {shlex.quote(frame)}'
             )
         return found
 
@@ -314,19 +414,19 @@ class Recording:
         return str(cloud.header.frame_id).lstrip('/')
 
     def _first(self, topic: str) -> Any:
-        """Return the first message on a topic, in the part that is read, that can be; or None."""
-        trouble: UnsupportedMessage | None = None
+        """Return the first readable message on a topic in the part that is read; None without."""
+        first_error: UnsupportedMessage | None = None
         for record in self._read(self._connections({topic}), self.start_ns, self.end_ns):
             try:
                 return self._message(record)
             except UnsupportedMessage as error:
-                trouble = trouble or error
-        if trouble is not None:
-            raise trouble
+                first_error = first_error or error
+        if first_error is not None:
+            raise first_error
         return None
 
     def _find(self) -> None:
-        """Settle topics and times, and complete the message definitions."""
+        """Find topics and times, and complete the message definitions."""
         self._topics = {
             c.topic: c.msgtype for c in sorted(self._reader.connections, key=lambda c: c.topic)
         }
@@ -361,7 +461,8 @@ class Recording:
             end = 'the end' if self._end is None else f'{self._end:g}'
             raise RecordingError(
                 f'start and end: expected a part of the {(last_ns - begin_ns) * 1e-9:.1f} s of '
-                f'{self}, got {self._start or 0:g} to {end}'
+                f'{self}, got {self._start or 0:g} to {end}; '
+                f'choose a smaller --start, or leave it out'
             )
 
     def _topic(self, role: str, what: str, types: tuple[str, ...]) -> str:
@@ -393,7 +494,7 @@ class Recording:
         return candidates[0]
 
     def _box_types(self) -> tuple[str, ...]:
-        """Return the types of boxes; not those without ids where there are others to choose."""
+        """Return the types of boxes; those without ids only if there are no others."""
         with_ids = tuple(name for name in ADAPTERS if name not in WITHOUT_IDS)
         is_free = self._convention.associate or self._asked['boxes'] is not None
         return tuple(ADAPTERS) if is_free or not self._candidates(with_ids) else with_ids
@@ -404,18 +505,18 @@ class Recording:
             return [self.odometry_topic]
         return [t for t, kind in self._topics.items() if kind in types and t in self._filled]
 
-    def _scout(self, tree: TransformTree, frame: str, wish: str | None) -> str | None:
-        """Feed `tree` from TF until that leads to the fixed frame, and a little longer."""
-        found = _fixed_frame(tree, frame, wish)
+    def _scout(self, tree: TransformTree, frame: str, wanted: str | None) -> str | None:
+        """Read TF until it connects the fixed frame, and `LOOKAHEAD_NS` longer."""
+        found = _fixed_frame(tree, frame, wanted)
         begin = self.start_ns - LOOKAHEAD_NS
         until = self.end_ns
         if self._candidates((ODOMETRY_TYPE,)):
-            until = min(until, begin + PATIENCE_NS)
+            until = min(until, begin + TF_SEARCH_NS)
         for record in self._read(self._connections(self._tf_topics()), begin):
             if record.received_ns > until:
                 break
             self._add_motion(tree, record)
-            was_found, found = found, _fixed_frame(tree, frame, wish)
+            was_found, found = found, _fixed_frame(tree, frame, wanted)
             if was_found is None and found is not None:
                 until = record.received_ns + LOOKAHEAD_NS
         return found
@@ -438,21 +539,64 @@ class Recording:
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[Record]:
-        with _readable(self):
-            for item in self._timeline.messages(connections, start_ns, end_ns):
-                yield Record(*item)
+        for message in self._timeline.messages(connections, start_ns, end_ns):
+            yield Record(*message)
+
+    def _records(self, tree: TransformTree, topics: set[str]) -> Iterator[Record]:
+        """Yield the messages on `topics`, still encoded, while `tree` follows."""
+        tree.rewind(0)  # motions that were read to choose a frame are read again
+        motion_topics = self._motion_topics()
+        connections = [*self._connections(topics), *self._connections(motion_topics)]
+        begin, end = self.part_ns
+        read_from = begin and begin - LOOKAHEAD_NS
+        read_to = end and end + LOOKAHEAD_NS
+        waiting: deque[Record] = deque()
+        for record in self._read(connections, read_from, read_to):
+            # Those complete first: after a pause, this record makes the tree forget.
+            while waiting and waiting[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
+                yield waiting.popleft()
+            if record.connection.topic in motion_topics:
+                self._add_motion(tree, record)
+            elif (begin or 0) <= record.received_ns and (not end or record.received_ns < end):
+                waiting.append(record)
+        yield from waiting
+
+    def _item(self, record: Record, with_intensities: bool) -> Item | None:
+        """Return a message decoded; None, and counted, if it cannot be."""
+        topic = record.connection.topic
+        try:
+            message = self._message(record)
+            content = self._content(topic, message)
+        except UnsupportedMessage as error:
+            self._count_unreadable(topic, error)
+            return None
+        self._decoded_topics.add(topic)
+        intensities = None
+        if with_intensities and isinstance(content, Sweep):
+            try:
+                intensities = pointcloud.intensities(message)
+            except UnsupportedMessage as error:
+                self._count_unreadable(topic, error)
+        return Item(record.received_ns, content, intensities)
+
+    def _count_unreadable(self, topic: str, error: UnsupportedMessage) -> None:
+        self.unreadable[topic] += 1
+        self.first_errors.setdefault(topic, error)
 
     def _message(self, record: Record) -> Any:
+        """Return a message decoded; UnsupportedMessage if its bytes are not of its type."""
         connection = record.connection
-        try:
-            return self._reader.deserialize(record.data, connection.msgtype)
-        except BoxregError:
-            raise
-        except Exception as error:  # the bytes are foreign, and so are the errors they cause
-            raise UnsupportedMessage(
-                f'{self}: a message on {connection.topic!r} is not a {connection.msgtype} as '
-                f'defined there: {_text(error)}'
-            ) from None
+        kind = connection.msgtype
+        origin = f'{self}: a message on {connection.topic!r} is not a {kind} as defined there'
+        with _malformed(origin):
+            return self._reader.deserialize(record.data, kind)
+
+    def _content(self, topic: str, message: Any) -> Sweep | BoxArray:
+        """Return the sweep or the boxes of a message; UnsupportedMessage if it has none."""
+        adapter: Any = pointcloud if topic == self.points_topic else self._adapter
+        with _malformed(f'topic {topic!r}'):
+            content: Sweep | BoxArray = adapter.from_msg(message)
+        return content
 
     def _stamp_of(self, connection: Connection, data: bytes) -> int | None:
         """Return the stamp of clouds, boxes and motion [ns]; None if there is none."""
@@ -462,41 +606,35 @@ class Recording:
             message = self._message(Record(connection, 0, data))
             if connection.topic == self.boxes_topic:
                 return self._content(connection.topic, message).stamp_ns or None
+            stamped = getattr(message, 'transforms', [message])
+            with _malformed(f'topic {connection.topic!r}'):
+                return poses.stamp_ns(stamped[0].header) or None if len(stamped) else None
         except UnsupportedMessage:
             return None
-        stamped = message.transforms if hasattr(message, 'transforms') else [message]
-        return poses.stamp_ns(stamped[0].header) or None if len(stamped) else None
-
-    def _content(self, topic: str, message: Any) -> Sweep | BoxArray:
-        """Return the sweep or the boxes in a message."""
-        reader: Any = pointcloud if topic == self.points_topic else self._adapter
-        try:
-            content: Sweep | BoxArray = reader.from_msg(message)
-            return content
-        except Exception as error:  # whatever a malformed message leads to
-            raise UnsupportedMessage(f'topic {topic!r}: {_text(error)}') from None
 
     def _add_motion(self, tree: TransformTree, record: Record) -> None:
+        topic = record.connection.topic
         try:
             message = self._message(record)
+            with _malformed(f'topic {topic!r}'):
+                if record.connection.msgtype == ODOMETRY_TYPE:
+                    tree.add_odometry(message)
+                else:
+                    is_static = topic in self._static_topics()
+                    tree.add_transforms(message.transforms, is_static)
         except UnsupportedMessage as error:
-            return self.pass_over(record, error)
-        if record.connection.msgtype == ODOMETRY_TYPE:
-            tree.add_odometry(message)
-        else:
-            is_static = record.connection.topic in self._static_topics()
-            tree.add_transforms(message.transforms, is_static)
+            self._count_unreadable(topic, error)
 
 
-def _fixed_frame(tree: TransformTree, frame: str, wish: str | None) -> str | None:
+def _fixed_frame(tree: TransformTree, frame: str, wanted: str | None) -> str | None:
     """Return the fixed frame if `tree` connects `frame` with one."""
-    if wish is None:
+    if wanted is None:
         return tree.fixed_frame(frame)
-    return wish.lstrip('/') if tree.connects(wish, frame) else None
+    return wanted.lstrip('/') if tree.connects(wanted, frame) else None
 
 
 def _files(paths: Sequence[Path]) -> list[Path]:
-    """Return what the reader can open; folders without metadata stand for the files in them."""
+    """Return the files and folders to open; of a folder without metadata, the files in it."""
     files = []
     for path in paths:
         if not path.exists():
@@ -524,7 +662,7 @@ def _opened(files: Sequence[Path]) -> Reader:
         return Reader(files, stock_types)
     except Exception:
         for path in files:
-            with _readable(path):
+            with readable(str(path)):
                 Reader([path], stock_types).close()
         raise
 
@@ -540,46 +678,64 @@ def stock_types() -> Typestore:
 
 
 @contextmanager
-def _readable(what: object) -> Iterator[None]:
-    """Turn whatever a reader throws at foreign or broken bytes into a RecordingError."""
+def _malformed(origin: str) -> Iterator[None]:
+    """
+    Turn errors that malformed messages cause into UnsupportedMessage; `origin` comes first.
+
+    Decoders and adapters raise UnsupportedMessage for bytes, sizes and values that contradict
+    each other. Beyond these, a message may lack a field because its definition in the recording
+    is another one; that is an AttributeError of the message. Every other error, also an
+    AttributeError of a module or of an object of ours, is a fault of boxreg_ros and goes on.
+
+    """
     try:
         yield
-    except BoxregError:
-        raise
-    except Exception as error:
-        raise RecordingError(
-            f'{what}: {_text(error)}; expected a whole MCAP file, rosbag2 folder, .db3 file or '
-            f'ROS 1 bag; mcap recover, ros2 bag reindex and rosbag reindex mend those cut short'
+    except UnsupportedMessage as error:
+        raise UnsupportedMessage(f'{origin}: {one_line(error)}') from None
+    except AttributeError as error:
+        if not is_message(error.obj):
+            raise
+        raise UnsupportedMessage(
+            f'{origin}: expected a field {error.name!r} in its {type(error.obj).__name__}, got '
+            f'none; the definition in the recording is not the one that is known'
         ) from None
-
-
-def _text(error: Exception) -> str:
-    """Return an error in one line."""
-    return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
 
 
 def input_boxes(
     path: Path, fixed_frame: str | None = None, **options: Any
 ) -> tuple[list[BoxArray], str]:
     """
-    Return the boxes of a recording as they are, in the fixed frame `relabel` would choose.
+    Return the input boxes of a recording in the fixed frame that `relabel` would choose.
 
-    Box arrays without a transform to that frame are left out, and what cannot be read: how many
-    comes beside, and why. `options` are those of `Recording`.
+    Parameters
+    ----------
+    path : Path
+        Recording.
+    fixed_frame : str, optional
+        Fixed frame to use instead.
+    **options
+        Of `Recording`.
+
+    Returns
+    -------
+    arrays : list of BoxArray
+        All that could be decoded and transformed.
+    left_out : str
+        Number of the others, and why; empty if there are none.
 
     """
-    tree, unmoved = TransformTree(), []
-    arrays = []
+    tree = TransformTree()
+    arrays: list[BoxArray] = []
+    missing_transforms: list[str] = []
     with Recording([path], **options) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
-        for record in recording.records(tree):
-            if record.connection.topic != recording.boxes_topic:
-                continue
+        for item in recording.items(tree, with_clouds=False):
             try:
-                arrays.append(to_fixed_frame(recording.decode(record), tree, fixed_frame))
-            except UnsupportedMessage as error:
-                recording.pass_over(record, error)
+                moved = to_fixed_frame(item.content, tree, fixed_frame)
             except TransformUnavailable as error:
-                unmoved.append(str(error))
-        left_out = recording.left_out(unmoved)
-    return [array for array in arrays if isinstance(array, BoxArray)], left_out
+                missing_transforms.append(str(error))
+                continue
+            if isinstance(moved, BoxArray):
+                arrays.append(moved)
+        left_out = recording.left_out(missing_transforms)
+    return arrays, left_out

@@ -1,4 +1,11 @@
-"""Messages of a recording in one order, also where some were recorded apart from the others."""
+"""
+Re-synchronisation: messages that were recorded apart from the clouds are merged by stamp.
+
+Receive times order a recording only if all topics were recorded together and without delay. A
+detector slower than the data, or boxes and odometry of another day in a file of their own, are
+received long after the clouds of their stamps, or before.
+
+"""
 
 from __future__ import annotations
 
@@ -8,41 +15,47 @@ from functools import cached_property
 from heapq import merge
 from itertools import islice
 
-from boxreg_ros.io.foxglove_mcap import Item, Reader
+from boxreg_ros.io.message_files import EncodedMessage, Reader
 from rosbags.interfaces import Connection
 
 APART_NS = 10**9
-"""Received so much earlier or later than clouds of their stamp, messages were recorded apart."""
+"""
+Difference of receive times to the clouds of the same stamp that means recorded apart [ns].
+
+A live detector is slower than its clouds by 0.1 to 0.5 s; that order is the order of the node.
+
+"""
 
 StampOf = Callable[[Connection, bytes], int | None]
 
 
 class Timeline:
     """
-    Messages by time of receipt, and by stamp those that were recorded apart from the clouds.
+    Order messages by receive time, and those recorded apart from the clouds by stamp.
 
-    A detector slower than the data, or boxes and odometry of another day in a file of their own,
-    are received long after the clouds they belong to, or before. They take part as if they had
-    come with the clouds of their stamp.
+    A message that was recorded apart gets the receive time of a cloud of its stamp. That is
+    possible where clouds were received with a constant delay after their stamps; it is not where
+    a recording was played in a loop or paused, and receive times are kept there.
 
     Parameters
     ----------
     reader : Reader
         Open.
     points_topic : str
-        Topic of the clouds, which the others are compared with.
+        Topic of the clouds, the reference for the others.
     stamp_of : callable
-        Returns the stamp of a message [ns]; None where there is none.
+        Returns the stamp of a message [ns]; None if it has none.
 
     Attributes
     ----------
     apart : dict of str and float
-        Topics found to be recorded apart, with how much later than the clouds [s].
+        Topics that were recorded apart, and how much later than the clouds [s].
 
     """
 
     def __init__(self, reader: Reader, points_topic: str, stamp_of: StampOf) -> None:
-        self._reader, self._stamp_of = reader, stamp_of
+        self._reader = reader
+        self._stamp_of = stamp_of
         self._clouds = [c for c in reader.connections if c.topic == points_topic]
         self._begin_ns, self._end_ns = self._span(self._clouds)
         self._known: dict[tuple[int, int], bool] = {}
@@ -55,8 +68,8 @@ class Timeline:
 
     def messages(
         self, connections: Collection[Connection], start_ns: int | None, end_ns: int | None
-    ) -> Iterator[Item]:
-        """Yield connection, time of receipt [ns] and bytes, in the order of these times."""
+    ) -> Iterator[EncodedMessage]:
+        """Yield connection, receive time [ns] and bytes, in the order of these times."""
         apart = [c for c in connections if self._is_apart(c)]
         together = [c for c in connections if c not in apart]
         streams = [self._reader.messages(together, start_ns, end_ns)]
@@ -64,23 +77,25 @@ class Timeline:
         return merge(*streams, key=lambda item: item[1])
 
     def received_ns(self, connection: Connection, received_ns: int, data: bytes) -> int:
-        """Return when a message on one of the topics `apart` counts as received [ns]."""
+        """Return the receive time that a message on one of the topics `apart` gets [ns]."""
         due_ns = self._due_ns(self._stamp_of(connection, data))
-        return received_ns if due_ns is None or abs(received_ns - due_ns) < APART_NS else due_ns
+        if due_ns is None or abs(received_ns - due_ns) < APART_NS:
+            return received_ns
+        return due_ns
 
     def _by_stamp(
         self, connection: Connection, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[Item]:
+    ) -> Iterator[EncodedMessage]:
         last_ns = self._begin_ns
         for _, _, data in self._reader.messages([connection], None, None):
             due_ns = self._due_ns(self._stamp_of(connection, data))
-            # What has no place among the clouds keeps its place behind the message before.
-            last_ns = last_ns if due_ns is None else due_ns
+            if due_ns is not None:  # else it stays behind the message before it
+                last_ns = due_ns
             if (start_ns is None or start_ns <= last_ns) and (end_ns is None or last_ns < end_ns):
                 yield connection, last_ns, data
 
     def _is_apart(self, connection: Connection) -> bool:
-        """Tell whether the first or the last message was received far from its clouds."""
+        """Return whether the first or the last message was received far from its clouds."""
         if connection in self._clouds:
             return False
         key = id(connection.owner), connection.id
@@ -92,23 +107,23 @@ class Timeline:
         return self._known[key]
 
     def _late_ns(self, connection: Connection) -> int:
-        """Return how late the first or the last message was, whichever is more; 0 if unknown."""
+        """Return the larger delay of the first and the last message [ns]; 0 if unknown."""
         delay_ns = self._delay_ns
         if delay_ns is None:
             return 0
         due = [(t, stamp_ns + delay_ns) for t, stamp_ns in self._ends(connection)]
         among = [(t, due_ns) for t, due_ns in due if self._is_among(due_ns)]
-        # Both may be outside: what begins before the first cloud and ends after the last.
+        # Both ends may lie outside: the topic begins before the clouds and ends after them.
         if not among and due and due[0][1] < self._begin_ns < self._end_ns < due[-1][1]:
             among = due
         return max((t - due_ns for t, due_ns in among), key=abs, default=0)
 
     def _ends(self, connection: Connection) -> list[tuple[int, int]]:
-        """Return time of receipt and stamp of the first and the last message with a stamp [ns]."""
+        """Return receive time and stamp of the first and the last message with a stamp [ns]."""
         begin_ns, end_ns = self._reader.span_ns(connection)
         ends = list(islice(self._stamped(connection, None), 1))
         window_ns = APART_NS // 10
-        while len(ends) == 1:  # from the end backward, further and further
+        while len(ends) == 1:  # search backwards from the end in windows of doubled size
             start_ns = end_ns - window_ns
             found = self._stamped(connection, start_ns if start_ns > begin_ns else None)
             ends += deque(found, maxlen=1)
@@ -117,19 +132,22 @@ class Timeline:
 
     def _stamped(self, connection: Connection, start_ns: int | None) -> Iterator[tuple[int, int]]:
         for _, received_ns, data in self._reader.messages([connection], start_ns, None):
-            if (stamp_ns := self._stamp_of(connection, data)) is not None:
+            stamp_ns = self._stamp_of(connection, data)
+            if stamp_ns is not None:
                 yield received_ns, stamp_ns
 
     @cached_property
     def _delay_ns(self) -> int | None:
-        """How long after their stamps clouds were received [ns]; None where that changes."""
+        """Return the delay of the clouds after their stamps [ns]; None if it is not constant."""
         ends = [end for connection in self._clouds for end in self._ends(connection)]
         delays = [received_ns - stamp_ns for received_ns, stamp_ns in ends]
-        # It does in a loop of playback, and when playback is paused: stamps give no order then.
-        return delays[0] if delays and max(delays) - min(delays) < APART_NS else None
+        # It changes when playback loops or pauses: stamps do not order the messages then.
+        if not delays or max(delays) - min(delays) >= APART_NS:
+            return None
+        return delays[0]
 
     def _due_ns(self, stamp_ns: int | None) -> int | None:
-        """Return when a cloud of this stamp was received [ns]; None if there cannot be any."""
+        """Return the receive time of a cloud of this stamp [ns]; None if there can be no such."""
         if stamp_ns is None or self._delay_ns is None:
             return None
         due_ns = stamp_ns + self._delay_ns

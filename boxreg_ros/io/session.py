@@ -1,80 +1,270 @@
-"""What sweeps and boxes pass on their way to the registrar, live and offline alike."""
+"""
+The way of sweeps and boxes to the registrar, the same for the live node and for recordings.
+
+`JumpConfirmation` detects time jumps, a `Session` brings each item into the fixed frame, assigns
+ids where they are asked for and checks the poses of the boxes, and `register` hands the result to
+the registrar. The live node adds waiting for transforms and publishing; `boxreg relabel` adds
+reading and writing.
+
+"""
 
 from __future__ import annotations
 
-from typing import cast, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.id_assignment import Tracker
 from boxreg_ros.io.pose_check import PoseCheck
-from boxreg_ros.io.transforms import Rewind
+from boxreg_ros.io.transforms import move_to_frame, TIME_JUMP, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
 
-_T = TypeVar('_T', bound=Sweep | BoxArray)
+_T = TypeVar('_T')
 
 
-class Intake:
+class Admitted(NamedTuple):
     """
-    Tell where stamps start again, give boxes ids where wanted, and look whether they fit.
+    A sweep or boxes on the way to the registrar.
 
-    Boxes fit that stand where their points are.
+    Attributes
+    ----------
+    moved : Sweep or BoxArray, or None
+        The item in the fixed frame, boxes with their ids; None where no transform is known.
+    T_fixed_item : array, shape (4, 4), or None
+        Maps the frame of the item to the fixed frame.
+    reason : str
+        ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; else empty.
+    detail : str
+        The transform that is missing; empty if none is.
 
     """
 
-    def __init__(self, convention: Convention, config: Config) -> None:
+    moved: Sweep | BoxArray | None
+    T_fixed_item: Floats | None
+    reason: str = ''
+    detail: str = ''
+
+
+class JumpConfirmation(Generic[_T]):
+    """
+    Detect that time goes back: a recording in a loop, a simulation that is reset.
+
+    Two old stamps in a row, of sweeps or boxes, are a time jump; a single one is a late item. So
+    an item with an old stamp is held until the next one, and the first items after a jump are
+    not late.
+
+    """
+
+    def __init__(self) -> None:
+        self._newest_ns: dict[type[Sweep | BoxArray], int] = {}
+        self._held: tuple[_T, Sweep | BoxArray] | None = None
+
+    def add(self, item: _T, content: Sweep | BoxArray) -> tuple[list[_T], bool]:
+        """
+        Return the items to process now, in order, and whether time went back before them.
+
+        Parameters
+        ----------
+        item : object
+            The next one; anything that the caller wants back.
+        content : Sweep or BoxArray
+            Its content, with a stamp.
+
+        """
+        held = self._held
+        self._held = None
+        is_old = self._is_old(content)
+        if is_old and held is None:
+            self._held = item, content
+            return [], False
+        if is_old and held is not None:
+            self._newest_ns.clear()
+            self._note(held[1])
+        self._note(content)
+        return ([item] if held is None else [held[0], item]), is_old
+
+    def release(self) -> list[_T]:
+        """Return the item that is held, if any: no other confirms a jump, so it is late."""
+        held = self._held
+        self._held = None
+        return [] if held is None else [held[0]]
+
+    @property
+    def held(self) -> _T | None:
+        """Return the item that is held; None if there is none."""
+        return None if self._held is None else self._held[0]
+
+    def _is_old(self, content: Sweep | BoxArray) -> bool:
+        newest_ns = self._newest_ns.get(type(content), content.stamp_ns)
+        return content.stamp_ns < newest_ns - round(TIME_JUMP * 1e9)
+
+    def _note(self, content: Sweep | BoxArray) -> None:
+        newest_ns = self._newest_ns.get(type(content), content.stamp_ns)
+        self._newest_ns[type(content)] = max(newest_ns, content.stamp_ns)
+
+
+class Session:
+    """
+    Prepare sweeps and boxes for the registrar.
+
+    State: the transforms, the tracks of id assignment, and the pose check. Not thread-safe.
+
+    Parameters
+    ----------
+    convention : Convention
+        Convention of the box poses and sizes, and whether ids are to be assigned. Adapters have
+        applied the convention already; the pose check compares it with the others.
+    config : Config
+        `max_gap` and `tolerance` are used.
+    fixed_frame : str
+        Frame to refine in; empty to choose it with `require_fixed_frame`.
+
+    Attributes
+    ----------
+    tree : TransformTree
+        To be fed by the caller.
+    fixed_frame : str
+        Frame to refine in; empty while it is not known.
+    sensor_frame : str
+        Frame of the point clouds, to be set by the caller; used to choose the fixed frame.
+
+    """
+
+    def __init__(
+        self,
+        convention: Convention,
+        config: Config,
+        fixed_frame: str = '',
+    ) -> None:
+        self.tree = TransformTree()
+        self.fixed_frame = fixed_frame.lstrip('/')
+        self.sensor_frame = ''
         self._convention = convention
+        self._config = config
         self._tracker = Tracker(config.max_gap) if convention.associate else None
-        self.begin(config)
+        self.restart()
 
-    def begin(self, config: Config) -> None:
-        """Forget what has been taken; ids that were given do not come again."""
-        self._check = PoseCheck(self._convention, config.tolerance)
-        self.change(config)
-        self._forget()
+    @property
+    def config(self) -> Config:
+        """Return the settings; `max_gap` may change at any time, `tolerance` at a restart."""
+        return self._config
 
-    def change(self, config: Config) -> None:
-        """Take over the setting that may change: how long a track may be unseen."""
+    @config.setter
+    def config(self, config: Config) -> None:
+        self._config = config
         if self._tracker is not None:
             self._tracker.max_gap = config.max_gap
 
-    def begins_anew(self, item: Sweep | BoxArray) -> bool:
-        """Tell whether stamps start again with the next sweep or boxes; then ids do, too."""
-        if says_nothing(item):
-            return False
-        if not self._rewinds[isinstance(item, BoxArray)].happened(item.stamp_ns):
-            return False
-        self._forget()
-        return True
+    def restart(self) -> None:
+        """Forget all but the transforms; ids that were assigned are not used again."""
+        self._pose_check = PoseCheck(self._convention, self._config.tolerance)
+        if self._tracker is not None:
+            self._tracker.forget()
 
-    def take(self, item: _T) -> _T:
-        """Return a sweep or boxes, in the fixed frame, as the registrar is to have them."""
-        self._check.add(item)
-        if self._tracker is None or not isinstance(item, BoxArray):
-            return item
-        return cast(_T, self._tracker.identify(item))
+    def admit(self, item: Sweep | BoxArray) -> Admitted:
+        """
+        Return a sweep or boxes in the fixed frame, with ids.
+
+        Parameters
+        ----------
+        item : Sweep or BoxArray
+            In the frame of its message.
+
+        """
+        if is_placeholder(item):
+            return Admitted(None, None)
+        try:
+            T_fixed_item = self.tree.lookup(
+                self.require_fixed_frame(item), item.frame_id, item.stamp_ns
+            )
+        except TransformUnavailable as error:
+            is_sweep = isinstance(item, Sweep)
+            reason = 'sweep_without_transform' if is_sweep else 'no_transform'
+            return Admitted(None, None, reason, str(error))
+        moved = move_to_frame(item, T_fixed_item, self.fixed_frame)
+        self._pose_check.add(moved)
+        if self._tracker is not None and isinstance(moved, BoxArray):
+            moved = self._tracker.identify(moved)
+        return Admitted(moved, T_fixed_item)
+
+    def require_fixed_frame(self, item: Sweep | BoxArray) -> str:
+        """
+        Return the fixed frame; choose it among the known transforms if it is not known yet.
+
+        Raises
+        ------
+        TransformUnavailable
+            If no motion of `sensor_frame` is known, or no point cloud has arrived.
+
+        """
+        if self.fixed_frame:
+            return self.fixed_frame
+        sensor_frame = self.sensor_frame
+        if not sensor_frame:
+            raise TransformUnavailable(
+                f'no point cloud has arrived, so the motion of the boxes in {item.frame_id!r} is '
+                f'not known; check the topic of the clouds and its QoS'
+            )
+        found = self.tree.fixed_frame(sensor_frame)
+        if found is None:
+            raise TransformUnavailable(
+                f'neither /tf nor odometry has the motion of the frame of the clouds '
+                f'{sensor_frame!r}; known: {self.tree}; if it does not move, set '
+                f'fixed_frame:={sensor_frame}'
+            )
+        self.fixed_frame = found
+        return found
 
     @property
     def finding(self) -> str:
-        """Return what is wrong with the poses and sizes; empty while nothing is known to be."""
-        return self._check.finding
+        """Return the fault that the pose check has found; empty if it has found none."""
+        return self._pose_check.finding
 
     @property
     def facts(self) -> dict[str, object]:
-        """Return what a report says about the ids."""
+        """Return the origin of the ids, for reports."""
         if self._tracker is None:
             return {'ids': 'of the input'}
         return {'ids': 'by association', 'associated_tracks': self._tracker.count}
 
-    def _forget(self) -> None:
-        self._rewinds = Rewind(), Rewind()
-        if self._tracker is not None:
-            self._tracker.forget()
+
+def register(
+    registrar: BoxRegistrar, moved: Sweep | BoxArray | None, restarts: bool
+) -> list[RefinedBoxes]:
+    """
+    Hand an admitted item to the registrar.
+
+    Parameters
+    ----------
+    registrar : BoxRegistrar
+        If time went back, its tracks are flushed and it is reset before the item is added.
+    moved : Sweep or BoxArray, or None
+        As of `Admitted`; a caller may have put a ticket on the boxes.
+    restarts : bool
+        Whether time went back before it.
+
+    Returns
+    -------
+    ready : list of RefinedBoxes
+        Results that are ready now.
+
+    """
+    ready: list[RefinedBoxes] = []
+    if restarts:
+        ready += registrar.flush()
+        registrar.reset()
+    if isinstance(moved, Sweep):
+        ready += registrar.add_sweep(moved)
+    elif moved is not None:
+        ready += registrar.add_boxes(moved)
+    return ready
 
 
-def says_nothing(item: Sweep | BoxArray) -> bool:
-    """Tell whether this is an array without boxes, and without a stamp or a frame to wait for."""
+def is_placeholder(item: Sweep | BoxArray) -> bool:
+    """Return whether this is an array without boxes that has no stamp or no frame either."""
     is_empty = isinstance(item, BoxArray) and not item.track_ids
     return is_empty and not (item.frame_id and item.stamp_ns)
 
@@ -83,7 +273,7 @@ def covariances_to_write(refined: RefinedBoxes) -> Floats:
     """
     Return covariances (n, 6, 6) for messages, NaN where the box is kept.
 
-    About a box that stays as it was, the detector knows more than we do.
+    A kept box is the detector's own, and so is the covariance that its message carries.
 
     """
     is_kept = np.array([status == KEPT for status in refined.status], dtype=bool)

@@ -1,8 +1,8 @@
 """
-Where the sensor is: transforms over time, for the live node and for recordings alike.
+Transforms between frames over time, from TF and odometry.
 
-``T_target_source`` is a (4, 4) matrix that maps coordinates of `source` to `target`. TF is asked
-first; odometry fills in where TF does not connect two frames.
+``T_target_source`` is a (4, 4) matrix that maps coordinates of `source` to `target`. TF has
+precedence; odometry is used where TF does not connect two frames.
 
 """
 
@@ -24,22 +24,38 @@ from boxreg_ros.structures import BoxArray, Floats, ROLL, Sweep, X, Z
 import numpy as np
 
 MAX_EXTRAPOLATION = 0.2
-"""How far beyond the first and the last transform a motion is carried on [s]."""
-MEMORY = 30.0
-"""How long transforms are remembered [s]."""
-BACK = 1.0
-"""Stamps that go back further than this mean that time starts again [s]."""
-FRAMES = 500
-"""So many frames are kept, and more if they move: some trackers give every object a frame."""
+"""
+Largest distance of a stamp from the known transforms of a moving frame [s].
+
+Two periods of a TF publisher of 10 Hz: one message may be late or lost. At 1 m/s^2 a motion
+carried on for that long is off by 2 cm.
+
+"""
+BUFFER_DURATION = 30.0
+"""Transforms this much older than the newest of their pair are forgotten [s]; tf2 keeps 10 s."""
+TIME_JUMP = 1.0
+"""
+A stamp this far before the newest is a time jump [s].
+
+Longer than any message is late on its way, shorter than a recording that is played in a loop.
+
+"""
+FRAMES_BEFORE_CLEANUP = 500
+"""
+Number of frames that starts the search for those not updated for `BUFFER_DURATION`.
+
+A vehicle has tens of frames; trackers that publish a frame per object add some every second.
+
+"""
 FLOAT32_RANGE = 4096.0
-"""Nearer than this to its origin [m], a frame is resolved to 0.5 mm by float32."""
+"""Nearer to the origin, float32 coordinates are 0.25 mm apart or less [m]: 2**(12 - 24) m."""
 
 
-class Rewind:
+class TimeJumpDetector:
     """
-    Tells when the stamps of a stream start again: a recording that loops, a simulation reset.
+    Detect that the stamps of a stream start again: a recording in a loop, a simulation reset.
 
-    One message that is much older than the newest is a stray, two in a row are a new beginning.
+    One message that is much older than the newest is an outlier; two in a row are a jump.
 
     """
 
@@ -47,38 +63,46 @@ class Rewind:
         self._newest_ns: int | None = None
         self._was_back = False
 
-    def happened(self, stamp_ns: int) -> bool:
-        """Take the next stamp [ns] and tell whether time has started again before it."""
-        newest_ns = stamp_ns if self._newest_ns is None else self._newest_ns
-        is_back = stamp_ns < newest_ns - round(BACK * 1e9)
-        happened, self._was_back = is_back and self._was_back, is_back and not self._was_back
-        self._newest_ns = stamp_ns if happened else max(newest_ns, stamp_ns)
-        return happened
+    def has_jumped(self, stamp_ns: int) -> bool:
+        """Add the next stamp [ns]; return whether time went back before it."""
+        if self._newest_ns is None:
+            self._newest_ns = stamp_ns
+        is_back = stamp_ns < self._newest_ns - round(TIME_JUMP * 1e9)
+        if is_back and self._was_back:
+            self._newest_ns = stamp_ns
+            self._was_back = False
+            return True
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        self._was_back = is_back
+        return False
 
 
 class TransformTree:
     """
     Frames and the transforms between them, looked up by integer stamp.
 
-    State: per pair of parent and child the samples of the last `memory` seconds, or one static
-    transform. Samples of a pair whose stamps start again replace the old ones. Not thread-safe.
+    State: per pair of parent and child, one static transform or the samples of the last
+    `buffer_duration` seconds. After a time jump of a pair, new samples replace the old ones. Not
+    thread-safe.
 
     Parameters
     ----------
     max_extrapolation : float
-        How far outside of the known samples a stamp may lie [s]; there, the last known motion is
-        carried on. Between samples, however far apart, positions are interpolated linearly and
-        orientations along the shortest turn, as tf2 does.
-    memory : float
+        Largest distance of a stamp from the known samples [s]; outside of them the motion is
+        extrapolated. Between samples, however far apart, positions are interpolated linearly
+        and orientations along the shortest rotation, as tf2 does.
+    buffer_duration : float
         How long a sample is kept after the newest of its pair [s].
 
     """
 
     def __init__(
-        self, max_extrapolation: float = MAX_EXTRAPOLATION, memory: float = MEMORY
+        self,
+        max_extrapolation: float = MAX_EXTRAPOLATION,
+        buffer_duration: float = BUFFER_DURATION,
     ) -> None:
         self._max_extrapolation_ns = round(max_extrapolation * 1e9)
-        self._memory_ns = round(memory * 1e9)
+        self._buffer_ns = round(buffer_duration * 1e9)
         self.clear()
 
     def clear(self) -> None:
@@ -86,7 +110,7 @@ class TransformTree:
         self._tf: dict[str, _Edge] = {}
         self._odometry: dict[str, _Edge] = {}
         self._routes: dict[tuple[str, str], list[tuple[_Edge, bool]]] = {}
-        self._most = FRAMES
+        self._frames_limit = FRAMES_BEFORE_CLEANUP
 
     def add_transforms(self, transforms: Iterable[Any], is_static: bool = False) -> None:
         """Add the ``geometry_msgs/TransformStamped`` of one TFMessage."""
@@ -100,12 +124,12 @@ class TransformTree:
         self._add(self._odometry, msg, pose.position, pose.orientation, False)
 
     def rewind(self, stamp_ns: int) -> None:
-        """Forget motions that are known beyond a stamp at which time has started again."""
+        """Forget samples of moving frames that are later than a stamp that time went back to."""
         for edge in self._edges():
             edge.rewind(stamp_ns)
 
     def newest_ns(self) -> int | None:
-        """Return the newest stamp of all motions; None if nothing moves [ns]."""
+        """Return the newest stamp of all moving frames [ns]; None if there are none."""
         return max(
             (e.stamps[-1] for e in self._edges() if e.stamps and not e.is_static), default=None
         )
@@ -117,7 +141,7 @@ class TransformTree:
         Raises
         ------
         TransformUnavailable
-            If nothing connects the frames, or something that does is not known at the stamp.
+            If no transforms connect the frames, or one of them is not known at the stamp.
 
         """
         T_target_source = np.eye(4)
@@ -127,7 +151,7 @@ class TransformTree:
         return T_target_source
 
     def connects(self, target: str, source: str) -> bool:
-        """Tell whether transforms lead from `source` to `target`, at whatever stamp."""
+        """Return whether transforms connect `source` with `target`, at any stamp."""
         try:
             self._route(target, source)
         except TransformUnavailable:
@@ -135,17 +159,18 @@ class TransformTree:
         return True
 
     def covers(self, target: str, source: str, stamp_ns: int) -> bool:
-        """Tell whether `lookup` would neither fail nor extrapolate."""
+        """Return whether `lookup` would neither fail nor extrapolate."""
         return self.connects(target, source) and all(
             edge.covers(stamp_ns) for edge, _ in self._route(target, source)
         )
 
     def fixed_frame(self, source: str) -> str | None:
         """
-        Return the frame that `source` moves in: the topmost it hangs from.
+        Return the topmost frame that `source` moves in.
 
-        That is the root of TF where TF knows a motion, or the header frame of the odometry that
-        moves this root or is connected to `source` otherwise; None if nothing moves.
+        It is the root of TF if a transform on the way to it moves; else the header frame of the
+        odometry that moves this root, or that is connected with `source` in another way. None
+        if no motion is known.
 
         """
         source = _name(source)
@@ -176,19 +201,19 @@ class TransformTree:
     ) -> None:
         parent, child = _name(item.header.frame_id), _name(item.child_frame_id)
         if not parent or not child:
-            return  # connects nothing, as tf2 has it; a failing lookup lists what is connected
+            return  # refused by tf2, too; errors of lookups list the known transforms
         edge = edges.get(child)
         if edge is None or edge.parent != parent:
-            edge = edges[child] = _Edge(parent, child, self._memory_ns)
+            edge = edges[child] = _Edge(parent, child, self._buffer_ns)
             self._routes.clear()
         edge.is_static |= is_static
         stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
         edge.add(stamp_ns, (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w))
-        if len(edges) > self._most:
-            oldest_ns = stamp_ns - self._memory_ns
+        if len(edges) > self._frames_limit:
+            oldest_ns = stamp_ns - self._buffer_ns
             for name in [name for name, edge in edges.items() if edge.is_older(oldest_ns)]:
                 del edges[name]
-            self._most = max(FRAMES, 2 * len(edges))
+            self._frames_limit = max(FRAMES_BEFORE_CLEANUP, 2 * len(edges))
 
     def _edges(self) -> list[_Edge]:
         return [*self._tf.values(), *self._odometry.values()]
@@ -202,8 +227,8 @@ class TransformTree:
                 route = _connect(*key, self._edges())
             if route is None:
                 raise TransformUnavailable(
-                    f'no transform from {source!r} to {target!r}; known: {self}; publish what '
-                    f'is missing on /tf or as odometry, or choose another fixed frame'
+                    f'no transform from {source!r} to {target!r}; known: {self}; publish the '
+                    f'missing one on /tf or as odometry, or choose another fixed frame'
                 )
             self._routes[key] = route
         return self._routes[key]
@@ -212,22 +237,24 @@ class TransformTree:
 class _Edge:
     """One parent and child: a static pose, or poses over time."""
 
-    def __init__(self, parent: str, child: str, memory_ns: int) -> None:
+    def __init__(self, parent: str, child: str, buffer_ns: int) -> None:
         self.parent = parent
         self.child = child
-        self._memory_ns = memory_ns
+        self._buffer_ns = buffer_ns
         self.is_static = False
         self.stamps: list[int] = []
         self._poses: list[Floats] = []
-        self._rewind = Rewind()
+        self._jump_detector = TimeJumpDetector()
         self._was_forgotten = False
+        self._last_added: tuple[int, Floats] | None = None
 
     def add(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
         """Add x y z qx qy qz qw; a second one of the same stamp replaces the first."""
         values = np.array(pose, dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[3:]):
-            return  # says nothing; a lookup reports the stamps that remain
-        if self._rewind.happened(stamp_ns):
+            return  # no pose; the error of a lookup has the stamps that are known
+        self._last_added = stamp_ns, values
+        if self._jump_detector.has_jumped(stamp_ns):
             self._forget()
             self._was_forgotten = True
         if self.is_static:
@@ -235,16 +262,21 @@ class _Edge:
         else:
             first, end = bisect_left(self.stamps, stamp_ns), bisect_right(self.stamps, stamp_ns)
         self.stamps[first:end], self._poses[first:end] = [stamp_ns], [values]
-        old = bisect_left(self.stamps, self.stamps[-1] - self._memory_ns)
-        # Two samples stay, whatever their age: a motion is carried on from two.
+        old = bisect_left(self.stamps, self.stamps[-1] - self._buffer_ns)
+        # Two samples stay at any age: extrapolation needs a velocity.
         old = max(min(old, len(self.stamps) - 2), 0)
         del self.stamps[:old], self._poses[:old]
 
     def rewind(self, stamp_ns: int) -> None:
-        if not self.is_static and self.stamps and self.stamps[-1] > stamp_ns + BACK * 1e9:
-            self._forget()
-            self._was_forgotten = stamp_ns > 0  # what is read once more has not gone back
-            self._rewind = Rewind()
+        newest_ns = stamp_ns + round(TIME_JUMP * 1e9)
+        if self.is_static or not self.stamps or self.stamps[-1] <= newest_ns:
+            return
+        self._forget()
+        self._was_forgotten = stamp_ns > 0  # 0: the recording is read again, no time jump
+        self._jump_detector = TimeJumpDetector()
+        last_added = self._last_added
+        if last_added is not None and last_added[0] <= newest_ns:
+            self.add(last_added[0], tuple(last_added[1]))  # it arrived after time went back
 
     def _forget(self) -> None:
         self.stamps.clear()
@@ -262,12 +294,12 @@ class _Edge:
         """Return ``T_parent_child`` at a stamp."""
         stamps = self.stamps
         if not stamps:
-            cause = 'none has come but what is NaN or has no orientation; look at its publisher'
+            cause = 'all poses are NaN or have no orientation; check its publisher'
             if self._was_forgotten:
-                cause = 'no pose has come since time went back; look whether its publisher goes on'
+                cause = 'no pose has arrived since time went back; check that its publisher runs'
             raise TransformUnavailable(f'transform {self.parent} -> {self.child}: {cause}')
         outside = max(stamps[0] - stamp_ns, stamp_ns - stamps[-1])
-        # A motion is carried on from two samples: a single one tells no speed.
+        # Extrapolation needs two samples; a single one has no velocity.
         if not self.is_static and outside > max_extrapolation_ns * (len(stamps) > 1):
             raise TransformUnavailable(
                 f'transform {self.parent} -> {self.child} is known from {stamps[0]} to '
@@ -302,7 +334,7 @@ def inverse(T: Floats) -> Floats:
 
 
 def interpolated(first: Floats, second: Floats, share: float) -> Floats:
-    """Return T (4, 4) on the way between two poses: 0 the first, 1 the second, or beyond."""
+    """Return T (4, 4) between two poses: `share` 0 is the first, 1 the second."""
     T = np.eye(4)
     T[:3, :3] = interpolate_rotation(first[3:], second[3:], share)
     T[:3, 3] = first[:3] + share * (second[:3] - first[:3])
@@ -313,18 +345,26 @@ def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     """
     Return the sweep, points and origin, in another frame.
 
-    float32 points stay float32 while the sensor is near enough to the frame's origin for their
-    resolution; far from it (a map in UTM) they become float64.
+    float32 points stay float32 while the sensor is within `FLOAT32_RANGE` of the origin of the
+    frame; farther away (a map in UTM) they become float64.
 
     """
-    points = sweep.points
-    is_near = np.abs(T_frame_sweep[:3, 3]).max() < FLOAT32_RANGE
-    kind = points.dtype if is_near else np.dtype(np.float64)
-    R, t = T_frame_sweep[:3, :3], T_frame_sweep[:3, 3]
-    moved, (x, y, z) = np.empty(points.T.shape, kind), points.astype(kind, copy=False).T
-    for i, (a, b, c) in enumerate(R.astype(kind)):  # BLAS would start threads beside the solver's
+    R = T_frame_sweep[:3, :3]
+    t = T_frame_sweep[:3, 3]
+    is_near = np.abs(t).max() < FLOAT32_RANGE
+    kind = sweep.points.dtype if is_near else np.dtype(np.float64)
+    x, y, z = sweep.points.astype(kind, copy=False).T
+    moved = np.empty((3, len(sweep.points)), kind)
+    for i, (a, b, c) in enumerate(R.astype(kind)):  # not R @: BLAS starts threads of its own
         moved[i] = a * x + b * y + c * z + t[i].astype(kind)
     return replace(sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t)
+
+
+def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -> Sweep | BoxArray:
+    """Return a sweep or boxes in another frame."""
+    if isinstance(item, Sweep):
+        return sweep_to_frame(item, T_frame_item, frame_id)
+    return boxes_to_frame(item, T_frame_item, frame_id)
 
 
 def to_fixed_frame(
@@ -336,17 +376,15 @@ def to_fixed_frame(
     Raises
     ------
     TransformUnavailable
-        If none is known at its stamp.
+        If no transform is known at the stamp.
 
     """
     T_fixed_item = tree.lookup(fixed_frame, item.frame_id, item.stamp_ns)
-    if isinstance(item, Sweep):
-        return sweep_to_frame(item, T_fixed_item, fixed_frame)
-    return boxes_to_frame(item, T_fixed_item, fixed_frame)
+    return move_to_frame(item, T_fixed_item, fixed_frame)
 
 
 def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> BoxArray:
-    """Return the boxes in another frame; what is NaN stays NaN."""
+    """Return the boxes in another frame; NaN stays NaN."""
     moved = boxes.boxes.copy()
     R = T_frame_boxes[:3, :3]
     moved[:, X : Z + 1] = boxes.boxes[:, X : Z + 1] @ R.T + T_frame_boxes[:3, 3]
@@ -355,12 +393,12 @@ def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> Box
 
 
 def _name(frame_id: str) -> str:
-    """Return a frame's name as tf2 spells it: ROS 1 put a slash before it."""
+    """Return the name of a frame without the leading slash of ROS 1, as in tf2."""
     return frame_id.lstrip('/')
 
 
 def _connect(target: str, source: str, edges: Iterable[_Edge]) -> list[tuple[_Edge, bool]] | None:
-    """Return the shortest way from `source` to `target` over `edges`, or None."""
+    """Return the shortest path from `source` to `target` over `edges`, or None."""
     neighbours: dict[str, list[tuple[_Edge, bool]]] = {}
     for edge in edges:
         neighbours.setdefault(edge.child, []).append((edge, True))

@@ -1,4 +1,4 @@
-"""Tables that grow: Parquet and Feather files, written in batches."""
+"""Parquet and Feather files, written in batches of rows."""
 
 from __future__ import annotations
 
@@ -8,50 +8,47 @@ from typing import Any
 
 from boxreg_ros.errors import RecordingError
 
-ROWS = 10_000
-"""Rows held before they are written."""
-ORIGIN = 'boxreg'
-"""Key of the provenance in a file's own metadata."""
+BATCH_ROWS = 10_000
+"""Number of rows held in memory before they are written."""
+METADATA_KEY = 'boxreg'
+"""Key of the provenance in the metadata of a file."""
 
 
 class Table:
     """
-    A file of rows.
+    Write a file row by row.
 
     Parameters
     ----------
     path : Path
         Ends in ``.parquet`` or ``.feather``.
     columns : mapping of str to str
-        Name and type of each column, as pyarrow calls it: int64, double, string, or with ``[]``
-        or ``[16]`` behind it a list of such, or of so many.
-    origin : str
-        Kept in the metadata of the file.
+        Name and type of each column. Types are those of pyarrow (int64, double, string). A type
+        followed by ``[]`` is a list, by ``[16]`` a list of sixteen items.
+    provenance : str
+        Text for the metadata of the file; '' for none.
 
     """
 
-    def __init__(self, path: Path, columns: Mapping[str, str], origin: str = '') -> None:
+    def __init__(self, path: Path, columns: Mapping[str, str], provenance: str = '') -> None:
         import pyarrow
         from pyarrow import ipc, parquet
 
-        kinds = {}
-        for name, kind in columns.items():
-            item, bracket, count = kind.rstrip(']').partition('[')
-            kinds[name] = pyarrow.type_for_alias(item)
-            if bracket:
-                kinds[name] = pyarrow.list_(kinds[name], int(count or -1))
-        self._schema = pyarrow.schema(kinds.items(), metadata={ORIGIN: origin} if origin else None)
-        self._file = path.open('wb')  # pyarrow itself takes no name that is not UTF-8
-        is_parquet = path.suffix == '.parquet'
-        new = parquet.ParquetWriter if is_parquet else ipc.new_file
-        self._writer = new(self._file, self._schema)
+        types = [(name, _arrow_type(text)) for name, text in columns.items()]
+        metadata = {METADATA_KEY: provenance} if provenance else None
+        self._schema = pyarrow.schema(types, metadata=metadata)
+        self._file = path.open('wb')  # pyarrow opens no path that is not UTF-8
+        if path.suffix == '.parquet':
+            self._writer = parquet.ParquetWriter(self._file, self._schema)
+        else:
+            self._writer = ipc.new_file(self._file, self._schema)
         self._rows: list[Sequence[Any]] = []
         self._names = list(columns)
 
     def add(self, *values: Any) -> None:
-        """Add a row, its values in the order of the columns; None where there is none."""
+        """Add a row: its values in the order of the columns, None for null."""
         self._rows.append(values)
-        if len(self._rows) == ROWS:
+        if len(self._rows) == BATCH_ROWS:
             self._flush()
 
     def close(self) -> None:
@@ -69,7 +66,7 @@ class Table:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Return all rows of a Parquet or Feather file, and raise as `read_table` does."""
+    """Return all rows of a Parquet or Feather file; raises as `read_table`."""
     return list(read_table(path).to_pylist())
 
 
@@ -80,7 +77,7 @@ def read_table(path: Path) -> Any:
     Raises
     ------
     RecordingError
-        If there is none, or it is broken.
+        If the file cannot be read.
 
     """
     import pyarrow
@@ -94,3 +91,14 @@ def read_table(path: Path) -> Any:
     except (OSError, pyarrow.ArrowException) as error:
         text = ' '.join(str(error).split())
         raise RecordingError(f'{path}: cannot be read: {text}') from None
+
+
+def _arrow_type(text: str) -> Any:
+    """Return the pyarrow type of 'double', 'double[]' or 'double[16]'."""
+    import pyarrow
+
+    name, bracket, count = text.rstrip(']').partition('[')
+    item = pyarrow.type_for_alias(name)
+    if not bracket:
+        return item
+    return pyarrow.list_(item, int(count) if count else -1)

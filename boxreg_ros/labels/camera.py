@@ -1,4 +1,4 @@
-"""A camera as label formats need it: where it is, and what it sees of a box."""
+"""A calibrated camera: reading its calibration, and projecting boxes into its image."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ import yaml
 Mask = NDArray[np.bool_]
 
 KITTI_SIZE = (1242, 375)
-NEAREST = 0.1
-"""What is nearer than this to the image plane is not projected [m]."""
+"""Width and height of the images of KITTI [px], where the calibration states none."""
+NEAR_PLANE = 0.1
+"""Parts of a box with a smaller depth than this are clipped before projection [m]."""
 CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""Corners (8, 3) of a unit cube; the bits of the index are x, y and z."""
 EDGES = np.array([(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
+"""Indices (12, 2) of the corners at the ends of each edge."""
 
-NAMES = {
+KEYS = {
     'projection': ('P2', 'P_rect_02', 'projection_matrix'),
     'rectification': ('R_rect', 'R0_rect', 'R_rect_00', 'rectification_matrix'),
     'pose': ('Tr_velo_cam', 'Tr_velo_to_cam', 'T_camera_sensor'),
     'size': ('S_rect_02', 'image_size'),
 }
-"""What each part is called in files of KITTI (tracking, object, raw) and in YAML."""
+"""Names of each part in files of KITTI (tracking, object, raw) and in YAML."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +45,7 @@ class Camera:
     rectification : array, shape (3, 3)
         From camera to rectified camera coordinates.
     T_camera_sensor : array, shape (4, 4)
-        Pose of the LiDAR in the camera's frame.
+        Pose of the LiDAR in the camera frame.
     size : tuple of two int
         Width and height of the image [px].
 
@@ -56,19 +59,21 @@ class Camera:
     @classmethod
     def read(cls, path: Path | None, needed_by: str = 'this format') -> Camera:
         """
-        Read a calibration file of KITTI, or YAML with the keys of ROS's ``camera_info``.
+        Read a calibration file of KITTI, or YAML with the keys of ``camera_info`` of ROS.
 
-        YAML holds ``projection_matrix``, ``T_camera_sensor`` (12 or 16 numbers, row by row),
-        and where they matter ``rectification_matrix``, ``image_width`` and ``image_height``.
+        YAML holds ``projection_matrix``, ``T_camera_sensor`` (12 or 16 numbers, row by row)
+        and optionally ``rectification_matrix``, ``image_width`` and ``image_height``.
 
         Raises
         ------
         ConfigError
-            If there is no file, or it lacks a part or numbers.
+            If `path` is None, cannot be read, or a part is missing or has the wrong size.
 
         """
         if path is None:
-            raise ConfigError(f'{needed_by} looks through a camera: say which with --camera FILE')
+            raise ConfigError(
+                f'{needed_by} needs the calibration of a camera; give it with --camera FILE'
+            )
         try:
             text = path.read_text(encoding='utf-8')
             is_yaml = path.suffix.lower() in ('.yaml', '.yml')
@@ -76,24 +81,15 @@ class Camera:
         except OSError as error:
             raise ConfigError(f'{path}: cannot be read: {error.strerror}') from None
         except (ValueError, TypeError, AttributeError, yaml.YAMLError) as error:
-            raise ConfigError(f'{path}: no calibration of a camera: {error}') from None
-
-        def part(name: str, counts: tuple[int, ...], default: Floats | None = None) -> Floats:
-            found = next((values[key] for key in NAMES[name] if key in values), default)
-            if found is None or found.size not in counts:
-                raise ConfigError(
-                    f'{path}: expected {" or ".join(map(str, counts))} numbers under one of '
-                    f'{", ".join(NAMES[name])}, got {"none" if found is None else found.size}'
-                )
-            return found
-
-        pose = np.eye(4)
-        pose[:3] = part('pose', (12, 16))[:12].reshape(3, 4)
-        width, height = part('size', (2,), np.array(KITTI_SIZE)).astype(int).tolist()
+            raise ConfigError(f'{path}: not a camera calibration: {error}') from None
+        T_camera_sensor = np.eye(4)
+        T_camera_sensor[:3] = _part(path, values, 'pose', (12, 16))[:12].reshape(3, 4)
+        size = _part(path, values, 'size', (2,), np.array(KITTI_SIZE))
+        width, height = size.astype(int).tolist()
         return cls(
-            part('projection', (12,)).reshape(3, 4),
-            part('rectification', (9,), np.eye(3)).reshape(3, 3),
-            pose,
+            _part(path, values, 'projection', (12,)).reshape(3, 4),
+            _part(path, values, 'rectification', (9,), np.eye(3)).reshape(3, 3),
+            T_camera_sensor,
             (width, height),
         )
 
@@ -104,76 +100,118 @@ class Camera:
         T_rect_camera[:3, :3] = self.rectification
         return T_rect_camera @ self.T_camera_sensor
 
-    def views(self, boxes: Floats) -> tuple[Floats, Mask]:
+    def project(self, boxes: Floats) -> tuple[Floats, Mask]:
         """
-        Return what the image shows of boxes, and of which it shows all.
+        Return the bounding rectangles of boxes in the image.
 
         Parameters
         ----------
         boxes : array, shape (n, 9)
-            In the LiDAR's frame.
+            In the LiDAR frame.
 
         Returns
         -------
         rectangles : array, shape (n, 4)
-            Left, top, right and bottom [px] within the image; NaN where it shows nothing.
-        is_whole : array, shape (n,)
-            False where a part is outside of the image or behind the camera.
+            Left, top, right and bottom [px], clipped to the image; NaN for boxes outside of it.
+        is_inside : array, shape (n,)
+            True where the whole box is inside the image and in front of the camera.
 
         """
-        T, P = self.T_rect_sensor, self.projection
-        turned = matrix_from_rpy(boxes[:, ROLL:])
-        corners = (CORNERS * boxes[:, None, LENGTH : HEIGHT + 1]) @ turned.transpose(0, 2, 1)
+        T = self.T_rect_sensor
+        P = self.projection
+        R = matrix_from_rpy(boxes[:, ROLL:])
+        # (n, corner, axis) in the box, then the LiDAR, then the rectified camera frame.
+        corners = (CORNERS * boxes[:, None, LENGTH : HEIGHT + 1]) @ R.transpose(0, 2, 1)
         corners = (corners + boxes[:, None, X : Z + 1]) @ T[:3, :3].T + T[:3, 3]
-        a, b = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]
-        is_before = corners[..., 2] >= NEAREST
-        crosses = (a[..., 2] >= NEAREST) != (b[..., 2] >= NEAREST)
-        rise = np.where(crosses, b[..., 2] - a[..., 2], 1.0)
-        cut = a + ((NEAREST - a[..., 2]) / rise)[..., None] * (b - a)
-        seen = np.concatenate([corners, cut], axis=1)
-        is_seen = np.concatenate([is_before, crosses], axis=1)[..., None]
-        pixels = np.where(is_seen, seen, [0.0, 0.0, 1.0]) @ P[:, :3].T + P[:, 3]
+        is_in_front = corners[..., 2] >= NEAR_PLANE
+        clipped, is_clipped = _clipped_edges(corners)
+        vertices = np.concatenate([corners, clipped], axis=1)
+        is_visible = np.concatenate([is_in_front, is_clipped], axis=1)[..., None]
+        pixels = np.where(is_visible, vertices, [0.0, 0.0, 1.0]) @ P[:, :3].T + P[:, 3]
         pixels = pixels[..., :2] / pixels[..., 2:]
-        low = np.where(is_seen, pixels, np.inf).min(axis=1)
-        high = np.where(is_seen, pixels, -np.inf).max(axis=1)
+        low = np.where(is_visible, pixels, np.inf).min(axis=1)
+        high = np.where(is_visible, pixels, -np.inf).max(axis=1)
         edge = np.array(self.size) - 1.0
-        is_inside = ((high >= 0) & (low <= edge)).all(axis=1)
-        is_whole = is_before.all(axis=1) & ((low >= 0) & (high <= edge)).all(axis=1)
+        overlaps = ((high >= 0) & (low <= edge)).all(axis=1)
+        is_inside = is_in_front.all(axis=1) & ((low >= 0) & (high <= edge)).all(axis=1)
         rectangles = np.hstack([np.maximum(low, 0), np.minimum(high, edge)])
-        return np.where(is_inside[:, None], rectangles, np.nan), is_whole
+        return np.where(overlaps[:, None], rectangles, np.nan), is_inside
 
-    def upright(self, boxes: Floats) -> tuple[Floats, Floats]:
+    def to_upright(self, boxes: Floats) -> tuple[Floats, Floats]:
         """
-        Return where KITTI has boxes: centre (n, 3) in the rectified frame and rotation_y (n,).
+        Return the pose of boxes as KITTI states it.
 
-        rotation_y turns the camera's x axis about its y axis into the box's heading; the rest
-        of the orientation is lost.
+        Parameters
+        ----------
+        boxes : array, shape (n, 9)
+            In the LiDAR frame.
+
+        Returns
+        -------
+        centres : array, shape (n, 3)
+            In the rectified camera frame [m].
+        rotation_y : array, shape (n,)
+            Angle about y of the camera from its x axis to the heading [rad]; roll and pitch are
+            lost.
 
         """
         T = self.T_rect_sensor
         centres = boxes[:, X : Z + 1] @ T[:3, :3].T + T[:3, 3]
-        turned = matrix_from_rpy(boxes[:, ROLL:])
-        headings = turned[:, :, 0] @ T[:3, :3].T
+        R = matrix_from_rpy(boxes[:, ROLL:])
+        headings = R[:, :, 0] @ T[:3, :3].T
         return centres, np.arctan2(-headings[:, 2], headings[:, 0])
 
     def from_upright(self, centres: Floats, rotation_y: Floats, extents: Floats) -> Floats:
-        """Return boxes (n, 9) in the LiDAR's frame: what `upright` is given, but for tilt."""
-        cos, sin, zero = np.cos(rotation_y), np.sin(rotation_y), np.zeros(len(rotation_y))
-        # Columns are the axes of the box: heading, left, and up, which is the camera's -y.
-        R_rect_box = np.array([[cos, sin, zero], [zero, zero, zero - 1], [-sin, cos, zero]])
-        R_rect_box = R_rect_box.transpose(2, 0, 1)
+        """Return upright boxes (n, 9) in the LiDAR frame; the inverse of `to_upright`."""
+        cos = np.cos(rotation_y)
+        sin = np.sin(rotation_y)
+        zero = np.zeros(len(rotation_y))
+        # Columns are the axes of the box: heading, left, and up, which is -y of the camera.
+        rows = [[cos, sin, zero], [zero, zero, zero - 1], [-sin, cos, zero]]
+        R_rect_box = np.array(rows).transpose(2, 0, 1)  # (n, row, column)
         T = inverse(self.T_rect_sensor)
         angles = rpy_from_matrix(T[:3, :3] @ R_rect_box)
         return np.hstack([centres @ T[:3, :3].T + T[:3, 3], extents, angles])
 
 
+def _clipped_edges(corners: Floats) -> tuple[Floats, Mask]:
+    """Return where the edges of boxes (n, 8, 3) cross the near plane (n, 12, 3), and which do."""
+    a = corners[:, EDGES[:, 0]]
+    b = corners[:, EDGES[:, 1]]
+    crosses = (a[..., 2] >= NEAR_PLANE) != (b[..., 2] >= NEAR_PLANE)
+    depth = np.where(crosses, b[..., 2] - a[..., 2], 1.0)
+    return a + ((NEAR_PLANE - a[..., 2]) / depth)[..., None] * (b - a), crosses
+
+
+def _part(
+    path: Path,
+    values: dict[str, Floats],
+    name: str,
+    sizes: tuple[int, ...],
+    default: Floats | None = None,
+) -> Floats:
+    """Return the numbers of a part of a calibration, one of `KEYS`, checked for their count."""
+    found = next((values[key] for key in KEYS[name] if key in values), default)
+    if found is None or found.size not in sizes:
+        count = 'none' if found is None else found.size
+        raise ConfigError(
+            f'{path}: expected {" or ".join(map(str, sizes))} numbers under one of '
+            f'{", ".join(KEYS[name])}, got {count}'
+        )
+    return found
+
+
+def _is_key(name: object) -> bool:
+    return any(name in keys for keys in KEYS.values())
+
+
 def _from_lines(text: str) -> dict[str, Floats]:
-    """Return the numbers of each line by the name before them; KITTI leaves out some colons."""
+    """Return the numbers of each line by the name before them; some names lack their colon."""
     values = {}
     for line in text.splitlines():
-        name, *rest = line.replace(':', ' ').split()[:17] or ['']
-        if any(name in names for names in NAMES.values()):
-            values[name] = np.array(rest, np.float64)
+        name, *numbers = line.replace(':', ' ').split()[:17] or ['']
+        if _is_key(name):
+            values[name] = np.array(numbers, np.float64)
     return values
 
 
@@ -181,9 +219,9 @@ def _from_yaml(text: str) -> dict[str, Floats]:
     content = yaml.safe_load(text)
     values = {}
     for name, value in content.items():
-        if any(name in names for names in NAMES.values()):
-            value = value['data'] if isinstance(value, dict) else value
-            values[name] = np.array(value, np.float64).ravel()
+        if _is_key(name):
+            numbers = value['data'] if isinstance(value, dict) else value
+            values[name] = np.array(numbers, np.float64).ravel()
     if 'image_width' in content:
         values['image_size'] = np.array([content['image_width'], content['image_height']], float)
     return values

@@ -1,4 +1,4 @@
-"""Point clouds as the files that labelling tools and data sets keep them in."""
+"""Point clouds in the file formats of labelling tools and data sets."""
 
 from __future__ import annotations
 
@@ -8,27 +8,29 @@ from boxreg_ros.errors import ConfigError
 import numpy as np
 from numpy.typing import NDArray
 
-PCD = """\
+PCD_HEADER = """\
 # .PCD v0.7 - Point Cloud Data file format
 VERSION 0.7
 FIELDS {names}
 SIZE {sizes}
 TYPE {types}
-COUNT {ones}
-WIDTH {count}
+COUNT {counts}
+WIDTH {points}
 HEIGHT 1
 VIEWPOINT 0 0 0 1 0 0 0
-POINTS {count}
+POINTS {points}
 DATA binary
 """
-PLY = """\
+PLY_HEADER = """\
 ply
 format binary_little_endian 1.0
-element vertex {count}
+element vertex {points}
 {properties}
 end_header
 """
-COLUMNS = {'.bin': 4, '.pcd.bin': 5}
+SUFFIXES = ('.pcd.bin', '.bin', '.pcd', '.ply')
+"""Longest first: ``.pcd.bin`` also ends in ``.bin``."""
+BIN_COLUMNS = {'.bin': 4, '.pcd.bin': 5}
 """Numbers per point: KITTI has x y z intensity, nuScenes also the ring."""
 
 
@@ -36,7 +38,7 @@ def write_cloud(
     path: Path, points: NDArray[np.floating], intensities: NDArray[np.floating] | None = None
 ) -> None:
     """
-    Write a cloud in the format that its file name asks for, as little-endian float32.
+    Write a cloud in the format of its file name, as little-endian float32.
 
     Parameters
     ----------
@@ -44,32 +46,44 @@ def write_cloud(
         Ends in ``.pcd`` (binary), ``.ply`` (binary), ``.pcd.bin`` (nuScenes: x y z intensity
         ring) or ``.bin`` (KITTI: x y z intensity).
     points : array, shape (M, 3)
-        In the sensor's frame [m]; M may be 0.
+        In the sensor frame [m]; M may be 0.
     intensities : array, shape (M,), optional
-        As the sensor gives them. Without them PCD and PLY have no such field, and BIN files
-        have zeros, as they have for the ring.
+        In the unit of the sensor. Without them, PCD and PLY files have no such field, and BIN
+        files have zeros. The ring is always zero.
 
     Raises
     ------
     ConfigError
-        If the name ends in something else.
+        If the name has another suffix.
 
     """
-    names = ['x', 'y', 'z'] if intensities is None else ['x', 'y', 'z', 'intensity']
-    ending = next((e for e in ('.pcd.bin', '.bin', '.pcd', '.ply') if path.name.endswith(e)), '')
-    if not ending:
+    suffix = next((s for s in SUFFIXES if path.name.endswith(s)), '')
+    if not suffix:
         raise ConfigError(f'cloud {path.name!r}: expected a name in .pcd, .ply, .bin or .pcd.bin')
-    table = np.zeros((len(points), COLUMNS.get(ending, len(names))), '<f4')
+    names = ['x', 'y', 'z']
+    if intensities is not None:
+        names.append('intensity')
+    table = np.zeros((len(points), BIN_COLUMNS.get(suffix, len(names))), '<f4')
     table[:, :3] = points
     if intensities is not None:
         table[:, 3] = intensities
     with path.open('wb') as file:
-        if ending == '.pcd':
-            n = len(names)
-            fields = {'sizes': ['4'] * n, 'types': ['F'] * n, 'ones': ['1'] * n, 'names': names}
-            texts = {key: ' '.join(values) for key, values in fields.items()}
-            file.write(PCD.format(count=len(points), **texts).encode())
-        elif ending == '.ply':
-            properties = '\n'.join(f'property float {name}' for name in names)
-            file.write(PLY.format(count=len(points), properties=properties).encode())
+        file.write(_header(suffix, names, len(points)).encode())
         file.write(table.tobytes())
+
+
+def _header(suffix: str, names: list[str], points: int) -> str:
+    """Return the header of a cloud of `points` points; BIN files have none."""
+    if suffix == '.pcd':
+        n = len(names)
+        return PCD_HEADER.format(
+            names=' '.join(names),
+            sizes=' '.join(['4'] * n),
+            types=' '.join(['F'] * n),
+            counts=' '.join(['1'] * n),
+            points=points,
+        )
+    if suffix == '.ply':
+        properties = '\n'.join(f'property float {name}' for name in names)
+        return PLY_HEADER.format(points=points, properties=properties)
+    return ''

@@ -1,4 +1,4 @@
-"""``boxes.csv``: one row per box, in the frame its row names."""
+"""``boxes.csv``: one row per box, with the name of its frame."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import csv
 from pathlib import Path
 
 from boxreg_ros.io.box_table import BoxTable, COLUMNS
-from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.files import refined_boxes
+from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.structures import HEIGHT, LENGTH, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
@@ -27,10 +27,10 @@ FORMAT = Format(
 
 class Writer:
     """
-    Write boxes.csv, numbers in full precision; what is not finite becomes an empty cell.
+    Write boxes.csv with numbers in full precision; values that are not finite are empty cells.
 
-    Rows are sorted by stamp. Boxes of an earlier stamp than the last written are put in their
-    place on closing, which reads the whole file once.
+    Rows are sorted by stamp. If boxes arrive after those of a later stamp, the file is read and
+    sorted when it is closed.
 
     """
 
@@ -51,17 +51,16 @@ class Writer:
         if self._newest_ns is not None and stamp_ns < self._newest_ns:
             self._is_sorted = False
         self._newest_ns = stamp_ns
-        values = boxes.boxes
-        poses = np.hstack(
+        numbers = np.hstack(
             [
                 boxes.scores[:, None],
-                values[:, X : Z + 1],
-                quaternions_of(values),
-                values[:, LENGTH : HEIGHT + 1],
+                boxes.boxes[:, X : Z + 1],
+                quaternions_of(boxes.boxes),
+                boxes.boxes[:, LENGTH : HEIGHT + 1],
             ]
         )
-        cells = poses.astype(object)
-        cells[~np.isfinite(poses)] = ''
+        cells = numbers.astype(object)
+        cells[~np.isfinite(numbers)] = ''
         for i, row in enumerate(cells.tolist()):
             self._table.writerow(
                 [
@@ -76,33 +75,35 @@ class Writer:
             )
 
     def close(self) -> None:
-        """Close the file, sorted."""
+        """Close the file; sort it if boxes arrived late."""
         self._file.close()
-        if not self._is_sorted:
-            with self._path.open(newline='', encoding='utf-8') as file:
-                header, *rows = csv.reader(file)
-            rows.sort(key=lambda row: int(row[0]))
-            with self._path.open('w', newline='', encoding='utf-8') as file:
-                csv.writer(file, lineterminator='\n').writerows([header, *rows])
+        if self._is_sorted:
+            return
+        with self._path.open(newline='', encoding='utf-8') as file:
+            header, *rows = csv.reader(file)
+        rows.sort(key=lambda row: int(row[0]))
+        with self._path.open('w', newline='', encoding='utf-8') as file:
+            csv.writer(file, lineterminator='\n').writerows([header, *rows])
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the boxes of each stamp and frame of reference.
+    Yield the boxes of each stamp and frame.
 
-    The frame that most boxes are in is taken for the fixed frame.
+    The frame of most boxes is used as the fixed frame.
 
     """
     if path.is_dir():
         path = path / 'boxes.csv'
     tables = BoxTable.read_frames(path)
     fixed_frame = max(tables, key=lambda name: len(tables[name].boxes), default='')
-    parts = []
+    groups = []
     for name, table in tables.items():
         order = np.argsort(table.stamps_ns, kind='stable')
-        begins = np.flatnonzero(np.diff(table.stamps_ns[order])) + 1
-        parts += [(int(table.stamps_ns[rows[0]]), name, rows) for rows in np.split(order, begins)]
-    for stamp_ns, name, rows in sorted(parts, key=lambda part: part[0]):
+        starts = np.flatnonzero(np.diff(table.stamps_ns[order])) + 1
+        for rows in np.split(order, starts):
+            groups.append((int(table.stamps_ns[rows[0]]), name, rows))
+    for stamp_ns, name, rows in sorted(groups, key=lambda group: group[0]):
         table = tables[name]
         refined = refined_boxes(
             stamp_ns,

@@ -1,9 +1,9 @@
 """
-KITTI tracking: a line per box, in the rectified frame of a camera.
+KITTI tracking: one line per box, in the rectified frame of a camera.
 
 The folder is one sequence of the benchmark: ``label_02/0000.txt``, ``calib/0000.txt`` and
-``velodyne/0000``. All boxes are there, those outside of the image with truncation 2 and a
-rectangle of -1; occlusion is 3, unknown. Beside the labels lie stamps and poses, see `Timeline`.
+``velodyne/0000``. Boxes outside of the image are written too, with truncation 2 and a rectangle
+of -1. Occlusion is 3, unknown. Stamps and poses are in the files of `sidecar`.
 
 """
 
@@ -11,15 +11,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from itertools import groupby
 from pathlib import Path
+from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import read_timeline, refined_boxes, the_one, Timeline, TrackNumbers
-from boxreg_ros.structures import HEIGHT, LENGTH, WIDTH
+from boxreg_ros.labels.files import require_single
+from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import refined_boxes, TrackNumbers
+from boxreg_ros.labels.sidecar import read_sidecar, SidecarWriter
+from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, WIDTH
 import numpy as np
 
 FORMAT = Format(
@@ -37,16 +40,20 @@ CLASSES = {
     name.lower(): name
     for name in ('Car', 'Van', 'Truck', 'Pedestrian', 'Person_sitting', 'Cyclist', 'Tram', 'Misc')
 }
-"""Names as the benchmark spells them; others stay as they are."""
+"""Class names as the benchmark spells them; others are written unchanged."""
+INSIDE_IMAGE, TRUNCATED, OUTSIDE_IMAGE = 0, 1, 2
+"""Values of truncation."""
 UNKNOWN_OCCLUSION = 3
+IGNORED_CLASS = 'DontCare'
+"""Regions without labels, which have no 3D box."""
 
 
 class Writer:
     """
-    Write a line per box as frames come.
+    Write one line per box.
 
-    The location is half a height below the centre along the camera's y, as whoever reads it
-    puts an upright box there: the centre stays what it is, however the camera is tilted.
+    The location is half a height below the centre along y of the camera, because readers
+    reconstruct the box upright along that axis: so its centre is right for a tilted camera too.
 
     """
 
@@ -61,117 +68,127 @@ class Writer:
         _write_calibration(self._camera, folder / 'calib' / f'{SEQUENCE}.txt')
         path = folder / 'label_02' / f'{SEQUENCE}.txt'
         self._file = path.open('w', encoding='utf-8')
-        self._timeline = Timeline(folder, provenance)
+        self._sidecar = SidecarWriter(folder, provenance)
         self._numbers = TrackNumbers()
         self._frames = 0
 
     def write(self, frame: LabelFrame) -> None:
         """Add the lines of a frame."""
-        rows, boxes = frame.placed('sensor', self.dropped)
-        given = frame.refined.boxes
-        centres, turns = self._camera.upright(boxes)
-        views, are_whole = self._camera.views(boxes)
-        is_outside = np.isnan(views).any(axis=1)
-        views[is_outside] = -1.0
-        truncation = np.where(is_outside, 2, np.where(are_whole, 0, 1))
-        for i, (row, box, centre, turn) in enumerate(
-            zip(rows, boxes, centres, turns, strict=True)
-        ):
-            alpha = _wrapped(turn - np.arctan2(centre[0], centre[2]))
-            numbers = [
-                alpha,
-                *views[i],
-                *box[[HEIGHT, WIDTH, LENGTH]],
-                centre[0],
-                centre[1] + box[HEIGHT] / 2,
-                centre[2],
-                turn,
-            ]
-            if np.isfinite(given.scores[row]):
-                numbers.append(given.scores[row])
-            number, name = self._numbers.of(given.track_ids[row]), _spelt(given.class_names[row])
-            self._file.write(
-                f'{self._frames} {number} {name} {truncation[i]} {UNKNOWN_OCCLUSION} '
-            )
+        rows, boxes = frame.boxes_in('sensor', self.dropped)
+        array = frame.refined.boxes
+        centres, rotations_y = self._camera.to_upright(boxes)
+        rectangles, is_inside = self._camera.project(boxes)
+        is_outside = np.isnan(rectangles).any(axis=1)
+        rectangles[is_outside] = -1.0
+        truncation = np.where(is_inside, INSIDE_IMAGE, TRUNCATED)
+        truncation[is_outside] = OUTSIDE_IMAGE
+        for i, (row, box) in enumerate(zip(rows, boxes, strict=True)):
+            x, y, z = centres[i]
+            alpha = float(wrap_angle(rotations_y[i] - np.arctan2(x, z)))
+            size = box[[HEIGHT, WIDTH, LENGTH]]
+            location = (x, y + box[HEIGHT] / 2, z)
+            numbers = [alpha, *rectangles[i], *size, *location, rotations_y[i]]
+            if np.isfinite(array.scores[row]):
+                numbers.append(array.scores[row])
+            track = self._numbers.of(array.track_ids[row])
+            name = _kitti_class(array.class_names[row])
+            self._file.write(f'{self._frames} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')
             self._file.write(' '.join(f'{value:.6f}' for value in numbers) + '\n')
         if frame.sweep is not None:
-            write_cloud(
-                self._clouds / f'{self._frames:06d}.bin', frame.sweep.points, frame.intensities
-            )
-        self._timeline.add(frame)
+            path = self._clouds / f'{self._frames:06d}.bin'
+            write_cloud(path, frame.sweep.points, frame.intensities)
+        self._sidecar.add(frame)
         self._frames += 1
 
     def close(self) -> None:
         """Complete the files."""
         self._file.close()
-        self._timeline.close(self._numbers.names())
+        self._sidecar.close(self._numbers.names())
+
+
+class _Line(NamedTuple):
+    """A box of a label file; `numbers` are height, width, length, x, y, z and rotation_y."""
+
+    track: str
+    class_name: str
+    numbers: list[float]
+    score: float
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the frames of a label file, or of the only sequence of a folder.
 
-    ``calib/NAME.txt`` lies beside ``label_02/NAME.txt``, `Timeline`'s files in the folder of
-    both. What is not to be cared for is left out.
+    ``calib/NAME.txt`` is beside ``label_02/NAME.txt``; the files of `sidecar` are in the folder
+    that contains both. Regions of the class DontCare are skipped.
 
     """
     if path.is_dir():
         found = sorted((path / 'label_02').glob('*.txt'))
-        path = the_one(found, path, 'sequence, label_02/NAME.txt')
+        path = require_single(found, path, 'sequence, label_02/NAME.txt')
     folder = absolute(path).parent.parent
+    lines_by_frame = _read_lines(path)
+    camera = Camera.read(folder / 'calib' / path.name)
+    sidecar = read_sidecar(folder, 1 + max(lines_by_frame, default=-1))
+    for index, stamp_ns in enumerate(sidecar.stamps_ns):
+        lines = lines_by_frame.get(index, [])
+        numbers = np.array([line.numbers for line in lines]).reshape(-1, 7)
+        refined = refined_boxes(
+            stamp_ns,
+            sidecar.sensor_frame,
+            [sidecar.tracks.get(line.track, line.track) for line in lines],
+            [line.class_name for line in lines],
+            _boxes(camera, numbers),
+            [line.score for line in lines],
+        )
+        yield sidecar.frame(index, refined)
+
+
+def _read_lines(path: Path) -> dict[int, list[_Line]]:
+    """Return the lines of a label file by frame; their order within a frame is kept."""
+    lines_by_frame: dict[int, list[_Line]] = {}
     try:
-        lines = [line.split() for line in path.read_text(encoding='utf-8').splitlines()]
-        rows = sorted((r for r in lines if r and r[2] != 'DontCare'), key=lambda r: int(r[0]))
-        of_frame = {frame: list(part) for frame, part in groupby(rows, lambda r: int(r[0]))}
-        numbers = {
-            frame: np.array([[*map(float, row[10:17])] for row in part])
-            for frame, part in of_frame.items()
-        }
-        scores = {
-            frame: [float(row[17]) if len(row) > 17 else np.nan for row in part]
-            for frame, part in of_frame.items()
-        }
+        for text in path.read_text(encoding='utf-8').splitlines():
+            words = text.split()
+            if not words or words[2] == IGNORED_CLASS:
+                continue
+            numbers = [float(word) for word in words[10:17]]
+            score = float(words[17]) if len(words) > 17 else np.nan
+            line = _Line(words[1], words[2], numbers, score)
+            if len(numbers) != 7:
+                raise ValueError(f'got {len(words)} columns')
+            lines_by_frame.setdefault(int(words[0]), []).append(line)
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     except (IndexError, ValueError) as error:
         raise RecordingError(
             f'{path}: expected 17 or 18 columns of KITTI tracking: {error}'
         ) from None
-    camera = Camera.read(folder / 'calib' / path.name)
-    timeline = read_timeline(folder, 1 + max(of_frame, default=-1))
-    for index, stamp_ns in enumerate(timeline.stamps_ns):
-        part = of_frame.get(index, [])
-        h_w_l_x_y_z_turn = numbers.get(index, np.zeros((0, 7)))
-        extents, centres = h_w_l_x_y_z_turn[:, [2, 1, 0]], h_w_l_x_y_z_turn[:, 3:6].copy()
-        centres[:, 1] -= h_w_l_x_y_z_turn[:, 0] / 2
-        refined = refined_boxes(
-            stamp_ns,
-            timeline.sensor_frame,
-            [timeline.tracks.get(row[1], row[1]) for row in part],
-            [row[2] for row in part],
-            camera.from_upright(centres, h_w_l_x_y_z_turn[:, 6], extents),
-            scores.get(index, []),
-        )
-        yield timeline.frame(index, refined)
+    return lines_by_frame
+
+
+def _boxes(camera: Camera, numbers: Floats) -> Floats:
+    """Return boxes (n, 9) in the LiDAR frame of the numbers (n, 7) of lines."""
+    extents = numbers[:, [2, 1, 0]]
+    centres = numbers[:, 3:6].copy()
+    centres[:, 1] -= numbers[:, 0] / 2
+    return camera.from_upright(centres, numbers[:, 6], extents)
 
 
 def _write_calibration(camera: Camera, path: Path) -> None:
-    """Write the calibration by the names of the benchmark; all four cameras are this one."""
-    parts = {f'P{i}': camera.projection for i in range(4)} | {
-        'R_rect': camera.rectification,
-        'Tr_velo_cam': camera.T_camera_sensor[:3],
-        'Tr_imu_velo': np.eye(4)[:3],
-        'S_rect_02': np.array(camera.size, float),
-    }
-    lines = (f'{k}: {" ".join(f"{n:.12e}" for n in v.ravel())}\n' for k, v in parts.items())
-    path.write_text(''.join(lines), encoding='utf-8')
+    """Write the calibration under the names of the benchmark, the same for all four cameras."""
+    parts = {f'P{i}': camera.projection for i in range(4)}
+    parts['R_rect'] = camera.rectification
+    parts['Tr_velo_cam'] = camera.T_camera_sensor[:3]
+    parts['Tr_imu_velo'] = np.eye(4)[:3]
+    parts['S_rect_02'] = np.array(camera.size, float)
+    with path.open('w', encoding='utf-8') as file:
+        for name, values in parts.items():
+            numbers = ' '.join(f'{value:.12e}' for value in values.ravel())
+            file.write(f'{name}: {numbers}\n')
 
 
-def _spelt(class_name: str) -> str:
+def _kitti_class(class_name: str) -> str:
     """Return a class name without spaces, as the benchmark spells it."""
     name = '_'.join(class_name.split()) or 'Misc'
     return CLASSES.get(name.lower(), name)
-
-
-def _wrapped(angle: float) -> float:
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)

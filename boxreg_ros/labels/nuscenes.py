@@ -1,10 +1,10 @@
 """
-nuScenes: the thirteen tables, one scene, boxes in the global frame; and T4, which is nearly that.
+nuScenes: its thirteen tables with one scene, boxes in the global frame. T4 is a variant.
 
-The sensor's frame stands for the ego vehicle's, so that its calibration is the identity;
-``--label-frame`` takes another. A sample is a frame of boxes whose pose is known. Beside the
-columns of the data set, annotations have status, reason, score, covariance and the stamp in
-nanoseconds, instances the name of the track. A track of several classes is as many instances.
+The sensor frame is written as the ego vehicle frame, with an identity calibration;
+``--label-frame`` chooses another frame. A sample is a box array with a known pose. Additional
+columns of annotations are status, reason, score, covariance and the stamp in nanoseconds, of
+instances the track id. A track that changes its class is several instances.
 
 """
 
@@ -21,17 +21,16 @@ import zlib
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import (
-    boxes_from,
     frame_names,
     from_json,
     JsonList,
-    refined_boxes,
-    the_one,
-    write_origin,
+    require_single,
+    write_provenance,
 )
+from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import boxes_from_quaternions, finite_or_none, refined_boxes
 from boxreg_ros.rotations import quaternion_from_matrix
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, WIDTH, X, Z
 from msg_adapters.poses import quaternions_of
@@ -47,21 +46,24 @@ FORMAT = Format(
     files='v1.0-boxreg/, samples/, maps/',
     options=('with_points',),
 )
-STREAMED = ('sample', 'sample_data', 'sample_annotation', 'ego_pose')
+STREAMED_TABLES = ('sample', 'sample_data', 'sample_annotation', 'ego_pose')
+"""Tables that grow with the recording; their rows are written one by one."""
 EMPTY_MAP = 'maps/empty.png'
-EVIDENCE = ('status', 'reason', 'score', 'covariance', 'stamp_ns')
 
 
 class Writer:
     """
-    Write samples, data and poses as they come, annotations one step later, the rest at the end.
+    Write the rows of each sample; the tables of one row or one per track when closed.
 
-    An annotation waits for the next of its track, to name it.
+    A row names the next of its table, an annotation the next of its track. So each is held until
+    the next is known.
 
     """
 
-    version, channel, clouds = 'v1.0-boxreg', 'LIDAR_TOP', 'samples/LIDAR_TOP'
-    captured = 'date_captured'
+    version = 'v1.0-boxreg'
+    channel = 'LIDAR_TOP'
+    clouds = 'samples/LIDAR_TOP'
+    date_key = 'date_captured'
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
@@ -70,58 +72,173 @@ class Writer:
         self._tables.mkdir()
         if options.with_points:
             (folder / self.clouds).mkdir(parents=True)
-        self._origin = asdict(provenance)
-        self._lists = {name: JsonList(self._tables / f'{name}.json') for name in STREAMED}
-        self._held: dict[str, dict[str, Any]] = {}
+        self._provenance = asdict(provenance)
+        self._streams = {name: JsonList(self._tables / f'{name}.json') for name in STREAMED_TABLES}
+        self._held_rows: dict[str, dict[str, Any]] = {}  # by table
+        self._held_annotations: dict[str, dict[str, Any]] = {}  # by instance key
         self._instances: dict[str, dict[str, Any]] = {}
         self._categories: dict[str, str] = {}
-        self._samples = self._nameless = 0
-        self._first: str = ''
+        self._num_samples = 0
+        self._num_single = 0  # annotations that are an instance of their own
 
     def write(self, frame: LabelFrame) -> None:
         """Add a sample with its annotations."""
-        rows, boxes = frame.placed('fixed', self.dropped)
-        T = frame.T_fixed_sensor
-        if T is None:
+        rows, boxes = frame.boxes_in('fixed', self.dropped)
+        if frame.T_fixed_sensor is None:
             self.dropped['no_transform'] += len(rows)
             return
-        self._origin |= {'fixed_frame': frame.fixed_frame, 'sensor_frame': frame.sensor_frame}
-        number = self._samples
-        self._samples += 1
-        stamp = round(frame.refined.boxes.stamp_ns / 1000)
-        sample, data = self._token('sample', number), self._token('sample_data', number)
-        pose = self._token('ego_pose', number)
-        self._first = self._first or sample
-        self._append('sample', {
-            'token': sample, 'timestamp': stamp, 'prev': '', 'next': '',
-            'scene_token': self._token('scene'),
-        })  # fmt: skip
-        file = f'{self.clouds}/{number:05d}.pcd.bin'
-        self._append('sample_data', {
-            'token': data, 'sample_token': sample, 'ego_pose_token': pose,
-            'calibrated_sensor_token': self._token('calibrated_sensor'), 'timestamp': stamp,
-            'fileformat': 'pcd.bin', 'is_key_frame': True, 'height': 0, 'width': 0,
-            'filename': file, 'prev': '', 'next': '', 'is_valid': True,
-        })  # fmt: skip
-        qx, qy, qz, qw = quaternion_from_matrix(T[:3, :3]).tolist()
-        self._lists['ego_pose'].append({
-            'token': pose, 'timestamp': stamp, 'rotation': [qw, qx, qy, qz],
-            'translation': T[:3, 3].tolist(),
-        })  # fmt: skip
+        self._provenance['fixed_frame'] = frame.fixed_frame
+        self._provenance['sensor_frame'] = frame.sensor_frame
+        number = self._num_samples
+        self._num_samples += 1
+        cloud_file = f'{self.clouds}/{number:05d}.pcd.bin'
+        timestamp = round(frame.refined.boxes.stamp_ns / 1000)
+        self._add_sample(number, timestamp, cloud_file, frame.T_fixed_sensor)
         if frame.sweep is not None:
-            write_cloud(self._folder / file, frame.sweep.points, frame.intensities)
-        self._annotate(frame, sample, rows.tolist(), boxes)
+            write_cloud(self._folder / cloud_file, frame.sweep.points, frame.intensities)
+        self._add_annotations(frame, self._token('sample', number), rows.tolist(), boxes)
 
     def close(self) -> None:
-        """Write what is still held, and the tables of what there is only one of."""
-        for name, held in self._held.items():
-            self._lists[name if name in STREAMED else 'sample_annotation'].append(held)
-        for streamed in self._lists.values():
-            streamed.close()
-        sensor, log = self._token('sensor'), self._token('log')
-        last = self._token('sample', self._samples - 1) if self._samples else ''
-        recordings = ', '.join(self._origin['recordings'])
-        tables: dict[str, list[dict[str, Any]]] = {
+        """Write the rows still held and the remaining tables."""
+        for table, row in self._held_rows.items():
+            self._streams[table].append(row)
+        for row in self._held_annotations.values():
+            self._streams['sample_annotation'].append(row)
+        for stream in self._streams.values():
+            stream.close()
+        for name, rows in self._closing_tables().items():
+            rows_file = JsonList(self._tables / f'{name}.json')
+            for row in rows:
+                rows_file.append(row)
+            rows_file.close()
+        # The devkit requires a map.
+        (self._folder / EMPTY_MAP).parent.mkdir()
+        (self._folder / EMPTY_MAP).write_bytes(_black_pixel())
+        write_provenance(self._folder, self._provenance)
+
+    def _add_sample(
+        self, number: int, timestamp: int, cloud_file: str, T_fixed_sensor: Floats
+    ) -> None:
+        """Add the rows of a sample: itself, its sweep and the pose of the ego vehicle."""
+        sample = self._token('sample', number)
+        pose = self._token('ego_pose', number)
+        self._link(
+            'sample',
+            {
+                'token': sample,
+                'timestamp': timestamp,
+                'prev': '',
+                'next': '',
+                'scene_token': self._token('scene'),
+            },
+        )
+        self._link(
+            'sample_data',
+            {
+                'token': self._token('sample_data', number),
+                'sample_token': sample,
+                'ego_pose_token': pose,
+                'calibrated_sensor_token': self._token('calibrated_sensor'),
+                'timestamp': timestamp,
+                'fileformat': 'pcd.bin',
+                'is_key_frame': True,
+                'height': 0,
+                'width': 0,
+                'filename': cloud_file,
+                'prev': '',
+                'next': '',
+                'is_valid': True,
+            },
+        )
+        qx, qy, qz, qw = quaternion_from_matrix(T_fixed_sensor[:3, :3]).tolist()
+        self._streams['ego_pose'].append(
+            {
+                'token': pose,
+                'timestamp': timestamp,
+                'rotation': [qw, qx, qy, qz],
+                'translation': T_fixed_sensor[:3, 3].tolist(),
+            }
+        )
+
+    def _add_annotations(
+        self, frame: LabelFrame, sample: str, rows: list[int], boxes: Floats
+    ) -> None:
+        refined = frame.refined
+        array = refined.boxes
+        quaternions_wxyz = quaternions_of(boxes)[:, [3, 0, 1, 2]].tolist()
+        keys_in_sample: set[str] = set()
+        for row, box, quaternion in zip(rows, boxes, quaternions_wxyz, strict=True):
+            track_id = array.track_ids[row]
+            class_name = array.class_names[row]
+            key = f'{track_id}\0{class_name}'
+            is_single = not track_id or key in keys_in_sample  # no identity
+            if is_single:
+                self._num_single += 1
+                key = f'\0{self._num_single}'
+            keys_in_sample.add(key)
+            token = self._token('annotation', f'{sample} {key}')
+            annotation = {
+                'token': token,
+                'sample_token': sample,
+                'instance_token': self._instance(key, track_id, class_name, token),
+                'attribute_tokens': [],
+                'visibility_token': 'unavailable',
+                'translation': box[X : Z + 1].tolist(),
+                'size': box[[WIDTH, LENGTH, HEIGHT]].tolist(),
+                'rotation': quaternion,
+                'num_lidar_pts': int(refined.num_points[row]),
+                'num_radar_pts': 0,
+                'prev': '',
+                'next': '',
+                'status': refined.status[row],
+                'reason': refined.reasons[row],
+                'score': finite_or_none(array.scores[row]),
+                'covariance': refined.covariances[row].ravel().tolist(),
+                'stamp_ns': array.stamp_ns,
+            }
+            if is_single:
+                self._streams['sample_annotation'].append(annotation)
+            else:
+                self._link('sample_annotation', annotation, key)
+
+    def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
+        """Return the token of an instance, and count the annotation."""
+        category = self._categories.setdefault(class_name, self._token('category', class_name))
+        if key not in self._instances:
+            self._instances[key] = {
+                'token': self._token('instance', key),
+                'instance_name': track_id,
+                'category_token': category,
+                'nbr_annotations': 0,
+                'first_annotation_token': annotation,
+            }
+        instance = self._instances[key]
+        instance['nbr_annotations'] += 1
+        instance['last_annotation_token'] = annotation
+        return str(instance['token'])
+
+    def _link(self, table: str, row: dict[str, Any], instance: str = '') -> None:
+        """Hold a row, and write the one before it of the same table and instance."""
+        held = self._held_annotations if instance else self._held_rows
+        key = instance or table
+        before = held.get(key)
+        if before is not None:
+            before['next'] = row['token']
+            row['prev'] = before['token']
+            self._streams[table].append(before)
+        held[key] = row
+
+    def _closing_tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the tables that are written when all samples are known."""
+        sensor = self._token('sensor')
+        log = self._token('log')
+        recordings = ', '.join(self._provenance['recordings'])
+        tool = f'{self._provenance["tool"]} {self._provenance["version"]}'
+        first_sample = last_sample = ''
+        if self._num_samples:
+            first_sample = self._token('sample', 0)
+            last_sample = self._token('sample', self._num_samples - 1)
+        return {
             'category': [
                 {'token': token, 'name': name, 'description': ''}
                 for name, token in self._categories.items()
@@ -130,173 +247,148 @@ class Writer:
             'visibility': [{'token': 'unavailable', 'level': 'unavailable', 'description': ''}],
             'instance': list(self._instances.values()),
             'sensor': [{'token': sensor, 'channel': self.channel, 'modality': 'lidar'}],
-            'calibrated_sensor': [{
-                'token': self._token('calibrated_sensor'), 'sensor_token': sensor,
-                'translation': [0.0, 0.0, 0.0], 'rotation': [1.0, 0.0, 0.0, 0.0],
-                'camera_intrinsic': [], 'camera_distortion': [],
-            }],
-            'log': [{
-                'token': log, 'logfile': recordings, 'vehicle': '', self.captured: '',
-                'location': '',
-            }],
-            'scene': [{
-                'token': self._token('scene'), 'log_token': log, 'nbr_samples': self._samples,
-                'first_sample_token': self._first, 'last_sample_token': last,
-                'name': 'scene-0001',
-                'description': f'{self._origin["tool"]} {self._origin["version"]}: {recordings}',
-            }],
-            'map': [{
-                'token': self._token('map'), 'log_tokens': [log], 'category': '',
-                'filename': EMPTY_MAP,
-            }],
-        }  # fmt: skip
-        for name, rows in tables.items():
-            table = JsonList(self._tables / f'{name}.json')
-            for row in rows:
-                table.append(row)
-            table.close()
-        # The devkit wants a map to be there.
-        (self._folder / EMPTY_MAP).parent.mkdir()
-        (self._folder / EMPTY_MAP).write_bytes(_black_pixel())
-        write_origin(self._folder, self._origin)
-
-    def _annotate(self, frame: LabelFrame, sample: str, rows: list[int], boxes: Floats) -> None:
-        refined, given = frame.refined, frame.refined.boxes
-        turns = quaternions_of(boxes)[:, [3, 0, 1, 2]].tolist()
-        seen = set()
-        for row, box, turn in zip(rows, boxes, turns, strict=True):
-            name = given.track_ids[row]
-            key = f'{name}\0{given.class_names[row]}'  # the class is the instance's
-            if not name or key in seen:  # without an identity: an instance of its own
-                self._nameless += 1
-                key = f'\0{self._nameless}'
-            seen.add(key)
-            token = self._token('annotation', f'{sample} {key}')
-            score = float(given.scores[row])
-            self._append('sample_annotation', {
-                'token': token, 'sample_token': sample,
-                'instance_token': self._instance(key, name, given.class_names[row], token),
-                'attribute_tokens': [], 'visibility_token': 'unavailable',
-                'translation': box[X : Z + 1].tolist(),
-                'size': box[[WIDTH, LENGTH, HEIGHT]].tolist(), 'rotation': turn,
-                'num_lidar_pts': int(refined.num_points[row]), 'num_radar_pts': 0,
-                'prev': '', 'next': '', 'status': refined.status[row],
-                'reason': refined.reasons[row], 'score': score if np.isfinite(score) else None,
-                'covariance': refined.covariances[row].ravel().tolist(),
-                'stamp_ns': given.stamp_ns,
-            }, key)  # fmt: skip
-
-    def _instance(self, key: str, name: str, class_name: str, annotation: str) -> str:
-        """Return the token of a track's instance, and count the annotation."""
-        item = self._instances.setdefault(key, {
-            'token': self._token('instance', key), 'instance_name': name,
-            'category_token': self._categories.setdefault(
-                class_name, self._token('category', class_name)
-            ),
-            'nbr_annotations': 0, 'first_annotation_token': annotation,
-        })  # fmt: skip
-        item['nbr_annotations'] += 1
-        item['last_annotation_token'] = annotation
-        return str(item['token'])
-
-    def _append(self, table: str, item: dict[str, Any], track: str = '') -> None:
-        """Write the item before of this table, or of this track, and hold this one."""
-        if track.startswith('\0'):  # one of its kind
-            self._lists[table].append(item)
-            return
-        name = f'\1{track}' if track else table
-        before = self._held.get(name)
-        if before is not None:
-            before['next'], item['prev'] = item['token'], before['token']
-            self._lists[table].append(before)
-        self._held[name] = item
+            'calibrated_sensor': [
+                {
+                    'token': self._token('calibrated_sensor'),
+                    'sensor_token': sensor,
+                    'translation': [0.0, 0.0, 0.0],
+                    'rotation': [1.0, 0.0, 0.0, 0.0],
+                    'camera_intrinsic': [],
+                    'camera_distortion': [],
+                }
+            ],
+            'log': [
+                {
+                    'token': log,
+                    'logfile': recordings,
+                    'vehicle': '',
+                    self.date_key: '',
+                    'location': '',
+                }
+            ],
+            'scene': [
+                {
+                    'token': self._token('scene'),
+                    'log_token': log,
+                    'nbr_samples': self._num_samples,
+                    'first_sample_token': first_sample,
+                    'last_sample_token': last_sample,
+                    'name': 'scene-0001',
+                    'description': f'{tool}: {recordings}',
+                }
+            ],
+            'map': [
+                {
+                    'token': self._token('map'),
+                    'log_tokens': [log],
+                    'category': '',
+                    'filename': EMPTY_MAP,
+                }
+            ],
+        }
 
     def _token(self, kind: str, key: object = '') -> str:
-        """Return 32 digits that stay the same for the same recording."""
-        text = f'{self._origin["recordings"]} {self._origin["config_hash"]} {kind} {key}'
+        """Return 32 digits that are the same in every run over the same recording."""
+        provenance = self._provenance
+        text = f'{provenance["recordings"]} {provenance["config_hash"]} {kind} {key}'
         return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the samples of all scenes, by time.
+    Yield the samples of all scenes in order of time.
 
-    `path` is the folder of the tables, or one that holds it. Tracks are instances, by name where
-    they have one; stamps are whole microseconds unless our own column has them.
+    `path` is the folder of the tables, or the folder that contains it. Tracks are instances,
+    named by ``instance_name`` where they have one, else by token. Stamps are whole microseconds,
+    unless the annotations have the column ``stamp_ns``.
 
     """
     path = absolute(path)
-    found = [path] if (path / 'sample.json').exists() else sorted(
-        file.parent for file in path.glob('*/sample.json')
-    )  # fmt: skip
-    tables = the_one(found, path, 'folder with the tables of nuScenes')
-    folder = tables.parent
+    found = [path]
+    if not (path / 'sample.json').exists():
+        found = sorted(file.parent for file in path.glob('*/sample.json'))
+    tables = require_single(found, path, 'folder with the tables of nuScenes')
     try:
-        category = {item['token']: item['name'] for item in from_json(tables / 'category.json')}
-        instance = {item['token']: item for item in from_json(tables / 'instance.json')}
-        poses = _poses(tables)
-        annotations: dict[str, list[dict[str, Any]]] = {}
-        for item in from_json(tables / 'sample_annotation.json'):
-            annotations.setdefault(item['sample_token'], []).append(item)
-        samples = sorted(from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
-        fixed, sensor = frame_names(folder)
-        for sample in samples:
-            items = annotations.get(sample['token'], [])
-            of_track = [instance[item['instance_token']] for item in items]
-            stamp_ns = next((i['stamp_ns'] for i in items if 'stamp_ns' in i), None)
-            numbers = np.array(
-                [[*item['translation'], *item['size'], *item['rotation']] for item in items]
-            ).reshape(-1, 10)
-            evidence = {name: [item.get(name) for item in items] for name in EVIDENCE}
-            refined = refined_boxes(
-                sample['timestamp'] * 1000 if stamp_ns is None else stamp_ns,
-                fixed,
-                [item.get('instance_name') or item['token'] for item in of_track],
-                [category[item['category_token']] for item in of_track],
-                boxes_from(numbers[:, :3], numbers[:, [4, 3, 5]], numbers[:, [7, 8, 9, 6]]),
-                evidence['score'],
-                evidence['status'],
-                [item['num_lidar_pts'] for item in items],
-                evidence['covariance'],
-                evidence['reason'],
-            )
-            yield LabelFrame(refined, fixed, sensor, poses.get(sample['token']))
+        yield from _read_tables(tables)
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(
             f'{tables}: expected the tables of nuScenes: {type(error).__name__} {error}'
         ) from None
 
 
+def _read_tables(tables: Path) -> Iterator[LabelFrame]:
+    category = {item['token']: item['name'] for item in from_json(tables / 'category.json')}
+    instance = {item['token']: item for item in from_json(tables / 'instance.json')}
+    poses = _poses(tables)
+    annotations: dict[str, list[dict[str, Any]]] = {}
+    for item in from_json(tables / 'sample_annotation.json'):
+        annotations.setdefault(item['sample_token'], []).append(item)
+    samples = sorted(from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
+    fixed_frame, sensor_frame = frame_names(tables.parent)
+    for sample in samples:
+        items = annotations.get(sample['token'], [])
+        instances = [instance[item['instance_token']] for item in items]
+        # x y z, width length height, qw qx qy qz
+        numbers = np.array(
+            [[*item['translation'], *item['size'], *item['rotation']] for item in items]
+        ).reshape(-1, 10)
+        refined = refined_boxes(
+            _stamp_ns(sample, items),
+            fixed_frame,
+            [item.get('instance_name') or item['token'] for item in instances],
+            [category[item['category_token']] for item in instances],
+            boxes_from_quaternions(
+                numbers[:, :3], numbers[:, [4, 3, 5]], numbers[:, [7, 8, 9, 6]]
+            ),
+            [item.get('score') for item in items],
+            [item.get('status') for item in items],
+            [item['num_lidar_pts'] for item in items],
+            [item.get('covariance') for item in items],
+            [item.get('reason') for item in items],
+        )
+        yield LabelFrame(refined, fixed_frame, sensor_frame, poses.get(sample['token']))
+
+
+def _stamp_ns(sample: dict[str, Any], annotations: list[dict[str, Any]]) -> int:
+    for item in annotations:
+        if 'stamp_ns' in item:
+            return int(item['stamp_ns'])
+    return int(sample['timestamp'] * 1000)
+
+
 def _poses(tables: Path) -> dict[str, Floats]:
     """Return the global pose (4, 4) of the LiDAR by sample."""
-    lidars = {s['token'] for s in from_json(tables / 'sensor.json') if s['modality'] == 'lidar'}
-    mounts = {
+    sensors = from_json(tables / 'sensor.json')
+    lidars = {sensor['token'] for sensor in sensors if sensor['modality'] == 'lidar'}
+    T_ego_lidar = {
         item['token']: _matrix(item)
         for item in from_json(tables / 'calibrated_sensor.json')
         if item['sensor_token'] in lidars
     }
-    ego = {item['token']: item for item in from_json(tables / 'ego_pose.json')}
-    return {
-        item['sample_token']: _matrix(ego[item['ego_pose_token']])
-        @ mounts[item['calibrated_sensor_token']]
-        for item in from_json(tables / 'sample_data.json')
-        if item['is_key_frame'] and item['calibrated_sensor_token'] in mounts
-    }
+    ego_poses = {item['token']: item for item in from_json(tables / 'ego_pose.json')}
+    poses = {}
+    for item in from_json(tables / 'sample_data.json'):
+        calibration = item['calibrated_sensor_token']
+        if item['is_key_frame'] and calibration in T_ego_lidar:
+            T_global_ego = _matrix(ego_poses[item['ego_pose_token']])
+            poses[item['sample_token']] = T_global_ego @ T_ego_lidar[calibration]
+    return poses
 
 
 def _matrix(item: dict[str, list[float]]) -> Floats:
-    w, *xyz = item['rotation']
-    return matrix(np.array([*item['translation'], *xyz, w]))
+    qw, *qxyz = item['rotation']
+    return matrix(np.array([*item['translation'], *qxyz, qw]))
 
 
 def _black_pixel() -> bytes:
     """Return a PNG of one black pixel."""
-    parts = [
+    chunks = [
         (b'IHDR', struct.pack('>IIBBBBB', 1, 1, 8, 0, 0, 0, 0)),
         (b'IDAT', zlib.compress(b'\0\0')),
         (b'IEND', b''),
     ]
-    return b'\x89PNG\r\n\x1a\n' + b''.join(
-        struct.pack('>I', len(data)) + kind + data + struct.pack('>I', zlib.crc32(kind + data))
-        for kind, data in parts
-    )
+    png = b'\x89PNG\r\n\x1a\n'
+    for kind, data in chunks:
+        checksum = zlib.crc32(kind + data)
+        png += struct.pack('>I', len(data)) + kind + data + struct.pack('>I', checksum)
+    return png

@@ -1,9 +1,9 @@
 """
 ASAM OpenLABEL 1.0: ``openlabel/labels.json``.
 
-A frame per box array, an object per track and class, and in each frame a cuboid per object: its
-ten values are x y z, qx qy qz qw, and the extents along the box's own x, y and z. Objects are
-numbered, as the format wants it, and carry the track id as their name.
+One frame per box array, one object per track and class, and in each frame one cuboid per object.
+Its ten values are x y z, qx qy qz qw, and the extents along x, y and z of the box. Objects are
+numbered, as the format requires, and have the track id as their name.
 
 """
 
@@ -17,12 +17,16 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.files import from_json, refined_boxes, to_json
+from boxreg_ros.labels.files import from_json, to_json
+from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.rotations import rpy_from_quaternion
-from boxreg_ros.structures import Floats, HEIGHT, is_valid_box, LENGTH, X, Z
+from boxreg_ros.structures import Floats, HEIGHT, is_valid_box, LENGTH, RefinedBoxes, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
 
 FORMAT = Format(
     name='openlabel',
@@ -34,8 +38,9 @@ FORMAT = Format(
     files='labels.json',
 )
 SCHEMA_VERSION = '1.0.0'
-COVARIANCE_DIGITS = 9  # a deviation of 0.03 mm; all of them would double the file
-POINTER = {
+COVARIANCE_DIGITS = 9
+"""Decimals of covariances: a standard deviation of 0.03 mm. Full precision doubles the file."""
+OBJECT_DATA_POINTER = {
     'type': 'cuboid',
     'attribute_pointers': {
         'status': 'text',
@@ -49,10 +54,10 @@ POINTER = {
 
 class Writer:
     """
-    Write frames as they come, and the objects with their intervals at the end.
+    Write one frame per box array, and the objects with their intervals when closed.
 
-    A box without a track id, or with one that its frame already has, is an object of its own.
-    Invalid boxes have no place in the format and are left out; ``boxes.csv`` has them.
+    A box without a track id, or with one that its frame already contains, is an object of its
+    own. The format cannot represent invalid boxes; they are left out and are in ``boxes.csv``.
 
     """
 
@@ -60,54 +65,26 @@ class Writer:
         self.dropped: Counter[str] = Counter()
         self._file = (folder / 'labels.json').open('w', encoding='utf-8')
         self._file.write('{"openlabel": {\n"metadata": ')
-        origin = asdict(provenance)
-        metadata = {'schema_version': SCHEMA_VERSION, 'annotator': origin['tool'], **origin}
-        self._file.write(to_json(metadata))
+        metadata = {'schema_version': SCHEMA_VERSION, 'annotator': provenance.tool}
+        self._file.write(to_json(metadata | asdict(provenance)))
         self._file.write(',\n"frames": {')
         self._frames = 0
         self._numbers = count()
-        self._tracks: dict[tuple[str, str], int] = {}
+        self._number_of_track: dict[tuple[str, str], int] = {}
         self._objects: dict[int, dict[str, Any]] = {}
         self._frame_ids: set[str] = set()
-        self._sensors: dict[str, str] = {}
+        self._parents: dict[str, str] = {}  # sensor frame -> fixed frame
 
     def write(self, frame: LabelFrame) -> None:
         """Add a frame."""
         refined = frame.refined
         boxes = refined.boxes
-        values = np.hstack(
-            [
-                boxes.boxes[:, X : Z + 1],
-                quaternions_of(boxes.boxes),
-                boxes.boxes[:, LENGTH : HEIGHT + 1],
-            ]
-        )
         is_valid = is_valid_box(boxes.boxes)
         self.dropped['invalid_box'] += int((~is_valid).sum())
         self._frame_ids.add(boxes.frame_id)
-        covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS).tolist()
         objects: dict[int, Any] = {}
-        for i in np.flatnonzero(is_valid):
-            number = self._number(boxes.track_ids[i], boxes.class_names[i], objects)
-            numbers = {'num_points': int(refined.num_points[i]), 'score': float(boxes.scores[i])}
-            attributes = {
-                'text': [
-                    {'name': 'status', 'val': refined.status[i]},
-                    {'name': 'reason', 'val': refined.reasons[i]},
-                ],
-                'num': [
-                    {'name': name, 'val': value}
-                    for name, value in numbers.items()
-                    if np.isfinite(value)
-                ],
-                'vec': [{'name': 'covariance', 'val': covariances[i]}],
-            }
-            cuboid = {
-                'name': 'box',
-                'coordinate_system': boxes.frame_id,
-                'val': values[i].tolist(),
-                'attributes': attributes,
-            }
+        for row, cuboid in zip(np.flatnonzero(is_valid), _cuboids(refined, is_valid), strict=True):
+            number = self._number(boxes.track_ids[row], boxes.class_names[row], objects)
             objects[number] = {'object_data': {'cuboid': [cuboid]}}
         properties: dict[str, Any] = {
             'timestamp': boxes.stamp_ns / 1e9,
@@ -115,53 +92,44 @@ class Writer:
         }
         if frame.T_fixed_sensor is not None and frame.sensor_frame != frame.fixed_frame:
             self._frame_ids |= {frame.sensor_frame, frame.fixed_frame}
-            self._sensors[frame.sensor_frame] = frame.fixed_frame
-            properties['transforms'] = {
-                f'{frame.sensor_frame}_to_{frame.fixed_frame}': {
-                    'src': frame.sensor_frame,
-                    'dst': frame.fixed_frame,
-                    'transform_src_to_dst': {'matrix4x4': frame.T_fixed_sensor.ravel().tolist()},
-                }
-            }
+            self._parents[frame.sensor_frame] = frame.fixed_frame
+            properties['transforms'] = _transforms(frame, frame.T_fixed_sensor)
         content = to_json({'frame_properties': properties, 'objects': objects})
-        self._file.write(f'{"," if self._frames else ""}\n"{self._frames}": {content}')
+        separator = ',' if self._frames else ''
+        self._file.write(f'{separator}\n"{self._frames}": {content}')
         self._frames += 1
 
     def close(self) -> None:
-        """Write what is known only at the end, and close the file."""
-        rest = {
+        """Write objects, intervals and coordinate systems, and close the file."""
+        intervals = []
+        if self._frames:
+            intervals.append({'frame_start': 0, 'frame_end': self._frames - 1})
+        sections = {
             'objects': self._objects,
-            'frame_intervals': _intervals(self._frames),
+            'frame_intervals': intervals,
             'coordinate_systems': {
-                name: {
-                    'type': 'sensor_cs' if name in self._sensors else 'scene_cs',
-                    'parent': self._sensors.get(name, ''),
-                    'children': [k for k, parent in self._sensors.items() if parent == name],
-                }
-                for name in sorted(self._frame_ids)
+                name: self._coordinate_system(name) for name in sorted(self._frame_ids)
             },
         }
         self._file.write('\n}')
-        for name, value in rest.items():
-            self._file.write(f',\n"{name}": {to_json(value)}')
+        for name, section in sections.items():
+            self._file.write(f',\n"{name}": {to_json(section)}')
         self._file.write('\n}}\n')
         self._file.close()
 
-    def _number(self, track_id: str, class_name: str, taken: dict[int, Any]) -> int:
-        """Return the object's number, and note that it is in this frame."""
-        track = track_id, class_name  # the class is the object's: a track may have several
-        number = self._tracks.get(track) if track_id else None
-        if number is None or number in taken:
-            number = next(self._numbers)
-            if track_id:
-                self._tracks.setdefault(track, number)
-            intervals: list[dict[str, int]] = []
-            self._objects[number] = {
-                'name': track_id,
-                'type': class_name,
-                'frame_intervals': intervals,
-                'object_data_pointers': {'box': POINTER | {'frame_intervals': intervals}},
-            }
+    def _coordinate_system(self, name: str) -> dict[str, Any]:
+        return {
+            'type': 'sensor_cs' if name in self._parents else 'scene_cs',
+            'parent': self._parents.get(name, ''),
+            'children': [child for child, parent in self._parents.items() if parent == name],
+        }
+
+    def _number(self, track_id: str, class_name: str, in_frame: dict[int, Any]) -> int:
+        """Return the number of the object, and add the current frame to its intervals."""
+        track = (track_id, class_name)  # a track that changes its class is several objects
+        number = self._number_of_track.get(track) if track_id else None
+        if number is None or number in in_frame:
+            number = self._new_object(track_id, class_name)
         intervals = self._objects[number]['frame_intervals']
         if intervals and intervals[-1]['frame_end'] == self._frames - 1:
             intervals[-1]['frame_end'] = self._frames
@@ -169,17 +137,64 @@ class Writer:
             intervals.append({'frame_start': self._frames, 'frame_end': self._frames})
         return number
 
+    def _new_object(self, track_id: str, class_name: str) -> int:
+        """Add an object and return its number; the first of a track stands for the track."""
+        number = next(self._numbers)
+        if track_id:
+            self._number_of_track.setdefault((track_id, class_name), number)
+        intervals: list[dict[str, int]] = []
+        pointer = OBJECT_DATA_POINTER | {'frame_intervals': intervals}
+        self._objects[number] = {
+            'name': track_id,
+            'type': class_name,
+            'frame_intervals': intervals,
+            'object_data_pointers': {'box': pointer},
+        }
+        return number
 
-def _intervals(frames: int) -> list[dict[str, int]]:
-    return [{'frame_start': 0, 'frame_end': frames - 1}] if frames else []
+
+def _cuboids(refined: RefinedBoxes, is_valid: Mask) -> Iterator[dict[str, Any]]:
+    """Yield the valid boxes with their evidence as attributes."""
+    boxes = refined.boxes
+    position = boxes.boxes[:, X : Z + 1]
+    extent = boxes.boxes[:, LENGTH : HEIGHT + 1]
+    values = np.hstack([position, quaternions_of(boxes.boxes), extent])
+    covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS).tolist()
+    for i in np.flatnonzero(is_valid):
+        texts = {'status': refined.status[i], 'reason': refined.reasons[i]}
+        numbers: dict[str, float] = {'num_points': int(refined.num_points[i])}
+        if np.isfinite(boxes.scores[i]):
+            numbers['score'] = float(boxes.scores[i])
+        attributes = {
+            'text': [{'name': name, 'val': value} for name, value in texts.items()],
+            'num': [{'name': name, 'val': value} for name, value in numbers.items()],
+            'vec': [{'name': 'covariance', 'val': covariances[i]}],
+        }
+        yield {
+            'name': 'box',
+            'coordinate_system': boxes.frame_id,
+            'val': values[i].tolist(),
+            'attributes': attributes,
+        }
+
+
+def _transforms(frame: LabelFrame, T_fixed_sensor: Floats) -> dict[str, Any]:
+    """Return the pose of the sensor as the transform of a frame."""
+    return {
+        f'{frame.sensor_frame}_to_{frame.fixed_frame}': {
+            'src': frame.sensor_frame,
+            'dst': frame.fixed_frame,
+            'transform_src_to_dst': {'matrix4x4': T_fixed_sensor.ravel().tolist()},
+        }
+    }
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the cuboids of each frame and coordinate system.
 
-    The track is the object's uid, in our own files its name. Rotations of three values are
-    taken as roll, pitch and yaw about the axes of `structures`.
+    The track id is the uid of the object, in files written by `Writer` its name. Rotations of
+    three values are read as roll, pitch and yaw, as defined in `structures`.
 
     """
     if path.is_dir():
@@ -187,12 +202,12 @@ def read(path: Path) -> Iterator[LabelFrame]:
     content = from_json(path)
     try:
         label = content['openlabel']
-        is_ours = label.get('metadata', {}).get('annotator') == Provenance().tool
+        has_names = label.get('metadata', {}).get('annotator') == Provenance().tool
         objects = label.get('objects', {})
-        names = {uid: item['name'] if is_ours else uid for uid, item in objects.items()}
+        names = {uid: item['name'] if has_names else uid for uid, item in objects.items()}
         classes = {uid: str(item.get('type', '')) for uid, item in objects.items()}
         for _, frame in sorted(label.get('frames', {}).items(), key=lambda item: int(item[0])):
-            yield from _frames(frame, names, classes)
+            yield from _read_frame(frame, names, classes)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RecordingError(
             f'{path}: expected frames with stamps and cuboids as in ASAM OpenLABEL 1.0: '
@@ -200,24 +215,19 @@ def read(path: Path) -> Iterator[LabelFrame]:
         ) from None
 
 
-def _frames(
+def _read_frame(
     frame: dict[str, Any], names: dict[str, str], classes: dict[str, str]
 ) -> Iterator[LabelFrame]:
-    """Yield the content of one frame, a `LabelFrame` for each coordinate system."""
+    """Yield the content of one frame, one `LabelFrame` per coordinate system."""
     properties = frame['frame_properties']
     stamp_ns = properties.get('stamp_ns')
-    stamp_ns = round(float(properties['timestamp']) * 1e9) if stamp_ns is None else int(stamp_ns)
+    if stamp_ns is None:
+        stamp_ns = round(float(properties['timestamp']) * 1e9)
     transforms = list(properties.get('transforms', {}).values())
-    of_system: dict[str, list[tuple[str, dict[str, Any]]]] = {}
-    for uid, item in frame.get('objects', {}).items():
-        for cuboid in item.get('object_data', {}).get('cuboid', ()):
-            if cuboid['val'] is not None:
-                system = cuboid.get('coordinate_system', '')
-                of_system.setdefault(system, []).append((uid, cuboid))
-    for system, items in of_system.items():
+    for system, items in _cuboids_by_system(frame).items():
         attributes = [_attributes(cuboid) for _, cuboid in items]
         refined = refined_boxes(
-            stamp_ns,
+            int(stamp_ns),
             system,
             [names[uid] for uid, _ in items],
             [classes[uid] for uid, _ in items],
@@ -228,16 +238,30 @@ def _frames(
             [found.get('covariance') for found in attributes],
             [found.get('reason') for found in attributes],
         )
-        T_fixed_sensor, fixed, sensor = None, system, ''
-        for item in transforms:
-            if (
-                system in (item['src'], item['dst'])
-                and 'matrix4x4' in item['transform_src_to_dst']
-            ):
-                fixed, sensor = item['dst'], item['src']
-                matrix = item['transform_src_to_dst']['matrix4x4']
-                T_fixed_sensor = np.array(matrix, np.float64).reshape(4, 4)
-        yield LabelFrame(refined, fixed, sensor, T_fixed_sensor)
+        fixed_frame, sensor_frame, T_fixed_sensor = _pose(system, transforms)
+        yield LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor)
+
+
+def _cuboids_by_system(frame: dict[str, Any]) -> dict[str, list[tuple[str, dict[str, Any]]]]:
+    """Return pairs of object uid and cuboid by coordinate system; null values are skipped."""
+    found: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    for uid, item in frame.get('objects', {}).items():
+        for cuboid in item.get('object_data', {}).get('cuboid', ()):
+            if cuboid['val'] is not None:
+                system = cuboid.get('coordinate_system', '')
+                found.setdefault(system, []).append((uid, cuboid))
+    return found
+
+
+def _pose(system: str, transforms: list[dict[str, Any]]) -> tuple[str, str, Floats | None]:
+    """Return fixed frame, sensor frame and T_fixed_sensor of the transform of a system."""
+    found: tuple[str, str, Floats | None] = (system, '', None)
+    for item in transforms:
+        matrix = item['transform_src_to_dst'].get('matrix4x4')
+        if system in (item['src'], item['dst']) and matrix is not None:
+            T_fixed_sensor = np.array(matrix, np.float64).reshape(4, 4)
+            found = (item['dst'], item['src'], T_fixed_sensor)
+    return found
 
 
 def _attributes(cuboid: dict[str, Any]) -> dict[str, Any]:

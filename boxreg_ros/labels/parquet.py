@@ -1,9 +1,9 @@
 """
-Parquet: the columns of ``boxes.csv`` and what that has no room for.
+Parquet: the columns of ``boxes.csv`` and more.
 
-Beyond them the reason of kept boxes, the covariance (36 numbers, of x y z roll pitch yaw in the
-axes of the row's frame), and the pose ``T_fixed_sensor`` (16 numbers, row by row) with the names
-of its frames. Provenance is in the file's own metadata.
+Additional columns: the reason of kept boxes; the covariance (36 numbers, of x y z roll pitch yaw
+in the frame of the row); and the pose ``T_fixed_sensor`` (16 numbers, row by row) with the names
+of its frames. The provenance is in the metadata of the file.
 
 """
 
@@ -18,9 +18,10 @@ from typing import Any
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import COLUMNS
-from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.arrow import read_table, Table
-from boxreg_ros.labels.files import boxes_from, refined_boxes, to_json
+from boxreg_ros.labels.files import to_json
+from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import boxes_from_quaternions, finite_or_none, refined_boxes
 from boxreg_ros.structures import HEIGHT, LENGTH, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
@@ -35,23 +36,25 @@ FORMAT = Format(
     files='boxes.parquet',
     packages=('pyarrow',),
 )
-TEXTS, COUNTS = {'frame_id', 'track_id', 'class_name', 'status'}, {'stamp_ns', 'num_points'}
+TEXT_COLUMNS = ('frame_id', 'track_id', 'class_name', 'status')
+INTEGER_COLUMNS = ('stamp_ns', 'num_points')
 TYPES = {
-    name: 'string' if name in TEXTS else 'int64' if name in COUNTS else 'double'
-    for name in COLUMNS
-} | {
+    **dict.fromkeys(COLUMNS, 'double'),
+    **dict.fromkeys(TEXT_COLUMNS, 'string'),
+    **dict.fromkeys(INTEGER_COLUMNS, 'int64'),
     'reason': 'string',
     'covariance': 'double[]',
     'fixed_frame': 'string',
     'sensor_frame': 'string',
     'T_fixed_sensor': 'double[]',
 }
-EMPTY = {'string': '', 'int64': 0, 'double': np.nan}
-"""What stands for null."""
+"""Type of each column; the order is that of ``boxes.csv``, then the additional columns."""
+NULL_VALUES = {'string': '', 'int64': 0, 'double': np.nan}
+"""Values that replace null when reading, by type."""
 
 
 class Writer:
-    """Write boxes.parquet; what is not finite becomes null."""
+    """Write boxes.parquet; numbers that are not finite become null."""
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
@@ -59,21 +62,33 @@ class Writer:
 
     def write(self, frame: LabelFrame) -> None:
         """Add one row per box."""
-        refined, boxes = frame.refined, frame.refined.boxes
-        values = boxes.boxes
-        numbers = np.hstack([
-            boxes.scores[:, None], values[:, X : Z + 1],
-            quaternions_of(values), values[:, LENGTH : HEIGHT + 1],
-        ])  # fmt: skip
+        refined = frame.refined
+        boxes = refined.boxes
+        numbers = np.hstack(
+            [
+                boxes.scores[:, None],
+                boxes.boxes[:, X : Z + 1],
+                quaternions_of(boxes.boxes),
+                boxes.boxes[:, LENGTH : HEIGHT + 1],
+            ]
+        )
         T = frame.T_fixed_sensor
-        pose = (frame.fixed_frame, frame.sensor_frame, None if T is None else T.ravel().tolist())
+        pose = None if T is None else T.ravel().tolist()
         for i, row in enumerate(numbers.tolist()):
             self._table.add(
-                boxes.stamp_ns, boxes.frame_id, boxes.track_ids[i], boxes.class_names[i],
-                *(value if np.isfinite(value) else None for value in row),
-                refined.status[i], int(refined.num_points[i]), refined.reasons[i],
-                refined.covariances[i].ravel().tolist(), *pose,
-            )  # fmt: skip
+                boxes.stamp_ns,
+                boxes.frame_id,
+                boxes.track_ids[i],
+                boxes.class_names[i],
+                *map(finite_or_none, row),
+                refined.status[i],
+                int(refined.num_points[i]),
+                refined.reasons[i],
+                refined.covariances[i].ravel().tolist(),
+                frame.fixed_frame,
+                frame.sensor_frame,
+                pose,
+            )
 
     def close(self) -> None:
         """Complete the file."""
@@ -81,20 +96,21 @@ class Writer:
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
-    """Yield the boxes of each stamp and frame; only the columns of boxes.csv have to be there."""
+    """Yield the boxes of each stamp and frame; only the columns of boxes.csv are required."""
     if path.is_dir():
         path = path / 'boxes.parquet'
     rows = _rows(path)
     rows.sort(key=lambda row: row['stamp_ns'])
-    for (stamp_ns, frame_id), part in groupby(rows, lambda r: (r['stamp_ns'], r['frame_id'])):
-        items = list(part)
+    for (stamp_ns, frame_id), group in groupby(rows, lambda r: (r['stamp_ns'], r['frame_id'])):
+        items = list(group)
+        # score, x y z, qx qy qz qw, length width height
         numbers = np.array([[item[name] for name in COLUMNS[4:15]] for item in items], np.float64)
         refined = refined_boxes(
             stamp_ns,
             frame_id,
             [item['track_id'] for item in items],
             [item['class_name'] for item in items],
-            boxes_from(numbers[:, 1:4], numbers[:, 8:], numbers[:, 4:8]),
+            boxes_from_quaternions(numbers[:, 1:4], numbers[:, 8:], numbers[:, 4:8]),
             numbers[:, 0],
             [item['status'] for item in items],
             [item['num_points'] for item in items],
@@ -112,37 +128,44 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
 def _rows(path: Path) -> list[dict[str, Any]]:
     """
-    Return the rows of a file, whatever types whoever wrote it gave the columns.
+    Return the rows of a file, with columns converted to `TYPES`.
 
-    Texts may be numbers (of pandas, ids are) and timestamps of any unit stand for their
-    nanoseconds; where there is none, a text is '' and a count 0.
+    Other writers use other types: pandas stores ids as numbers, and stamps may be timestamps of
+    any unit. Null becomes '' in text and 0 in integers.
 
     """
-    from pyarrow import ArrowException, timestamp, types
+    from pyarrow import ArrowException
 
     table = read_table(path)
     missing = [name for name in COLUMNS if name not in table.column_names]
     if missing:
         raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
     for i, name in enumerate(table.column_names):
-        column, kind = table[name], TYPES.get(name)
-        if kind not in EMPTY:
+        kind = TYPES.get(name)
+        if kind not in NULL_VALUES:
             continue
+        column = table[name]
         try:
             if name == 'stamp_ns':
-                is_timestamp = types.is_timestamp(column.type)
-                if not (is_timestamp or types.is_integer(column.type)) or column.null_count:
-                    raise RecordingError(
-                        f'{path}: column stamp_ns: expected whole nanoseconds (int64) in every '
-                        f'row, got {column.type}, {column.null_count} of {len(column)} empty; '
-                        f'write them as integers'
-                    )
-                if is_timestamp:
-                    column = column.cast(timestamp('ns', column.type.tz))
-            column = column.cast(kind).fill_null(EMPTY[kind])
+                column = _stamps(path, column)
+            column = column.cast(kind).fill_null(NULL_VALUES[kind])
         except ArrowException as error:
             raise RecordingError(
                 f'{path}: column {name}: expected {kind}, got {column.type}: {error}'
             ) from None
         table = table.set_column(i, name, column)
     return list(table.to_pylist())
+
+
+def _stamps(path: Path, column: Any) -> Any:
+    """Return a column of integers or timestamps as integers or nanoseconds, without null."""
+    from pyarrow import timestamp, types
+
+    is_timestamp = types.is_timestamp(column.type)
+    is_number = is_timestamp or types.is_integer(column.type)
+    if not is_number or column.null_count:
+        raise RecordingError(
+            f'{path}: column stamp_ns: expected whole nanoseconds (int64) in every row, got '
+            f'{column.type}, {column.null_count} of {len(column)} empty; write them as integers'
+        )
+    return column.cast(timestamp('ns', column.type.tz)) if is_timestamp else column

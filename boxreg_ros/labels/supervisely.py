@@ -1,33 +1,35 @@
 """
 Supervisely: a project of point cloud episodes.
 
-In it, ``episode/annotation.json`` has frames and objects, and ``episode/pointcloud`` the clouds.
+``episode/annotation.json`` holds frames and objects, ``episode/pointcloud`` the clouds.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.cuboids import (
-    box_of,
+    box_from_cuboid,
+    Cuboid,
     cuboids_of,
+    EVIDENCE_KEY,
     FrameNames,
-    frames_in,
-    numbers,
-    OURS,
-    part_of,
+    from_xyz,
+    read_frames,
+    ReadCuboid,
+    single_part,
     write_points,
 )
-from boxreg_ros.labels.files import from_json, Timeline, to_json
-from boxreg_ros.structures import Floats
+from boxreg_ros.labels.files import from_json, to_json
+from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.sidecar import SidecarWriter
 
 FORMAT = Format(
     name='supervisely',
@@ -39,24 +41,28 @@ FORMAT = Format(
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
     options=('with_points',),
 )
-EPISODE, CUBOID = 'episode', 'cuboid_3d'
+EPISODE_FOLDER = 'episode'
+CUBOID = 'cuboid_3d'
 TAGS = ('track_id', 'status')
 
 
 class Writer:
     """
-    Write frames as they come, and objects with their tags at the end.
+    Write one record per frame, and the objects with their tags when closed.
 
-    An object has its track id as a tag, and its status as tags over ranges of frames. One whose
-    track is in a frame twice has two figures there; one without a track id is in one frame.
+    An object has its track id as a tag, and its status as tags over ranges of frames. A track
+    that occurs twice in a frame has two figures there. A box without a track id is an object of
+    one frame.
 
     """
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
-        self._folder, self._episode = folder, folder / EPISODE
+        self._folder = folder
+        self._episode = folder / EPISODE_FOLDER
         self._with_points = options.with_points
-        self._names, self._timeline = FrameNames(), Timeline(folder, provenance)
+        self._names = FrameNames()
+        self._sidecar = SidecarWriter(folder, provenance)
         (self._episode / 'pointcloud').mkdir(parents=True)
         self._file = (self._episode / 'annotation.json').open('w', encoding='utf-8')
         head = {'description': to_json(asdict(provenance)), 'key': _key('episode'), 'tags': []}
@@ -69,70 +75,46 @@ class Writer:
         number = len(self._frames)
         name = self._names.of(frame.refined.boxes.stamp_ns)
         figures = []
-        for c in cuboids_of(frame, self.dropped):
-            alone = '' if c.track_id else f'{number}/{c.row}'
-            key = _key(f'object/{c.class_name}/{c.track_id}/{alone}')
-            self._note(key, c.track_id, c.class_name, c.evidence['status'], number)
-            figures.append(
-                {
-                    'key': _key(f'figure/{number}/{c.row}'),
-                    'objectKey': key,
-                    'geometryType': CUBOID,
-                    'geometry': {
-                        'position': c.position,
-                        'rotation': c.angles,
-                        'dimensions': c.extent,
-                    },
-                    OURS: c.evidence,
-                }
-            )
+        for cuboid in cuboids_of(frame, self.dropped):
+            object_key = self._add_to_object(cuboid, number)
+            figures.append(_figure(cuboid, number, object_key))
         content = to_json({'index': number, 'figures': figures})
-        self._file.write(f'{"," if number else ""}\n{content}')
+        separator = ',' if number else ''
+        self._file.write(f'{separator}\n{content}')
         self._frames.append(f'{name}.pcd')
         if self._with_points:
             write_points(frame, self._episode / 'pointcloud' / f'{name}.pcd')
-        self._timeline.add(frame)
+        self._sidecar.add(frame)
 
     def close(self) -> None:
-        """Write what is known only at the end."""
+        """Write the objects and the files of the project."""
         objects = to_json(list(self._objects.values()))
         count = len(self._frames)
         self._file.write(f'\n],\n"objects": {objects},\n"framesCount": {count}}}\n')
         self._file.close()
         classes = dict.fromkeys(item['classTitle'] for item in self._objects.values())
-        meta = {
-            'classes': [
-                {'title': title, 'shape': CUBOID, 'color': _colour(title), 'geometry_config': {}}
-                for title in classes
-            ],
-            'tags': [
-                {'name': name, 'value_type': 'any_string', 'color': _colour(name)} for name in TAGS
-            ],
-            'projectType': 'point_cloud_episodes',
-        }
-        _dump(self._folder / 'meta.json', meta)
+        _dump(self._folder / 'meta.json', _meta(classes))
         ids: dict[str, Any] = {kind: {} for kind in ('tags', 'objects', 'figures', 'videos')}
         _dump(self._folder / 'key_id_map.json', ids)
         _dump(self._episode / 'frame_pointcloud_map.json', dict(enumerate(self._frames)))
-        self._timeline.close()
+        self._sidecar.close()
 
-    def _note(self, key: str, track_id: str, class_name: str, status: str, number: int) -> None:
-        """Remember an object, and its status in this frame."""
-        item = self._objects.setdefault(
-            key,
-            {
-                'key': key,
-                'classTitle': class_name,
-                'tags': [{'key': _key(f'{key}/track'), 'name': 'track_id', 'value': track_id}],
-            },
-        )
-        last = item['tags'][-1]
+    def _add_to_object(self, cuboid: Cuboid, number: int) -> str:
+        """Return the key of the object of a cuboid; add its status in frame `number`."""
+        suffix = '' if cuboid.track_id else f'{number}/{cuboid.row}'
+        key = _key(f'object/{cuboid.class_name}/{cuboid.track_id}/{suffix}')
+        if key not in self._objects:
+            tag = {'key': _key(f'{key}/track'), 'name': 'track_id', 'value': cuboid.track_id}
+            self._objects[key] = {'key': key, 'classTitle': cuboid.class_name, 'tags': [tag]}
+        tags = self._objects[key]['tags']
+        status = cuboid.evidence['status']
+        last = tags[-1]
         if last['name'] == 'status' and last['value'] == status:
             if last['frameRange'][1] == number - 1:
                 last['frameRange'][1] = number
             if last['frameRange'][1] == number:
-                return
-        item['tags'].append(
+                return key
+        tags.append(
             {
                 'key': _key(f'{key}/{number}/{status}'),
                 'name': 'status',
@@ -140,54 +122,81 @@ class Writer:
                 'frameRange': [number, number],
             }
         )
+        return key
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the frames of an episode, or of a project's only one.
+    Yield the frames of an episode, or of the only episode of a project.
 
-    ``timestamps.txt`` in the episode or in the project has a stamp [ns] per frame.
+    ``timestamps.txt`` in the episode or in the project has one stamp [ns] per frame.
 
     Raises
     ------
     RecordingError
-        If a file is missing or does not hold cuboids of Supervisely, or there are several
+        If a file is missing or does not contain cuboids of Supervisely, or there are several
         episodes.
 
     """
-    episode, folder = part_of(path, 'episode', ['annotation.json'])
+    episode, folder = single_part(path, 'episode', ['annotation.json'])
     file = episode / 'annotation.json'
     content = from_json(file)
     clouds = from_json(file.with_name('frame_pointcloud_map.json'))
     try:
         objects = {item['key']: item for item in content['objects']}
         figures = {str(frame['index']): frame['figures'] for frame in content['frames']}
-        items = {
+        cuboids = {
             Path(cloud).stem: [
-                _item(figure, objects[figure['objectKey']])
+                _cuboid(figure, objects[figure['objectKey']])
                 for figure in figures.get(index, ())
                 if figure['geometryType'] == CUBOID
             ]
             for index, cloud in sorted(clouds.items(), key=lambda item: int(item[0]))
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RecordingError(
-            f'{file}: expected cuboids as Supervisely has them: {error!r}'
-        ) from None
-    yield from frames_in(folder, list(items), items.__getitem__)
+        raise RecordingError(f'{file}: expected cuboids of Supervisely: {error!r}') from None
+    yield from read_frames(folder, list(cuboids), cuboids.__getitem__)
 
 
-def _item(
-    figure: dict[str, Any], parent: dict[str, Any]
-) -> tuple[str, str, Floats, Mapping[str, Any]]:
+def _cuboid(figure: dict[str, Any], parent: dict[str, Any]) -> ReadCuboid:
+    """Return the cuboid of a figure; `parent` is its object."""
     tags = {tag['name']: tag.get('value') for tag in parent.get('tags', ())}
-    keys = ('position', 'rotation', 'dimensions')
-    return (
-        str(tags.get('track_id', parent['key'])),
-        parent['classTitle'],
-        box_of(*(numbers(figure['geometry'][key]) for key in keys)),
-        figure.get(OURS, {}),
+    geometry = figure['geometry']
+    box = box_from_cuboid(
+        from_xyz(geometry['position']),
+        from_xyz(geometry['rotation']),
+        from_xyz(geometry['dimensions']),
     )
+    track_id = str(tags.get('track_id', parent['key']))
+    return ReadCuboid(track_id, parent['classTitle'], box, figure.get(EVIDENCE_KEY, {}))
+
+
+def _figure(cuboid: Cuboid, number: int, object_key: str) -> dict[str, Any]:
+    return {
+        'key': _key(f'figure/{number}/{cuboid.row}'),
+        'objectKey': object_key,
+        'geometryType': CUBOID,
+        'geometry': {
+            'position': cuboid.position,
+            'rotation': cuboid.angles,
+            'dimensions': cuboid.extent,
+        },
+        EVIDENCE_KEY: cuboid.evidence,
+    }
+
+
+def _meta(classes: Iterable[str]) -> dict[str, Any]:
+    """Return the content of ``meta.json``: classes and tags of the project."""
+    return {
+        'classes': [
+            {'title': title, 'shape': CUBOID, 'color': _colour(title), 'geometry_config': {}}
+            for title in classes
+        ],
+        'tags': [
+            {'name': name, 'value_type': 'any_string', 'color': _colour(name)} for name in TAGS
+        ],
+        'projectType': 'point_cloud_episodes',
+    }
 
 
 def _key(text: str) -> str:
@@ -196,6 +205,7 @@ def _key(text: str) -> str:
 
 
 def _colour(text: str) -> str:
+    """Return a colour that is the same in every run, as hexadecimal RGB."""
     return '#' + _key(text)[:6].upper()
 
 

@@ -1,4 +1,4 @@
-"""T4, the data set format of TIER IV: nuScenes with other names of folders and channel."""
+"""T4, the data set format of TIER IV: nuScenes with other folder and channel names."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ FORMAT = replace(
 
 
 class Writer(nuscenes.Writer):
-    """Write the tables where T4 has them."""
+    """Write the tables of nuScenes under the names of T4."""
 
-    version, channel, clouds = 'annotation', 'LIDAR_CONCAT', 'data/LIDAR_CONCAT'
-    captured = 'data_captured'
+    version = 'annotation'
+    channel = 'LIDAR_CONCAT'
+    clouds = 'data/LIDAR_CONCAT'
+    date_key = 'data_captured'

@@ -1,10 +1,10 @@
 """
-KITTI raw: ``tracklet_labels.xml``, a tracklet per unbroken run of a track in one class.
+KITTI raw: ``tracklet_labels.xml``, one tracklet per gapless sequence of a track in one class.
 
-A tracklet has one extent: the median of the track's. Its poses are of the centre of the bottom
-face, in the LiDAR's frame, by the number of their frame. What KITTI calls length lies along the
-box's x. Datumaro and CVAT differ: they look for the extents along x, y and z under ``w``, ``h``
-and ``l``, and take the position for the centre; ``--swap-axes`` writes it so.
+A tracklet has one extent, the median over its boxes, and one pose per frame: the centre of the
+bottom face in the LiDAR frame. ``l`` is the extent along x of the box. Datumaro and CVAT differ:
+they read the extents along x, y and z from ``h``, ``w`` and ``l`` and the position as the centre;
+``--swap-axes`` writes files for them.
 
 """
 
@@ -17,14 +17,16 @@ from pathlib import Path
 import re
 import shutil
 from tempfile import TemporaryFile
-from typing import cast
+from typing import cast, NamedTuple
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape, unescape
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import read_timeline, refined_boxes, Timeline, to_json
+from boxreg_ros.labels.files import to_json
+from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import refined_boxes
+from boxreg_ros.labels.sidecar import read_sidecar, SidecarWriter
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     Floats,
@@ -49,14 +51,15 @@ FORMAT = Format(
     options=('with_points', 'swap_axes'),
 )
 FILE = 'tracklet_labels.xml'
-POSE = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz')
-EXTENTS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
-"""Where length, width and height are written, as KITTI has it and as Datumaro reads it."""
-SWAPPED, TRACK = 'axes swapped', 'track '
-HYPHEN = '&#45;'
-"""What a hyphen is in a comment where XML does not take it: beside another, or at the end."""
-UNFIT = re.compile('[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
-"""Characters that XML does not take, or not as they are (carriage returns)."""
+POSE_TAGS = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz')
+EXTENT_TAGS = {False: ('l', 'w', 'h'), True: ('h', 'w', 'l')}
+"""Tags of length, width and height by `Options.swap_axes`."""
+SWAPPED_COMMENT = 'axes swapped'
+TRACK_COMMENT = 'track '
+ESCAPED_HYPHEN = '&#45;'
+"""Replaces a hyphen in a comment where XML forbids it: beside another, or at the end."""
+INVALID_CHARACTERS = re.compile('[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
+"""Characters that XML forbids, or changes (carriage returns)."""
 HEAD = """\
 <?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
 <!DOCTYPE boost_serialization>
@@ -70,11 +73,12 @@ CLASS_IDS = tuple(
     f' class_id="{i}" tracking_level="0" version="{version}"'
     for i, version in ((1, 1), (2, 0), (3, 2))
 )
-"""What boost wants to read at the first of each kind: tracklet, poses, pose."""
+"""Attributes that boost requires at the first tracklet, poses and pose."""
 TAIL = '</tracklets>\n</boost_serialization>\n'
-INTERPOLATED_STATE, LABELLED_STATE = 1, 2
+INTERPOLATED_STATE = 1
+LABELLED_STATE = 2
 UNKNOWN_TRUNCATION = {False: '99', True: '-1'}
-"""What stands for unknown in files of KITTI, and what Datumaro takes for it."""
+"""Unknown truncation by `Options.swap_axes`: of KITTI and of Datumaro."""
 FLAGS = """\
 <occlusion>-1</occlusion><occlusion_kf>0</occlusion_kf><truncation>{unknown}</truncation>\
 <amt_occlusion>-1</amt_occlusion><amt_occlusion_kf>-1</amt_occlusion_kf>\
@@ -82,18 +86,18 @@ FLAGS = """\
 
 
 @dataclass(slots=True)
-class _Run:
-    """An unbroken run of a track."""
+class _Tracklet:
+    """A gapless sequence of boxes (9,) of a track, from frame `first_frame` on."""
 
     track_id: str
     class_name: str
-    first: int
+    first_frame: int
     boxes: list[Floats] = field(default_factory=list)
     states: list[int] = field(default_factory=list)
 
 
 class Writer:
-    """Hold the tracks that are seen, and write a tracklet as soon as its track is not."""
+    """Hold the tracklets of the current frame, and write each when its track is interrupted."""
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
@@ -101,84 +105,100 @@ class Writer:
         self._clouds = folder / 'velodyne_points' / 'data'
         if options.with_points:
             self._clouds.mkdir(parents=True)
-        self._swap = options.swap_axes
-        self._origin = asdict(provenance) | ({'axes': SWAPPED} if self._swap else {})
-        # The number of tracklets comes before them: they wait in a file of their own.
+        self._is_swapped = options.swap_axes
+        self._provenance = asdict(provenance)
+        if self._is_swapped:
+            self._provenance['axes'] = SWAPPED_COMMENT
+        # The file begins with the number of tracklets: they are collected in another file first.
         self._body = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
-        self._timeline = Timeline(folder, provenance)
-        self._runs: dict[tuple[str, str], _Run] = {}
-        self._count = self._frames = 0
+        self._sidecar = SidecarWriter(folder, provenance)
+        self._open: dict[tuple[str, str], _Tracklet] = {}
+        self._count = 0
+        self._frames = 0
 
     def write(self, frame: LabelFrame) -> None:
-        """Add a pose to each track that is seen, and write those that are not."""
-        rows, boxes = frame.placed('sensor', self.dropped)
-        given = frame.refined.boxes
-        runs: dict[tuple[str, str], _Run] = {}
+        """Add a pose to the tracklets of this frame, and write those that have ended."""
+        rows, boxes = frame.boxes_in('sensor', self.dropped)
+        array = frame.refined.boxes
+        continued: dict[tuple[str, str], _Tracklet] = {}
         for row, box in zip(rows, boxes, strict=True):
-            name, class_name = given.track_ids[row], given.class_names[row]
-            run = _Run(name, class_name, self._frames)
-            key = name, class_name
-            if not name or key in runs:  # without an identity: a run of its own
-                key = f'\0{row}', ''
+            track_id = array.track_ids[row]
+            class_name = array.class_names[row]
+            tracklet = _Tracklet(track_id, class_name, self._frames)
+            key = (track_id, class_name)
+            if not track_id or key in continued:  # no identity: a tracklet of one frame
+                key = (f'\0{row}', '')
             else:
-                run = self._runs.pop(key, run)
-            runs[key] = run
-            is_guess = frame.refined.status[row] == INTERPOLATED
-            run.boxes.append(box)
-            run.states.append(INTERPOLATED_STATE if is_guess else LABELLED_STATE)
-        for run in self._runs.values():
-            self._write(run)
-        self._runs = runs
+                tracklet = self._open.pop(key, tracklet)
+            continued[key] = tracklet
+            is_interpolated = frame.refined.status[row] == INTERPOLATED
+            tracklet.boxes.append(box)
+            tracklet.states.append(INTERPOLATED_STATE if is_interpolated else LABELLED_STATE)
+        for tracklet in self._open.values():
+            self._write(tracklet)
+        self._open = continued
         if frame.sweep is not None:
-            write_cloud(
-                self._clouds / f'{self._frames:010d}.bin', frame.sweep.points, frame.intensities
-            )
-        self._timeline.add(frame)
+            path = self._clouds / f'{self._frames:010d}.bin'
+            write_cloud(path, frame.sweep.points, frame.intensities)
+        self._sidecar.add(frame)
         self._frames += 1
 
     def close(self) -> None:
-        """Write the tracks that are left, and put all together."""
-        for run in self._runs.values():
-            self._write(run)
+        """Write the open tracklets, and assemble the file."""
+        for tracklet in self._open.values():
+            self._write(tracklet)
         self._body.seek(0)
         with self._path.open('w', encoding='utf-8') as file:
-            file.write(HEAD.format(origin=_comment(to_json(self._origin)), count=self._count))
+            origin = _comment(to_json(self._provenance))
+            file.write(HEAD.format(origin=origin, count=self._count))
             shutil.copyfileobj(self._body, file)
             file.write(TAIL)
         self._body.close()
-        self._timeline.close()
+        self._sidecar.close()
 
-    def _write(self, run: _Run) -> None:
-        boxes = np.array(run.boxes)
+    def _write(self, tracklet: _Tracklet) -> None:
+        boxes = np.array(tracklet.boxes)
         extent = np.median(boxes[:, LENGTH : HEIGHT + 1], axis=0)
-        sizes = dict(zip(EXTENTS[self._swap], extent.tolist(), strict=True))
-        down = 0.0 if self._swap else -extent[2] / 2
-        poses = np.hstack([_shifted(boxes, down), boxes[:, ROLL : YAW + 1]])
-        names = UNFIT.sub('\N{REPLACEMENT CHARACTER}', ' '.join(run.class_name.split())) or 'Misc'
-        flags = FLAGS.format(unknown=UNKNOWN_TRUNCATION[self._swap])
-        item, poses_item, pose_item = CLASS_IDS if self._count == 0 else ('', '', '')
+        sizes = dict(zip(EXTENT_TAGS[self._is_swapped], extent.tolist(), strict=True))
+        shift = 0.0 if self._is_swapped else -extent[2] / 2
+        poses = np.hstack([_shifted_centres(boxes, shift), boxes[:, ROLL : YAW + 1]])
+        class_name = ' '.join(tracklet.class_name.split())
+        class_name = INVALID_CHARACTERS.sub('\N{REPLACEMENT CHARACTER}', class_name) or 'Misc'
+        flags = FLAGS.format(unknown=UNKNOWN_TRUNCATION[self._is_swapped])
+        item_id, poses_id, pose_id = CLASS_IDS if self._count == 0 else ('', '', '')
         lines = [
-            f'<item{item}>',
-            f'<!--{_comment(TRACK + run.track_id)}-->',
-            f'<objectType>{escape(names)}</objectType>',
-            ''.join(f'<{name}>{sizes[name]!r}</{name}>' for name in 'hwl'),
-            f'<first_frame>{run.first}</first_frame>',
-            f'<poses{poses_item}>',
+            f'<item{item_id}>',
+            f'<!--{_comment(TRACK_COMMENT + tracklet.track_id)}-->',
+            f'<objectType>{escape(class_name)}</objectType>',
+            ''.join(f'<{tag}>{sizes[tag]!r}</{tag}>' for tag in 'hwl'),
+            f'<first_frame>{tracklet.first_frame}</first_frame>',
+            f'<poses{poses_id}>',
             f'<count>{len(poses)}</count>\n<item_version>2</item_version>',
         ]
-        for pose, state in zip(poses.tolist(), run.states, strict=True):
-            values = ''.join(f'<{k}>{v!r}</{k}>' for k, v in zip(POSE, pose, strict=True))
-            lines.append(f'<item{pose_item}>{values}<state>{state}</state>{flags}</item>')
-            pose_item = ''
-        self._body.write('\n'.join([*lines, '</poses>\n<finished>1</finished>\n</item>\n']))
+        for pose, state in zip(poses.tolist(), tracklet.states, strict=True):
+            tagged = zip(POSE_TAGS, pose, strict=True)
+            values = ''.join(f'<{tag}>{value!r}</{tag}>' for tag, value in tagged)
+            lines.append(f'<item{pose_id}>{values}<state>{state}</state>{flags}</item>')
+            pose_id = ''
+        lines.append('</poses>\n<finished>1</finished>\n</item>\n')
+        self._body.write('\n'.join(lines))
         self._count += 1
+
+
+class _ReadBox(NamedTuple):
+    """A box (9,) of a tracklet in the sensor frame."""
+
+    track_id: str
+    class_name: str
+    box: Floats
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the frames of a tracklet file; its stamps as `Timeline` or KITTI's raw drives have them.
+    Yield the frames of a tracklet file; its stamps are those of `sidecar` or of KITTI raw.
 
-    Tracks are named as our own writer left it in comments, else by the number of the tracklet.
+    The track id is in a comment of files written by `Writer`, else it is the number of the
+    tracklet.
 
     """
     if path.is_dir():
@@ -187,65 +207,80 @@ def read(path: Path) -> Iterator[LabelFrame]:
         builder = ElementTree.TreeBuilder(insert_comments=True)
         tree = ElementTree.parse(path, ElementTree.XMLParser(target=builder))
         text = path.read_text(encoding='utf-8')
-        is_swapped = SWAPPED in text[: text.find('<boost_serialization')]
-        of_frame: dict[int, list[tuple[str, str, Floats]]] = {}
-        for number, item in enumerate(tree.getroot().findall('tracklets/item')):
-            comments = [str(e.text) for e in item if _is_comment(e)]
-            named = [text for text in comments if text.startswith(TRACK)]
-            name = _uncomment(named[0].removeprefix(TRACK)) if named else str(number)
-            extent = [_number(item, key) for key in EXTENTS[is_swapped]]
-            first = int(_number(item, 'first_frame'))
-            for index, pose in enumerate(item.findall('poses/item'), first):
-                values = [_number(pose, key) for key in POSE]
-                box = np.array([*values[:3], *extent, *values[3:]])
-                if not is_swapped:
-                    box[X : Z + 1] = _shifted(box[None], extent[2] / 2)[0]
-                kind = (item.findtext('objectType') or '').strip()
-                of_frame.setdefault(index, []).append((name, kind, box))
+        is_swapped = SWAPPED_COMMENT in text[: text.find('<boost_serialization')]
+        boxes_by_frame = _boxes_by_frame(tree.getroot(), is_swapped)
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     except (ElementTree.ParseError, ValueError) as error:
         raise RecordingError(f'{path}: expected tracklets of KITTI: {error}') from None
-    raw = path.parent / 'velodyne_points' / 'timestamps.txt'
-    count = 1 + max(of_frame, default=-1)
-    timeline = read_timeline(path.parent, count, raw if raw.exists() else None)
-    for index, stamp_ns in enumerate(timeline.stamps_ns):
-        part = of_frame.get(index, [])
+    raw_stamps = path.parent / 'velodyne_points' / 'timestamps.txt'
+    count = 1 + max(boxes_by_frame, default=-1)
+    sidecar = read_sidecar(path.parent, count, raw_stamps if raw_stamps.exists() else None)
+    for index, stamp_ns in enumerate(sidecar.stamps_ns):
+        boxes = boxes_by_frame.get(index, [])
         refined = refined_boxes(
             stamp_ns,
-            timeline.sensor_frame,
-            [name for name, _, _ in part],
-            [kind for _, kind, _ in part],
-            [box for _, _, box in part],
+            sidecar.sensor_frame,
+            [item.track_id for item in boxes],
+            [item.class_name for item in boxes],
+            [item.box for item in boxes],
         )
-        yield timeline.frame(index, refined)
+        yield sidecar.frame(index, refined)
+
+
+def _boxes_by_frame(root: ElementTree.Element, is_swapped: bool) -> dict[int, list[_ReadBox]]:
+    """Return the boxes of all tracklets by the index of their frame."""
+    boxes_by_frame: dict[int, list[_ReadBox]] = {}
+    for number, item in enumerate(root.findall('tracklets/item')):
+        track_id = _track_id(item, str(number))
+        class_name = (item.findtext('objectType') or '').strip()
+        extent = [_number(item, tag) for tag in EXTENT_TAGS[is_swapped]]
+        first_frame = int(_number(item, 'first_frame'))
+        for index, pose in enumerate(item.findall('poses/item'), first_frame):
+            values = [_number(pose, tag) for tag in POSE_TAGS]
+            box = np.array([*values[:3], *extent, *values[3:]])
+            if not is_swapped:
+                box[X : Z + 1] = _shifted_centres(box[None], extent[2] / 2)[0]
+            boxes_by_frame.setdefault(index, []).append(_ReadBox(track_id, class_name, box))
+    return boxes_by_frame
+
+
+def _track_id(item: ElementTree.Element, default: str) -> str:
+    """Return the track id in the comment of a tracklet, or the default."""
+    for element in item:
+        text = str(element.text)
+        if _is_comment(element) and text.startswith(TRACK_COMMENT):
+            return _uncomment(text.removeprefix(TRACK_COMMENT))
+    return default
 
 
 def _is_comment(element: ElementTree.Element) -> bool:
-    # Its tag is the function that makes comments, though annotated as text.
+    # The tag of a comment is the function `Comment`, though it is annotated as text.
     return cast(object, element.tag) is ElementTree.Comment
 
 
-def _shifted(boxes: Floats, shift: float) -> Floats:
-    """Return centres (n, 3), moved along the boxes' own z."""
-    turned = matrix_from_rpy(boxes[:, ROLL:])
-    return boxes[:, X : Z + 1] + shift * turned[:, :, 2]
+def _shifted_centres(boxes: Floats, shift: float) -> Floats:
+    """Return the centres (n, 3) of boxes (n, 9), moved along z of the box by `shift` [m]."""
+    R = matrix_from_rpy(boxes[:, ROLL:])
+    return boxes[:, X : Z + 1] + shift * R[:, :, 2]
 
 
-def _number(item: ElementTree.Element, name: str) -> float:
-    text = item.findtext(name)
+def _number(item: ElementTree.Element, tag: str) -> float:
+    text = item.findtext(tag)
     if text is None:
-        raise ValueError(f'<{item.tag}> lacks <{name}>')
+        raise ValueError(f'<{item.tag}> lacks <{tag}>')
     return float(text)
 
 
 def _comment(text: str) -> str:
-    """Return text as may stand in a comment of XML; `_uncomment` returns it."""
-    text = UNFIT.sub(lambda found: f'&#{ord(found[0])};', escape(text))
-    text = text.replace('--', f'-{HYPHEN}')
-    return text.removesuffix('-') + HYPHEN if text.endswith('-') else text
+    """Return text escaped for a comment of XML; `_uncomment` is the inverse."""
+    text = INVALID_CHARACTERS.sub(lambda found: f'&#{ord(found[0])};', escape(text))
+    text = text.replace('--', f'-{ESCAPED_HYPHEN}')
+    if text.endswith('-'):
+        text = text.removesuffix('-') + ESCAPED_HYPHEN
+    return text
 
 
 def _uncomment(text: str) -> str:
-    """Return what `_comment` was given."""
+    """Return the text that `_comment` has escaped."""
     return unescape(re.sub('&#([0-9]{1,7});', lambda found: chr(int(found[1])), text))

@@ -1,8 +1,8 @@
 """
 Waymo: the tables ``lidar_box`` and ``vehicle_pose`` of the perception data set, version 2.
 
-The sensor's frame stands for the vehicle's; ``--label-frame`` takes another. What the tables have
-no column for stands in columns of our own.
+The sensor frame is written as the vehicle frame; ``--label-frame`` chooses another frame. Values
+without a column in the tables are in additional columns named ``boxreg``.
 
 """
 
@@ -17,9 +17,11 @@ from pathlib import Path
 
 from boxreg_ros.config import Config, words_of
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels import absolute, Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.arrow import read_rows, Table
-from boxreg_ros.labels.files import frame_names, refined_boxes, the_one, to_json, write_origin
+from boxreg_ros.labels.files import frame_names, require_single, to_json, write_provenance
+from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.records import finite_or_none, refined_boxes
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import HEIGHT, LENGTH, X, YAW, Z
 import numpy as np
 
@@ -33,20 +35,22 @@ FORMAT = Format(
     files='lidar_box/, vehicle_pose/',
     packages=('pyarrow',),
 )
-SEGMENT, MICROS = 'key.segment_context_name', 'key.frame_timestamp_micros'
+SEGMENT = 'key.segment_context_name'
+MICROSECONDS = 'key.frame_timestamp_micros'
 OBJECT = 'key.laser_object_id'
 BOX = '[LiDARBoxComponent].'
 CENTER = [f'{BOX}box.center.{axis}' for axis in 'xyz']
 SIZE = [f'{BOX}box.size.{axis}' for axis in 'xyz']
-HEADING, TYPE = f'{BOX}box.heading', f'{BOX}type'
-COUNT = f'{BOX}num_lidar_points_in_box'
-UNKNOWN = {
+HEADING = f'{BOX}box.heading'
+TYPE = f'{BOX}type'
+NUM_POINTS = f'{BOX}num_lidar_points_in_box'
+UNUSED_COLUMNS = {
     f'{BOX}num_top_lidar_points_in_box': 'int64',
     **{f'{BOX}{name}.{axis}': 'double' for name in ('speed', 'acceleration') for axis in 'xyz'},
     **{f'{BOX}difficulty_level.{name}': 'int8' for name in ('detection', 'tracking')},
 }
-"""Columns that we have nothing for."""
-OURS = {
+"""Columns of the data set that are written as null."""
+EVIDENCE_COLUMNS = {
     'boxreg.stamp_ns': 'int64',
     'boxreg.class_name': 'string',
     'boxreg.status': 'string',
@@ -54,110 +58,129 @@ OURS = {
     'boxreg.score': 'double',
     'boxreg.covariance': 'double[]',
 }
-KEY = {SEGMENT: 'string', MICROS: 'int64'}
+KEY_COLUMNS = {SEGMENT: 'string', MICROSECONDS: 'int64'}
 COLUMNS = (
-    KEY
+    KEY_COLUMNS
     | {OBJECT: 'string'}
     | dict.fromkeys([*CENTER, *SIZE, HEADING], 'double')
-    | {TYPE: 'int8', COUNT: 'int64'}
-    | UNKNOWN
-    | OURS
+    | {TYPE: 'int8', NUM_POINTS: 'int64'}
+    | UNUSED_COLUMNS
+    | EVIDENCE_COLUMNS
 )
 POSE = '[VehiclePoseComponent].world_from_vehicle.transform'
 TYPES = ('', 'vehicle', 'pedestrian', 'sign', 'cyclist')
+"""Names of the values of the type column; '' is unknown."""
 
 
 class Writer:
-    """Write boxes and poses as they come, in batches."""
+    """Write boxes and poses in batches."""
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
         self._folder = folder
-        self._origin = asdict(provenance)
-        self._segment = Path(provenance.recordings[0]).stem if provenance.recordings else 'boxreg'
-        origin, file = to_json(self._origin), f'{self._segment}.parquet'
+        self._provenance = asdict(provenance)
+        self._segment = 'boxreg'
+        if provenance.recordings:
+            self._segment = Path(provenance.recordings[0]).stem
         for name in ('lidar_box', 'vehicle_pose'):
             (folder / name).mkdir()
-        self._boxes = Table(folder / 'lidar_box' / file, COLUMNS, origin)
-        self._poses = Table(folder / 'vehicle_pose' / file, KEY | {POSE: 'double[16]'})
+        file = f'{self._segment}.parquet'
+        self._boxes = Table(folder / 'lidar_box' / file, COLUMNS, to_json(self._provenance))
+        self._poses = Table(folder / 'vehicle_pose' / file, KEY_COLUMNS | {POSE: 'double[16]'})
 
     def write(self, frame: LabelFrame) -> None:
         """Add a row per box, and the pose."""
-        rows, boxes = frame.placed('sensor', self.dropped)
-        refined, given = frame.refined, frame.refined.boxes
-        key = (self._segment, round(given.stamp_ns / 1000))
+        rows, boxes = frame.boxes_in('sensor', self.dropped)
+        refined = frame.refined
+        array = refined.boxes
+        key = (self._segment, round(array.stamp_ns / 1000))
         for row, box in zip(rows, boxes.tolist(), strict=True):
-            score = float(given.scores[row])
-            heading = (box[YAW] + np.pi) % (2 * np.pi) - np.pi
             self._boxes.add(
-                *key, given.track_ids[row], *box[X : Z + 1], *box[LENGTH : HEIGHT + 1], heading,
-                _type(given.class_names[row]), int(refined.num_points[row]),
-                *[None] * len(UNKNOWN),
-                given.stamp_ns, given.class_names[row], refined.status[row], refined.reasons[row],
-                score if np.isfinite(score) else None, refined.covariances[row].ravel().tolist(),
-            )  # fmt: skip
+                *key,
+                array.track_ids[row],
+                *box[X : Z + 1],
+                *box[LENGTH : HEIGHT + 1],
+                float(wrap_angle(box[YAW])),
+                _type(array.class_names[row]),
+                int(refined.num_points[row]),
+                *[None] * len(UNUSED_COLUMNS),
+                array.stamp_ns,
+                array.class_names[row],
+                refined.status[row],
+                refined.reasons[row],
+                finite_or_none(array.scores[row]),
+                refined.covariances[row].ravel().tolist(),
+            )
         if frame.T_fixed_sensor is not None:
             self._poses.add(*key, frame.T_fixed_sensor.ravel().tolist())
-        self._origin |= {'fixed_frame': frame.fixed_frame, 'sensor_frame': frame.sensor_frame}
+        self._provenance['fixed_frame'] = frame.fixed_frame
+        self._provenance['sensor_frame'] = frame.sensor_frame
 
     def close(self) -> None:
         """Complete the files."""
         self._boxes.close()
         self._poses.close()
-        write_origin(self._folder, self._origin)
+        write_provenance(self._folder, self._provenance)
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
     """
     Yield the boxes of one segment: a file of ``lidar_box``, or the only one in a folder.
 
-    Stamps are whole microseconds unless our own column has them.
+    Stamps are whole microseconds, unless the column ``boxreg.stamp_ns`` has nanoseconds.
 
     """
     if path.is_dir():
         found = sorted((path / 'lidar_box').glob('*.parquet'))
-        path = the_one(found, path, 'segment, lidar_box/NAME.parquet')
+        path = require_single(found, path, 'segment, lidar_box/NAME.parquet')
     folder = absolute(path).parent.parent
     rows = read_rows(path)
-    missing = [name for name in COLUMNS if rows and name not in (*rows[0], *UNKNOWN, *OURS)]
+    optional = {*UNUSED_COLUMNS, *EVIDENCE_COLUMNS}
+    missing = [name for name in COLUMNS if rows and name not in {*rows[0], *optional}]
     if missing:
         raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
     pose_file = folder / 'vehicle_pose' / path.name
     poses = read_rows(pose_file) if pose_file.exists() else []
-    T_world_vehicle = {row[MICROS]: np.array(row[POSE]).reshape(4, 4) for row in poses}
-    fixed, sensor = frame_names(folder, 'world', 'vehicle')
-
-    def stamp(row: dict[str, int]) -> int:
-        return row.get('boxreg.stamp_ns') or row[MICROS] * 1000
-
-    for stamp_ns, part in groupby(sorted(rows, key=stamp), stamp):
-        items = list(part)
+    T_world_vehicle = {row[MICROSECONDS]: np.array(row[POSE]).reshape(4, 4) for row in poses}
+    fixed_frame, sensor_frame = frame_names(folder, 'world', 'vehicle')
+    rows.sort(key=_stamp_ns)
+    for stamp_ns, group in groupby(rows, _stamp_ns):
+        items = list(group)
         boxes = np.zeros((len(items), 9))
         boxes[:, : HEIGHT + 1] = [[item[name] for name in (*CENTER, *SIZE)] for item in items]
         boxes[:, YAW] = [item[HEADING] for item in items]
         refined = refined_boxes(
             stamp_ns,
-            sensor,
+            sensor_frame,
             [item[OBJECT] for item in items],
             [item.get('boxreg.class_name') or TYPES[item[TYPE]] for item in items],
             boxes,
             [item.get('boxreg.score') for item in items],
             [item.get('boxreg.status') for item in items],
-            [item[COUNT] for item in items],
+            [item[NUM_POINTS] for item in items],
             [item.get('boxreg.covariance') for item in items],
             [item.get('boxreg.reason') for item in items],
         )
-        yield LabelFrame(refined, fixed, sensor, T_world_vehicle.get(items[0][MICROS]))
+        T = T_world_vehicle.get(items[0][MICROSECONDS])
+        yield LabelFrame(refined, fixed_frame, sensor_frame, T)
+
+
+def _stamp_ns(row: dict[str, int]) -> int:
+    return row.get('boxreg.stamp_ns') or row[MICROSECONDS] * 1000
 
 
 @lru_cache
 def _type(class_name: str) -> int:
-    """Return the number of the data set's class that the words of a name tell."""
-    words, kinds = words_of(class_name), Config()
-    known = {
-        'vehicle': kinds.vehicle.names,
-        'cyclist': kinds.cyclist.names,
-        'pedestrian': kinds.pedestrian.names,
+    """Return the number of the type whose class names share a word with `class_name`, else 0."""
+    config = Config()
+    names_by_type = {
+        'vehicle': config.vehicle.names,
+        'cyclist': config.cyclist.names,
+        'pedestrian': config.pedestrian.names,
         'sign': ('sign',),
     }
-    return next((TYPES.index(k) for k, names in known.items() if {*names} & words), 0)
+    words = words_of(class_name)
+    for name, class_names in names_by_type.items():
+        if words.intersection(class_names):
+            return TYPES.index(name)
+    return 0

@@ -1,38 +1,48 @@
-"""What the node tells about itself on /diagnostics, and how often it says it in the log."""
+"""Counters and latencies of the node, their report on /diagnostics and in the log."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from threading import Lock
 import time
+import traceback
 
 from boxreg_ros.reasons import FAULTS, REASONS
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.impl.rcutils_logger import RcutilsLogger
 
 LOG_PERIOD = 10.0
-"""The same trouble is logged this often at most [s]."""
-WITHOUT_CLOUDS = ('no_transform', 'no_sweep')
-"""What becomes of boxes if no clouds come."""
+"""The same reason is logged at most once in this time [s]."""
+REASONS_WITHOUT_CLOUDS = ('no_transform', 'no_sweep')
+"""Reasons that boxes get when no cloud arrives at all."""
 RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')
+"""Counters that are also reported as a rate."""
+LATENCY_QUANTILES = (('median', 0.5), ('p99', 0.99), ('most', 1.0))
 
 
 class Health:
     """
-    Counters, latencies and who has been warned of what. Thread-safe.
+    Counters, latencies and the time of the last log entry per reason. Thread-safe.
 
-    Counters only grow; rates and levels are those of the time since the last `status`.
+    Counters only grow. Rates and levels refer to the time since the last `status`.
+
+    Parameters
+    ----------
+    logger : RcutilsLogger
+        Logger of the node.
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, logger: RcutilsLogger) -> None:
+        self._logger = logger
         self._lock = Lock()
         self._counts: Counter[str] = Counter()
-        self._elsewhere: Counter[str] = Counter()
+        self._core_counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
         self._logged: Counter[str] = Counter()
+        self._logged_at: dict[str, float] = {}
         self._latencies: list[float] = []
-        self._warned: dict[str, float] = {}
         self._since = time.monotonic()
 
     def count(self, name: str, number: int = 1) -> None:
@@ -40,74 +50,118 @@ class Health:
         with self._lock:
             self._counts[name] += number
 
-    def set_counts(self, counts: Mapping[str, int]) -> None:
-        """Take over counters that are kept elsewhere, to be added to those counted here."""
+    def set_core_counts(self, counts: Mapping[str, int]) -> None:
+        """Replace the counters of the core; `status` reports their sum with the others."""
         with self._lock:
-            self._elsewhere = Counter(counts)
+            self._core_counts = Counter(counts)
 
     def add_latency(self, seconds: float) -> None:
-        """Note how long after its boxes had come an early estimate was published."""
+        """Record the time from the arrival of boxes to the publication of the early estimate."""
         with self._lock:
             self._latencies.append(seconds)
 
-    def is_time_to_warn(self, reason: str) -> bool:
-        """Tell whether the log has not heard of this reason for a while; it is told now."""
+    def report(self, reason: str, text: str, number: int = 1) -> None:
+        """Count a reason and log the text, at most once per `LOG_PERIOD` and reason."""
+        self.count(reason, number)
+        if self.is_due(reason):
+            self._log(reason, f'{reason}: {" ".join(text.split())}')
+
+    def report_failure(self, error: Exception) -> None:
+        """Count an internal error as ``failed``; its traceback goes to the debug log."""
+        self.report('failed', f'{type(error).__name__}: {error}')
+        self._logger.debug(''.join(traceback.format_exception(error)))
+
+    def is_due(self, reason: str) -> bool:
+        """Return whether a reason may be logged now, and if so record that it is."""
         now = time.monotonic()
         with self._lock:
-            is_time = now - self._warned.get(reason, -LOG_PERIOD) >= LOG_PERIOD
-            if is_time:
-                self._warned[reason] = now
-                self._logged[reason] = self._counts[reason] + self._elsewhere[reason]
-        return is_time
+            if now - self._logged_at.get(reason, -LOG_PERIOD) < LOG_PERIOD:
+                return False
+            self._logged_at[reason] = now
+            self._logged[reason] = self._counts[reason] + self._core_counts[reason]
+        return True
 
-    def complaints(self) -> Iterator[str]:
-        """Yield a line with the remedy for every reason that has one and is due in the log."""
+    def log_counts(self) -> None:
+        """Log every reason that has a remedy and was counted since its last log entry."""
         with self._lock:
-            counts = self._counts + self._elsewhere
+            counts = self._counts + self._core_counts
+            unlogged = counts - self._logged
         for name, reason in REASONS.items():
-            number = counts[name] - self._logged[name]
-            if number and reason.remedy and self.is_time_to_warn(name):
-                yield f'{name} ({number} more): {reason.meaning}; {reason.remedy}'
+            if unlogged[name] and reason.remedy and self.is_due(name):
+                text = f'{name} ({unlogged[name]} more): {reason.meaning}; {reason.remedy}'
+                self._log(name, text)
 
     def status(self, name: str, facts: Mapping[str, object]) -> DiagnosticStatus:
-        """Return the state since the last call; `facts` are added to the values."""
+        """
+        Return the state since the last call.
+
+        Parameters
+        ----------
+        name : str
+            Name of the status.
+        facts : mapping
+            Further values, reported between the latencies and the counters.
+
+        """
         now = time.monotonic()
         with self._lock:
-            counts = self._counts + self._elsewhere
-            fresh = counts - self._reported
+            counts = self._counts + self._core_counts
+            recent = counts - self._reported
             self._reported = counts
-            latencies, self._latencies = sorted(self._latencies), []
-            period, self._since = max(now - self._since, 1e-3), now
-        values = {f'{what} [Hz]': f'{fresh[what] / period:.1f}' for what in RATES}
-        for what, share in (('median', 0.5), ('p99', 0.99), ('most', 1.0)):
-            if latencies:
-                row = min(int(share * len(latencies)), len(latencies) - 1)
-                values[f'latency {what} [ms]'] = f'{1e3 * latencies[row]:.1f}'
+            latencies = sorted(self._latencies)
+            self._latencies = []
+            period = max(now - self._since, 1e-3)
+            self._since = now
+        values = {f'{rate} [Hz]': f'{recent[rate] / period:.1f}' for rate in RATES}
+        values |= _latency_values(latencies)
         values |= {key: str(value) for key, value in facts.items()}
         values |= {key: str(number) for key, number in sorted(counts.items())}
-        level, message = _verdict(fresh)
+        level, message = _level_and_message(recent)
         return DiagnosticStatus(
             level=level, name=name, message=message,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )  # fmt: skip
 
+    def _log(self, reason: str, text: str) -> None:
+        if reason in FAULTS:
+            self._logger.error(text)
+        else:
+            self._logger.warning(text)
 
-def _verdict(fresh: Counter[str]) -> tuple[bytes, str]:
-    """Return level and message for what happened since the last time."""
-    trouble = next((name for name, why in REASONS.items() if fresh[name] and why.remedy), None)
-    if trouble is not None:
-        reason = REASONS[trouble]
-        is_idle = bool(fresh['boxes_received']) and not fresh['refined']
-        level = DiagnosticStatus.ERROR if is_idle or trouble in FAULTS else DiagnosticStatus.WARN
-        text = f'{trouble}: {reason.meaning}; {reason.remedy}'
-        if trouble in WITHOUT_CLOUDS and not fresh['points_received']:
-            text = 'nothing received on points'
-        return level, f'no box was refined; {text}' if is_idle else text
-    missing = [name for name in ('points', 'boxes') if not fresh[f'{name}_received']]
+
+def _latency_values(latencies: list[float]) -> dict[str, str]:
+    """Return quantiles of sorted latencies; nothing if there are none."""
+    values = {}
+    for name, share in LATENCY_QUANTILES:
+        if latencies:
+            row = min(int(share * len(latencies)), len(latencies) - 1)
+            values[f'latency {name} [ms]'] = f'{1e3 * latencies[row]:.1f}'
+    return values
+
+
+def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
+    """Return level and message of the counters of one status period."""
+    worst = next((name for name, why in REASONS.items() if recent[name] and why.remedy), None)
+    if worst is not None:
+        return _level_and_message_of(worst, recent)
+    missing = [name for name in ('points', 'boxes') if not recent[f'{name}_received']]
     if missing:
         return DiagnosticStatus.WARN, f'nothing received on {" and ".join(missing)}'
-    if fresh['kept'] and not fresh['refined']:
-        why = max((n for n in REASONS if REASONS[n].unit == 'box'), key=lambda name: fresh[name])
+    if recent['kept'] and not recent['refined']:
+        box_reasons = [name for name, reason in REASONS.items() if reason.unit == 'box']
+        why = max(box_reasons, key=lambda name: recent[name])
         text = f'no box was refined; most often {why}: {REASONS[why].meaning}'
         return DiagnosticStatus.WARN, text
     return DiagnosticStatus.OK, 'refining'
+
+
+def _level_and_message_of(worst: str, recent: Counter[str]) -> tuple[bytes, str]:
+    """Return level and message where `worst` is the gravest reason of the period."""
+    is_idle = bool(recent['boxes_received']) and not recent['refined']
+    level = DiagnosticStatus.ERROR if is_idle or worst in FAULTS else DiagnosticStatus.WARN
+    text = f'{worst}: {REASONS[worst].meaning}; {REASONS[worst].remedy}'
+    if worst in REASONS_WITHOUT_CLOUDS and not recent['points_received']:
+        text = 'nothing received on points'
+    if is_idle:
+        text = f'no box was refined; {text}'
+    return level, text

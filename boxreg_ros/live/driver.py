@@ -1,34 +1,65 @@
-"""Messages in, messages with refined boxes out: the node without its topics and threads."""
+"""Registration of messages as they arrive: the node without its topics and threads."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros import refine, Track
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.session import covariances_to_write, Intake, says_nothing
-from boxreg_ros.io.transforms import boxes_to_frame, inverse, sweep_to_frame, TransformTree
+from boxreg_ros.io.session import (
+    covariances_to_write,
+    is_placeholder,
+    JumpConfirmation,
+    register,
+    Session,
+)
+from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.poses import turned_covariances
 import numpy as np
 
-SETTLE = 0.3
-"""Transforms are collected this long before a fixed frame is chosen among them [s]."""
-SILENCE = 3.0
-"""After so long without boxes, final ones are not held back any more [s]."""
+CONFIRMATION_TIME = 0.5
+"""A message waits this long for the one that confirms a time jump [s]: five sweeps at 10 Hz."""
+SETTLING_TIME = 0.3
+"""
+Time for collecting transforms before the fixed frame is chosen among them [s].
+
+Publishers of /tf at 10 Hz and faster have sent three messages by then.
+
+"""
+BOXES_SILENCE = 3.0
+"""After this time without boxes, final boxes are published without further observations [s]."""
 CLOUD_SILENCE = 0.5
-"""After so long without clouds, boxes that have waited as long do not wait for theirs [s]."""
+"""
+After this time without clouds, boxes that have waited as long are published unrefined [s].
+
+Five periods of a LiDAR of 10 Hz.
+
+"""
 
 
-class Arrival(NamedTuple):
-    """A decoded message, and when it was received by a clock that never jumps [s]."""
+class ReceivedMessage(NamedTuple):
+    """
+    A decoded message.
+
+    Attributes
+    ----------
+    message : message
+        As it was received.
+    content : Sweep or BoxArray
+        In the frame of the message.
+    received : float
+        Time of a clock that never jumps [s].
+
+    """
 
     message: Any
     content: Sweep | BoxArray
@@ -39,8 +70,17 @@ class Outgoing(NamedTuple):
     """
     A message to publish.
 
-    `given` and `refined` are in the frame of `message`; both are None where the input message
-    is passed through as it came; `received` is when the boxes were, None for those.
+    Attributes
+    ----------
+    message : message
+        Of the type of the input.
+    is_final : bool
+        True for the topic of final boxes, False for that of early ones.
+    given, refined : BoxArray and RefinedBoxes, or None
+        Input and result in the frame of `message`; None for an input message that is passed
+        through.
+    received : float or None
+        When the input arrived [s]; None if it is passed through.
 
     """
 
@@ -53,54 +93,49 @@ class Outgoing(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class _Pending:
-    """A box array the registrar has: its message waits for the boxes that replace its own."""
+    """A message whose boxes are with the registrar; the ticket of these boxes."""
 
     message: Any
     given: BoxArray
     received: float
     T_output_fixed: Floats
-    T_output_item: Floats | None
-    is_named_anew: bool
+    T_output_item: Floats | None  # None: the output frame is that of the message
+    has_new_ids: bool
     is_early_out: bool = False
 
 
 class _Passing(NamedTuple):
-    """A message that passes through, its final copy behind those that came before it."""
+    """A message that passes through; its final copy waits for the messages before it."""
 
     message: Any
 
 
 class LiveRegistrar:
     """
-    Bring messages into the fixed frame, register them, and make the messages to publish.
+    Register messages as they arrive, and make the messages to publish.
 
-    Holds the transforms, the registrar and, until their final boxes come, the input messages.
-    Belongs to one thread.
+    State: a `Session` with the transforms, the registrar, and the input messages whose final
+    boxes have not been published. Not thread-safe.
 
     Parameters
     ----------
     config : Config
         Settings of the core; `estimate` must be ``final``.
     fixed_frame, output_frame : str
-        Frames to refine and to publish in. Empty: the topmost frame the clouds' frame moves in,
-        chosen once; and the frame of each input message.
+        Frames to refine and to publish in. Empty: the topmost frame that the frame of the clouds
+        moves in, chosen once; and the frame of each input message.
     transform_timeout : float
-        How long an arrival waits for transforms that cover its stamp [s]. After that it takes
-        what a short extrapolation gives.
+        How long a message waits for transforms that cover its stamp [s]. After that, transforms
+        may be extrapolated a little.
     trouble : callable
-        Told the reason, as counted, the text and the number of everything that is not refined
-        here.
+        Called with reason, text and count for everything that is not refined here.
     convention : Convention
-        How the boxes are to be read.
+        Convention of the boxes, and whether ids are to be assigned.
 
     Attributes
     ----------
-    tree : TransformTree
-        To be fed with what comes.
-    fixed_frame, cloud_frame : str
-        The frame chosen, and the frame of the clouds, to be set; empty while not known.
-    adapter : Adapter
-        Reads and writes the boxes; to be set before the first.
+    adapter : Adapter or None
+        Reads and writes the boxes; to be set before the first of them.
     output_frame, transform_timeout
         As above; may change.
 
@@ -115,233 +150,283 @@ class LiveRegistrar:
         trouble: Callable[[str, str, int], None],
         convention: Convention = STANDARD,
     ) -> None:
-        self.tree = TransformTree()
-        self.fixed_frame = fixed_frame.lstrip('/')
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
-        self._trouble = trouble
-        self._intake = Intake(convention, config)
-        self._registrar = BoxRegistrar(config)
-        self._held: deque[_Pending | _Passing] = deque()  # as they came; the first is pending
-        self._made: list[Outgoing] = []  # from what has become ready, up to a fault
-        self.cloud_frame = ''
-        self._choose_at: float | None = None
         self.adapter: Adapter | None = None
+        self._trouble = trouble
+        self._session = Session(convention, config, fixed_frame)
+        self._registrar = BoxRegistrar(config)
+        self._jumps = JumpConfirmation[ReceivedMessage]()
+        self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
+        self._made: list[Outgoing] = []  # survives an error while further messages are made
+        self._choose_at: float | None = None
         self._last_boxes = 0.0
 
     @property
+    def tree(self) -> TransformTree:
+        """Return the transforms, to be fed by the caller."""
+        return self._session.tree
+
+    @property
+    def fixed_frame(self) -> str:
+        """Return the frame to refine in; empty while it is not known."""
+        return self._session.fixed_frame
+
+    @property
+    def cloud_frame(self) -> str:
+        """Return the frame of the clouds; to be set by the caller."""
+        return self._session.sensor_frame
+
+    @cloud_frame.setter
+    def cloud_frame(self, frame_id: str) -> None:
+        self._session.sensor_frame = frame_id
+
+    @property
     def config(self) -> Config:
-        """Return the settings of the core; see `BoxRegistrar` for what may change."""
+        """Return the settings of the core; see `BoxRegistrar` for those that may change."""
         return self._registrar.config
 
     @config.setter
     def config(self, config: Config) -> None:
         self._registrar.config = config
-        self._intake.change(config)
+        self._session.config = config
 
     @property
     def counts(self) -> Counter[str]:
-        """Sweeps, boxes by status, and reasons of the registrar; see `BoxRegistrar`."""
+        """Return the counters of the registrar; see `BoxRegistrar`."""
         return self._registrar.counts
 
-    def is_ready(self, item: Arrival, now: float) -> bool:
-        """Tell whether the transforms of an arrival have come, or are no longer waited for."""
+    @property
+    def facts(self) -> dict[str, object]:
+        """Return the origin of the ids, for reports."""
+        return self._session.facts
+
+    def confirm(self, item: ReceivedMessage) -> tuple[list[ReceivedMessage], list[Outgoing]]:
+        """
+        Confirm the order of stamps before a message is processed.
+
+        Returns
+        -------
+        confirmed : list of ReceivedMessage
+            The messages to process next, in order: none while this one is held.
+        ready : list of Outgoing
+            Everything that was held where time went back: tracks and transforms start anew.
+
+        """
+        if is_placeholder(item.content):
+            return [item], []
+        confirmed, has_jumped = self._jumps.add(item, item.content)
+        if not has_jumped:
+            return confirmed, []
+        stamp_ns = confirmed[0].content.stamp_ns
+        self._trouble('time_jump', f'stamps went back to {stamp_ns} ns', 1)
+        ready = self.reset()
+        self.tree.rewind(stamp_ns)
+        return confirmed, ready
+
+    def release(self, now: float = inf) -> list[ReceivedMessage]:
+        """Return the message that no other has confirmed in time, if any: it is late."""
+        held = self._jumps.held
+        if held is None or now < held.received + CONFIRMATION_TIME:
+            return []
+        return self._jumps.release()
+
+    def is_ready(self, item: ReceivedMessage, now: float) -> bool:
+        """Return whether the transforms of a message have arrived or are not waited for."""
         content = item.content
-        if now >= item.received + self.transform_timeout or says_nothing(content):
+        if now >= item.received + self.transform_timeout or is_placeholder(content):
             return True
         if self._choose_at is None:
-            self._choose_at = now + SETTLE
+            self._choose_at = now + SETTLING_TIME
         if not self.fixed_frame and now < self._choose_at:
             return False
         try:
-            return all(self.tree.covers(*frames, content.stamp_ns) for frames in self._hops(item))
+            fixed_frame = self._session.require_fixed_frame(content)
         except TransformUnavailable:
             return False
+        is_covered = self.tree.covers(fixed_frame, content.frame_id, content.stamp_ns)
+        if is_covered and self._changes_frame(content):
+            return self.tree.covers(self.output_frame, fixed_frame, content.stamp_ns)
+        return is_covered
 
-    def process(self, item: Arrival) -> list[Outgoing]:
-        """Register an arrival; return what has become ready."""
+    def process(self, item: ReceivedMessage) -> list[Outgoing]:
+        """Register a message; return the messages that are ready to be published."""
         content = item.content
-        if says_nothing(content):
+        if is_placeholder(content):
             return self.passed_through(item.message)
-        ready: list[Outgoing] = []
-        if self._intake.begins_anew(content):
-            self._trouble('time_jump', f'stamps went back to {content.stamp_ns} ns', 1)
-            ready = self.reset()
-            self.tree.rewind(content.stamp_ns)
-        return ready + self._register(item)
-
-    def _register(self, item: Arrival) -> list[Outgoing]:
-        content = item.content
-        stamp_ns = content.stamp_ns
-        try:
-            T_fixed_item, *others = [
-                self.tree.lookup(*frames, stamp_ns) for frames in self._hops(item)
-            ]
-        except TransformUnavailable as error:
-            if isinstance(content, Sweep):
-                self._trouble('sweep_without_transform', str(error), 1)
-                return []
-            if content.track_ids:
-                self._trouble('no_transform', str(error), len(content.track_ids))
-            return self.passed_through(item.message)
-        if isinstance(content, Sweep):
-            sweep = sweep_to_frame(content, T_fixed_item, self.fixed_frame)
-            return self._outgoing(self._registrar.add_sweep(self._intake.take(sweep)))
-        self._last_boxes = item.received
-        boxes = self._intake.take(boxes_to_frame(content, T_fixed_item, self.fixed_frame))
-        if self._intake.finding:
-            self._trouble('pose_reference', self._intake.finding, 1)
-        T_output_fixed = others[0] if others else inverse(T_fixed_item)
-        T_output_item = T_output_fixed @ T_fixed_item if others else np.eye(4)
-        given = boxes_to_frame(content, T_output_item, self._output_of(content))
-        given = replace(given, track_ids=boxes.track_ids)
-        pending = _Pending(
-            item.message, given, item.received, T_output_fixed, T_output_item if others else None,
-            boxes.track_ids != content.track_ids,
-        )  # fmt: skip
-        self._held.append(pending)
-        return self._outgoing(self._registrar.add_boxes(boxes))
+        admitted = self._session.admit(content)
+        if admitted.reason:
+            self._report_missing_transform(content, admitted.reason, admitted.detail)
+        moved = admitted.moved
+        if isinstance(moved, BoxArray):
+            assert isinstance(content, BoxArray) and admitted.T_fixed_item is not None
+            moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
+        ready = self._outgoing(register(self._registrar, moved, restarts=False))
+        if moved is None and isinstance(content, BoxArray):
+            ready += self.passed_through(item.message)
+        return ready
 
     def lose(self, stamp_ns: int) -> list[Outgoing]:
-        """Have the boxes of a cloud that was dropped not wait for it."""
-        sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_lost=True)
+        """Release the boxes that wait for a cloud that was dropped."""
+        sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_dropped=True)
         return self._outgoing(self._registrar.add_sweep(sweep))
 
     def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:
-        """Have boxes not wait for clouds that do not come any more."""
+        """Release boxes that wait for clouds if no clouds have arrived for long."""
         if now < cloud_received + CLOUD_SILENCE:
             return []
         overdue = [
-            p.given.stamp_ns
-            for p in self._held
-            if isinstance(p, _Pending) and not p.is_early_out and now >= p.received + CLOUD_SILENCE
+            pending.given.stamp_ns
+            for pending in self._held
+            if isinstance(pending, _Pending)
+            and not pending.is_early_out
+            and now >= pending.received + CLOUD_SILENCE
         ]
         if not overdue:
             return []
-        # Out of reach of the boxes: a cloud that came before them is still theirs.
+        # Beyond the reach of these boxes: a cloud that arrived before them may still be theirs.
         reach = max(self.config.reach, self.config.tolerance)
         return self.lose(max(overdue) + round(reach * 1e9) + 1)
 
     @property
     def is_holding(self) -> bool:
-        """Tell whether boxes are held back, for a cloud or for what comes later."""
-        return bool(self._held)
+        """Return whether messages wait for a cloud, further observations or confirmation."""
+        return bool(self._held) or self._jumps.held is not None
 
     def is_silent(self, now: float) -> bool:
-        """Tell whether boxes are held, but no others have come for long."""
-        return self.is_holding and self.has_ceased(now)
+        """Return whether boxes are held and no further ones have arrived for long."""
+        return bool(self._held) and self.has_ceased(now)
 
     def has_ceased(self, now: float) -> bool:
-        """Tell whether no boxes have come for long."""
-        return now >= self._last_boxes + max(SILENCE, self.config.max_gap)
+        """Return whether no boxes have arrived for long."""
+        return now >= self._last_boxes + max(BOXES_SILENCE, self.config.max_gap)
 
     def flush(self) -> list[Outgoing]:
-        """Return everything still held; tracks go on, should more boxes come."""
+        """Return everything that is held; tracks continue if further boxes arrive."""
         return self._outgoing(self._registrar.flush())
 
     def reset(self) -> list[Outgoing]:
-        """Start afresh but for the transforms; return everything still held."""
+        """Forget everything but the transforms; return everything that is held."""
         ready = self.flush()
         self._registrar.reset()
-        self._intake.begin(self.config)
+        self._session.restart()
         return ready
 
-    def abandon(self, item: Arrival | None) -> list[Outgoing]:
-        """Start afresh after a fault; pass what is held, and the arrival at fault, through."""
+    def abandon(self, item: ReceivedMessage | None) -> list[Outgoing]:
+        """
+        Start again after an internal error.
+
+        Parameters
+        ----------
+        item : ReceivedMessage or None
+            The message that was being processed.
+
+        Returns
+        -------
+        ready : list of Outgoing
+            Messages made before the error, and all that are held, passed through.
+
+        """
         self._registrar.reset()
-        self._intake.begin(self.config)
+        self._session.restart()
         held = list(self._held)
         self._held.clear()
-        passed, self._made = self._made, []
-        for p in held:
-            is_early_out = isinstance(p, _Passing) or p.is_early_out
-            passed += ([] if is_early_out else [Outgoing(p.message, False)]) + self.last(p.message)
-        is_held = item is None or any(p.message is item.message for p in held)
+        ready = self._made
+        self._made = []
+        for waiting in held:
+            if isinstance(waiting, _Pending) and not waiting.is_early_out:
+                ready.append(Outgoing(waiting.message, False))
+            ready += self.last(waiting.message)
+        is_held = item is None or any(waiting.message is item.message for waiting in held)
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
-            passed += self.passed_through(item.message)
-        return passed
-
-    @property
-    def facts(self) -> dict[str, object]:
-        """Return what there is to tell about the boxes beside the counts."""
-        return self._intake.facts
+            ready += self.passed_through(item.message)
+        return ready
 
     def passed_through(self, message: Any) -> list[Outgoing]:
-        """Return a message as it came, as early and, if nothing before it is held, as final."""
+        """Return an input message as early boxes and, once those before it are, as final."""
         return [Outgoing(message, False), *self.last(message)]
 
     def last(self, message: Any) -> list[Outgoing]:
-        """Return a message as it came, as final, or hold it behind what came before it."""
+        """Return an input message as final boxes, or hold it behind those before it."""
         if not self._held:
             return [Outgoing(message, True)]
         self._held.append(_Passing(message))
         return []
 
-    def _output_of(self, boxes: BoxArray) -> str:
-        return self.output_frame or boxes.frame_id
+    def _report_missing_transform(
+        self, content: Sweep | BoxArray, reason: str, detail: str
+    ) -> None:
+        """Report a sweep, or the boxes of an array, that no transform is known for."""
+        count = 1 if isinstance(content, Sweep) else len(content.track_ids)
+        if count:
+            self._trouble(reason, detail, count)
 
-    def _hops(self, item: Arrival) -> list[tuple[str, str]]:
-        """
-        Return the pairs (target, source) of frames an arrival needs.
+    def _with_ticket(
+        self, item: ReceivedMessage, content: BoxArray, moved: BoxArray, T_fixed_item: Floats
+    ) -> BoxArray | None:
+        """Hold a message until its boxes are ready; None if the output frame is not reached."""
+        T_output_fixed = inverse(T_fixed_item)
+        T_output_item: Floats | None = None
+        given = content
+        if self._changes_frame(content):
+            try:
+                T_output_fixed = self.tree.lookup(
+                    self.output_frame, self.fixed_frame, content.stamp_ns
+                )
+            except TransformUnavailable as error:
+                self._report_missing_transform(content, 'no_transform', str(error))
+                return None
+            T_output_item = T_output_fixed @ T_fixed_item
+            given = boxes_to_frame(content, T_output_item, self.output_frame)
+        self._last_boxes = item.received
+        if self._session.finding:
+            self._trouble('pose_reference', self._session.finding, 1)
+        pending = _Pending(
+            item.message, replace(given, track_ids=moved.track_ids), item.received,
+            T_output_fixed, T_output_item, moved.track_ids != content.track_ids,
+        )  # fmt: skip
+        self._held.append(pending)
+        return replace(moved, ticket=pending)
 
-        First from its frame to the fixed one, then, for boxes to be published elsewhere than in
-        their own frame, from there to the output frame.
-
-        """
-        content = item.content
-        if not self.fixed_frame:
-            self._choose_fixed_frame(content)
-        hops = [(self.fixed_frame, content.frame_id)]
-        if isinstance(content, BoxArray) and self._output_of(content) != content.frame_id:
-            hops.append((self.output_frame, self.fixed_frame))
-        return hops
-
-    def _choose_fixed_frame(self, content: Sweep | BoxArray) -> None:
-        frame = self.cloud_frame
-        if not frame:
-            raise TransformUnavailable(
-                f'no point cloud has come, so there is no telling how the boxes in '
-                f'{content.frame_id!r} move; check the topic of the clouds and its QoS'
-            )
-        found = self.tree.fixed_frame(frame)
-        if found is None:
-            raise TransformUnavailable(
-                f'neither /tf nor odometry tells how the frame of the clouds {frame!r} moves; '
-                f'known: {self.tree}; if it does not move, say so with fixed_frame:={frame}'
-            )
-        self.fixed_frame = found
+    def _changes_frame(self, content: Sweep | BoxArray) -> bool:
+        """Return whether boxes are published in another frame than that of their message."""
+        is_boxes = isinstance(content, BoxArray)
+        return is_boxes and self.output_frame not in ('', content.frame_id)
 
     def _outgoing(self, ready: list[RefinedBoxes]) -> list[Outgoing]:
+        """Return the messages to publish for results of the registrar."""
         for refined in ready:
-            stamp_ns = refined.boxes.stamp_ns
-            pending = next(
-                p
-                for p in self._held
-                if isinstance(p, _Pending)
-                and p.given.stamp_ns == stamp_ns
-                and (refined.is_final or not p.is_early_out)
-            )
-            moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
-            assert self.adapter is not None  # it has read the message
-            message, T = pending.message, pending.T_output_item
-            # What is kept is the input: in haste, and then most is, nothing is to be made of it.
-            if REFINED in refined.status or T is not None or pending.is_named_anew:
-                covariances = covariances_to_write(moved)
-                message = self.adapter.to_msg(message, moved.boxes, covariances, T)
-            self._made.append(
-                Outgoing(message, refined.is_final, pending.given, moved, pending.received)
-            )
+            pending = refined.boxes.ticket
+            assert isinstance(pending, _Pending)
+            self._made.append(self._message_of(refined, pending))
             pending.is_early_out = True
             if refined.is_final:
                 self._held.remove(pending)
-                while self._held and isinstance(self._held[0], _Passing):
-                    self._made.append(Outgoing(self._held.popleft().message, True))
-        made, self._made = self._made, []
+                self._release_passing()
+        made = self._made
+        self._made = []
         return made
+
+    def _message_of(self, refined: RefinedBoxes, pending: _Pending) -> Outgoing:
+        """Return the message of refined boxes, in the output frame."""
+        assert self.adapter is not None  # it has read the message
+        moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
+        message = pending.message
+        T_output_item = pending.T_output_item
+        # Copying a message takes time; under load most boxes are kept.
+        if REFINED in refined.status or T_output_item is not None or pending.has_new_ids:
+            covariances = covariances_to_write(moved)
+            message = self.adapter.to_msg(message, moved.boxes, covariances, T_output_item)
+        return Outgoing(message, refined.is_final, pending.given, moved, pending.received)
+
+    def _release_passing(self) -> None:
+        """Release the final copies of passing messages that wait for no other any more."""
+        while self._held and isinstance(self._held[0], _Passing):
+            self._made.append(Outgoing(self._held.popleft().message, True))
 
 
 def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str) -> RefinedBoxes:
-    """Return refined boxes, and their covariances, in another frame."""
+    """Return refined boxes and their covariances in another frame."""
     return replace(
         refined,
         boxes=boxes_to_frame(refined.boxes, T_frame_boxes, frame_id),
@@ -351,14 +436,14 @@ def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str
 
 def warm_up(config: Config) -> None:
     """
-    Solve a made-up track: the first real one must not wait for what is loaded lazily.
+    Solve a synthetic track, so that the first real one does not wait for lazy imports.
 
-    A few steps of the solver are enough for that.
+    A few iterations of the solver are enough.
 
     Raises
     ------
     ConfigError
-        If the device is none that can be used here.
+        If torch cannot use the device.
 
     """
     rng = np.random.default_rng(0)

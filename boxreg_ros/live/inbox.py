@@ -1,4 +1,4 @@
-"""Between the threads of the node: what has been received and waits for the worker."""
+"""Queue between the two threads of the node: the executor puts messages, the worker takes them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,18 @@ from threading import Event, Lock
 import time
 from typing import Any, NamedTuple
 
+BOXES_PER_CLOUD = 20
+"""
+Capacity for box arrays relative to that for clouds.
+
+Arrays whose cloud was dropped cost no solver time and are published in order with the others, so
+many more of them than of clouds may wait.
+
+"""
+
 
 class Message(NamedTuple):
-    """A message as received, in the order and at the time of its arrival."""
+    """A received message with its order of arrival and its time of arrival (monotonic) [s]."""
 
     number: int
     topic: str
@@ -19,66 +28,70 @@ class Message(NamedTuple):
 
 class Inbox:
     """
-    What waits for the worker: transforms, and a bounded number of clouds and of box arrays.
+    Bounded queues of clouds and box arrays, and an unbounded one of events.
 
-    Many more box arrays than clouds: those whose cloud was dropped cost the solver nothing, and
-    come out in order with the others.
-
-    Thread-safe: the executor puts, the worker takes; neither waits for the other.
+    Events are transforms, odometry, parameter changes and service requests. The worker handles
+    them before the next message. Thread-safe: neither thread waits for the other.
 
     Parameters
     ----------
     capacity : int
-        Clouds that may wait.
+        Number of clouds that may wait.
 
     Attributes
     ----------
-    capacity : dict
-        How many messages of each topic may wait.
+    capacity : dict of str to int
+        Number of messages that may wait, by topic.
+    wake_up : threading.Event
+        Set whenever something was put.
 
     """
 
     def __init__(self, capacity: int) -> None:
-        self.capacity = {'points': capacity, 'boxes': 20 * capacity}
+        self.capacity = {'points': capacity, 'boxes': BOXES_PER_CLOUD * capacity}
+        self.wake_up = Event()
         self._lock = Lock()
         self._number = 0
-        self._news: deque[tuple[str, Any]] = deque()
+        self._events: deque[tuple[str, Any]] = deque()
         self._waiting: dict[str, deque[Message]] = {
             topic: deque() for topic in ('points', 'boxes', 'passing')
         }
-        self.news = Event()
 
-    def put_news(self, topic: str, content: Any) -> None:
-        """Take transforms or a wish; none is dropped, the worker is quick with them."""
-        self._news.append((topic, content))
-        self.news.set()
+    def put_event(self, kind: str, content: Any) -> None:
+        """Add an event; none is ever dropped."""
+        self._events.append((kind, content))
+        self.wake_up.set()
 
     def put(self, topic: str, content: Any) -> Message | None:
-        """Take a cloud or boxes; return the oldest of its kind if there are too many."""
+        """Add a cloud or box array; return the oldest one of its topic if the queue is full."""
+        dropped = None
         with self._lock:
             self._number += 1
             queue = self._waiting[topic]
             queue.append(Message(self._number, topic, content, time.monotonic()))
-            dropped = queue.popleft() if len(queue) > self.capacity[topic] else None
-        self.news.set()
+            if len(queue) > self.capacity[topic]:
+                dropped = queue.popleft()
+        self.wake_up.set()
         return dropped
 
-    def let_pass(self, message: Message) -> None:
-        """Have `take` return boxes that were dropped, in their turn, as of topic ``passing``."""
+    def put_passing(self, message: Message) -> None:
+        """Return a dropped box array to its place in the order, as topic ``passing``."""
         with self._lock:
             self._waiting['passing'].append(message._replace(topic='passing'))
-        self.news.set()
+        self.wake_up.set()
 
-    def take_news(self) -> list[tuple[str, Any]]:
-        """Return what has come by `put_news` since the last call."""
-        return [self._news.popleft() for _ in range(len(self._news))]
+    def take_events(self) -> list[tuple[str, Any]]:
+        """Remove and return all events, oldest first."""
+        return [self._events.popleft() for _ in range(len(self._events))]
 
     def take(self) -> Message | None:
-        """Return the cloud or boxes that have waited longest."""
+        """Remove and return the message that arrived first, or None."""
         with self._lock:
             filled = [queue for queue in self._waiting.values() if queue]
-            return min(filled, key=lambda queue: queue[0].number).popleft() if filled else None
+            if not filled:
+                return None
+            return min(filled, key=lambda queue: queue[0].number).popleft()
 
     def sizes(self) -> dict[str, int]:
-        """Return how many wait."""
+        """Return the number of waiting messages per topic."""
         return {f'{topic}_waiting': len(queue) for topic, queue in self._waiting.items()}

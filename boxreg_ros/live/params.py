@@ -1,4 +1,4 @@
-"""ROS parameters: every setting of `Config` under its dotted name, and those of the node."""
+"""ROS parameters: every setting of `Config` under its dotted name, and the options of the node."""
 
 from __future__ import annotations
 
@@ -17,60 +17,55 @@ from rclpy.parameter import Parameter
 NODE_SETTINGS = (
     Setting(
         'boxes_type', '',
-        'message type of the boxes, as package/msg/Type; empty: the first that can be read',
-        '', None, None, (),
+        'message type of the boxes, as package/msg/Type; empty: the first supported type '
+        'published on the topic',
     ),
     Setting(
         'pose_reference', 'center',
-        f'point of a box that its pose is at: {", ".join(REFERENCES)}, or x,y,z in parts of '
-        f'length, width and height',
-        '', None, None, (),
+        f'point of the box that the pose refers to: {", ".join(REFERENCES)}, or x,y,z as '
+        f'fractions of length, width and height',
     ),
     Setting(
-        'size_order', 'lwh', 'what x, y and z of a size are: length, width, height',
-        '', None, None, SIZE_ORDERS,
+        'size_order', 'lwh', 'order of length, width and height in size x, y, z',
+        choices=SIZE_ORDERS,
     ),
     Setting(
-        'forward_axis', 'x+', 'axis of a pose that points forward', '', None, None, tuple(FORWARD)
+        'forward_axis', 'x+', 'axis of the pose that points forward', choices=tuple(FORWARD)
     ),
-    Setting(
-        'associate', False, 'give boxes ids by association, whatever ids they have',
-        '', None, None, (),
-    ),
+    Setting('associate', False, 'assign track ids by data association, ignoring those given'),
     Setting(
         'fixed_frame', '',
-        'frame to refine in; empty: the topmost frame that the frame of the clouds moves in',
-        '', None, None, (),
+        'frame to refine in; empty: the root of the tree that the frame of the clouds moves in',
+    ),
+    Setting('output_frame', '', 'frame of the refined boxes; empty: that of the input boxes'),
+    Setting(
+        'transform_timeout', 0.3, 'maximum wait of a cloud or box array for its transform',
+        's', 0.0, 60.0,
     ),
     Setting(
-        'output_frame', '', 'frame of the refined boxes; empty: that of the input boxes',
-        '', None, None, (),
+        'backlog', 0.1,
+        'maximum wait of a cloud for the solver before it is dropped; of a box array ten times '
+        'that, before it passes through unrefined',
+        's', 0.0, 3600.0,
     ),
     Setting(
-        'transform_timeout', 0.3, 'how long a cloud or boxes wait for their transform',
-        's', 0.0, 60.0, (),
-    ),
-    Setting(
-        'backlog', 0.1, 'clouds that wait longer are dropped, boxes pass after ten times that',
-        's', 0.0, 3600.0, (),
-    ),
-    Setting(
-        'config_file', 'boxreg_node.yaml', 'where ~/save_config writes all parameters',
-        '', None, None, (),
+        'config_file', 'boxreg_node.yaml', 'file that ~/save_config writes all parameters to'
     ),
 )  # fmt: skip
+"""Options of the node beside `Config`; `config.NODE_OPTIONS` holds their names."""
 
-AT_ONCE = (
+DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
     *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'config_file'),
 )
-"""Beginnings of the names of what may change while the node runs."""
-READ_ONLY = 'set before the start: windows, threads or subscriptions are built from it'
+"""Prefixes of the parameters that may change while the node runs."""
+READ_ONLY = 'read-only: windows, threads or subscriptions are built from it at start-up'
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+"""Prefixes of the parameters that rclpy declares itself."""
 
 
 class NodeOptions(NamedTuple):
-    """What the node is told beside `Config`; see `NODE_SETTINGS`."""
+    """Options of the node beside `Config`, described in `NODE_SETTINGS`."""
 
     boxes_type: str
     pose_reference: str
@@ -85,16 +80,24 @@ class NodeOptions(NamedTuple):
 
     @property
     def convention(self) -> Convention:
-        """Return how boxes are to be read."""
+        """Return the convention of the poses and sizes of the input boxes."""
         return Convention(self.pose_reference, self.size_order, self.forward_axis, self.associate)
 
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:
     """
-    Declare all parameters of a node and return what they are set to.
+    Declare all parameters of a node and return their values.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides``: so
-    whole numbers can be given for real ones, and names that do not exist be told.
+    Parameters
+    ----------
+    node : Node
+        Made with ``automatically_declare_parameters_from_overrides``: this way integers are
+        accepted for real parameters, and unknown names can be reported.
+
+    Returns
+    -------
+    config, options
+        Settings of the core with `estimate` ``final``, and options of the node.
 
     Raises
     ------
@@ -103,32 +106,48 @@ def declare(node: Node) -> tuple[Config, NodeOptions]:
 
     Notes
     -----
-    `estimate` has no say here: the node publishes the early and the final estimate.
+    `estimate` is ignored with a warning: the node publishes both early and final estimates.
 
     """
-    parameters: dict[str, Any] = node.get_parameters_by_prefix('')  # typed wrongly in rclpy
+    parameters: dict[str, Any] = node.get_parameters_by_prefix('')  # wrong annotation in rclpy
     given = _values_of(parameters.values())
-    changes = {item.name: given[item.name] for item in settings() if item.name in given}
-    config = Config().updated(changes)
-    if changes.get('estimate', 'final') != 'final':
+    if given.get('estimate', 'final') != 'final':
         node.get_logger().warning(
-            f'estimate {config.estimate!r} is for recordings: this node publishes early and final'
+            f'estimate: {given["estimate"]!r} is ignored: the node publishes the early and the '
+            f'final estimate'
         )
+    config, options = _updated(Config(), _default_options(), given)
     config = replace(config, estimate='final')
-    options = NodeOptions(
-        *(_checked(item, given.get(item.name, item.default)) for item in NODE_SETTINGS)
-    )
     values = [*config.items(), *zip(NODE_SETTINGS, options, strict=True)]
     for item, value in values:
         if item.name in given:
             node.undeclare_parameter(item.name)
         node.declare_parameter(item.name, _plain(value), describe(item), ignore_override=True)
     known = {item.name for item, _ in values}
-    if unknown := sorted(n for n in given if n not in known and not n.startswith(ROS_OWN)):
+    unknown = sorted(n for n in given if n not in known and not n.startswith(ROS_OWN))
+    if unknown:
         node.get_logger().warning(
-            f'no such parameters here: {", ".join(unknown)}; see the table in the README'
+            f'unknown parameters are ignored: {", ".join(unknown)}; see the list of parameters'
         )
     return config, options
+
+
+def reals_from_integers(node: Node, parameters: list[Parameter]) -> list[Parameter]:
+    """
+    Return parameters with integers converted where the node declares a real.
+
+    ``ros2 param set NODE sampling.margin 1`` sends an integer.
+
+    """
+    converted = []
+    for parameter in parameters:
+        is_integer = parameter.type_ == Parameter.Type.INTEGER
+        if is_integer and node.has_parameter(parameter.name):
+            kind = node.get_parameter(parameter.name).type_
+            if kind == Parameter.Type.DOUBLE:
+                parameter = Parameter(parameter.name, kind, float(parameter.value))
+        converted.append(parameter)
+    return converted
 
 
 def changed(
@@ -143,52 +162,97 @@ def changed(
         For a value of the wrong type or out of its bounds, by name.
 
     """
-    given = _values_of(parameters)
+    return _updated(config, options, _values_of(parameters))
+
+
+def parameters_yaml(config: Config, options: NodeOptions | None = None) -> str:
+    """
+    Return all settings as a ROS parameter file with a comment per setting.
+
+    The file applies to nodes of any name in any namespace. ``boxreg relabel --config`` reads it
+    too and ignores the options of the node. `estimate` is left out: the node ignores it.
+
+    Parameters
+    ----------
+    config : Config
+        Settings of the core.
+    options : NodeOptions, optional
+        Options of the node; None: their defaults.
+
+    """
+    if options is None:
+        options = _default_options()
+    lines = ['/**:', '  ros__parameters:']
+    for item, value in zip(NODE_SETTINGS, options, strict=True):
+        lines.append(_yaml_line(item, '    ', item.name, value))
+    current_group = ''
+    for item, value in config.items():
+        group, _, name = item.name.rpartition('.')
+        if group and group != current_group:
+            current_group = group
+            lines.append(f'    {group}:')
+        if item.name != 'estimate':
+            lines.append(_yaml_line(item, '      ' if group else '    ', name, value))
+    return '\n'.join(lines) + '\n'
+
+
+def describe(item: Setting) -> ParameterDescriptor:
+    """Return the descriptor of a parameter: meaning, unit, bounds and whether it may change."""
+    unit = f' [{item.unit}]' if item.unit else ''
+    is_fixed = not item.name.startswith(DYNAMIC)
+    constraints = [f'one of {", ".join(item.choices)}'] if item.choices else []
+    if is_fixed:
+        constraints.append(READ_ONLY)
+    descriptor = ParameterDescriptor(
+        description=f'{item.meaning}{unit}',
+        additional_constraints='; '.join(constraints),
+        read_only=is_fixed,
+    )
+    if item.low is not None and item.high is not None:
+        if isinstance(item.default, float):
+            reals = FloatingPointRange(from_value=float(item.low), to_value=float(item.high))
+            descriptor.floating_point_range = [reals]
+        elif isinstance(item.default, int):
+            integers = IntegerRange(from_value=int(item.low), to_value=int(item.high), step=1)
+            descriptor.integer_range = [integers]
+    return descriptor
+
+
+def _default_options() -> NodeOptions:
+    defaults: list[Any] = [item.default for item in NODE_SETTINGS]
+    return NodeOptions(*defaults)
+
+
+def _updated(
+    config: Config, options: NodeOptions, given: dict[str, Any]
+) -> tuple[Config, NodeOptions]:
+    """Return the settings with the given values, by name, set; other names are ignored."""
     config = config.updated({s.name: given[s.name] for s in settings() if s.name in given})
     own = {s.name: _checked(s, given[s.name]) for s in NODE_SETTINGS if s.name in given}
     return config, options._replace(**own)
 
 
-def parameters_yaml(
-    config: Config, options: NodeOptions | None = None, node_name: str = '/**/boxreg_node'
-) -> str:
-    """
-    Return all settings as a parameter file of ROS, with what they mean.
-
-    Those of `Config` come first, for every node: this is the part that ``boxreg relabel
-    --config`` reads. `estimate` is left out, the node having no use for it.
-
-    """
-    lines, group = ['/**:', '  ros__parameters:'], ''
-    for item, value in config.items():
-        *groups, name = item.name.split('.')
-        if groups and groups[0] != group:
-            group = groups[0]
-            lines.append(f'    {group}:')
-        if item.name != 'estimate':
-            lines.append(_yaml_line(item, '      ' if groups else '    ', name, value))
-    lines += [f'{node_name}:', '  ros__parameters:']
-    own = options or [item.default for item in NODE_SETTINGS]
-    for item, value in zip(NODE_SETTINGS, own, strict=True):
-        lines.append(_yaml_line(item, '    ', item.name, value))
-    return '\n'.join(lines) + '\n'
-
-
 def _yaml_line(item: Setting, indent: str, name: str, value: Any) -> str:
-    bounds = ', '.join(item.choices)
-    if item.low is not None and item.high is not None:
-        bounds = f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
-    note = f'{item.meaning} ({bounds})' if bounds else item.meaning
-    return f'{indent}{name}: {json.dumps(_plain(value))}  # {note}'
+    """Return the line of one setting; its comment gives meaning and bounds."""
+    bounds = ', '.join(item.choices) or _bounds_of(item)
+    comment = f'{item.meaning} ({bounds})' if bounds else item.meaning
+    return f'{indent}{name}: {json.dumps(_plain(value))}  # {comment}'
+
+
+def _bounds_of(item: Setting) -> str:
+    """Return the bounds of a number with its unit, or an empty text."""
+    if item.low is None or item.high is None:
+        return ''
+    return f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as a parameter takes it: of an empty list ROS cannot tell the type."""
+    """Return a value as ROS takes it: ``['']`` for no text, as an empty list has no type."""
     return (list(value) or ['']) if isinstance(value, tuple) else value
 
 
 def _values_of(parameters: Iterable[Parameter]) -> dict[str, Any]:
-    """Return values by name, lists without the empty texts that stand for no text at all."""
+    """Return values by name; empty strings in lists are removed, they stand for an empty list."""
     values = {parameter.name: parameter.value for parameter in parameters}
     return {
         name: [v for v in value if v != ''] if isinstance(value, list) else value
@@ -197,33 +261,12 @@ def _values_of(parameters: Iterable[Parameter]) -> dict[str, Any]:
 
 
 def _checked(item: Setting, value: Any) -> Any:
-    """Return the value of a setting of the node in its type, or raise ConfigError."""
+    """Return the value of an option of the node in its type, or raise ConfigError."""
     kind: Any = type(item.default)
     if kind is float and type(value) is int:
         value = float(value)
     if type(value) is not kind:
         raise ConfigError(f'{item.name}: expected {kind.__name__}, got {value!r}')
     if item.low is not None and item.high is not None and not item.low <= value <= item.high:
-        bounds = f'{item.low:g} to {item.high:g} {item.unit}'.rstrip()
-        raise ConfigError(f'{item.name}: expected {bounds}, got {value!r}')
+        raise ConfigError(f'{item.name}: expected {_bounds_of(item)}, got {value!r}')
     return value
-
-
-def describe(item: Setting) -> ParameterDescriptor:
-    """Return what a setting means, its unit and its bounds, as ROS tools show it."""
-    unit = f' [{item.unit}]' if item.unit else ''
-    is_fixed = not item.name.startswith(AT_ONCE)
-    constraints = [f'one of {", ".join(item.choices)}'] if item.choices else []
-    descriptor = ParameterDescriptor(
-        description=f'{item.meaning}{unit}',
-        additional_constraints='; '.join([*constraints, READ_ONLY] if is_fixed else constraints),
-        read_only=is_fixed,
-    )
-    if item.low is not None and item.high is not None:
-        if isinstance(item.default, float):
-            bounds = FloatingPointRange(from_value=float(item.low), to_value=float(item.high))
-            descriptor.floating_point_range = [bounds]
-        elif isinstance(item.default, int):
-            whole = IntegerRange(from_value=int(item.low), to_value=int(item.high), step=1)
-            descriptor.integer_range = [whole]
-    return descriptor

@@ -1,4 +1,4 @@
-"""Options of the subcommands that read recordings, and what they mean."""
+"""Command line options shared by the subcommands that read recordings."""
 
 from __future__ import annotations
 
@@ -12,58 +12,92 @@ import yaml
 
 
 def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say what is read of which recordings, and under which settings."""
+    """Add the recordings, their topics and the settings."""
     parser.add_argument(
         'recordings', nargs='+', type=Path, metavar='RECORDING',
         help='MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; several are merged by time',
     )  # fmt: skip
     add_topic_arguments(parser)
-    parser.add_argument('--config', type=Path, metavar='FILE', help='settings as YAML')
+    parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')
     parser.add_argument(
         '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
-        help='one setting, as in solver.rounds=2; wins over --config',
+        help='one setting, as in solver.rounds=2; overrides --config; can be repeated',
     )  # fmt: skip
 
 
 def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which topics are read, and what the poses of boxes mean."""
-    parser.add_argument('--points', metavar='TOPIC', help='point clouds (default: found by type)')
-    parser.add_argument('--boxes', metavar='TOPIC', help='boxes (default: found by type)')
+    """Add the topics to read, and the convention of the boxes."""
     parser.add_argument(
-        '--odometry', metavar='TOPIC', help='where TF does not lead to a fixed frame'
+        '--points', metavar='TOPIC', help='topic of the point clouds (default: found by type)'
     )
     parser.add_argument(
+        '--boxes', metavar='TOPIC', help='topic of the boxes (default: found by type)'
+    )
+    parser.add_argument(
+        '--odometry', metavar='TOPIC',
+        help='odometry topic, used where TF does not connect the clouds with a fixed frame '
+        '(default: found by type)',
+    )  # fmt: skip
+    parser.add_argument(
         '--pose-reference', metavar='POINT', default=STANDARD.pose_reference,
-        help=f'point of a box that its pose is at: {", ".join(REFERENCES)}, or X,Y,Z in parts of '
+        help=f'point of the box at its pose: {", ".join(REFERENCES)}, or X,Y,Z as fractions of '
         f'length, width and height (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument(
         '--size-order', choices=SIZE_ORDERS, default=STANDARD.size_order,
-        help='what x, y and z of a size are (default: %(default)s, length, width, height)',
+        help='meaning of x, y and z of a size (default: %(default)s: length, width, height)',
     )  # fmt: skip
     parser.add_argument(
         '--forward-axis', choices=FORWARD, default=STANDARD.forward_axis,
-        help='axis of a pose that points forward (default: %(default)s)',
+        help='axis of the box pose that points forward (default: %(default)s)',
+    )  # fmt: skip
+
+
+def add_label_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the label formats, for every subcommand that writes them."""
+    parser.add_argument(
+        '--camera', type=Path, metavar='FILE',
+        help='camera calibration, for formats with image coordinates',
+    )  # fmt: skip
+    parser.add_argument(
+        '--swap-axes', action='store_true',
+        help='write the extents in the order that Datumaro and CVAT display them',
+    )  # fmt: skip
+    parser.add_argument(
+        '--with-points', action='store_true',
+        help='also write the point clouds that a label format stores beside its labels',
+    )  # fmt: skip
+    parser.add_argument(
+        '--label-frame', metavar='FRAME',
+        help='sensor frame of the label files (default: frame of the clouds)',
     )  # fmt: skip
 
 
 def convention_from(args: argparse.Namespace, associate: bool = False) -> Convention:
-    """Return what `--pose-reference` and the options beside it say."""
+    """Return the convention of the boxes that the arguments describe."""
     return Convention(args.pose_reference, args.size_order, args.forward_axis, associate)
 
 
 def setting(text: str) -> tuple[str, Any]:
-    """Return name and value of ``KEY=VALUE``, the value read as YAML."""
+    """
+    Return name and value of ``KEY=VALUE``, the value parsed as YAML.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If the text has another form, or the value is not YAML.
+
+    """
     name, equals, value = text.partition('=')
     if not name or not equals:
         raise argparse.ArgumentTypeError(f'expected KEY=VALUE, got {text!r}')
     try:
         return name, yaml.safe_load(value)
     except yaml.YAMLError:
-        raise argparse.ArgumentTypeError(f'{name}: not a YAML value: {value!r}') from None
+        raise argparse.ArgumentTypeError(f'{name}: expected a YAML value, got {value!r}') from None
 
 
 def config_from(args: argparse.Namespace) -> Config:
-    """Return the settings of ``--config`` and ``--set``."""
+    """Return the settings of ``--config``, overridden by those of ``--set``."""
     config = Config() if args.config is None else Config.from_yaml(args.config)
     return config.updated(dict(args.set))

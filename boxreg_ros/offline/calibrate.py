@@ -1,8 +1,8 @@
 """
-`boxreg calibrate`: the annotation rule and the errors of the input, from a few labelled tracks.
+`boxreg calibrate`: labelling margins and errors of the input, from a few labelled tracks.
 
-The rule is what the core sees of the faces of true boxes, counted as it counts input boxes while
-it learns from them. The errors are those of the boxes of the recording against the true ones.
+The labelling margins come from face observations at true boxes, pooled as the core pools those at
+input boxes. The errors are the deviations of the boxes of the recording from the true ones.
 
 """
 
@@ -16,12 +16,20 @@ import sys
 from typing import Any
 
 from boxreg_ros.config import Config, Setting, settings
-from boxreg_ros.core.face_support import Rule, support
-from boxreg_ros.core.input_model import expect, InputModel, InputNoise, LEAST, scatter, TRACKS
-from boxreg_ros.core.input_model import KINDS as FACE_KINDS
-from boxreg_ros.core.objective import EXTENT, State
+from boxreg_ros.core.batch import EXTENT, State
+from boxreg_ros.core.face_support import FaceOffsets, observe_faces
+from boxreg_ros.core.input_model import (
+    expect,
+    FACE_GROUPS,
+    input_residuals,
+    InputModel,
+    InputNoise,
+    MAD_TO_DEVIATION,
+    MAX_TRACKS,
+    MIN_OBSERVATIONS_FOR_NOISE,
+)
 from boxreg_ros.core.observation import Observation, observe
-from boxreg_ros.core.window import batches, stack, Window
+from boxreg_ros.core.window import group_windows, stack_windows, Window
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
@@ -34,26 +42,28 @@ import torch
 import yaml
 
 GAPS = ('gap_ends', 'gap_sides', 'gap_top', 'gap_bottom')
-DEPTHS = ('depth_ends', 'depth_sides')
+INSETS = ('inset_ends', 'inset_sides')
 ERRORS = ('position', 'lateral', 'height', 'tilt', 'heading', 'extent')
 KINDS = ('vehicle', 'cyclist', 'pedestrian')
-PASSES = 4  # how a face is seen depends a little on the rule that is looked for
-FEWEST = 3  # tracks that make a value
+PASSES = 4
+"""Passes of the estimation: the outermost points depend a little on the margins. Chosen."""
+MIN_TRACKS = 3
+"""Fewest tracks that give a value. Chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
     """
-    A setting as labelled tracks have it.
+    A setting as estimated from labelled tracks.
 
     Attributes
     ----------
     value : float
-        What it should be; NaN where nothing told.
+        The estimate; NaN without evidence.
     spread : float
         Robust standard deviation between tracks, in the unit of the value.
     tracks : int
-        How many told.
+        Number of tracks with evidence.
 
     """
 
@@ -62,75 +72,67 @@ class Measured:
     tracks: int
 
     @classmethod
-    def median(cls, values: Floats, tracks: int) -> Measured:
-        """Return the median of values, of which each track gave some."""
+    def median(cls, means: Sequence[Floats]) -> Measured:
+        """Return the median over values, one array of them per track."""
+        values = np.concatenate([np.zeros(0), *means])
         middle = float(np.median(values)) if len(values) else np.nan
-        return cls(middle, _deviation(values - middle), tracks)
+        return cls(middle, _deviation(values - middle), len(means))
 
 
-class _Sights(InputModel):
-    """What the core learns of a rule, track by track."""
-
-    def of(self, which: int, faces: Sequence[int]) -> list[Floats]:
-        """Return shifts of gaps (0) or depths (1) of faces, per track that tells some [m]."""
-        means = []
-        for known in self._sights.values():
-            total, count, share = known[which][:, faces]
-            if (count >= FEWEST).any():  # observations, as the model wants of a track
-                means.append(total[count >= FEWEST] / share[count >= FEWEST])
-        return means
-
-
-def annotation_rule(drive: Drive, config: Config) -> dict[str, Measured]:
+def labelling_margins(drive: Drive, config: Config) -> dict[str, Measured]:
     """
-    Return the gaps and depths of faces, as true boxes show them.
+    Estimate the labelling margins and insets of faces at true boxes.
 
     Parameters
     ----------
     drive : Drive
-        Sweeps and true boxes; its noisy boxes do not matter.
+        Sweeps and true boxes; its input boxes are not used.
     config : Config
-        How faces are seen, and the rule to begin with.
+        How faces are observed, and the margins to begin with.
 
     Returns
     -------
-    rule : dict of Measured
-        By name of the setting [m]: gaps of the kinds of objects there are, depths of all
-        together. What was seen on no track is NaN.
+    margins : dict of Measured
+        By name of the setting [m]: margins of the kinds of objects there are, insets of all kinds
+        together. NaN without evidence.
 
     """
     kinds: dict[str, list[Window]] = {}
     for window in _true_windows(drive, config):
         kinds.setdefault(_kind(window.class_name, config), []).append(window)
-    rule: dict[str, Measured] = {}
+    found: dict[str, Measured] = {}
     for _ in range(PASSES):
-        gaps: dict[str, list[Floats]] = {f'{k}.{n}': [] for k in kinds for n in GAPS}
-        depths: dict[str, list[Floats]] = {f'faces.{n}': [] for n in DEPTHS}
-        for kind, windows in kinds.items():
-            expected = [getattr(getattr(config, kind), name) for name in GAPS]
-            for first in range(0, len(windows), TRACKS):
-                model = _Sights(config.faces)
-                _show(model, windows[first : first + TRACKS], config, model.rule())
-                for name, gap, faces in zip(GAPS, expected, FACE_KINDS, strict=True):
-                    gaps[f'{kind}.{name}'] += [gap + shift for shift in model.of(0, faces)]
-                for name, faces in zip(DEPTHS, FACE_KINDS, strict=False):
-                    depths[f'faces.{name}'] += model.of(1, faces)
-        rule = {
-            name: Measured.median(np.concatenate([np.zeros(0), *means]), len(means))
-            for name, means in (gaps | depths).items()
-        }
-        config = config.updated(_valid(rule))
-    return rule
+        means = _means_of_tracks(kinds, config)
+        found = {name: Measured.median(values) for name, values in means.items()}
+        config = config.updated(_valid(found))
+    return found
+
+
+def _means_of_tracks(
+    kinds: Mapping[str, Sequence[Window]], config: Config
+) -> dict[str, list[Floats]]:
+    """Return margins and insets by name of the setting, one array per track with evidence [m]."""
+    gaps: dict[str, list[Floats]] = {f'{kind}.{name}': [] for kind in kinds for name in GAPS}
+    insets: dict[str, list[Floats]] = {f'faces.{name}': [] for name in INSETS}
+    for kind, windows in kinds.items():
+        expected = [getattr(getattr(config, kind), name) for name in GAPS]
+        for first in range(0, len(windows), MAX_TRACKS):
+            model = _model_of(windows[first : first + MAX_TRACKS], config)
+            for name, gap, faces in zip(GAPS, expected, FACE_GROUPS, strict=True):
+                gaps[f'{kind}.{name}'] += [gap + shift for shift in model.gaps_of_tracks(faces)]
+            for name, faces in zip(INSETS, FACE_GROUPS, strict=False):
+                insets[f'faces.{name}'] += model.occlusion_insets_of_tracks(faces)
+    return gaps | insets
 
 
 def input_errors(drive: Drive, config: Config) -> dict[str, Measured]:
-    """Return how the boxes of a drive err, by name of the setting, for kinds of objects it has."""
+    """Return the errors of a drive's boxes by name of the setting, for its kinds of objects."""
     given = {
         (array.stamp_ns, name): box
         for array in reversed(drive.boxes)
         for name, box in zip(reversed(array.track_ids), reversed(array.boxes), strict=True)
         if is_valid_box(box)
-    }  # of boxes with one identity the first counts
+    }  # of several boxes with one id the first counts
     pairs: dict[str, dict[str, list[tuple[int, Floats, Floats]]]] = {}
     truth = drive.truth
     for i in np.argsort(truth.stamps_ns, kind='stable'):
@@ -149,48 +151,54 @@ def input_errors(drive: Drive, config: Config) -> dict[str, Measured]:
 def _errors_of_kind(
     tracks: list[list[tuple[int, Floats, Floats]]], config: Config
 ) -> dict[str, Measured]:
-    """Return the errors of tracks of (stamp, input box, true box) long enough to tell."""
-    tracks = [track for track in tracks if len(track) >= LEAST]
+    """Return the errors of tracks of (stamp, input box, true box) that are long enough."""
+    tracks = [track for track in tracks if len(track) >= MIN_OBSERVATIONS_FOR_NOISE]
+    found = dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
     if not tracks:
-        return dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
-    problem, base = stack([_bare([row[:2] for row in track]) for track in tracks], config)
-    true, true_base = stack([_bare([row[::2] for row in track]) for track in tracks], config)
-    problem = problem._replace(mask=problem.valid[..., None])  # the truth tells, not points
-    pose = true.pose + torch.nn.functional.pad(torch.from_numpy(true_base - base), (0, 3))[:, None]
-    # Headings against those of the truth, whichever of the two directions a track is given in.
+        return found
+    given = [_bare([row[:2] for row in track]) for track in tracks]
+    labelled = [_bare([row[::2] for row in track]) for track in tracks]
+    problem, base = stack_windows(given, config)
+    true, true_base = stack_windows(labelled, config)
+    problem = problem._replace(mask=problem.valid[..., None])  # as if all boxes had points
+    shift = torch.nn.functional.pad(torch.from_numpy(true_base - base), (0, 3))
+    pose = true.pose + shift[:, None]
+    # The input may have the opposite heading, for a whole track: yaw is compared modulo 180°.
     half_turns = torch.tensor([2.0, 2.0, 1.0]) * torch.pi
     pose[..., 3:] += half_turns * ((problem.pose - pose)[..., 3:] / half_turns).round()
-    rule = Rule(*torch.zeros(3, 6))
-    extent = expect(true, rule).shared
-    off = scatter(problem, State(pose, extent))
-    off = off[off.isfinite().all(2).sum(1) >= LEAST]  # the boxes of others were held
-
-    def deviations(rows: slice) -> Floats:
-        noise = InputNoise.measure(off[rows])
-        lon, lat, z, roll, pitch, yaw = noise.deviation[:6].tolist()
-        return np.array([lon, lat, z, np.hypot(roll, pitch) / np.sqrt(2), yaw])
-
-    found = dict.fromkeys(ERRORS, Measured(np.nan, np.nan, 0))
-    if len(off):
-        single = np.array([deviations(slice(b, b + 1)) for b in range(len(off))])
+    no_offsets = FaceOffsets(*torch.zeros(3, 6))
+    extent = expect(true, no_offsets).shared
+    residuals = input_residuals(problem, State(pose, extent))
+    # Without tracks whose boxes only repeat the one before.
+    counts = residuals.isfinite().all(2).sum(1)
+    residuals = residuals[counts >= MIN_OBSERVATIONS_FOR_NOISE]
+    if len(residuals):
+        single = np.array([_deviations(residuals[b : b + 1]) for b in range(len(residuals))])
         spreads = [_deviation(column - np.median(column)) for column in single.T]
-        for name, value, spread in zip(ERRORS, deviations(slice(None)), spreads, strict=False):
-            found[name] = Measured(float(value), spread, len(off))
-    # What counts for the one extent of a track is the error of its mean.
-    error = (expect(problem, rule).shared / extent)[:, EXTENT].numpy() - 1
-    size = 1.48 * np.median(np.abs(error), axis=1)
-    found['extent'] = Measured(
-        1.48 * float(np.median(np.abs(error))), _deviation(size - np.median(size)), len(tracks)
-    )
+        values = _deviations(residuals)
+        for name, value, spread in zip(ERRORS, values, spreads, strict=False):
+            found[name] = Measured(float(value), spread, len(residuals))
+    # A track has one extent: what counts is the error of its mean.
+    error = np.abs((expect(problem, no_offsets).shared / extent)[:, EXTENT].numpy() - 1)
+    by_track = MAD_TO_DEVIATION * np.median(error, axis=1)
+    spread = _deviation(by_track - np.median(by_track))
+    found['extent'] = Measured(MAD_TO_DEVIATION * float(np.median(error)), spread, len(tracks))
     return found
+
+
+def _deviations(residuals: torch.Tensor) -> Floats:
+    """Return the deviations (5,) of all `ERRORS` but the extent, of residuals (B, N, 9)."""
+    noise = InputNoise.estimate(residuals)
+    lon, lat, z, roll, pitch, yaw = noise.deviation[:6].tolist()
+    return np.array([lon, lat, z, np.hypot(roll, pitch) / np.sqrt(2), yaw])
 
 
 def calibrated(config: Config, measured: Mapping[str, Measured]) -> dict[str, Any]:
     """
-    Return the settings that were measured, and those in `config` that are not the defaults.
+    Return the settings that were estimated, and those in `config` that are not the defaults.
 
-    The rule is stated, and not learnt from the input any more, where of each kind of objects
-    all gaps are known or none is: such a kind keeps what is expected of it.
+    `faces.learn` is switched off if for each kind of objects all margins are known, or none: a
+    kind without labels keeps those of `config`.
 
     """
     values: dict[str, Any] = {
@@ -206,13 +214,13 @@ def calibrated(config: Config, measured: Mapping[str, Measured]) -> dict[str, An
 
 
 def _valid(measured: Mapping[str, Measured]) -> dict[str, Any]:
-    """Return values by name that enough tracks told, as near as the bounds of settings allow."""
+    """Return values by name that enough tracks have evidence of, within the bounds of settings."""
     bounds = {item.name: item for item in settings()}
     values = {}
     for name, found in measured.items():
-        if found.tracks >= FEWEST:
+        if found.tracks >= MIN_TRACKS:
             item = bounds[name]
-            # Angles that neither labels nor input have tell nothing of an error.
+            # Neither labels nor input may have roll and pitch: their error is unknown.
             if not (name.endswith('tilt') and found.value < (item.low or 0)):
                 values[name] = float(np.clip(found.value, item.low, item.high))
     return values
@@ -229,17 +237,18 @@ def write_settings(path: Path, values: Mapping[str, Any], origin: str) -> None:
         inner[last] = value
     text = yaml.safe_dump({'/**': {'ros__parameters': nested}}, sort_keys=False)
     text = f'# boxreg calibrate, {origin}\n{text}'
-    path.write_text(text, encoding='utf-8', errors='backslashreplace')  # names of files in origin
+    # `origin` has file names, which may not be valid text.
+    path.write_text(text, encoding='utf-8', errors='backslashreplace')
 
 
 def table(measured: Mapping[str, Measured], config: Config) -> list[str]:
-    """Return lines: each setting as measured, and what it was before."""
+    """Return lines: each setting before and as estimated."""
     known: dict[str, tuple[Setting, Any]] = {item.name: (item, v) for item, v in config.items()}
     used = _valid(measured)
     lines = [f'{"setting":22}{"before":>9}{"measured":>10}{"spread":>9}{"tracks":>8}']
     for name, found in measured.items():
         item, before = known[name]
-        note = f'  {item.unit}' if name in used else '  (stays: too little to tell)'
+        note = f'  {item.unit}' if name in used else '  (kept: not enough evidence)'
         numbers = (f'{x:.3f}' if np.isfinite(x) else '-' for x in (found.value, found.spread))
         value, spread = numbers
         lines.append(f'{name:22}{before:9.3f}{value:>10}{spread:>9}{found.tracks:8d}{note}')
@@ -254,22 +263,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='true boxes of some tracks, in the columns of boxes.csv',
     )  # fmt: skip
     parser.add_argument(
-        '-o', '--output', type=Path, metavar='RULE.yaml', help='where the settings go'
+        '-o', '--output', type=Path, metavar='RULE.yaml', help='file to write the settings to'
     )
     parser.add_argument(
-        '--no-boxes', action='store_true', help='measure the rule alone, no errors of the input'
-    )
+        '--no-boxes',
+        action='store_true',
+        help='estimate the labelling margins only, not the errors of the input',
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, print what was found, and write it as settings."""
+    """Estimate, print a table, and write the settings."""
     config = config_from(args)
     if args.output and (args.output.is_dir() or not args.output.parent.is_dir()):
         raise ConfigError(
             f'output {str(args.output)!r}: expected a file in a folder that is there, got '
             f'{str(args.output if args.output.is_dir() else args.output.parent)!r}; choose another'
         )
-    if args.output:  # that of --config may be measured anew
+    if args.output:  # may be the file of --config
         spare_file(args.output, [*args.recordings, args.truth])
     truth = BoxTable.read(args.truth)
     recording = Recording(
@@ -279,11 +290,12 @@ def run(args: argparse.Namespace) -> int:
     drive = Drive.of(recording, truth, config.tolerance)
     if drive.left_out:
         print(f'boxreg: {drive.left_out}', file=sys.stderr)
-    measured = annotation_rule(drive, config)
+    measured = labelling_margins(drive, config)
     if not any(found.tracks for found in measured.values()):
         raise RecordingError(
-            f'{args.truth}: expected true boxes with points in {recording}, got no face of '
-            f'{len(truth.boxes)} boxes that is seen; are stamps and frame those of the recording?'
+            f'{args.truth}: expected true boxes with points in {recording}, got no face '
+            f'observation at {len(truth.boxes)} boxes; '
+            'are stamps and frame those of the recording?'
         )
     if not args.no_boxes:
         measured |= input_errors(drive, config)
@@ -291,24 +303,24 @@ def run(args: argparse.Namespace) -> int:
     values = calibrated(config, measured)
     learns = values.get('faces.learn', config.faces.learn)
     print(
-        f'{len(set(truth.track_ids))} labelled tracks; spread between them; the rule '
+        f'{len(set(truth.track_ids))} labelled tracks; the spread is between them; '
         + (
-            'is still corrected by the input: not all gaps of a kind told'
+            'the input still corrects the labelling margins: some of a kind are unknown'
             if learns
-            else 'is stated (faces.learn: false), where nothing told as before'
+            else 'the labelling margins are fixed (faces.learn: false)'
         )
     )
     if args.output:
         write_settings(args.output, values, f'{args.truth.name} of {recording}')
-        print(f'{args.output}: for --config of boxreg relabel and --params-file of the node')
+        print(f'{args.output}: use it with boxreg relabel --config or the node --params-file')
     return 0
 
 
 def _true_windows(drive: Drive, config: Config) -> list[Window]:
-    """Return the labelled tracks as the core would see them if they were its input."""
+    """Return the labelled tracks as windows, as if the labels were the input."""
     truth = drive.truth
     rows = np.flatnonzero([is_valid_box(box) for box in truth.boxes])
-    seen: dict[str, list[Observation]] = {}
+    observations: dict[str, list[Observation]] = {}
     classes: dict[str, str] = {}
     for stamp_ns in np.unique(truth.stamps_ns[rows]).tolist() if drive.sweeps else ():
         (sweep,) = drive.sweeps_at(np.array([stamp_ns]))
@@ -317,20 +329,27 @@ def _true_windows(drive: Drive, config: Config) -> list[Window]:
         here = rows[truth.stamps_ns[rows] == stamp_ns]
         found = observe(sweep, truth.boxes[here], stamp_ns, config)
         for i, observation in zip(here, found, strict=True):
-            seen.setdefault(truth.track_ids[i], []).append(observation)
+            observations.setdefault(truth.track_ids[i], []).append(observation)
             classes[truth.track_ids[i]] = truth.class_names[i]
-    nothing = np.zeros((0, 9))
-    return [Window(name, classes[name], o, len(o), nothing) for name, o in seen.items()]
+    start = np.zeros((0, 9))
+    return [
+        Window(track_id, classes[track_id], track, len(track), start)
+        for track_id, track in observations.items()
+    ]
 
 
-def _show(model: InputModel, windows: Sequence[Window], config: Config, rule: Rule) -> None:
-    """Show true boxes to a model as `registration` shows it input boxes."""
-    for rows in batches(windows, config):
+def _model_of(windows: Sequence[Window], config: Config) -> InputModel:
+    """Return an input model with the face observations at the boxes of `windows`."""
+    model = InputModel(config.faces)
+    offsets = model.offsets()
+    for rows in group_windows(windows, config):
         part = [windows[i] for i in rows]
-        problem, _ = stack(part, config)
-        state = State(problem.pose, expect(problem, rule).shared)
-        sights = support(problem, state, config.faces.outermost, rule)
-        model.learn_rule([w.track_id for w in part], sights, problem.valid, rule)
+        problem, _ = stack_windows(part, config)
+        state = State(problem.pose, expect(problem, offsets).shared)
+        observations = observe_faces(problem, state, offsets, config)
+        track_ids = [window.track_id for window in part]
+        model.add_face_observations(track_ids, observations, problem.valid, offsets)
+    return model
 
 
 def _bare(rows: Iterable[Sequence[Any]]) -> Window:
@@ -351,4 +370,4 @@ def _kind(class_name: str, config: Config) -> str:
 
 def _deviation(offsets: Floats) -> float:
     """Return the robust standard deviation of offsets from their median; NaN without any."""
-    return 1.48 * float(np.median(np.abs(offsets))) if len(offsets) else np.nan
+    return MAD_TO_DEVIATION * float(np.median(np.abs(offsets))) if len(offsets) else np.nan

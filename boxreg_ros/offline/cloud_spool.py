@@ -1,4 +1,4 @@
-"""Clouds on their way to label files, on disk: the boxes of a cloud may be ready much later."""
+"""Clouds kept on disk until the boxes of their stamp are final and their files are written."""
 
 from __future__ import annotations
 
@@ -11,57 +11,82 @@ from boxreg_ros.io.transforms import inverse, sweep_to_frame
 from boxreg_ros.structures import Floats, Sweep
 import numpy as np
 
+FOLDER = '.clouds'
+
 
 class Spool:
     """
-    Sweeps in their own frame, each a file until nothing can ask for it any more.
+    Store sweeps in their own frame, one file each, until no box array can need them.
 
     Parameters
     ----------
     folder : Path
-        Of results; the clouds are in a folder of their own in it, until `remove`.
+        Folder of results. The clouds lie in a hidden folder inside it until `remove`.
     config : Config
-        Tells how far off boxes a cloud may be that is theirs, as for the registrar.
+        Gives the maximum time offset between boxes and their cloud, as for the registrar.
 
     """
 
     def __init__(self, folder: Path, config: Config) -> None:
-        self._folder = folder / '.clouds'
-        self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
-        self._poses: dict[int, tuple[str, Floats]] = {}
-        self._stamps: list[int] = []
+        self._folder = folder / FOLDER
+        self._max_offset_ns = round(max(config.reach, config.tolerance) * 1e9)
+        self._frames: dict[int, tuple[str, Floats]] = {}  # stamp -> frame id, T_fixed_sweep
+        self._stamps: list[int] = []  # ascending
         self._folder.mkdir()
 
     def add(self, sweep: Sweep, T_fixed_sweep: Floats, intensities: Floats | None = None) -> None:
-        """Store a sweep with the pose of its frame; of one stamp, the first."""
-        if sweep.stamp_ns not in self._poses:
-            insort(self._stamps, sweep.stamp_ns)
-            self._poses[sweep.stamp_ns] = sweep.frame_id, T_fixed_sweep
-            columns = [sweep.points]
-            if intensities is not None:
-                columns.append(intensities[:, None])
-            table = np.hstack(columns, dtype=sweep.points.dtype, casting='same_kind')
-            np.save(self._file(sweep.stamp_ns), table)
+        """
+        Store a sweep; a second one of the same stamp is ignored.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            Points in the frame of the sensor.
+        T_fixed_sweep : array, shape (4, 4)
+            Pose of that frame in the fixed frame at the stamp.
+        intensities : array, shape (M,), optional
+            One value per point.
+
+        """
+        stamp_ns = sweep.stamp_ns
+        if stamp_ns in self._frames:
+            return
+        insort(self._stamps, stamp_ns)
+        self._frames[stamp_ns] = sweep.frame_id, T_fixed_sweep
+        columns = [sweep.points]
+        if intensities is not None:
+            columns.append(intensities[:, None])
+        table = np.hstack(columns, dtype=sweep.points.dtype, casting='same_kind')
+        np.save(self._file(stamp_ns), table)
 
     def take(
         self, stamp_ns: int, frame_id: str, T_fixed_frame: Floats
     ) -> tuple[Sweep | None, Floats | None]:
         """
-        Return the cloud nearest to a stamp, in a frame as that was at the stamp.
+        Return the cloud nearest to a stamp, and delete the clouds that are too old for it.
 
-        Its intensities come with it. Clouds that are older are removed. None if there is none
-        within reach.
+        Parameters
+        ----------
+        stamp_ns : int
+            Stamp of a box array [ns], not smaller than in the call before.
+        frame_id : str
+            Frame to return the points in.
+        T_fixed_frame : array, shape (4, 4)
+            Pose of that frame in the fixed frame at the stamp.
+
+        Returns
+        -------
+        sweep : Sweep or None
+            None where no cloud lies within the maximum time offset.
+        intensities : array, shape (M,), or None
+            None where the cloud has none.
 
         """
-        first = bisect_left(self._stamps, stamp_ns - self._reach_ns)
-        for old in self._stamps[:first]:
-            self._file(old).unlink()
-            del self._poses[old]
-        del self._stamps[:first]
+        self._delete_before(stamp_ns - self._max_offset_ns)
         nearest = min(self._stamps, key=lambda stamp: abs(stamp - stamp_ns), default=None)
-        if nearest is None or abs(nearest - stamp_ns) > self._reach_ns:
+        if nearest is None or abs(nearest - stamp_ns) > self._max_offset_ns:
             return None, None
-        own_frame, T_fixed_sweep = self._poses[nearest]
+        own_frame, T_fixed_sweep = self._frames[nearest]
         table = np.load(self._file(nearest))
         intensities = table[:, 3] if table.shape[1] > 3 else None
         sweep = Sweep(nearest, own_frame, table[:, :3])
@@ -70,8 +95,15 @@ class Spool:
         return sweep, intensities
 
     def remove(self) -> None:
-        """Remove all that is left."""
+        """Delete the folder with the clouds that are left."""
         shutil.rmtree(self._folder)
+
+    def _delete_before(self, oldest_ns: int) -> None:
+        first = bisect_left(self._stamps, oldest_ns)
+        for stamp_ns in self._stamps[:first]:
+            self._file(stamp_ns).unlink()
+            del self._frames[stamp_ns]
+        del self._stamps[:first]
 
     def _file(self, stamp_ns: int) -> Path:
         return self._folder / f'{stamp_ns}.npy'

@@ -10,12 +10,13 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import EXTENT
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
+from boxreg_ros.errors import RecordingError, TransformUnavailable
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.session import register
 from boxreg_ros.io.transforms import sweep_to_frame, to_fixed_frame, TransformTree
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.simulation.simulate import Scene
+from boxreg_ros.simulation.scene import Scene
 from boxreg_ros.structures import (
     BoxArray,
     Floats,
@@ -29,7 +30,8 @@ from boxreg_ros.structures import (
 import numpy as np
 from numpy.typing import NDArray
 
-MARGIN = 1.0  # [m], points this far outside a box are handed to the baselines
+MARGIN = 1.0
+"""Points up to this distance outside of a box are passed to the baselines [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +41,13 @@ class Drive:
 
     Attributes
     ----------
-    sweeps, boxes, truth
-        What there is.
+    sweeps : tuple of Sweep
+    boxes : tuple of BoxArray
+        Noisy boxes.
+    truth : BoxTable
+        True boxes; all are in their frame.
     left_out : str
-        How many messages of a recording are not among these, and why; '' if all are.
+        Number of messages of the recording that are not used, and why; empty if all are.
 
     """
 
@@ -53,7 +58,7 @@ class Drive:
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Drive:
-        """Return what was simulated."""
+        """Return a simulated drive."""
         sweeps = zip(scene.sweeps, scene.T_fixed_sensor, strict=True)
         moved = tuple(sweep_to_frame(sweep, T, 'odom') for sweep, T in sweeps)
         return cls(moved, tuple(scene.fixed_detections()), scene.truth)
@@ -66,7 +71,7 @@ class Drive:
         Raises
         ------
         RecordingError
-            If they are not there, or cannot be read.
+            If they do not exist, or cannot be read.
 
         """
         if not folder.is_dir():
@@ -83,36 +88,36 @@ class Drive:
         """
         Read a recording that is not open yet, in the frame of its true boxes.
 
-        Messages that cannot be read or have no transform are passed over. All sweeps are held in
-        memory, or those no further from the stamp of a true box than `within` [s].
+        Messages that cannot be decoded or have no transform are left out. Sweeps are held in
+        memory: all of them, or those within `within` [s] of the stamp of a true box.
 
         Raises
         ------
         RecordingError
-            If it has no sweeps, cannot be read, or nothing connects it with that frame.
+            If it has no sweeps, cannot be read, or no transforms connect it with that frame.
 
         """
         tree = TransformTree()
-        sweeps, boxes, unmoved = [], [], []
+        sweeps: list[Sweep] = []
+        boxes: list[BoxArray] = []
+        missing_transforms: list[str] = []
         has_sweeps = False
         with recording:
             fixed_frame = recording.choose_fixed_frame(tree, truth.frame_id)
-            for record in recording.records(tree):
+            for item in recording.items(tree):
                 try:
-                    item = to_fixed_frame(recording.decode(record), tree, fixed_frame)
-                except UnsupportedMessage as error:
-                    recording.pass_over(record, error)
+                    moved = to_fixed_frame(item.content, tree, fixed_frame)
                 except TransformUnavailable as error:
-                    unmoved.append(str(error))
-                else:
-                    if isinstance(item, BoxArray):
-                        boxes.append(item)
-                        continue
-                    has_sweeps = True
-                    off_ns = np.abs(truth.stamps_ns - item.stamp_ns)
-                    if within is None or (off_ns <= within * 1e9).any():
-                        sweeps.append(item)
-        left_out = recording.left_out(unmoved)
+                    missing_transforms.append(str(error))
+                    continue
+                if isinstance(moved, BoxArray):
+                    boxes.append(moved)
+                    continue
+                has_sweeps = True
+                away_ns = np.abs(truth.stamps_ns - moved.stamp_ns)
+                if within is None or (away_ns <= within * 1e9).any():
+                    sweeps.append(moved)
+        left_out = recording.left_out(missing_transforms)
         if not has_sweeps:
             reason = f': {left_out}' if left_out else ''
             raise RecordingError(f'{recording}: expected sweeps, got none{reason}')
@@ -124,15 +129,12 @@ class Drive:
         )
 
     def registered(self, config: Config) -> dict[str, BoxTable]:
-        """Return boxes by estimate: 'early' and 'final' come from one run, 'track' of another."""
+        """Return refined boxes by estimate: 'early' and that of `config`, from one run."""
         registrar = BoxRegistrar(config)
         results: list[RefinedBoxes] = []
         items: list[Sweep | BoxArray] = [*self.sweeps, *self.boxes]
         for item in sorted(items, key=lambda item: item.stamp_ns):
-            if isinstance(item, Sweep):
-                results += registrar.add_sweep(item)
-            else:
-                results += registrar.add_boxes(item)
+            results += register(registrar, item, restarts=False)
         results += registrar.flush()
         found: dict[str, list[BoxArray]] = {}
         for result in results:
@@ -158,11 +160,11 @@ class Drive:
         return tracks
 
     def ranges(self, rows: Ints) -> Floats:
-        """Return how far the true boxes in `rows` are from the sensor, in the plane [m]."""
+        """Return the horizontal distance (n,) of the true boxes in `rows` to the sensor [m]."""
         near = self.sweeps_at(self.truth.stamps_ns[rows])
         origins = np.array([sweep.origin for sweep in near]).reshape(-1, 3)
-        apart: Floats = np.linalg.norm((self.truth.boxes[rows, :3] - origins)[:, :2], axis=1)
-        return apart
+        ranges: Floats = np.linalg.norm((self.truth.boxes[rows, :3] - origins)[:, :2], axis=1)
+        return ranges
 
     def sweeps_at(self, stamps_ns: Ints) -> list[Sweep]:
         """Return the sweep nearest in time to each stamp."""

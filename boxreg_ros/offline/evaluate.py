@@ -1,4 +1,4 @@
-"""`boxreg evaluate`: boxes against true boxes, matched by stamp and track."""
+"""`boxreg evaluate`: compare boxes with true boxes, matched by stamp and track id."""
 
 from __future__ import annotations
 
@@ -23,8 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 RECALLS = (0.5, 0.7, 0.8)
+"""IoU thresholds of the recalls."""
 POINT_BINS = (0, 10, 30, 100, 300, 1000)
-LONGEST_STEP = 1.0  # [s], jitter is not read across longer silences
+"""Lower limits of the groups by number of points."""
+MAX_STEP = 1.0
+"""Jitter is not computed across longer gaps [s]."""
 
 Mask = NDArray[np.bool_]
 
@@ -32,35 +35,35 @@ Mask = NDArray[np.bool_]
 @dataclass(frozen=True, slots=True)
 class Matches:
     """
-    Every true box in scope with the prediction of the same stamp and track, if there is one.
+    All true boxes in scope, each with the prediction of its stamp and track id if there is one.
 
     Attributes
     ----------
     rows : array, shape (n,)
-        Where the true boxes are in their table.
+        Rows of the true boxes in their table.
     class_names : tuple of n str
         Of the true boxes.
     num_points : array, shape (n,)
         Of the true boxes.
     is_matched : array, shape (n,)
-        True where a finite prediction exists; the rows of the others hold 0 below.
+        True where a finite prediction exists; the errors below are 0 elsewhere.
     iou_bev, iou_3d : array, shape (n,)
         Overlap with the prediction.
     translation, extent, rotation : array, shape (n, 3)
         Errors as in `PoseErrors`.
     scale_iou : array, shape (n,)
-        3D IoU after centres and headings are aligned.
+        3D IoU after alignment of centre and heading.
     is_flipped : array, shape (n,)
-        True where the heading is off by more than a right angle.
+        True where the heading error is larger than 90 degrees.
     jitter, turn_jitter : array, shape (n,)
-        Size of the second difference over time of the predicted centre [m/s^2] and yaw
-        [rad/s^2]; NaN where no neighbour before or after is within `LONGEST_STEP`.
+        Norm of the second difference over time of the predicted centre [m/s^2] and yaw
+        [rad/s^2]; NaN without a box of the track within `MAX_STEP` before and after.
     true_jitter : array, shape (n,)
-        The same of the true centre, to read `jitter` against.
+        The same of the true centre, as a reference for `jitter`.
     unmatched : int
-        Predictions whose stamp and track are not in the truth at all.
+        Predictions without a true box of the same stamp and track id.
     invalid : int
-        True boxes left out of scope: NaN, or an extent that is not positive.
+        True boxes that are out of scope because of NaN or an extent that is not positive.
 
     """
 
@@ -85,7 +88,7 @@ class Matches:
 @dataclass(frozen=True, slots=True)
 class Scores:
     """
-    Means over true boxes; errors over those with a prediction, recalls over all.
+    Means over true boxes: errors over those with a prediction, recalls over all.
 
     Attributes
     ----------
@@ -94,14 +97,15 @@ class Scores:
     iou_bev, iou_3d, iou_bev_median, iou_3d_median : float
         Over matched boxes.
     recall_bev, recall_3d : tuple of float
-        Part of the true boxes overlapped by at least each of `RECALLS`; a missing one counts
-        as not recalled.
+        Fraction of the true boxes with at least each IoU of `RECALLS`; a missing prediction
+        counts as IoU 0.
     ate, ase, aoe, aoe_median : float
-        Centre error [m], 1 - IoU of aligned extents, absolute yaw error [rad].
+        Average translation error [m], average scale error (1 - IoU after alignment), and
+        average absolute yaw error [rad], as in nuScenes.
     flips : float
-        Part of the matched boxes whose heading is off by more than a right angle.
+        Fraction of the matched boxes with a heading error larger than 90 degrees.
     jitter, turn_jitter, true_jitter : float
-        Means of those of `Matches` [m/s^2, rad/s^2].
+        Means of the values in `Matches` [m/s^2, rad/s^2].
 
     """
 
@@ -128,92 +132,88 @@ def match(
     predicted: BoxTable, truth: BoxTable, min_points: int = 0, classes: Sequence[str] = ()
 ) -> Matches:
     """
-    Compare predictions with the truth of the same stamp and track.
+    Compare predictions with the true boxes of the same stamp and track id.
 
     Parameters
     ----------
     predicted, truth : BoxTable
-        In one frame. Predictions of true boxes that are out of scope are left out silently.
+        Boxes in the same frame. Predictions of true boxes that are out of scope are ignored.
     min_points : int
         True boxes with fewer points are out of scope.
     classes : sequence of str
-        True boxes whose class name holds none of these words are out of scope, any case; empty
-        for all.
+        True boxes whose class name contains none of these words are out of scope; case is
+        ignored. Empty: all classes are in scope.
 
     Raises
     ------
     RecordingError
-        If the frames differ, or a track comes twice at a stamp of the truth.
+        If the frames differ, or the truth has a track id twice at one stamp.
 
     """
     if len(predicted.boxes) and len(truth.boxes) and predicted.frame_id != truth.frame_id:
         raise RecordingError(
-            f'frames differ: predicted boxes are in {predicted.frame_id!r}, true ones in '
-            f'{truth.frame_id!r}; relabel with --fixed-frame {truth.frame_id}'
+            f'predicted boxes: expected the frame of the true boxes, {truth.frame_id!r}, got '
+            f'{predicted.frame_id!r}; relabel with --fixed-frame {truth.frame_id}'
         )
-    row_of: dict[tuple[int, str], int] = {}
-    for row, key in enumerate(_keys(predicted)):
-        row_of.setdefault(key, row)  # of boxes with one identity the first counts
     true_keys = _keys(truth)
-    if len(set(true_keys)) < len(true_keys):
-        stamp, track_id = Counter(true_keys).most_common(1)[0][0]
-        raise RecordingError(f'true boxes: track {track_id!r} comes twice at stamp {stamp}')
-    in_class = np.array([has_word(name, classes) for name in truth.class_names], bool)
+    _check_unique(true_keys)
+    row_of: dict[tuple[int, str], int] = {}  # row of the prediction
+    for row, key in enumerate(_keys(predicted)):
+        row_of.setdefault(key, row)  # of two predictions with the same key the first counts
     is_valid = is_valid_box(truth.boxes)
-    kept = np.flatnonzero(is_valid & in_class & (truth.num_points >= min_points))
-    finite = np.isfinite(predicted.boxes).all(axis=1)
-    rows = np.array([row_of.get(key, -1) for key in true_keys], np.int64)[kept]
-    matched = (rows >= 0) & np.append(finite, False)[rows]
-    a, b = predicted.boxes[rows[matched]], truth.boxes[kept][matched]
-    errors = pose_errors(a, b)
-    aligned = b.copy()
-    aligned[:, EXTENT] = a[:, EXTENT]
-    stamps, tracks = truth.stamps_ns[kept][matched], [truth.track_ids[i] for i in kept[matched]]
-
-    def spread(values: NDArray[Any], absent: float = 0) -> NDArray[Any]:
-        full = np.full((len(kept), *values.shape[1:]), absent, dtype=values.dtype)
-        full[matched] = values
-        return full
-
+    is_in_class = np.array([has_word(name, classes) for name in truth.class_names], bool)
+    scope = np.flatnonzero(is_valid & is_in_class & (truth.num_points >= min_points))
+    predicted_rows = np.array([row_of.get(key, -1) for key in true_keys], np.int64)[scope]
+    is_finite = np.isfinite(predicted.boxes).all(axis=1)
+    is_matched = (predicted_rows >= 0) & np.append(is_finite, False)[predicted_rows]
+    true_rows = scope[is_matched]
+    boxes = predicted.boxes[predicted_rows[is_matched]]
+    true_boxes = truth.boxes[true_rows]
+    stamps = truth.stamps_ns[true_rows]
+    tracks = [truth.track_ids[i] for i in true_rows]
+    errors = pose_errors(boxes, true_boxes)
+    jitter = _second_difference(stamps, tracks, boxes[:, :3])
+    turn_jitter = _second_difference(stamps, tracks, boxes[:, [YAW]], is_angle=True)
+    true_jitter = _second_difference(stamps, tracks, true_boxes[:, :3])
     return Matches(
-        rows=kept,
-        class_names=tuple(truth.class_names[i] for i in kept),
-        num_points=truth.num_points[kept],
-        is_matched=matched,
-        iou_bev=spread(iou_bev(a, b)),
-        iou_3d=spread(iou_3d(a, b)),
-        translation=spread(errors.translation),
-        extent=spread(errors.extent),
-        rotation=spread(errors.rotation),
-        scale_iou=spread(iou_3d(aligned, b)),
-        is_flipped=spread(errors.is_flipped),
-        jitter=spread(_second_difference(stamps, tracks, a[:, :3]), np.nan),
-        turn_jitter=spread(_second_difference(stamps, tracks, a[:, [YAW]], is_angle=True), np.nan),
-        true_jitter=spread(_second_difference(stamps, tracks, b[:, :3]), np.nan),
+        rows=scope,
+        class_names=tuple(truth.class_names[i] for i in scope),
+        num_points=truth.num_points[scope],
+        is_matched=is_matched,
+        iou_bev=_spread(iou_bev(boxes, true_boxes), is_matched),
+        iou_3d=_spread(iou_3d(boxes, true_boxes), is_matched),
+        translation=_spread(errors.translation, is_matched),
+        extent=_spread(errors.extent, is_matched),
+        rotation=_spread(errors.rotation, is_matched),
+        scale_iou=_spread(_scale_iou(boxes, true_boxes), is_matched),
+        is_flipped=_spread(errors.is_flipped, is_matched),
+        jitter=_spread(jitter, is_matched, np.nan),
+        turn_jitter=_spread(turn_jitter, is_matched, np.nan),
+        true_jitter=_spread(true_jitter, is_matched, np.nan),
         unmatched=len(row_of.keys() - set(true_keys)),
         invalid=int((~is_valid).sum()),
     )
 
 
 def summarise(matches: Matches, mask: Mask | None = None) -> Scores:
-    """Return the scores over the true boxes where `mask` is True, or over all."""
+    """Return the scores over the true boxes where `mask` (n,) is True, or over all."""
     chosen = np.ones(len(matches.is_matched), bool) if mask is None else mask
     rows = chosen & matches.is_matched
-    bev, volume, yaw = matches.iou_bev, matches.iou_3d, np.abs(matches.rotation[rows, 2])
+    yaw_errors = np.abs(matches.rotation[rows, 2])
     return Scores(
         boxes=int(chosen.sum()),
         missing=int(chosen.sum() - rows.sum()),
         unmatched=matches.unmatched if mask is None else 0,
-        iou_bev=_mean(bev[rows]),
-        iou_3d=_mean(volume[rows]),
-        iou_bev_median=_median(bev[rows]),
-        iou_3d_median=_median(volume[rows]),
-        recall_bev=tuple(_mean(bev[chosen] >= level) for level in RECALLS),
-        recall_3d=tuple(_mean(volume[chosen] >= level) for level in RECALLS),
+        iou_bev=_mean(matches.iou_bev[rows]),
+        iou_3d=_mean(matches.iou_3d[rows]),
+        iou_bev_median=_median(matches.iou_bev[rows]),
+        iou_3d_median=_median(matches.iou_3d[rows]),
+        recall_bev=tuple(_mean(matches.iou_bev[chosen] >= level) for level in RECALLS),
+        recall_3d=tuple(_mean(matches.iou_3d[chosen] >= level) for level in RECALLS),
         ate=_mean(np.linalg.norm(matches.translation[rows], axis=1)),
         ase=_mean(1 - matches.scale_iou[rows]),
-        aoe=_mean(yaw),
-        aoe_median=_median(yaw),
+        aoe=_mean(yaw_errors),
+        aoe_median=_median(yaw_errors),
         flips=_mean(matches.is_flipped[rows]),
         jitter=_mean(matches.jitter[rows]),
         turn_jitter=_mean(matches.turn_jitter[rows]),
@@ -224,13 +224,15 @@ def summarise(matches: Matches, mask: Mask | None = None) -> Scores:
 def evaluate(
     predicted: BoxTable, truth: BoxTable, min_points: int = 0, classes: Sequence[str] = ()
 ) -> Scores:
-    """Return the scores of `predicted` over all true boxes in scope; see `match`."""
+    """Return the scores over all true boxes in scope; arguments and errors as of `match`."""
     return summarise(match(predicted, truth, min_points, classes))
 
 
 def has_word(class_name: str, words: Sequence[str]) -> bool:
-    """Return whether `class_name` holds one of `words`, any case; True for no words."""
-    return not words or not {w.lower() for w in words}.isdisjoint(words_of(class_name))
+    """Return whether a class name contains one of `words`, in any case; True without words."""
+    if not words:
+        return True
+    return not {word.lower() for word in words}.isdisjoint(words_of(class_name))
 
 
 def groups(matches: Matches) -> dict[str, dict[str, Scores]]:
@@ -241,89 +243,88 @@ def groups(matches: Matches) -> dict[str, dict[str, Scores]]:
     for low, high in zip(POINT_BINS, (*POINT_BINS[1:], math.inf), strict=True):
         mask = (matches.num_points >= low) & (matches.num_points < high)
         if mask.any():
-            by_points[f'{low}+' if high == math.inf else f'{low}-{high - 1}'] = summarise(
-                matches, mask
-            )
+            name = f'{low}+' if high == math.inf else f'{low}-{high - 1}'
+            by_points[name] = summarise(matches, mask)
     return {'by_class': by_class, 'by_points': by_points}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what `run` reads."""
+    """Add the options of `boxreg evaluate`."""
     parser.add_argument(
         'predicted', type=Path, metavar='PREDICTED',
-        help='folder or boxes.csv of a run, or a recording: its input boxes as they are',
+        help='result folder or boxes.csv, or a recording, whose input boxes are compared',
     )  # fmt: skip
-    parser.add_argument('truth', type=Path, metavar='TRUTH.csv', help='true boxes, same columns')
+    parser.add_argument(
+        'truth', type=Path, metavar='TRUTH.csv', help='true boxes, with the columns of boxes.csv'
+    )
     parser.add_argument(
         '--min-points', type=int, default=0, metavar='N',
-        help='leave out true boxes with fewer points (default: 0)',
+        help='ignore true boxes with fewer points (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument(
         '--classes', nargs='+', default=[], metavar='WORD',
-        help='only true boxes whose class name holds one of these words, as in car,van,truck',
+        help='compare only true boxes whose class name contains one of these words, as in '
+        'car,van,truck',
     )  # fmt: skip
     add_topic_arguments(parser)
-    parser.add_argument('--fixed-frame', metavar='FRAME', help='as of `boxreg relabel`')
+    parser.add_argument(
+        '--fixed-frame', metavar='FRAME',
+        help='frame to compare in, for a recording (default: as for boxreg relabel)',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the scores of one table of boxes, or of a recording's own boxes."""
+    """Print the scores of a table of boxes or of the input boxes of a recording."""
     truth = BoxTable.read(args.truth)
-    source = args.predicted
-    topics = {name: getattr(args, name) for name in ('points', 'boxes', 'odometry')}
-    convention = convention_from(args)
-    if (table_of_run := source / 'boxes.csv').is_file():
-        source = table_of_run
-    if source.suffix == '.csv':
-        if any((*topics.values(), args.fixed_frame)) or not convention.is_standard:
-            raise ConfigError(
-                f'--points, --boxes, --odometry, --fixed-frame, {convention}: expected a '
-                f'recording that they are about, got the table {str(source)!r}; leave them out'
-            )
-        predicted = _in_frame(BoxTable.read_frames(source), truth.frame_id)
-    else:
-        from boxreg_ros.io.recording import input_boxes  # reads bags: not needed for tables
-
-        arrays, left_out = input_boxes(source, args.fixed_frame, convention=convention, **topics)
-        if left_out:
-            print(f'boxreg: {left_out}', file=sys.stderr)
-        predicted = BoxTable.from_arrays(arrays)
+    predicted = _predicted(args, truth.frame_id)
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes)
     if matches.invalid:
-        print(
-            f'boxreg: {matches.invalid} of {len(truth.boxes)} true boxes are left out: NaN, or an '
-            f'extent that is not positive',
-            file=sys.stderr,
+        _warn(
+            f'{matches.invalid} of {len(truth.boxes)} true boxes are left out: NaN, or an extent '
+            f'that is not positive'
         )
     if not len(matches.is_matched):
+        names = ', '.join(sorted(set(truth.class_names)))
         raise RecordingError(
-            f'{args.truth}: none of {len(truth.boxes)} true boxes is in scope; lower --min-points '
-            f'or name other --classes; there are {", ".join(sorted(set(truth.class_names)))}'
+            f'{args.truth}: expected true boxes in scope, got none of {len(truth.boxes)}; lower '
+            f'--min-points or choose other --classes; the table has {names}'
         )
     if len(predicted.boxes) and not matches.is_matched.any():
-        print(f'boxreg: {_why_none_matches(predicted, truth, matches)}', file=sys.stderr)
-    overall, grouped = summarise(matches), groups(matches)
+        _warn(_why_none_matches(predicted, truth, matches))
+    overall = summarise(matches)
     if args.json:
-        report = asdict(overall) | {
-            name: {key: asdict(scores) for key, scores in group.items()}
-            for name, group in grouped.items()
-        }
-        print(json.dumps(finite(report)))
+        print(json.dumps(finite(_report(overall, groups(matches)))))
     else:
-        rows = {'all': overall} | grouped['by_class']
-        rows |= {f'{name} points': scores for name, scores in grouped['by_points'].items()}
-        print(table(rows))
-        print(
-            f'{overall.boxes} true boxes, {overall.missing} missing, {overall.unmatched} '
-            'predictions without one; recalls are 3D, errors in m and rad, jitter in m/s^2'
-        )
+        _print_tables(overall, groups(matches))
     return 0
 
 
-def _in_frame(tables: dict[str, BoxTable], frame_id: str) -> BoxTable:
-    """Return the boxes in a frame, those without a transform to it left out; else the most."""
+def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
+    """Read the boxes to compare: a table, or the input boxes of a recording."""
+    source: Path = args.predicted
+    if (source / 'boxes.csv').is_file():
+        source = source / 'boxes.csv'
+    topics = {name: getattr(args, name) for name in ('points', 'boxes', 'odometry')}
+    convention = convention_from(args)
+    if source.suffix == '.csv':
+        if any(topics.values()) or args.fixed_frame or not convention.is_standard:
+            raise ConfigError(
+                f'--points, --boxes, --odometry, --fixed-frame, {convention}: expected with a '
+                f'recording only, got the table {str(source)!r}; leave them out'
+            )
+        return _table_in_frame(BoxTable.read_frames(source), frame_id)
+    from boxreg_ros.io.recording import input_boxes  # slow to import: it reads bags
+
+    arrays, left_out = input_boxes(source, args.fixed_frame, convention=convention, **topics)
+    if left_out:
+        _warn(left_out)
+    return BoxTable.from_arrays(arrays)
+
+
+def _table_in_frame(tables: dict[str, BoxTable], frame_id: str) -> BoxTable:
+    """Return the boxes in a frame, or if there are none the largest table; warn of the others."""
     found = max(
         tables.values(),
         key=lambda table: (table.frame_id == frame_id, len(table.boxes)),
@@ -331,85 +332,176 @@ def _in_frame(tables: dict[str, BoxTable], frame_id: str) -> BoxTable:
     )
     for name, other in tables.items():
         if other is not found:
-            print(
-                f'boxreg: {len(other.boxes)} predicted boxes in {name!r} are left out, those in '
-                f'{found.frame_id!r} compared',
-                file=sys.stderr,
+            _warn(
+                f'{len(other.boxes)} predicted boxes in frame {name!r} are left out; those in '
+                f'{found.frame_id!r} are compared'
             )
     return found
 
 
-def _why_none_matches(predicted: BoxTable, truth: BoxTable, matches: Matches) -> str:
-    """Return what stamps and tracks of two tables have in common."""
-    true_keys, keys = _keys(truth), set(_keys(predicted))
-    if invalid := sum(true_keys[row] in keys for row in matches.rows):
-        return (
-            f'all {invalid} predicted boxes of the stamp and the track of a true one are invalid: '
-            f'expected finite numbers and a quaternion other than 0 0 0 0'
-        )
-    mine, true = predicted.stamps_ns, truth.stamps_ns
-    stamps, tracks = np.intersect1d(mine, true), set(predicted.track_ids) & set(truth.track_ids)
-    own, other = ([f'{x * 1e-9:.3f}' for x in (side.min(), side.max())] for side in (mine, true))
-    return (
-        f'no predicted box has the stamp and the track of a true one: {len(stamps)} stamps and '
-        f'{len(tracks)} track ids are in both; predicted boxes are of {" to ".join(own)} s, '
-        f'true ones of {" to ".join(other)} s; are they of one recording, with ids of one tracker?'
+def _report(overall: Scores, grouped: dict[str, dict[str, Scores]]) -> dict[str, Any]:
+    """Return all scores as plain values."""
+    report = asdict(overall)
+    for name, group in grouped.items():
+        report[name] = {key: asdict(scores) for key, scores in group.items()}
+    return report
+
+
+def _print_tables(overall: Scores, grouped: dict[str, dict[str, Scores]]) -> None:
+    """Print all scores as one table and a line with their units."""
+    rows = {'all': overall} | grouped['by_class']
+    for name, scores in grouped['by_points'].items():
+        rows[f'{name} points'] = scores
+    print(table(rows))
+    print(
+        f'{overall.boxes} true boxes, {overall.missing} missing, {overall.unmatched} predictions '
+        f'without a true box; recalls of 3D IoU, ATE in m, ASE is 1 - IoU, AOE in rad, jitter in '
+        f'm/s^2'
     )
 
 
+def _why_none_matches(predicted: BoxTable, truth: BoxTable, matches: Matches) -> str:
+    """Return why no predicted box has a true one."""
+    true_keys = _keys(truth)
+    keys = set(_keys(predicted))
+    invalid = sum(true_keys[row] in keys for row in matches.rows)
+    if invalid:
+        return (
+            f'all {invalid} predicted boxes with the stamp and the track id of a true one are '
+            f'invalid: expected finite numbers and a quaternion other than 0 0 0 0'
+        )
+    stamps = np.intersect1d(predicted.stamps_ns, truth.stamps_ns)
+    tracks = set(predicted.track_ids) & set(truth.track_ids)
+    return (
+        f'no predicted box has the stamp and the track id of a true one: {len(stamps)} stamps and '
+        f'{len(tracks)} track ids are in both; stamps of predicted boxes: '
+        f'{_time_range(predicted.stamps_ns)}, of true boxes: {_time_range(truth.stamps_ns)}; '
+        f'compare boxes of one recording with the ids of one tracker'
+    )
+
+
+def _time_range(stamps_ns: Ints) -> str:
+    return f'{stamps_ns.min() * 1e-9:.3f} to {stamps_ns.max() * 1e-9:.3f} s'
+
+
+def _warn(message: str) -> None:
+    print(f'boxreg: {message}', file=sys.stderr)
+
+
 def table(rows: dict[str, Scores]) -> str:
-    """Return scores as text, one line each."""
-    head = ['boxes', 'BEV', '3D'] + [f'R@{level}' for level in RECALLS]
-    head += ['ATE', 'ASE', 'AOE', 'flips', 'jitter', '(true)']
+    """Return scores as a text table, one line per row."""
+    titles = ['boxes', 'BEV', '3D', *(f'R@{threshold}' for threshold in RECALLS)]
+    titles += ['ATE', 'ASE', 'AOE', 'flips', 'jitter', '(true)']
     width = max(len('boxes of'), *(len(name) for name in rows))
-    lines = [' ' * width + ''.join(f'{name:>8}' for name in head)]
-    for name, s in rows.items():
+    lines = [' ' * width + ''.join(f'{title:>8}' for title in titles)]
+    for name, scores in rows.items():
         numbers = (
-            s.iou_bev, s.iou_3d, *s.recall_3d, s.ate, s.ase, s.aoe, s.flips, s.jitter,
-            s.true_jitter,
-        )  # fmt: skip
-        lines.append(f'{name:{width}}{s.boxes:8d}' + ''.join(f'{n:8.3f}' for n in numbers))
+            scores.iou_bev,
+            scores.iou_3d,
+            *scores.recall_3d,
+            scores.ate,
+            scores.ase,
+            scores.aoe,
+            scores.flips,
+            scores.jitter,
+            scores.true_jitter,
+        )
+        cells = ''.join(f'{number:8.3f}' for number in numbers)
+        lines.append(f'{name:{width}}{scores.boxes:8d}{cells}')
     return '\n'.join(lines)
 
 
 def finite(value: Any) -> Any:
-    """Return nested plain values with NaN as None, which is all that JSON knows."""
+    """Return nested plain values with None for NaN and infinity, which JSON does not have."""
     if isinstance(value, dict):
         return {key: finite(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
         return [finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _check_unique(true_keys: Sequence[tuple[int, str]]) -> None:
+    """Refuse true boxes with the same stamp and track id."""
+    for (stamp_ns, track_id), count in Counter(true_keys).most_common(1):
+        if count == 1:
+            return
+        raise RecordingError(
+            f'true boxes: expected each track id once per stamp, got {track_id!r} {count} times '
+            f'at stamp {stamp_ns}; give every object an id of its own'
+        )
+
+
+def _spread(values: NDArray[Any], is_matched: Mask, absent: float = 0) -> NDArray[Any]:
+    """Return the values of matched boxes as rows of all true boxes; `absent` elsewhere."""
+    full = np.full((len(is_matched), *values.shape[1:]), absent, dtype=values.dtype)
+    full[is_matched] = values
+    return full
+
+
+def _scale_iou(boxes: Floats, true_boxes: Floats) -> Floats:
+    """Return the 3D IoU (n,) after alignment of centre and heading."""
+    aligned = true_boxes.copy()
+    aligned[:, EXTENT] = boxes[:, EXTENT]
+    return iou_3d(aligned, true_boxes)
 
 
 def _second_difference(
     stamps_ns: Ints, track_ids: Sequence[str], values: Floats, is_angle: bool = False
 ) -> Floats:
-    """Return its size per row, shape (n,); NaN without a neighbour on both sides in time."""
-    size = np.full(len(stamps_ns), np.nan)
+    """
+    Return the norm of the second difference over time of the values of each track.
+
+    Parameters
+    ----------
+    stamps_ns : array, shape (n,)
+        Stamps [ns].
+    track_ids : sequence of n str
+        Tracks.
+    values : array, shape (n, D)
+        Values, in metres or radians.
+    is_angle : bool
+        Wrap differences to the half-open interval from -pi to pi.
+
+    Returns
+    -------
+    norms : array, shape (n,)
+        In units per s^2; NaN without a value of the track within `MAX_STEP` before and after.
+
+    """
+    norms = np.full(len(stamps_ns), np.nan)
     _, codes = np.unique(np.array(track_ids, str), return_inverse=True)
     order = np.lexsort((stamps_ns, codes))
     before, here, after = order[:-2], order[1:-1], order[2:]
-    first = (stamps_ns[here] - stamps_ns[before]) / 1e9
-    second = (stamps_ns[after] - stamps_ns[here]) / 1e9
-    near = (codes[before] == codes[after]) & (np.maximum(first, second) <= LONGEST_STEP)
-    before, here, after = before[near], here[near], after[near]
-    steps = [values[here] - values[before], values[after] - values[here]]
+    first_seconds = (stamps_ns[here] - stamps_ns[before]) / 1e9
+    second_seconds = (stamps_ns[after] - stamps_ns[here]) / 1e9
+    is_one_track = codes[before] == codes[after]
+    is_near = is_one_track & (np.maximum(first_seconds, second_seconds) <= MAX_STEP)
+    before, here, after = before[is_near], here[is_near], after[is_near]
+    first = values[here] - values[before]
+    second = values[after] - values[here]
     if is_angle:
-        steps = [wrap_angle(step) for step in steps]
-    first, second = first[near, None], second[near, None]
-    rate = steps[1] / second - steps[0] / first
-    size[here] = np.linalg.norm(2 * rate / (first + second), axis=1)
-    return size
+        first = wrap_angle(first)
+        second = wrap_angle(second)
+    first_seconds = first_seconds[is_near, None]
+    second_seconds = second_seconds[is_near, None]
+    difference = second / second_seconds - first / first_seconds
+    norms[here] = np.linalg.norm(2 * difference / (first_seconds + second_seconds), axis=1)
+    return norms
 
 
 def _keys(boxes: BoxTable) -> list[tuple[int, str]]:
+    """Return stamp and track id of each box."""
     return list(zip(boxes.stamps_ns.tolist(), boxes.track_ids, strict=True))
 
 
 def _mean(values: NDArray[Any]) -> float:
-    values = values[np.isfinite(values)]
-    return float(values.mean()) if len(values) else math.nan
+    """Return the mean of the finite values; NaN without any."""
+    finite_values = values[np.isfinite(values)]
+    return float(finite_values.mean()) if len(finite_values) else math.nan
 
 
 def _median(values: NDArray[Any]) -> float:
+    """Return the median; NaN without a value."""
     return float(np.median(values)) if len(values) else math.nan

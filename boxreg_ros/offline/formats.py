@@ -1,39 +1,47 @@
-"""`boxreg formats`: the label formats, and what each means by a box."""
+"""`boxreg formats`: the label formats and their conventions."""
 
 from __future__ import annotations
 
 import argparse
 from importlib import import_module
 
-from boxreg_ros.labels import FORMATS
+from boxreg_ros.labels import can_read, Format, FORMATS
 
 HEAD = ('name', 'format', 'read', 'frame', 'position', 'sizes', 'rotation', 'files', 'needs')
 
 
 def rows() -> list[tuple[str, ...]]:
-    """Return what each format states, in the order of `HEAD`."""
-    found: list[tuple[str, ...]] = []
-    for path in FORMATS.values():
-        module = import_module(path)
-        f = module.FORMAT
-        can_read = 'yes' if hasattr(module, 'read') else ''
-        needs = ', '.join(f.packages)
-        found.append(
-            (f.name, f.title, can_read, f.frame, f.reference, f.sizes, f.rotation, f.files, needs)
+    """Return the conventions of each format, in the columns of `HEAD`."""
+    table: list[tuple[str, ...]] = []
+    for name, path in FORMATS.items():
+        # Not `module_of`: the table lists formats whose packages are not installed too.
+        form: Format = import_module(path).FORMAT
+        table.append(
+            (
+                name,
+                form.title,
+                'yes' if can_read(name) else '',
+                form.frame,
+                form.reference,
+                form.sizes,
+                form.rotation,
+                form.files,
+                ', '.join(form.packages),
+            )
         )
-    return found
+    return table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what `run` reads: nothing."""
+    """Declare the arguments of `run`: none."""
 
 
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph per format."""
-    for name, title, can_read, *facts, needs in rows():
-        print(f'{name}: {title}' + ('' if can_read else ' (written only)'))
-        for what, fact in zip(HEAD[3:], facts, strict=False):
-            print(f'    {what:9} {fact}')
+    for name, title, is_readable, *conventions, needs in rows():
+        print(f'{name}: {title}' + ('' if is_readable else ' (written only)'))
+        for column, text in zip(HEAD[3:], conventions, strict=False):
+            print(f'    {column:9} {text}')
         if needs:
             print(f'    needs     pip install {needs}')
     return 0

@@ -1,27 +1,26 @@
-"""Recordings whose boxes come from label files, and the frames that labels are written in."""
+"""Recordings with boxes from label files, and the sensor frame of label files."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, TransformUnavailable
-from boxreg_ros.io.recording import Record, Recording
+from boxreg_ros.io.recording import Item, ItemSource, not_measured, Recording, Stage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of, LabelFrame
-from boxreg_ros.structures import BoxArray, Floats, Sweep
+from boxreg_ros.structures import Floats
 
 
 class LabelledRecording(Recording):
     """
-    Clouds and motion of a recording, and the boxes of label files as if they were in it.
+    Clouds and motion of a recording, with the boxes of label files in place of a topic.
 
-    Boxes come after the sweep of their stamp, or the next. They are taken in the frame of the
-    sensor where the labels tell how they are placed in it, and move with the recording; else in
-    the frame they name.
+    The boxes of a stamp follow the sweep of that stamp, or the next one. Boxes whose labels have
+    poses in the sensor frame are taken in the frame of the clouds and move with the recording;
+    the others are taken in the frame that the labels name.
 
     Parameters
     ----------
@@ -30,66 +29,66 @@ class LabelledRecording(Recording):
     paths, options
         As those of `Recording`.
 
-    Attributes
-    ----------
-    label : LabelFrame
-        What the boxes last decoded are of.
-    outside : int
-        Boxes of the label files outside of the part that is read.
-
     """
 
     has_boxes = False
-    label: LabelFrame
 
     def __init__(self, labels: tuple[str, Path], paths: Any, **options: Any) -> None:
         super().__init__(paths, **options)
         self._labels = labels
         self._is_part = any(options.get(name) is not None for name in ('start', 'end'))
-        self._newest_ns: int | None = None
+
+    def items(
+        self,
+        tree: TransformTree,
+        *,
+        with_clouds: bool = True,
+        with_intensities: bool = False,
+        stage: Stage = not_measured,
+    ) -> Iterator[Item]:
+        """
+        Yield clouds and boxes; see `Recording.items`.
+
+        Boxes have `Item.refined`: status and covariances as in the label files.
+
+        """
         self.outside = 0
-
-    def records(self, tree: TransformTree) -> Iterator[Record]:
-        """Yield clouds and stand-ins for labels; each wants to be decoded before the next."""
         frames = frames_of(*self._labels)
+        frame = next(frames, None)
         sensor_frame = self.sensor_frame()
-        waiting = next(frames, None)
-        begin_ns: int | None = None
-        for record in super().records(tree):
-            yield record
-            begin_ns = self._newest_ns if begin_ns is None else begin_ns
-            while waiting is not None and _stamp(waiting) <= (self._newest_ns or 0):
-                if self._is_part and _stamp(waiting) < (begin_ns or 0):
-                    self.outside += len(waiting.refined.status)
+        received_ns = self.start_ns
+        first_ns: int | None = None
+        newest_ns = 0
+        clouds = super().items(tree, with_intensities=with_intensities, stage=stage)
+        for cloud in clouds:
+            received_ns = cloud.received_ns
+            newest_ns = max(newest_ns, cloud.content.stamp_ns)
+            if first_ns is None:
+                first_ns = newest_ns
+            if with_clouds:
+                yield cloud
+            while frame is not None and _stamp(frame) <= newest_ns:
+                if self._is_part and _stamp(frame) < first_ns:
+                    self.outside += len(frame.refined.status)
                 else:
-                    yield self._stand_in(record, waiting, tree, sensor_frame)
-                waiting = next(frames, None)
-        while waiting is not None:
+                    yield _item(frame, received_ns, tree, sensor_frame)
+                frame = next(frames, None)
+        while frame is not None:  # later than the last cloud
             if self._is_part:
-                self.outside += len(waiting.refined.status)
+                self.outside += len(frame.refined.status)
             else:
-                yield self._stand_in(record, waiting, tree, sensor_frame)
-            waiting = next(frames, None)
+                yield _item(frame, received_ns, tree, sensor_frame)
+            frame = next(frames, None)
 
-    def decode(self, record: Record) -> Sweep | BoxArray:
-        """Return the sweep of a record, or the boxes it stands for."""
-        if record.connection.topic != self.points_topic:
-            return self.label.refined.boxes
-        item = super().decode(record)
-        self._newest_ns = max(self._newest_ns or item.stamp_ns, item.stamp_ns)
-        return item
 
-    def _stand_in(
-        self, record: Record, frame: LabelFrame, tree: TransformTree, sensor_frame: str
-    ) -> Record:
-        """Return a record that stands for boxes, and remember those."""
-        placed = frame.moved('sensor')
-        boxes = placed.refined.boxes
-        is_sensor = frame.sensor_frame != '' and boxes.frame_id == frame.sensor_frame
-        if is_sensor and not tree.connects(boxes.frame_id, sensor_frame):
-            boxes = replace(boxes, frame_id=sensor_frame)
-        self.label = replace(placed, refined=replace(placed.refined, boxes=boxes))
-        return record._replace(connection=record.connection._replace(topic=''), data=b'')
+def _item(frame: LabelFrame, received_ns: int, tree: TransformTree, sensor_frame: str) -> Item:
+    """Return the boxes of a label frame, in a frame that the transforms know if possible."""
+    placed = frame.moved('sensor')
+    boxes = placed.refined.boxes
+    is_sensor = frame.sensor_frame != '' and boxes.frame_id == frame.sensor_frame
+    if is_sensor and not tree.connects(boxes.frame_id, sensor_frame):
+        boxes = replace(boxes, frame_id=sensor_frame)
+    return Item(received_ns, boxes, refined=replace(placed.refined, boxes=boxes))
 
 
 def _stamp(frame: LabelFrame) -> int:
@@ -105,15 +104,15 @@ def pose_of(tree: TransformTree, fixed_frame: str, frame: str, stamp_ns: int) ->
 
 
 def label_frame_of(
-    recording: Recording, tree: TransformTree, fixed_frame: str, wish: str | None
+    recording: ItemSource, tree: TransformTree, fixed_frame: str, wish: str | None
 ) -> str:
     """
-    Return the frame that stands for the sensor's in label files: that of the clouds, or `wish`.
+    Return the sensor frame of label files: the frame of the clouds, or `wish`.
 
     Raises
     ------
     RecordingError
-        If nothing connects it with the fixed frame.
+        If no transforms connect it with the fixed frame.
 
     """
     frame = (wish or recording.sensor_frame()).lstrip('/')
@@ -123,23 +122,3 @@ def label_frame_of(
             f'{fixed_frame!r}; TF: {tree}'
         )
     return frame
-
-
-def add_label_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that label formats need, whoever writes them."""
-    parser.add_argument(
-        '--camera', type=Path, metavar='FILE',
-        help='calibration, for formats that look through a camera',
-    )  # fmt: skip
-    parser.add_argument(
-        '--swap-axes', action='store_true',
-        help='extents where Datumaro and CVAT look for them',
-    )  # fmt: skip
-    parser.add_argument(
-        '--with-points', action='store_true',
-        help='write the clouds that the label formats need beside their labels',
-    )  # fmt: skip
-    parser.add_argument(
-        '--label-frame', metavar='FRAME',
-        help='frame that stands for the sensor in label files (default: that of the clouds)',
-    )  # fmt: skip

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from bisect import insort
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline.cloud_spool import Spool
-from boxreg_ros.offline.reader import Arrival, Source
+from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.review.changes import Changes
@@ -20,78 +20,70 @@ import numpy as np
 
 
 @dataclass(eq=False, slots=True)
-class Slot:
-    """The place of one box array in the order of the output."""
+class _Slot:
+    """The place of one box array in the output."""
 
     boxes: BoxArray
     T_fixed_sensor: Floats | None
-    T_fixed_given: Floats | None
+    T_fixed_boxes: Floats | None
     result: RefinedBoxes | None = None
 
     @property
     def stamp_ns(self) -> int:
-        """Return the stamp of the boxes [ns]."""
         return self.boxes.stamp_ns
-
-    def flips(self, refined: RefinedBoxes) -> int:
-        """Return how many headings are off the given ones by more than a right angle."""
-        n = len(self.boxes.track_ids)  # what is put in comes behind
-        turn = refined.boxes.boxes[:n, YAW] - self.boxes.boxes[:, YAW]
-        is_refined = np.array([status == REFINED for status in refined.status[:n]], bool)
-        return int((is_refined & (np.cos(turn) < 0)).sum())
 
 
 class Sink:
     """
-    Brings results into the order of stamps, each box array once, and has them written.
+    Collect results, bring them into the order of stamps and write each box array once.
+
+    Every box array gets a ticket on its way to the registrar; its result is found by that
+    ticket, because several arrays may have the same stamp.
 
     Parameters
     ----------
     folder : Path
-        Of results.
+        Result folder.
     request : Request
-        The formats, and what else is to be kept of the results.
+        Formats to write, and further products of the results.
     source : Source
-        What the results are of.
+        The recording.
     clock : Stopwatch
-        Counts the writing.
+        The time spent on files is added to its stage ``write``.
 
     Attributes
     ----------
     boxes_in, boxes_out : int
-        What was to come, and what has come, that which is put in included.
+        Boxes of the input, and boxes written, interpolated ones included.
     status, reasons : Counter
-        Of the boxes that have come.
+        Of the boxes written.
     heading_flips : int
-        Refined headings that are off the given ones by more than a right angle.
+        Refined headings that differ from the input by more than 90 degrees.
     without_cloud : int
-        Box arrays that came without one, where clouds are to be written.
+        Box arrays without a cloud, where clouds are to be written.
     changes : Changes or None
-        What a report is to show.
+        Boxes before and after, for the report.
 
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        request: Request,
-        source: Source,
-        clock: Stopwatch,
-    ) -> None:
-        config, with_points = request.config, request.options.with_points
-        self._fixed_frame, self._sensor_frame = source.fixed_frame, source.sensor_frame
-        self._is_early = config.estimate == 'early'
+    def __init__(self, folder: Path, request: Request, source: Source, clock: Stopwatch) -> None:
+        self._fixed_frame = source.fixed_frame
+        self._sensor_frame = source.sensor_frame
+        self._writes_early = request.config.estimate == 'early'
         self._clock = clock
-        self._spool = Spool(folder, config) if with_points else None
-        provenance = Provenance.of(request.recordings, config)
+        self._spool: Spool | None = None
+        if request.options.with_points:
+            self._spool = Spool(folder, request.config)
+        provenance = Provenance.of(request.recordings, request.config)
         options = replace(request.options, recording=request.recording())
         self._writers = {
             name: writer_for(name, folder, provenance, options) for name in request.all_formats
         }
-        self._bridge: Bridge[Slot] = Bridge(request.bridge, self._fixed_frame, config)
+        self._bridge: Bridge[_Slot] = Bridge(request.bridge, self._fixed_frame, request.config)
         self.changes = Changes(self._fixed_frame) if request.report else None
-        self._slots: list[Slot] = []
-        self._unsettled: dict[int, deque[Slot]] = {}
+        self._by_stamp: list[_Slot] = []  # not yet written
+        self._by_ticket: dict[object, _Slot] = {}  # without a result
+        self._last_ticket = 0
         self.boxes_in = 0
         self.boxes_out = 0
         self.status: Counter[str] = Counter()
@@ -99,95 +91,119 @@ class Sink:
         self.heading_flips = 0
         self.without_cloud = 0
 
-    def expect(self, arrival: Arrival) -> None:
-        """Keep a cloud that files need, or a place for boxes: those not moved stay as they are."""
-        given = arrival.given
-        if not isinstance(given, BoxArray):
-            if self._spool and given is not None and arrival.T_fixed_given is not None:
-                with self._clock('write'):
-                    self._spool.add(given, arrival.T_fixed_given, arrival.intensities)
-            return
-        boxes = arrival.moved if isinstance(arrival.moved, BoxArray) else given
-        n = len(boxes.track_ids)
-        slot = Slot(boxes, arrival.T_fixed_sensor, arrival.T_fixed_given)
-        self.boxes_in += n
-        if arrival.moved is not None:
-            self._unsettled.setdefault(boxes.stamp_ns, deque()).append(slot)
-        elif not n:
-            return
-        else:
-            reasons, unknown = ('no_transform',) * n, np.broadcast_to(np.eye(6), (n, 6, 6))
-            slot.result = RefinedBoxes(boxes, (KEPT,) * n, reasons, np.zeros(n, np.int64), unknown)
-        insort(self._slots, slot, key=lambda slot: slot.stamp_ns)
+    def expect(self, item: ReadItem) -> ReadItem:
+        """
+        Store a cloud that files need, or reserve the place of a box array.
+
+        Returns
+        -------
+        item : ReadItem
+            The same for the registrar; boxes carry a ticket.
+
+        """
+        if isinstance(item.given, BoxArray):
+            return self._reserve(item, item.given)
+        if self._spool and item.given is not None and item.T_fixed_given is not None:
+            with self._clock('write'):
+                self._spool.add(item.given, item.T_fixed_given, item.intensities)
+        return item
 
     def take(self, ready: Sequence[RefinedBoxes]) -> None:
-        """Take what the registrar returns: per box array one final result, or an early one."""
+        """Take results of the registrar; write arrays up to the first one without a result."""
         for refined in ready:
-            slots = self._unsettled[refined.boxes.stamp_ns]
-            if refined.is_final:
-                slot = slots.popleft()
-                if not slots:
-                    del self._unsettled[refined.boxes.stamp_ns]
-            elif self._is_early:
-                slot = next(slot for slot in slots if slot.result is None)
-            else:
-                continue
-            slot.result = slot.result or refined
-        self._write()
+            if refined.is_final or self._writes_early:
+                slot = self._by_ticket.pop(refined.boxes.ticket, None)
+                if slot is not None:  # otherwise its early result has been taken
+                    slot.result = refined
+        while self._by_stamp:
+            first = self._by_stamp[0]
+            if first.result is None:
+                return
+            del self._by_stamp[0]
+            for refined, slot in self._bridge.add(first.result, first):
+                self._put(refined, slot)
 
     def __enter__(self) -> Sink:
         """Return the sink."""
         return self
 
     def __exit__(self, failure: object, *_: object) -> None:
-        """Complete the files, but not after a failure: then nothing of them will be kept."""
-        if failure is None:
-            for refined, slot in self._bridge.flush():
-                self._put(refined, slot)
-            with self._clock('write'):
-                for writer in self._writers.values():
-                    writer.close()
-                if self._spool is not None:
-                    self._spool.remove()
+        """Complete the files; after a failure the caller deletes them."""
+        if failure is not None:
+            return
+        for refined, slot in self._bridge.flush():
+            self._put(refined, slot)
+        with self._clock('write'):
+            for writer in self._writers.values():
+                writer.close()
+            if self._spool is not None:
+                self._spool.remove()
 
     def left_out(self) -> dict[str, dict[str, int]]:
-        """Return the boxes that a format has no place for, by format and reason."""
-        return {
-            name: dict(+writer.dropped)
-            for name, writer in self._writers.items()
-            if +writer.dropped
-        }
+        """Return the number of boxes that a format cannot represent, by format and reason."""
+        counts = {name: dict(+writer.dropped) for name, writer in self._writers.items()}
+        return {name: dropped for name, dropped in counts.items() if dropped}
 
     def missing(self) -> int:
-        """Return how many boxes have gone in and not come out."""
-        return self.boxes_in - sum(
-            self.status[name] for name in self.status if name != INTERPOLATED
-        )
+        """Return the number of input boxes that have not been written."""
+        return self.boxes_in - (self.boxes_out - self.status[INTERPOLATED])
 
-    def _write(self) -> None:
-        """Write what nothing earlier is missing for."""
-        while self._slots and (result := self._slots[0].result) is not None:
-            for refined, slot in self._bridge.add(result, self._slots.pop(0)):
-                self._put(refined, slot)
+    def _reserve(self, item: ReadItem, given: BoxArray) -> ReadItem:
+        """Reserve a place; boxes that could not be transformed have their result at once."""
+        count = len(given.track_ids)
+        self.boxes_in += count
+        if isinstance(item.moved, BoxArray):
+            slot = _Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
+            self._last_ticket += 1
+            self._by_ticket[self._last_ticket] = slot
+            moved = replace(item.moved, ticket=self._last_ticket)
+            item = item._replace(moved=moved)
+        elif count:
+            slot = _Slot(given, item.T_fixed_sensor, item.T_fixed_given, _kept(given))
+        else:
+            return item
+        insort(self._by_stamp, slot, key=lambda slot: slot.stamp_ns)
+        return item
 
-    def _put(self, refined: RefinedBoxes, slot: Slot) -> None:
-        """Count the boxes of a slot, and have them written."""
+    def _put(self, refined: RefinedBoxes, slot: _Slot) -> None:
+        """Count the boxes of one array and write them in all formats."""
         self.boxes_out += len(refined.status)
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
-        self.heading_flips += slot.flips(refined)
+        self.heading_flips += _heading_flips(slot.boxes, refined)
         if self.changes is not None:
             self.changes.add(slot.boxes, refined)
         with self._clock('write'):
-            sweep = intensities = None
-            if self._spool and slot.T_fixed_sensor is not None:
+            frame = self._frame(refined, slot)
+            for writer in self._writers.values():
+                writer.write(frame)
+
+    def _frame(self, refined: RefinedBoxes, slot: _Slot) -> LabelFrame:
+        """Return all that label writers need about one array, its cloud included."""
+        sweep = intensities = None
+        if self._spool is not None:
+            if slot.T_fixed_sensor is not None:
                 sweep, intensities = self._spool.take(
                     slot.stamp_ns, self._sensor_frame, slot.T_fixed_sensor
                 )
-            self.without_cloud += bool(self._spool) and sweep is None
-            frame = LabelFrame(
-                refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep,
-                intensities, slot.T_fixed_given,
-            )  # fmt: skip
-            for writer in self._writers.values():
-                writer.write(frame)
+            self.without_cloud += sweep is None
+        return LabelFrame(
+            refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep,
+            intensities, slot.T_fixed_boxes,
+        )  # fmt: skip
+
+
+def _kept(boxes: BoxArray) -> RefinedBoxes:
+    """Return the result of boxes in a frame that no transform connects with the fixed frame."""
+    n = len(boxes.track_ids)
+    unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
+    reasons = ('no_transform',) * n
+    return RefinedBoxes(boxes, (KEPT,) * n, reasons, np.zeros(n, np.int64), unknown)
+
+
+def _heading_flips(boxes: BoxArray, refined: RefinedBoxes) -> int:
+    """Return how many refined headings differ from the input by more than 90 degrees."""
+    n = len(boxes.track_ids)  # interpolated boxes stand behind those of the input
+    turn = refined.boxes.boxes[:n, YAW] - boxes.boxes[:, YAW]
+    is_refined = np.array([status == REFINED for status in refined.status[:n]], bool)
+    return int((is_refined & (np.cos(turn) < 0)).sum())

@@ -1,7 +1,7 @@
 """
-Messages of a recording on their way to the registrar: read, decoded, in the fixed frame.
+Items of a recording on their way to the registrar: read, decoded, in the fixed frame.
 
-That happens in a process beside the one that uses them, as `Coming` says.
+This runs in a process of its own, a few items ahead of the registrar; see `ReadAhead`.
 
 """
 
@@ -14,40 +14,38 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
-from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.session import Intake
-from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
-from boxreg_ros.offline.labelled_recording import label_frame_of, LabelledRecording, pose_of
-from boxreg_ros.offline.peer import beside, Peer
+from boxreg_ros.io.recording import Item, ItemSource
+from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.worker_process import run_in_worker, WorkerProcess
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 
 
-class Arrival(NamedTuple):
+class ReadItem(NamedTuple):
     """
-    A cloud or boxes on the way to the registrar, and what files need to know with them.
+    A cloud or boxes for the registrar, with the poses that label files need.
 
     Attributes
     ----------
     seconds : float
-        Part of the recording that lies behind [s].
-    begins_anew : bool
-        Stamps start again with it.
+        Time since the start of the part that is read [s].
+    restarts : bool
+        True if time went back before this item.
     given, moved : Sweep or BoxArray, or None
-        In its own and in the fixed frame: `given` is None for a cloud that is not written,
-        `moved` where nothing connects the frames.
+        In its own and in the fixed frame. `given` is None for a cloud that is not written;
+        `moved` is None where no transform is known.
     T_fixed_given, T_fixed_sensor : array, shape (4, 4), or None
-        Poses of its own frame, and of that which stands for the sensor's in label files; None
-        where unknown, and for a cloud that is not written.
+        Poses of its own frame and of the sensor frame of label files. None where unknown, and
+        for a cloud that is not written.
     intensities : array, shape (M,), or None
-        Those of a cloud, if they are written.
+        Of a cloud that is written.
 
     """
 
     seconds: float
-    begins_anew: bool
+    restarts: bool
     given: Sweep | BoxArray | None
     moved: Sweep | BoxArray | None
     T_fixed_given: Floats | None
@@ -57,16 +55,16 @@ class Arrival(NamedTuple):
 
 class Source(NamedTuple):
     """
-    What a recording turned out to be.
+    Properties of a recording that are known before the first item.
 
     Attributes
     ----------
     topics : dict
         Topics of points, boxes and odometry; None where there is none.
     fixed_frame, sensor_frame : str
-        That to refine in, and that which stands for the sensor's in label files.
+        Frame to refine in, and sensor frame of label files.
     seconds : float
-        How long it lasts [s].
+        Duration of the part that is read [s].
 
     """
 
@@ -78,24 +76,24 @@ class Source(NamedTuple):
 
 class Findings(NamedTuple):
     """
-    What was found while a recording was read.
+    Properties of a recording that are known after the last item.
 
     Attributes
     ----------
     counts : Counter
-        Sweeps, box arrays and time jumps, and what was not used by reason.
+        Sweeps, box arrays, time jumps, and sweeps without a transform.
     first_missing_transform : str
-        What is not known of the first item without a transform; else empty.
+        Error of the first item without a transform; empty if there is none.
     unreadable, first_unreadable : int and str
-        How many messages could not be read, and why the first of each topic could not.
+        Number of unreadable messages, and the first error of each topic.
     apart : dict
-        By how much topics were recorded apart from the clouds [s].
+        Topics that were recorded apart from the clouds, and by how much [s].
     outside : int
-        Boxes of label files outside the part that was asked for.
+        Boxes of label files outside of the part that is read.
     warning, facts : str and dict
-        What `Intake` says of the boxes and of their ids.
+        Finding of the pose check, and origin of the ids.
     seconds : dict
-        What each stage took [s].
+        Time spent in each stage [s].
 
     """
 
@@ -110,40 +108,51 @@ class Findings(NamedTuple):
     seconds: dict[str, float]
 
 
-class Arrivals:
+class RecordingReader:
     """
-    All that happens to messages before the registrar: reading, decoding, the fixed frame.
+    Read a recording and bring its items into the fixed frame.
+
+    Parameters
+    ----------
+    recording : ItemSource
+        Open.
+    request : Request
+        Frames, convention and settings.
+    clock : Stopwatch
+        Measures the stages ``read``, ``decode`` and ``transform``.
 
     Attributes
     ----------
     source : Source
-        What is known before the first item.
+        Known before the first item.
 
     """
 
-    def __init__(self, recording: Recording, request: Request, clock: Stopwatch) -> None:
+    def __init__(self, recording: ItemSource, request: Request, clock: Stopwatch) -> None:
         self._recording = recording
         self._clock = clock
-        self._tree = TransformTree()
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
+        self._session = Session(request.convention, request.config)
+        self._jumps = JumpConfirmation[Item]()
+        tree = self._session.tree
         with clock('read'):
-            fixed = recording.choose_fixed_frame(self._tree, request.fixed_frame)
-            sensor = label_frame_of(recording, self._tree, fixed, request.label_frame)
+            fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
+            sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
+        self._session.fixed_frame = fixed_frame
         topics = {
             'points': recording.points_topic,
             'boxes': recording.boxes_topic or None,
             'odometry': recording.odometry_topic,
         }
         seconds = (recording.end_ns - recording.start_ns) * 1e-9
-        self.source = Source(topics, fixed, sensor, seconds)
-        self._intake = Intake(request.convention, request.config)
+        self.source = Source(topics, fixed_frame, sensor_frame, seconds)
         self._counts: Counter[str] = Counter()
         self._first_missing_transform = ''
 
-    def __iter__(self) -> Iterator[Arrival]:
+    def __iter__(self) -> Iterator[ReadItem]:
         """
-        Yield clouds and boxes in the order they were received, but for those unreadable.
+        Yield clouds and boxes in the order they were received.
 
         Raises
         ------
@@ -151,40 +160,25 @@ class Arrivals:
             At the end, if no cloud, or no message of boxes, was readable.
 
         """
-        read: set[str] = set()
-        for record in self._clock.each('read', self._recording.records(self._tree)):
-            topic = record.connection.topic
-            with self._clock('decode'):
-                try:
-                    given = self._recording.decode(record)
-                except UnsupportedMessage as error:
-                    self._recording.pass_over(record, error)
-                    continue
-                is_cloud = isinstance(given, Sweep)
-                is_written = is_cloud and self._with_points
-                intensities = self._recording.intensities(record) if is_written else None
-            read.add(topic)
-            self._counts['sweeps' if is_cloud else 'box_arrays'] += 1
-            begins_anew = self._intake.begins_anew(given)
-            self._counts['time_jump'] += begins_anew
-            is_kept = is_written or not is_cloud
-            with self._clock('transform'):
-                arrival = Arrival(
-                    (record.received_ns - self._recording.start_ns) * 1e-9,
-                    begins_anew,
-                    given if is_kept else None,
-                    self._moved(given),
-                    self._pose_of(given.frame_id, given.stamp_ns) if is_kept else None,
-                    self._pose_of(self.source.sensor_frame, given.stamp_ns) if is_kept else None,
-                    intensities,
-                )
-            yield arrival
-        for topic, first in self._recording.first_errors.items():
-            if topic not in read and topic in self._recording.data_topics:
-                raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
+        items = self._recording.items(
+            self._session.tree, with_intensities=self._with_points, stage=self._clock
+        )
+        for item in items:
+            confirmed, restarts = [item], False
+            if not is_placeholder(item.content):
+                confirmed, restarts = self._jumps.add(item, item.content)
+            if restarts:
+                # The tree, which is ahead of the items, has detected the jump itself.
+                self._session.restart()
+                self._counts['time_jump'] += 1
+            for ready in confirmed:
+                yield self._read_item(ready, restarts and ready is confirmed[0])
+        for late in self._jumps.release():
+            yield self._read_item(late, restarts=False)
+        self._recording.check_readable()
 
     def findings(self) -> Findings:
-        """Return what is known after the last item."""
+        """Return the properties that are known after the last item."""
         recording = self._recording
         return Findings(
             self._counts,
@@ -192,66 +186,86 @@ class Arrivals:
             recording.unreadable.total(),
             '; '.join(map(str, recording.first_errors.values())),
             recording.apart,
-            recording.outside if isinstance(recording, LabelledRecording) else 0,
-            self._intake.finding,
-            self._intake.facts,
+            recording.outside,
+            self._session.finding,
+            self._session.facts,
             self._clock.stages(),
         )
 
-    def _moved(self, given: Sweep | BoxArray) -> Sweep | BoxArray | None:
-        """Return a cloud or boxes in the fixed frame; None, and counted, where it is unknown."""
-        if isinstance(given, Sweep) and not self._with_times:
-            given = replace(given, times=None)
-        try:
-            return self._intake.take(to_fixed_frame(given, self._tree, self.source.fixed_frame))
-        except TransformUnavailable as error:
-            self._counts['sweep_without_transform'] += isinstance(given, Sweep)
-            self._first_missing_transform = self._first_missing_transform or str(error)
-            return None
+    def _count(self, given: Sweep | BoxArray, admitted: Admitted) -> None:
+        is_sweep = isinstance(given, Sweep)
+        self._counts['sweeps' if is_sweep else 'box_arrays'] += 1
+        if admitted.detail:
+            self._counts['sweep_without_transform'] += is_sweep
+            self._first_missing_transform = self._first_missing_transform or admitted.detail
 
-    def _pose_of(self, frame: str, stamp_ns: int) -> Floats | None:
-        return pose_of(self._tree, self.source.fixed_frame, frame, stamp_ns)
+    def _read_item(self, item: Item, restarts: bool) -> ReadItem:
+        """Return an item in the fixed frame, without what nobody reads: it is copied."""
+        with self._clock('transform'):
+            admitted = self._session.admit(item.content)
+            self._count(item.content, admitted)
+            return self._trimmed(item, admitted, restarts)
+
+    def _trimmed(self, item: Item, admitted: Admitted, restarts: bool) -> ReadItem:
+        given = item.content
+        moved = admitted.moved
+        if isinstance(moved, Sweep) and not self._with_times:
+            moved = replace(moved, times=None)
+        seconds = (item.received_ns - self._recording.start_ns) * 1e-9
+        if isinstance(given, Sweep) and not self._with_points:
+            return ReadItem(seconds, restarts, None, moved, None, None, None)
+        fixed_frame = self.source.fixed_frame
+        T_fixed_sensor = pose_of(
+            self._session.tree, fixed_frame, self.source.sensor_frame, given.stamp_ns
+        )
+        return ReadItem(
+            seconds, restarts, given, moved, admitted.T_fixed_item, T_fixed_sensor,
+            item.intensities,
+        )  # fmt: skip
 
 
-def reader(request: Request) -> AbstractContextManager[Peer]:
-    """Return, for a block, the process that reads a recording for `Coming`."""
-    return beside(partial(_read, request), 'reads the recording')
+def reader(request: Request) -> AbstractContextManager[WorkerProcess]:
+    """Return, for a block, the process that reads a recording for `ReadAhead`."""
+    return run_in_worker(partial(_read, request), 'reads the recording')
 
 
-class Coming:
+class ReadAhead:
     """
-    `Arrivals` as another process makes them, at most a few ahead; that process opens them, too.
+    Iterate over the items that a `RecordingReader` yields in another process, a few ahead.
 
     Parameters
     ----------
-    peer : Peer
+    process : WorkerProcess
         The process, from `reader`.
 
     Attributes
     ----------
     source : Source
-        What is known before the first item.
+        Known before the first item.
     findings : Findings
-        What is known after the last one; not before.
+        Known after the last item; not set before.
 
     """
 
-    def __init__(self, peer: Peer) -> None:
-        self._peer = peer
-        self.source: Source = peer.receive()
+    def __init__(self, process: WorkerProcess) -> None:
+        self._process = process
+        self.source: Source = process.receive()
         self.findings: Findings
 
-    def __iter__(self) -> Iterator[Arrival]:
-        """Yield clouds and boxes; errors are raised where they came."""
-        while not isinstance(item := self._peer.receive(), Findings):
-            yield item
-        self.findings = item
+    def __iter__(self) -> Iterator[ReadItem]:
+        """Yield clouds and boxes; an error of the process is raised at its place."""
+        while True:
+            received = self._process.receive()
+            if isinstance(received, Findings):
+                self.findings = received
+                return
+            yield received
 
 
 def _read(request: Request, _: Callable[[], Any], send: Callable[[Any], None]) -> None:
     with request.recording() as recording:
-        arrivals = Arrivals(recording, request, Stopwatch())
-        send(arrivals.source)
-        for arrival in arrivals:
-            send(arrival)
-        send(arrivals.findings())
+        reading = RecordingReader(recording, request, Stopwatch())
+        send(reading.source)
+        for read_item in reading:
+            send(read_item)
+        send(reading.findings())

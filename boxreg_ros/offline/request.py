@@ -1,7 +1,8 @@
-"""What `boxreg relabel` is asked for, refused where it cannot work."""
+"""Inputs and options of one `boxreg relabel` run, checked before any work is done."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 import hashlib
 from math import isfinite
@@ -21,35 +22,39 @@ from msg_adapters.convention import Convention, STANDARD
 @dataclass(frozen=True, slots=True)
 class Request:
     """
-    What to relabel, and how.
+    Inputs and options of one relabel run.
 
     Attributes
     ----------
     recordings : tuple of Path
         Files or folders of one drive, merged by time.
     points, boxes, odometry : str or None
-        Topics; None where the type tells.
+        Topics; None where the only topic of the type is used.
     fixed_frame : str or None
-        Frame to refine in; None for the topmost the cloud's frame moves in.
+        Frame to refine in; None for the topmost frame that the frame of the clouds moves in.
     formats : tuple of str
-        Label formats beside ``csv``, which is always written.
+        Label formats to write; ``csv`` is always written.
     start, end : float or None
-        Part of the recording, from its beginning [s].
+        Part of the recording to read, from its beginning [s].
     config : Config
         Settings of the core.
     options : Options
         Settings of the label formats.
     labels : tuple of str and Path, or None
-        Format and files that the boxes come from instead of a topic.
+        Format and path of label files to read the boxes from instead of a topic.
     label_frame : str or None
-        Frame that stands for the sensor's in label formats; None for that of the clouds.
+        Sensor frame of the written label files; None for the frame of the clouds.
     convention : Convention
-        How the boxes are to be read.
+        Meaning of pose and size of the input boxes.
     bridge : float
-        Where a track is missing between two of its boxes that are no further apart than this,
-        a box is put in [s]; 0 for nowhere.
+        Longest gap of a track that is filled with interpolated boxes [s]; 0 fills none.
     report : bool
-        Write ``report.html`` too, for which the recording is read a second time.
+        Also write ``report.html``; the recording is then read twice.
+
+    Raises
+    ------
+    ConfigError
+        If an option cannot work, alone or with another one.
 
     """
 
@@ -70,30 +75,49 @@ class Request:
     report: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what cannot work before any work is done."""
-        if self.labels is not None and self.boxes is not None:
-            raise ConfigError('boxes: expected a topic or label files, got both; leave one out')
-        if self.labels is not None and not self.convention.is_standard:
-            raise ConfigError(
-                f'{self.convention}: expected for boxes of a topic, got label files; each format '
-                f'has its own convention, see boxreg formats'
-            )
-        for name, seconds in (('start', self.start), ('end', self.end)):
-            if seconds is not None and not isfinite(seconds):
-                raise ConfigError(
-                    f'{name}: expected seconds from the beginning, got {seconds}; leave it out '
-                    f'for all of the recording'
-                )
+        """Check the options."""
+        self._check_boxes()
+        self._check_part()
         if not 0 <= self.bridge <= self.config.max_gap:
             raise ConfigError(
-                f'bridge: expected 0 to max_gap ({self.config.max_gap:g} s), after which an id is '
-                f'that of another track, got {self.bridge:g}'
+                f'bridge: expected 0 to max_gap ({self.config.max_gap:g} s), got {self.bridge:g}; '
+                f'after a longer gap an id names another track: choose a smaller --bridge or a '
+                f'larger max_gap'
             )
         check_options(self.formats, self.options)
-        if self.labels is not None:
-            module_of(self.labels[0])
         if self.report:
             check_packages()
+
+    def _check_boxes(self) -> None:
+        """Check where the boxes come from."""
+        if self.labels is None:
+            return
+        if self.boxes is not None:
+            raise ConfigError(
+                'boxes: expected either a topic (--boxes) or label files (--labels), got both; '
+                'leave one out'
+            )
+        if not self.convention.is_standard:
+            raise ConfigError(
+                f'{self.convention}: expected for boxes of a topic only, got label files; leave '
+                f'it out: each label format has its own convention, see boxreg formats'
+            )
+        module_of(self.labels[0])  # refuses an unknown format
+
+    def _check_part(self) -> None:
+        """Check `start` and `end` as far as that is possible without the recording."""
+        for name, seconds in (('start', self.start), ('end', self.end)):
+            if seconds is not None and not (isfinite(seconds) and seconds >= 0):
+                raise ConfigError(
+                    f'{name}: expected seconds from the beginning of the recording, 0 or more, '
+                    f'got {seconds:g}; leave --{name} out to read to that end of the recording'
+                )
+        start = self.start or 0.0
+        if self.end is not None and self.end <= start:
+            raise ConfigError(
+                f'end: expected more than start ({start:g} s), got {self.end:g}; choose a larger '
+                f'--end or a smaller --start'
+            )
 
     def recording(self) -> Recording:
         """Return the recording, not yet open."""
@@ -113,18 +137,28 @@ class Request:
         return tuple(dict.fromkeys(('csv', *self.formats)))
 
     def inputs(self) -> tuple[Path, ...]:
-        """Return the files and folders it reads."""
-        label_files = (self.labels or ())[1:]
-        return (*self.recordings, *filter(None, (self.options.camera, *label_files)))
+        """Return the input files and folders."""
+        paths = list(self.recordings)
+        if self.options.camera is not None:
+            paths.append(self.options.camera)
+        if self.labels is not None:
+            paths.append(self.labels[1])
+        return tuple(paths)
 
     def fingerprint(self) -> str:
-        """Return a digest of the request and of the files it reads, by size and time."""
-        files = [
-            (str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns)
-            for path in self.inputs()
-            # Folders in that of a recording are no part of it; one may be that of the results.
-            for deep in ['*' if path in self.recordings else '**/*']
-            for file in sorted([path] if path.is_file() else path.glob(deep))
-            if file.is_file()
-        ]
+        """Return a hash of the request and of its input files, by size and modification time."""
+        files = []
+        for file in self._input_files():
+            status = file.stat()
+            files.append((str(file.resolve()), status.st_size, status.st_mtime_ns))
         return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
+
+    def _input_files(self) -> Iterator[Path]:
+        """Yield every input file, those of folders included."""
+        for path in self.inputs():
+            if path.is_file():
+                yield path
+                continue
+            # Subfolders of a recording are not part of it; one may hold the results.
+            pattern = '*' if path in self.recordings else '**/*'
+            yield from (file for file in sorted(path.glob(pattern)) if file.is_file())

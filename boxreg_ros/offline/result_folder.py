@@ -1,4 +1,4 @@
-"""Folders of results: whole or not at all."""
+"""Result folders that appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ def earlier_summary(out: Path) -> dict[str, Any] | None:
 
 def spare(out: Path, inputs: Iterable[Path | None]) -> None:
     """
-    Refuse to replace a folder of results that holds what it would be made from.
+    Refuse to replace a result folder that contains an input.
 
     Raises
     ------
     ConfigError
-        If one of `inputs` is `out` or lies in it, links followed.
+        If one of `inputs` is `out` or lies in it, symbolic links followed.
 
     """
     folder = out.resolve()
     for path in filter(None, inputs):
         if path.resolve().is_relative_to(folder):
             raise ConfigError(
-                f'output {str(out)!r}: expected a folder that no input is in, got one with '
-                f'{str(path)!r}, which would be replaced with it; choose another with -o'
+                f'output {str(out)!r}: expected a folder that contains no input, got one with '
+                f'{str(path)!r}, which the results would replace; choose another with -o'
             )
 
 
 def spare_file(out: Path, inputs: Iterable[Path]) -> None:
     """
-    Refuse to write a file over what it would be made from.
+    Refuse to write a file over an input.
 
     Raises
     ------
     ConfigError
-        If `out` is one of `inputs`, or in a folder that is one, links followed.
+        If `out` is one of `inputs`, or lies in a folder that is one, symbolic links followed.
 
     """
     file = out.resolve()
     for path in inputs:
         if file.is_relative_to(path.resolve()):
             raise ConfigError(
-                f'output {str(out)!r}: expected a file that is no input and in none, got one '
+                f'output {str(out)!r}: expected a file that is no input and lies in none, got one '
                 f'that would change {str(path)!r}; choose another with -o'
             )
 
@@ -67,32 +67,23 @@ def spare_file(out: Path, inputs: Iterable[Path]) -> None:
 @contextmanager
 def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path]:
     """
-    Yield a folder to fill that becomes `out` on success, and vanishes otherwise.
+    Yield a temporary folder that replaces `out` on success and is deleted on failure.
 
     Raises
     ------
     ConfigError
         If one of `inputs` is in `out`.
     RecordingError
-        If `out` exists and is not the result of an earlier run, as that left it.
+        If `out` exists and is not the unchanged result of an earlier run.
 
     """
     spare(out, inputs)
-    if out.exists() and earlier_summary(out) is None and not _is_empty(out):
-        raise RecordingError(
-            f'output {str(out)!r}: expected a new folder or an earlier result, got something '
-            f'else; choose another with -o'
-        )
-    if (changed := _changed_since(out)) is not None:
-        raise RecordingError(
-            f'output {str(out)!r}: expected an earlier result as it was made, got one with '
-            f'{str(changed)!r} changed or added since, which would be lost; choose another with '
-            f'-o, or remove this one'
-        )
+    _check_replaceable(out)
     out = out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
     unique = f'.{out.name}.{uuid4().hex[:8]}'
-    partial, earlier = out.with_name(f'{unique}.partial'), out.with_name(f'{unique}.earlier')
+    partial = out.with_name(f'{unique}.partial')
+    earlier = out.with_name(f'{unique}.earlier')
     try:
         partial.mkdir()
         yield partial
@@ -106,13 +97,32 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
         shutil.rmtree(earlier, ignore_errors=True)
 
 
+def _check_replaceable(out: Path) -> None:
+    """Refuse a folder that is not the unchanged result of an earlier run."""
+    if out.exists() and earlier_summary(out) is None and not _is_empty(out):
+        raise RecordingError(
+            f'output {str(out)!r}: expected a new folder or an earlier result, got other files; '
+            f'choose another with -o'
+        )
+    changed = _changed_since(out)
+    if changed is not None:
+        raise RecordingError(
+            f'output {str(out)!r}: expected an unchanged earlier result, got one with '
+            f'{str(changed)!r} changed or added since, which would be lost; choose another with '
+            f'-o, or delete this one'
+        )
+
+
 def _changed_since(out: Path) -> Path | None:
     """Return a file in a result that is younger than its summary, which is written last."""
-    if not (out / SUMMARY).is_file():
+    summary = out / SUMMARY
+    if not summary.is_file():
         return None
-    made_ns = (out / SUMMARY).stat().st_mtime_ns
-    files = (file for file in out.rglob('*') if file.is_file())
-    return next((f.relative_to(out) for f in files if f.stat().st_mtime_ns > made_ns), None)
+    made_ns = summary.stat().st_mtime_ns
+    for file in out.rglob('*'):
+        if file.is_file() and file.stat().st_mtime_ns > made_ns:
+            return file.relative_to(out)
+    return None
 
 
 def _is_empty(folder: Path) -> bool:

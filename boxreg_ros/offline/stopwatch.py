@@ -1,8 +1,8 @@
-"""What each stage of a long run takes."""
+"""Time that the stages of a long run take."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 import time
@@ -13,30 +13,30 @@ _T = TypeVar('_T')
 
 class Stopwatch:
     """
-    Adds up what each stage takes [s].
+    Sum up the time of each stage [s].
 
-    What processes beside this one take is added; as their work overlaps, stages may add up to
-    more than the total.
+    The times of worker processes are added to it. Processes overlap, so the sum of all stages
+    can be larger than the total.
 
     """
 
     def __init__(self) -> None:
         self._begun = time.perf_counter()
-        self._seconds: Counter[str] = Counter()
+        self._seconds: dict[str, float] = defaultdict(float)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Count what the block takes to a stage."""
+        """Add the duration of the block to a stage."""
         begun = time.perf_counter()
         yield
         self.add(stage, time.perf_counter() - begun)
 
     def add(self, stage: str, seconds: float) -> None:
-        """Count what was measured elsewhere to a stage."""
-        self._seconds[stage] += seconds  # type: ignore[assignment]
+        """Add a time measured elsewhere to a stage."""
+        self._seconds[stage] += seconds
 
     def each(self, stage: str, items: Iterator[_T]) -> Iterator[_T]:
-        """Yield `items`, adding up what it takes to get them."""
+        """Yield `items` and add the time that the iterator takes to a stage."""
         end = object()
         while True:
             with self(stage):
@@ -46,9 +46,9 @@ class Stopwatch:
             yield item  # type: ignore[misc]
 
     def stages(self) -> dict[str, float]:
-        """Return what each stage took."""
+        """Return the time of each stage [s]."""
         return {name: round(seconds, 4) for name, seconds in self._seconds.items()}
 
     def seconds(self) -> dict[str, float]:
-        """Return what each stage took, and the total since this was made."""
+        """Return the time of each stage, and as ``total`` the time since construction [s]."""
         return {**self.stages(), 'total': round(time.perf_counter() - self._begun, 4)}

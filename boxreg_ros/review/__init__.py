@@ -1,1 +1,1 @@
-"""What was changed, to look at."""
+"""Report of the changes that registration has made."""

@@ -1,4 +1,4 @@
-"""What became of boxes: before and after, side by side, by track."""
+"""Boxes before and after registration, side by side, by track."""
 
 from __future__ import annotations
 
@@ -15,29 +15,31 @@ from numpy.typing import ArrayLike, NDArray
 @dataclass(frozen=True, slots=True)
 class TrackChanges:
     """
-    What became of the boxes of one track, by stamp.
+    The boxes of one track before and after registration, by stamp.
 
     Attributes
     ----------
     track_id, class_name : str
-        As in the input; the class that most boxes have.
+        As in the input; the most frequent class of the track.
     stamps_ns : array, shape (n,)
         Header stamps [ns].
     given, boxes : array, shape (n, 9)
-        Before and after in the fixed frame; NaN where a box has no place there, and before where
-        it was put in.
+        Input and result in the fixed frame; NaN where a box is invalid or in another frame, and
+        in `given` for interpolated boxes.
     change : array, shape (n, 4)
-        After minus before along the axes of the box [m] and in yaw [rad], half turns undone.
+        Result minus input along the axes of the box [m] and in yaw [rad], without 180 degree
+        flips.
     deviations : array, shape (n, 4)
-        Standard deviations of the same; NaN for boxes that are not refined.
+        Standard deviations of the result along the same axes; NaN for boxes that are not
+        refined.
     is_flipped : array, shape (n,)
-        True where the heading was turned around.
+        True where the heading was flipped by 180 degrees.
     status : array of str, shape (n,)
         As in `RefinedBoxes`.
     reasons : Counter
         Why boxes were kept.
     num_points : array, shape (n,)
-        Returns inside the input boxes.
+        Points inside the input boxes.
 
     """
 
@@ -55,50 +57,62 @@ class TrackChanges:
 
     @property
     def is_refined(self) -> NDArray[np.bool_]:
-        """Return where boxes are refined, shape (n,)."""
+        """Return which boxes are refined, shape (n,)."""
         return np.asarray(self.status == REFINED)
 
     @property
     def shift(self) -> float:
-        """Return how far refined centres moved, on average [m]; NaN where none is refined."""
+        """Return the mean distance that refined centres moved [m]; NaN without any."""
         return mean(np.linalg.norm(self.change[self.is_refined, :3], axis=1))
 
     @property
     def turn(self) -> float:
-        """Return how far refined boxes were turned, on average [deg]; NaN where none is."""
+        """Return the mean absolute yaw change of refined boxes [deg]; NaN without any."""
         return float(np.degrees(mean(np.abs(self.change[self.is_refined, 3]))))
 
     @property
     def deviation(self) -> float:
-        """Return the median deviation of refined centres from above [m]; NaN without any."""
+        """Return the median horizontal standard deviation of refined centres [m], or NaN."""
         return median(np.linalg.norm(self.deviations[self.is_refined, :2], axis=1))
 
 
 class Changes:
     """
-    Collects what became of every box, in few numbers each.
+    Collect all boxes before and after registration, in a few numbers each.
 
     Parameters
     ----------
     fixed_frame : str
-        Boxes in another frame are counted, but have no place.
+        Boxes in another frame are counted, but their numbers are NaN.
 
     """
 
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
-        self._names: list[tuple[str, str, str, str]] = []  # id, class, status and reason
-        self._numbers: list[Floats] = []
-        self._counts: list[Ints] = []
+        self._names: list[tuple[str, str, str, str]] = []  # id, class, status, reason
+        self._numbers: list[Floats] = []  # rows of given (9), boxes (9), deviations (4)
+        self._counts: list[Ints] = []  # rows of stamp, number of points
 
     def add(self, given: BoxArray, refined: RefinedBoxes) -> None:
-        """Take the boxes of one stamp before and after; those put in come behind the others."""
-        boxes, n = refined.boxes, len(refined.status)
-        before, after = np.full((n, 9), np.nan), boxes.boxes.copy()
+        """
+        Add the boxes of one array.
+
+        Parameters
+        ----------
+        given : BoxArray
+            The input.
+        refined : RefinedBoxes
+            The result; interpolated boxes stand behind those of the input.
+
+        """
+        boxes = refined.boxes
+        n = len(refined.status)
+        before = np.full((n, 9), np.nan)
         before[: len(given.boxes)] = given.boxes
-        has_place = is_valid_box(after)
-        has_place &= boxes.frame_id == self._fixed_frame
-        before[~has_place] = after[~has_place] = np.nan
+        after = boxes.boxes.copy()
+        is_usable = is_valid_box(after) & (boxes.frame_id == self._fixed_frame)
+        before[~is_usable] = np.nan
+        after[~is_usable] = np.nan
         deviations = _deviations(after, refined.covariances)
         self._numbers.append(np.hstack([before, after, deviations]))
         self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
@@ -107,53 +121,80 @@ class Changes:
         )
 
     def tracks(self) -> list[TrackChanges]:
-        """Return all tracks, those that were moved most first."""
+        """Return all tracks, by descending mean shift."""
         numbers = np.concatenate([np.zeros((0, 22)), *self._numbers])
         counts = np.concatenate([np.zeros((0, 2), np.int64), *self._counts])
         given, boxes, deviations = np.split(numbers, [9, 18], axis=1)
-        errors = pose_errors(given, boxes)  # in the axes of the boxes after
-        change = -np.column_stack([errors.translation, wrap_angle(2 * errors.rotation[:, 2]) / 2])
-        rows_of: dict[str, list[int]] = {}
-        for row in np.argsort(counts[:, 0], kind='stable').tolist():
-            rows_of.setdefault(self._names[row][0], []).append(row)
+        errors = pose_errors(given, boxes)  # of the input, in the axes of the result
+        yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
+        change = -np.column_stack([errors.translation, yaw_change])
         found = []
-        for name, rows in rows_of.items():
+        for track_id, rows in self._rows_by_track(counts[:, 0]).items():
             _, classes, status, reasons = zip(*(self._names[row] for row in rows), strict=True)
             is_refined = np.array(status) == REFINED
             found.append(
                 TrackChanges(
-                    name, Counter(classes).most_common(1)[0][0], counts[rows, 0], given[rows],
-                    boxes[rows], change[rows],
-                    np.where(is_refined[:, None], deviations[rows], np.nan),
-                    errors.is_flipped[rows] & is_refined, np.array(status),
-                    Counter(filter(None, reasons)), counts[rows, 1],
+                    track_id=track_id,
+                    class_name=Counter(classes).most_common(1)[0][0],
+                    stamps_ns=counts[rows, 0],
+                    given=given[rows],
+                    boxes=boxes[rows],
+                    change=change[rows],
+                    deviations=np.where(is_refined[:, None], deviations[rows], np.nan),
+                    is_flipped=errors.is_flipped[rows] & is_refined,
+                    status=np.array(status),
+                    reasons=Counter(filter(None, reasons)),
+                    num_points=counts[rows, 1],
                 )
-            )  # fmt: skip
+            )
         return sorted(found, key=lambda track: -np.nan_to_num(track.shift, nan=-1.0))
+
+    def _rows_by_track(self, stamps_ns: Ints) -> dict[str, list[int]]:
+        """Return the rows of each track id, by stamp."""
+        rows_of: dict[str, list[int]] = {}
+        for row in np.argsort(stamps_ns, kind='stable').tolist():
+            rows_of.setdefault(self._names[row][0], []).append(row)
+        return rows_of
 
 
 def mean(values: ArrayLike) -> float:
-    """Return the mean of what is known; NaN where nothing is."""
+    """Return the mean of the finite values; NaN without any."""
     found = known(values)
     return float(found.mean()) if len(found) else np.nan
 
 
 def median(values: ArrayLike) -> float:
-    """Return the median of what is known; NaN where nothing is."""
+    """Return the median of the finite values; NaN without any."""
     found = known(values)
     return float(np.median(found)) if len(found) else np.nan
 
 
 def known(values: ArrayLike) -> Floats:
-    """Return the values that are finite, in one row."""
+    """Return the finite values as one row."""
     values = np.asarray(values, dtype=np.float64)
     return np.asarray(values[np.isfinite(values)])
 
 
 def _deviations(boxes: Floats, covariances: Floats) -> Floats:
-    """Return standard deviations (n, 4) along the heading, across it, up [m] and of yaw [rad]."""
-    cos, sin = np.cos(boxes[:, YAW]), np.sin(boxes[:, YAW])
-    axes = np.array([[cos, sin], [-sin, cos]])
-    flat = np.einsum('kin,nij,kjn->nk', axes, covariances[:, :2, :2], axes)
-    variances = np.column_stack([flat, covariances[:, 2, 2], covariances[:, 5, 5]])
+    """
+    Return standard deviations along the axes of the boxes.
+
+    Parameters
+    ----------
+    boxes : array, shape (n, 9)
+        Boxes in the fixed frame.
+    covariances : array, shape (n, 6, 6)
+        Of x y z roll pitch yaw in the fixed frame.
+
+    Returns
+    -------
+    deviations : array, shape (n, 4)
+        Along the heading, across it and up [m], and of the yaw [rad].
+
+    """
+    cos = np.cos(boxes[:, YAW])
+    sin = np.sin(boxes[:, YAW])
+    axes = np.array([[cos, sin], [-sin, cos]])  # (axis of the box, x or y, n)
+    horizontal = np.einsum('kin,nij,kjn->nk', axes, covariances[:, :2, :2], axes)
+    variances = np.column_stack([horizontal, covariances[:, 2, 2], covariances[:, 5, 5]])
     return np.asarray(np.sqrt(variances.clip(0)))

@@ -1,72 +1,64 @@
 """
-`boxreg relabel --report`: one page that shows what became of the boxes, and where to look closer.
+`boxreg relabel --report`: one HTML page that shows the changes and which tracks to check.
 
-The page needs nothing but itself: pictures are in it, and nothing is fetched.
+The page needs no other file and no network: its pictures are embedded.
 
 """
 
 from __future__ import annotations
 
-from base64 import b64encode
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
-from io import BytesIO
 from math import isfinite
 import os
 from pathlib import Path
 import re
 from string import ascii_uppercase
-from typing import Any, NamedTuple
+from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.metrics import EXTENT
-from boxreg_ros.core.observation import CLEARANCE, crop
+from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason, REASONS
-from boxreg_ros.review.changes import known, mean, median, TrackChanges
-from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.review.changes import mean, median, TrackChanges
+from boxreg_ros.review.pictures import STYLE, top_view, track_picture
+from boxreg_ros.review.track_points import BoxPoints, gather_points, in_box_frame
 from boxreg_ros.structures import (
     BoxArray,
     Floats,
+    HEIGHT,
     INTERPOLATED,
     KEPT,
-    LENGTH,
     REFINED,
-    ROLL,
     Sweep,
-    WIDTH,
     X,
-    Y,
-    YAW,
     Z,
 )
 import numpy as np
-from numpy.typing import NDArray
 
 REPORT = 'report.html'
-PACKAGES = 'jinja2', 'matplotlib'
+PACKAGES = ('jinja2', 'matplotlib')
 TEMPLATE = Path(__file__).parents[1] / 'share' / 'report.html.j2'
-SHOWN, SHORTEST = 12, 10  # tracks with pictures, and boxes that one of them has at least
-SWEEPS, POINTS = 60, 150  # most of a track, and most of a box, that its pictures show
-ROWS = 300  # tracks in the table
-MARGIN = 0.6  # points so far outside of a box are shown [m]
-CELL = 0.1  # the fewer cubes of this edge the points of all sweeps fill, the sharper they are [m]
-STYLE: Any = {'font.size': 8, 'axes.spines.top': False, 'axes.spines.right': False}
-COLOURS = {REFINED: '#1769aa', KEPT: '#e07b00', INTERPOLATED: '#8e44ad'}
-GREY = '#9a9a9a'
-AXES = 'along [m]', 'across [m]', 'up [m]', 'yaw [deg]'
+MAX_SHOWN = 12
+"""Tracks with a picture."""
+MIN_BOXES = 10
+"""Boxes in the fixed frame that a track with a picture has at least."""
+MAX_ROWS = 300
+"""Tracks in the table of all tracks."""
+CELL = 0.1
+"""Edge of the cubes that measure how sharp the points of all sweeps are in their boxes [m]."""
 
 
 def check_packages() -> None:
     """
-    Look whether the packages of a report are there.
+    Check that the packages of the report are installed.
 
     Raises
     ------
     ConfigError
-        If one is not installed.
+        If one is not.
 
     """
     for package in PACKAGES:
@@ -92,37 +84,37 @@ def write_report(
     Parameters
     ----------
     path : Path
-        Where to.
+        The file.
     line : str
-        What was done, in one line.
+        The closing line of the run.
     summary : mapping
-        What ``summary.json`` holds.
+        Content of ``summary.json``.
     config : Config
         Settings of the run.
     tracks : sequence of TrackChanges
         All tracks, in the order of the table.
     items : iterable of Sweep and BoxArray
-        Those of the recording once more, in the fixed frame and in the order they came. Of their
-        points few are kept, however many there are.
+        The recording once more, in the fixed frame. One item is held at a time.
 
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     import matplotlib
 
-    reasons = chosen(tracks)
-    letters = dict(zip(reasons, ascii_uppercase, strict=False))
-    shown = [track for name in letters for track in tracks if track.track_id == name]
-    seen, origins = _gathered(shown, items, config)
+    selected = select_tracks(tracks)
+    letters = dict(zip(selected, ascii_uppercase, strict=False))
+    shown = [track for track_id in selected for track in tracks if track.track_id == track_id]
+    points, origins = gather_points(shown, items, config)
     begin_ns = min((int(track.stamps_ns[0]) for track in tracks), default=0)
+    in_fixed_frame = [track for track in tracks if np.isfinite(track.boxes[:, X]).any()]
+    sections = []
     with matplotlib.rc_context(STYLE):
-        placed = [track for track in tracks if np.isfinite(track.boxes[:, X]).any()]
-        overview = _overview(placed, letters, origins) if placed else ''
-        sections = [
-            _facts(track)
-            | {'letter': letters[track.track_id], 'why': reasons[track.track_id]}
-            | _pictured(track, seen[track.track_id], begin_ns)
-            for track in shown
-        ]
+        overview = top_view(in_fixed_frame, letters, origins) if in_fixed_frame else ''
+        for track in shown:
+            section = _numbers(track)
+            section['letter'] = letters[track.track_id]
+            section['why'] = selected[track.track_id]
+            section |= _picture(track, points[track.track_id], begin_ns)
+            sections.append(section)
     environment = Environment(
         loader=FileSystemLoader(TEMPLATE.parent), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
@@ -142,269 +134,131 @@ def write_report(
         overview=overview,
         sections=sections,
         letters=letters,
-        rows=[_facts(track) for track in tracks[:ROWS]],
+        rows=[_numbers(track) for track in tracks[:MAX_ROWS]],
         count=len(tracks),
-        shortest=SHORTEST,
+        min_boxes=MIN_BOXES,
+        cell=CELL,
     )
-    # Names of files need not be UTF-8.
+    # File names need not be valid UTF-8.
     path.write_text(page, encoding='utf-8', errors='backslashreplace')
 
 
-def chosen(tracks: Sequence[TrackChanges]) -> dict[str, str]:
-    """Return the ids of the tracks to be shown, and why each of them is."""
-    able = [t for t in tracks if t.track_id and np.isfinite(t.boxes[:, X]).sum() >= SHORTEST]
-    kept = [int(((t.status == KEPT) & (t.num_points > 0)).sum()) for t in able]
-    points = [median(t.num_points) for t in able]
-    orders: list[list[tuple[float, str, TrackChanges]]] = [
-        [(t.shift, f'moved most: {t.shift:.2f} m on average', t) for t in able],
-        [(t.deviation, f'least certain: {t.deviation:.2f} m (1 sigma)', t) for t in able],
-        [
-            (k, f'kept in spite of points: {k} of {len(t.status)} boxes', t)
-            for k, t in zip(kept, able, strict=True)
-        ],
-        [(p, f'most points: {p:,.0f} a box', t) for p, t in zip(points, able, strict=True)],
-    ]
-    orders = [[item for item in order if item[0] > 0] for order in orders]
+def select_tracks(tracks: Sequence[TrackChanges]) -> dict[str, str]:
+    """
+    Select the tracks to show with a picture.
+
+    By turns the next track of four orders is taken: largest shift, largest standard deviation,
+    most boxes kept although they have points, and, for comparison, most points.
+
+    Returns
+    -------
+    selected : dict
+        Why each track is shown, by track id, in the order of the page.
+
+    """
+    candidates = []
+    for track in tracks:
+        if track.track_id and np.isfinite(track.boxes[:, X]).sum() >= MIN_BOXES:
+            candidates.append(track)
+    orders: list[list[tuple[float, str, str]]] = [[], [], [], []]  # (value, why, track id)
+    for track in candidates:
+        shift = track.shift
+        deviation = track.deviation
+        points = median(track.num_points)
+        kept = int(((track.status == KEPT) & (track.num_points > 0)).sum())
+        texts = (
+            f'largest shift: mean {shift:.2f} m',
+            f'largest uncertainty: {deviation:.2f} m (1 sigma)',
+            f'boxes kept although they have points: {kept} of {len(track.status)}',
+            f'most points: {points:,.0f} per box',
+        )
+        values = (shift, deviation, kept, points)
+        for order, value, text in zip(orders, values, texts, strict=True):
+            if value > 0:  # NaN is not
+                order.append((value, text, track.track_id))
     for order in orders:
         order.sort(key=lambda item: -item[0])
-    found: dict[str, str] = {}
-    for rank in range(len(able)):
+    selected: dict[str, str] = {}
+    for rank in range(len(candidates)):
         for order in orders:
-            if rank < len(order) and len(found) < SHOWN:
-                _, why, track = order[rank]
-                found.setdefault(track.track_id, why)
-    return found
+            if rank < len(order) and len(selected) < MAX_SHOWN:
+                _, why, track_id = order[rank]
+                selected.setdefault(track_id, why)
+    return selected
 
 
-class _Seen(NamedTuple):
-    """Points (M, 3) of a sweep near the box in one row of a track, in the fixed frame."""
-
-    row: int
-    points: Floats
-
-
-def _gathered(
-    shown: Sequence[TrackChanges], items: Iterable[Sweep | BoxArray], config: Config
-) -> tuple[dict[str, list[_Seen]], Floats]:
-    """Return some points of the tracks shown, and where the sensor was (n, 3)."""
-    wanted = {
-        (int(track.stamps_ns[row]), track.track_id): (track, row)
-        for track in shown
-        for row in reversed(_spread(track))  # of two boxes of one stamp the first counts
+def _picture(track: TrackChanges, points: Sequence[BoxPoints], begin_ns: int) -> dict[str, Any]:
+    """Return the picture of a track, and the cells that its points fill before and after."""
+    before = in_box_frame(points, track.given, track.is_flipped)
+    after = in_box_frame(points, track.boxes, np.zeros_like(track.is_flipped))
+    half_height = np.nanmedian(track.boxes[:, HEIGHT]) / 2
+    is_object = after[:, Z] > GROUND_CLEARANCE - half_height  # lower points may be road
+    return {
+        'picture': track_picture(track, before, after, is_object, begin_ns),
+        'sweeps': len(points),
+        'cells': [_filled_cells(before[is_object]), _filled_cells(after[is_object])],
     }
-    seen: dict[str, list[_Seen]] = {track.track_id: [] for track in shown}
-    origins: list[Floats] = []
-    for boxes, sweep in _pairs(items, config, origins):
-        for name in boxes.track_ids if sweep is not None else ():
-            track, row = wanted.pop((boxes.stamp_ns, name), (None, 0))
-            if track is not None and sweep is not None:
-                seen[name].append(_Seen(row, _near(track, row, sweep, config)))
-    return seen, np.reshape(origins, (-1, 3))
 
 
-def _pairs(
-    items: Iterable[Sweep | BoxArray], config: Config, origins: list[Floats]
-) -> Iterator[Pair]:
-    """Yield boxes and sweeps that belong together; add where the sensor was to `origins`."""
-    matcher = StampMatcher(config, Counter())
-    for item in items:
-        if isinstance(item, Sweep):
-            origins.append(item.origin)
-            yield from matcher.add_sweep(item)
-        else:
-            yield from matcher.add_boxes(item)
-    yield from matcher.flush()
+def _filled_cells(points: Floats) -> int:
+    """Return the number of cubes of edge `CELL` that hold points (M, 3)."""
+    return len(np.unique(np.floor(points / CELL), axis=0))
 
 
-def _spread(track: TrackChanges) -> list[int]:
-    """Return rows of boxes with points in or near them, all over the track."""
-    has_points = track.is_refined | (track.num_points > 0)
-    rows = np.flatnonzero(np.isfinite(track.change).all(axis=1) & has_points)
-    picks = np.linspace(0, len(rows) - 1, min(SWEEPS, len(rows))).astype(int)
-    return [int(row) for row in rows[picks]]
-
-
-def _near(track: TrackChanges, row: int, sweep: Sweep, config: Config) -> Floats:
-    """Return points (M, 3) near a box before and after, carried along its way to its stamp."""
-    has_place = np.isfinite(track.boxes[:, X])
-    times = (track.stamps_ns[has_place] - track.stamps_ns[row]) * 1e-9
-    centers = track.boxes[has_place, : Z + 1]
-
-    def way(seconds: Floats) -> Floats:
-        there = [np.interp(seconds, times, center) for center in centers.T]
-        return np.asarray(track.boxes[row, : Z + 1] - np.column_stack(there))
-
-    late = np.array([(sweep.stamp_ns - track.stamps_ns[row]) * 1e-9])
-    both = np.array([track.given[row], track.boxes[row]])
-    both[:, : Z + 1] -= way(late)
-    index, _, _, outside = crop(sweep.points, both, MARGIN)
-    index = np.unique(index[outside.max(0) < MARGIN])
-    index = index[:: max(1, -(-len(index) // POINTS))]
-    if config.sampling.deskew and sweep.times is not None:
-        late = late + sweep.times[index]
-    return np.asarray(sweep.points[index] + way(late))
-
-
-def _pictured(track: TrackChanges, seen: Sequence[_Seen], begin_ns: int) -> dict[str, Any]:
-    """Return the picture of a track, and how many cells its points fill before and after."""
-    from matplotlib.figure import Figure
-
-    before = _carried(seen, track.given, track.is_flipped)
-    after = _carried(seen, track.boxes, np.zeros_like(track.is_flipped))
-    given, boxes = (np.nanmedian(b[:, EXTENT], axis=0) for b in (track.given, track.boxes))
-    above = after[:, 2] > CLEARANCE - boxes[2] / 2  # what is lower may be road
-    length, *reaches = np.maximum(given, boxes) / 2 + MARGIN
-    figure = Figure((13, 4.2))
-    grid = figure.add_gridspec(
-        2, 2, left=0.04, right=0.6, top=0.93, bottom=0.09, hspace=0.1, wspace=0.04,
-        height_ratios=reaches,
-    )  # fmt: skip
-    panels: Any = grid.subplots(sharex=True, sharey='row')
-    looks = (before, given, GREY), (after, boxes, COLOURS[REFINED])
-    for k, (points, extent, colour) in enumerate(looks):
-        for panel, axis, reach in zip(panels[:, k], (Y, Z), reaches, strict=True):
-            dots = points[above] if axis == Y else points
-            fade = float(np.clip(800 / (1 + len(dots)), 0.2, 0.8))
-            panel.scatter(dots[:, X], dots[:, axis], s=4 * fade**0.5, c='k', alpha=fade, lw=0)
-            panel.plot(*_outline(extent[0], extent[axis]).T, color=colour, lw=1.2)
-            panel.set(xlim=(-length, length), ylim=(-reach, reach), aspect='equal')
-    for panel, title in zip(panels[0], ('before, by the input boxes', 'after'), strict=True):
-        panel.set_title(title, fontweight='bold')
-    for panel, title in zip(panels[:, 0], ('from above [m]', 'from the side [m]'), strict=True):
-        panel.set_ylabel(title)
-    _draw_series(track, figure, begin_ns)
-    cells = [len(np.unique(np.floor(p[above] / CELL), axis=0)) for p in (before, after)]
-    return {'picture': _png(figure), 'sweeps': len(seen), 'cells': cells, 'cell': CELL}
-
-
-def _draw_series(track: TrackChanges, figure: Any, begin_ns: int) -> None:
-    """Draw what was changed over time, and around zero how certain the refined box is."""
-    grid = figure.add_gridspec(4, 1, left=0.66, right=0.99, top=0.93, bottom=0.09, hspace=0.15)
-    panels = grid.subplots(sharex=True)
-    scale = np.array([1, 1, 1, np.degrees(1)])
-    change, band = track.change * scale, 2 * track.deviations * scale
-    seconds = (track.stamps_ns - begin_ns) * 1e-9
-    for panel, name, values, reach in zip(panels, AXES, change.T, band.T, strict=True):
-        panel.axhline(0, color=GREY, lw=0.6)
-        panel.fill_between(seconds, -reach, reach, color=COLOURS[REFINED], alpha=0.15, lw=0)
-        for status in (REFINED, KEPT):
-            of_kind = track.status == status
-            panel.plot(seconds[of_kind], values[of_kind], '.', ms=3, color=COLOURS[status])
-        most = max([0.02, *np.abs(values[np.isfinite(values)]), *known([median(reach)])])
-        panel.set(ylabel=name, ylim=(-1.15 * most, 1.15 * most))
-    figure.align_ylabels(panels)
-    panels[0].set_title('refined minus input; band: ±2 sigma', fontweight='bold')
-    panels[-1].set_xlabel('time [s]')
-
-
-def _overview(tracks: Sequence[TrackChanges], letters: Mapping[str, str], sensor: Floats) -> str:
-    """Return a picture from above of tracks that have a box in the fixed frame each."""
-    from matplotlib.figure import Figure
-
-    gap = np.full((1, 9), np.nan)  # a line ends where its track does
-    given = np.concatenate([part for track in tracks for part in (track.given, gap)])
-    boxes = np.concatenate([track.boxes for track in tracks])
-    status = np.concatenate([track.status for track in tracks])
-    width, depth = (np.ptp(known(column)) + 20.0 for column in boxes[:, :2].T)
-    figure = Figure((13, float(np.clip(13 * depth / width, 4, 8))))
-    axes = figure.add_axes((0.05, 0.08, 0.94, 0.9))
-    axes.plot(given[:, X], given[:, Y], color=GREY, lw=0.7, label='input')
-    for name, colour in COLOURS.items():
-        of_kind = boxes[status == name]
-        if len(of_kind):
-            axes.plot(of_kind[:, X], of_kind[:, Y], '.', ms=2, color=colour, label=name)
-    axes.plot(*sensor[:, :2].T, color='k', lw=1, ls=':', label='sensor')
-    for track in tracks:
-        placed = track.boxes[np.isfinite(track.boxes[:, X])]
-        box = placed[len(placed) // 2]
-        cos, sin = np.cos(box[YAW]), np.sin(box[YAW])
-        turned = _outline(box[LENGTH], box[WIDTH]) @ np.array([[cos, sin], [-sin, cos]])
-        axes.plot(*(turned + box[[X, Y]]).T, color='k', lw=0.6)
-        if letter := letters.get(track.track_id):
-            axes.annotate(
-                letter, box[[X, Y]], (5, 5), textcoords='offset points', fontweight='bold',
-                bbox={'boxstyle': 'round,pad=0.2', 'fc': 'w', 'ec': GREY, 'lw': 0.5},
-            )  # fmt: skip
-    axes.set_aspect('equal', adjustable='datalim')
-    axes.set(xlabel='x [m]', ylabel='y [m]')
-    axes.legend(markerscale=4, frameon=False, loc='best')
-    return _png(figure)
-
-
-def _carried(seen: Sequence[_Seen], boxes: Floats, is_flipped: NDArray[np.bool_]) -> Floats:
-    """Return the points (M, 3) of all sweeps as each lies in its box, half turns undone."""
-    local = [np.zeros((0, 3))]
-    for row, points in seen:
-        R = matrix_from_rpy(boxes[row, ROLL:])
-        sign = np.array([-1, -1, 1]) if is_flipped[row] else 1
-        local.append((points - boxes[row, : Z + 1]) @ R * sign)
-    return np.concatenate(local)
-
-
-def _outline(length: float, width: float) -> Floats:
-    """Return the outline (7, 2) of a box that heads along x, with a stroke forward."""
-    corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [1.2, 0]])
-    return np.asarray(corners * [length, width] / 2)
-
-
-def _png(figure: Any) -> str:
-    """Return a figure as the base64 of a PNG file."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format='png', dpi=100)
-    return b64encode(buffer.getvalue()).decode('ascii')
-
-
-def _facts(track: TrackChanges) -> dict[str, Any]:
-    """Return what the page says about a track in numbers."""
+def _numbers(track: TrackChanges) -> dict[str, Any]:
+    """Return the numbers of a track on the page."""
     counts = Counter(track.status.tolist())
-    n = len(track.status) - counts[INTERPOLATED]
-    extents = [[median(v) for v in b[:, EXTENT].T] for b in (track.given, track.boxes)]
+    boxes = len(track.status) - counts[INTERPOLATED]
+    is_input = track.status != INTERPOLATED
     return {
         'track_id': track.track_id,
         'class_name': track.class_name,
-        'boxes': n,
+        'boxes': boxes,
         'interpolated': counts[INTERPOLATED],
         'seconds': (track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
-        'points': median(track.num_points[track.status != INTERPOLATED]),
-        'refined': counts[REFINED] / n if n else np.nan,
-        'kept': ', '.join(f'{name} {k:,}' for name, k in track.reasons.most_common()),
+        'points': median(track.num_points[is_input]),
+        'refined': counts[REFINED] / boxes if boxes else np.nan,
+        'kept': ', '.join(f'{name} {count:,}' for name, count in track.reasons.most_common()),
         'shift': track.shift,
         'turn': track.turn,
         'deviation': track.deviation,
-        'extents': extents,
+        'extents': [_median_extents(track.given), _median_extents(track.boxes)],
         'flips': int(track.is_flipped.sum()),
     }
 
 
+def _median_extents(boxes: Floats) -> list[float]:
+    return [median(values) for values in boxes[:, EXTENT].T]
+
+
 def _warnings(summary: Mapping[str, Any]) -> list[str]:
-    """Return what a user should not overlook."""
-    found = [summary['warning']]
+    """Return the warnings at the top of the page."""
+    found = [summary['warning']] if summary['warning'] else []
     if summary['boxes_in'] and not summary['status'].get(REFINED):
-        found.append('No box was refined; the reasons are below.')
-    for name, text in (
-        ('first_missing_transform', 'First transform that is missing'),
-        ('first_unreadable', 'First that cannot be read'),
-    ):
-        found.append(f'{text}: {summary[name]}' if summary[name] else '')
+        found.append('No box was refined; see "Why boxes were kept" below.')
+    if summary['first_missing_transform']:
+        found.append(f'First missing transform: {summary["first_missing_transform"]}')
+    if summary['first_unreadable']:
+        found.append(f'First unreadable message: {summary["first_unreadable"]}')
     for name, dropped in summary['left_out_of_labels'].items():
         counts = ', '.join(f'{reason} {count:,}' for reason, count in dropped.items())
-        found.append(f'Boxes that {name} has no place for: {counts}')
-    return [text for text in found if text]
+        found.append(f'Boxes that format {name} cannot represent: {counts}')
+    return found
 
 
 def _explained(counts: Mapping[str, int]) -> list[tuple[str, int, Reason]]:
-    """Return reasons with what they mean, the most frequent first."""
-    found = [(name, n, REASONS.get(name, Reason('', ''))) for name, n in counts.items()]
+    """Return reasons with their count and explanation, the most frequent first."""
+    found = [(name, count, REASONS.get(name, Reason('', ''))) for name, count in counts.items()]
     return sorted(found, key=lambda item: -item[1])
 
 
 def _number(value: float, digits: int = 2) -> str:
-    """Return a number as people read it; a dash where it is unknown."""
+    """Return a number with separators; a dash for NaN."""
     return f'{value:,.{digits}f}' if isfinite(value) else '\N{EN DASH}'
 
 
 def _code(text: str) -> Any:
-    """Return text for the page, what stands between backticks as code."""
+    """Return text as HTML; words between backticks become code."""
     from markupsafe import escape, Markup
 
     return Markup(re.sub(r'`([^`]+)`', r'<code>\1</code>', str(escape(text))))

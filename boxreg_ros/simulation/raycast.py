@@ -1,8 +1,8 @@
 """
-Bodies of road users as convex parts, and a spinning sensor's rays against them.
+Ray casting of a spinning sensor against road users, whose bodies are convex parts.
 
-A part is what lies inside its side view, its top view and its front view at once, so a ray meets
-it where it has entered all of the half-spaces. Views are drawn in parts of the extent: x and y
+A part is the intersection of its side view, its top view and its front view, so a ray meets it
+where it has entered all of the half-spaces. Views are polygons in units of the extent: x and y
 from -0.5 to 0.5, z from 0 (road) to 1 (roof), counter-clockwise.
 
 """
@@ -18,7 +18,7 @@ from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
-PERIOD = 0.1  # [s] per revolution; the stamp is its middle
+PERIOD = 0.1  # of a revolution [s]; the stamp is its middle
 ROAD = -1  # owner of returns from the road
 
 View = list[tuple[float, float]]
@@ -135,30 +135,30 @@ def body(shape: str, extent: Floats) -> list[Floats]:
 
 
 def cast(parts: list[Floats], origins: NDArray[Any], directions: Floats) -> Floats:
-    """Return how far rays (R, 3) travel until they enter one of `parts`, or inf, shape (R,)."""
+    """Return the distance (R,) at which rays (R, 3) enter the first of `parts`; inf without."""
     nearest = np.full(len(origins), np.inf)
     for planes in parts:
-        room = planes[:, 3] - origins @ planes[:, :3].T  # (R, P), negative: outside
+        clearance = planes[:, 3] - origins @ planes[:, :3].T  # (R, P), negative outside
         speed = directions @ planes[:, :3].T
         with np.errstate(divide='ignore', invalid='ignore'):
-            crossing = room / speed
+            crossing = clearance / speed
         entry = np.where(speed < 0, crossing, -np.inf).max(axis=1)
         leave = np.where(speed > 0, crossing, np.inf).min(axis=1)
-        passes_by = ((speed == 0) & (room < 0)).any(axis=1)
-        hit = (entry < leave) & (entry > 0) & ~passes_by
+        is_beside = ((speed == 0) & (clearance < 0)).any(axis=1)
+        hit = (entry < leave) & (entry > 0) & ~is_beside
         nearest[hit] = np.minimum(nearest[hit], entry[hit])
     return nearest
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Where something is over time: poses (G, 6) x y z roll pitch yaw at `times` (G,) [s]."""
+    """A pose over time: poses (G, 6) x y z roll pitch yaw [m, rad] at `times` (G,) [s]."""
 
     times: NDArray[Any]
     poses: NDArray[Any]
 
     def at(self, times: NDArray[Any]) -> Floats:
-        """Return poses at `times` (n,) [s], linear between those given, shape (n, 6)."""
+        """Return poses (n, 6) at `times` (n,) [s], by linear interpolation."""
         return np.stack([np.interp(times, self.times, column) for column in self.poses.T], axis=1)
 
 
@@ -175,7 +175,7 @@ class Actor:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A spinning LiDAR: elevations of its beams [rad], columns per turn, reach and noise [m]."""
+    """A spinning LiDAR: beam elevations [rad], columns per revolution, reach and noise [m]."""
 
     elevations: Floats
     columns: int
@@ -193,37 +193,40 @@ def revolution(
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats, Ints]:
     """
-    Return one turn of a sensor on `ego`, on a plane road at z = 0, first hits only.
+    Return the first hits of one revolution of a sensor on `ego`, above a flat road at z = 0.
 
     Parameters
     ----------
     actors, parts
-        Who stands around, and their bodies.
+        All road users, and the parts of their bodies.
     ego : Motion
-        Of the sensor.
+        Motion of the sensor.
     sensor : Sensor
-        What it is able to.
+        Its beams, reach and noise.
     stamp : float
-        The middle of the turn [s].
+        The middle of the revolution [s].
     rng : Generator
-        Of noise and drop-outs.
+        Source of noise and drop-outs.
 
     Returns
     -------
     points : array, shape (M, 3)
         In the fixed frame [m].
     times : array, shape (M,)
-        When each ray left, after the stamp [s].
+        Time of each ray relative to the stamp [s].
     owners : array, shape (M,)
-        Row of the actor that was hit, or `ROAD`.
+        Row of the actor that each ray hit, or `ROAD`.
 
     """
-    columns, beams = sensor.columns, len(sensor.elevations)
-    turned = (np.arange(columns) + 0.5) / columns - 0.5
-    azimuth, times = 2 * np.pi * turned, PERIOD * turned
+    columns = sensor.columns
+    beams = len(sensor.elevations)
+    phase = (np.arange(columns) + 0.5) / columns - 0.5
+    azimuth = 2 * np.pi * phase
+    times = PERIOD * phase
     poses = ego.at(stamp + times)
-    flat, rise = np.cos(sensor.elevations), np.sin(sensor.elevations)
-    rays = np.stack(
+    flat = np.cos(sensor.elevations)
+    rise = np.sin(sensor.elevations)
+    rays = np.stack(  # (columns, beams, xyz)
         [
             np.cos(azimuth)[:, None] * flat,
             np.sin(azimuth)[:, None] * flat,
@@ -237,10 +240,11 @@ def revolution(
         ranges = np.where(rays[..., 2] < 0, -origins[:, None, 2] / rays[..., 2], np.inf)
     owner = np.full((columns, beams), ROAD)
     for index, actor in enumerate(actors):
-        # First only rays that can meet the sphere around the body, 1 m wider for its motion.
+        # Only rays that can meet the sphere around the body, 1 m wider for its motion.
         center = actor.motion.at(np.array([stamp]))[0, :3]
         offset = center - poses[columns // 2, :3]
-        distance, radius = np.hypot(*offset[:2]), np.linalg.norm(actor.extent) / 2 + 1
+        distance = np.hypot(*offset[:2])
+        radius = np.linalg.norm(actor.extent) / 2 + 1
         if distance - radius > sensor.reach:
             continue
         half = np.arcsin(radius / distance) if distance > radius else np.pi
@@ -249,8 +253,8 @@ def revolution(
         height = np.arctan2(offset[2], distance)
         rows = np.flatnonzero(np.abs(sensor.elevations - height) <= half + 0.02)
         T_body_fixed = np.linalg.inv(to_matrix(actor.motion.at(stamp + times[cols])))
-        R, start = T_body_fixed[:, :3, :3], T_body_fixed[:, :3, 3]
-        start = np.einsum('cij,cj->ci', R, origins[cols]) + start
+        R = T_body_fixed[:, :3, :3]
+        start = np.einsum('cij,cj->ci', R, origins[cols]) + T_body_fixed[:, :3, 3]
         start = np.repeat(start, len(rows), axis=0)
         ahead = np.einsum('cij,cbj->cbi', R, rays[np.ix_(cols, rows)]).reshape(-1, 3)
         found = cast([box_planes(actor.extent)], start, ahead)

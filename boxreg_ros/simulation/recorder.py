@@ -1,4 +1,4 @@
-"""Sweeps, boxes and the sensor's motion, written as an MCAP recording."""
+"""Write sweeps, boxes and the motion of the sensor as an MCAP recording."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ def write_recording(
     is_compressed: bool = False,
 ) -> None:
     """
-    Write ``/points``, ``/detections``, ``/odom`` and ``/tf``; an old file is replaced whole.
+    Write ``/points``, ``/detections``, ``/odom`` and ``/tf``; an old file is replaced at the end.
 
     Parameters
     ----------
     path : Path
         Ends in ``.mcap``.
     sweeps, intensities, detections
-        One each per stamp, all in the sensor's frame.
+        One each per stamp, all in the sensor frame.
     T_fixed_sensor : n arrays, shape (4, 4)
-        Where the sensor was at each stamp, in `fixed_frame`.
+        Pose of the sensor in `fixed_frame` at each stamp.
     fixed_frame : str
         Parent frame of the odometry.
     is_compressed : bool
-        Compress by zstd; `ros2 bag record` does not unless asked to.
+        Compress by zstd, which `ros2 bag record` does only on request.
 
     Raises
     ------
@@ -74,7 +74,8 @@ def write_recording(
                 for sweep, intensity, boxes, T in zip(
                     sweeps, intensities, detections, T_fixed_sensor, strict=True
                 ):
-                    stamp_ns, frames = sweep.stamp_ns, (fixed_frame, sweep.frame_id)
+                    stamp_ns = sweep.stamp_ns
+                    frames = (fixed_frame, sweep.frame_id)
                     put('/tf', messages.transform(stamp_ns, *frames, T), stamp_ns)
                     put('/odom', messages.odometry(stamp_ns, *frames, T), stamp_ns)
                     put('/points', messages.cloud(sweep, intensity), stamp_ns)
@@ -85,7 +86,7 @@ def write_recording(
 
 
 class _Messages:
-    """Makes the messages above; knows nothing but their layouts."""
+    """Makes the messages of the recording."""
 
     def __init__(self) -> None:
         self.store = get_typestore(Stores.ROS2_JAZZY)

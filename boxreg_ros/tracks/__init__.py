@@ -1,1 +1,1 @@
-"""From refined tracks to whole tracks."""
+"""Post-processing of refined tracks: gaps are filled."""

@@ -1,11 +1,13 @@
-"""The ablation: what is switched off is off, and on again afterwards."""
+"""`boxreg bench ablation`: every ingredient that is switched off changes the boxes."""
 
+from dataclasses import fields
 import json
 
 from boxreg_ros import cli
 from boxreg_ros.bench import ablation as bench_ablation
-from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE, without
+from boxreg_ros.config import Ingredients, settings
+from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
@@ -16,13 +18,13 @@ NAMES = list(INGREDIENTS)[1:]
 
 @pytest.fixture(scope='module')
 def scene():
-    # Long enough that noise is measured (14 boxes of a track), and full of neighbours.
+    # Long enough that noise is estimated (14 boxes of a track), with many neighbours.
     return simulate('street', seed=3, sweeps=24)
 
 
 @pytest.fixture(scope='module')
 def drive(scene):
-    return bench.Drive.from_scene(scene)
+    return Drive.from_scene(scene)
 
 
 @pytest.fixture(scope='module')
@@ -31,8 +33,8 @@ def whole(drive):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_an_ingredient_that_is_off_makes_a_difference(drive, whole, name):
-    if name == 'memory':  # nothing leaves the window of a whole track
+def test_switching_off_an_ingredient_changes_boxes(drive, whole, name):
+    if name == 'marginalisation':  # nothing leaves the window of a whole track
         whole, found = (without(INGREDIENTS[key], drive, 'early') for key in (WHOLE, name))
     else:
         found = without(INGREDIENTS[name], drive)
@@ -41,17 +43,21 @@ def test_an_ingredient_that_is_off_makes_a_difference(drive, whole, name):
     assert np.abs(found.boxes - whole.boxes).max() > 1e-3
 
 
-def test_all_is_on_again_afterwards(drive, whole):
-    places = {(place, name) for item in INGREDIENTS.values() for place, name, _ in item.replaced}
-    before = {key: vars(key[0])[key[1]] for key in places}
-    with pytest.raises(AttributeError):  # also where a run fails
-        without(INGREDIENTS['ownership'], None)
-    assert all(vars(place)[name] is value for (place, name), value in before.items())
+def test_ingredients_are_switched_by_their_run_alone(drive, whole):
+    # Nothing of the core is replaced: a run with all of them after one without is as before.
+    without(INGREDIENTS['point ownership'], drive)
     again = without(INGREDIENTS[WHOLE], drive)
     np.testing.assert_array_equal(again.boxes, whole.boxes)
 
 
-def test_what_it_costs_is_printed(tmp_path, scene, capsys):
+def test_every_switch_is_used():
+    names = {name for item in INGREDIENTS.values() for name in item.settings}
+    switches = {f'ingredients.{item.name}' for item in fields(Ingredients)}
+    assert {name for name in names if name.startswith('ingredients.')} == switches
+    assert not switches & {item.name for item in settings()}  # they are no settings
+
+
+def test_losses_are_printed(tmp_path, scene, capsys):
     for name in ('a', 'b'):
         (tmp_path / name).mkdir()
         intensities = [np.zeros(len(owner)) for owner in scene.owners]
@@ -67,20 +73,20 @@ def test_what_it_costs_is_printed(tmp_path, scene, capsys):
     assert text.count('\none extent ') == 3  # both recordings, and their mean
     assert 'mean of 2 recordings' in text
     assert cli.main(['bench', 'ablation', folders[0], *options, '--json']) == 0
-    (rows,) = json.loads(capsys.readouterr().out).values()
+    (rows,) = json.loads(capsys.readouterr().out)['results'].values()
     assert set(rows) == {WHOLE, 'one extent'}
     assert 0.5 < rows[WHOLE]['iou_3d'] < 1
 
 
-def test_any_estimate(drive, whole):
+def test_estimates_differ(drive, whole):
     newest, final = (without(INGREDIENTS[WHOLE], drive, name) for name in ('early', 'final'))
     for one, other in ((newest, final), (final, whole), (newest, whole)):
         assert len(one.boxes) == len(other.boxes)
         assert np.abs(one.boxes - other.boxes).max() > 1e-3
 
 
-def test_costs_by_hand():
-    rows = {WHOLE: [0.9, 0.8, 0.7, 0.01], 'bias': [0.85, 0.81, 0.7, 0.03]}
-    cells = bench_ablation.table(rows)[2].split()
+def test_losses_by_hand():
+    rows = {WHOLE: [0.9, 0.8, 0.7, 0.01], 'input bias': [0.85, 0.81, 0.7, 0.03]}
+    cells = bench_ablation.table(rows)[2].split()[1:]
     assert cells[1::2] == ['0.850', '0.810', '0.700', '0.030']
     assert cells[2::2] == ['(+0.050)', '(-0.010)', '(+0.000)', '(+0.020)']

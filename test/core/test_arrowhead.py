@@ -1,4 +1,4 @@
-"""Matrices of a chain with a border against the same as dense ones."""
+"""Arrowhead matrices against the same as dense ones."""
 
 from boxreg_ros.core.arrowhead import Chain, LINK
 import numpy as np
@@ -36,7 +36,7 @@ def vectors(length):
 
 
 @pytest.mark.parametrize('length', LENGTHS)
-def test_stretches_are_summed_up(length):
+def test_blocks_are_added_up(length):
     found, known = chain(length)
     np.testing.assert_allclose(dense(found, length), known, atol=1e-12)
 
@@ -63,7 +63,7 @@ def test_solution_and_inverse(length):
 
 @pytest.mark.parametrize('spoil', [-1.0, float('nan')])
 @pytest.mark.parametrize('place', [1, 25])
-def test_one_that_is_not_positive_definite_does_not_touch_its_neighbours(spoil, place):
+def test_an_indefinite_matrix_does_not_affect_others(spoil, place):
     found, _ = chain(27)
     x, ones = vectors(27), torch.ones(B, 27 * LINK + S, dtype=torch.float64)
     known = found.factorised(ones)

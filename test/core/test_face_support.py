@@ -1,13 +1,20 @@
-"""Which points tell where a face is, against boxes whose points are placed by hand."""
+"""Face observations of boxes whose points are placed by hand."""
 
-from boxreg_ros.core.face_support import aspect, retreat, Rule, support
-from boxreg_ros.core.objective import State
+from boxreg_ros.config import Config
+from boxreg_ros.core.batch import State
+from boxreg_ros.core.face_support import (
+    FaceOffsets,
+    inset_shares,
+    observe_faces,
+    visibility,
+)
 import numpy as np
 import pytest
 from scenes import problem_of, shared_of
 import torch
 
 D = torch.float64
+CONFIG = Config()
 
 
 def tensor(values):
@@ -20,28 +27,28 @@ def seen_from(origin, points=((0.0, 0, 0),), yaw=0.0, **changes):
     return problem_of([[box]], points=np.array([[points]]), origins=[[origin]], **changes)
 
 
-def test_aspect_by_hand():
+def test_visibility_by_hand():
     # From 12 m ahead and 5 m to the left of a 4 x 2 m box: 10 m before the plane of the front,
     # 4 m to the side of its edge; 4 m before the left plane, 10 m ahead of its edge. From the
     # back plane 14 m on the wrong side, the right one 6 m.
     known = [[[10 / 4, -14 / 4, 4 / 10, -6 / 10, 9, -9]]]
-    np.testing.assert_allclose(aspect(seen_from([12.0, 5.0, 1.0])), known)
+    np.testing.assert_allclose(visibility(seen_from([12.0, 5.0, 1.0])), known)
 
 
-def test_aspect_turns_with_the_box():
-    turned = aspect(seen_from([-5.0, 12.0, 1.0], yaw=np.pi / 2))
-    np.testing.assert_allclose(turned, aspect(seen_from([12.0, 5.0, 1.0])))
+def test_visibility_turns_with_the_box():
+    turned = visibility(seen_from([-5.0, 12.0, 1.0], yaw=np.pi / 2))
+    np.testing.assert_allclose(turned, visibility(seen_from([12.0, 5.0, 1.0])))
 
 
-def test_without_a_sensor_the_centre_of_mass_tells_the_open_faces():
-    found = aspect(seen_from([np.nan] * 3, [[-1.5, 0.5, 0.3], [-1.9, 0.8, 0.1]]))
+def test_without_a_sensor_faces_toward_the_centre_of_mass_are_visible():
+    found = visibility(seen_from([np.nan] * 3, [[-1.5, 0.5, 0.3], [-1.9, 0.8, 0.1]]))
     assert (found[0, 0, :4] > 0).tolist() == [False, True, True, False]
 
 
-def test_retreat_grows_as_a_face_turns_away():
+def test_occlusion_inset_grows_as_a_face_turns_away():
     open_ = torch.linspace(-50, 50, 201, dtype=D)[None, :, None].expand(-1, -1, 6)
     problem = problem_of([[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 201])
-    hidden, distant = retreat(problem, open_)[:, 0]
+    hidden, distant = inset_shares(problem, open_, CONFIG)[:, 0]
     assert (hidden.diff(dim=0) <= 0).all()
     np.testing.assert_allclose(hidden[0], 1, atol=1e-4)
     np.testing.assert_allclose(hidden[-1], 0, atol=1e-4)
@@ -51,31 +58,30 @@ def test_retreat_grows_as_a_face_turns_away():
 @pytest.mark.parametrize(
     ('away', 'share'), [(10.0, 0.0), (20.0, 0.0), (45.0, 0.5), (70.0, 1.0), (200.0, 1.5)]
 )
-def test_points_of_what_is_far_stand_further_in(away, share):
-    # From 20 m on by a part of what is learnt that grows to 1 in another 50 m, 1.5 at most; what
-    # counts is the distance on the ground. The front and the roof are open, the back and the
-    # bottom hidden: they stand further in for that alone.
+def test_range_inset_grows_with_range(away, share):
+    # From 20 m on the share grows by 1 in another 50 m, to 1.5 at most; the range is horizontal.
+    # Front and roof are visible; back and bottom are occluded and have the occlusion inset only.
     problem = seen_from([0.6 * away, 0.8 * away, 5.0])
-    hidden, distant = retreat(problem, aspect(problem))[:, 0, 0]
+    hidden, distant = inset_shares(problem, visibility(problem), CONFIG)[:, 0, 0]
     np.testing.assert_allclose(distant, share * (1 - hidden))
     assert (hidden[[0, 2, 4]] < 0.2).all()
     assert (hidden[[1, 3, 5]] > 0.8).all()
 
 
-def test_faces_far_away_say_less_the_further_in_their_points_are_expected():
-    # At 70 m, points 0.15 m inside the roof, of which 0.1 m are expected for the distance: half
-    # the trust, and 0.05 m less far out than expected. For 0.2 m a fifth: 1 / (1 + (0.2 / 0.1)^2).
+def test_range_inset_lowers_the_weight_of_a_face():
+    # At 70 m, points 0.15 m inside the roof. With a range inset of 0.1 m the weight is 1/2 and
+    # the distance -0.05 m; with 0.2 m the weight is 1 / (1 + (0.2 / 0.1)^2) = 1/5.
     problem = seen_from([42.0, 56.0, 2.0], on_faces(0.15, faces=(4,)))
-    for distant, trust in ((0.0, 1.0), (0.1, 0.5), (0.2, 0.2)):
+    for distant, weight in ((0.0, 1.0), (0.1, 0.5), (0.2, 0.2)):
         found = supported(problem, distant=distant)
-        assert found.trust[0, 0, 4].item() == pytest.approx(trust, rel=0.01)
-        assert found.outwardness[0, 0, 4].item() == pytest.approx(distant - 0.15, abs=1e-3)
-        assert found.retreat[0, 0, 4].item() == pytest.approx(distant, abs=1e-3)
-        assert found.retreat[0, 0, 5].item() == pytest.approx(0, abs=1e-3)  # the road
+        assert found.weight[0, 0, 4].item() == pytest.approx(weight, rel=0.01)
+        assert found.distance[0, 0, 4].item() == pytest.approx(distant - 0.15, abs=1e-3)
+        assert found.inset[0, 0, 4].item() == pytest.approx(distant, abs=1e-3)
+        assert found.inset[0, 0, 5].item() == pytest.approx(0, abs=1e-3)  # the road
 
 
 def on_faces(inside, n=40, faces=(0, 2, 4)):
-    """Return points on front, left and top of 4 x 2 x 2 m, `inside` m further in."""
+    """Return points on front, left and top of a box of 4 x 2 x 2 m, `inside` m inside."""
     rng = np.random.default_rng(4)
     points = []
     for face in faces:
@@ -88,22 +94,23 @@ def on_faces(inside, n=40, faces=(0, 2, 4)):
 
 def supported(problem, gap=0.0, outermost=0.05, depths=0.0, distant=0.0):
     state = State(problem.pose, shared_of(GAP=[gap] * 6))
-    rule = Rule(*(torch.full((6,), value, dtype=D) for value in (0.0, depths, distant)))
-    return support(problem, state, outermost, rule)
+    offsets = FaceOffsets(*(torch.full((6,), value, dtype=D) for value in (0.0, depths, distant)))
+    config = CONFIG.updated({'faces.outermost': outermost})
+    return observe_faces(problem, state, offsets, config)
 
 
 @pytest.mark.parametrize('gap', [0.0, 0.04])
-def test_points_on_faces_stand_as_far_out_as_expected(gap):
-    # The points are 0.1 m inside, `gap` of it expected: outwardness gap - 0.1.
+def test_distance_of_points_is_counted_from_the_labelling_margin(gap):
+    # The points are 0.1 m inside, `gap` of which is expected: the distance is gap - 0.1.
     found = supported(seen_from([30.0, 30.0, 2.0], on_faces(0.1)), gap)
-    assert found.trust[0, 0].tolist()[:5:2] == [1, 1, 1]
-    np.testing.assert_allclose(found.outwardness[0, 0, [0, 2, 4]], gap - 0.1, atol=1e-6)
-    assert found.points.item() == 120
+    assert found.weight[0, 0].tolist()[:5:2] == [1, 1, 1]
+    np.testing.assert_allclose(found.distance[0, 0, [0, 2, 4]], gap - 0.1, atol=1e-6)
+    assert found.num_points.item() == 120
 
 
-def test_outermost_points_are_the_furthest_out():
+def test_outermost_points_of_each_strip_by_hand():
     # Twelve of 240 points (0.05) on the front, four in each of the strips between y = -1, -1/3,
-    # 1/3 and 1, told by hand: their moment and their mean.
+    # 1/3 and 1: their moment and their mean.
     rng = np.random.default_rng(5)
     points = np.c_[rng.uniform(1.8, 1.95, 240), rng.uniform(-0.9, 0.9, (240, 2))]
     found = supported(seen_from([30.0, 0.0, 0.0], points))
@@ -111,61 +118,61 @@ def test_outermost_points_are_the_furthest_out():
     outer = np.concatenate([strip[np.argsort(-strip[:, 0])[:4]] for strip in strips])
     homogeneous = np.c_[outer, np.ones(12)]
     np.testing.assert_allclose(found.moments[0, 0, 0], homogeneous.T @ homogeneous / 12, rtol=1e-6)
-    assert found.outwardness[0, 0, 0].item() == pytest.approx(outer[:, 0].mean() - 2, abs=1e-4)
-    assert found.trust[0, 0, 0] == 1
+    assert found.distance[0, 0, 0].item() == pytest.approx(outer[:, 0].mean() - 2, abs=1e-4)
+    assert found.weight[0, 0, 0] == 1
 
 
 @pytest.mark.parametrize(('behind', 'used'), [(0.15, 9), (0.25, 6)])
-def test_a_strip_far_behind_the_others_is_no_part_of_the_face(behind, used):
+def test_a_strip_far_behind_the_others_is_left_out(behind, used):
     # The left strip of the front stands 0.15 or 0.25 m behind the other two; 0.2 m is the limit.
-    # Of 60 points the fewest, three, tell a strip.
+    # Of 60 points each strip takes the minimum, three.
     y = np.repeat([-0.7, 0.0, 0.7], 20)
     points = np.c_[np.where(y > 0.5, 1.9 - behind, 1.9), y, np.tile(np.linspace(-0.8, 0.8, 20), 3)]
     found = supported(seen_from([30.0, 0.0, 0.0], points))
     mean = 1.9 - (behind / 3 if used == 9 else 0.0)
-    assert found.outwardness[0, 0, 0].item() == pytest.approx(mean - 2, abs=1e-4)
+    assert found.distance[0, 0, 0].item() == pytest.approx(mean - 2, abs=1e-4)
     side = found.moments[0, 0, 0][1, 3]  # mean y
     assert side.item() == pytest.approx(0.0 if used == 9 else -0.35, abs=1e-6)
 
 
-def test_strips_without_points_are_no_part_of_the_face():
+def test_strips_without_points_are_left_out():
     # Two points in one strip, two in the next, none in the last: the mean of four.
     points = np.array([[1.9, -0.7, 0.1], [1.8, -0.6, 0.2], [1.9, 0.0, 0.3], [1.8, 0.1, 0.4]])
     found = supported(seen_from([30.0, 0.0, 0.0], points))
-    assert found.outwardness[0, 0, 0].item() == pytest.approx(-0.15, abs=1e-4)
+    assert found.distance[0, 0, 0].item() == pytest.approx(-0.15, abs=1e-4)
     np.testing.assert_allclose(found.moments[0, 0, 0][3, :3], points.mean(0), atol=1e-6)
 
 
-def test_faces_turned_away_have_less_say():
+def test_occluded_faces_have_less_weight():
     # Points on front and back, seen from the front.
     points = on_faces(0.05, faces=(0, 1, 2))
     found = supported(seen_from([30.0, 0.0, 0.0], points))
-    assert found.trust[0, 0, 0] == 1
-    assert found.trust[0, 0, 1] < 1
+    assert found.weight[0, 0, 0] == 1
+    assert found.weight[0, 0, 1] < 1
 
 
-def test_a_face_without_points_is_not_seen():
-    # Two points are fewer than it takes.
+def test_a_face_without_points_has_no_weight():
+    # Two points are fewer than the minimum.
     found = supported(seen_from([30.0, 0.0, 0.0], on_faces(0.05, n=2, faces=(0,))))
-    assert found.trust[0, 0, 0] == 0
-    assert found.outwardness.isfinite().all()
+    assert found.weight[0, 0, 0] == 0
+    assert found.distance.isfinite().all()
     assert found.moments.isfinite().all()
 
 
-def test_points_far_off_are_no_evidence():
-    # 1 m ahead of the front is beyond the margin of 0.4 m.
+def test_points_beyond_the_margin_are_left_out():
+    # 1 m ahead of the front is beyond the margin of 0.35 m.
     found = supported(seen_from([30.0, 0.0, 0.0], on_faces(-1.0, faces=(0,))))
-    assert found.trust[0, 0, 0] == 0
-    assert found.points.item() == 0
+    assert found.weight[0, 0, 0] == 0
+    assert found.num_points.item() == 0
 
 
-def test_the_road_stands_for_the_bottom():
+def test_the_road_is_the_observation_of_the_bottom():
     # The road is 1.2 m below the centre of a box whose bottom is 1 m below it: 0.2 m too high.
     problem = seen_from([30.0, 0.0, 0.0], on_faces(0.0), ground=[[-1.2]])
     found = supported(problem)
-    assert found.trust[0, 0, 5] == 1
-    assert found.outwardness[0, 0, 5].item() == pytest.approx(0.2)
-    assert supported(seen_from([30.0, 0.0, 0.0], on_faces(0.0))).trust[0, 0, 5] == 0
+    assert found.weight[0, 0, 5] == 1
+    assert found.distance[0, 0, 5].item() == pytest.approx(0.2)
+    assert supported(seen_from([30.0, 0.0, 0.0], on_faces(0.0))).weight[0, 0, 5] == 0
 
 
 def test_order_and_padding_of_points_do_not_matter():
@@ -175,7 +182,12 @@ def test_order_and_padding_of_points_do_not_matter():
     boxes = [[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 2]
     order = rng.permutation(120)
     known, found = (
-        support(problem, State(problem.pose, shared_of()), 0.2, Rule(*torch.ones(3, 6)))
+        observe_faces(
+            problem,
+            State(problem.pose, shared_of()),
+            FaceOffsets(*torch.ones(3, 6)),
+            CONFIG.updated({'faces.outermost': 0.2}),
+        )
         for problem in (
             problem_of(boxes, points=points, mask=mask, origins=[[[9.0, 9.0, 9.0]] * 2]),
             problem_of(
@@ -190,7 +202,7 @@ def test_order_and_padding_of_points_do_not_matter():
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
-def test_points_are_carried_to_the_stamp():
+def test_points_are_motion_compensated_to_the_stamp():
     # A car at 10 m/s, points on its front measured 50 ms before each stamp: half a metre back.
     boxes = np.array([[[i * 1.0, 0, 0, 4, 2, 2, 0, 0, 0] for i in range(4)]])
     front = on_faces(0.0, faces=(0,))
@@ -198,11 +210,11 @@ def test_points_are_carried_to_the_stamp():
     origins = np.array([[[30.0, 0, 0]] * 4])
     late = problem_of(boxes, points=points, origins=origins, delays=np.full((1, 4, 40), -0.05))
     found = supported(late)
-    np.testing.assert_allclose(found.outwardness[..., 0], 0, atol=1e-6)
-    assert (supported(late._replace(delays=0 * late.delays)).outwardness[..., 0] < -0.4).all()
+    np.testing.assert_allclose(found.distance[..., 0], 0, atol=1e-6)
+    assert (supported(late._replace(delays=0 * late.delays)).distance[..., 0] < -0.4).all()
 
 
-def test_what_is_carried_does_not_hang_on_padding():
+def test_motion_compensation_does_not_depend_on_padding():
     # The same two boxes alone, and padded to three as a window of a batch is.
     boxes = np.array([[[i * 1.0, 0, 0, 4, 2, 2, 0, 0, 0] for i in (0, 1, 1)]])
     points = np.tile(on_faces(0.0, faces=(0,)) - [0.5, 0, 0], (1, 3, 1, 1))
@@ -214,12 +226,12 @@ def test_what_is_carried_does_not_hang_on_padding():
         boxes[:, :2], points=points[:, :2], delays=np.full((1, 2, 40), -0.05),
         origins=np.full((1, 2, 3), 30.0),
     )  # fmt: skip
-    found, known = supported(whole).outwardness[:, :2], supported(alone).outwardness
+    found, known = supported(whole).distance[:, :2], supported(alone).distance
     np.testing.assert_allclose(known[..., 0], 0, atol=1e-6)
     np.testing.assert_allclose(found, known)
 
 
-def test_what_is_seen_once_is_not_carried():
+def test_a_single_observation_has_no_velocity():
     points = on_faces(0.0, faces=(0,))
     once = seen_from([30.0, 0.0, 0.0], points, delays=np.full((1, 1, 40), -0.05))
-    assert supported(once).outwardness[0, 0, 0].item() == pytest.approx(0, abs=1e-6)
+    assert supported(once).distance[0, 0, 0].item() == pytest.approx(0, abs=1e-6)

@@ -1,4 +1,4 @@
-"""Box geometry against scipy, finite differences and values known by hand."""
+"""Box geometry against SciPy, finite differences and values calculated by hand."""
 
 from boxreg_ros.core.geometry import (
     FACE_AXIS,
@@ -6,7 +6,6 @@ from boxreg_ros.core.geometry import (
     FACE_SIGN,
     rotation_derivatives,
     rotation_from_rpy,
-    wrap_angle,
 )
 import numpy as np
 import pytest
@@ -49,24 +48,7 @@ def test_any_leading_dimensions(function):
     assert function(rpy[:0]).shape == (0, *many.shape[1:])
 
 
-@pytest.mark.parametrize(
-    'angle, wrapped',
-    [(0.0, 0.0), (3.5, 3.5 - 2 * np.pi), (-3.5, 2 * np.pi - 3.5), (7 * np.pi / 2, -np.pi / 2)],
-)
-def test_wrap_angle(angle, wrapped):
-    value = wrap_angle(torch.tensor(angle, dtype=torch.float64))
-    assert value.item() == pytest.approx(wrapped, abs=1e-14)
-
-
-def test_wrap_angle_turns_by_whole_turns_into_half_a_turn():
-    angle = torch.linspace(-50, 50, 1001, dtype=torch.float64)
-    wrapped = wrap_angle(angle)
-    turns = (angle - wrapped) / (2 * np.pi)
-    assert wrapped.abs().max() <= np.pi
-    np.testing.assert_allclose(turns, turns.round(), atol=1e-13)
-
-
-def test_face_distances_undo_scipy():
+def test_face_distances_equal_scipy():
     rng = np.random.default_rng(2)
     local, boxes = rng.normal(size=(20, 30, 3)), rng.normal(size=(20, 9))
     turned = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()
@@ -85,7 +67,7 @@ def test_face_distances_by_hand():
 
 
 def test_face_distances_of_corners():
-    # A corner is on three faces, and as far inside the opposite ones as the box is large.
+    # A corner lies on three faces; its distance from the opposite ones is minus the extent.
     rng = np.random.default_rng(3)
     box = rng.normal(size=9)
     box[3:6] = 4.5, 1.9, 1.6
@@ -93,13 +75,13 @@ def test_face_distances_of_corners():
     R = Rotation.from_euler('ZYX', box[[8, 7, 6]]).as_matrix()
     corners = torch.from_numpy(signs * box[3:6] / 2 @ R.T + box[:3])
     on_positive = np.repeat(signs > 0, 2, axis=1)
-    is_here = on_positive == (FACE_SIGN.numpy() > 0)
-    known = np.where(is_here, 0.0, -box[3:6][FACE_AXIS])
+    is_on_face = on_positive == (FACE_SIGN.numpy() > 0)
+    known = np.where(is_on_face, 0.0, -box[3:6][FACE_AXIS])
     np.testing.assert_allclose(face_distances(corners, torch.from_numpy(box)), known, atol=1e-13)
 
 
 def test_face_distances_do_not_depend_on_the_frame():
-    # Yaw and a shift applied to boxes and points alike change nothing.
+    # A rotation about z and a shift of boxes and points change nothing.
     rng = np.random.default_rng(4)
     points, boxes = rng.normal(size=(5, 10, 3)), rng.normal(size=(5, 9))
     angle, shift = 0.7, np.array([5.0, -3.0, 2.0])

@@ -1,4 +1,4 @@
-"""Minima of many rows at once: known ones, those of torch's own L-BFGS, and each row alone."""
+"""Batched L-BFGS: known minima, those of torch's own L-BFGS, and each row by itself."""
 
 from boxreg_ros.core.lbfgs import minimize, Status
 import numpy as np
@@ -39,7 +39,7 @@ def starts(B, n, seed=1):
     return torch.from_numpy(np.random.default_rng(seed).normal(size=(B, n)))
 
 
-def test_quadratics():
+def test_minima_of_quadratics():
     A, known = quadratics(5, 8)
     found = minimize(quadratic(A, known), starts(5, 8), 200, 8, 1e-16)
     # The tolerance bounds what is left to gain, x' A x / 2 with A of 1 at least.
@@ -49,14 +49,14 @@ def test_quadratics():
     assert (found.iterations < 200).all()
 
 
-def test_rosenbrock():
+def test_minima_of_rosenbrock():
     start = torch.tensor([[-1.2, 1.0], [0.0, 0.0], [2.0, -1.0]], dtype=D)
     found = minimize(rosenbrock, start, 200, 6, 1e-16)
     np.testing.assert_allclose(found.x, 1, atol=1e-5)
     assert (found.status == Status.CONVERGED).all()
 
 
-def test_minimum_of_torch():
+def test_minima_equal_those_of_torch():
     # Of one well-conditioned smooth function without a bottom known by hand, from afar.
     A, known = quadratics(4, 6, seed=2)
 
@@ -82,7 +82,7 @@ def test_minimum_of_torch():
 
 
 @pytest.mark.parametrize('iterations', [1, 5, 300])
-def test_a_batch_equals_its_rows_alone(iterations):
+def test_a_batch_equals_single_rows(iterations):
     # Rows end at different times, so ended ones leave the batch on the way.
     start = torch.cat([starts(7, 4), torch.ones(1, 4, dtype=D)])
     many = minimize(rosenbrock, start, iterations, 5, 1e-12)
@@ -94,7 +94,7 @@ def test_a_batch_equals_its_rows_alone(iterations):
         assert len(set(many.iterations.tolist())) > 2
 
 
-def test_rows_are_asked_for_by_number():
+def test_the_function_gets_the_numbers_of_its_rows():
     # A function that depends on the row must be asked with the row's own number, even when only
     # some rows are left: here every row has its own minimum.
     A, known = quadratics(6, 3, seed=3)
@@ -114,7 +114,7 @@ def test_rows_are_asked_for_by_number():
 
 
 @pytest.mark.parametrize('broken', ['value', 'gradient', 'later'])
-def test_a_broken_row_does_not_touch_its_neighbours(broken):
+def test_a_failing_row_does_not_affect_others(broken):
     A, known = quadratics(3, 4, seed=4)
     start = starts(3, 4)
 
@@ -138,9 +138,9 @@ def test_a_broken_row_does_not_touch_its_neighbours(broken):
 
 @pytest.mark.parametrize('function', [rosenbrock, 'rough'])
 @pytest.mark.parametrize('iterations', [0, 1, 2, 3, 5, 10, 30])
-def test_never_above_the_start(function, iterations):
+def test_the_value_never_exceeds_that_of_the_start(function, iterations):
     if function == 'rough':
-        # Its gradient is wrong by far: what is promised does not come.
+        # Its gradient is wrong by far: the predicted decrease is not reached.
         def function(x, rows):
             value, gradient = rosenbrock(x)
             return value, gradient * torch.tensor([1.0, -30.0, 0.1, 7.0], dtype=D)
@@ -154,7 +154,7 @@ def test_never_above_the_start(function, iterations):
         np.testing.assert_array_equal(found.x, start)
 
 
-def test_a_metric_solves_a_quadratic_at_once():
+def test_the_inverse_hessian_as_metric_solves_a_quadratic_in_one_step():
     # With the inverse of its Hessian the first step is Newton's, and ends at the minimum.
     A, known = quadratics(4, 5, seed=5)
     inverse = torch.linalg.inv(A)
@@ -167,7 +167,7 @@ def test_a_metric_solves_a_quadratic_at_once():
     assert (found.status == Status.CONVERGED).all()
 
 
-def test_statuses():
+def test_every_status():
     # Of x^2: at its minimum; far from it with one iteration; with a gradient that points the
     # wrong way, so that no step is ever better; not a number.
     start = torch.tensor([[0.0], [50.0], [1.0], [torch.nan]], dtype=D)
@@ -184,7 +184,7 @@ def test_statuses():
     np.testing.assert_array_equal(found.x[[0, 2, 3]], start[[0, 2, 3]])
 
 
-def test_the_start_is_not_written_to():
+def test_the_start_is_not_modified():
     start = starts(3, 4)
     copy = start.clone()
     minimize(rosenbrock, start, 20, 5, 1e-9)

@@ -1,4 +1,4 @@
-"""Pairing by stamp: every order of arrival, and what is dropped is counted."""
+"""Pairing by stamp in every order of arrival; dropped sweeps are counted."""
 
 from collections import Counter
 from itertools import permutations
@@ -12,8 +12,8 @@ import pytest
 TOLERANCE_NS, REACH_NS = 20, 60
 
 
-def sweep(stamp_ns, is_lost=False):
-    return Sweep(stamp_ns, 'odom', np.zeros((0, 3)), is_lost=is_lost)
+def sweep(stamp_ns, is_dropped=False):
+    return Sweep(stamp_ns, 'odom', np.zeros((0, 3)), is_dropped=is_dropped)
 
 
 def boxes(stamp_ns):
@@ -22,9 +22,9 @@ def boxes(stamp_ns):
 
 class Feed:
     """
-    A matcher that takes ``'s100'`` or ``'b105'`` and tells pairs as stamps.
+    A matcher whose input and output are written as stamps.
 
-    ``'l100'`` is a sweep that is lost.
+    ``'s100'`` is a sweep, ``'b105'`` a box array, ``'d100'`` a dropped sweep.
 
     """
 
@@ -37,17 +37,17 @@ class Feed:
         pairs = []
         for item in items:
             stamp_ns = int(item[1:])
-            if item[0] in 'sl':
-                pairs += self.matcher.add_sweep(sweep(stamp_ns, is_lost=item[0] == 'l'))
+            if item[0] in 'sd':
+                pairs += self.matcher.add_sweep(sweep(stamp_ns, is_dropped=item[0] == 'd'))
             else:
                 pairs += self.matcher.add_boxes(boxes(stamp_ns))
-        return told(pairs)
+        return stamps_of(pairs)
 
     def flush(self):
-        return told(self.matcher.flush())
+        return stamps_of(self.matcher.flush())
 
 
-def told(pairs):
+def stamps_of(pairs):
     return [
         (pair.boxes.stamp_ns, None if pair.sweep is None else pair.sweep.stamp_ns)
         for pair in pairs
@@ -55,7 +55,7 @@ def told(pairs):
 
 
 @pytest.mark.parametrize('items', [('s100', 'b100'), ('b100', 's100')])
-def test_a_pair_leaves_when_it_is_complete(items):
+def test_a_pair_is_returned_when_it_is_complete(items):
     feed = Feed()
     assert feed.add(items[0]) == []
     assert feed.add(items[1]) == [(100, 100)]
@@ -65,7 +65,7 @@ def test_a_pair_leaves_when_it_is_complete(items):
 
 @pytest.mark.parametrize('stamp, is_pair', [(80, True), (120, True), (79, False), (121, False)])
 @pytest.mark.parametrize('first', ['sweep', 'boxes'])
-def test_the_tolerance_holds_to_both_sides(stamp, is_pair, first):
+def test_the_tolerance_is_symmetric(stamp, is_pair, first):
     feed = Feed()
     items = [f's{stamp}', 'b100'][:: 1 if first == 'sweep' else -1]
     pairs = feed.add(*items) + feed.flush()
@@ -73,14 +73,14 @@ def test_the_tolerance_holds_to_both_sides(stamp, is_pair, first):
     assert feed.counts['sweep_without_boxes'] == (not is_pair)
 
 
-def test_the_nearest_sweep_is_taken():
+def test_the_nearest_sweep_is_paired():
     feed = Feed()
     assert feed.add('s90', 's104', 's115', 'b100') == [(100, 104)]
     assert feed.flush() == []
     assert feed.counts == {'sweep_without_boxes': 2}
 
 
-def test_a_sweep_serves_all_boxes_near_it():
+def test_a_sweep_is_paired_with_all_boxes_near_it():
     feed = Feed()
     assert feed.add('s100', 'b95', 'b105') == [(95, 100), (105, 100)]
     assert feed.flush() == []
@@ -88,7 +88,7 @@ def test_a_sweep_serves_all_boxes_near_it():
 
 
 @pytest.mark.parametrize('late', range(3))
-def test_between_sweeps_the_nearest_is_known_when_a_younger_one_has_come(late):
+def test_boxes_between_sweeps_are_paired_when_a_younger_sweep_is_known(late):
     # 150 is 45 from 105, 55 from 205: within reach of both, the tolerance of neither.
     items = ['s105', 's205']
     items.insert(late, 'b150')
@@ -109,22 +109,22 @@ def test_boxes_at_twice_the_rate_share_sweeps():
     assert feed.counts == {}
 
 
-def test_the_boxes_of_a_lost_sweep_leave_alone():
+def test_boxes_of_a_dropped_sweep_are_returned_without_one():
     feed = Feed(reach=REACH_NS)
-    assert feed.add('s100', 'l150', 'b150') == [(150, None)]  # at once, and not with 100
-    assert feed.add('b200', 'l200') == [(200, None)]
+    assert feed.add('s100', 'd150', 'b150') == [(150, None)]  # at once, and not with 100
+    assert feed.add('b200', 'd200') == [(200, None)]
 
 
-def test_sweeps_that_come_twice_or_too_late_are_counted():
+def test_duplicate_and_late_sweeps_are_counted():
     feed = Feed()
     assert feed.add('s100', 's100', 's200', 'b200', 's100', 's179') == [(200, 200)]
     assert feed.add('s180', 'b180') == [(180, 180)]
     assert feed.counts == {'sweep_duplicate': 1, 'sweep_without_boxes': 1, 'sweep_late': 2}
 
 
-def test_any_order_loses_nothing():
-    # Whatever comes when: every box array comes back once, with its own sweep or none, and the
-    # sweeps without boxes are counted. In order if each kind comes in order.
+def test_no_box_array_is_lost_in_any_order():
+    # In every order each box array is returned once, with its own sweep or none, and sweeps
+    # without boxes are counted. If each kind arrives in order, all are paired.
     for order in permutations(['s100', 's200', 's300', 'b100', 'b200', 'b300']):
         feed = Feed()
         pairs = feed.add(*order) + feed.flush()
@@ -138,24 +138,24 @@ def test_any_order_loses_nothing():
             assert pairs == [(100, 100), (200, 200), (300, 300)], order
 
 
-def test_boxes_out_of_order_leave_in_order():
+def test_boxes_are_returned_in_the_order_of_stamps():
     feed = Feed()
     assert feed.add('b300', 'b100', 'b200') == []
     assert feed.add('s100', 's200', 's300') == [(100, 100), (200, 200), (300, 300)]
 
 
-def test_boxes_wait_until_a_younger_sweep_has_come():
+def test_boxes_are_held_until_a_younger_sweep_is_known():
     feed = Feed()
     assert feed.add('b100', 'b200') == []
     assert feed.add('s120') == [(100, 120)]
     assert feed.add('s220') == [(200, 220)]
-    # 320 is within reach of a sweep at 340, not after one at 341 has come.
+    # A sweep at 340 would be paired with 320; after one at 341 no such sweep is expected.
     assert feed.add('b320') == []
     assert feed.add('s341') == [(320, None)]
 
 
-def test_a_sweep_waits_for_boxes_that_come_late():
-    # A tracker is behind the sensor by a second: ten sweeps.
+def test_sweeps_are_held_for_boxes_that_arrive_late():
+    # A tracker with a latency of one second: ten sweeps.
     feed = Feed(capacity=20)
     assert feed.add(*[f's{100 * i}' for i in range(1, 11)]) == []
     assert feed.add('b100', 'b200', 'b300') == [(100, 100), (200, 200), (300, 300)]
@@ -171,7 +171,7 @@ def test_sweeps_beyond_capacity_are_dropped_oldest_first_and_counted():
     assert feed.counts == {'sweep_without_boxes': 3}  # 400 had no boxes
 
 
-def test_boxes_beyond_capacity_leave_alone_oldest_first():
+def test_boxes_beyond_capacity_are_returned_unpaired_oldest_first():
     feed = Feed(capacity=3)
     assert feed.add('b100', 'b200', 'b300') == []
     assert feed.add('b400') == [(100, None)]
@@ -180,7 +180,7 @@ def test_boxes_beyond_capacity_leave_alone_oldest_first():
     assert feed.counts == {}
 
 
-def test_flush_returns_what_waits_and_forgets():
+def test_flush_returns_all_boxes_and_discards_sweeps():
     feed = Feed()
     assert feed.add('b100', 's300', 'b310', 'b350', 's500') == [
         (100, None),
@@ -193,8 +193,8 @@ def test_flush_returns_what_waits_and_forgets():
     assert feed.flush() == []
 
 
-def test_nothing_is_held_for_ever():
-    # Sweeps without boxes, boxes without sweeps, for a long time.
+def test_memory_is_bounded():
+    # Many sweeps without boxes, then many boxes without sweeps.
     feed = Feed(capacity=5)
     pairs = feed.add(*[f's{100 * i}' for i in range(100)], *[f'b{100 * i}' for i in range(200)])
     pairs += feed.flush()

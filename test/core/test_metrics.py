@@ -1,8 +1,7 @@
-"""Overlap and pose errors against answers known by hand, shapely and Monte Carlo."""
+"""Overlap and pose errors against values calculated by hand, shapely, Qhull and Monte Carlo."""
 
 from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ShapeError
-from boxreg_ros.rotations import wrap_angle
 import numpy as np
 import pytest
 from scipy.optimize import linprog
@@ -80,7 +79,7 @@ def test_3d_equals_monte_carlo():
 
 
 @pytest.mark.parametrize('iou', [iou_bev, iou_3d])
-def test_known_by_hand(iou):
+def test_iou_of_known_pairs(iou):
     def moved(**change):
         box = CAR.copy()
         for column, value in change.items():
@@ -104,7 +103,7 @@ def test_known_by_hand(iou):
     assert iou(inner, CAR)[0] == pytest.approx(0.5**power, abs=1e-8)
 
 
-def test_height_counts_in_3d_only():
+def test_height_affects_iou_3d_only():
     raised = CAR + np.eye(9)[2] * 0.8  # half of 1.6 m shared
     assert iou_3d(CAR, raised)[0] == pytest.approx(1 / 3, abs=1e-8)
     assert iou_bev(CAR, raised)[0] == pytest.approx(1.0, abs=1e-8)
@@ -121,7 +120,7 @@ def test_almost_equal_boxes_overlap_fully(size):
     assert iou_bev(a, b).min() > 1 - 1e-4
 
 
-def test_far_from_the_origin():
+def test_iou_is_accurate_far_from_the_origin():
     a, b = pairs(50, np.random.default_rng(5), tilt=0.1)
     far = np.array([4e5, 5e6, 100, 0, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(iou_3d(a + far, b + far), iou_3d(a, b), atol=1e-6)
@@ -155,10 +154,7 @@ def test_pose_errors_by_hand():
     assert errors.is_flipped.tolist() == [False, True]
 
 
-def test_wrap_and_shapes():
-    np.testing.assert_allclose(
-        wrap_angle(np.array([np.pi, -np.pi, 7.0])), [-np.pi, -np.pi, 7 - 2 * np.pi]
-    )
+def test_wrong_shapes_are_refused():
     with pytest.raises(ShapeError, match=r'truth: expected shape \(1, 9\), got \(2, 9\)'):
         iou_3d(CAR, np.repeat(CAR, 2, axis=0))
     with pytest.raises(ShapeError, match=r'expected shape \(N, 9\)'):

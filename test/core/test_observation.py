@@ -1,4 +1,4 @@
-"""What a box sees of a sweep, against values known by hand and brute force."""
+"""Observations of boxes in a sweep, against values calculated by hand and plain loops."""
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.observation import farthest_point_sample, observe
@@ -15,7 +15,7 @@ def sweep(points, **more):
     return Sweep(STAMP_NS, 'odom', np.asarray(points, dtype=np.float32).reshape(-1, 3), **more)
 
 
-def see(points, *boxes, changes=None, **more):
+def observed(points, *boxes, changes=None, **more):
     config = Config().updated(changes or {})
     return observe(sweep(points, **more), np.array(boxes), STAMP_NS, config)
 
@@ -42,17 +42,17 @@ def test_points_within_the_margin_are_kept(axis, sign):
     # The margin is 0.6 m: of two points 0.59 m and 0.61 m out of a face one is kept.
     offsets = np.zeros((2, 3))
     offsets[:, axis] = sign * (CAR[3 + axis] / 2 + np.array([0.59, 0.61]))
-    (seen,) = see(CAR[:3] + offsets, CAR)
+    (seen,) = observed(CAR[:3] + offsets, CAR)
     np.testing.assert_allclose(seen.points, offsets[:1], atol=1e-5)
     assert seen.points.dtype == np.float32
     assert seen.num_points == 0  # both are outside the box itself
 
 
-def test_the_crop_turns_with_the_box():
+def test_the_crop_rotates_with_the_box():
     # Heading along +y, the box reaches 2 m along y and 1 m along x, and 0.6 m more.
     turned = CAR + np.eye(9)[8] * np.pi / 2
     offsets = np.array([[0, 2.5, 0], [1.5, 0, 0], [2.5, 0, 0], [0, 0.5, 0]])
-    (seen,) = see(CAR[:3] + offsets, turned)
+    (seen,) = observed(CAR[:3] + offsets, turned)
     assert rows(seen.points) == rows(offsets[[0, 1, 3]])
     assert seen.num_points == 1
 
@@ -62,7 +62,7 @@ def test_observation_is_relative_to_the_center():
     origin = np.array([1.0, 2.0, 3.0])
     changes = {'sampling.deskew': True}
     points = near([1.0, 0, 0], [-1.0, 0, 0])
-    (seen,) = see(points, CAR, changes=changes, times=times, origin=origin)
+    (seen,) = observed(points, CAR, changes=changes, times=times, origin=origin)
     assert seen.stamp_ns == STAMP_NS
     np.testing.assert_array_equal(seen.box, CAR)
     np.testing.assert_array_equal(seen.origin, origin - CAR[:3])
@@ -75,14 +75,14 @@ def test_observation_is_relative_to_the_center():
 @pytest.mark.parametrize(
     'changes, more', [({}, {'times': np.ones(1)}), ({'sampling.deskew': True}, {})]
 )
-def test_delays_are_zero_where_not_asked_for_or_unknown(changes, more):
-    (seen,) = see(near([1.0, 0, 0]), CAR, changes=changes, **more)
+def test_delays_are_zero_without_deskew_or_times(changes, more):
+    (seen,) = observed(near([1.0, 0, 0]), CAR, changes=changes, **more)
     np.testing.assert_array_equal(seen.delays, [0.0])
 
 
 @pytest.mark.parametrize('points', [np.empty((0, 3)), [[1e4, -1e4, 0.0]]])
-def test_a_box_without_points(points):
-    (seen,) = see(points, CAR)
+def test_observation_without_points(points):
+    (seen,) = observed(points, CAR)
     assert seen.points.shape == (0, 3)
     assert seen.delays.shape == (0,)
     assert seen.num_points == 0
@@ -100,7 +100,7 @@ def test_a_box_without_points(points):
         (4000.2, -7000.9),
     ],
 )
-def test_a_box_sees_the_same_wherever_it_is(x, y, kind):
+def test_the_crop_is_the_same_at_any_position(x, y, kind):
     # Offsets in eighths of a metre are exact; the box reaches 0.6 m beyond 2 m and 1 m, and above
     # its bottom by 0.2 m. Turned by a right angle, length and width change places.
     offsets = np.array(np.meshgrid(*[np.arange(-4, 4.1, 0.125)] * 2, [0.25])).reshape(3, -1).T
@@ -115,38 +115,38 @@ def test_a_box_sees_the_same_wherever_it_is(x, y, kind):
         np.testing.assert_allclose(rows(seen.points), rows(known), atol=5e-4)
 
 
-def test_places_far_apart_are_told_apart():
-    # 256 m to the side or 1 m across and 256 m along, numbers of cells are the same.
+def test_boxes_that_share_cell_numbers_do_not_share_points():
+    # At these offsets the 16-bit numbers of the raster cells are the same.
     apart = [[256, 0], [0, 65536], [-256, 0], [1, -256], [0, 0], [512, 0]]
     boxes = CAR + np.pad(apart, [(0, 0), (0, 7)])
-    heights = np.linspace(0.0, 0.5, 6)  # of one point in each, to know them by
-    seen = see(boxes[:, :3] + np.c_[np.zeros((6, 2)), heights], *boxes)
+    heights = np.linspace(0.0, 0.5, 6)  # of the one point in each box, all different
+    seen = observed(boxes[:, :3] + np.c_[np.zeros((6, 2)), heights], *boxes)
     assert [observation.points[:, 2].tolist() for observation in seen] == [
         [pytest.approx(height, abs=1e-6)] for height in heights
     ]
 
 
 @pytest.mark.parametrize('length, width', [(2000.0, 3.0), (3.0, 2000.0), (600.0, 600.0)])
-def test_a_box_larger_than_the_raster_sees_each_point_once(length, width):
+def test_a_box_larger_than_the_raster_gets_each_point_once(length, width):
     rng = np.random.default_rng(11)
     box = np.array([40.5, -80.5, 1.0, length, width, 2.0, 0, 0, 0])
     points = box[:3] + rng.uniform(-0.5, 0.5, (5000, 3)) * [length, width, 0.5]
     changes = {'sampling.points': 100000, 'sampling.deskew': True}
-    seen, other = see(points, box, CAR + 5000.0, changes=changes, times=np.arange(5000.0))
+    seen, other = observed(points, box, CAR + 5000.0, changes=changes, times=np.arange(5000.0))
     assert seen.num_points == 5000
     assert sorted(seen.delays) == list(range(5000))
     assert len(other.points) == 0
 
 
-def test_points_come_along_x_and_then_as_in_the_sweep():
-    # Two boxes that share points: every third of each is kept, of equal x those named first.
+def test_points_are_sorted_by_x_then_by_row():
+    # Every third point of each box is kept; points of equal x are in the order of the sweep.
     rng = np.random.default_rng(12)
     x = 10.0 + rng.integers(-4, 5, 600) * 0.25
     points = np.c_[x, 20 + rng.uniform(-0.9, 0.9, 600), np.full(600, 1.0)]
     changes = {'sampling.points': 200, 'sampling.deskew': True}
     far = CAR + np.eye(9)[1] * 100
     more = points + np.array([0, 100, 0])
-    first, second = see(
+    first, second = observed(
         np.r_[more[:5], points, more[5:]], CAR, far, changes=changes, times=np.arange(1200.0)
     )
     order = np.argsort(x, kind='stable')[::3]
@@ -154,9 +154,9 @@ def test_points_come_along_x_and_then_as_in_the_sweep():
     assert second.delays.tolist() == np.where(order < 5, order, 600 + order).tolist()
 
 
-def test_points_beyond_all_sense_are_nowhere():
+def test_points_with_huge_coordinates_are_ignored():
     with np.errstate(all='raise'):
-        (seen,) = see([[3e38, -3e38, 0.0], [3e9, 20.0, 1.0], [10.0, 20.0, 1.0]], CAR)
+        (seen,) = observed([[3e38, -3e38, 0.0], [3e9, 20.0, 1.0], [10.0, 20.0, 1.0]], CAR)
     np.testing.assert_array_equal(seen.points, [[0.0, 0.0, 0.0]])
 
 
@@ -170,28 +170,28 @@ OTHER = CAR + np.eye(9)[0] * 3.5
     'x, owners',
     [(11.6, [0]), (11.7, [0, 1]), (11.8, [0, 1]), (11.9, [1]), (11.4, [0]), (12.1, [1])],
 )
-def test_a_point_belongs_to_the_box_it_is_deeper_in(x, owners):
+def test_a_point_belongs_to_the_box_it_is_deeper_inside_of(x, owners):
     # At 11.6: 0.4 m inside the first, 0.1 m inside the second; at 11.9 the other way round. At
-    # 11.7 the difference is 0.1 m: it may be of either. At 11.4 it is 0.1 m out of the second, in
+    # 11.7 the difference is 0.1 m: it belongs to both. At 11.4 it is 0.1 m out of the second, in
     # whose margin it lies.
-    seen = see([[x, 20.0, 1.0]], CAR, OTHER)
+    seen = observed([[x, 20.0, 1.0]], CAR, OTHER)
     assert [len(observation.points) for observation in seen] == [0 in owners, 1 in owners]
 
 
 def test_two_boxes_of_one_object_share_its_points():
-    # A second box 0.1 m ahead: what is on the sides and ends of the car is seen by both.
+    # A second box 0.1 m ahead: points on the sides and ends of the car belong to both.
     points = near([2.0, 0, 0], [-2.0, 0, 0], [0, 0.9, 0], [1.0, -0.9, 0.3])
-    seen = see(points, CAR, CAR + np.eye(9)[0] * 0.1)
+    seen = observed(points, CAR, CAR + np.eye(9)[0] * 0.1)
     assert [len(observation.points) for observation in seen] == [4, 4]
 
 
-def test_num_points_counts_what_is_inside_whoever_owns_it():
-    seen = see([[11.7, 20.0, 1.0], [11.8, 20.0, 1.0], [10.0, 20.0, 1.0]], CAR, OTHER)
+def test_num_points_counts_points_of_any_owner():
+    seen = observed([[11.7, 20.0, 1.0], [11.8, 20.0, 1.0], [10.0, 20.0, 1.0]], CAR, OTHER)
     assert [observation.num_points for observation in seen] == [3, 2]
 
 
 def test_many_boxes_equal_brute_force():
-    # The raster and the sorting are for speed: every box must see what a plain loop sees.
+    # The raster and the sorting are for speed: the result must equal that of a plain loop.
     rng = np.random.default_rng(5)
     n = 25
     boxes = np.c_[
@@ -205,10 +205,10 @@ def test_many_boxes_equal_brute_force():
     outside = np.array(
         [(np.abs(p) - b[3:6] / 2).max(1) for p, b in zip(local, boxes, strict=True)]
     )
-    seen = see(points, *boxes, changes={'sampling.points': 100000})
+    seen = observed(points, *boxes, changes={'sampling.points': 100000})
     assert sum(len(observation.points) for observation in seen) > 500
     for i, (box, observation) in enumerate(zip(boxes, seen, strict=True)):
-        # The road is parallel to the bottom; its height is told along z of the frame.
+        # The road is parallel to the bottom; `ground` is measured along z of the frame.
         known = not np.isnan(observation.ground)
         ground = observation.ground * axes[i, 2, 2] if known else -box[5] / 2
         above = local[i][:, 2] > ground + 0.2
@@ -220,18 +220,18 @@ def test_many_boxes_equal_brute_force():
 # --- road ---------------------------------------------------------------------------------------
 
 
-def test_the_road_beside_the_box_is_found_and_left_out():
-    # The road lies 0.1 m above the bottom of the box, so 0.9 m below its centre. What is 0.1 m
-    # above the road is within the clearance of 0.2 m, what is 0.3 m above it is the car's.
+def test_points_of_the_road_beside_the_box_are_left_out():
+    # The road is 0.1 m above the bottom of the box, so 0.9 m below its centre. A point 0.1 m
+    # above the road is within the clearance of 0.2 m; a point 0.3 m above it is of the car.
     on_car = near([1.9, 0.9, -0.8], [1.9, 0.9, -0.6])
-    (seen,) = see(np.r_[road(0.1), on_car], CAR)
+    (seen,) = observed(np.r_[road(0.1), on_car], CAR)
     assert seen.ground == pytest.approx(-0.9, abs=1e-6)
     np.testing.assert_allclose(seen.points, [[1.9, 0.9, -0.6]], atol=1e-5)
 
 
-def test_without_road_the_bottom_of_the_box_stands_for_it():
-    # The bottom is 1 m below the centre: what is lower than 0.8 m below it is left out.
-    (seen,) = see(near([1.0, 0, -0.9], [1.0, 0, -0.7]), CAR)
+def test_without_road_the_bottom_of_the_box_replaces_it():
+    # The bottom is 1 m below the centre: points more than 0.8 m below the centre are left out.
+    (seen,) = observed(near([1.0, 0, -0.9], [1.0, 0, -0.7]), CAR)
     assert np.isnan(seen.ground)
     np.testing.assert_allclose(seen.points, [[1.0, 0, -0.7]], atol=1e-5)
 
@@ -240,39 +240,39 @@ def test_without_road_the_bottom_of_the_box_stands_for_it():
     'points',
     [
         road(np.linspace(0, 0.55, 40)),  # a wall: heights from 0 to 0.55 m
-        road(0.0, count=4),  # too few to tell
+        road(0.0, count=4),  # too few points
         road(0.0, inside=-0.5),  # below the box, not beside it
-        road(0.0, inside=1.2),  # too far off
-        road(0.8),  # as high as the car's middle
+        road(0.0, inside=1.2),  # too far from the box
+        road(0.8),  # as high as the middle of the car
     ],
     ids=['wall', 'few', 'under', 'far', 'high'],
 )
-def test_what_is_no_road(points):
-    (seen,) = see(points, CAR)
+def test_other_surfaces_are_no_road(points):
+    (seen,) = observed(points, CAR)
     assert np.isnan(seen.ground)
 
 
-def test_a_sloping_road_is_taken_at_its_lower_part():
+def test_the_height_of_a_sloping_road_is_its_third_tenth():
     # Heights spread evenly over 0 to 0.1 m: 0.05 m from the first to the sixth tenth, flat
     # enough; the third tenth is at 0.03 m.
-    (seen,) = see(road(np.linspace(0, 0.1, 101), count=101), CAR)
+    (seen,) = observed(road(np.linspace(0, 0.1, 101), count=101), CAR)
     assert seen.ground == pytest.approx(-1 + 0.03, abs=1e-6)
 
 
-def test_every_box_has_its_own_road():
+def test_the_road_is_found_per_box():
     # The roads of 40 points lie 0.1 m above the bottom, 0.2 m below it, and 0.3 m above it;
-    # the first, third and last box see none or too little of one.
+    # the first, third and last box have no road points or too few.
     shifts = 50.0 * np.arange(6)[:, None] * [1.0, 0, 0]
     heights = [None, 0.1, None, -0.2, 0.3, None]
     scene = [road(h) + s for h, s in zip(heights, shifts, strict=True) if h is not None]
     scene.append(road(0.0, count=4) + shifts[5])
-    seen = see(np.concatenate(scene), *(CAR + np.pad(shifts, [(0, 0), (0, 6)])))
+    seen = observed(np.concatenate(scene), *(CAR + np.pad(shifts, [(0, 0), (0, 6)])))
     known = [np.nan if height is None else -1 + height for height in heights]
     np.testing.assert_allclose([observation.ground for observation in seen], known, atol=1e-6)
 
 
 @pytest.mark.parametrize('roll', [0.0, 0.3])
-def test_the_road_is_looked_for_up_to_a_metre_beside_the_box(roll):
+def test_the_road_is_searched_up_to_a_metre_beside_the_box(roll):
     # 20 points lie 0.95 m beside the left face on the road, 80 points 0.05 m higher 1.05 m beside
     # it: only the first count. On a slope as well: the road is 1 m below the centre then, square
     # to the bottom, and 1 m / cos(roll) straight down.
@@ -280,17 +280,17 @@ def test_the_road_is_looked_for_up_to_a_metre_beside_the_box(roll):
     box = np.r_[slope.apply([10.0, 20.3, 1.0]), CAR[3:6], roll, 0, 0]
     near, far = road(0.0, count=20), road(0.05, count=80)
     near[:, 1], far[:, 1] = 21.3 + 0.95, 21.3 + 1.05
-    (seen,) = see(slope.apply(np.r_[near, far]), box)
+    (seen,) = observed(slope.apply(np.r_[near, far]), box)
     assert seen.ground == pytest.approx(-1 / np.cos(roll), abs=1e-5)
 
 
 @pytest.mark.parametrize('distance, is_seen', [(3.2, True), (3.27, False)])
-def test_the_ring_ends_at_an_upright_square(distance, is_seen):
+def test_the_road_is_searched_within_an_upright_square(distance, is_seen):
     # Half the diagonal is 5 ** 0.5 = 2.236 m, so the square reaches 3.236 m. The box is turned so
     # that a corner of the ring, (3, 2) in its own axes and 3.6 m from its centre, lies ahead.
     box = CAR - np.eye(9)[8] * np.arctan2(2, 3)
     spot = [distance, 0, -1.0] + np.linspace(-0.01, 0.01, 20)[:, None] * [0, 1, 0]
-    (seen,) = see(CAR[:3] + spot, box)
+    (seen,) = observed(CAR[:3] + spot, box)
     assert seen.ground == pytest.approx(-1.0 if is_seen else np.nan, abs=1e-6, nan_ok=True)
 
 
@@ -299,24 +299,24 @@ def test_the_ring_ends_at_an_upright_square(distance, is_seen):
 
 @pytest.mark.parametrize('objective', ['robust', 'paper'])
 @pytest.mark.parametrize('count', [40, 41, 79, 80, 81, 500])
-def test_at_most_the_points_asked_for_are_kept(objective, count):
+def test_no_more_points_than_configured_are_kept(objective, count):
     rng = np.random.default_rng(6)
     points = CAR[:3] + rng.uniform(-0.7, 0.7, (count, 3))
     changes = {'sampling.points': 40, 'sampling.deskew': True, 'objective': objective}
-    (seen,) = see(points, CAR, changes=changes, times=np.arange(count) * 1e-3)
+    (seen,) = observed(points, CAR, changes=changes, times=np.arange(count) * 1e-3)
     assert min(count, 40) // 2 <= len(seen.points) <= 40
     assert seen.num_points == count
-    # Times stay with their points.
+    # Each delay is that of its point.
     given = {tuple(p): t for p, t in zip((points - CAR[:3]).round(3), range(count), strict=True)}
     for point, time in zip(seen.points.round(3).astype(float), seen.delays, strict=True):
         nearest = min(given, key=lambda p: np.abs(np.array(p) - point).sum())
         assert given[nearest] == pytest.approx(1e3 * time, abs=1e-3)
 
 
-def test_the_paper_keeps_the_farthest_points():
+def test_the_paper_objective_keeps_the_farthest_points():
     rng = np.random.default_rng(7)
     points = (CAR[:3] + rng.uniform(-0.7, 0.7, (60, 3))).astype(np.float32).astype(float)
-    (seen,) = see(points, CAR, changes={'sampling.points': 20, 'objective': 'paper'})
+    (seen,) = observed(points, CAR, changes={'sampling.points': 20, 'objective': 'paper'})
     known = brute_force(points - CAR[:3], 20)
     assert rows(seen.points) == rows((points - CAR[:3])[known])
 
@@ -342,5 +342,5 @@ def test_farthest_points_by_hand():
     assert farthest_point_sample(points, 4).tolist() == [3, 0, 2, 1]
 
 
-def test_equal_points_are_each_chosen_once():
+def test_equal_points_are_each_picked_once():
     assert sorted(farthest_point_sample(np.ones((12, 3)), 12)) == list(range(12))

@@ -1,29 +1,32 @@
-"""Windows solved together, alone, and by torch's own L-BFGS; and how they are stacked."""
+"""Windows solved together, alone, and by torch's own L-BFGS; weights and acceptance tests."""
 
 from dataclasses import fields, replace
 
 from boxreg_ros.config import Config
-from boxreg_ros.core import input_model as calibration
-from boxreg_ros.core import objective, registration
-from boxreg_ros.core.face_support import Rule, support
+from boxreg_ros.core import batch, paper, registration, solver, terms
+from boxreg_ros.core.batch import POSE_ERRORS, State
+from boxreg_ros.core.face_support import FaceOffsets, observe_faces
 from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.input_model import expect, InputModel, InputNoise
 from boxreg_ros.core.lbfgs import minimize, Minimum, select
 from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.core.objective import State
-from boxreg_ros.core.registration import register, solve_paper, weigh
-from boxreg_ros.core.window import stack
+from boxreg_ros.core.paper import solve_paper
+from boxreg_ros.core.registration import register
+from boxreg_ros.core.terms import Objective, Term
+from boxreg_ros.core.weights import parked_steps, weigh
+from boxreg_ros.core.window import stack_windows
+from boxreg_ros.structures import POSE
 import numpy as np
 import pytest
 from scenes import drive, EXTENT, problem_of, returns, track_of, window_of
 import torch
 
-D, RULE = torch.float64, Rule(*torch.zeros(3, 6))
-# Nothing is learnt from the neighbours, so that windows are independent.
+D, NO_OFFSETS = torch.float64, FaceOffsets(*torch.zeros(3, 6))
+# Labelling margins are fixed, so that windows are independent.
 ALONE = Config().updated({'estimate': 'final', 'faces.learn': False})
 PAPER = ALONE.updated({'objective': 'paper', 'sampling.points': 40, 'paper.nearest': 8})
 WEIGHTS = replace(PAPER.paper, closeness=1.0, alignment=0.1)  # points against motion, about even
-# The paper's terms have kinks, at which rounding is enough to end elsewhere: before it gets there.
+# Rounding errors change where a search ends at the kinks of the paper's terms: stop before that.
 BRIEF = PAPER.updated({'paper.iterations': 5, 'paper.multiplier_rounds': 2})
 
 
@@ -48,7 +51,7 @@ def given(window):
 # --- against the truth --------------------------------------------------------------------------
 
 
-def test_boxes_are_registered_to_their_points():
+def test_refined_boxes_are_closer_to_the_truth():
     # Input errors of 0.15 m and 0.05 rad give an IoU of some 0.8; half of what is missing to 1
     # must be gained, on average, and something every time.
     missing = []
@@ -64,9 +67,9 @@ def test_boxes_are_registered_to_their_points():
     assert after.mean() < 0.5 * before.mean()
 
 
-def test_covariances_are_of_the_size_of_the_errors():
+def test_covariances_are_as_large_as_the_errors():
     # Squared errors over covariances of x, y and yaw average to 1 where covariances are right.
-    # These are for detectors and sensors of the street: points that know their rule to 1 cm
+    # Ours are for real detectors and sensors: points with a labelling margin known to 1 cm
     # leave smaller errors, by less than a factor of six in the deviation, and not larger ones.
     ratios = []
     for seed in range(8):
@@ -80,12 +83,12 @@ def test_covariances_are_of_the_size_of_the_errors():
     assert 1 / 36 < np.mean(ratios) < 2
 
 
-# --- what a tracker holds -----------------------------------------------------------------------
+# --- repeated boxes -----------------------------------------------------------------------------
 
 WHOLE = ALONE.updated({'estimate': 'track'})
 
 
-def test_extents_that_a_tracker_holds_are_estimated():
+def test_constant_errors_of_extents_are_corrected():
     # Eight cars of one length pass the sensor, which sees their fronts first and their backs
     # later: that length is there to be measured. The input is 6 % too long for one half of them
     # and too short for the other, always the same.
@@ -100,7 +103,7 @@ def test_extents_that_a_tracker_holds_are_estimated():
     assert np.mean(lengths[1::2]) - np.mean(lengths[::2]) < before / 2
 
 
-def test_parked_boxes_that_a_tracker_holds_do_not_pass_for_exact():
+def test_repeated_parked_boxes_are_not_taken_for_exact():
     # Nine parked cars, the box of each always the same, 0.2 m off along or across; and three
     # that move, whose boxes wander by 0.15 m: by these the input is judged, and the others too.
     rng, many, truths, n = np.random.default_rng(0), [], [], 60
@@ -127,7 +130,7 @@ def test_parked_boxes_that_a_tracker_holds_do_not_pass_for_exact():
 
 
 @pytest.mark.parametrize('config', [ALONE, BRIEF], ids=['robust', 'paper'])
-def test_a_batch_equals_its_windows_alone(config):
+def test_a_batch_equals_single_windows(config):
     # Padded to the longest, and to the one with most points.
     many = windows(config)
     together = register(many, config, InputModel(config.faces))
@@ -140,7 +143,7 @@ def test_a_batch_equals_its_windows_alone(config):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device here')
 @pytest.mark.parametrize('estimate', ['final', 'track'])
-def test_a_gpu_gives_the_same(estimate):
+def test_a_gpu_gives_the_same_boxes(estimate):
     config = ALONE.updated({'estimate': estimate})
     there = config.updated({'device': 'cuda'})
     known = register(windows(), config, InputModel(config.faces))
@@ -159,7 +162,7 @@ def test_the_order_of_windows_does_not_matter(config):
         np.testing.assert_allclose(a.boxes, b.boxes, atol=1e-8)
 
 
-def test_a_window_out_of_proportion_does_not_touch_its_neighbours():
+def test_an_ill_conditioned_window_does_not_affect_others():
     # Stamps a nanosecond apart let the curvature lose its definiteness in rounding.
     many = windows()
     known = register(many, ALONE, InputModel(ALONE.faces))
@@ -173,21 +176,21 @@ def test_a_window_out_of_proportion_does_not_touch_its_neighbours():
     assert np.isfinite(found[2].covariances).all()
 
 
-def test_what_was_seen_before_is_not_learnt_again():
+def test_observations_are_learnt_from_once():
     config = ALONE.updated({'faces.learn': True})
     model = InputModel(config.faces)
     many = [window(drive(12), seed, config, str(seed)) for seed in range(4)]
     register(many, config, model)
-    known = model.rule().gaps
-    assert (known - InputModel(config.faces).rule().gaps).abs().max() > 1e-4
+    known = model.offsets().gap_correction
+    assert (known - InputModel(config.faces).offsets().gap_correction).abs().max() > 1e-4
     again = [
-        w._replace(fresh=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
+        w._replace(num_new=0, observations=w.observations[-4:], start=given(w)[-4:]) for w in many
     ]
     register(again, config, model)
-    np.testing.assert_array_equal(model.rule().gaps, known)
+    np.testing.assert_array_equal(model.offsets().gap_correction, known)
 
 
-def test_short_windows_tell_nothing():
+def test_short_windows_have_no_estimate():
     many = [window(drive(2), 0, name='a'), window(drive(3), 0, name='b')]
     short, long = register(many, ALONE, InputModel(ALONE.faces))
     assert short is None
@@ -195,14 +198,14 @@ def test_short_windows_tell_nothing():
 
 
 @pytest.mark.parametrize('many', [[], [window(drive(1))]], ids=['none', 'one box'])
-def test_nothing_to_solve(many):
+def test_no_windows_to_solve(many):
     assert register(many, ALONE, InputModel(ALONE.faces)) == [None] * len(many)
 
 
-# --- what is shared and what rests --------------------------------------------------------------
+# --- shared variables and parked objects --------------------------------------------------------
 
 
-def test_what_is_expected_of_the_shared_by_hand():
+def test_expectation_of_shared_variables_by_hand():
     # Lengths of 4.0, 4.4 and 4.5 m are in the window, two of 4.3 m have left: 21.5 / 5 = 4.3 m;
     # what is padded, 9 m, does not count. The pivot is a quarter of that behind the centre.
     boxes = np.zeros((2, 4, 9))
@@ -213,22 +216,22 @@ def test_what_is_expected_of_the_shared_by_hand():
     kinds = {**kinds, 'gap_bottom': [7, 8]}
     kinds = {name: torch.tensor(values, dtype=D) for name, values in kinds.items()}
     kinds = {**dict(numbers(ALONE.vehicle)), **kinds}
-    problem = problem_of(boxes, valid=valid, seen=seen, deviations=kinds)
+    problem = problem_of(boxes, valid=valid, marginalised_extents=seen, class_numbers=kinds)
     gaps = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], dtype=D)  # beyond those of the classes
-    found = expect(problem, Rule(gaps, *torch.zeros(2, 6))).shared
-    known = np.zeros((2, objective.SHARED))
-    known[:, objective.EXTENT] = [[4.3, 2.0, 1.5], [4.3, 2.0, 1.5]]
-    known[:, objective.GAP] = [[1.1, 1.2, 3.3, 3.4, 5.5, 7.6], [2.1, 2.2, 4.3, 4.4, 6.5, 8.6]]
-    known[:, objective.PIVOT] = [4.3 / 4, 4.3 / 5]
+    found = expect(problem, FaceOffsets(gaps, *torch.zeros(2, 6))).shared
+    known = np.zeros((2, batch.SHARED))
+    known[:, batch.EXTENT] = [[4.3, 2.0, 1.5], [4.3, 2.0, 1.5]]
+    known[:, batch.GAP] = [[1.1, 1.2, 3.3, 3.4, 5.5, 7.6], [2.1, 2.2, 4.3, 4.4, 6.5, 8.6]]
+    known[:, batch.PIVOT] = [4.3 / 4, 4.3 / 5]
     np.testing.assert_allclose(found, known, atol=1e-12)
 
 
 def parked(boxes, heading=0.0):
     kinds = {'heading': torch.tensor([ALONE.vehicle.heading])}
-    return registration._parked(problem_of([boxes], deviations=kinds), torch.tensor([heading]))
+    return parked_steps(problem_of([boxes], class_numbers=kinds), torch.tensor([heading]))
 
 
-def test_what_comes_back_is_not_parked():
+def test_an_object_that_returns_is_not_parked():
     # 4 m forward and back: on average it goes nowhere.
     boxes = drive(60, 0.0, 0.0)
     boxes[:, 0] += 2.0 * (1 - np.cos(np.linspace(0, 2 * np.pi, 60)))
@@ -236,14 +239,14 @@ def test_what_comes_back_is_not_parked():
     assert not parked(boxes).any()
 
 
-def test_what_turns_on_the_spot_is_not_parked():
+def test_an_object_that_turns_on_the_spot_is_not_parked():
     # 0.01 rad/s over 5.9 s are 0.059 rad, less than three errors of 0.04 rad of a heading.
     assert parked(drive(60, 0.0, 0.01)).all()
     assert not parked(drive(60, 0.0, 0.03)).any()
     assert parked(drive(60, 0.0, 0.03), heading=0.06).all()  # 0.177 rad: no more than it errs
 
 
-def test_where_a_parked_vehicle_drives_off_it_does_not_rest():
+def test_a_parked_vehicle_that_drives_off_is_not_held_there():
     boxes = drive(80, 0.0, 0.0)
     since = (np.arange(80) - 68).clip(0) / 10
     boxes[:, 0] += since**2  # 2 m/s^2 for 1.1 s
@@ -265,7 +268,7 @@ def test_where_a_parked_vehicle_drives_off_it_does_not_rest():
         (0.2, 30, True),  # 0.58 m
     ],
 )
-def test_what_hardly_moves_is_parked(speed, length, rests):
+def test_parked_objects_by_speed_and_distance(speed, length, rests):
     # Slower than 0.3 m/s and moved less than 0.7 m. Of two windows the second is padded with
     # boxes far away, and errors that take turns do not make it move.
     boxes = drive(length, speed, 0.0)
@@ -276,47 +279,47 @@ def test_what_hardly_moves_is_parked(speed, length, rests):
     many = np.stack([np.concatenate([boxes, boxes[-1:], boxes[-1:]]), padded])
     valid = np.arange(length + 2) < length
     kinds = {name: torch.full((2,), value) for name, value in numbers(ALONE.vehicle)}
-    problem = problem_of(many, valid=np.stack([valid] * 2), deviations=kinds)
-    expected = expect(problem, RULE)
+    problem = problem_of(many, valid=np.stack([valid] * 2), class_numbers=kinds)
+    expected = expect(problem, NO_OFFSETS)
     state = State(problem.pose, expected.shared)
-    sights = support(problem, state, 0.05, RULE)
+    observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
     (rest,) = (
         term.weight
-        for term in weigh(problem, state, sights, expected, ALONE)
-        if term.function is objective.rest
+        for term in weigh(problem, state, observations, expected, ALONE)
+        if term.function is terms.zero_motion
     )
     held = (rest.diagonal(dim1=-2, dim2=-1) > 0)[:, :, 0].all(-1)
     np.testing.assert_array_equal(held, np.stack([valid[1:] & rests] * 2))
 
 
 @pytest.mark.parametrize(
-    ('trust', 'fast', 'slow'),
+    ('weight', 'fast', 'slow'),
     [
         (0.0, 0.235 / 0.3, 1.0),
         (0.5, 2.5**0.5 * 0.1425 / 0.3, 2.5**0.5),
         (1.0, 2 * 0.05 / 0.3, 2.0),
     ],
 )
-def test_the_bias_to_expect_by_hand(trust, fast, slow):
-    # Twice as wide as expected, correlated by 0.2 where 0.385 is usual: half of the trust lies
+def test_expected_bias_by_hand(weight, fast, slow):
+    # Twice as wide as expected, correlated by 0.2 where 0.385 is usual: weight 1/2 lies
     # between, at 0.2925, and at (1 + 4) / 2 times the power. A bias is in proportion to that
     # deviation and to what the correlation is above 0.15, up to 0.45, over a tenth of a second:
     # at 2 Hz the fifth root of all three is.
     kinds = {name: torch.full((2,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
     times = torch.arange(6, dtype=D) * torch.tensor([[0.1], [0.5]], dtype=D)
     boxes = np.broadcast_to(drive(6), (2, 6, 9)).copy()
-    problem = problem_of(boxes, times=times, deviations=kinds)
-    state = State(problem.pose, expect(problem, RULE).shared)
-    sights = support(problem, state, 0.05, RULE)
-    error = problem.of(*objective.ERRORS)
+    problem = problem_of(boxes, times=times, class_numbers=kinds)
+    state = State(problem.pose, expect(problem, NO_OFFSETS).shared)
+    observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
+    error = problem.of_class(*POSE_ERRORS)
     deviation = torch.cat([2 * error[0], torch.ones(3, dtype=D)])
-    noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), trust=trust)
-    (weight,) = (
+    noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), weight=weight)
+    (information,) = (
         term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
-        for term in weigh(problem, state, sights, expect(problem, RULE, noise), ALONE)
-        if term.function is objective.shared_prior
+        for term in weigh(problem, state, observations, expect(problem, NO_OFFSETS, noise), ALONE)
+        if term.function is terms.shared_prior
     )
-    bias = weight[:, objective.BIAS] ** -0.5 / error
+    bias = information[:, batch.BIAS] ** -0.5 / error
     known = torch.tensor([[fast], [slow]], dtype=D) * torch.tensor([1, 1, 1, 1, 1, 0.5])
     np.testing.assert_allclose(bias, known, rtol=1e-9)
 
@@ -324,64 +327,66 @@ def test_the_bias_to_expect_by_hand(trust, fast, slow):
 @pytest.mark.parametrize(
     ('offset', 'lasting'),
     [
-        (0.0, 0.1),  # drawn with care: all the bias there may be is the least
+        (0.0, 0.1),  # low-noise input: the smallest bias
         (0.3, 0.36),  # (0.3 / 0.5)^2
         (0.7, 0.7),  # smoothed by a filter: as of a detector that scatters as usual, not larger
     ],
 )
-def test_the_bias_of_what_scatters_little_by_hand(offset, lasting):
+def test_expected_bias_of_low_noise_input_by_hand(offset, lasting):
     # Boxes that scatter by a hundredth of what is usual, correlated by 0.9 over a tenth of a
-    # second. How far tracks are off along and across, and in their lengths, tells of positions
-    # and extents, which are free where that is half; nothing is told of angles.
+    # second. Offsets of tracks along, across and in length free the bias of
+    # positions and the extents from one half of the usual error on; not that of angles.
     kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
-    problem = problem_of(drive(6)[None], deviations=kinds)
-    state = State(problem.pose, expect(problem, RULE).shared)
-    sights = support(problem, state, 0.05, RULE)
-    error, extent = problem.of(*objective.ERRORS), kinds['extent'][:, None]
+    problem = problem_of(drive(6)[None], class_numbers=kinds)
+    state = State(problem.pose, expect(problem, NO_OFFSETS).shared)
+    observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
+    error, extent = problem.of_class(*POSE_ERRORS), kinds['extent'][:, None]
     usual = torch.cat([error, extent.expand(-1, 3)], 1)[0]
     parts = torch.tensor([1.5, 0.5, 9, 9, 9, 9, 1, 9, 9], dtype=D)  # 1 on average, of three
     noise = InputNoise(0.01 * usual, torch.full((9,), 0.9, dtype=D), parts * offset * usual, 1.0)
     (weight,) = (
         term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
-        for term in weigh(problem, state, sights, expect(problem, RULE, noise), ALONE)
-        if term.function is objective.shared_prior
+        for term in weigh(problem, state, observations, expect(problem, NO_OFFSETS, noise), ALONE)
+        if term.function is terms.shared_prior
     )
     found = weight**-0.5
     bias = torch.tensor([[lasting] * 3 + [0.1, 0.1, 0.05]], dtype=D)
-    np.testing.assert_allclose(found[:, objective.BIAS] / error, bias, rtol=1e-9)
-    extents = found[:, objective.EXTENT] / state.shared[:, objective.EXTENT] / extent
+    np.testing.assert_allclose(found[:, batch.BIAS] / error, bias, rtol=1e-9)
+    extents = found[:, batch.EXTENT] / state.shared[:, batch.EXTENT] / extent
     np.testing.assert_allclose(extents, np.full((1, 3), min(1.0, 2 * lasting)), rtol=1e-9)
-    # Gaps differ by up to twice as much where boxes were drawn with care.
-    loose = found[:, objective.GAP] / ALONE.faces.spread
+    # Margins of low-noise input differ by up to twice as much.
+    loose = found[:, batch.GAP] / ALONE.faces.spread
     np.testing.assert_allclose(loose, np.full((1, 6), max(1.0, 2 - 2 * lasting)), rtol=1e-9)
 
 
-def test_how_far_a_gap_may_be_off_by_hand():
-    # Points 0.3 m above the roofs of two boxes of three, of which each has its say; the left side
+def test_robust_prior_of_labelling_margins_by_hand():
+    # Points 0.3 m above the roofs of two boxes of three, all of weight 1; the left side
     # has been found with a gap 0.1 m wider than expected, 2 of its deviations; on the other faces
     # all is as expected. An input correlated as usual, by 0.385, has biases of
     # (0.385 - 0.15) / 0.3 of its errors, and so for extents, half of which a face moves by.
     kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
-    problem = problem_of(drive(3)[None], deviations=kinds)
-    expected = expect(problem, RULE)
-    left, top = objective.GAP.start + 2, objective.GAP.start + 4
-    sights = support(problem, State(problem.pose, expected.shared), 0.05, RULE)
-    outwardness, trust = torch.zeros(1, 3, 6, dtype=D), torch.ones(1, 3, 6, dtype=D)
-    outwardness[0, :, 4], trust[0, 2, 4] = torch.tensor([0.3, 0.3, 9.0], dtype=D), 0.0
-    sights = sights._replace(outwardness=outwardness, trust=trust)
+    problem = problem_of(drive(3)[None], class_numbers=kinds)
+    expected = expect(problem, NO_OFFSETS)
+    left, top = batch.GAP.start + 2, batch.GAP.start + 4
+    observations = observe_faces(problem, State(problem.pose, expected.shared), NO_OFFSETS, ALONE)
+    distance = torch.zeros(1, 3, 6, dtype=D)
+    distance[0, :, 4] = torch.tensor([0.3, 0.3, 9.0], dtype=D)
+    face_weight = torch.ones(1, 3, 6, dtype=D)
+    face_weight[0, 2, 4] = 0.0
+    observations = observations._replace(distance=distance, weight=face_weight)
     state = State(problem.pose, expected.shared.clone())
     state.shared[0, left] += 2 * ALONE.faces.spread
     (weight,) = (
         term.weight[0, 0, 0].diagonal()
-        for term in weigh(problem, state, sights, expected, ALONE)
-        if term.function is objective.shared_prior
+        for term in weigh(problem, state, observations, expected, ALONE)
+        if term.function is terms.shared_prior
     )
     part, height = (0.385 - 0.15) / 0.3, drive(1)[0, 5]
     z, half = part * ALONE.vehicle.height, part * ALONE.vehicle.extent * height / 2
     known = np.full(22, ALONE.faces.spread)
     known[left] *= 2**0.5
     known[top] *= (1 + 0.3**2 / (ALONE.faces.spread**2 + z**2 + half**2) / 4) ** 0.5
-    np.testing.assert_allclose(weight[objective.GAP] ** -0.5, known[objective.GAP], rtol=1e-9)
+    np.testing.assert_allclose(weight[batch.GAP] ** -0.5, known[batch.GAP], rtol=1e-9)
 
 
 def numbers(kind):
@@ -393,51 +398,51 @@ def numbers(kind):
 
 @pytest.mark.parametrize('estimate', ['final', 'track'])
 @pytest.mark.parametrize('part', [1, 4000, 2**18])
-def test_the_number_of_threads_makes_no_difference(monkeypatch, estimate, part):
+def test_the_number_of_threads_does_not_change_results(monkeypatch, estimate, part):
     # One window at a time, a few, and all at once.
     config = ALONE.updated({'estimate': estimate})
     known = register(windows(), config, InputModel(config.faces))
-    monkeypatch.setattr(registration, 'PART', part)
+    monkeypatch.setattr(solver, 'OBSERVATIONS_PER_THREAD', part)
     for threads in (0, 1, 3):
         more = config.updated({'solver.threads': threads})
         for a, b in zip(register(windows(), more, InputModel(more.faces)), known, strict=True):
             assert (a.status, a.reasons) == (b.status, b.reasons)
             np.testing.assert_allclose(a.boxes, b.boxes, rtol=0, atol=1e-9)
             np.testing.assert_allclose(a.covariances, b.covariances, rtol=0, atol=1e-9)
-            assert (a.memory is None) == (b.memory is None)
-            for one, other in zip(a.memory or (), b.memory or (), strict=True):
+            assert (a.prior is None) == (b.prior is None)
+            for one, other in zip(a.prior or (), b.prior or (), strict=True):
                 np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
 
 
-class WrongNoise(InputModel):
-    """Says of five numbers what there are nine of, which a round stumbles over."""
-
-    def noise(self):
-        return InputNoise(torch.ones(5), torch.zeros(5))
+def patch_observe_faces(monkeypatch, function):
+    """Replace `observe_faces` where labelling margins are learnt and where rounds are taken."""
+    for module in (registration, solver):
+        monkeypatch.setattr(module, 'observe_faces', function)
 
 
 @pytest.mark.parametrize('estimate', ['final', 'track'])
-def test_many_points_wait_for_the_last_round(monkeypatch, estimate):
+def test_all_points_are_used_in_the_last_round_only(monkeypatch, estimate):
     # Of some 1,000 points about 256 until the boxes rest, then all; nothing is lost by that.
     config = ALONE.updated({'estimate': estimate, 'sampling.points': 2000})
     rng, truth = np.random.default_rng(0), drive(10)
     points = [returns(box, rng, 1800) for box in truth]
     one = window_of(replace(track_of(truth, rng), points=points), config)
     most = max(len(observation.points) for observation in one.observations)
-    few = -(-most // (most // registration.COARSE))
+    few = -(-most // (most // solver.COARSE_POINTS))
     seen = []
 
     def noted(problem, *rest):
         seen.append(problem.points.shape[2])
-        return support(problem, *rest)
+        return observe_faces(problem, *rest)
 
-    monkeypatch.setattr(registration, 'support', noted)
+    patch_observe_faces(monkeypatch, noted)
     (found,) = register([one], config, InputModel(config.faces))
     assert most > 900 and few < 350
-    assert seen.pop(0) == few  # the rule is learnt from few, too
+    assert seen.pop(0) == few  # margins are learnt from few, too
     assert seen == sorted(seen) and set(seen) == {few, most}
     assert seen.count(few) >= 2 and seen.count(most) <= 2
-    monkeypatch.setattr(registration, 'COARSE', most)
+    for module in (registration, solver):
+        monkeypatch.setattr(module, 'COARSE_POINTS', most)
     seen.clear()
     (known,) = register([one], config, InputModel(config.faces))
     assert set(seen) == {most}
@@ -447,20 +452,25 @@ def test_many_points_wait_for_the_last_round(monkeypatch, estimate):
 
 
 @pytest.mark.parametrize('part', [1, 2**18])
-def test_an_error_in_a_thread_comes_out(monkeypatch, part):
-    monkeypatch.setattr(registration, 'PART', part)
+def test_an_error_in_a_thread_is_raised(monkeypatch, part):
+    monkeypatch.setattr(solver, 'OBSERVATIONS_PER_THREAD', part)
     threads = torch.get_num_threads()
-    with pytest.raises(RuntimeError, match='must match'):
-        register(windows(), ALONE, WrongNoise(ALONE.faces))
+
+    def broken(*_):
+        raise RuntimeError('broken')
+
+    monkeypatch.setattr(solver, 'observe_faces', broken)
+    with pytest.raises(RuntimeError, match='broken'):
+        register(windows(), ALONE, InputModel(ALONE.faces))
     assert torch.get_num_threads() == threads
 
 
 # --- extents ------------------------------------------------------------------------------------
 
 
-def test_what_a_detector_shrank_grows_by_what_the_points_of_others_tell(monkeypatch):
-    # Lengths of 16 cars, of which the input tells half of what they differ by, -0.5 in logarithms.
-    # Most drive by, every fourth one is seen from behind only. All of them together tell more of
+def test_shrunk_extents_are_corrected_by_the_population():
+    # Lengths of 16 cars, which differ half as much in the input: a slope of -0.5 in logarithms.
+    # Most drive by, every fourth one is seen from behind only. The population has more evidence of
     # each than each alone: of what was left of the slope a quarter and more is made good.
     config = ALONE.updated({'estimate': 'track'})
     rng, many, lengths = (
@@ -476,104 +486,103 @@ def test_what_a_detector_shrank_grows_by_what_the_points_of_others_tell(monkeypa
         track.boxes[:, 3] = (EXTENT[0] * length) ** 0.5
         many.append(window_of(track, config))
 
-    def slope():
+    def slope(config):
         found = register(many, config, InputModel(config.faces))
         wrong = np.log([estimate.boxes[0, 3] for estimate in found]) - np.log(lengths)
         return np.polyfit(np.log(lengths), wrong, 1)[0]
 
-    known = slope()
-    monkeypatch.setattr(calibration, 'SLOPES', 1e-9)
-    alone = slope()
+    known = slope(config)
+    alone = slope(config.updated({'ingredients.population_extents': False}))
     assert -0.3 < alone < -0.1
     assert abs(known) < 0.75 * abs(alone)
 
 
 @pytest.fixture
-def judged_by(monkeypatch):
+def extents_used(monkeypatch):
     """Collect the extents (3,) that faces of the first window are judged by, round by round."""
     seen = []
 
     def noted(problem, state, *rest):
-        seen.append(state.shared[0, objective.EXTENT].numpy().copy())
-        return support(problem, state, *rest)
+        seen.append(state.shared[0, batch.EXTENT].numpy().copy())
+        return observe_faces(problem, state, *rest)
 
-    monkeypatch.setattr(registration, 'support', noted)
+    patch_observe_faces(monkeypatch, noted)
     return seen
 
 
 @pytest.mark.parametrize(
     ('changes', 'held'), [({'extent': 'fixed'}, [0, 1, 2]), ({'mode': 'bev'}, [2]), ({}, [])]
 )
-def test_a_tick_judges_faces_by_what_was_found_or_is_held(judged_by, changes, held):
+def test_a_warm_window_uses_the_extents_of_the_tick_before(extents_used, changes, held):
     # What is not to be solved for is the mean of the input, the rest as the tick before left it.
     config, found = ALONE.updated(changes), [4.0, 2.0, 1.3]
     whole = window(drive(6), extent=0.05)
     start = given(whole)[:-1]
     start[:, 3:6] = found
-    register([whole._replace(fresh=1, start=start)], config, InputModel(config.faces))
-    assert len(judged_by) == 2  # to learn from it, and the one round of a tick
+    register([whole._replace(num_new=1, start=start)], config, InputModel(config.faces))
+    assert len(extents_used) == 2  # to learn from it, and the one round of a tick
     known = np.where(np.isin(np.arange(3), held), given(whole)[:, 3:6].mean(0), found)
-    np.testing.assert_allclose(judged_by[1], known)
+    np.testing.assert_allclose(extents_used[1], known)
 
 
 @pytest.mark.parametrize('rounds', [1, 2])
-def test_a_cold_window_judges_faces_by_the_mean_of_the_input(judged_by, rounds):
+def test_a_cold_window_starts_from_the_mean_extents_of_the_input(extents_used, rounds):
     config = ALONE.updated({'solver.rounds': rounds})
     whole = window(drive(6), extent=0.05)
     register([whole], config, InputModel(config.faces))
-    assert len(judged_by) == 1 + rounds
-    np.testing.assert_allclose(judged_by[1], given(whole)[:, 3:6].mean(0))
+    assert len(extents_used) == 1 + rounds
+    np.testing.assert_allclose(extents_used[1], given(whole)[:, 3:6].mean(0))
 
 
-# --- what is remembered -------------------------------------------------------------------------
+# --- marginalisation prior ----------------------------------------------------------------------
 
 
-def test_full_windows_leave_what_they_know():
+def test_full_windows_leave_a_marginalisation_prior():
     # Of ten, the length of a window, the first is to leave; shorter ones are to grow.
     many = windows()
     found = register(many, ALONE, InputModel(ALONE.faces))
-    assert [estimate.memory is not None for estimate in found] == [True, False, False, False]
-    memory, boxes = found[0].memory, found[0].boxes
+    assert [estimate.prior is not None for estimate in found] == [True, False, False, False]
+    prior, boxes = found[0].prior, found[0].boxes
     first = given(many[0])[0]
-    np.testing.assert_array_equal(memory.base, first[:3])
-    np.testing.assert_array_equal(memory.seen, [*first[3:6], 1])
+    np.testing.assert_array_equal(prior.base, first[:3])
+    np.testing.assert_array_equal(prior.marginalised_extents, [*first[3:6], 1])
     left = boxes[1:3] - [*first[:3], *np.zeros(6)]
-    np.testing.assert_allclose(memory.state[:12], left[:, objective.POSE].ravel(), atol=1e-9)
-    np.testing.assert_allclose(memory.state[12:15], boxes[0, 3:6], atol=1e-9)
-    np.testing.assert_allclose(memory.information, memory.information.T, atol=1e-6)
-    assert np.linalg.eigvalsh(memory.information).min() > -1e-6 * memory.information.max()
+    np.testing.assert_allclose(prior.state[:12], left[:, POSE].ravel(), atol=1e-9)
+    np.testing.assert_allclose(prior.state[12:15], boxes[0, 3:6], atol=1e-9)
+    np.testing.assert_allclose(prior.information, prior.information.T, atol=1e-6)
+    assert np.linalg.eigvalsh(prior.information).min() > -1e-6 * prior.information.max()
     for config in (ALONE.updated({'estimate': 'track'}), BRIEF):
         found = register(windows(config), config, InputModel(config.faces))
-        assert {estimate.memory for estimate in found} == {None}
+        assert {estimate.prior for estimate in found} == {None}
 
 
 def slid(whole, count, turns=0.0, config=ALONE):
-    """Return the estimates of windows of ten of `whole`, one after the other; memory + `turns`."""
-    estimates, memory, start = [], None, np.zeros((0, 9))
+    """Return the estimates of windows of ten of `whole`, one after the other; prior + `turns`."""
+    estimates, prior, start = [], None, np.zeros((0, 9))
     for first in range(count):
         observations = whole.observations[first : first + 10]
         one = whole._replace(
-            observations=observations, fresh=10 - len(start), start=start, memory=memory
+            observations=observations, num_new=10 - len(start), start=start, prior=prior
         )
         estimates += register([one], config, InputModel(config.faces))
-        memory, start = estimates[-1].memory, estimates[-1].boxes[1:]
-        state = memory.state.copy()
+        prior, start = estimates[-1].prior, estimates[-1].boxes[1:]
+        state = prior.state.copy()
         state[[5, 11]] += turns
-        memory = memory._replace(state=state)
+        prior = prior._replace(state=state)
     return estimates
 
 
-def test_memory_goes_on_and_on():
+def test_marginalisation_prior_improves_the_newest_box():
     whole = window(drive(14))
     estimates = slid(whole, 5)
     boxes = given(whole)
     for i, estimate in enumerate(estimates):
-        np.testing.assert_array_equal(estimate.memory.base, boxes[0, :3])
+        np.testing.assert_array_equal(estimate.prior.base, boxes[0, :3])
         known = [*boxes[: i + 1, 3:6].sum(0), i + 1]
-        np.testing.assert_allclose(estimate.memory.seen, known)
-    # What has left tells of the bias and the extent: without it, the same window knows less.
+        np.testing.assert_allclose(estimate.prior.marginalised_extents, known)
+    # The prior has information about bias and extent: without it, the covariance is larger.
     last = whole._replace(
-        observations=whole.observations[4:], fresh=1, start=estimates[3].boxes[1:]
+        observations=whole.observations[4:], num_new=1, start=estimates[3].boxes[1:]
     )
     (forgetful,) = register([last], ALONE, InputModel(ALONE.faces))
     spread = [np.trace(e.covariances[-1][:2, :2]) for e in (estimates[4], forgetful)]
@@ -581,13 +590,13 @@ def test_memory_goes_on_and_on():
 
 
 @pytest.mark.parametrize('turns', [2 * np.pi, -4 * np.pi])
-def test_whole_turns_between_windows_do_not_matter(turns):
+def test_prior_is_invariant_to_whole_turns(turns):
     whole = window(drive(13, turn=0.4, start=(5.0, 6.0, 2.9)))  # across half a turn
     for found, known in zip(slid(whole, 4, turns), slid(whole, 4), strict=True):
         np.testing.assert_allclose(found.boxes, known.boxes, atol=1e-9)
 
 
-def test_a_window_that_fails_leaves_nothing():
+def test_a_failed_window_leaves_no_prior():
     # All of one stamp, as the registrar lets none through: no speed is finite. Its neighbour
     # remembers.
     many = [window(drive(10), 0), window(drive(10, start=(-9.0, 3.0, -1.0)), 1)]
@@ -595,9 +604,9 @@ def test_a_window_that_fails_leaves_nothing():
     many[0] = many[0]._replace(observations=bad)
     failed, found = register(many, ALONE, InputModel(ALONE.faces))
     assert set(failed.reasons) == {'not_finite'}
-    assert failed.memory is None
+    assert failed.prior is None
     assert set(found.status) == {'refined'}
-    assert found.memory is not None
+    assert found.prior is not None
 
 
 # --- solver against torch's ---------------------------------------------------------------------
@@ -623,15 +632,15 @@ def oracle(function, start):
     return best[0]
 
 
-def test_the_robust_objective_against_torch():
+def test_minimum_of_the_default_objective_against_torch():
     # One round of terms: torch gets the sum of r' W r / 2 and its automatic gradient, ours gets
     # the written gradient and the Gauss-Newton curvature as metric, and all windows at once.
-    problem, _ = stack(windows(), ALONE)
+    problem, _ = stack_windows(windows(), ALONE)
     terms = robust_terms(problem)
     length = problem.valid.shape[1]
-    shared = torch.cat([problem.boxes[:, 0, 3:6], torch.zeros(4, objective.SHARED - 3)], 1)
+    shared = torch.cat([problem.boxes[:, 0, 3:6], torch.zeros(4, batch.SHARED - 3)], 1)
     x = State(problem.pose, shared.to(D)).pack()
-    function = objective.Sum(terms, x, length, torch.ones_like(x))
+    function = Objective(terms, x, length, torch.ones_like(x))
     found = minimize(function, x, 12, 6, 1e-6, function.newton)
     assert (found.value < 0.9 * function(x, torch.arange(4))[0]).all()
     for row in range(4):
@@ -663,47 +672,47 @@ def robust_terms(problem):
     homogeneous = (homogeneous * problem.mask[..., None]).to(D)
     moments = torch.einsum('bnmi,bnmj->bnij', homogeneous, homogeneous)
     moments = moments[:, :, None] * torch.tensor([1.0, 0, 1.0, 0, 1.0, 0])[:, None, None]
-    expected = torch.zeros(B, objective.SHARED, dtype=D)
+    expected = torch.zeros(B, batch.SHARED, dtype=D)
     expected[:, :3] = problem.boxes[:, 0, 3:6]
-    expected[:, objective.PIVOT] = problem.boxes[:, 0, 3] / 4
+    expected[:, batch.PIVOT] = problem.boxes[:, 0, 3] / 4
     one = torch.ones(B, 1, dtype=D)
     axes = rotation_from_rpy(problem.pose[..., 3:])
     return [
-        objective.Term(objective.faces, moments, (problem.pose, torch.zeros(B, N, 6, dtype=D))),
-        objective.Term(objective.prior, diagonal(weight, valid), (problem.pose, axes)),
-        objective.Term(objective.acceleration, diagonal(motion, valid[:, 2:]), (problem.times,)),
-        objective.Term(
-            objective.slip, diagonal(torch.tensor([40.0, 20.0]).to(D), valid[:, 1:]),
+        Term(terms.faces, moments, (problem.pose, torch.zeros(B, N, 6, dtype=D))),
+        Term(terms.input_pose, diagonal(weight, valid), (problem.pose, axes)),
+        Term(terms.acceleration, diagonal(motion, valid[:, 2:]), (problem.times,)),
+        Term(
+            terms.slip, diagonal(torch.tensor([40.0, 20.0]).to(D), valid[:, 1:]),
             (problem.times,),
         ),
-        objective.Term(
-            objective.shared_prior,
-            diagonal(torch.full((objective.SHARED,), 400.0, dtype=D), one), (expected,),
+        Term(
+            terms.shared_prior,
+            diagonal(torch.full((batch.SHARED,), 400.0, dtype=D), one), (expected,),
         ),
     ]  # fmt: skip
 
 
 def paper_problem():
-    problem, _ = stack(windows(PAPER), PAPER)
+    problem, _ = stack_windows(windows(PAPER), PAPER)
     x = problem.pose.flatten(1)
     extent = problem.boxes[..., 3:6]
 
-    def total(x, rows, multipliers, rounding=objective.EPSILON):
+    def total(x, rows, multipliers, rounding=paper.EPSILON):
         pose = x.unflatten(1, (extent.shape[1], 6))
         boxes = torch.cat([pose[..., :3], extent[rows], pose[..., 3:]], -1)
-        return objective.total(boxes, select(problem, rows), WEIGHTS, multipliers, rounding)
+        return paper.total(boxes, select(problem, rows), WEIGHTS, multipliers, rounding)
 
     return problem, x, total
 
 
-def test_the_papers_objective_against_torch():
+def test_minimum_of_the_papers_objective_against_torch():
     # Eq. 8 has kinks, where quasi-Newton methods stop early. Ours comes from rounded ones, so it
     # must not be worse than torch's by more than a hundredth of the value.
     _, x, total = paper_problem()
     multipliers = torch.full((4, 2), 0.1, dtype=D)
 
     found = Minimum(x, *[None] * 3)
-    for rounding in (0.3, 3e-3, 3e-5, objective.EPSILON):
+    for rounding in (0.3, 3e-3, 3e-5, paper.EPSILON):
 
         def function(x, rows, rounding=rounding):
             x = x.detach().requires_grad_()
@@ -723,12 +732,12 @@ def test_the_papers_objective_against_torch():
         assert found.value[row] <= 1.01 * best
 
 
-def test_multipliers_lower_the_violation_of_the_constraints():
+def test_multipliers_reduce_constraint_violations():
     # Smoothness and alignment are constraints: after the rounds they are violated less than at
     # the input, and the objective at the multipliers of the first round is lower.
     problem, x, total = paper_problem()
-    state, covariances, left, _ = solve_paper(problem, PAPER)
-    assert left == ()
+    state, covariances, prior, *_ = solve_paper(problem, PAPER)
+    assert prior is None
     assert covariances.shape == (*problem.valid.shape, 6, 6)
     rows, none = torch.arange(4), torch.zeros(4, 2, dtype=D)
     before, violation = total(x, rows, none)
@@ -737,11 +746,11 @@ def test_multipliers_lower_the_violation_of_the_constraints():
     assert (rest < violation).all()
 
 
-# --- what is free -------------------------------------------------------------------------------
+# --- free variables -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('name', ['robust', 'paper'])
-def test_bev_leaves_height_roll_and_pitch(name):
+def test_bev_keeps_height_roll_and_pitch(name):
     config = (ALONE if name == 'robust' else PAPER).updated({'mode': 'bev'})
     one = window(drive(6), 1, config)
     (found,) = register([one], config, InputModel(config.faces))
@@ -750,7 +759,7 @@ def test_bev_leaves_height_roll_and_pitch(name):
 
 
 @pytest.mark.parametrize('name', ['robust', 'paper'])
-def test_extents_of_a_track_are_one_or_the_inputs(name):
+def test_extents_are_one_per_track_or_fixed(name):
     config = ALONE if name == 'robust' else PAPER
     one = window(drive(6), 1, config, extent=0.05)
     (found,) = register([one], config, InputModel(config.faces))

@@ -1,9 +1,9 @@
-"""One rigid shape per track: steps known by hand, and what it does to relative poses."""
+"""One rigid shape per track: steps known by hand, and its effect on relative poses."""
 
 from boxreg_ros import Config, refine
-from boxreg_ros.core.objective import State
+from boxreg_ros.core.batch import State
 from boxreg_ros.core.rigid_shape import agreement
-from boxreg_ros.core.window import AWAY
+from boxreg_ros.core.window import PADDING_POSITION
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
 import pytest
@@ -28,8 +28,8 @@ def problem(poses, seed=0):
     boxes = np.tile(BOX, (len(poses), 1))
     boxes[:, :3], boxes[:, 6:] = np.array(poses)[:, :3], np.array(poses)[:, 3:]
     points = [corner(rng) - box[:3] for box in boxes]
-    deviations = {'shape': torch.tensor([0.03], dtype=torch.float64)}
-    return problem_of(boxes[None], points=np.array([points]), deviations=deviations)
+    class_numbers = {'shape': torch.tensor([0.03], dtype=torch.float64)}
+    return problem_of(boxes[None], points=np.array([points]), class_numbers=class_numbers)
 
 
 def look(poses):
@@ -38,10 +38,10 @@ def look(poses):
     return [part[0].numpy() for part in found]
 
 
-def test_one_that_stands_apart_is_wanted_back():
-    # Nine boxes agree, the tenth is 0.05 m ahead, 0.04 m to the left and 0.01 rad turned: it is
-    # wanted back by as much, less the tenth of the shape that is its own and what a smeared shape
-    # holds back (measured: a tenth again).
+def test_an_outlying_pose_is_moved_back():
+    # Nine boxes agree, the tenth is 0.05 m ahead, 0.04 m to the left and 0.01 rad turned. The
+    # wanted step is minus that, less a tenth, since a tenth of the shape is its own, and less
+    # another tenth (measured), since it smears the shape.
     poses = np.zeros((10, 6))
     poses[4] = [0.05, 0.04, 0, 0, 0, 0.01]
     information, wanted = look(poses)
@@ -51,25 +51,25 @@ def test_one_that_stands_apart_is_wanted_back():
     np.testing.assert_allclose(others, np.tile(0.1 * poses[4], (9, 1)), atol=0.006)
 
 
-def test_a_common_step_is_not_seen():
+def test_a_common_step_is_not_observable():
     _, alike = look(np.zeros((6, 6)))
     _, moved = look(np.tile([0.2, -0.1, 0.05, 0, 0, 0], (6, 1)))
     np.testing.assert_allclose(alike, 0, atol=2e-3)
     np.testing.assert_allclose(moved, 0, atol=2e-3)
 
 
-def test_too_few_points_say_nothing():
+def test_too_few_points_give_no_information():
     seen = problem(np.zeros((3, 6)))
-    seen.points[..., 2:, :] = AWAY
+    seen.points[..., 2:, :] = PADDING_POSITION
     information, wanted = agreement(seen, State(seen.pose, shared_of(EXTENT=BOX[3:6])))
     np.testing.assert_array_equal(information, 0)
     np.testing.assert_array_equal(wanted, 0)
 
 
-def test_a_wall_pins_no_step_along_it():
-    # Only the front is seen: steps to the left or up, and a roll about x, leave it as it is.
+def test_a_plane_gives_no_information_along_it():
+    # Only the front is visible: steps to the left or up, and a roll about x, do not change it.
     seen = problem(np.zeros((5, 6)))
-    seen.points[seen.points[..., 0] < 1.99] = AWAY
+    seen.points[seen.points[..., 0] < 1.99] = PADDING_POSITION
     information, _ = agreement(seen, State(seen.pose, shared_of(EXTENT=BOX[3:6])))
     pinned = information[0].diagonal(dim1=-2, dim2=-1)
     assert (pinned[:, [0, 4, 5]] > 100).all()
@@ -77,9 +77,9 @@ def test_a_wall_pins_no_step_along_it():
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_relative_poses_are_better_with_it(seed):
-    # A real shape, seen in parts: errors that are not common to all boxes are what it can tell,
-    # and they fall by a quarter at least, to what the faces alone leave.
+def test_rigid_shape_improves_relative_poses(seed):
+    # A body of which each sweep shows a part: errors that are not common to all boxes fall by a
+    # quarter at least, against faces alone.
     scene = simulate('paper', seed)
     (track,) = scene.tracks()
 
@@ -91,13 +91,13 @@ def test_relative_poses_are_better_with_it(seed):
     assert spread(config) < 0.75 * spread(config.updated({'vehicle.shape': 1.0}))
 
 
-def test_what_is_not_finite_touches_no_neighbour():
+def test_non_finite_values_do_not_affect_other_windows():
     poses = np.zeros((2, 6, 6))
     poses[0, 3, 0] = 0.05
     seen = problem_of(
         np.tile(BOX, (2, 6, 1)) + np.pad(poses[..., :3], ((0, 0), (0, 0), (0, 6))),
         points=np.tile(corner(np.random.default_rng(0)), (2, 6, 1, 1)) - poses[..., None, :3],
-        deviations={'shape': torch.tensor([0.03, 0.03], dtype=torch.float64)},
+        class_numbers={'shape': torch.tensor([0.03, 0.03], dtype=torch.float64)},
     )
     shared = shared_of(EXTENT=BOX[3:6]).expand(2, -1).clone()
     expected = agreement(seen, State(seen.pose, shared))

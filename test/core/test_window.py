@@ -1,8 +1,14 @@
-"""Windows of observations, and their batches as padded tensors."""
+"""Windows of observations, and batches of windows as padded tensors."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.objective import MEMORY
-from boxreg_ros.core.window import batches, FADING, Memory, one_heading, stack
+from boxreg_ros.core.batch import PRIOR_SIZE
+from boxreg_ros.core.window import (
+    group_windows,
+    MarginalisationPrior,
+    PRIOR_DECAY,
+    resolve_headings,
+    stack_windows,
+)
 from boxreg_ros.structures import POSE, ROLL, YAW
 import numpy as np
 import pytest
@@ -20,31 +26,33 @@ def given(window):
     return np.array([observation.box for observation in window.observations])
 
 
-def remembering(window, yaw=0.0):
-    """Return a window of which one box has left, given 1 m before the first; headings + `yaw`."""
+def with_prior(window, yaw=0.0):
+    """Return a window with a prior whose base is 1 m before the first box; headings + `yaw`."""
     boxes = given(window)
     base = boxes[0, :3] - [1.0, 0, 0]
     pose = boxes[:2, POSE] - [*base, 0, 0, 0]
     pose[:, 5] += yaw
-    shared = [*boxes[0, 3:6], *np.zeros(MEMORY - 15)]
-    step = np.random.default_rng(3).normal(size=MEMORY)
-    information = np.diag(1.0 + np.arange(MEMORY))
-    memory = Memory(base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1]))
+    shared = [*boxes[0, 3:6], *np.zeros(PRIOR_SIZE - 15)]
+    step = np.random.default_rng(3).normal(size=PRIOR_SIZE)
+    information = np.diag(1.0 + np.arange(PRIOR_SIZE))
+    prior = MarginalisationPrior(
+        base, np.r_[pose.ravel(), shared], step, information, np.array([4, 2, 1, 1])
+    )
     start = boxes[:-1] + 0.01 * np.eye(9)[8]
-    return window._replace(fresh=1, start=start, memory=memory)
+    return window._replace(num_new=1, start=start, prior=prior)
 
 
-def turned(window):
-    """Return `window` with all its input boxes turned around."""
+def flipped(window):
+    """Return `window` with the heading signs of all input boxes changed."""
     boxes = [o.box + np.pi * np.eye(9)[8] for o in window.observations]
     pairs = zip(window.observations, boxes, strict=True)
     return window._replace(observations=[o._replace(box=box) for o, box in pairs])
 
 
-def test_stack_pads():
+def test_windows_are_padded():
     lengths = [10, 6, 8, 3]
     many = windows(lengths)
-    problem, base = stack(many, CONFIG)
+    problem, base = stack_windows(many, CONFIG)
     assert problem.valid.sum(1).tolist() == lengths
     np.testing.assert_allclose(problem.boxes[:, 0, :3], 0)
     assert (problem.times.diff(dim=1) > 0).all()
@@ -57,11 +65,11 @@ def test_stack_pads():
             np.testing.assert_array_equal(problem.points[b, i][mask], observation.points)
             np.testing.assert_array_equal(problem.origins[b, i], observation.origin)
         assert not problem.mask[b, n:].any()
-    assert problem.of('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
+    assert problem.of_class('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
 
 
 def seconds(boxes):
-    """Return the times of `boxes` (1, N, 9), ten in a second."""
+    """Return the times of `boxes` (1, N, 9) at 10 Hz."""
     return 0.1 * np.arange(boxes.shape[1])[None]
 
 
@@ -76,31 +84,30 @@ def seconds(boxes):
         ([2.0], [2.0]),
     ],
 )
-def test_one_heading(yaw, known):
-    # Up to whole turns; steps are small whatever the input.
-    # What is padded, here by half turns, has no say.
+def test_flips_of_a_minority_are_corrected(yaw, known):
+    # Equal up to whole turns; steps are small for any input. Padding, here flipped, is ignored.
     boxes = np.zeros((1, len(yaw) + 9, 9))
     boxes[0, :, YAW] = yaw + [yaw[-1] + np.pi] * 9
     times, valid = seconds(boxes), np.arange(boxes.shape[1])[None] < len(yaw)
-    (found,) = one_heading(boxes, times, valid, np.array([np.nan]))[:, : len(yaw)]
+    (found,) = resolve_headings(boxes, times, valid, np.array([np.nan]))[:, : len(yaw)]
     np.testing.assert_allclose(np.cos(found - known), 1, atol=1e-12)
     assert (np.abs(np.diff(found)) < np.pi / 2).all()
 
 
-def test_a_quarter_turn_takes_no_other_box_along():
+def test_a_quarter_turn_does_not_affect_other_boxes():
     yaw = np.zeros(60)
     yaw[29:32] = -0.05, 1.54, -0.05  # nearer to -pi / 2 than to pi / 2, seen from the next one
     boxes = yaw[None, :, None] * np.eye(9)[YAW]
-    (found,) = one_heading(boxes, seconds(boxes), np.ones((1, 60), bool), np.array([np.nan]))
+    (found,) = resolve_headings(boxes, seconds(boxes), np.ones((1, 60), bool), np.array([np.nan]))
     np.testing.assert_allclose(np.delete(found, 30), np.delete(yaw, 30), atol=1e-12)
 
 
-def test_a_half_turn_is_one_about_the_axis_of_the_box():
-    # Turned around, what rolls to its left and noses up rolls to its right and noses down.
+def test_a_flip_changes_the_signs_of_roll_and_pitch():
+    # With the opposite heading, roll to the left is roll to the right and nose up is nose down.
     truth = drive(9, turn=0) + np.array([0, 0, 0, 0, 0, 0, 0.1, -0.2, 0])
     track = track_of(truth, np.random.default_rng(0), position=0.0, heading=0.0)
     track.boxes[::3, ROLL:] = track.boxes[::3, ROLL:] * [-1, -1, 1] + [0, 0, np.pi]
-    problem, _ = stack([window_of(track, CONFIG)], CONFIG)
+    problem, _ = stack_windows([window_of(track, CONFIG)], CONFIG)
     np.testing.assert_allclose(problem.boxes[0, :, ROLL:YAW], truth[:, ROLL:YAW], atol=1e-9)
 
 
@@ -116,99 +123,103 @@ def test_a_half_turn_is_one_about_the_axis_of_the_box():
         (8, np.pi, np.pi),
     ],
 )
-def test_a_known_heading_is_kept_until_three_quarters_say_otherwise(
+def test_a_known_heading_sign_is_kept_unless_three_quarters_contradict(
     turns, is_first_turned, contrary, unknown, known
 ):
-    # Eight boxes that turn slowly from 0, of which `contrary` are turned around, the first of
-    # them or not; what has left headed to 0, give or take whole turns.
+    # Eight boxes that turn slowly from 0, of which `contrary` are flipped, the first or the last
+    # ones. The heading known from before is 0 plus whole turns.
     steps = 0.01 * np.arange(8)
     is_contrary = np.arange(8) < contrary if is_first_turned else np.arange(8) >= 8 - contrary
     boxes, valid = np.zeros((1, 8, 9)), np.ones((1, 8), dtype=bool)
     boxes[0, :, YAW] = steps + np.pi * is_contrary
     for heading, base in ((np.nan, unknown), (0.02 + turns, known)):
-        (found,) = one_heading(boxes, seconds(boxes), valid, np.array([heading]))
+        (found,) = resolve_headings(boxes, seconds(boxes), valid, np.array([heading]))
         np.testing.assert_allclose(np.cos(found - steps - base), 1, atol=1e-12)
         assert (np.abs(np.diff(found)) < np.pi / 2).all()
 
 
 @pytest.mark.parametrize('heading', [np.nan, 0.3, 0.3 + np.pi])
 @pytest.mark.parametrize('speed', [7.0, 5.0, 0.0, -5.0, -7.0])
-def test_what_is_faster_than_anything_reverses_moves_forward(speed, heading):
-    # Ten boxes that all head to 0.3 and move along that at `speed`; the last is 1 km off, as
-    # after an identity switch, and one is missing. Slower ones keep what the majority says.
+def test_fast_objects_move_forward(speed, heading):
+    # Ten boxes with heading 0.3 that move along it at `speed`; the last is 1 km off, as after an
+    # id switch, and one is missing. Slower objects may reverse: the majority decides.
     times = np.delete(0.1 * np.arange(11), 4)[None]
     boxes, valid = np.zeros((1, 10, 9)), np.ones((1, 10), dtype=bool)
     boxes[..., YAW] = 0.3
     boxes[..., :2] = speed * times[..., None] * [np.cos(0.3), np.sin(0.3)]
     boxes[0, -1, :2] -= 1000.0
-    found = one_heading(boxes, times, valid, np.array([heading]))
+    found = resolve_headings(boxes, times, valid, np.array([heading]))
     np.testing.assert_allclose(np.cos(found - 0.3), -1 if speed == -7.0 else 1)
 
 
-def test_what_has_left_is_stacked():
+def test_priors_are_stacked():
     one, other = windows([5, 4])
-    problem, base = stack([remembering(one), other], CONFIG)
-    memory = remembering(one).memory
-    np.testing.assert_array_equal(base, [memory.base, given(other)[0, :3]])
+    problem, base = stack_windows([with_prior(one), other], CONFIG)
+    prior = with_prior(one).prior
+    np.testing.assert_array_equal(base, [prior.base, given(other)[0, :3]])
     np.testing.assert_allclose(problem.boxes[:, 0, :3], [[1, 0, 0], [0, 0, 0]])
-    np.testing.assert_allclose(problem.recalled[0], memory.state + memory.step, atol=1e-12)
-    np.testing.assert_allclose(problem.information[0], FADING * memory.information)
-    np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1], [0, 0, 0, 0]])
-    np.testing.assert_array_equal(problem.recalled[1], 0)
-    np.testing.assert_array_equal(problem.information[1], 0)
-    assert memory.information[3, 3] == 4  # nor is it written to
-    assert remembering(one).fresh_part().memory is None
+    np.testing.assert_allclose(problem.prior_mean[0], prior.state + prior.step, atol=1e-12)
+    np.testing.assert_allclose(problem.prior_information[0], PRIOR_DECAY * prior.information)
+    np.testing.assert_array_equal(problem.marginalised_extents, [[4, 2, 1, 1], [0, 0, 0, 0]])
+    np.testing.assert_array_equal(problem.prior_mean[1], 0)
+    np.testing.assert_array_equal(problem.prior_information[1], 0)
+    assert prior.information[3, 3] == 4  # the input is not changed
+    assert with_prior(one).learning_part().prior is None
 
 
 @pytest.mark.parametrize('turns', [2 * np.pi, -2 * np.pi, 6 * np.pi])
-def test_whole_turns_are_no_difference(turns):
-    # What is remembered comes to where the search starts, however often it has turned since.
+def test_whole_turns_between_prior_and_start_are_removed(turns):
+    # The minimum of the prior is moved to the turn of the starting angles.
     (window,) = windows([5])
-    known, _ = stack([remembering(window)], CONFIG)
-    found, _ = stack([remembering(window, turns)], CONFIG)
+    known, _ = stack_windows([with_prior(window)], CONFIG)
+    found, _ = stack_windows([with_prior(window, turns)], CONFIG)
     for a, b in zip(found, known, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
 
 
-def test_a_window_turned_against_its_memory_drops_it():
-    # All boxes say otherwise: the form is of boxes that head elsewhere, and tells nothing now.
+def test_a_prior_of_the_opposite_heading_is_dropped():
+    # All boxes have the other heading sign: the prior does not hold for them.
     (window,) = windows([5])
-    for one in (turned(remembering(window)), remembering(window, np.pi)):
-        problem, _ = stack([one], CONFIG)
-        np.testing.assert_array_equal(problem.information, 0)
-        assert problem.recalled.isfinite().all()
-        np.testing.assert_array_equal(problem.seen, [[4, 2, 1, 1]])
-    kept, _ = stack([turned(remembering(window, np.pi))], CONFIG)
-    assert (kept.information[0].diagonal() > 0).all()
+    for one in (flipped(with_prior(window)), with_prior(window, np.pi)):
+        problem, _ = stack_windows([one], CONFIG)
+        np.testing.assert_array_equal(problem.prior_information, 0)
+        assert problem.prior_mean.isfinite().all()
+        np.testing.assert_array_equal(problem.marginalised_extents, [[4, 2, 1, 1]])
+    kept, _ = stack_windows([flipped(with_prior(window, np.pi))], CONFIG)
+    assert (kept.prior_information[0].diagonal() > 0).all()
 
 
-def test_a_solved_window_starts_where_it_was():
+def test_a_solved_window_starts_from_its_estimates():
     # The first three of four boxes were solved before, 0.2 m off and a whole turn away.
     (window,) = windows([4])
     solved = given(window)[:3] + np.array([0.2, 0, 0, 0, 0, 0, 0, 0, -2 * np.pi])
-    window = window._replace(fresh=1, start=solved)
+    window = window._replace(num_new=1, start=solved)
     assert window.is_warm
-    problem, _ = stack([window], CONFIG)
+    problem, _ = stack_windows([window], CONFIG)
     known = np.zeros((4, 9))
     known[:3, 0] = 0.2
     np.testing.assert_allclose(problem.start[0] - problem.boxes[0], known, atol=1e-12)
-    # What was the newest when it was solved is learnt from now, as it was fitted.
-    fresh = window.fresh_part()
-    assert fresh.observations == window.observations[2:3]
-    np.testing.assert_array_equal(fresh.start, solved[2:])
-    first = window._replace(fresh=4, start=solved[:0]).fresh_part()
+    # The newest of the window before is learnt from now, at its estimate.
+    learning = window.learning_part()
+    assert learning.observations == window.observations[2:3]
+    np.testing.assert_array_equal(learning.start, solved[2:])
+    first = window._replace(num_new=4, start=solved[:0]).learning_part()
     assert first.observations == window.observations[:3]
-    np.testing.assert_array_equal(stack([first], CONFIG)[0].start, stack([first], CONFIG)[0].boxes)
+    np.testing.assert_array_equal(
+        stack_windows([first], CONFIG)[0].start, stack_windows([first], CONFIG)[0].boxes
+    )
 
 
-def test_batches_hold_every_window_that_is_long_enough_once():
+def test_groups_contain_each_window_that_is_long_enough_once():
     many = windows([10, 2, 6, 3, 1, 6])
-    rows = batches(many, CONFIG)
+    rows = group_windows(many, CONFIG)
     assert sorted(i for group in rows for i in group) == [0, 2, 3, 5]
 
 
-def test_batches_are_bounded_and_equally_warm(monkeypatch):
+def test_groups_are_bounded_and_either_warm_or_cold(monkeypatch):
     many = windows([5, 6, 7, 8])
-    many[1] = many[1]._replace(fresh=1, start=given(many[1])[:5])
-    monkeypatch.setattr('boxreg_ros.core.window.BATCH_VALUES', 2 * 8 * CONFIG.sampling.points * 18)
-    assert batches(many, CONFIG) == [[0, 2], [3], [1]]
+    many[1] = many[1]._replace(num_new=1, start=given(many[1])[:5])
+    monkeypatch.setattr(
+        'boxreg_ros.core.window.MAX_BATCH_VALUES', 2 * 8 * CONFIG.sampling.points * 18
+    )
+    assert group_windows(many, CONFIG) == [[0, 2], [3], [1]]

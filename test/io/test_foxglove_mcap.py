@@ -160,9 +160,7 @@ def test_what_is_not_refined_survives_in_its_own_encoding(tmp_path, encoding):
     with path.open('rb') as file:
         ((_, _, raw),) = make_reader(file).iter_messages('/boxes')
     with Recording([path]) as recording:
-        (record,) = (
-            r for r in recording.records(TransformTree()) if r.connection.topic == '/boxes'
-        )
+        (record,) = recording._records(TransformTree(), {'/boxes'})
         message = recording._message(record)
         adapter = adapter_for(SCENE)
         boxes = adapter.from_msg(message)
@@ -216,10 +214,9 @@ def test_clouds_with_a_pose_of_their_own_are_refused(tmp_path):
 def test_bytes_that_are_no_message_are_told(tmp_path):
     drive = Drive(sweeps=1, boxes=SCENE)
     path = write(tmp_path / 'a.mcap', drive, {'/boxes': 'json', '/points': 'cdr', '/tf': 'cdr'})
-    with Recording([path]) as recording:
-        records = {r.connection.topic: r for r in recording.records(TransformTree())}
-        with pytest.raises(UnsupportedMessage, match="'/boxes'"):
-            recording.decode(records['/boxes']._replace(data=b'{"entities": ['))
+    match = r"'/boxes'.*not JSON"
+    with Recording([path]) as recording, pytest.raises(UnsupportedMessage, match=match):
+        recording.box_message(b'{"entities": [')
 
 
 @pytest.mark.parametrize('encoding', ['protobuf', 'json'])
@@ -231,11 +228,7 @@ def test_overlay_has_refined_boxes_in_the_same_encoding(tmp_path, encoding):
     overlay = tmp_path / 'out' / 'overlay.mcap'
     table = BoxTable.read(tmp_path / 'out' / 'boxes.csv')
     with Recording([overlay], boxes='/boxes_refined') as recording:
-        found = [
-            recording.decode(record)
-            for record in recording.records(TransformTree())
-            if record.connection.topic == '/boxes_refined'
-        ]
+        found = [item.content for item in recording.items(TransformTree(), with_clouds=False)]
     assert [boxes.stamp_ns for boxes in found] == drive.stamps
     for k, boxes in enumerate(found):  # the drive goes along x, 0.5 m per sweep, 2 m above
         expected = table.boxes[table.stamps_ns == boxes.stamp_ns] - [0.5 * k, 0, 2, *[0] * 6]

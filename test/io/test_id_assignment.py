@@ -1,12 +1,7 @@
 """Ids by association: the same for the same object, whatever comes between."""
 
-from dataclasses import replace
-
-from boxreg_ros.config import Config
 from boxreg_ros.io.id_assignment import Tracker
-from boxreg_ros.io.session import Intake
 from boxreg_ros.structures import BoxArray
-from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 from paths import SHARED
 import pytest
@@ -100,42 +95,6 @@ def test_invalid_boxes_get_no_id_and_leave_the_others_alone():
     tracker = Tracker(max_gap=1.0)
     boxes = array_of(START, (0, 0, CAR), (np.nan, 0, CAR), (9, 0, (0, 1, 1)), (20, 0, CAR))
     assert tracker.identify(boxes).track_ids == ('1', '', '', '2')
-
-
-def test_intake_gives_ids_where_they_are_wanted_and_says_so():
-    boxes = array_of(START, (0, 0, CAR))
-    intake = Intake(STANDARD, Config())
-    assert intake.take(boxes) is boxes
-    assert intake.facts == {'ids': 'of the input'}
-    intake = Intake(Convention(associate=True), Config())
-    assert intake.take(boxes).track_ids == ('1',)
-    assert intake.facts == {'ids': 'by association', 'associated_tracks': 1}
-
-
-def test_intake_begins_anew_with_new_ids_and_takes_another_gap():
-    intake = Intake(Convention(associate=True), Config(max_gap=0.5))
-    first, later = array_of(START, (0, 0, CAR)), array_of(START + 8 * 10**8, (0, 0, CAR))
-    assert intake.take(first).track_ids == ('1',)
-    intake.change(Config(max_gap=1.0))
-    assert intake.take(later).track_ids == ('1',)
-    intake.begin(Config(max_gap=0.5))
-    assert intake.take(first).track_ids == ('2',)
-    assert intake.take(later).track_ids == ('3',)
-
-
-def test_intake_tells_where_stamps_start_again():
-    intake = Intake(Convention(associate=True), Config())
-    ids, jumps = [], []
-    # A stray that is old is none; two in a row are a new beginning, and so is what follows it.
-    for seconds in (10.0, 10.1, 3.0, 10.2, 3.0, 3.1, 3.2):
-        boxes = array_of(START + round(seconds * SECOND), (5.0, 0.0, CAR))
-        jumps.append(intake.begins_anew(boxes))
-        ids.append(intake.take(boxes).track_ids[0])
-    assert jumps == [False] * 5 + [True, False]
-    assert ids[5] == ids[6] not in ids[:5]
-    # An array without boxes, stamp and frame is older than anything, and tells nothing.
-    nothing = replace(array_of(0), frame_id='')
-    assert not any(intake.begins_anew(nothing) for _ in range(3))
 
 
 def test_ids_of_a_real_drive():

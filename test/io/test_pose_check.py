@@ -1,7 +1,7 @@
 """What a pose and a size mean; worked out by hand, there and back."""
 
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.io.pose_check import ENOUGH, PoseCheck
+from boxreg_ros.io.pose_check import DECISIVE_BOXES, PoseCheck
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import adapter_for
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
@@ -195,7 +195,7 @@ def test_the_check_ends_and_takes_only_what_belongs_together():
         assert not check.finding
         check.add(few)
         check.add(Sweep(STAMP + k, 'map', points))
-    assert ENOUGH == 12 and check.finding
+    assert DECISIVE_BOXES == 12 and check.finding
     empty = np.full((2, 9), np.nan)
     check = PoseCheck(STANDARD, tolerance=0.02)
     for _ in range(5):

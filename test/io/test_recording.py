@@ -18,7 +18,9 @@ def read(paths, tree=None, fixed_frame=None, **options):
     tree = tree or TransformTree()
     with Recording(paths if isinstance(paths, list) else [paths], **options) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
-        items = [recording.decode(record) for record in recording.records(tree)]
+        items = [item.content for item in recording.items(tree)]
+        for error in recording.first_errors.values():
+            raise error
     sweeps = [item for item in items if isinstance(item, Sweep)]
     return sweeps, [item for item in items if isinstance(item, BoxArray)], fixed_frame
 
@@ -94,8 +96,8 @@ def test_transforms_are_read_ahead(tmp_path):
     with Recording([path]) as recording:
         recording.choose_fixed_frame(tree)
         found = {}
-        for record in recording.records(tree):
-            stamp = recording.decode(record).stamp_ns
+        for item in recording.items(tree):
+            stamp = item.content.stamp_ns
             found[stamp] = tree.lookup('odom', 'lidar', stamp)[0, 3]
     assert found == {START + k * SECOND // 10: 0.5 * k for k in range(8)}
 
@@ -111,10 +113,10 @@ def test_only_a_window_of_the_recording_is_held(tmp_path):
     tree = TransformTree()
     with Recording([path]) as recording:
         recording.choose_fixed_frame(tree)
-        for record in recording.records(tree):
-            assert tree.covers('odom', 'lidar', record.received_ns)
-            assert not tree.covers('odom', 'lidar', record.received_ns + 3 * SECOND)
-            assert not tree.covers('odom', 'lidar', record.received_ns - 40 * SECOND)
+        for item in recording.items(tree):
+            assert tree.covers('odom', 'lidar', item.received_ns)
+            assert not tree.covers('odom', 'lidar', item.received_ns + 3 * SECOND)
+            assert not tree.covers('odom', 'lidar', item.received_ns - 40 * SECOND)
 
 
 def test_what_comes_before_a_long_pause_has_its_transforms(tmp_path):
@@ -125,8 +127,8 @@ def test_what_comes_before_a_long_pause_has_its_transforms(tmp_path):
     tree, found = TransformTree(), []
     with Recording(paths) as recording:
         recording.choose_fixed_frame(tree)
-        for record in recording.records(tree):
-            found.append(recording.decode(record).stamp_ns)
+        for item in recording.items(tree):
+            found.append(item.content.stamp_ns)
             tree.lookup('odom', 'lidar', found[-1])
     assert sorted(set(found)) == drives[0].stamps + drives[1].stamps
 

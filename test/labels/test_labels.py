@@ -1,8 +1,11 @@
+"""``boxes.csv`` and OpenLABEL: values, order and what is left out."""
+
 import csv
+from importlib import import_module
 import json
 
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.labels import FORMATS, LabelFrame, module_of, Provenance, writer_for
+from boxreg_ros.labels import FORMATS, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.files import to_json
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
@@ -29,7 +32,7 @@ def refined(stamp_ns, tracks, boxes=None, frame_id='odom', status=None):
     )
 
 
-def written(name, folder, results):
+def write(name, folder, results):
     writer = writer_for(name, folder, Provenance(('drive.mcap',), 'cafe'))
     for result in results:
         writer.write(LabelFrame(result, 'odom', 'lidar'))
@@ -43,7 +46,7 @@ def rows_of(folder):
 
 
 def openlabel_of(folder):
-    """Return the content, checked against the standard's schema and rules."""
+    """Return the content, checked against the schema and the rules of the standard."""
     path = folder / 'openlabel' / 'labels.json'
     checker = pytest.importorskip('openlabel_checker', reason='openlabel-checker not installed')
     report = checker.check_file(str(path))
@@ -55,7 +58,7 @@ def openlabel_of(folder):
 
 
 def test_columns_and_golden_values(tmp_path):
-    written('csv', tmp_path, [refined(1_700_000_000_123_456_789, ['a,"b'], status=('kept',))])
+    write('csv', tmp_path, [refined(1_700_000_000_123_456_789, ['a,"b'], status=('kept',))])
     assert (tmp_path / 'boxes.csv').read_text().splitlines()[0] == COLUMNS
     (row,) = rows_of(tmp_path)
     assert row['stamp_ns'] == '1700000000123456789'
@@ -70,14 +73,14 @@ def test_columns_and_golden_values(tmp_path):
 def test_numbers_keep_their_full_precision(tmp_path):
     box = np.array(TILTED)
     box[0] = 1 / 3 + 5e5
-    written('csv', tmp_path, [refined(1, ['a'], [box])])
+    write('csv', tmp_path, [refined(1, ['a'], [box])])
     assert float(rows_of(tmp_path)[0]['x']) == box[0]
 
 
-def test_what_is_not_finite_is_an_empty_cell(tmp_path):
+def test_values_that_are_not_finite_are_empty_cells(tmp_path):
     boxes = np.array([TILTED, TILTED])
     boxes[0, 1], boxes[1, 8] = np.nan, np.inf
-    written('csv', tmp_path, [refined(1, ['a', 'b'], boxes)])
+    write('csv', tmp_path, [refined(1, ['a', 'b'], boxes)])
     first, second = rows_of(tmp_path)
     assert (first['x'], first['y'], first['qw'] != '') == ('1.5', '', True)
     assert (second['x'], second['qx'], second['qy'], second['qz'], second['qw']) == (
@@ -85,14 +88,14 @@ def test_what_is_not_finite_is_an_empty_cell(tmp_path):
     )  # fmt: skip
 
 
-def test_rows_are_sorted_by_stamp_even_when_boxes_come_late(tmp_path):
+def test_rows_are_sorted_by_stamp_if_boxes_arrive_late(tmp_path):
     results = [refined(10, ['a', 'b']), refined(30, ['c']), refined(20, ['e', 'd'])]
-    written('csv', tmp_path, [*results, refined(10, ['f'])])
+    write('csv', tmp_path, [*results, refined(10, ['f'])])
     assert [row['track_id'] for row in rows_of(tmp_path)] == ['a', 'b', 'f', 'e', 'd', 'c']
 
 
-def test_no_boxes_leave_a_header(tmp_path):
-    written('csv', tmp_path, [refined(1, [])])
+def test_file_without_boxes_has_a_header(tmp_path):
+    write('csv', tmp_path, [refined(1, [])])
     assert (tmp_path / 'boxes.csv').read_text() == COLUMNS + '\n'
 
 
@@ -100,7 +103,7 @@ def test_no_boxes_leave_a_header(tmp_path):
 
 
 def test_openlabel_golden_values(tmp_path):
-    written('openlabel', tmp_path, [refined(1_500_000_000, ['x7'], status=('kept',))])
+    write('openlabel', tmp_path, [refined(1_500_000_000, ['x7'], status=('kept',))])
     label = openlabel_of(tmp_path)
     assert label['metadata']['schema_version'] == '1.0.0'
     frame = label['frames']['0']
@@ -116,9 +119,9 @@ def test_openlabel_golden_values(tmp_path):
     assert list(label['coordinate_systems']) == ['odom']
 
 
-def test_openlabel_intervals_follow_the_tracks(tmp_path):
-    seen = [['a', 'b'], ['a'], ['b', 'a'], [], ['b']]
-    written('openlabel', tmp_path, [refined(k, names) for k, names in enumerate(seen)])
+def test_openlabel_intervals_are_those_of_the_tracks(tmp_path):
+    tracks = [['a', 'b'], ['a'], ['b', 'a'], [], ['b']]
+    write('openlabel', tmp_path, [refined(k, names) for k, names in enumerate(tracks)])
     label = openlabel_of(tmp_path)
     assert label['frame_intervals'] == [{'frame_start': 0, 'frame_end': 4}]
     assert list(label['frames']) == ['0', '1', '2', '3', '4']
@@ -132,48 +135,51 @@ def test_openlabel_intervals_follow_the_tracks(tmp_path):
         assert (pointer['type'], pointer['frame_intervals']) == ('cuboid', item['frame_intervals'])
 
 
-def test_openlabel_boxes_without_identity_are_objects_of_their_own(tmp_path):
-    written('openlabel', tmp_path, [refined(1, ['', 'a', '', 'a']), refined(2, ['', 'a'])])
+def test_openlabel_boxes_without_track_id_are_separate_objects(tmp_path):
+    write('openlabel', tmp_path, [refined(1, ['', 'a', '', 'a']), refined(2, ['', 'a'])])
     label = openlabel_of(tmp_path)
     assert [item['name'] for item in label['objects'].values()] == ['', 'a', '', 'a', '']
     assert sorted(label['frames']['1']['objects']) == ['1', '4']
 
 
-def test_openlabel_leaves_invalid_boxes_out(tmp_path):
+def test_openlabel_omits_invalid_boxes(tmp_path):
     boxes = np.array([TILTED, TILTED, TILTED, TILTED])
     boxes[0, 0], boxes[1, 8], boxes[2, 4] = np.nan, np.inf, 0.0
-    written('openlabel', tmp_path, [refined(1, ['a', 'b', 'c', 'd'], boxes)])
+    write('openlabel', tmp_path, [refined(1, ['a', 'b', 'c', 'd'], boxes)])
     assert [item['name'] for item in openlabel_of(tmp_path)['objects'].values()] == ['d']
 
 
-def test_openlabel_of_nothing(tmp_path):
-    written('openlabel', tmp_path, [])
+def test_openlabel_without_frames(tmp_path):
+    write('openlabel', tmp_path, [])
     label = openlabel_of(tmp_path)
     assert (label['frames'], label['objects']) == ({}, {})
 
 
-def test_openlabel_names_every_frame_of_reference(tmp_path):
+def test_openlabel_lists_all_coordinate_systems(tmp_path):
     results = [refined(1, ['a']), refined(2, ['a'], frame_id='lidar')]
-    written('openlabel', tmp_path, results)
+    write('openlabel', tmp_path, results)
     assert sorted(openlabel_of(tmp_path)['coordinate_systems']) == ['lidar', 'odom']
 
 
-def test_formats():
+def test_formats_state_all_conventions():
     with pytest.raises(ConfigError, match=r"'kiti': expected one of csv, "):
         writer_for('kiti', None, Provenance())
     for name in FORMATS:
-        facts = module_of(name).FORMAT
-        assert facts.name == name
-        stated = set(facts.__slots__) - {'packages', 'options'}  # of which there may be none
-        assert all(getattr(facts, field) for field in stated)
+        conventions = import_module(FORMATS[name]).FORMAT
+        assert conventions.name == name
+        required = set(conventions.__slots__) - {'packages', 'options'}
+        assert all(getattr(conventions, field) for field in required)
 
 
-def test_json_is_read_by_every_parser():
+def test_json_is_standard_json():
     value = {1: [np.nan, np.float64('inf'), 1e-9, np.float64(0.1)], 'é': None}
     text = to_json(value)
     assert 'é' in text  # not escaped
 
-    def refuse(constant):
+    def refuse_constant(constant):
         raise AssertionError(f'{constant} is not JSON')
 
-    assert json.loads(text, parse_constant=refuse) == {'1': [None, None, 1e-9, 0.1], 'é': None}
+    assert json.loads(text, parse_constant=refuse_constant) == {
+        '1': [None, None, 1e-9, 0.1],
+        'é': None,
+    }

@@ -1,4 +1,4 @@
-"""Labels for SUSTechPOINTS, Datumaro and CVAT, Supervisely and Xtreme1, and clouds beside them."""
+"""Labels for SUSTechPOINTS, Datumaro and CVAT, Supervisely and Xtreme1, and their clouds."""
 
 import json
 import shutil
@@ -15,21 +15,20 @@ TOOLS = ('sustechpoints', 'datumaro', 'supervisely', 'xtreme1')
 STAMP = 1_700_000_000_100_000_000
 NAME = '1700000000100000000'
 
-# A tilted box, off the origin, in a fixed frame that the sensor stands in at (10, 20, 1.5),
-# turned by a quarter turn to the left.
+# A tilted box in the fixed frame. The sensor is at (10, 20, 1.5) with a yaw of 90 degrees.
 TILTED = [1.5, -2.25, 0.1, 4.5, 1.8, 1.6, 0.1, -0.2, 2.5]
 T_ODOM_LIDAR = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 1.5], [0, 0, 0, 1]])
-# From the sensor, the centre less (10, 20, 1.5) is (-8.5, -22.25, -1.4), turned back by a quarter
-# turn, (x, y) to (y, -x):
+# The centre minus (10, 20, 1.5) is (-8.5, -22.25, -1.4);
+# rotated by -90 degrees, (x, y) to (y, -x):
 CENTER = [-22.25, 8.5, -1.4]
-# The turn about z leaves roll and pitch, and takes pi/2 from yaw: R = Rz(0.929204) Ry(-0.2)
-# Rx(0.1), of which by multiplying out
+# The rotation about z keeps roll and pitch, and subtracts pi/2 from yaw: R = Rz(0.929204) Ry(-0.2)
+# Rx(0.1), with the elements
 #   R[0, 0] = cos y cos p                       = 0.598472 * 0.980067    =  0.586543
 #   R[0, 1] = cos y sin p sin r - sin y cos r   = -0.011870 - 0.797141   = -0.809012
 #   R[0, 2] = cos y sin p cos r + sin y sin r   = -0.118304 + 0.079981   = -0.038323
 #   R[1, 2] = sin y sin p cos r - cos y sin r   = -0.158367 - 0.059748   = -0.218115
 #   R[2, 2] = cos p cos r                       = 0.980067 * 0.995004    =  0.975170
-# and of R = Rx(a) Ry(b) Rz(c): sin b = R[0, 2], tan a = -R[1, 2] / R[2, 2],
+# and for R = Rx(a) Ry(b) Rz(c): sin b = R[0, 2], tan a = -R[1, 2] / R[2, 2],
 # tan c = -R[0, 1] / R[0, 0].
 ANGLES = [np.arctan2(0.218115, 0.975170), np.arcsin(-0.038323), np.arctan2(0.809012, 0.586543)]
 EXTENT = [4.5, 1.8, 1.6]
@@ -38,7 +37,7 @@ EXTENT = [4.5, 1.8, 1.6]
 def refined(stamp_ns, tracks, boxes=None, status=None, classes=None, frame_id='odom'):
     n = len(tracks)
     values = np.array([TILTED] * n if boxes is None else boxes, dtype=float).reshape(n, 9)
-    # A full symmetric matrix, all of its numbers different.
+    # A full symmetric matrix whose numbers are all different.
     covariance = np.diag(np.arange(1.0, 7.0))
     covariance[np.triu_indices(6, 1)] = np.arange(15) * 0.01
     covariance = np.maximum(covariance, covariance.T)
@@ -79,7 +78,7 @@ CLOUD = Sweep(STAMP, 'lidar', np.array([[1.5, -2.0, 0.25], [3.0, 4.0, -1.0]], np
 BRIGHT = np.array([0.5, 200.0])
 
 
-# Golden values --------------------------------------------------------------------------------
+# Golden values -----------------------------------------------------------------------------------
 
 
 def test_sustechpoints_golden_values(tmp_path):
@@ -113,21 +112,21 @@ def test_xtreme1_golden_values(tmp_path):
 def test_datumaro_golden_values_in_datumaro(tmp_path, swapped):
     frames = [frame(STAMP, ['x7'], sweep=CLOUD)]
     write('datumaro', tmp_path, frames, with_points=True, swap_axes=swapped)
-    seen = consumer('datumaro', tmp_path / 'datumaro')
-    (item,) = seen['found']
-    # Datumaro itself rounds to two digits.
+    project = consumer('datumaro', tmp_path / 'datumaro')
+    (item,) = project['cuboids']
+    # Datumaro rounds to two digits.
     assert item['position'] == pytest.approx(CENTER, abs=0.0051)
     assert item['rotation'] == pytest.approx(ANGLES, abs=0.0051)
     assert item['scale'] == (EXTENT[::-1] if swapped else EXTENT)
     assert (item['item'], item['frame'], item['label']) == (NAME, 0, 'car')
-    assert item['bytes'] > 24  # two points of three numbers, behind their header
+    assert item['bytes'] > 24  # a header and two points of three float32
     attributes = item['attributes']
     assert (attributes['track'], attributes['status']) == ('x7', 'refined')
     assert attributes['track_id'] == 10**6
-    assert seen['infos']['config_hash'] == 'cafe'
-    (tracklet,) = seen['tracklets']
+    assert project['infos']['config_hash'] == 'cafe'
+    (tracklet,) = project['tracklets']
     length, width, height = EXTENT
-    if swapped:  # what the option is for: KITTI's own meaning of the three
+    if swapped:  # the purpose of the option: h, w and l as KITTI defines them
         assert tracklet == {'h': height, 'w': width, 'l': length}
     else:
         assert tracklet == {'h': length, 'w': width, 'l': height}
@@ -139,11 +138,12 @@ def test_supervisely_golden_values_in_supervisely(tmp_path):
         for k, (n, status) in enumerate([(2, 'refined'), (1, 'refined'), (2, 'kept')])
     ]
     write('supervisely', tmp_path, frames, with_points=True)
-    seen = consumer('supervisely', tmp_path / 'supervisely')
-    assert (seen['type'], seen['frames'], len(seen['items'])) == ('point_cloud_episodes', 3, 3)
-    assert json.loads(seen['description'])['config_hash'] == 'cafe'
-    assert [figure['frame'] for figure in seen['figures']] == [0, 0, 1, 2, 2]
-    figure = seen['figures'][0]
+    project = consumer('supervisely', tmp_path / 'supervisely')
+    assert (project['type'], project['frames']) == ('point_cloud_episodes', 3)
+    assert len(project['items']) == 3
+    assert json.loads(project['description'])['config_hash'] == 'cafe'
+    assert [figure['frame'] for figure in project['figures']] == [0, 0, 1, 2, 2]
+    figure = project['figures'][0]
     assert (figure['cloud'], figure['class']) == (f'{NAME}.pcd', 'car')
     assert figure['geometry']['position'] == vector(CENTER)
     assert figure['geometry']['rotation'] == vector(ANGLES)
@@ -151,19 +151,19 @@ def test_supervisely_golden_values_in_supervisely(tmp_path):
     assert figure['tags'] == [
         ['track_id', 'x7', None], ['status', 'refined', [0, 1]], ['status', 'kept', [2, 2]],
     ]  # fmt: skip
-    assert seen['figures'][1]['tags'] == [
+    assert project['figures'][1]['tags'] == [
         ['track_id', 'y', None], ['status', 'kept', [0, 0]], ['status', 'kept', [2, 2]],
     ]  # fmt: skip
 
 
-# What the tools without a library ask for ------------------------------------------------------
+# Requirements of tools without a library ---------------------------------------------------------
 
 
 def test_sustechpoints_scene_is_complete(tmp_path):
     frames = [frame(STAMP, ['a']), frame(STAMP + 1, []), frame(STAMP + 1, ['a'])]
     write('sustechpoints', tmp_path, frames, with_points=True)
     scene = tmp_path / 'sustechpoints'
-    # Its server lists lidar/ as the frames, sorted, and pairs labels by name.
+    # The server lists the frames from lidar/, sorted, and finds labels by name.
     names = sorted(path.stem for path in (scene / 'lidar').iterdir())
     assert names == [NAME, '1700000000100000001', '1700000000100000001_1']
     assert sorted(path.stem for path in (scene / 'label').iterdir()) == names
@@ -174,34 +174,35 @@ def test_xtreme1_upload_is_complete(tmp_path):
     frames = [frame(STAMP, ['a', '', '']), frame(STAMP + 1, [])]
     write('xtreme1', tmp_path, frames, with_points=True)
     scene = tmp_path / 'xtreme1' / 'scene_1'
-    # Data are the files in folders lidar_point_cloud_<digit>; a result has a name of theirs, and
-    # at least one object, each with a type and a contour; the scene's name begins with 'scene'.
+    # Data are the files in folders lidar_point_cloud_<digit>. A result has the name of a file and
+    # at least one object, each with a type and a contour. The name of a scene begins with 'scene'.
     clouds = {path.stem for path in (scene / 'lidar_point_cloud_0').iterdir()}
     results = {path.stem for path in (scene / 'result').iterdir()}
     assert len(clouds) == 2
     assert results == {NAME}
     objects = content(scene / 'result' / f'{NAME}.json')['objects']
     assert all(item['type'] == '3D_BOX' and item['contour'] for item in objects)
-    assert len({item['trackId'] for item in objects}) == 3  # nameless boxes are not one object
+    assert len({item['trackId'] for item in objects}) == 3  # boxes without track id are not merged
 
 
-# Round trips ----------------------------------------------------------------------------------
+# Round trips -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('name', TOOLS)
 @pytest.mark.parametrize('with_points', [False, True])
-def test_read_back_as_it_was(tmp_path, name, with_points):
+def test_round_trip(tmp_path, name, with_points):
     boxes = [TILTED, [100.0, 50, 2, 12, 2.5, 3.5, 0, 0, -3], [0, 0, 0, 1, 1, 1, -0.3, 0.4, 1]]
-    given = [
+    frames = [
         frame(STAMP, ['7', 'b', ''], boxes=boxes, status=('refined', 'kept', 'interpolated')),
         frame(STAMP + 10**8, []),
         frame(STAMP + 2 * 10**8, ['b'], classes=('truck',)),
     ]
-    write(name, tmp_path, given, with_points=with_points)
-    back = list(frames_of(name, tmp_path / name))
-    assert len(back) == 3
-    for before, after in zip(given, back, strict=True):
-        one, two = before.refined, after.refined
+    write(name, tmp_path, frames, with_points=with_points)
+    read = list(frames_of(name, tmp_path / name))
+    assert len(read) == 3
+    for before, after in zip(frames, read, strict=True):
+        one = before.refined
+        two = after.refined
         assert two.boxes.stamp_ns == one.boxes.stamp_ns
         assert (after.fixed_frame, after.sensor_frame) == ('odom', 'lidar')
         assert two.boxes.frame_id == 'odom'
@@ -215,14 +216,14 @@ def test_read_back_as_it_was(tmp_path, name, with_points):
         np.testing.assert_array_equal(two.covariances, one.covariances)
 
 
-def test_swapped_axes_are_swapped_back(tmp_path):
+def test_swapped_axes_round_trip(tmp_path):
     write('datumaro', tmp_path, [frame(STAMP, ['a'])], swap_axes=True)
     (back,) = frames_of('datumaro', tmp_path / 'datumaro')
     np.testing.assert_allclose(back.refined.boxes.boxes, [TILTED], atol=1e-9)
 
 
 @pytest.mark.parametrize('name', TOOLS)
-def test_scores_that_are_no_numbers(tmp_path, name):
+def test_nan_score_round_trips(tmp_path, name):
     given = frame(STAMP, ['a'])
     given.refined.boxes.scores[0] = np.nan
     write(name, tmp_path, [given])
@@ -230,7 +231,7 @@ def test_scores_that_are_no_numbers(tmp_path, name):
     assert np.isnan(back.refined.boxes.scores[0])
 
 
-def test_a_scene_of_the_tool_itself(tmp_path):
+def test_scene_written_by_sustechpoints(tmp_path):
     (tmp_path / 'label').mkdir()
     psr = {'position': {'x': 1, 'y': 2, 'z': 3}, 'scale': {'x': 4, 'y': 2, 'z': 1.5}}
     psr['rotation'] = {'x': 0, 'y': 0, 'z': 0.5}
@@ -253,7 +254,7 @@ def test_a_scene_of_the_tool_itself(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['supervisely', 'datumaro'])
-def test_frames_with_names_of_others_come_in_their_order(tmp_path, name):
+def test_frames_with_other_names_keep_their_order(tmp_path, name):
     # By name, frame_10 and frame_11 would come before frame_2.
     boxes = [[float(k), 0, 0, 4, 2, 1.5, 0, 0, 0] for k in range(12)]
     given = [frame(STAMP + k, ['a'], boxes=[boxes[k]], frame_id='lidar') for k in range(12)]
@@ -279,7 +280,7 @@ def test_frames_with_names_of_others_come_in_their_order(tmp_path, name):
         ('xtreme1', f'scene_1/result/{NAME}.json'),
     ],
 )
-def test_foreign_json_is_refused(tmp_path, name, file):
+def test_json_of_another_layout_is_refused(tmp_path, name, file):
     write(name, tmp_path, [frame(STAMP, ['a'])])
     (tmp_path / name / file).write_text('[{"a": 1}]')
     with pytest.raises(RecordingError, match='expected'):
@@ -290,7 +291,7 @@ def test_foreign_json_is_refused(tmp_path, name, file):
     ('name', 'part', 'word'),
     [('supervisely', 'episode', 'episode'), ('xtreme1', 'scene_1', 'scene')],
 )
-def test_of_several_parts_one_is_to_be_named(tmp_path, name, part, word):
+def test_several_scenes_or_episodes_are_refused(tmp_path, name, part, word):
     write(name, tmp_path, [frame(STAMP, ['a'])])
     project = tmp_path / name
     shutil.copytree(project / part, project / 'second')
@@ -298,7 +299,7 @@ def test_of_several_parts_one_is_to_be_named(tmp_path, name, part, word):
         list(frames_of(name, project))
     (found,) = frames_of(name, project / 'second')
     assert found.refined.boxes.track_ids == ('a',)
-    # Of another time: its own timeline is in its folder.
+    # A part with sidecar files of its own uses these.
     (project / 'second' / 'timestamps.txt').write_text(f'{STAMP + 7}\n')
     stamps = [next(frames_of(name, project / p)).refined.boxes.stamp_ns for p in (part, 'second')]
     assert stamps == [STAMP, STAMP + 7]
@@ -308,22 +309,22 @@ def test_of_several_parts_one_is_to_be_named(tmp_path, name, part, word):
         list(frames_of(name, project))
 
 
-# Clouds ---------------------------------------------------------------------------------------
+# Clouds ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('ending', ['.pcd', '.ply'])
 @pytest.mark.parametrize('intensities', [None, BRIGHT])
-def test_clouds_in_the_libraries_of_others(tmp_path, ending, intensities):
+def test_third_party_readers_read_the_clouds(tmp_path, ending, intensities):
     path = tmp_path / f'cloud{ending}'
     write_cloud(path, CLOUD.points, intensities)
-    seen = consumer('cloud', path)
+    cloud = consumer('cloud', path)
     rows = CLOUD.points.tolist()
     if intensities is not None:
         rows = [[*row, value] for row, value in zip(rows, intensities, strict=True)]
-    assert seen == {'fields': ['x', 'y', 'z', 'intensity'][: len(rows[0])], 'rows': rows}
+    assert cloud == {'fields': ['x', 'y', 'z', 'intensity'][: len(rows[0])], 'rows': rows}
 
 
-def test_bin_files_have_four_numbers_or_five(tmp_path):
+def test_bin_files_of_kitti_and_nuscenes(tmp_path):
     write_cloud(tmp_path / 'kitti.bin', CLOUD.points, BRIGHT)
     write_cloud(tmp_path / 'nuscenes.pcd.bin', CLOUD.points)
     kitti = np.fromfile(tmp_path / 'kitti.bin', '<f4').reshape(-1, 4)
@@ -332,17 +333,17 @@ def test_bin_files_have_four_numbers_or_five(tmp_path):
     np.testing.assert_array_equal(nuscenes, np.pad(CLOUD.points, ((0, 0), (0, 2))))
 
 
-def test_an_empty_cloud_is_a_file(tmp_path):
+def test_empty_cloud_is_written(tmp_path):
     write_cloud(tmp_path / 'cloud.pcd', np.zeros((0, 3)))
     assert consumer('cloud', tmp_path / 'cloud.pcd')['rows'] == []
 
 
-def test_other_clouds_are_refused(tmp_path):
+def test_unknown_cloud_suffix_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"'cloud.las': expected a name in .pcd, .ply"):
         write_cloud(tmp_path / 'cloud.las', CLOUD.points)
 
 
-def test_intensities_come_along_in_other_formats(tmp_path):
+def test_intensities_are_written_in_other_formats(tmp_path):
     feather = pytest.importorskip('pyarrow.feather')
     item = frame(STAMP, ['a'], sweep=CLOUD, intensities=np.array([0.5, 900.0]))
     write('tracklets', tmp_path, [item], with_points=True)
@@ -350,4 +351,4 @@ def test_intensities_come_along_in_other_formats(tmp_path):
     np.testing.assert_array_equal(np.fromfile(file, '<f4')[3::4], [0.5, 900.0])
     write('argoverse2', tmp_path, [item], with_points=True)
     (file,) = (tmp_path / 'argoverse2').rglob(f'lidar/{STAMP}.feather')
-    assert feather.read_table(file)['intensity'].to_pylist() == [0, 255]  # whole, in one byte
+    assert feather.read_table(file)['intensity'].to_pylist() == [0, 255]  # bytes

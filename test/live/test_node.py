@@ -1,6 +1,7 @@
-"""The real node, a process of its own, over DDS."""
+"""The real node over DDS, as a process of its own."""
 
 from contextlib import ExitStack
+from importlib.util import find_spec
 import signal
 import subprocess
 import sys
@@ -9,8 +10,7 @@ import time
 
 from boxreg_ros.config import Config, settings
 from boxreg_ros.io.markers import MarkerBoard, NAMESPACES
-from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.live.node import import_message
+from boxreg_ros.live.topics import import_message
 from boxreg_ros.offline.calibrate import calibrated, GAPS, Measured, write_settings
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -51,8 +51,8 @@ def values_of(diagnostics):
     return {item.key: item.value for item in newest}
 
 
-def test_odometry_alone_is_enough(graph, tmp_path):
-    """Type from the graph, a best-effort publisher of boxes, no tf2_msgs; markers, diagnostics."""
+def test_odometry_replaces_tf(graph, tmp_path):
+    """Type from the graph, best-effort boxes, no tf2_msgs installed; markers and diagnostics."""
     drive = Drive(sweeps=6, boxes='markers', motion='odometry')
     leaving = [item[2] for item in drive.items if item[0] == '/boxes'][4:]
     for message in leaving:
@@ -78,9 +78,9 @@ def test_odometry_alone_is_enough(graph, tmp_path):
     graph.wait(lambda: values_of(diagnostics).get('early_published') == '6', 'diagnostics')
     assert values_of(diagnostics)['fixed_frame'] == 'odom'
     assert int(values_of(diagnostics)['refined']) > 0
-    told = {message.status[0].message: message.status[0].level for message in diagnostics}
-    assert told['refining'] == DiagnosticStatus.OK
-    assert all(text == 'refining' or text.startswith('nothing received') for text in told), told
+    levels = {message.status[0].message: message.status[0].level for message in diagnostics}
+    assert levels.pop('refining') == DiagnosticStatus.OK
+    assert all(text.startswith('nothing received') for text in levels), levels
     assert ended_cleanly(node)
     assert "fixed frame is 'odom'" in node.output()
     assert node.output().count('tf2_msgs') >= 1
@@ -96,10 +96,10 @@ def test_odometry_alone_is_enough(graph, tmp_path):
     assert numbers.keys() == {'1', '2'}
     deleted = [{m.id for m in message.markers if m.action == 2} for message in shown[:6]]
     assert deleted == [set(), set(), set(), set(), {numbers['2']}, set()]
-    assert shown[-1].markers[0].action == 3  # all are removed when the node ends
+    assert shown[-1].markers[0].action == 3  # all are deleted when the node ends
 
 
-def test_transforms_may_come_late_and_bad_messages_do_no_harm(graph, tmp_path):
+def test_late_transforms_are_awaited_and_bad_messages_pass_through(graph, tmp_path):
     drive = Drive(sweeps=8)
     drive.replace(
         '/boxes', 3, lambda m: setattr(m.detections[0].bbox.center.position, 'x', np.nan)
@@ -116,14 +116,14 @@ def test_transforms_may_come_late_and_bad_messages_do_no_harm(graph, tmp_path):
     play(graph, [record for record in records if record.topic != '/tf'])
     for _ in range(20):
         graph.executor.spin_once(timeout_sec=0.02)
-    assert not early  # they wait
+    assert not early  # they wait for their transforms
     play(graph, moving)
     graph.wait(lambda: len(early) == 8, 'early boxes')
     graph.wait(lambda: values_of(diagnostics).get('unreadable') == '1', 'the unreadable cloud')
     assert ended_cleanly(node, signal.SIGTERM)
     assert 'unreadable' in node.output() and 'width' in node.output()
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
-    # Kept as it came, in place; the detector's NaN is not made worse nor better.
+    # The invalid box is returned unchanged in its place.
     assert [d.id for d in final[3].detections] == ['1', '2']
     assert np.isnan(final[3].detections[0].bbox.center.position.x)
     for message in final:
@@ -135,10 +135,9 @@ def test_transforms_may_come_late_and_bad_messages_do_no_harm(graph, tmp_path):
 
 
 @pytest.mark.parametrize('package', ['tf2_ros', 'none'])
-def test_transforms_come_by_tf2_ros_where_it_is_installed(graph, tmp_path, package):
-    """With it and without it: the same transforms, the same boxes."""
-    if package == 'tf2_ros':
-        pytest.importorskip('tf2_ros', reason='tf2_ros is not installed', exc_type=ImportError)
+def test_transforms_are_received_with_and_without_tf2_ros(graph, tmp_path, package):
+    if package == 'tf2_ros' and find_spec('tf2_ros') is None:
+        pytest.skip('tf2_ros is not installed')
     records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
     publishers_for(graph, records)
     early = graph.collect(DETECTIONS, '/refined_boxes')
@@ -153,10 +152,10 @@ def test_transforms_come_by_tf2_ros_where_it_is_installed(graph, tmp_path, packa
     assert (values['fixed_frame'], values.get('no_transform')) == ('odom', None)
     assert int(values['refined']) > 0
     assert ended_cleanly(node)
-    assert ('transforms come by tf2_ros' in node.output()) == (package == 'tf2_ros')
+    assert ('transforms are received by tf2_ros' in node.output()) == (package == 'tf2_ros')
 
 
-def test_without_motion_boxes_pass_through_until_told_otherwise(graph, tmp_path):
+def test_boxes_pass_through_without_a_fixed_frame(graph, tmp_path):
     drive = Drive(sweeps=4, boxes='vision', motion='none')
     path = drive.write(tmp_path / 'drive')
     records = records_of(path)
@@ -199,7 +198,7 @@ sys.exit(main())
 """
 
 
-def test_signals_in_quick_succession_end_it_cleanly_while_data_flow(graph, tmp_path):
+def test_two_signals_end_the_node_cleanly_under_load(graph, tmp_path):
     records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
     publishers_for(graph, records)
     node = graph.start(*RELIABLE, *QUICK, command=('-c', SLOW_EVENTS))
@@ -223,9 +222,9 @@ def test_signals_in_quick_succession_end_it_cleanly_while_data_flow(graph, tmp_p
         player.join()
 
 
-def test_of_several_types_the_one_that_can_be_read_is_taken(graph, tmp_path):
-    """BoundingBox3DArray, the first by name, has no ids; other types that come later are told."""
-    with ExitStack() as stack:  # one participant cannot have several
+def test_first_readable_type_of_several_is_chosen(graph, tmp_path):
+    """BoundingBox3DArray, first by name, has no ids; a later readable type is reported."""
+    with ExitStack() as stack:  # one participant cannot publish a topic with several types
 
         def publish(type_name):
             other = Graph(tmp_path, graph.domain)
@@ -243,16 +242,16 @@ def test_of_several_types_the_one_that_can_be_read_is_taken(graph, tmp_path):
     assert node.output().count('set boxes_type') == 1
 
 
-def test_boxes_of_another_type_than_before_are_told(graph):
+def test_boxes_of_another_type_are_reported(graph):
     graph.publisher(MARKERS, '/boxes')
     node = graph.start('-p', f'boxes_type:={DETECTIONS}')
-    graph.wait(lambda: 'start the node anew' in node.output(), 'a warning')
-    assert f'expected boxes of type {DETECTIONS}, got {MARKERS}' in node.output()
+    graph.wait(lambda: 'restart the node' in node.output(), 'an error')
+    assert f'expected messages of type {DETECTIONS}, got {MARKERS}' in node.output()
     assert ended_cleanly(node)
 
 
-def test_best_effort_boxes_are_heard_whenever_their_publisher_comes(graph, tmp_path):
-    """Which QoS fits is settled when a node subscribes, and then nobody publishes yet."""
+def test_best_effort_publisher_of_boxes_may_start_after_the_node(graph, tmp_path):
+    """With BEST_AVAILABLE the QoS is chosen on subscription, when nobody publishes yet."""
     records = records_of(Drive(sweeps=4).write(tmp_path / 'drive'))
     publishers_for(graph, [record for record in records if record.topic != '/boxes'])
     early = graph.collect(DETECTIONS, '/refined_boxes')
@@ -266,10 +265,10 @@ def test_best_effort_boxes_are_heard_whenever_their_publisher_comes(graph, tmp_p
     assert 'qos_incompatible' not in node.output()
 
 
-def test_what_waited_for_transforms_is_not_the_solvers_fault(graph, tmp_path):
-    # All clouds become ready at once, when the transforms come, and take longer to be solved than
-    # `backlog`; boxes come before the first cloud, by which the fixed frame is found.
-    drive, records, early, final = thirty_stamps(graph, tmp_path)
+def test_wait_for_transforms_does_not_count_as_backlog(graph, tmp_path):
+    # All clouds get their transforms at once and take longer to solve than `backlog`. Boxes
+    # arrive before the first cloud, which determines the fixed frame.
+    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
     options = ['transform_timeout:=60.0', 'queue:=100', 'backlog:=0.02']
     node = graph.start(*RELIABLE, *[part for text in options for part in ('-p', text)])
     graph.wait_until_connected()
@@ -282,20 +281,20 @@ def test_what_waited_for_transforms_is_not_the_solvers_fault(graph, tmp_path):
         graph.executor.spin_once(timeout_sec=0.02)
     assert not early
     play(graph, moving)
-    values = all_published(graph, early)
-    assert int(values['refined']) > 30  # those held back for nine more are not counted yet
+    values = wait_for_thirty_early_boxes(graph, early)
+    assert int(values['refined']) > 30  # boxes held for `lag` = 9 stamps are not counted yet
     assert not {'points_queue_full', 'boxes_queue_full', 'no_transform'} & values.keys()
     assert ended_cleanly(node)
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
 
 
-def test_markers_leave_with_an_array_without_boxes(graph, tmp_path):
-    """Markers carry the stamp: an empty array of them has none."""
+def test_empty_box_array_deletes_the_markers(graph, tmp_path):
+    """An empty MarkerArray has no stamp: stamps are in its markers."""
     records = records_of(Drive(sweeps=4, boxes='markers').write(tmp_path / 'drive'))
     publishers_for(graph, records)
     early = graph.collect(MARKERS, '/refined_boxes')
     shown = graph.collect(MARKERS, '/refined_markers')
-    node = graph.start(*RELIABLE, *QUICK, '-p', 'max_gap:=1000.0')  # else they leave after a while
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'max_gap:=1000.0')  # else silence deletes them
     graph.wait_until_connected()
     play(graph, records, early)
     graph.wait(lambda: len(shown) == 4, 'markers')
@@ -305,8 +304,8 @@ def test_markers_leave_with_an_array_without_boxes(graph, tmp_path):
     assert ended_cleanly(node)
 
 
-def thirty_stamps(graph, tmp_path):
-    """Return a drive of 30 stamps, its records, and what will come of early and final boxes."""
+def publish_thirty_stamps(graph, tmp_path):
+    """Return a drive of 30 stamps, its records, and lists that fill with early and final boxes."""
     drive = Drive(sweeps=30)
     records = records_of(drive.write(tmp_path / 'drive'))
     publishers_for(graph, records)
@@ -314,8 +313,8 @@ def thirty_stamps(graph, tmp_path):
     return drive, records, *found
 
 
-def all_published(graph, early):
-    """Wait until all 30 early boxes are there and counted; return the counters."""
+def wait_for_thirty_early_boxes(graph, early):
+    """Wait until all 30 early boxes have arrived and are counted; return the counters."""
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     graph.wait(lambda: len(early) == 30, 'early boxes')
     graph.wait(lambda: int(values_of(diagnostics).get('early_published', 0)) == 30, 'counters')
@@ -323,9 +322,9 @@ def all_published(graph, early):
 
 
 def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
-    # Ten times the backlog is 1 s. With so many updates of its multipliers a window of the paper's
-    # objective takes some 2 s: the fifth stamp is solved while those after it wait.
-    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    # Boxes wait ten times the backlog, 1 s. With 60 multiplier updates a window of the paper's
+    # objective takes about 2 s to solve, while the boxes after it wait.
+    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
     slow = ['objective:=paper', 'paper.multiplier_rounds:=60', 'paper.iterations:=10000']
     options = [part for text in (*slow, 'backlog:=0.1') for part in ('-p', text)]
     node = graph.start(*RELIABLE, *options)
@@ -333,7 +332,7 @@ def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
     first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[3])
     play(graph, records[:first], early)
     play(graph, records[first:])
-    passed = int(all_published(graph, early)['boxes_queue_full'])
+    passed = int(wait_for_thirty_early_boxes(graph, early)['boxes_queue_full'])
     assert 0 < passed < 30
     assert 'boxes_queue_full' in node.output()
     assert ended_cleanly(node)
@@ -341,20 +340,20 @@ def test_boxes_that_wait_too_long_pass_through(graph, tmp_path):
 
 
 def test_overload_drops_clouds_but_no_boxes(graph, tmp_path):
-    drive, records, early, final = thirty_stamps(graph, tmp_path)
+    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
     slow = ('-p', 'solver.rounds:=40', '-p', 'solver.iterations:=400')
     node = graph.start(*RELIABLE, *slow, '-p', 'backlog:=0.2')
     graph.wait_until_connected()
     play(graph, records)
-    assert int(all_published(graph, early)['points_queue_full']) > 5
+    assert int(wait_for_thirty_early_boxes(graph, early)['points_queue_full']) > 5
     assert 'points_queue_full' in node.output()
     assert ended_cleanly(node)
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
 
 
-def test_what_comes_while_the_process_is_held_up_is_taken(graph, tmp_path):
-    """More clouds at once than a sensor's usual queue holds, none of which is in the way."""
-    drive, records, early, final = thirty_stamps(graph, tmp_path)
+def test_messages_are_queued_while_the_process_is_suspended(graph, tmp_path):
+    """The queue in DDS holds more clouds than the usual depth of sensor data."""
+    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
     first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[14])
     node = graph.start(*RELIABLE, '-p', 'transform_timeout:=20', '-p', 'backlog:=60.0')
     graph.wait_until_connected()
@@ -363,15 +362,15 @@ def test_what_comes_while_the_process_is_held_up_is_taken(graph, tmp_path):
     node.popen.send_signal(signal.SIGCONT)
     graph.wait(lambda: len(early) == 15, 'boxes of the first half')
     play(graph, records[first:], early)
-    counts = all_published(graph, early)
+    counts = wait_for_thirty_early_boxes(graph, early)
     assert counts['points_received'] == counts['boxes_received'] == '30'
     assert counts.get('boxes_without_sweep', '0') == '0'
     assert ended_cleanly(node)
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
 
 
-def test_what_waits_when_the_node_ends_comes_out(graph, tmp_path):
-    drive, records, early, final = thirty_stamps(graph, tmp_path)
+def test_waiting_boxes_are_published_at_shutdown(graph, tmp_path):
+    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
     slow = ('-p', 'solver.rounds:=20', '-p', 'solver.iterations:=100', '-p', 'backlog:=60.0')
     node = graph.start(*RELIABLE, *slow, '-p', 'queue:=100')
     graph.wait_until_connected()
@@ -382,7 +381,7 @@ def test_what_waits_when_the_node_ends_comes_out(graph, tmp_path):
     assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
 
 
-def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
+def test_busy_solver_delays_neither_diagnostics_nor_shutdown(graph, tmp_path):
     records = records_of(Drive(sweeps=30).write(tmp_path / 'drive'))
     publishers_for(graph, records)
     early = graph.collect(DETECTIONS, '/refined_boxes')
@@ -398,11 +397,11 @@ def test_a_busy_solver_does_not_keep_the_node(graph, tmp_path):
     assert ended_cleanly(node)
 
 
-def test_a_calibrated_rule_is_taken_as_parameters(graph, tmp_path):
-    """What `boxreg calibrate` writes, of every type there is, reaches the running node."""
+def test_calibrated_settings_are_read_as_parameters(graph, tmp_path):
+    """Settings of every type that `boxreg calibrate` writes reach the running node."""
     changes = {
         'max_gap': 2, 'window': 8, 'solver.tolerance': 1e-5, 'sampling.deskew': True,
-        'mode': 'bev', 'vehicle.names': ['ute'],
+        'mode': 'bev', 'vehicle.names': ['ute'], 'lag': 7,
     }  # fmt: skip
     gap = Measured(value=0.25, spread=0.01, tracks=9)
     measured = {f'cyclist.{name}': gap for name in GAPS} | {'cyclist.position': gap}
@@ -429,7 +428,7 @@ def test_a_calibrated_rule_is_taken_as_parameters(graph, tmp_path):
 
 @pytest.fixture(scope='module')
 def refused(tmp_path_factory):
-    """Start nodes with bad arguments side by side; return status and output of each."""
+    """Start nodes with bad arguments in parallel; return output and status of each."""
     cases = {
         'range': ['--ros-args', '-p', 'window:=2'],
         'boxes': ['--ros-args', '-p', 'boxes_type:=std_msgs/msg/String'],
@@ -464,10 +463,10 @@ def refused(tmp_path_factory):
         ('list', 2, ('vehicle.names', "['']")),
     ],
 )
-def test_bad_arguments_are_told_in_one_line(refused, case, status, words):
+def test_bad_arguments_are_reported_in_one_line(refused, case, status, words):
     output, returned = refused[case]
     assert returned == status, output
-    ours = [line for line in output.splitlines() if '[rcl]' not in line]  # rcl adds its own
+    ours = [line for line in output.splitlines() if '[rcl]' not in line]  # rcl logs too
     assert len(ours) == 1, output
     for word in words:
         assert word in ours[0]
@@ -484,17 +483,17 @@ def refined_of(boxes, *status):
     return RefinedBoxes(boxes, status, ('',) * n, np.zeros(n, int), np.tile(np.eye(6), (n, 1, 1)))
 
 
-def test_markers_stay_with_their_track():
+def test_markers_keep_one_id_per_track():
     board = MarkerBoard()
     given = boxes_of('a', 'b', '', '')
     assert not board.is_showing
     first = board.update(given, refined_of(given, REFINED, KEPT, KEPT, KEPT)).markers
-    assert first.pop(0).action == 3  # what an earlier node may have left
+    assert first.pop(0).action == 3  # deletes markers of an earlier node
     assert len({(m.ns, m.id) for m in first}) == len(first) == 20
     cubes = {m.id: m.color.r for m in first if m.ns == 'refined'}
     assert cubes[0] != cubes[1]
     given = boxes_of('c', 'b')
-    given.boxes[0, 0] = np.nan  # no viewer takes it
+    given.boxes[0, 0] = np.nan  # viewers reject it
     second = board.update(given, refined_of(given, KEPT, KEPT)).markers
     assert {m.id for m in second if m.action == 0} == {1}
     assert {(m.ns, m.id) for m in second if m.action == 2} == {
@@ -502,56 +501,11 @@ def test_markers_stay_with_their_track():
     }
     assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
     assert board.is_showing and board.clear() and not board.is_showing
-    given.boxes[1, 4] = 0.0  # nor this
+    given.boxes[1, 4] = 0.0  # and this
     assert not board.update(given, refined_of(given, KEPT, KEPT)).markers
 
 
-def test_health_tells_the_worst_of_the_last_period():
-    health = Health()
-    health.count('points_received')
-    health.count('boxes_received')
-    health.add_latency(0.05)
-    status = health.status('node', {'fixed_frame': 'odom'})
-    assert status.level == DiagnosticStatus.OK
-    values = {item.key: item.value for item in status.values}
-    assert values['latency median [ms]'] == '50.0'
-    assert values['fixed_frame'] == 'odom'
-    assert health.status('node', {}).level == DiagnosticStatus.WARN  # nothing more came
-    health.count('no_sweep', 3)
-    health.count('boxes_received')
-    status = health.status('node', {})  # its remedy would lead astray
-    assert status.level == DiagnosticStatus.ERROR
-    assert status.message == 'no box was refined; nothing received on points'
-    health.count('points_received')
-    health.set_counts({'no_sweep': 3, 'refined': 5})
-    status = health.status('node', {})
-    assert status.level == DiagnosticStatus.WARN
-    assert status.message.startswith('no_sweep') and 'stamp' in status.message
-    health.count('failed')
-    assert health.status('node', {}).level == DiagnosticStatus.ERROR
-    for name, level in (('refined', DiagnosticStatus.WARN), ('kept', DiagnosticStatus.ERROR)):
-        health.count('boxes_received')
-        health.count('late')
-        health.count(name)
-        assert health.status('node', {}).level == level
-    assert [line.split()[0] for line in health.complaints()] == ['failed', 'no_sweep', 'late']
-    health.count('late')
-    assert not list(health.complaints())  # at a limited rate
-    health.count('unreadable')
-    assert health.is_time_to_warn('unreadable') and not health.is_time_to_warn('unreadable')
-    health._warned.clear()  # as if the period were over
-    assert [line.split()[0] for line in health.complaints()] == ['late']  # told, not told again
-    assert health.is_time_to_warn('invalid_box')
-    health.status('node', {})
-    for name in ('points_received', 'boxes_received', 'no_points', 'no_gain', 'no_gain'):
-        health.count(name)
-    health.count('kept', 3)
-    status = health.status('node', {})
-    assert status.level == DiagnosticStatus.WARN
-    assert 'no box was refined' in status.message and 'no_gain' in status.message
-
-
-def test_without_ros_the_remedy_is_told():
+def test_missing_ros_is_reported_with_a_remedy():
     code = 'import sys; sys.modules["rclpy"] = None; from boxreg_ros.cli import main; '
     process = subprocess.run(
         [sys.executable, '-c', f'{code}sys.exit(main(["node"]))'], cwd=ROOT, capture_output=True,
@@ -578,8 +532,8 @@ sys.exit(main())
 """
 
 
-def test_a_signal_within_a_destructor_ends_it_too():
-    """Imports are full of them; what is raised in one is lost."""
+def test_signal_within_a_destructor_ends_the_process():
+    """Imports run destructors, and an exception raised in one is lost."""
     process = subprocess.run(
         [sys.executable, '-c', SIGNAL_IN_DESTRUCTOR], cwd=ROOT, capture_output=True, timeout=60,
         text=True,
@@ -588,7 +542,7 @@ def test_a_signal_within_a_destructor_ends_it_too():
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_starting_ends_it_quietly(number):
+def test_signal_during_start_up_ends_the_process_quietly(number):
     process = subprocess.Popen(
         [sys.executable, '-m', 'boxreg_ros.live.main'], cwd=ROOT, stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True,

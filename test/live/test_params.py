@@ -1,14 +1,15 @@
-"""Every setting is a ROS parameter, with its meaning, unit and bounds."""
+"""Parameters of the node: declaration, types, bounds, changes at run time and files."""
 
-from boxreg_ros.config import Config, settings
+from boxreg_ros.config import Config, NODE_OPTIONS, settings
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.live.params import (
-    AT_ONCE,
     changed,
     declare,
+    DYNAMIC,
     NODE_SETTINGS,
     parameters_yaml,
     READ_ONLY,
+    reals_from_integers,
 )
 import pytest
 import rclpy
@@ -28,9 +29,11 @@ def context():
 def make_node(context):
     nodes = []
 
-    def make(cli_args=None, **given):
+    def make(cli_args=None, name='params', **given):
+        namespace, _, base = name.rpartition('/')
         node = rclpy.create_node(
-            'params', context=context, automatically_declare_parameters_from_overrides=True,
+            base, namespace=namespace, context=context,
+            automatically_declare_parameters_from_overrides=True,
             parameter_overrides=[Parameter(name, value=value) for name, value in given.items()],
             cli_args=cli_args,
         )  # fmt: skip
@@ -42,7 +45,7 @@ def make_node(context):
         node.destroy_node()
 
 
-def test_every_setting_is_a_parameter(make_node):
+def test_every_setting_is_a_described_parameter(make_node):
     node = make_node()
     config, options = declare(node)
     assert config == Config(estimate='final')
@@ -51,7 +54,7 @@ def test_every_setting_is_a_parameter(make_node):
         descriptor = node.describe_parameter(item.name)
         assert descriptor.description.startswith(item.meaning)
         assert not item.unit or f'[{item.unit}]' in descriptor.description
-        assert descriptor.read_only == (not item.name.startswith(AT_ONCE))
+        assert descriptor.read_only == (not item.name.startswith(DYNAMIC))
         assert (READ_ONLY in descriptor.additional_constraints) == descriptor.read_only
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
         assert [(r.from_value, r.to_value) for r in ranges] == (
@@ -64,20 +67,26 @@ def test_every_setting_is_a_parameter(make_node):
         assert (tuple(value) if isinstance(default, tuple) else value) == default
 
 
-def test_values_are_taken_and_kept_in_their_type(make_node):
+def test_integers_are_accepted_for_reals_at_start_up(make_node):
     node = make_node(
-        **{'sampling.margin': 1, 'window': 7, 'vehicle.names': ['ute'], 'transform_timeout': 2}
+        **{
+            'sampling.margin': 1,
+            'window': 7,
+            'lag': 6,
+            'vehicle.names': ['ute'],
+            'transform_timeout': 2,
+        }
     )
     config, options = declare(node)
     assert config == Config(estimate='final').updated(
-        {'sampling.margin': 1.0, 'window': 7, 'vehicle.names': ['ute']}
+        {'sampling.margin': 1.0, 'window': 7, 'lag': 6, 'vehicle.names': ['ute']}
     )
     assert type(node.get_parameter('sampling.margin').value) is float
     assert type(options.transform_timeout) is float
     assert options.transform_timeout == 2.0
 
 
-def test_one_yaml_file_serves_node_and_recordings(make_node, tmp_path):
+def test_node_and_relabel_read_the_same_file(make_node, tmp_path):
     path = tmp_path / 'params.yaml'
     values = {'window': 6, 'lag': 2, 'solver': {'rounds': 2}, 'faces': {'learn': False}}
     path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {**values, 'estimate': 'final'}}}))
@@ -92,6 +101,7 @@ def test_one_yaml_file_serves_node_and_recordings(make_node, tmp_path):
         ('window', 2, ('window', '3', '2')),
         ('window', 'abc', ('window', 'int', 'abc')),
         ('lag', 1000, ('lag', '999', '1000')),
+        ('lag', 10, ('lag', 'window (10)', 'got 10')),
         ('mode', '4d', ('mode', 'bev', '4d')),
         ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
         ('backlog', 'x', ('backlog', 'float', 'x')),
@@ -106,7 +116,7 @@ def test_bad_values_are_refused_by_name(make_node, name, value, words):
         assert word in str(caught.value)
 
 
-def test_parameters_cannot_be_changed_behind_the_node(make_node):
+def test_fixed_parameters_are_read_only(make_node):
     node = make_node()
     declare(node)
     (result,) = node.set_parameters([Parameter('window', value=5)])
@@ -115,7 +125,7 @@ def test_parameters_cannot_be_changed_behind_the_node(make_node):
     assert node.get_parameter('window').value == Config().window
 
 
-def test_what_may_change_changes(make_node):
+def test_dynamic_parameters_change_within_their_bounds(make_node):
     node = make_node()
     settings_before = declare(node)
     changes = [Parameter('solver.rounds', value=2), Parameter('transform_timeout', value=1.5)]
@@ -130,19 +140,50 @@ def test_what_may_change_changes(make_node):
             changed(*settings_before, [bad])
 
 
-def test_a_parameter_file_says_it_all_and_serves_both(make_node, tmp_path):
+def test_written_file_is_read_by_nodes_of_any_name_and_by_relabel(make_node, tmp_path):
     path = tmp_path / 'params.yaml'
     config = Config(estimate='final').updated(
-        {'window': 7, 'vehicle.names': ['ute', 'car'], 'solver.tolerance': 1e-5, 'mode': 'bev'}
+        {
+            'window': 7,
+            'lag': 5,
+            'vehicle.names': ['ute', 'car'],
+            'solver.tolerance': 1e-5,
+            'mode': 'bev',
+        }
     )
     config = config.updated({'cyclist.names': []})
     _, options = declare(make_node())
     options = options._replace(fixed_frame='map', backlog=9.0)
-    path.write_text(parameters_yaml(config, options, '/**/params'))
-    again = declare(make_node(cli_args=['--ros-args', '--params-file', str(path)]))
-    assert again == (config, options)
+    path.write_text(parameters_yaml(config, options))
+    for name in ('params', '/front/other'):
+        arguments = ['--ros-args', '--params-file', str(path)]
+        assert declare(make_node(cli_args=arguments, name=name)) == (config, options)
     read = Config.from_yaml(path)
-    assert read.cyclist.names == ('',)  # no class is named so
+    assert read.cyclist.names == ('',)  # matches no class
     assert read.updated({'cyclist.names': []}) == config.updated({'estimate': 'track'})
     for item in settings():
         assert item.name == 'estimate' or item.meaning in path.read_text()
+
+
+def test_relabel_ignores_parameters_of_the_node_only(tmp_path):
+    path = tmp_path / 'params.yaml'
+    own = [item.name for item in NODE_SETTINGS]
+    assert NODE_OPTIONS[: len(own)] == tuple(own)
+    values = {name: 'x' for name in NODE_OPTIONS} | {'window': 12}
+    values['qos_overrides./points.subscription.depth'] = 3
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+    assert Config.from_yaml(path) == Config().updated({'window': 12})
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values | {'windw': 3}}}))
+    with pytest.raises(ConfigError, match='windw: no such setting'):
+        Config.from_yaml(path)
+
+
+def test_integers_are_accepted_for_reals_at_run_time(make_node):
+    node = make_node()
+    declare(node)
+    node.add_pre_set_parameters_callback(lambda given: reals_from_integers(node, given))
+    result = node.set_parameters_atomically([Parameter('sampling.margin', value=1)])
+    assert result.successful, result.reason
+    assert node.get_parameter('sampling.margin').value == 1.0
+    result = node.set_parameters_atomically([Parameter('solver.rounds', value=2.5)])
+    assert not result.successful

@@ -1,4 +1,4 @@
-"""What is installed beside the code; `python test/test_share.py` writes the parameter file."""
+"""Files installed beside the code; ``python test/live/test_share.py`` writes params.yaml."""
 
 import json
 import re
@@ -8,26 +8,30 @@ from boxreg_ros.bench.node import PROFILE
 from boxreg_ros.config import Config
 from boxreg_ros.io.markers import NAMESPACES
 from boxreg_ros.live.params import declare, NODE_SETTINGS, parameters_yaml
-from paths import SHARE
+from paths import ROOT, SHARE
 import pytest
 import rclpy
 import yaml
 
+PAGE = ROOT / 'docs' / 'tasks' / 'run-on-a-robot.md'
 PARAMETERS = SHARE / 'params.yaml'
-NODE = (SHARE.parent / 'boxreg_node.py').read_text(encoding='utf-8')
+NODE = (SHARE.parent / 'live' / 'node.py').read_text(encoding='utf-8')
 
 
-def test_parameter_file_holds_the_defaults():
+@pytest.mark.parametrize('name', ['boxreg_node', '/front/lidar/refiner'])
+def test_parameter_file_holds_the_defaults_for_any_node(name):
     assert PARAMETERS.read_text(encoding='utf-8') == parameters_yaml(Config()), (
-        'run: python test/test_share.py'
+        'run: PYTHONPATH=test python test/live/test_share.py'
     )
     assert Config.from_yaml(PARAMETERS) == Config()
     context = rclpy.Context()
     rclpy.init(context=context, args=['--ros-args', '--params-file', str(PARAMETERS)])
     try:
+        namespace, _, base = name.rpartition('/')
         node = rclpy.create_node(
-            'boxreg_node', context=context, automatically_declare_parameters_from_overrides=True
-        )
+            base, namespace=namespace, context=context,
+            automatically_declare_parameters_from_overrides=True,
+        )  # fmt: skip
         given = set(node.get_parameters_by_prefix(''))
         assert {item.name for item in NODE_SETTINGS} < given
         config, options = declare(node)
@@ -38,20 +42,33 @@ def test_parameter_file_holds_the_defaults():
         rclpy.shutdown(context=context)
 
 
-def test_launch_file_starts_the_node_with_its_topics():
+def test_launch_file_starts_the_node_with_its_arguments():
     launch = ElementTree.parse(SHARE / 'boxreg.launch.xml').getroot()
-    arguments = {item.get('name') for item in launch.iter('arg')}
+    arguments = {item.get('name'): item for item in launch.iter('arg')}
+    assert all(item.get('description') for item in arguments.values())
     node = next(item for item in launch.iter('node') if item.get('pkg') == 'boxreg_ros')
-    assert node.get('exec') == node.get('name') == 'boxreg_node'
+    assert node.get('exec') == arguments['name'].get('default') == 'boxreg_node'
+    for argument in ('name', 'namespace', 'respawn'):
+        assert node.get(argument) == f'$(var {argument})'
+    assert node.get('ros_args') == '--log-level $(var log_level)'
     assert {item.get('from') for item in node.iter('remap')} == {'points', 'boxes', 'odom'}
+    given = [item.get('from') or item.get('name') for item in node.iter('param')]
+    assert given == ['$(var params)', 'boxes_type', 'use_sim_time']  # later ones win
     text = (SHARE / 'boxreg.launch.xml').read_text(encoding='utf-8')
-    assert set(re.findall(r'\$\(var (\w+)\)', text)) == arguments
+    assert set(re.findall(r'\$\(var (\w+)\)', text)) == set(arguments)
     for file in re.findall(r'find-pkg-share boxreg_ros\)/([\w.]+)', text):
         assert (SHARE / file).is_file()
 
 
+def test_page_names_every_launch_argument():
+    launch = ElementTree.parse(SHARE / 'boxreg.launch.xml').getroot()
+    table = PAGE.read_text(encoding='utf-8').split('## Launch arguments')[1].split('\n## ')[0]
+    named = set(re.findall(r'`(\w+)`', '\n'.join(re.findall(r'^\|([^|]+)\|', table, re.M))))
+    assert named == {item.get('name') for item in launch.iter('arg')}
+
+
 @pytest.mark.parametrize('file', ['boxreg.rviz', 'foxglove.json'])
-def test_views_show_what_the_node_publishes(file):
+def test_views_show_the_topics_and_namespaces_of_the_node(file):
     text = (SHARE / file).read_text(encoding='utf-8')
     view = json.loads(text) if file.endswith('json') else yaml.safe_load(text)
     if file.endswith('json'):
@@ -69,7 +86,7 @@ def test_views_show_what_the_node_publishes(file):
     assert all(f"'{name}'" in NODE for name in names)
 
 
-def test_profile_has_room_for_several_large_clouds():
+def test_shared_memory_segment_holds_three_large_clouds():
     space = '{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}'
     profile = ElementTree.parse(PROFILE).getroot()
     (segment,) = (int(item.text) for item in profile.iter(f'{space}segment_size'))

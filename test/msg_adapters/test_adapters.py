@@ -1,3 +1,5 @@
+"""Point clouds, detections and markers: values, units, layouts and contradictions."""
+
 import array
 from types import SimpleNamespace
 
@@ -19,7 +21,7 @@ def columns(kind='f4', names='xyz', xyz=XYZ):
     return [(name, kind, xyz[:, 'xyz'.index(name)]) for name in names]
 
 
-# Point clouds ----------------------------------------------------------------------------------
+# Point clouds ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('order', ['<', '>'])
@@ -53,7 +55,7 @@ def test_cloud_keeps_float64_exact_far_from_the_origin():
     np.testing.assert_array_equal(sweep.points, xyz)
 
 
-def test_points_that_are_not_finite_go_with_their_times():
+def test_points_that_are_not_finite_are_removed_with_their_times():
     xyz = XYZ.copy()
     xyz[1, 2], xyz[2, 0] = np.nan, -np.inf
     message = M.cloud(STAMP, 'lidar', [*columns(xyz=xyz), ('t', 'u4', np.arange(4) * 20_000_000)])
@@ -80,7 +82,18 @@ SECONDS = np.array([-0.01, 0.0, 0.05, 0.09])
         ('f8', SECONDS * 1e6 + STAMP * 1e-3, 1e-6),
         ('f8', SECONDS * 1e9 + STAMP, 1e-6),
     ],
-    ids=['s', 's f8', 'ms', 'us f4', 'ns f8', 'us', 'ns', 'clock s', 'clock us', 'clock ns'],
+    ids=[
+        's',
+        's f8',
+        'ms',
+        'us f4',
+        'ns f8',
+        'us',
+        'ns',
+        'absolute s',
+        'absolute us',
+        'absolute ns',
+    ],
 )
 def test_point_times_in_any_unit(name, kind, values, accuracy):
     sweep = pointcloud.from_msg(M.cloud(STAMP, 'lidar', [*columns(), (name, kind, values)]))
@@ -90,37 +103,38 @@ def test_point_times_in_any_unit(name, kind, values, accuracy):
 @pytest.mark.parametrize(
     ('kind', 'unit'), [('u4', 1e-9), ('u4', 1e-6), ('u2', 1e-3), ('u1', 1e-3)]
 )
-def test_point_times_counted_from_the_start_of_the_sweep(kind, unit):
+def test_point_times_relative_to_the_start_of_the_sweep(kind, unit):
     seconds = np.array([0.0, 0.025, 0.05, 0.099])
     column = ('t', kind, np.round(seconds / unit).astype(kind))
     sweep = pointcloud.from_msg(M.cloud(STAMP, 'lidar', [*columns(), column]))
     np.testing.assert_allclose(sweep.times, seconds, rtol=0, atol=1e-12)
 
 
-def test_absolute_times_of_a_simulated_clock():
+def test_absolute_point_times_of_a_simulated_clock():
     values = SECONDS + 500.0
     message = M.cloud(500 * 10**9, 'lidar', [*columns(), ('timestamp', 'f8', values)])
     np.testing.assert_allclose(pointcloud.from_msg(message).times, SECONDS, atol=1e-12)
 
 
-def test_intensities_go_with_their_points():
-    xyz, seconds = XYZ.copy(), np.array([0.0, 0.1, 0.2, 0.3])
-    xyz[1:3, 2] = np.inf, np.nan
+def test_intensities_belong_to_the_finite_points():
+    seconds = np.array([0.0, 0.1, 0.2, 0.3])
+    xyz = XYZ.copy()
+    xyz[1:3, 2] = [np.inf, np.nan]
     extra = [('t', 'f4', seconds), ('intensity', 'u2', np.array([5, 6, 7, 800]))]
     message = M.cloud(STAMP, 'lidar', [*columns(xyz=xyz), *extra], height=2, row_padding=3)
     np.testing.assert_array_equal(pointcloud.from_msg(message).points, XYZ[[0, 3]])
     np.testing.assert_array_equal(pointcloud.intensities(message), [5, 800])
 
 
-def test_intensities_that_are_missing():
+def test_missing_or_non_finite_intensities():
     assert pointcloud.intensities(M.cloud(STAMP, 'lidar', columns())) is None
-    strange = [*columns(), ('i', 'f4', np.array([np.nan, np.inf, 2.0, -np.inf]))]
-    message = M.cloud(STAMP, 'lidar', strange)
+    fields = [*columns(), ('i', 'f4', np.array([np.nan, np.inf, 2.0, -np.inf]))]
+    message = M.cloud(STAMP, 'lidar', fields)
     np.testing.assert_array_equal(pointcloud.intensities(message), [0, 0, 2, 0])
 
 
 @pytest.mark.parametrize(('kind', 'origin'), [('f4', 0.0), ('f8', 0.0), ('f8', STAMP * 1e-9)])
-def test_points_of_unknown_time_are_kept(kind, origin):
+def test_points_with_non_finite_time_are_kept(kind, origin):
     for unknown, expected in (([1, 3], [-0.01, 0.0, 0.05, 0.0]), ([0, 1, 2, 3], None)):
         seconds = SECONDS + origin
         seconds[unknown] = np.tile([np.nan, np.inf], 2)[: len(unknown)]
@@ -135,7 +149,7 @@ def test_points_of_unknown_time_are_kept(kind, origin):
             np.testing.assert_allclose(sweep.times, expected, atol=1e-6)
 
 
-def test_times_that_fit_nothing_are_left_out():
+def test_point_times_in_no_known_unit_are_ignored():
     values = SECONDS - 2e9
     message = M.cloud(STAMP, 'lidar', [*columns(), ('timestamp', 'f8', values)])
     assert pointcloud.from_msg(message).times is None
@@ -153,10 +167,12 @@ def test_empty_cloud():
     [
         ({'width': 5}, 'expected at least 60 bytes, got 48'),
         ({'height': 2, 'width': 4, 'row_step': 47}, 'expected at least 96 bytes, got 48'),
+        ({'width': -1}, 'of at least 0, got -1, 1, 12, 48'),
+        ({'data': np.zeros(0, np.uint8)}, 'expected at least 48 bytes, got 0'),
         ({'point_step': 8}, "field 'z' ends at byte 12: expected at most point_step, got 8"),
     ],
 )
-def test_sizes_that_contradict_each_other(fields, expected):
+def test_contradicting_sizes_are_refused(fields, expected):
     message = M.points(STAMP, 'lidar', XYZ)
     for name, value in fields.items():
         setattr(message, name, value)
@@ -164,10 +180,13 @@ def test_sizes_that_contradict_each_other(fields, expected):
         pointcloud.from_msg(message)
 
 
-def test_fields_that_cannot_be_read():
+def test_unreadable_fields_are_refused():
     message = M.cloud(STAMP, 'lidar', [('x', 'f4', XYZ[:, 0]), ('range', 'f4', XYZ[:, 1])])
     with pytest.raises(UnsupportedMessage, match='expected fields x, y, z, got x, range'):
         pointcloud.from_msg(message)
+    message.fields[1].name = 'intensity'
+    with pytest.raises(UnsupportedMessage, match='expected fields x, y, z, got x, intensity'):
+        pointcloud.intensities(message)
     message = M.points(STAMP, 'lidar', XYZ)
     message.fields[1].datatype = 12
     with pytest.raises(UnsupportedMessage, match=r"field 'y'.*datatype 12"):
@@ -177,7 +196,7 @@ def test_fields_that_cannot_be_read():
         pointcloud.from_msg(message)
 
 
-# Boxes -----------------------------------------------------------------------------------------
+# Boxes -------------------------------------------------------------------------------------------
 
 RPY = np.array([[0.1, -0.2, 2.5], [0.0, 0.0, -3.0]])
 QUATERNIONS = Rotation.from_euler('ZYX', RPY[:, ::-1]).as_quat()
@@ -228,7 +247,7 @@ def test_marker_boxes():
 
 
 @pytest.mark.parametrize('adapter', [vision, markers])
-def test_boxes_that_go_out_come_back(adapter):
+def test_written_boxes_are_read_back(adapter):
     message = vision_msg() if adapter is vision else markers_msg()
     given = adapter.from_msg(message)
     moved = BoxArray(
@@ -240,11 +259,11 @@ def test_boxes_that_go_out_come_back(adapter):
     assert back.class_names == given.class_names
     np.testing.assert_allclose(back.boxes, moved.boxes, atol=1e-12)
     unchanged = adapter.from_msg(message)
-    assert unchanged.frame_id == 'lidar', 'the input message is left alone'
+    assert unchanged.frame_id == 'lidar', 'the input message is not modified'
     np.testing.assert_array_equal(unchanged.boxes, given.boxes)
 
 
-def test_vision_output_carries_the_rest_and_the_covariance():
+def test_vision_output_has_the_covariance_and_copies_the_rest():
     message = vision_msg()
     given = vision.from_msg(message)
     covariances = np.arange(72.0).reshape(2, 6, 6)
@@ -257,7 +276,7 @@ def test_vision_output_carries_the_rest_and_the_covariance():
     assert M.store.serialize_cdr(out, DETECTIONS)
 
 
-def test_marker_output_carries_what_is_no_box():
+def test_marker_output_copies_other_markers():
     message = markers_msg()
     out = markers.to_msg(message, markers.from_msg(message))
     assert [(m.type, m.action) for m in out.markers] == [(1, 3), (1, 0), (9, 0), (1, 0), (1, 2)]
@@ -265,8 +284,8 @@ def test_marker_output_carries_what_is_no_box():
     assert M.store.serialize_cdr(out, MARKERS)
 
 
-@pytest.mark.parametrize('bad', [(0, 0, 0, 0), (0, 0, 1, 1), (np.nan, 0, 0, 1)])
-def test_orientation_that_says_nothing_makes_the_box_invalid(bad):
+@pytest.mark.parametrize('bad', [(0, 0, 0, 0), (0, 0, 1, 1), (1e200, 0, 0, 1), (np.nan, 0, 0, 1)])
+def test_quaternion_that_is_not_unit_makes_the_box_invalid(bad):
     message = vision_msg([bad, QUATERNIONS[1]])
     boxes = vision.from_msg(message)
     assert np.isnan(boxes.boxes[0, 6:]).all()
@@ -276,7 +295,7 @@ def test_orientation_that_says_nothing_makes_the_box_invalid(bad):
     np.testing.assert_array_equal([out.x, out.y, out.z, out.w], bad)
 
 
-def test_position_that_is_not_finite_stays_in_the_array():
+def test_box_with_non_finite_position_remains_in_the_array():
     message = vision_msg()
     message.detections[0].bbox.center.position.x = float('nan')
     boxes = vision.from_msg(message).boxes
@@ -284,7 +303,7 @@ def test_position_that_is_not_finite_stays_in_the_array():
     assert np.isfinite(boxes[1]).all()
 
 
-def test_quaternion_within_rounding_is_normalised():
+def test_quaternion_within_tolerance_is_normalised():
     boxes = vision.from_msg(vision_msg(QUATERNIONS * 1.001)).boxes
     np.testing.assert_allclose(boxes, BOXES, atol=1e-12)
 
@@ -317,14 +336,14 @@ def test_detection_without_hypothesis():
     assert (boxes.class_names[0], boxes.scores[0]) == ('', 1.0)
 
 
-def test_frame_of_the_detections_serves_an_array_without_one():
+def test_array_without_frame_uses_the_header_of_its_detections():
     message = vision_msg()
     message.header = M.header(0, '')
     boxes = vision.from_msg(message)
     assert (boxes.frame_id, boxes.stamp_ns) == ('lidar', STAMP)
 
 
-def test_headers_that_disagree():
+def test_contradicting_headers_are_refused():
     message = markers_msg()
     message.markers[3].header = M.header(STAMP, 'map')
     with pytest.raises(UnsupportedMessage, match=r"one frame and one stamp.*'lidar'.*'map'"):
@@ -335,7 +354,7 @@ def test_headers_that_disagree():
         vision.from_msg(message)
 
 
-def test_layout_of_old_vision_msgs_is_named():
+def test_old_definition_of_vision_msgs_is_refused():
     old = SimpleNamespace(
         header=M.header(STAMP, 'lidar'),
         detections=[
@@ -350,7 +369,7 @@ def test_layout_of_old_vision_msgs_is_named():
         vision.from_msg(old)
 
 
-def test_adapters_are_found_by_either_spelling():
+def test_adapters_are_found_by_both_spellings_of_the_type():
     assert adapter_for('vision_msgs/msg/Detection3DArray') is vision
     assert adapter_for('vision_msgs/Detection3DArray') is vision
     assert adapter_for('visualization_msgs/MarkerArray') is markers
@@ -361,7 +380,7 @@ def test_adapters_are_found_by_either_spelling():
         adapter_for('std_msgs/msg/String')
 
 
-# The same bytes through rclpy and rosbags ------------------------------------------------------
+# The same bytes through rclpy and rosbags --------------------------------------------------------
 
 
 def rclpy_message(name, data):

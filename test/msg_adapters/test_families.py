@@ -1,4 +1,4 @@
-"""Every family of box messages: the same bytes through every reader, and what survives."""
+"""All types of box messages: values, copied fields, and the same bytes in all libraries."""
 
 from dataclasses import replace
 import sys
@@ -7,7 +7,8 @@ from types import SimpleNamespace
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
-from msg_adapters import adapter_for, ADAPTERS, WITHOUT_IDS
+from boxreg_ros.structures import is_valid_box
+from msg_adapters import adapter_for, ADAPTERS, HEAD, rows, WITHOUT_IDS
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import pytest
@@ -32,24 +33,24 @@ M = Messages()
 RPY = np.array([[0.0, 0.0, 0.0], [0.1, -0.2, 2.5]])
 POSITIONS = np.array([[10.0, -2.0, 0.5], [-20.0, 3.0, 1.5]])
 SIZES = np.array([[4.5, 1.8, 1.6], [8.0, 2.5, 3.0]])
-GIVEN = np.hstack([POSITIONS, SIZES, RPY])
-OWN = 0.5 * np.eye(6)
-"""The covariance that the messages come with."""
+INPUT_BOXES = np.hstack([POSITIONS, SIZES, RPY])
+INPUT_COVARIANCE = 0.5 * np.eye(6)
+"""Covariance in the input messages."""
 WITH_COVARIANCE = (DETECTIONS, TRACKED, DETECTED, OBJECTS_WITH_COVARIANCE)
 
 
 def message_of(type_name, rpy=RPY):
-    turns = Rotation.from_euler('ZYX', rpy[:, ::-1]).as_quat()
-    found = [(n + 1, (POSITIONS[n], turns[n]), SIZES[n]) for n in range(2)]
-    return M.boxes(type_name, STAMP, 'lidar', found)
+    quaternions = Rotation.from_euler('ZYX', rpy[:, ::-1]).as_quat()
+    boxes = [(n + 1, (POSITIONS[n], quaternions[n]), SIZES[n]) for n in range(2)]
+    return M.boxes(type_name, STAMP, 'lidar', boxes)
 
 
 def bytes_of(message, type_name):
     return bytes(M.store.serialize_cdr(message, type_name))
 
 
-def moved(given, frame_id='lidar', boxes=None):
-    """Return other boxes in place of the given ones: a little longer and further left."""
+def moved_boxes(given, frame_id='lidar', boxes=None):
+    """Return longer boxes further to the left instead of the given ones."""
     step = np.array([0, 1.0, 0, 0.9, 0.36, 0, 0, 0, 0.01])
     return replace(given, frame_id=frame_id, boxes=given.boxes + step if boxes is None else boxes)
 
@@ -69,7 +70,7 @@ def covariances_of(message, type_name):
 def test_boxes_are_read(type_name):
     boxes = adapter_for(type_name).from_msg(message_of(type_name))
     assert (boxes.stamp_ns, boxes.frame_id) == (STAMP, 'lidar')
-    np.testing.assert_allclose(boxes.boxes, GIVEN, atol=1e-12)
+    np.testing.assert_allclose(boxes.boxes, INPUT_BOXES, atol=1e-12)
     ids = {TRACKED: ('0' * 31 + '1', '0' * 31 + '2'), **dict.fromkeys(WITHOUT_IDS, ('', ''))}
     assert boxes.track_ids == ids.get(type_name, ('1', '2'))
     classes = {BOXES: '', JSK: '3'}
@@ -80,22 +81,24 @@ def test_boxes_are_read(type_name):
 
 
 @pytest.mark.parametrize('type_name', ADAPTERS)
-def test_what_is_not_refined_survives(type_name):
-    """Boxes that have not changed leave no byte changed; those that have, only their own."""
+def test_other_fields_are_copied(type_name):
+    """Writing the same boxes changes no byte; writing other boxes and these again neither."""
     message = message_of(type_name, np.zeros((2, 3)))
     before = bytes_of(message, type_name)
     adapter = adapter_for(type_name)
     boxes = adapter.from_msg(message)
-    nothing = np.full((2, 6, 6), np.nan)
-    assert bytes_of(adapter.to_msg(message, boxes, nothing), type_name) == before
-    out = adapter.to_msg(message, moved(boxes), np.stack([np.eye(6)] * 2))
-    assert bytes_of(message, type_name) == before, 'the input message is left alone'
+    unknown = np.full((2, 6, 6), np.nan)
+    assert bytes_of(adapter.to_msg(message, boxes, unknown), type_name) == before
+    out = adapter.to_msg(message, moved_boxes(boxes), np.stack([np.eye(6)] * 2))
+    assert bytes_of(message, type_name) == before, 'the input message is not modified'
     back = adapter.from_msg(out)
-    np.testing.assert_allclose(back.boxes, moved(boxes).boxes, atol=1e-6)
-    again = adapter.to_msg(out, boxes, np.stack([OWN] * 2) if type_name != DETECTIONS else None)
+    np.testing.assert_allclose(back.boxes, moved_boxes(boxes).boxes, atol=1e-6)
+    again = adapter.to_msg(
+        out, boxes, np.stack([INPUT_COVARIANCE] * 2) if type_name != DETECTIONS else None
+    )
     if type_name == DETECTIONS:
         again = adapter.to_msg(out, boxes, np.zeros((2, 6, 6)))
-    if type_name == DETECTED:  # it has become known
+    if type_name == DETECTED:  # set because a covariance was written
         for item in again.objects:
             assert item.kinematics.has_position_covariance
             item.kinematics.has_position_covariance = False
@@ -115,7 +118,7 @@ def test_kept_boxes_keep_the_covariance_of_the_detector(type_name):
 
 
 @pytest.mark.parametrize('type_name', WITH_COVARIANCE)
-def test_covariances_turn_into_another_frame_with_their_boxes(type_name):
+def test_covariances_are_rotated_to_the_output_frame(type_name):
     message, adapter = message_of(type_name), adapter_for(type_name)
     items = message.objects if hasattr(message, 'objects') else message.detections
     for item in items:
@@ -123,29 +126,29 @@ def test_covariances_turn_into_another_frame_with_their_boxes(type_name):
         posed = posed or item.kinematics.pose_with_covariance
         posed.covariance = np.diag([4.0, 1.0, 0, 0, 0, 0]).reshape(36)
     T = np.eye(4)
-    T[:2, :2] = [[0, -1], [1, 0]]  # a quarter turn: x becomes y
-    boxes = moved(adapter.from_msg(message), 'map')
+    T[:2, :2] = [[0, -1], [1, 0]]  # yaw of 90 degrees: x becomes y
+    boxes = moved_boxes(adapter.from_msg(message), 'map')
     out = adapter.to_msg(message, boxes, None, T)
-    for spread in covariances_of(out, type_name):
-        np.testing.assert_allclose(np.diag(spread)[:3], [1.0, 4.0, 0.0], atol=1e-12)
+    for covariance in covariances_of(out, type_name):
+        np.testing.assert_allclose(np.diag(covariance)[:3], [1.0, 4.0, 0.0], atol=1e-12)
 
 
-def test_footprint_is_stretched_with_its_box():
+def test_footprint_is_scaled_with_the_box():
     adapter = adapter_for(TRACKED)
     message = message_of(TRACKED)
-    out = adapter.to_msg(message, moved(adapter.from_msg(message)))
-    # 4.5 m and 1.8 m become 5.4 m and 2.16 m: the corner at half of each goes along.
+    out = adapter.to_msg(message, moved_boxes(adapter.from_msg(message)))
+    # 4.5 m and 1.8 m become 5.4 m and 2.16 m: a factor of 1.2 for both coordinates.
     corner, other = out.objects[0].shape.footprint.points
     np.testing.assert_allclose([corner.x, corner.y, other.x, other.y], [2.7, 1.08, -2.7, 1.08])
 
 
 @pytest.mark.parametrize('type_name', [TRACKED, DETECTED])
-def test_twist_in_the_object_turns_around_with_its_heading(type_name):
+def test_twist_is_rotated_where_the_heading_flips(type_name):
     adapter = adapter_for(type_name)
     message = message_of(type_name)
     boxes = adapter.from_msg(message)
-    turned = boxes.boxes + np.array([[0, 0, 0, 0, 0, 0, 0, 0, np.pi], np.zeros(9)])
-    out = adapter.to_msg(message, moved(boxes, boxes=turned))
+    flipped = boxes.boxes + np.array([[0, 0, 0, 0, 0, 0, 0, 0, np.pi], np.zeros(9)])
+    out = adapter.to_msg(message, moved_boxes(boxes, boxes=flipped))
     first, second = (o.kinematics.twist_with_covariance.twist for o in out.objects)
     assert (first.linear.x, first.linear.y, first.angular.z) == (-3.0, -0.5, 0.1)
     assert (second.linear.x, second.linear.y) == (3.0, 0.5)
@@ -154,31 +157,31 @@ def test_twist_in_the_object_turns_around_with_its_heading(type_name):
         assert accel.linear.x == -0.25
 
 
-def test_orientation_that_is_not_available_makes_no_box_but_a_cylinder():
+def test_unavailable_orientation_makes_the_box_invalid_except_for_cylinders():
     message = message_of(TRACKED)
     message.objects[0].kinematics.orientation_availability = 0
     boxes = adapter_for(TRACKED).from_msg(message).boxes
     assert np.isnan(boxes[0, 6:]).all() and np.isfinite(boxes[0, :6]).all()
-    np.testing.assert_allclose(boxes[1], GIVEN[1], atol=1e-12)
+    np.testing.assert_allclose(boxes[1], INPUT_BOXES[1], atol=1e-12)
     message.objects[0].shape.type = 1
     assert np.isfinite(adapter_for(TRACKED).from_msg(message).boxes).all()
-    message.objects[0].kinematics.orientation_availability = 1  # its sign is not known
+    message.objects[0].kinematics.orientation_availability = 1  # SIGN_UNKNOWN
     out = adapter_for(TRACKED).to_msg(message, adapter_for(TRACKED).from_msg(message))
     assert out.objects[0].kinematics.orientation_availability == 1
 
 
-def test_a_cylinder_has_one_diameter():
+def test_cylinder_gets_the_mean_of_length_and_width():
     message = message_of(TRACKED)
     message.objects[0].shape.type = 1
     adapter = adapter_for(TRACKED)
-    out = adapter.to_msg(message, moved(adapter.from_msg(message)))
+    out = adapter.to_msg(message, moved_boxes(adapter.from_msg(message)))
     # 4.5 m and 1.8 m become 5.4 m and 2.16 m, on average 3.78 m.
     first, second = (o.shape.dimensions for o in out.objects)
     np.testing.assert_allclose([first.x, first.y, first.z], [3.78, 3.78, 1.6])
     assert second.x != second.y
 
 
-def test_all_that_is_in_the_frame_of_the_header_moves_with_it():
+def test_copied_fields_are_transformed_to_the_output_frame():
     message = message_of(OBJECTS_WITH_COVARIANCE)
     message.objects[0].twist.covariance = np.diag([9.0, 1, 1, 4, 1, 1]).ravel()
     corner = M.make('geometry_msgs/msg/Point32', x=4.0, y=-1.0, z=0.5)
@@ -186,15 +189,17 @@ def test_all_that_is_in_the_frame_of_the_header_moves_with_it():
     adapter = adapter_for(OBJECTS_WITH_COVARIANCE)
     T = np.eye(4)
     T[:2, :2], T[:3, 3] = [[0, -1], [1, 0]], [100.0, 200.0, 0.0]
-    out = adapter.to_msg(message, moved(adapter.from_msg(message), 'map'), None, T).objects[0]
-    spread = np.reshape(out.twist.covariance, (6, 6))
-    np.testing.assert_allclose(np.diag(spread), [1, 9, 1, 1, 4, 1], atol=1e-12)
-    # (4, -1) a quarter turn further is (1, 4).
+    out = adapter.to_msg(message, moved_boxes(adapter.from_msg(message), 'map'), None, T).objects[
+        0
+    ]
+    covariance = np.reshape(out.twist.covariance, (6, 6))
+    np.testing.assert_allclose(np.diag(covariance), [1, 9, 1, 1, 4, 1], atol=1e-12)
+    # (4, -1) rotated by 90 degrees is (1, 4).
     (point,) = out.polygon.points
     np.testing.assert_allclose([point.x, point.y, point.z], [101.0, 204.0, 0.5])
 
 
-def test_labels_that_came_later_and_ids_that_say_nothing():
+def test_unknown_labels_and_zero_uuids():
     message = message_of(TRACKED)
     message.objects[0].classification[0].probability = 1.0
     message.objects[0].classification[0].label = 8
@@ -205,7 +210,7 @@ def test_labels_that_came_later_and_ids_that_say_nothing():
     assert boxes.track_ids == ('0' * 31 + '1', '')
 
 
-def test_objects_that_are_no_boxes_are_passed_over_and_move_with_their_frame():
+def test_objects_that_are_not_boxes_are_skipped_and_transformed():
     message = message_of(OBJECTS)
     message.objects[0].shape.type = 2
     message.objects[0].shape.dimensions = np.array([0.5])
@@ -214,15 +219,18 @@ def test_objects_that_are_no_boxes_are_passed_over_and_move_with_their_frame():
     assert boxes.track_ids == ('2',)
     T = np.eye(4)
     T[:2, :2], T[:3, 3] = [[0, -1], [1, 0]], [100.0, 0.0, 0.0]
-    out = adapter.to_msg(message, moved(boxes, 'map'), None, T)
-    at, twist = out.objects[0].pose.position, out.objects[0].twist.linear
-    # (10, -2) a quarter turn further is (2, 10); 3 m/s along x become 3 m/s along y.
-    np.testing.assert_allclose([at.x, at.y, twist.x, twist.y], [102.0, 10.0, 0.0, 3.0], atol=1e-9)
+    out = adapter.to_msg(message, moved_boxes(boxes, 'map'), None, T)
+    position = out.objects[0].pose.position
+    twist = out.objects[0].twist.linear
+    # (10, -2) rotated by 90 degrees is (2, 10); 3 m/s along x become 3 m/s along y.
+    np.testing.assert_allclose(
+        [position.x, position.y, twist.x, twist.y], [102.0, 10.0, 0.0, 3.0], atol=1e-9
+    )
     assert {o.header.frame_id for o in out.objects} == {'map'}
-    np.testing.assert_allclose(adapter.from_msg(out).boxes, moved(boxes).boxes, atol=1e-9)
+    np.testing.assert_allclose(adapter.from_msg(out).boxes, moved_boxes(boxes).boxes, atol=1e-9)
 
 
-def test_scene_with_several_cubes_and_none():
+def test_scene_entities_with_several_cubes_or_none():
     message = message_of(SCENE)
     message.entities[0].cubes.append(message.entities[1].cubes[0])
     message.entities[1].cubes = []
@@ -231,8 +239,8 @@ def test_scene_with_several_cubes_and_none():
     assert boxes.track_ids == ('1/0', '1/1')
     T = np.eye(4)
     T[0, 3] = 100.0
-    out = adapter.to_msg(message, moved(boxes, 'map'), None, T)
-    np.testing.assert_allclose(adapter.from_msg(out).boxes, moved(boxes).boxes, atol=1e-9)
+    out = adapter.to_msg(message, moved_boxes(boxes, 'map'), None, T)
+    np.testing.assert_allclose(adapter.from_msg(out).boxes, moved_boxes(boxes).boxes, atol=1e-9)
     assert out.entities[0].texts[0].pose.position.x == 110.0
     assert [entity.frame_id for entity in out.entities] == ['map', 'lidar']
     empty = adapter.from_msg(M.build(SCENE))
@@ -260,7 +268,7 @@ int32[] histogram
 """
 
 
-def test_variants_of_jsk_boxes_are_told_by_their_definition(tmp_path):
+def test_forks_of_jsk_boxes_are_read_by_the_definition_in_the_recording(tmp_path):
     messages = Messages(ros1=True)
     box = 'jsk_recognition_msgs/msg/BoundingBox'
     for name in (box, JSK):
@@ -276,11 +284,10 @@ def test_variants_of_jsk_boxes_are_told_by_their_definition(tmp_path):
     with pytest.raises(UnsupportedMessage, match='--associate'), Recording([path]):
         pass
     with Recording([path], convention=Convention(associate=True)) as recording:
-        _, record = recording.records(TransformTree())
-        boxes = recording.decode(record)
-        raw = recording._message(record)
-    np.testing.assert_allclose(boxes.boxes, GIVEN[:1], atol=1e-12)
-    out = adapter_for(JSK).to_msg(raw, moved(boxes))
+        (record,) = recording._records(TransformTree(), {'/boxes'})
+        raw, boxes = recording.box_message(record.data)
+    np.testing.assert_allclose(boxes.boxes, INPUT_BOXES[:1], atol=1e-12)
+    out = adapter_for(JSK).to_msg(raw, moved_boxes(boxes))
     assert out.boxes[0].histogram.tolist() == [1, 2, 3]
 
 
@@ -290,10 +297,10 @@ def test_types_without_ids_are_refused_with_a_hint(type_name):
         adapter_for(type_name, STANDARD)
 
 
-# The same bytes through all readers ------------------------------------------------------------
+# The same bytes in all libraries -----------------------------------------------------------------
 
 
-def native(type_name, data):
+def from_rclpy(type_name, data):
     pytest.importorskip('rclpy', reason='rclpy is not installed')
     from rclpy.serialization import deserialize_message
 
@@ -316,26 +323,26 @@ def test_rclpy_rosbags_and_mcap_read_and_write_the_same(type_name):
     covariances = np.stack([np.full((6, 6), np.nan), 2 * np.eye(6)])
     T = np.eye(4)
     T[:2, :2] = [[0, -1], [1, 0]]
-    written = adapter.to_msg(message, moved(ours, 'map'), covariances, T)
-    for reader in (native, from_mcap):
+    written = adapter.to_msg(message, moved_boxes(ours, 'map'), covariances, T)
+    for reader in (from_rclpy, from_mcap):
         theirs = reader(type_name, data)
         boxes = adapter.from_msg(theirs)
         assert (boxes.stamp_ns, boxes.frame_id) == (ours.stamp_ns, ours.frame_id)
         assert (boxes.track_ids, boxes.class_names) == (ours.track_ids, ours.class_names)
         np.testing.assert_array_equal(boxes.scores, ours.scores)
         np.testing.assert_array_equal(boxes.boxes, ours.boxes)
-        out = adapter.to_msg(theirs, moved(boxes, 'map'), covariances, T)
+        out = adapter.to_msg(theirs, moved_boxes(boxes, 'map'), covariances, T)
         np.testing.assert_array_equal(adapter.from_msg(out).boxes, adapter.from_msg(written).boxes)
-        if reader is native:
+        if reader is from_rclpy:
             from rclpy.serialization import serialize_message
 
             again = M.store.deserialize_cdr(serialize_message(out), type_name)
             assert bytes_of(again, type_name) == bytes_of(written, type_name)
 
 
-def test_a_package_that_is_not_installed_is_named(monkeypatch):
+def test_missing_message_package_is_named(monkeypatch):
     pytest.importorskip('rclpy', reason='rclpy is not installed')
-    from boxreg_ros.live.node import import_message
+    from boxreg_ros.live.topics import import_message
 
     for type_name in ADAPTERS:
         package = type_name.split('/')[0]
@@ -344,7 +351,7 @@ def test_a_package_that_is_not_installed_is_named(monkeypatch):
             import_message(type_name)
 
 
-def test_times_of_any_encoding():
+def test_timestamps_of_all_encodings():
     for stamp in (
         SimpleNamespace(sec=7, nanosec=9),
         SimpleNamespace(sec=7, nsec=9),
@@ -354,3 +361,90 @@ def test_times_of_any_encoding():
         for entity in message.entities:
             entity.timestamp = stamp
         assert adapter_for(SCENE).from_msg(message).stamp_ns == 7 * 10**9 + 9
+
+
+# Malformed messages -----------------------------------------------------------------------------
+
+
+def as_namespace(message):
+    """Return a message as `json` decodes it: lists and namespaces of plain values."""
+    if isinstance(message, list):
+        return [as_namespace(item) for item in message]
+    if hasattr(message, '__dataclass_fields__'):
+        names = [name for name in message.__dataclass_fields__ if name != '__msgtype__']
+        return SimpleNamespace(**{name: as_namespace(getattr(message, name)) for name in names})
+    return message
+
+
+@pytest.mark.parametrize(
+    ('path', 'value', 'expected'),
+    [
+        ('entities', 5, 'expected a list as entities, got 5'),
+        ('entities.0.cubes', 'many', "expected a list as cubes, got 'many'"),
+        ('entities.0.cubes.0.pose', None, 'field pose.position.x'),
+        ('entities.0.cubes.0.size', SimpleNamespace(x=1.0), 'field size.y'),
+        (
+            'entities.0.cubes.0.size.x',
+            'wide',
+            'expected numbers as position, orientation and size',
+        ),
+        ('entities.0.cubes.0.size.x', 10**400, 'expected numbers as position'),
+        ('entities.0.cubes.0.pose.position.x', [1.0], 'expected numbers as position'),
+        ('entities.0.timestamp', None, 'expected a timestamp of whole seconds'),
+        ('entities.0.timestamp.sec', 'noon', 'expected a timestamp of whole seconds'),
+        ('entities.0.timestamp.sec', 10**12, 'expected a timestamp of whole seconds'),
+        ('entities.0.metadata', [1], 'field key'),
+        ('entities.0.frame_id', 5, 'expected one frame and one stamp for all boxes'),
+    ],
+)
+def test_malformed_json_scene_is_refused(path, value, expected):
+    message = as_namespace(message_of(SCENE))
+    *parents, name = path.split('.')
+    owner = message
+    for parent in parents:
+        owner = owner[int(parent)] if parent.isdigit() else getattr(owner, parent)
+    setattr(owner, name, value)
+    with pytest.raises(UnsupportedMessage, match=expected):
+        adapter_for(SCENE).from_msg(message)
+
+
+def test_json_scene_with_null_lists_is_read():
+    message = as_namespace(message_of(SCENE))
+    message.entities[0].cubes = None
+    message.entities[1].metadata = None
+    boxes = adapter_for(SCENE).from_msg(message)
+    assert (boxes.track_ids, boxes.class_names, boxes.scores.tolist()) == (('2',), ('',), [1.0])
+
+
+@pytest.mark.parametrize(
+    ('type_name', 'items', 'field'),
+    [
+        (TRACKED, 'objects', 'existence_probability'),
+        (DETECTED, 'objects', 'kinematics'),
+        (OBJECTS, 'objects', 'classification'),
+        (JSK, 'boxes', 'value'),
+        (MARKERS, 'markers', 'scale'),
+        (DETECTIONS, 'detections', 'id'),
+    ],
+)
+def test_definition_without_a_field_is_refused(type_name, items, field):
+    message = as_namespace(message_of(type_name))
+    for item in getattr(message, items):
+        delattr(item, field)
+    with pytest.raises(UnsupportedMessage, match=field):
+        adapter_for(type_name).from_msg(message)
+
+
+@pytest.mark.parametrize('type_name', ADAPTERS)
+@pytest.mark.parametrize('size', [(-4.5, 1.8, 1.6), (0.0, 1.8, 1.6), (np.nan, 1.8, 1.6)])
+def test_boxes_with_invalid_sizes_remain_in_the_array(type_name, size):
+    boxes = [(n + 1, (POSITIONS[n], (0, 0, 0, 1)), size if n else SIZES[0]) for n in range(2)]
+    message = M.boxes(type_name, STAMP, 'lidar', boxes)
+    found = adapter_for(type_name).from_msg(message)
+    assert is_valid_box(found.boxes).tolist() == [True, False]
+
+
+def test_table_of_message_types():
+    assert [name for name, *_ in rows()] == list(ADAPTERS)
+    assert {len(row) for row in rows()} == {len(HEAD)}
+    assert set(WITHOUT_IDS) == {BOXES, DETECTED, JSK}

@@ -1,4 +1,4 @@
-"""`boxreg calibrate`: rules and errors that are known are found again."""
+"""`boxreg calibrate`: labelling margins and errors that are known are found again."""
 
 from dataclasses import replace
 
@@ -6,7 +6,13 @@ from boxreg_ros import cli
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.calibrate import annotation_rule, calibrated, GAPS, input_errors, Measured
+from boxreg_ros.offline.calibrate import (
+    calibrated,
+    GAPS,
+    input_errors,
+    labelling_margins,
+    Measured,
+)
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
@@ -18,11 +24,11 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 RULE = {'gap_ends': 0.12, 'gap_sides': 0.07, 'gap_top': 0.09, 'gap_bottom': 0.05}
-"""How far outside of the bodies' own boxes an annotator draws [m]."""
+"""Labelling margins around the boxes of the bodies [m]."""
 
 
 def drawn(truth, rule=RULE):
-    """Return true boxes drawn by a rule."""
+    """Return true boxes with labelling margins."""
     boxes = truth.boxes.copy()
     up, down = rule['gap_top'], rule['gap_bottom']
     boxes[:, 3:6] += 2 * rule['gap_ends'], 2 * rule['gap_sides'], up + down
@@ -38,37 +44,37 @@ def scene():
 
 @pytest.fixture(scope='module')
 def plain(scene):
-    return annotation_rule(Drive.from_scene(scene), Config())
+    return labelling_margins(Drive.from_scene(scene), Config())
 
 
-def test_the_rule_of_a_simulated_recording_is_found(scene, plain):
-    # Bodies stand on the road, which is the bottom of their boxes. Elsewhere they reach these
+def test_labelling_margins_of_a_simulated_recording_are_found(scene, plain):
+    # The bodies are on the road, which is the bottom of their boxes. Elsewhere they reach these
     # here and there, and of the noise of 0.02 m the outermost twentieth is 2 deviations out.
     assert plain['vehicle.gap_bottom'].value == pytest.approx(0.0, abs=0.01)
     assert all(-0.05 < plain[f'vehicle.{name}'].value < 0.15 for name in GAPS)
     drive = Drive.from_scene(scene)
-    found = annotation_rule(replace(drive, truth=drawn(drive.truth)), Config())
+    found = labelling_margins(replace(drive, truth=drawn(drive.truth)), Config())
     for gap_name, gap in RULE.items():
         name = f'vehicle.{gap_name}'
         assert found[name].value - plain[name].value == pytest.approx(gap, abs=0.012), name
         assert (
             10 <= found[name].tracks <= 19
-        )  # vehicles of 22 tracks: half at least tell each face
+        )  # vehicles of 22 tracks: half at least show each face
         assert found[name].spread < 0.1
-    # How round a body is does not change with how its box is drawn.
-    for name in ('faces.depth_ends', 'faces.depth_sides'):
+    # The inset of occluded faces does not depend on the labelling margins.
+    for name in ('faces.inset_ends', 'faces.inset_sides'):
         assert found[name].value == pytest.approx(plain[name].value, abs=0.06)
 
 
-def test_kinds_have_rules_of_their_own(scene):
-    # Every other track is said to be a motorcycle, and those are drawn by `RULE`.
+def test_each_kind_has_its_own_margins(scene):
+    # Every other track is labelled motorcycle, with the margins of `RULE`.
     drive = Drive.from_scene(scene)
     rides = np.array([int(name) % 2 == 1 for name in drive.truth.track_ids])
     names = tuple('motorcycle' if ride else 'car' for ride in rides)
     plain = replace(drive.truth, class_names=names)
     boxes = np.where(rides[:, None], drawn(plain).boxes, plain.boxes)
     before, found = (
-        annotation_rule(replace(drive, truth=truth), Config())
+        labelling_margins(replace(drive, truth=truth), Config())
         for truth in (plain, replace(plain, boxes=boxes))
     )
     assert not any(name.startswith('pedestrian') for name in found)
@@ -80,16 +86,16 @@ def test_kinds_have_rules_of_their_own(scene):
         assert found[f'cyclist.{name}'].tracks + found[f'vehicle.{name}'].tracks <= 22
 
 
-def test_the_rule_does_not_hang_on_where_it_begins(scene, plain):
+def test_margins_do_not_depend_on_the_start(scene, plain):
     begin = Config().updated(
         {'vehicle.gap_ends': 0.3, 'vehicle.gap_top': -0.1, 'faces.learn': False}
     )
-    found = annotation_rule(Drive.from_scene(scene), begin)
+    found = labelling_margins(Drive.from_scene(scene), begin)
     for name in (f'vehicle.{name}' for name in GAPS):
         assert found[name].value == pytest.approx(plain[name].value, abs=0.01), name
 
 
-def test_few_tracks_tell_their_part(scene, plain):
+def test_margins_of_few_tracks(scene, plain):
     drive = Drive.from_scene(scene)
     keep = [i for i, name in enumerate(drive.truth.track_ids) if name in ('9', '10', '11', '12')]
     few = replace(
@@ -99,7 +105,7 @@ def test_few_tracks_tell_their_part(scene, plain):
         **{name: tuple(getattr(drive.truth, name)[i] for i in keep)
            for name in ('track_ids', 'class_names', 'status')},
     )  # fmt: skip
-    found = annotation_rule(replace(drive, truth=few), Config())
+    found = labelling_margins(replace(drive, truth=few), Config())
     assert {found[f'vehicle.{name}'].tracks for name in GAPS} <= {3, 4}
     known = plain['vehicle.gap_bottom'].value
     assert found['vehicle.gap_bottom'].value == pytest.approx(known, abs=0.02)
@@ -141,14 +147,14 @@ def test_errors_of_the_input_are_found(bias, turned):
     assert set(found) == {f'vehicle.{name}' for name in expected}
     for name, value in expected.items():
         measured = found[f'vehicle.{name}']
-        # 1000 errors tell a deviation to 4 %; 75 extents to 15 %.
+        # 1000 errors give a deviation to 4 %; 75 extents to 15 %.
         assert measured.value == pytest.approx(value, rel=0.25 if name == 'extent' else 0.1), name
         assert measured.tracks == 25
         assert 0 < measured.spread < value
 
 
 @pytest.mark.parametrize('held', [10, 25])
-def test_boxes_that_are_held_tell_the_errors_of_extents_only(held):
+def test_repeated_boxes_give_errors_of_extents_only(held):
     # Of 25 tracks some have the same box at all stamps.
     drive = noisy_drive(DEVIATION)
     first = drive.boxes[0].boxes[:held]
@@ -162,7 +168,7 @@ def test_boxes_that_are_held_tell_the_errors_of_extents_only(held):
         assert set(calibrated(Config(), found)) == {'vehicle.extent'}
 
 
-def test_kinds_have_errors_of_their_own():
+def test_each_kind_has_its_own_errors():
     drives = [noisy_drive(DEVIATION * k, class_name=c) for k, c in ((1, 'bus'), (2, 'person'))]
     walkers = [replace(a, track_ids=tuple(f'p{n}' for n in a.track_ids)) for a in drives[1].boxes]
     truth = [d.truth for d in drives]
@@ -179,15 +185,15 @@ def test_kinds_have_errors_of_their_own():
     assert not any(name.startswith('cyclist') for name in found)
 
 
-def test_short_tracks_tell_no_errors():
+def test_short_tracks_give_no_errors():
     found = input_errors(noisy_drive(DEVIATION, n=13), Config())
     assert found['vehicle.position'].tracks == 0
     assert calibrated(Config(), found) == {}
 
 
-def test_settings_that_come_out():
+def test_settings_that_are_written():
     rule = {f'vehicle.{name}': Measured(gap, 0.01, 3) for name, gap in RULE.items()}
-    # Two tracks of a kind tell nothing of it, and do not keep that of others from being stated.
+    # Two tracks of a kind are too few for margins; those of other kinds are fixed all the same.
     rule |= {f'cyclist.{name}': Measured(0.4, 0.01, 2) for name in RULE}
     found = calibrated(Config(lag=4), rule)
     known = {f'vehicle.{name}': gap for name, gap in RULE.items()}
@@ -199,10 +205,10 @@ def test_settings_that_come_out():
     assert calibrated(Config(), rule) == {k: v for k, v in known.items() if k[-4:] != '_top'}
     # Values beyond what a setting may have; tilt that neither labels nor input have.
     edges = {
-        'faces.depth_ends': Measured(-0.1, 0.01, 9), 'vehicle.tilt': Measured(0.0, 0.0, 9),
+        'faces.inset_ends': Measured(-0.1, 0.01, 9), 'vehicle.tilt': Measured(0.0, 0.0, 9),
         'vehicle.heading': Measured(0.0, 0.0, 9),
     }  # fmt: skip
-    assert calibrated(Config(), edges) == {'faces.depth_ends': 0.0, 'vehicle.heading': 0.001}
+    assert calibrated(Config(), edges) == {'faces.inset_ends': 0.0, 'vehicle.heading': 0.001}
 
 
 @pytest.fixture(scope='module')
@@ -225,7 +231,7 @@ def test_what_is_written_is_what_relabel_reads(street, scene, tmp_path, capsys):
     text = capsys.readouterr().out
     assert 'vehicle.gap_bottom' in text
     assert 'vehicle.position' in text
-    assert 'the rule is stated' in text
+    assert 'the labelling margins are fixed' in text
     assert f'{len(set(scene.truth.track_ids))} labelled tracks' in text
     config = Config.from_yaml(rule)
     assert config.vehicle.gap_bottom == pytest.approx(RULE['gap_bottom'], abs=0.01)
@@ -239,7 +245,7 @@ def test_what_is_written_is_what_relabel_reads(street, scene, tmp_path, capsys):
     assert Config.from_yaml(out / 'config.yaml') == config
 
 
-def test_a_recording_without_boxes_has_a_rule(street, scene, tmp_path, capsys):
+def test_margins_of_a_recording_without_boxes(street, scene, tmp_path, capsys):
     path = tmp_path / 'clouds.mcap'
     nobody = [replace(a, track_ids=(), class_names=(), scores=a.scores[:0], boxes=a.boxes[:0])
               for a in scene.detections]  # fmt: skip
@@ -252,7 +258,7 @@ def test_a_recording_without_boxes_has_a_rule(street, scene, tmp_path, capsys):
     assert 'vehicle.position' not in text
 
 
-def test_sweeps_without_labels_are_not_held(street, scene):
+def test_sweeps_without_labels_are_not_kept(street, scene):
     few = scene.truth.stamps_ns[[0, -1]]
     truth = replace(scene.truth, stamps_ns=np.where(scene.truth.stamps_ns < few[1], *few))
     drive = Drive.of(Recording([street]), truth, Config().tolerance)
@@ -260,7 +266,7 @@ def test_sweeps_without_labels_are_not_held(street, scene):
     assert len(drive.boxes) == len(scene.detections)
 
 
-def test_what_cannot_be_used_is_passed_over_and_told(tmp_path, capsys):
+def test_unusable_messages_are_skipped_and_reported(tmp_path, capsys):
     made = Recorded(sweeps=8)
     made.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
     made.replace('/boxes', 4, lambda m: setattr(m.detections[0].header, 'frame_id', 'camera'))
@@ -295,7 +301,7 @@ def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
 
 
 @pytest.mark.parametrize('given', ['{bag}', '{link}', '{truth}', '{folder}/rule.yaml'])
-def test_the_rule_is_not_written_over_what_it_is_measured_from(tmp_path, capsys, given):
+def test_the_output_never_overwrites_an_input(tmp_path, capsys, given):
     folder = Recorded(sweeps=2).write(tmp_path / 'drive', 'sqlite3')
     bag, truth, link = next(folder.glob('*.db3')), tmp_path / 'truth.csv', tmp_path / 'link'
     BoxTable.from_arrays([]).write(truth)

@@ -1,4 +1,4 @@
-"""Scores of boxes whose errors are known."""
+"""Scores of boxes with known errors."""
 
 import argparse
 import codecs
@@ -17,7 +17,7 @@ STEP = 100_000_000
 
 
 def truth_table(count=10):
-    """Return a car that drives at 5 m/s along x and a pedestrian who stands."""
+    """Return a car that moves at 5 m/s along x and a pedestrian at rest."""
     arrays = []
     for i in range(count):
         boxes = [[0.5 * i, 0, 1, 4, 2, 1.5, 0, 0, 0], [0, 9, 1, 0.6, 0.6, 1.8, 0, 0, 2]]
@@ -31,6 +31,7 @@ def truth_table(count=10):
 
 
 def rows(table, keep):
+    """Return a table with the rows `keep` of another one."""
     keep = np.asarray(keep)
     arrays = ('stamps_ns', 'scores', 'boxes', 'num_points')
     words = ('track_ids', 'class_names', 'status')
@@ -42,12 +43,13 @@ def rows(table, keep):
 
 
 def run(*words):
+    """Run the subcommand; return its exit status."""
     parser = argparse.ArgumentParser()
     cli.add_arguments(parser)
     return cli.run(parser.parse_args([str(word) for word in words]))
 
 
-def test_truth_against_itself_is_perfect():
+def test_truth_has_perfect_scores():
     scores = evaluate(truth_table(), truth_table())
     assert scores.iou_bev == scores.iou_3d == pytest.approx(1, abs=1e-8)
     assert scores.recall_3d == scores.recall_bev == (1, 1, 1)
@@ -56,11 +58,11 @@ def test_truth_against_itself_is_perfect():
     assert scores.jitter == pytest.approx(0, abs=1e-9)
 
 
-def test_known_errors():
+def test_scores_of_known_errors():
     truth = truth_table()
     boxes = truth.boxes.copy()
     car = np.array(truth.class_names) == 'Car'
-    boxes[car, 0] += 1.0  # 3 of 4 m shared: IoU 3 / 5
+    boxes[car, 0] += 1.0  # overlap 3 m, union 5 m
     boxes[np.flatnonzero(car)[:3], 8] += np.pi
     scores = evaluate(replace(truth, boxes=boxes), truth, classes=['car'])
     assert scores.boxes == 10
@@ -73,7 +75,7 @@ def test_known_errors():
     assert scores.aoe_median == 0
 
 
-def test_extent_error():
+def test_scale_error_of_doubled_length():
     truth = truth_table()
     boxes = truth.boxes.copy()
     boxes[:, 3] *= 2
@@ -85,7 +87,7 @@ def test_extent_error():
 def test_jitter_is_the_second_difference():
     truth = truth_table(5)
     boxes = truth.boxes.copy()
-    boxes[4, 1] += 0.1  # the car, once, 0.1 m to the side: 10, 20, 10 m/s^2
+    boxes[4, 1] += 0.1  # the car, at one stamp, 0.1 m to the side: 10, 20, 10 m/s^2
     boxes[4, 8] += 0.01
     matches = match(replace(truth, boxes=boxes), truth, classes=['car'])
     np.testing.assert_allclose(matches.jitter, [np.nan, 10, 20, 10, np.nan], atol=1e-9)
@@ -94,15 +96,15 @@ def test_jitter_is_the_second_difference():
     assert summarise(matches).jitter == pytest.approx(40 / 3)
 
 
-def test_jitter_over_uneven_steps_and_gaps():
+def test_constant_velocity_has_no_jitter_at_uneven_steps():
     truth = rows(truth_table(30), np.flatnonzero(np.arange(60) % 2 == 0)[[0, 1, 3, 4, 20, 21]])
-    matches = match(truth, truth)  # constant velocity: no jitter whatever the steps
+    matches = match(truth, truth)  # the last two steps are next to a gap
     np.testing.assert_allclose(matches.jitter, [np.nan, 0, 0, np.nan, np.nan, np.nan], atol=1e-9)
 
 
-def test_missing_and_unmatched():
+def test_missing_and_unmatched_boxes_are_counted():
     truth = truth_table()
-    predicted = rows(truth, np.arange(2, 20))  # the first stamp is not predicted
+    predicted = rows(truth, np.arange(2, 20))  # both boxes of the first stamp are missing
     predicted = replace(predicted, track_ids=('ghost', *predicted.track_ids[1:]))
     scores = evaluate(predicted, truth)
     assert (scores.boxes, scores.missing, scores.unmatched) == (20, 3, 1)
@@ -113,7 +115,7 @@ def test_missing_and_unmatched():
     assert evaluate(replace(predicted, boxes=broken), truth).missing == 4
 
 
-def test_scope():
+def test_scope_by_points_and_class():
     truth = truth_table()
     assert evaluate(truth, truth, min_points=100).boxes == 10
     assert evaluate(truth, truth, min_points=201).boxes == 0
@@ -128,11 +130,13 @@ def test_scope():
     }  # fmt: skip
 
 
-def test_refused():
+def test_tables_that_cannot_be_compared_are_refused():
     truth = truth_table()
-    with pytest.raises(RecordingError, match="predicted boxes are in 'map', true ones in 'odom'"):
+    with pytest.raises(
+        RecordingError, match="expected the frame of the true boxes, 'odom', got 'map'"
+    ):
         match(replace(truth, frame_id='map'), truth)
-    with pytest.raises(RecordingError, match="track '1' comes twice at stamp 0"):
+    with pytest.raises(RecordingError, match="got '1' 2 times at stamp 0"):
         match(truth, rows(truth, [0, 0]))
     arrays = [
         BoxArray(0, frame, ('1',), ('car',), np.ones(1), np.ones((1, 9))) for frame in ('a', 'b')
@@ -141,7 +145,7 @@ def test_refused():
         BoxTable.from_arrays(arrays)
 
 
-def test_table_round_trip(tmp_path):
+def test_table_survives_the_round_trip(tmp_path):
     truth = truth_table()
     boxes = truth.boxes + np.random.default_rng(0).normal(0, 0.3, truth.boxes.shape)
     boxes[:, :3] += 5e5
@@ -173,20 +177,20 @@ def test_table_round_trip(tmp_path):
          'line 2, column stamp_ns: expected a whole number of 64 bits, got 99999'),
     ],
 )  # fmt: skip
-def test_bad_table(tmp_path, text, message):
+def test_malformed_table_is_refused(tmp_path, text, message):
     (tmp_path / 'boxes.csv').write_text(text)
     with pytest.raises(RecordingError, match=message):
         BoxTable.read(tmp_path / 'boxes.csv')
 
 
-def test_absent_or_binary_table(tmp_path):
+def test_absent_or_binary_table_is_refused(tmp_path):
     (tmp_path / 'binary.csv').write_bytes(bytes(range(256)))
     for name, reason in (('absent.csv', 'read: No such file'), ('binary.csv', 'read as CSV')):
         with pytest.raises(RecordingError, match=f'cannot be {reason}'):
             BoxTable.read(tmp_path / name)
 
 
-def test_command(tmp_path, capsys):
+def test_command_prints_scores(tmp_path, capsys):
     truth = truth_table()
     truth.write(tmp_path / 'truth.csv')
     rows(truth, np.arange(4, 20)).write(tmp_path / 'boxes.csv')
@@ -203,39 +207,41 @@ def test_command(tmp_path, capsys):
     text = capsys.readouterr().out
     assert 'pedestrian' not in text
     assert '10 true boxes, 2 missing' in text
-    with pytest.raises(RecordingError, match='none of 20 true boxes is in scope'):
+    with pytest.raises(RecordingError, match='expected true boxes in scope, got none of 20'):
         run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'tank')
 
 
-def test_boxes_that_stayed_in_another_frame_are_missing(tmp_path, capsys):
+def test_boxes_in_another_frame_are_left_out(tmp_path, capsys):
     truth = truth_table()
     truth.write(tmp_path / 'truth.csv')
-    # Without a transform for most of the drive, as relabel leaves them.
+    # As relabel writes boxes without a transform, here most of the drive.
     replace(rows(truth, np.arange(14)), frame_id='lidar').write(tmp_path / 'boxes.csv')
     rows(truth, np.arange(14, 20)).write(tmp_path / 'more.csv')
     with (tmp_path / 'boxes.csv').open('a') as file:
         file.writelines((tmp_path / 'more.csv').read_text().splitlines(keepends=True)[1:])
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
-    told = capsys.readouterr()
-    assert '20 true boxes, 14 missing, 0 predictions' in told.out
-    assert "14 predicted boxes in 'lidar' are left out" in told.err
+    printed = capsys.readouterr()
+    assert '20 true boxes, 14 missing, 0 predictions' in printed.out
+    assert "14 predicted boxes in frame 'lidar' are left out" in printed.err
     replace(truth, frame_id='map').write(tmp_path / 'truth.csv')
-    with pytest.raises(RecordingError, match=r"boxes are in 'lidar', true ones in 'map'"):
+    with pytest.raises(
+        RecordingError, match="expected the frame of the true boxes, 'map', got 'lidar'"
+    ):
         run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv')
 
 
-def test_nothing_in_common_is_explained(tmp_path, capsys):
+def test_tables_without_a_common_stamp_are_explained(tmp_path, capsys):
     truth = truth_table()
     truth.write(tmp_path / 'truth.csv')
     replace(truth, stamps_ns=truth.stamps_ns + 10**12).write(tmp_path / 'boxes.csv')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
     assert (
-        '0 stamps and 2 track ids are in both; predicted boxes are of 1000.000 to 1000.900 s, '
-        'true ones of 0.000 to 0.900 s'
+        '0 stamps and 2 track ids are in both; stamps of predicted boxes: 1000.000 to '
+        '1000.900 s, of true boxes: 0.000 to 0.900 s'
     ) in capsys.readouterr().err
 
 
-def test_true_boxes_that_are_none_are_left_out_and_told(tmp_path, capsys):
+def test_invalid_true_boxes_are_left_out_with_a_warning(tmp_path, capsys):
     truth = truth_table()
     boxes = truth.boxes.copy()
     boxes[3, 0], boxes[5, 4] = np.nan, 0
@@ -249,13 +255,15 @@ def test_true_boxes_that_are_none_are_left_out_and_told(tmp_path, capsys):
     assert '2 of 20 true boxes are left out' in capsys.readouterr().err
 
 
-def test_predictions_that_are_all_invalid_are_explained(tmp_path, capsys):
+def test_tables_with_invalid_predictions_only_are_explained(tmp_path, capsys):
     truth = truth_table()
     truth.write(tmp_path / 'truth.csv')
     boxes = truth.boxes.copy()
     boxes[:, 0] = np.inf
     replace(truth, boxes=boxes).write(tmp_path / 'boxes.csv')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'car') == 0
-    told = capsys.readouterr()
-    assert 'all 10 predicted boxes of the stamp and the track of a true one are' in told.err
-    assert '10 true boxes, 10 missing' in told.out
+    printed = capsys.readouterr()
+    assert (
+        'all 10 predicted boxes with the stamp and the track id of a true one are' in printed.err
+    )
+    assert '10 true boxes, 10 missing' in printed.out

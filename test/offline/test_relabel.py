@@ -9,6 +9,7 @@ import sys
 
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
+from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import input_boxes
@@ -47,7 +48,7 @@ def keys(rows):
 
 @pytest.mark.parametrize('estimate', ['track', 'final', 'early'])
 @pytest.mark.parametrize('boxes', ['vision', 'markers'])
-def test_every_box_comes_out_once_in_order(tmp_path, estimate, boxes):
+def test_every_box_is_written_once_in_order(tmp_path, estimate, boxes):
     drive = Drive(sweeps=7, boxes=boxes)
     summary, rows = run(
         drive.write(tmp_path / 'drive'),
@@ -63,7 +64,7 @@ def test_every_box_comes_out_once_in_order(tmp_path, estimate, boxes):
     assert summary['status'].get('refined', 0) > 0
 
 
-def test_boxes_land_on_the_truth_in_the_fixed_frame(tmp_path):
+def test_refined_boxes_match_the_truth_in_the_fixed_frame(tmp_path):
     drive = Drive(sweeps=7)
     _, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
     for row in rows:
@@ -90,7 +91,7 @@ def test_boxes_and_clouds_in_different_frames(tmp_path):
             assert float(after[name]) == pytest.approx(float(before[name]), abs=1e-6)
 
 
-def test_several_recordings_are_one_drive(tmp_path):
+def test_several_recordings_are_merged(tmp_path):
     drive = Drive(sweeps=6)
     whole = run(drive.write(tmp_path / 'whole'), tmp_path / 'whole_out')[1]
     half = len(drive.items) // 2
@@ -102,13 +103,13 @@ def test_several_recordings_are_one_drive(tmp_path):
     assert rows_of(tmp_path / 'parts_out') == whole
 
 
-def test_a_part_of_the_recording(tmp_path):
+def test_start_and_end_select_a_part(tmp_path):
     drive = Drive(sweeps=10)
     rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out', start=0.25, end=0.75)[1]
     assert sorted({stamp for stamp, _ in keys(rows)}) == drive.stamps[3:8]
 
 
-def test_output_folder_holds_what_the_design_says(tmp_path):
+def test_output_folder_contents(tmp_path):
     path = Drive(sweeps=4).write(tmp_path / 'drive')
     summary, _ = run(path, tmp_path / 'out', settings={'solver.iterations': 2})
     out = tmp_path / 'out'
@@ -127,16 +128,16 @@ def test_output_folder_holds_what_the_design_says(tmp_path):
     assert len(label['frames']) == 4
 
 
-def test_csv_alone(tmp_path):
+def test_csv_as_the_only_format(tmp_path):
     run(Drive(sweeps=3).write(tmp_path / 'drive'), tmp_path / 'out', formats=('csv',))
     assert not (tmp_path / 'out' / 'openlabel').exists()
     assert (tmp_path / 'out' / 'boxes.csv').exists()
 
 
-# What goes wrong -------------------------------------------------------------------------------
+# Faulty input and failures ----------------------------------------------------------------------
 
 
-def test_bad_boxes_come_back_as_they_are(tmp_path):
+def test_invalid_boxes_are_written_unchanged(tmp_path):
     drive = Drive(sweeps=5)
 
     def spoil(message):
@@ -183,12 +184,12 @@ def test_bad_boxes_come_back_as_they_are(tmp_path):
     assert len(label['openlabel']['frames']['2']['objects']) == 5
 
 
-def test_missing_transforms_keep_the_boxes_in_their_frame(tmp_path):
+def test_boxes_without_transform_stay_in_their_frame(tmp_path):
     drive = Drive(sweeps=10)
     gone = drive.stamps[:4]
     drive.items = [item for item in drive.items if item[0] != '/tf' or item[1] not in gone]
     summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
-    # Motion is carried on for 0.2 s: the stamps 0.2 and 0.3 s are still covered.
+    # Motion is extrapolated by at most 0.2 s: this covers the stamps 0.2 and 0.3 s.
     early = [row for row in rows if int(row['stamp_ns']) in drive.stamps[:2]]
     assert {(row['frame_id'], row['status']) for row in early} == {('lidar', 'kept')}
     assert {row['frame_id'] for row in rows[4:]} == {'odom'}
@@ -203,7 +204,7 @@ def test_missing_transforms_keep_the_boxes_in_their_frame(tmp_path):
     assert left_out.startswith('2 messages had no transform, first: transform odom -> base')
 
 
-def test_boxes_in_a_frame_that_nothing_connects(tmp_path):
+def test_boxes_in_an_unconnected_frame(tmp_path):
     drive = Drive(sweeps=3)
     for topic, _, message in drive.items:
         if topic == '/boxes':
@@ -216,7 +217,7 @@ def test_boxes_in_a_frame_that_nothing_connects(tmp_path):
     assert "'radar'" in summary['first_missing_transform']
 
 
-def test_sweeps_and_boxes_that_miss_each_other(tmp_path):
+def test_unpaired_sweeps_and_boxes(tmp_path):
     drive = Drive(sweeps=6)
     drive.items = [
         item
@@ -241,7 +242,7 @@ def test_sweeps_and_boxes_that_miss_each_other(tmp_path):
         ('mcap', '/odom', 3600),
     ],
 )
-def test_a_topic_recorded_another_time_is_merged_by_stamp(tmp_path, storage, topic, late):
+def test_topic_recorded_at_another_time_is_merged_by_stamp(tmp_path, storage, topic, late):
     motion = 'odometry' if topic == '/odom' else 'tf'
     drive = Drive(sweeps=12, motion=motion, ros1=storage == 'rosbag1')
     whole = drive.write(tmp_path / 'whole', storage)
@@ -259,15 +260,15 @@ def test_a_topic_recorded_another_time_is_merged_by_stamp(tmp_path, storage, top
     assert summary['status'] == {'refined': 24}
     assert summary['recorded_apart'] == {topic: pytest.approx(late)}
     assert together['recorded_apart'] == {}
-    # A part is one of the clouds' recording, whenever the rest was recorded.
+    # Start and end count from the first cloud, whenever the rest was recorded.
     options = {'start': 0.35, 'end': 0.75, 'config': QUICK}
     relabel(Request(paths, **options), tmp_path / 'part')
     relabel(Request((whole,), **options), tmp_path / 'part_expected')
     assert rows_of(tmp_path / 'part') == rows_of(tmp_path / 'part_expected')
 
 
-def test_a_detector_that_falls_behind_loses_nothing(tmp_path):
-    """Its last boxes come 5.5 s late, which is more clouds than `queue` waits with."""
+def test_boxes_of_a_slow_detector_are_merged_by_stamp(tmp_path):
+    """The last boxes are 5.5 s late: more clouds than `queue` holds."""
     drive = Drive(sweeps=56)
     expected = run(drive.write(tmp_path / 'punctual'), tmp_path / 'expected')[1]
     slow = [
@@ -280,10 +281,10 @@ def test_a_detector_that_falls_behind_loses_nothing(tmp_path):
     assert closing_line(summary, tmp_path).endswith('; merged by stamp: /boxes (+5.5 s)')
 
 
-def test_what_begins_before_the_clouds_and_ends_after_them_is_merged_by_stamp(tmp_path):
-    """Poses of the whole drive, worked out another day, and clouds of a part in its middle."""
-    whole, (begin, end) = Drive(sweeps=60), (20, 40)
-    stamps = whole.stamps[begin:end]
+def test_topic_longer_than_the_clouds_is_merged_by_stamp(tmp_path):
+    """Poses of the whole drive, computed later, and clouds of a part in its middle."""
+    whole = Drive(sweeps=60)
+    stamps = whole.stamps[20:40]
     part = [item for item in whole.items if stamps[0] <= item[1] <= stamps[-1]]
     part.insert(0, whole.items[0])  # /tf_static
     expected = run(write_recording(tmp_path / 'part', part), tmp_path / 'expected')[1]
@@ -297,8 +298,8 @@ def test_what_begins_before_the_clouds_and_ends_after_them_is_merged_by_stamp(tm
     assert rows_of(tmp_path / 'out') == expected
 
 
-def test_ends_that_say_nothing_do_not_hide_what_was_recorded_apart(tmp_path):
-    """Trackers begin and end with empty arrays, which have no stamp where items carry it."""
+def test_empty_arrays_at_the_ends_do_not_prevent_the_merge_by_stamp(tmp_path):
+    """Some trackers begin and end with empty arrays; in a MarkerArray these have no stamp."""
     drive = Drive(sweeps=30, boxes='markers')
     for topic, _, message in drive.items:
         if topic == '/boxes' and message.markers[0].header.stamp.nanosec % 10**9 in (0, 10**8):
@@ -319,7 +320,7 @@ def test_ends_that_say_nothing_do_not_hide_what_was_recorded_apart(tmp_path):
     assert summary['status']['refined'] > 40
 
 
-def test_a_part_without_boxes_is_told(tmp_path, capsys):
+def test_part_without_boxes_is_a_warning(tmp_path, capsys):
     drive = Drive(sweeps=10)
     drive.items = [i for i in drive.items if i[0] != '/boxes' or i[1] < drive.stamps[5]]
     path = drive.write(tmp_path / 'drive')
@@ -327,8 +328,9 @@ def test_a_part_without_boxes_is_told(tmp_path, capsys):
     assert 'no boxes in this part' in capsys.readouterr().err
 
 
-def test_a_part_begins_with_the_clouds_whatever_else_is_in_the_files(tmp_path):
-    drive, day = Drive(sweeps=10), 86_400 * SECOND
+def test_start_counts_from_the_first_cloud(tmp_path):
+    drive = Drive(sweeps=10)
+    day = 86_400 * SECOND
     expected = run(drive.write(tmp_path / 'drive'), tmp_path / 'expected', start=0.25, end=0.75)[1]
     static = [(topic, t - day, m) for topic, t, m in drive.items if topic == '/tf_static']
     other = [('/points2', t - day, m) for topic, t, m in drive.items if topic == '/points']
@@ -341,8 +343,8 @@ def test_a_part_begins_with_the_clouds_whatever_else_is_in_the_files(tmp_path):
     assert rows_of(tmp_path / 'out') == expected
 
 
-def test_stamps_of_another_clock_are_no_order(tmp_path):
-    """Boxes stamped by a clock that the clouds know nothing of stay where they were received."""
+def test_stamps_of_another_clock_do_not_change_the_order(tmp_path):
+    """Boxes stamped by another clock stay in the order in which they were received."""
     drive = Drive(sweeps=12)
     for topic, _, message in drive.items:
         if topic == '/boxes':
@@ -368,9 +370,40 @@ def test_boxes_of_one_stamp_in_two_messages(tmp_path):
         assert stamps == sorted(2 * [*drive.stamps, drive.stamps[1]])
 
 
+def test_results_are_written_to_their_array_by_ticket(tmp_path, monkeypatch):
+    """Two arrays of one stamp with different tracks; the results return in reverse order."""
+    drive = Drive(sweeps=5)
+    first = [item for item in drive.items if item[0] == '/boxes'][1]
+    other = drive.messages.detections(
+        first[1], 'lidar', [('9', 'car', 0.5, (9.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (4, 2, 1.5))]
+    )
+    drive.items.insert(drive.items.index(first) + 1, (*first[:2], other))
+    path = drive.write(tmp_path / 'drive')
+    expected = run(path, tmp_path / 'expected')[1]
+    assert [row['track_id'] for row in expected[2:5]] == ['1', '2', '9']
+
+    class ReversingRegistrar(BoxRegistrar):
+        """Return all results at the end, the last one first."""
+
+        def add_sweep(self, sweep):
+            held.extend(super().add_sweep(sweep))
+            return []
+
+        def add_boxes(self, boxes):
+            held.extend(super().add_boxes(boxes))
+            return []
+
+        def flush(self):
+            return [*held, *super().flush()][::-1]
+
+    held = []
+    monkeypatch.setattr('boxreg_ros.offline.relabel.BoxRegistrar', ReversingRegistrar)
+    assert run(path, tmp_path / 'out')[1] == expected
+
+
 @pytest.mark.parametrize('pause', [0, 5])
-def test_a_recording_that_holds_a_loop_begins_anew(tmp_path, pause):
-    """Played in a loop while it was recorded: the second round is as good as the first."""
+def test_recording_of_a_loop_starts_again_after_the_time_jump(tmp_path, pause):
+    """Recorded while a drive was played twice: the second round is refined like the first."""
     drive = Drive(sweeps=50)
     length = 5 * SECOND + pause * SECOND
     drive.items += [(topic, t + length, m) for topic, t, m in drive.items if topic != '/tf_static']
@@ -385,8 +418,8 @@ def test_a_recording_that_holds_a_loop_begins_anew(tmp_path, pause):
             found = [float(row[name]) for name in ('x', 'y', 'z')]
             np.testing.assert_allclose(found, true[:3], atol=0.35)
     assert {len(both) for both in rounds.values()} == {2}
-    # One array and one cloud are spent on finding out that time has begun again. Without a pause
-    # the transforms of up to two seconds, that are read ahead, begin again before boxes do.
+    # One array and one cloud are needed to detect the time jump. Without a pause, transforms are
+    # read up to two seconds ahead and jump before the boxes do.
     kept = sum(row['status'] == 'kept' for row in rows)
     assert kept <= (4 if pause else 44)
 
@@ -403,7 +436,7 @@ def test_empty_clouds_and_empty_arrays(tmp_path):
     assert (summary['sweeps'], summary['box_arrays']) == (6, 6)
 
 
-def test_boxes_that_never_have_points_and_lone_boxes(tmp_path):
+def test_boxes_without_points_are_written(tmp_path):
     drive = Drive(sweeps=4)
     pose = ((-30.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     for topic, stamp, message in drive.items:
@@ -420,7 +453,7 @@ def test_boxes_that_never_have_points_and_lone_boxes(tmp_path):
 
 
 def truncated(path, out, sizes):
-    """Copy a recording; `sizes` has the bytes that are left of message k on a topic."""
+    """Copy a recording; `sizes` maps (topic, k) to the bytes left of message k on the topic."""
     count = Counter()
     with (
         AnyReader([path]) as reader,
@@ -438,12 +471,12 @@ def truncated(path, out, sizes):
     return next(out.glob('*.mcap'))
 
 
-def test_unreadable_messages_are_passed_over_and_counted(tmp_path):
+def test_unreadable_messages_are_skipped_and_counted(tmp_path):
     drive = Drive(sweeps=8)
     drive.replace('/points', 3, lambda message: setattr(message, 'point_step', 2))
     path = drive.write(tmp_path / 'whole')
-    # A cloud of which nothing is left but its stamp, the first that tells the frame; one of which
-    # half is left; boxes that end amid the first; a transform between two others.
+    # The first cloud keeps its stamp only (and loses the frame), another one half of its bytes,
+    # an array ends within its first box, and one transform between two others is cut.
     sizes = {('/points', 0): 12, ('/points', 6): 1500, ('/boxes', 5): 60, ('/tf', 4): 30}
     path = truncated(path, tmp_path / 'drive', sizes)
     summary, rows = run(path, tmp_path / 'out', formats=('csv', 'mcap'))
@@ -460,14 +493,14 @@ def test_unreadable_messages_are_passed_over_and_counted(tmp_path):
     assert "'/boxes' is not a vision_msgs/msg/Detection3DArray" in summary['first_unreadable']
     assert "'/tf' is not a tf2_msgs/msg/TFMessage" in summary['first_unreadable']
     assert '5 messages could not be read' in closing_line(summary, tmp_path / 'out')
-    # The overlay has them as they were; the refined topic has the others.
+    # The overlay holds the unreadable messages unchanged; the refined topic has the other arrays.
     with AnyReader([tmp_path / 'out' / 'overlay.mcap']) as reader:
         copied = Counter(c.topic for c, _, _ in reader.messages())
     assert (copied['/points'], copied['/boxes'], copied['/boxes_refined']) == (8, 8, 7)
 
 
 @pytest.mark.parametrize('topic', ['/points', '/boxes'])
-def test_a_recording_of_which_nothing_is_readable_is_an_error(tmp_path, topic):
+def test_recording_without_a_readable_message_is_an_error(tmp_path, topic):
     path = Drive(sweeps=3).write(tmp_path / 'whole')
     path = truncated(path, tmp_path / 'drive', {(topic, k): 12 for k in range(3)})
     with pytest.raises(UnsupportedMessage, match=f"on '{topic}' is not a "):
@@ -475,7 +508,7 @@ def test_a_recording_of_which_nothing_is_readable_is_an_error(tmp_path, topic):
     assert not (tmp_path / 'results').exists() or not list((tmp_path / 'results').iterdir())
 
 
-def test_failures_leave_nothing_behind(tmp_path):
+def test_failed_run_leaves_no_files(tmp_path):
     drive = Drive(sweeps=6)
     for k in range(6):
         drive.replace('/points', k, lambda message: setattr(message, 'point_step', 2))
@@ -484,7 +517,7 @@ def test_failures_leave_nothing_behind(tmp_path):
     assert list((tmp_path / 'results').iterdir()) == []
 
 
-def test_earlier_results_survive_a_failure_and_are_replaced_by_success(tmp_path):
+def test_earlier_result_is_replaced_only_by_success(tmp_path):
     good = Drive(sweeps=3).write(tmp_path / 'good')
     run(good, tmp_path / 'out')
     before = (tmp_path / 'out' / 'boxes.csv').read_bytes()
@@ -494,20 +527,20 @@ def test_earlier_results_survive_a_failure_and_are_replaced_by_success(tmp_path)
         run(broken.write(tmp_path / 'broken'), tmp_path / 'out')
     assert (tmp_path / 'out' / 'boxes.csv').read_bytes() == before
     (tmp_path / 'out' / 'old').touch()
-    os.utime(tmp_path / 'out' / 'old', (1, 1))  # no younger than the results
+    os.utime(tmp_path / 'out' / 'old', (1, 1))  # older than the results
     assert len(run(Drive(sweeps=5).write(tmp_path / 'more'), tmp_path / 'out')[1]) == 10
     assert not (tmp_path / 'out' / 'old').exists()
     assert not [item for item in tmp_path.iterdir() if item.name.startswith('.')]
 
 
-def test_clouds_beside_labels_are_those_the_boxes_are_paired_with(tmp_path):
+def test_spool_returns_clouds_within_the_maximum_time_offset(tmp_path):
     spool = Spool(tmp_path, Config(tolerance=0.02, reach=0.06))
     spool.add(Sweep(START, 'lidar', np.ones((1, 3))), np.eye(4))
     assert spool.take(START - SECOND * 50 // 1000, 'lidar', np.eye(4))[0] is not None
     assert spool.take(START - SECOND * 70 // 1000, 'lidar', np.eye(4))[0] is None
 
 
-def test_clouds_that_are_missing_beside_labels_are_told(tmp_path):
+def test_missing_clouds_beside_labels_are_a_note(tmp_path):
     drive = Drive(sweeps=6)
     gone = drive.stamps[2:4]
     drive.items = [item for item in drive.items if item[0] != '/points' or item[1] not in gone]
@@ -515,11 +548,11 @@ def test_clouds_that_are_missing_beside_labels_are_told(tmp_path):
     options = {'formats': ('sustechpoints',), 'options': Options(with_points=True)}
     summary, _ = run(path, tmp_path / 'out', **options)
     assert summary['frames_without_cloud'] == 2
-    assert list(notes(summary)) == ['2 of 6 box arrays have no cloud beside them']
+    assert list(notes(summary)) == ['2 of 6 box arrays have no cloud to write beside them']
     assert list(notes(run(path, tmp_path / 'plain')[0])) == []
 
 
-def test_intensities_that_cannot_be_read_cost_no_cloud(tmp_path):
+def test_unreadable_intensities_drop_no_cloud(tmp_path):
     drive = Drive(sweeps=4)
     field = drive.messages.build(
         'sensor_msgs/msg/PointField', name='intensity', offset=0, datatype=7, count=2
@@ -534,8 +567,9 @@ def test_intensities_that_cannot_be_read_cost_no_cloud(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['boxes.csv', 'mine/notes.txt'])
-def test_results_that_were_changed_by_hand_are_not_lost(tmp_path, name):
-    drive, file = Drive(sweeps=3).write(tmp_path / 'drive'), tmp_path / 'out' / name
+def test_result_changed_by_hand_is_not_replaced(tmp_path, name):
+    drive = Drive(sweeps=3).write(tmp_path / 'drive')
+    file = tmp_path / 'out' / name
     run(drive, tmp_path / 'out')
     file.parent.mkdir(exist_ok=True)
     file.write_text('by hand')
@@ -545,7 +579,7 @@ def test_results_that_were_changed_by_hand_are_not_lost(tmp_path, name):
 
 
 @pytest.mark.parametrize('content', ['notes.txt', 'summary.json'])
-def test_folders_of_others_are_left_alone(tmp_path, content):
+def test_folder_with_other_files_is_not_replaced(tmp_path, content):
     out = tmp_path / 'out'
     out.mkdir()
     (out / content).write_text('{"mine": true}')
@@ -558,8 +592,9 @@ def test_folders_of_others_are_left_alone(tmp_path, content):
 
 
 @pytest.mark.parametrize('given', ['{out}/drive.mcap', '{out}', '{link}', '{bag}'])
-def test_inputs_inside_of_the_output_survive(tmp_path, capsys, given):
-    out, link = tmp_path / 'out', tmp_path / 'link.mcap'
+def test_output_that_contains_an_input_is_refused(tmp_path, capsys, given):
+    out = tmp_path / 'out'
+    link = tmp_path / 'link.mcap'
     bag = Drive(sweeps=3).write(tmp_path / 'drive')
     run(bag, out)
     shutil.copy(bag, out / 'drive.mcap')
@@ -572,7 +607,7 @@ def test_inputs_inside_of_the_output_survive(tmp_path, capsys, given):
     assert main(words) == 2
     assert 'choose another with -o' in capsys.readouterr().err
     labels = 'csv', out / 'boxes.csv'
-    with pytest.raises(ConfigError, match=r"no input is in, got one with .*boxes\.csv'"):
+    with pytest.raises(ConfigError, match=r"contains no input, got one with .*boxes\.csv'"):
         run(bag, out, labels=labels)
     conversion = Conversion(out, 'csv', ('openlabel',))
     with pytest.raises(ConfigError, match='choose another'):
@@ -580,12 +615,12 @@ def test_inputs_inside_of_the_output_survive(tmp_path, capsys, given):
     assert sorted(out.rglob('*')) == before
 
 
-def test_unknown_format_is_refused_at_once():
+def test_unknown_format_is_refused_before_reading():
     with pytest.raises(ConfigError, match="format 'kiti'"):
         Request((Path('nothing'),), formats=('csv', 'kiti'))
 
 
-def test_fingerprint_tells_requests_apart(tmp_path):
+def test_fingerprint_differs_between_requests(tmp_path):
     path = Drive(sweeps=3).write(tmp_path / 'drive')
     first = Request((path,)).fingerprint()
     assert Request((path,)).fingerprint() == first
@@ -595,16 +630,17 @@ def test_fingerprint_tells_requests_apart(tmp_path):
     assert Request((path,)).fingerprint() != first
 
 
-def test_boxes_are_read_as_they_are_meant(tmp_path, capsys):
-    """Bottoms and w, l, h in the messages: the same results once that is said."""
+def test_convention_of_the_input_boxes(tmp_path, capsys):
+    """Messages with the bottom as pose and w, l, h as size: same results with these options."""
     drive = Drive(sweeps=8)
     command = ['relabel', '--formats=csv', '-o']
     path = str(drive.write(tmp_path / 'drive'))
     assert main([*command, str(tmp_path / 'expected'), path]) == 0
     for topic, _, message in drive.items:
         for detection in message.detections if topic == '/boxes' else ():
-            size, at = detection.bbox.size, detection.bbox.center.position
-            size.x, size.y, at.z = size.y, size.x, at.z - size.z / 2
+            size = detection.bbox.size
+            size.x, size.y = size.y, size.x
+            detection.bbox.center.position.z -= size.z / 2
     path = str(drive.write(tmp_path / 'bottoms'))
     meant = ['--pose-reference', 'bottom', '--size-order', 'wlh']
     assert not capsys.readouterr().err
@@ -618,7 +654,7 @@ def test_boxes_are_read_as_they_are_meant(tmp_path, capsys):
         assert float(row['length']) == pytest.approx(float(other['length']), abs=1e-6)
     assert main([*command, str(tmp_path / 'x'), path, '--pose-reference', 'floor']) == 2
     assert 'pose_reference' in capsys.readouterr().err
-    # The input is scored under the convention it is meant in; a table has its own.
+    # `evaluate` applies the convention to a recording; a table has a fixed one.
     truth = str(tmp_path / 'expected' / 'boxes.csv')
     scores = []
     for options in ([], meant):
@@ -626,11 +662,12 @@ def test_boxes_are_read_as_they_are_meant(tmp_path, capsys):
         scores.append(json.loads(capsys.readouterr().out)['iou_3d'])
     assert scores[0] < 0.5 < 0.75 < scores[1]
     assert main(['evaluate', truth, truth, *meant]) == 2
-    assert 'expected a recording that they are about' in capsys.readouterr().err
+    assert 'expected with a recording only' in capsys.readouterr().err
 
 
-def test_topics_with_ids_go_before_those_without(tmp_path):
-    drive, other = Drive(sweeps=4), Drive(sweeps=4, boxes=JSK)
+def test_box_topic_with_ids_is_preferred(tmp_path):
+    drive = Drive(sweeps=4)
+    other = Drive(sweeps=4, boxes=JSK)
     more = [('/clusters', *item[1:]) for item in other.items if item[0] == '/boxes']
     drive.items += more
     path = drive.write(tmp_path / 'drive')
@@ -640,10 +677,10 @@ def test_topics_with_ids_go_before_those_without(tmp_path):
         run(path, tmp_path / 'out', convention=Convention(associate=True))
 
 
-# The input as it is ----------------------------------------------------------------------------
+# Input boxes ----------------------------------------------------------------------------
 
 
-def test_input_boxes_are_those_of_the_recording_in_the_fixed_frame(tmp_path):
+def test_input_boxes_in_the_fixed_frame(tmp_path):
     drive = Drive(sweeps=4)
     arrays, left_out = input_boxes(drive.write(tmp_path / 'drive'))
     assert not left_out
@@ -653,11 +690,12 @@ def test_input_boxes_are_those_of_the_recording_in_the_fixed_frame(tmp_path):
         np.testing.assert_allclose(array.boxes, drive.truth[array.stamp_ns], atol=0.25)
 
 
-def test_what_evaluate_and_convert_ask_for_they_take(tmp_path, capsys):
+def test_evaluate_and_convert_accept_the_options_they_propose(tmp_path, capsys):
     drive = Drive(sweeps=4, motion='odometry')
     for topic in ('/boxes', '/odom'):
         drive.items += [(f'{topic}2', *item[1:]) for item in drive.items if item[0] == topic]
-    path, table = str(drive.write(tmp_path / 'drive')), str(tmp_path / 'input.csv')
+    path = str(drive.write(tmp_path / 'drive'))
+    table = str(tmp_path / 'input.csv')
     topics = {'boxes': '/boxes2', 'odometry': '/odom2'}
     BoxTable.from_arrays(input_boxes(Path(path), **topics)[0]).write(table)
     assert main(['evaluate', path, table]) == 1
@@ -681,7 +719,7 @@ MAKER = SHARED / 'tools' / 'make_recording.py'
 
 @pytest.mark.skipif(not (KITTI.exists() and MAKER.exists()), reason='real data is not here')
 @pytest.mark.parametrize(('storage', 'boxes'), [('mcap', 'vision'), ('sqlite3', 'markers')])
-def test_real_boxes_come_back_each_once(tmp_path, storage, boxes):
+def test_every_real_box_is_written_once(tmp_path, storage, boxes):
     command = [sys.executable, MAKER, KITTI, tmp_path, '--noise', 'real', '--seed', '7']
     options = ['--storage', storage, '--boxes', boxes, '--max-sweeps', '15']
     subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL)

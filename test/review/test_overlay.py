@@ -1,4 +1,4 @@
-"""overlay.mcap: all of the recording, and the refined boxes beside it."""
+"""overlay.mcap: the whole recording and the refined boxes."""
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
@@ -26,7 +26,7 @@ def run(recordings, out, formats=('mcap',), config=QUICK, **options):
 
 
 def messages_of(path):
-    """Return all of an MCAP file: (topic, log time, publish time, sequence, data), channels."""
+    """Return messages (topic, log time, publish time, sequence, data) and channels of a file."""
     with path.open('rb') as file:
         reader = make_reader(file)
         items = [(s, c, m) for s, c, m in reader.iter_messages()]
@@ -38,10 +38,10 @@ def messages_of(path):
 
 
 def expected_boxes(out, drive, stamp_ns, sensor_z=2.0):
-    """Return the boxes of boxes.csv at a stamp, back in the frame of the sensor."""
+    """Return the boxes of boxes.csv at a stamp, transformed to the sensor frame."""
     table = BoxTable.read(out / 'boxes.csv')
     rows = table.boxes[table.stamps_ns == stamp_ns]
-    # The drive goes along x, 0.5 m per sweep, the sensor is 2 m above and never turns.
+    # The sensor moves 0.5 m along x per sweep, 2 m above ground, and does not rotate.
     rows[:, 0] -= 0.5 * drive.stamps.index(stamp_ns)
     rows[:, 2] -= sensor_z
     return rows
@@ -49,7 +49,7 @@ def expected_boxes(out, drive, stamp_ns, sensor_z=2.0):
 
 @pytest.mark.parametrize('storage', ['mcap', 'mcap-folder', 'sqlite3'])
 @pytest.mark.parametrize('boxes', ['vision', 'markers'])
-def test_everything_is_copied_and_refined_boxes_are_beside_it(tmp_path, storage, boxes):
+def test_all_messages_are_copied_and_refined_boxes_added(tmp_path, storage, boxes):
     drive = Drive(sweeps=6, boxes=boxes)
     path = drive.write(tmp_path / 'drive', storage)
     summary = run(path, tmp_path / 'out')
@@ -79,18 +79,19 @@ def test_everything_is_copied_and_refined_boxes_are_beside_it(tmp_path, storage,
     assert summary['status']['refined'] > 0
     moved = 0.0
     for stamp_ns, message, original in refined:
-        found, was = adapter.from_msg(message), adapter.from_msg(original)
+        found = adapter.from_msg(message)
+        boxes_in = adapter.from_msg(original)
         assert (found.stamp_ns, found.frame_id) == (stamp_ns, 'lidar')
-        assert (found.track_ids, found.class_names) == (was.track_ids, was.class_names)
-        np.testing.assert_array_equal(found.scores, was.scores)
+        assert (found.track_ids, found.class_names) == (boxes_in.track_ids, boxes_in.class_names)
+        np.testing.assert_array_equal(found.scores, boxes_in.scores)
         expected = expected_boxes(tmp_path / 'out', drive, stamp_ns)
         np.testing.assert_allclose(found.boxes, expected, atol=1e-6)
-        moved = max(moved, np.abs(found.boxes - was.boxes).max())
+        moved = max(moved, np.abs(found.boxes - boxes_in.boxes).max())
     assert moved > 0.01
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'rosbag1'])
-def test_markers_show_boxes_before_and_after(tmp_path, storage):
+def test_markers_of_input_and_refined_boxes(tmp_path, storage):
     drive = Drive(sweeps=4, ros1=storage == 'rosbag1')
     run(drive.write(tmp_path / 'drive', storage), tmp_path / 'out')
     rows, facts = messages_of(tmp_path / 'out' / 'overlay.mcap')
@@ -109,8 +110,9 @@ def test_markers_show_boxes_before_and_after(tmp_path, storage):
         assert texts == ['1', '2']
 
 
-def test_boxes_of_another_day_come_beside_their_clouds(tmp_path):
-    drive, day_ns = Drive(sweeps=8), 86_400 * 10**9
+def test_boxes_recorded_at_another_time_get_the_time_of_their_clouds(tmp_path):
+    drive = Drive(sweeps=8)
+    day_ns = 86_400 * 10**9
     parts = (
         [item for item in drive.items if item[0] != '/boxes'],
         [(topic, t + day_ns, m) for topic, t, m in drive.items if topic == '/boxes'],
@@ -126,7 +128,7 @@ def test_boxes_of_another_day_come_beside_their_clouds(tmp_path):
         assert summary['left_out_of_labels'] == {}
 
 
-def test_ros1_stays_ros1(tmp_path):
+def test_ros1_recording_gives_a_ros1_overlay(tmp_path):
     drive = Drive(sweeps=4, ros1=True)
     path = drive.write(tmp_path / 'drive', 'rosbag1')
     run(path, tmp_path / 'out')
@@ -150,7 +152,7 @@ def test_ros1_stays_ros1(tmp_path):
             np.testing.assert_allclose(found.boxes, expected, atol=1e-6)
 
 
-def test_what_only_mcap_holds_survives(tmp_path):
+def test_attachments_metadata_and_sequence_numbers_are_copied(tmp_path):
     drive = Drive(sweeps=3)
     plain = drive.write(tmp_path / 'plain')
     path = tmp_path / 'rich.mcap'
@@ -193,7 +195,7 @@ def messages_sorted(path):
     return sorted(messages_of(path)[0])
 
 
-def test_boxes_in_another_frame_than_the_clouds(tmp_path):
+def test_boxes_stay_in_their_own_frame(tmp_path):
     drive = Drive(sweeps=5)
     for _, _, message in drive.items:
         if hasattr(message, 'detections'):
@@ -213,7 +215,7 @@ def test_boxes_in_another_frame_than_the_clouds(tmp_path):
         np.testing.assert_allclose(boxes.boxes, expected, atol=1e-6)
 
 
-def test_a_part_has_its_own_messages_and_all_static_transforms(tmp_path):
+def test_overlay_of_a_part_has_all_static_transforms(tmp_path):
     drive = Drive(sweeps=10)
     run(drive.write(tmp_path / 'drive'), tmp_path / 'out', start=0.25, end=0.75)
     rows, _ = messages_of(tmp_path / 'out' / 'overlay.mcap')
@@ -223,7 +225,7 @@ def test_a_part_has_its_own_messages_and_all_static_transforms(tmp_path):
     assert len(times['/points']) == 5
 
 
-def test_several_recordings_are_one_overlay(tmp_path):
+def test_several_recordings_give_one_overlay(tmp_path):
     drive = Drive(sweeps=6)
     half = len(drive.items) // 2
     parts = tuple(
@@ -252,7 +254,7 @@ def test_empty_messages_and_messages_out_of_order(tmp_path):
     assert summary['left_out_of_labels'] == {}
 
 
-def test_boxes_without_transforms_stay_as_they_are(tmp_path):
+def test_boxes_without_transform_are_unchanged(tmp_path):
     drive = Drive(sweeps=6)
     gone = drive.stamps[:4]
     drive.items = [item for item in drive.items if item[0] != '/tf' or item[1] not in gone]
@@ -279,14 +281,14 @@ def test_an_overlay_can_be_relabelled_again(tmp_path):
     assert count['/boxes'] == count['/boxes_refined'] == count['/boxes_refined_refined'] == 4
 
 
-def test_labels_alone_make_no_overlay(tmp_path):
-    with pytest.raises(ConfigError, match=r"'mcap' writes a recording again.*another format"):
+def test_overlay_without_a_recording_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"'mcap' copies a recording.*another format"):
         writer_for('mcap', tmp_path, Provenance())
     assert not list(tmp_path.iterdir())
 
 
-def test_clouds_in_the_folder_of_a_tool(tmp_path):
-    """With --with-points, intensities included, from the recording to the tool's file."""
+def test_clouds_are_written_beside_labels(tmp_path):
+    """--with-points writes points and intensities of the recording as PCD files."""
     drive = Drive(sweeps=3)
     m = drive.messages
     for i, (topic, stamp_ns, message) in enumerate(drive.items):

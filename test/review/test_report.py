@@ -1,4 +1,4 @@
-"""`boxreg relabel --report`: one page, whole in itself, with the numbers of the run."""
+"""`boxreg relabel --report`: one self-contained page with the numbers of the run."""
 
 import base64
 from dataclasses import replace
@@ -15,16 +15,16 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.relabel import closing_line, relabel, Request
 from boxreg_ros.review.changes import Changes
-from boxreg_ros.review.report import chosen, SHOWN, write_report
+from boxreg_ros.review.report import MAX_SHOWN, select_tracks, write_report
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
 from paths import BAGS
-from PIL import Image
 import pytest
 from ros_messages import Drive, JSK
 from scenes import drive, jittered, PERIOD_NS, START_NS, track_of
 
+Image = pytest.importorskip('PIL.Image')
 STREET = BAGS / 'street.mcap'
 QUICK = Config().updated({'solver.rounds': 1, 'solver.iterations': 3, 'sampling.points': 64})
 SCRIPT = '<script>alert(1)</script>'
@@ -32,7 +32,7 @@ BROWSER = shutil.which('chromium') or shutil.which('chromium-browser') or ''
 
 
 class Page(HTMLParser):
-    """The text of a page, its pictures, cells by table, and whatever it names beside itself."""
+    """The text of a page, its pictures, the cells of its tables, its links and tags."""
 
     def __init__(self, path):
         super().__init__()
@@ -67,7 +67,7 @@ class Page(HTMLParser):
             self.tables[-1][-1][-1] = f'{self.tables[-1][-1][-1]} {data}'.strip()
 
     def table(self, *head):
-        """Return the rows of the table that begins with these titles, as dicts."""
+        """Return the rows of the table whose first titles are these, as dicts."""
         (found,) = (t for t in self.tables if tuple(t[0][: len(head)]) == head)
         return [dict(zip(found[0], row, strict=True)) for row in found[1:]]
 
@@ -86,7 +86,7 @@ def street(tmp_path_factory):
     return out, *run(STREET, out, config=Config().updated({'window': 9, 'lag': 8}))
 
 
-def test_page_holds_all_it_needs(street):
+def test_page_needs_no_other_file(street):
     out, _, page = street
     assert sorted(item.name for item in out.iterdir()) == [
         'boxes.csv', 'config.yaml', 'report.html', 'summary.json',
@@ -97,9 +97,9 @@ def test_page_holds_all_it_needs(street):
     assert (out / 'report.html').stat().st_size < 5e6
 
 
-def test_pictures_show_something(street):
+def test_pictures_are_not_blank(street):
     pictures = street[2].pictures
-    assert len(pictures) == 1 + SHOWN
+    assert len(pictures) == 1 + MAX_SHOWN
     for picture in pictures:
         assert picture.width >= 1200
         tones = np.asarray(picture.convert('L'), float)
@@ -107,13 +107,13 @@ def test_pictures_show_something(street):
         assert np.mean(tones < 250) > 0.005
 
 
-def test_numbers_are_those_of_the_summary(street):
+def test_numbers_agree_with_the_summary(street):
     out, summary, page = street
     before = {**summary, 'seconds': {'total': 0.0}}
     assert closing_line(before, out).split(' in 0.0 s')[0] in page.text
     tracks = page.table('track', 'class', 'boxes')
     assert sum(int(row['boxes']) for row in tracks) == summary['boxes_in']
-    flips = sum(int(row['turned around'] or 0) for row in tracks)
+    flips = sum(int(row['flips'] or 0) for row in tracks)
     assert flips == summary['heading_flips'] > 0
     shifts = [float(row['shift [m]']) for row in tracks]
     assert shifts == sorted(shifts, reverse=True)
@@ -121,11 +121,11 @@ def test_numbers_are_those_of_the_summary(street):
     assert {row['reason']: int(row['count']) for row in reasons} == summary['reasons']
     assert all(row['meaning'] for row in reasons)
     shown = page.table('track', 'class', 'why')
-    assert len(shown) == SHOWN
-    # On simulated surfaces all boxes that have many points follow them better than before.
-    sharper = [float(row['cells'].rstrip(' %')) for row in shown if 'most points' in row['why']]
-    assert sharper
-    assert max(sharper) < -10
+    assert len(shown) == MAX_SHOWN
+    # On simulated surfaces the refined boxes of all tracks with many points follow them better.
+    changes = [float(row['cells'].rstrip(' %')) for row in shown if 'most points' in row['why']]
+    assert changes
+    assert max(changes) < -10
     for name in ('window: 9', 'lag: 8'):
         assert name in page.text
     assert 'solver.rounds' not in page.text
@@ -133,7 +133,7 @@ def test_numbers_are_those_of_the_summary(street):
 
 
 def spoiled(drive):
-    """Put all that may be odd beside the two tracks of a drive."""
+    """Add unusual boxes, ids and classes to the two tracks of a drive."""
     pose = ((-30.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     for topic, stamp, message in drive.items:
         if topic != '/boxes':
@@ -160,7 +160,7 @@ def spoiled(drive):
 
 
 @pytest.mark.filterwarnings('error::RuntimeWarning')
-def test_odd_boxes_have_their_place(tmp_path):
+def test_unusual_boxes_are_counted_and_escaped(tmp_path):
     recording = spoiled(Drive(sweeps=18)).write(tmp_path / 'drive')
     summary, page = run(recording, tmp_path / 'out', bridge=0.5)
     assert summary['status']['interpolated'] == 2
@@ -170,19 +170,19 @@ def test_odd_boxes_have_their_place(tmp_path):
     assert 'script' not in page.tags
     rows = {row['track']: row for row in page.table('track', 'class', 'boxes')}
     assert set(rows) == {
-        f'A {SCRIPT}', 'B 1', 'empty', 'once', 'flat', 'nowhere', 'without an id',
+        f'A {SCRIPT}', 'B 1', 'empty', 'once', 'flat', 'nowhere', 'no id',
     }  # fmt: skip
     assert rows[f'A {SCRIPT}']['class'] == '<b>$car$</b>'
     assert rows['B 1']['boxes'] == '17 + 2'
     assert rows['flat']['shift [m]'] == '\N{EN DASH}'
     assert sum(int(row['boxes'].split()[0]) for row in rows.values()) == summary['boxes_in']
-    assert page.text.count('First transform that is missing') == 1
+    assert page.text.count('First missing transform') == 1
     assert len(page.pictures) == 3
 
 
 @pytest.mark.filterwarnings('error::RuntimeWarning')
 @pytest.mark.parametrize('kind', ['no boxes', 'another frame', 'no points'])
-def test_nothing_refined_is_still_a_page(tmp_path, kind):
+def test_page_of_a_run_that_refined_nothing(tmp_path, kind):
     drive = Drive(sweeps=11)
     for topic, _, message in drive.items:
         for detection in message.detections if topic == '/boxes' else ():
@@ -194,11 +194,11 @@ def test_nothing_refined_is_still_a_page(tmp_path, kind):
     summary, page = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
     assert 'refined' not in summary['status']
     assert ('No box was refined' in page.text) == (kind != 'no boxes')
-    assert 'There is no track' in page.text
+    assert 'No track has 10 boxes' in page.text
     assert len(page.pictures) == (kind == 'no points')
 
 
-def test_points_are_found_wherever_boxes_and_ids_come_from(tmp_path):
+def test_points_are_found_for_label_files_and_associated_ids(tmp_path):
     recording = Drive(sweeps=12).write(tmp_path / 'drive', 'sqlite3')
     nameless = Drive(sweeps=12, boxes=JSK).write(tmp_path / 'nameless', 'rosbag1')
     run(recording, tmp_path / 'out')
@@ -210,7 +210,7 @@ def test_points_are_found_wherever_boxes_and_ids_come_from(tmp_path):
         assert page.text.count('The points of 12 sweeps fill') == 2
 
 
-def test_off_by_default_and_another_request(tmp_path):
+def test_report_is_off_by_default_and_part_of_the_fingerprint(tmp_path):
     recording = Drive(sweeps=4).write(tmp_path / 'drive')
     plain = Request((recording,), config=QUICK)
     summary = relabel(plain, tmp_path / 'out')
@@ -220,7 +220,7 @@ def test_off_by_default_and_another_request(tmp_path):
 
 
 @pytest.mark.parametrize('package', ['jinja2', 'matplotlib'])
-def test_missing_package_is_told_before_any_work(tmp_path, monkeypatch, capsys, package):
+def test_missing_package_is_refused_before_reading(tmp_path, monkeypatch, capsys, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ConfigError, match=f'pip install {package}'):
         Request((Path('nothing'),), report=True)
@@ -229,19 +229,19 @@ def test_missing_package_is_told_before_any_work(tmp_path, monkeypatch, capsys, 
 
 
 def test_progress_counts_both_passes(tmp_path):
-    told = []
+    shown = []
     request = Request((Drive(sweeps=4).write(tmp_path / 'drive'),), config=QUICK, report=True)
-    relabel(request, tmp_path / 'out', lambda done, total: told.append(done / total))
-    assert told == sorted(told)
-    assert 0.4 < told[len(told) // 2 - 1] <= 0.5
-    assert told[-1] == pytest.approx(1.0)
+    relabel(request, tmp_path / 'out', lambda done, total: shown.append(done / total))
+    assert shown == sorted(shown)
+    assert 0.4 < shown[len(shown) // 2 - 1] <= 0.5
+    assert shown[-1] == pytest.approx(1.0)
 
 
-# Known numbers -----------------------------------------------------------------------------------
+# Known values ------------------------------------------------------------------------------------
 
 
 def changes_of(given, boxes, status='refined', stamps_ns=None, spread=0.01):
-    """Return the track '7' of boxes (n, 9) before and after."""
+    """Return the changes of a track '7' with input and result (n, 9)."""
     changes = Changes('odom')
     n = len(boxes)
     stamps_ns = START_NS + PERIOD_NS * np.arange(n) if stamps_ns is None else stamps_ns
@@ -256,7 +256,7 @@ def changes_of(given, boxes, status='refined', stamps_ns=None, spread=0.01):
     return changes.tracks()
 
 
-def test_changes_are_along_and_across_and_half_turns_do_not_count():
+def test_changes_are_along_the_box_axes_without_half_turns():
     boxes = drive(12)
     heading = np.c_[np.cos(boxes[:, 8]), np.sin(boxes[:, 8])]
     given = boxes.copy()
@@ -269,14 +269,14 @@ def test_changes_are_along_and_across_and_half_turns_do_not_count():
     assert np.flatnonzero(track.is_flipped).tolist() == [3]
     assert track.shift == pytest.approx(0.5)
     assert track.turn == pytest.approx(2.0)
-    assert track.deviation == pytest.approx(np.sqrt(0.05))  # whatever the heading
+    assert track.deviation == pytest.approx(np.sqrt(0.05))  # independent of the heading
     cos, sin = heading[5]
     along = np.sqrt(0.04 * cos**2 + 0.01 * sin**2)
     assert track.deviations[5] == pytest.approx([along, np.sqrt(0.05 - along**2), 0.1, 0.1])
-    assert list(chosen([track])) == ['7']
+    assert list(select_tracks([track])) == ['7']
     (kept,) = changes_of(boxes, boxes, status='kept')
     assert np.isnan(kept.shift)
-    assert chosen([kept]) == {'7': 'kept in spite of points: 12 of 12 boxes'}
+    assert select_tracks([kept]) == {'7': 'boxes kept although they have points: 12 of 12'}
 
 
 SUMMARY = {
@@ -288,22 +288,25 @@ SUMMARY = {
 
 
 def cells_of(tmp_path, tracks, items, config=None):
-    """Return how many cells the points of the one track fill before and after."""
+    """Return the number of cells that the points of the track fill before and after."""
     path = tmp_path / 'report.html'
     write_report(path, 'done', SUMMARY, config or Config(), tracks, items)
-    found = re.search(r'sweeps fill ([\d,]+) cells of 0.1 m before, ([\d,]+)', Page(path).text)
+    found = re.search(
+        r'sweeps fill ([\d,]+) cells of 0.1 m in the input boxes, ([\d,]+)', Page(path).text
+    )
     return [int(number.replace(',', '')) for number in found.groups()]
 
 
 def streamed(track, late_ns=()):
-    """Yield boxes and sweeps of a `Track`, each box `late_ns` after its sweep."""
+    """Yield sweeps and boxes of a `Track`, each box `late_ns` after its sweep."""
     for k, stamp in enumerate(track.stamps_ns.tolist()):
         yield Sweep(stamp, 'odom', track.points[k].astype(np.float32), None, np.zeros(3))
-        boxes, late = track.boxes[k : k + 1], int(late_ns[k]) if len(late_ns) else 0
+        boxes = track.boxes[k : k + 1]
+        late = int(late_ns[k]) if len(late_ns) else 0
         yield BoxArray(stamp + late, 'odom', ('7',), ('car',), np.ones(1), boxes)
 
 
-def test_points_are_sharper_where_boxes_are_better(tmp_path):
+def test_points_fill_fewer_cells_in_better_boxes(tmp_path):
     rng = np.random.default_rng(3)
     truth = drive(30)
     track = track_of(truth, rng, '7')
@@ -316,19 +319,21 @@ def test_points_are_sharper_where_boxes_are_better(tmp_path):
     assert same[1] == after
 
 
-def test_points_go_along_with_boxes_between_sweeps(tmp_path):
+def test_points_are_motion_compensated_to_the_box_stamp(tmp_path):
     rng = np.random.default_rng(3)
-    truth, late_ns = drive(30, speed=15.0, turn=0.0), 20_000_000 * (np.arange(30) % 3)
+    truth = drive(30, speed=15.0, turn=0.0)
+    late_ns = 20_000_000 * (np.arange(30) % 3)
     track = track_of(truth, rng, '7')
-    there, way = truth.copy(), 15.0 * late_ns[:, None] * 1e-9
-    there[:, :2] += way * np.c_[np.cos(truth[:, 8]), np.sin(truth[:, 8])]
+    there = truth.copy()
+    distance = 15.0 * late_ns[:, None] * 1e-9
+    there[:, :2] += distance * np.c_[np.cos(truth[:, 8]), np.sin(truth[:, 8])]
     tracks = changes_of(jittered(there, rng), there, stamps_ns=track.stamps_ns + late_ns)
     between = cells_of(tmp_path, tracks, streamed(track, late_ns))[1]
     exact = cells_of(tmp_path, changes_of(truth, truth), streamed(track))[1]
     assert between < 1.1 * exact
 
 
-def test_points_go_along_with_their_times(tmp_path):
+def test_points_are_motion_compensated_by_their_times(tmp_path):
     rng = np.random.default_rng(3)
     truth = drive(30, speed=15.0, turn=0.0)
     items = list(streamed(track_of(truth, rng, '7')))
@@ -339,14 +344,15 @@ def test_points_go_along_with_their_times(tmp_path):
             times = rng.uniform(-0.05, 0.05, len(item.points))
             item = replace(item, points=item.points + 15.0 * times[:, None] * heading, times=times)
         late.append(item)
-    tracks, deskewing = changes_of(truth, truth), Config().updated({'sampling.deskew': True})
+    tracks = changes_of(truth, truth)
+    deskewing = Config().updated({'sampling.deskew': True})
     blurred, _ = cells_of(tmp_path, tracks, late)
     sharp, _ = cells_of(tmp_path, tracks, late, deskewing)
     exact, _ = cells_of(tmp_path, tracks, items)
     assert sharp < 1.2 * exact < 0.8 * blurred
 
 
-# As a browser has it -----------------------------------------------------------------------------
+# In a browser ----------------------------------------------------------------------------------
 
 MEASURE = """
 <script>document.title = [document.documentElement.scrollHeight,
@@ -356,7 +362,7 @@ MEASURE = """
 
 
 @pytest.mark.skipif(not BROWSER, reason='no chromium on PATH to open the page with')
-def test_browser_shows_the_page(street, tmp_path):
+def test_browser_renders_the_page(street, tmp_path):
     page = tmp_path / 'page.html'
     page.write_text(street[2].source + MEASURE, encoding='utf-8')
     done = subprocess.run(
@@ -370,7 +376,7 @@ def test_browser_shows_the_page(street, tmp_path):
     assert 'CONSOLE' not in done.stderr
     found = re.search(r'<title>(\d+),(-?\d+),(\w+)</title>', done.stdout)
     assert found, done.stderr
-    height, beside, has_pictures = found.groups()
+    height, overflow, has_pictures = found.groups()
     assert int(height) > 4000
-    assert int(beside) <= 0
+    assert int(overflow) <= 0
     assert has_pictures == 'true'

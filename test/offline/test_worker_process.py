@@ -1,5 +1,6 @@
-"""Work in processes beside this one: the same boxes, errors told here, no process left over."""
+"""Worker processes: same results, errors raised in the parent, no process left over."""
 
+from dataclasses import replace
 import os
 from pathlib import Path
 import signal
@@ -7,33 +8,59 @@ import subprocess
 import sys
 import time
 
+from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.offline import workers as solving
-from boxreg_ros.offline.peer import beside, LARGE
+from boxreg_ros.offline import registration_worker as registration
+from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.stopwatch import Stopwatch
-from boxreg_ros.offline.workers import solver
+from boxreg_ros.offline.worker_process import LARGE_BYTES, run_in_worker
 import numpy as np
 from paths import ROOT
 import pytest
 from ros_messages import Drive
 from scenes import drive, stream_of, track_of
-from test_registrar import assert_equal, cut, fed, setup
 
-SHORT = setup('track', track_window=24, max_gap=0.3)
+SHORT = Config().updated({'sampling.points': 64, 'track_window': 24, 'max_gap': 0.3})
+
+
+def cut(track, part):
+    """Return a `Track` with the observations `part` of another one."""
+    return replace(
+        track, stamps_ns=track.stamps_ns[part], boxes=track.boxes[part], points=track.points[part],
+        sensor_origins=track.sensor_origins[part],
+    )  # fmt: skip
+
+
+def fed(registrar, stream):
+    """Add sweeps and boxes to a registrar; return the results."""
+    results = []
+    for sweep, boxes in stream:
+        results += registrar.add_sweep(sweep)
+        results += registrar.add_boxes(boxes)
+    return results
+
+
+def assert_equal(results, expected):
+    """Check that two lists of results are the same."""
+    assert len(results) == len(expected)
+    for a, b in zip(results, expected, strict=True):
+        assert (a.boxes.stamp_ns, a.boxes.track_ids) == (b.boxes.stamp_ns, b.boxes.track_ids)
+        np.testing.assert_array_equal(a.boxes.boxes, b.boxes.boxes)
+        assert (a.status, a.reasons, a.is_final) == (b.status, b.reasons, b.is_final)
 
 
 @pytest.fixture(scope='module')
 def stream():
-    """Return three cars of which one ends early, one comes late, and two swap their ids."""
+    """Return four tracks: one ends early, one begins late, and two swap their ids."""
     rng = np.random.default_rng(0)
     long, other = (drive(60, start=(5.0, y, 0.2)) for y in (6.0, -6.0))
     tracks = [track_of(long, rng, 'a'), track_of(other, rng, 'b')]
     tracks += [cut(track_of(drive(60, start=(25.0, 0.0, 0.2)), rng, 'late'), slice(9, 60))]
     tracks += [cut(track_of(drive(60, start=(-9.0, 0.0, 0.2)), rng, 'short'), slice(5))]
     stream = stream_of(tracks)
-    # Tick 24 fills the windows with the first boxes of the other object, before that is told.
+    # At tick 24 the windows are full; by then the id switch of tick 23 has not been detected.
     names = [('b', 'a') if i >= 23 else ('a', 'b') for i in range(60)]
     return [
         (s, type(b)(b.stamp_ns, b.frame_id, (*pair, *b.track_ids[2:]), b.class_names, b.scores,
@@ -43,7 +70,7 @@ def stream():
 
 
 def children_of(pid):
-    """Return the processes whose parent is `pid`."""
+    """Return the ids of the child processes of `pid`."""
     found = []
     for path in Path('/proc').glob('[0-9]*/stat'):
         try:
@@ -56,13 +83,13 @@ def children_of(pid):
 
 
 @pytest.fixture(autouse=True)
-def none_left():
+def no_process_left():
     before = children_of(os.getpid())
     yield
     assert children_of(os.getpid()) == before
 
 
-# --- any work -----------------------------------------------------------------------------------
+# --- any function -------------------------------------------------------------------------------
 
 
 def echo(receive, send):
@@ -70,21 +97,26 @@ def echo(receive, send):
         send(receive())
 
 
-def test_what_is_sent_comes_back():
+def flood(receive, send):
+    while True:
+        send(np.zeros(LARGE_BYTES))
+
+
+def test_items_survive_the_round_trip():
     rng = np.random.default_rng(0)
-    size = LARGE // 4
-    with beside(echo, 'echoes') as peer:
+    size = LARGE_BYTES // 4
+    with run_in_worker(echo, 'echoes') as process:
         for item in (
             None,
             {'a': (1, 'b')},
             np.zeros(0),
             rng.normal(size=(size, 3)),
-            rng.normal(size=(3, size)).T.astype(np.float32),  # by columns, and so it stays
+            rng.normal(size=(3, size)).T.astype(np.float32),  # in Fortran order, which is kept
             rng.normal(size=(size, 6))[:, ::2],
             [rng.integers(9, size=size), np.arange(size)],
         ):
-            peer.send(item)
-            found = peer.receive()
+            process.send(item)
+            found = process.receive()
             np.testing.assert_equal(found, item)
             if isinstance(item, np.ndarray) and item.size:
                 assert (found.dtype, found.flags.writeable) == (item.dtype, True)
@@ -92,42 +124,44 @@ def test_what_is_sent_comes_back():
                     assert found.flags.f_contiguous
 
 
-def test_an_error_is_raised_here_with_where_it_came_from():
+def test_exception_is_raised_in_the_parent_with_its_traceback():
     def fail(receive, send):
         raise ValueError(f'not a {receive()}')
 
-    with beside(fail, 'fails') as peer:
-        peer.send('window')
+    with run_in_worker(fail, 'fails') as process:
+        process.send('window')
         with pytest.raises(ValueError, match='not a window') as caught:
-            peer.receive()
+            process.receive()
         assert 'in fail' in caught.value.__notes__[0]
-        with pytest.raises(BoxregError, match='the process that fails has ended'):
-            peer.receive()
+        with pytest.raises(BoxregError, match=r'the process that fails: .* has ended'):
+            process.receive()
 
 
-def test_the_block_is_left_at_once_whatever_goes_on_there():
+def test_leaving_the_block_does_not_wait_for_the_worker():
     begun = time.monotonic()
     with (
         pytest.raises(KeyError),
-        beside(lambda receive, send: time.sleep(60), 'sleeps'),
-        beside(echo, 'waits'),
-        beside(lambda receive, send: [send(np.zeros(LARGE)) for _ in range(99)], 'pushes') as peer,
+        run_in_worker(lambda receive, send: time.sleep(60), 'sleeps'),
+        run_in_worker(echo, 'waits'),
+        run_in_worker(
+            lambda receive, send: [send(np.zeros(LARGE_BYTES)) for _ in range(99)], 'pushes'
+        ) as process,
     ):
-        peer.receive()
+        process.receive()
         raise KeyError
     assert time.monotonic() - begun < 10
 
 
-def test_where_children_are_not_waited_for():
-    ours = signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # as some that start others leave it
+def test_worker_where_sigchld_is_ignored():
+    ours = signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # some parents leave it so
     try:
-        with beside(lambda receive, send: send(1), 'ends') as peer:
-            assert peer.receive() == 1
+        with run_in_worker(lambda receive, send: send(1), 'ends') as process:
+            assert process.receive() == 1
             with pytest.raises(BoxregError):
-                peer.receive()
-        with beside(echo, 'echoes') as peer:
-            peer.send(2)
-            assert peer.receive() == 2
+                process.receive()
+        with run_in_worker(echo, 'echoes') as process:
+            process.send(2)
+            assert process.receive() == 2
     finally:
         signal.signal(signal.SIGCHLD, ours)
 
@@ -136,30 +170,30 @@ def test_where_children_are_not_waited_for():
 
 
 @pytest.mark.parametrize('offset_ns', [0, 30_000_000])
-def test_the_same_boxes_as_without(stream, offset_ns):
+def test_registration_worker_returns_the_same_boxes(stream, offset_ns):
     stream = [(type(s)(s.stamp_ns + offset_ns, s.frame_id, s.points), b) for s, b in stream]
-    known = BoxRegistrar(SHORT)
-    expected = fed(known, stream) + known.flush()
+    direct = BoxRegistrar(SHORT)
+    expected = fed(direct, stream) + direct.flush()
     clock = Stopwatch()
-    with solver(SHORT, clock) as begin:
+    with registration_worker(SHORT, clock) as begin:
         registrar = BoxRegistrar(SHORT, begin)
         early = fed(registrar, stream)
-        assert 0 < len(early) < len(stream)  # a part comes back before the end
+        assert 0 < len(early) < len(stream)  # some boxes are returned before the end
         assert_equal(early + registrar.flush(), expected)
-        assert registrar.counts == known.counts
-        # What the model learnt there is here: another stream begins anew all the same.
+        assert registrar.counts == direct.counts
+        # The worker updates the input model; `reset` must clear it for the next stream.
         registrar.reset()
         assert_equal(fed(registrar, stream) + registrar.flush(), expected)
     assert clock.seconds()['solve'] > 0
 
 
-def test_more_is_taken_while_windows_are_registered(stream):
-    """What is begun is not waited for before the next windows are full, or the end has come."""
+def test_registrar_takes_input_while_windows_are_registered(stream):
+    """Estimates are awaited when the next windows are full, or at the end."""
     events = []
 
     def begin(windows, config, model):
         events.append('begin')
-        estimates = solving.register(windows, config, model)
+        estimates = registration.register(windows, config, model)
         return lambda: events.append('wait') or estimates
 
     registrar = BoxRegistrar(SHORT, begin)
@@ -167,8 +201,8 @@ def test_more_is_taken_while_windows_are_registered(stream):
         events.append(tick)
         fed(registrar, [pair])
     registrar.flush()
-    # Windows of 24, which keep 6: the first are full at tick 24, the next every 18 ticks, where
-    # those before are waited for. What is left at the end has nothing to go on beside it.
+    # Windows of 24 observations keep 6: the first are full at tick 24, the next every 18 ticks,
+    # and then the estimates of the earlier ones are awaited. At the end all are awaited.
     expected = [*range(24), 'begin']
     for tick in (24, 42):
         expected += [*range(tick, tick + 18), 'wait', 'begin']
@@ -176,39 +210,39 @@ def test_more_is_taken_while_windows_are_registered(stream):
 
 
 @pytest.mark.parametrize('changes', [{'estimate': 'final'}, {'device': 'meta'}])
-def test_where_it_does_not_pay_there_is_none(changes):
-    with solver(SHORT.updated(changes), Stopwatch()) as begin:
+def test_no_worker_for_sliding_windows_or_other_devices(changes):
+    with registration_worker(SHORT.updated(changes), Stopwatch()) as begin:
         assert begin is None
 
 
-def test_relabel_gives_the_same_files(tmp_path):
+def test_relabel_writes_the_same_files_with_a_worker(tmp_path):
     request = Request((Drive(sweeps=30).write(tmp_path / 'drive'),), config=SHORT)
-    summary = relabel(request, tmp_path / 'beside')
+    summary = relabel(request, tmp_path / 'worker')
     assert 0 < summary['seconds']['solve'] < summary['seconds']['total']
-    whole = SHORT.updated({'device': 'cpu:0'})
-    relabel(Request(request.recordings, config=whole), tmp_path / 'within')
-    within, next_to_it = (tmp_path / name / 'boxes.csv' for name in ('within', 'beside'))
-    assert next_to_it.read_bytes() == within.read_bytes()
+    no_worker = SHORT.updated({'device': 'cpu:0'})
+    relabel(Request(request.recordings, config=no_worker), tmp_path / 'direct')
+    direct, worker = (tmp_path / name / 'boxes.csv' for name in ('direct', 'worker'))
+    assert worker.read_bytes() == direct.read_bytes()
 
 
-def test_an_error_there_ends_what_is_done_here(tmp_path, monkeypatch):
+def test_exception_in_the_worker_ends_relabel(tmp_path, monkeypatch):
     def fail(windows, config, model):
         raise ValueError('no such window')
 
     recording = Drive(sweeps=30).write(tmp_path / 'drive')
-    monkeypatch.setattr(solving, 'register', fail)  # the fork has it too
+    monkeypatch.setattr(registration, 'register', fail)  # the fork copies it
     with pytest.raises(ValueError, match='no such window'):
         relabel(Request((recording,), config=SHORT), tmp_path / 'out')
     assert sorted(item.name for item in tmp_path.iterdir()) == ['drive']
 
 
 @pytest.mark.parametrize('which', ['registers windows', 'reads the recording'])
-def test_a_process_that_is_killed_is_an_error_with_a_remedy(tmp_path, monkeypatch, which):
+def test_killed_worker_is_an_error_with_a_remedy(tmp_path, monkeypatch, which):
     recording = Drive(sweeps=30).write(tmp_path / 'drive')
     added = []
 
     def killing(self, boxes):
-        if not added:  # as the kernel does when memory runs out
+        if not added:  # like the kernel when memory runs out
             pids = sorted(children_of(os.getpid()))
             os.kill(pids[which == 'reads the recording'], signal.SIGKILL)
         added.append(boxes)
@@ -216,12 +250,14 @@ def test_a_process_that_is_killed_is_an_error_with_a_remedy(tmp_path, monkeypatc
 
     add = BoxRegistrar.add_boxes
     monkeypatch.setattr(BoxRegistrar, 'add_boxes', killing)
-    with pytest.raises(BoxregError, match=f'{which} has ended .*: choose a smaller track_window'):
+    with pytest.raises(
+        BoxregError, match=f'{which}: .* has ended.*: choose a smaller track_window'
+    ):
         relabel(Request((recording,), config=SHORT), tmp_path / 'out')
     assert sorted(item.name for item in tmp_path.iterdir()) == ['drive']
 
 
-def test_none_is_left_when_this_one_is_killed(tmp_path):
+def test_workers_end_when_the_parent_is_killed(tmp_path):
     recording = Drive(sweeps=200).write(tmp_path / 'drive')
     command = [sys.executable, '-m', 'boxreg_ros.cli', 'relabel', str(recording)]
     process = subprocess.Popen([*command, '-o', str(tmp_path / 'out')], cwd=ROOT)

@@ -1,0 +1,132 @@
+"""
+`boxreg bench real`: the accuracy of every method on recordings with known truth.
+
+All methods of a table get the same sweeps and the same boxes, in the same run.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import asdict
+from itertools import pairwise
+import math
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.common import (
+    add_json_argument,
+    add_scope_arguments,
+    in_scope,
+    line,
+    print_json,
+    progress_bar,
+)
+from boxreg_ros.bench.methods import add_method_argument, run_methods
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.evaluate import Matches, RECALLS, summarise
+from boxreg_ros.structures import Floats
+import numpy as np
+
+RANGE_BINS = (0, 20, 40, 80, math.inf)  # [m]
+POINT_BINS = (0, 30, 100, 300, 1000, math.inf)
+GROUPINGS = {'by_range': 'by range [m]', 'by_points': 'by points'}
+
+Groups = dict[str, dict[str, float]]
+"""Mean IoU by the key of a grouping, and by the label of a bin."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `boxreg bench real`."""
+    add_scope_arguments(parser)
+    add_method_argument(parser)
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the scores of each method, one table per recording."""
+    report: dict[str, Any] = {}
+    with progress_bar(len(args.data) * len(args.methods), args) as bar:
+        for folder in args.data:
+            drive = Drive.read(folder)
+            methods = run_methods(drive, '3d', args.methods, bar.update)
+            found = {
+                name: boxes if isinstance(boxes, str) else in_scope(boxes, drive.truth, args)
+                for name, boxes in methods.items()
+            }
+            if not args.json:
+                bar.clear()
+                print_tables(folder, drive, found)
+            report[str(folder)] = {
+                name: matches if isinstance(matches, str) else _scores(drive, matches)
+                for name, matches in found.items()
+            }
+    if args.json:
+        print_json(report)
+    return 0
+
+
+def _scores(drive: Drive, matches: Matches) -> dict[str, Any]:
+    groups = iou_by_group(iou_and_group_values(drive, matches, '3d'))
+    return asdict(summarise(matches)) | groups
+
+
+def print_tables(folder: Path, drive: Drive, found: Mapping[str, Matches | str]) -> None:
+    """Print one table of scores, and 3D IoU by range and by number of points."""
+    measured = {name: m for name, m in found.items() if not isinstance(m, str)}
+    count = len(measured['input'].rows)
+    print(f'{folder}: {count} true boxes')
+    recalls = [f'R@{level}' for level in RECALLS]
+    print(line('', ('BEV', '3D', *recalls, 'ATE', 'ASE', 'AOE', 'flips', 'jitter')))
+    for name, matches in found.items():
+        if isinstance(matches, str):
+            print(line(name, matches))
+            continue
+        s = summarise(matches)
+        numbers = (s.iou_bev, s.iou_3d, *s.recall_3d, s.ate, s.ase, s.aoe, s.flips, s.jitter)
+        print(line(name, numbers))
+    groups = {
+        name: iou_by_group(iou_and_group_values(drive, matches, '3d'))
+        for name, matches in measured.items()
+    }
+    print_groups(groups, '3D')
+    print()
+
+
+def iou_and_group_values(drive: Drive, matches: Matches, mode: str) -> Floats:
+    """
+    Return for each true box its IoU and the values by which boxes are grouped.
+
+    Returns
+    -------
+    rows : array, shape (n, 3)
+        IoU of `mode` (NaN without a prediction), range [m], number of points.
+
+    """
+    iou = matches.iou_3d if mode == '3d' else matches.iou_bev
+    iou = np.where(matches.is_matched, iou, np.nan)
+    return np.stack([iou, drive.ranges(matches.rows), matches.num_points], axis=1)
+
+
+def iou_by_group(rows: Floats) -> Groups:
+    """Return mean IoU by range and by number of points, of the `iou_and_group_values` (n, 3)."""
+    iou, *columns = rows[np.isfinite(rows).all(axis=1)].T
+    groups: Groups = {}
+    for grouping, values, edges in zip(GROUPINGS, columns, (RANGE_BINS, POINT_BINS), strict=True):
+        groups[grouping] = {}
+        for low, high in pairwise(edges):
+            label = f'{low:g}-{high:g}' if math.isfinite(high) else f'{low:g}+'
+            mask = (values >= low) & (values < high)
+            if mask.any():
+                groups[grouping][label] = float(iou[mask].mean())
+    return groups
+
+
+def print_groups(found: Mapping[str, Groups], iou: str) -> None:
+    """Print the `iou_by_group` of each method; `iou` names the kind of IoU."""
+    for grouping, title in GROUPINGS.items():
+        labels = list(dict.fromkeys(key for groups in found.values() for key in groups[grouping]))
+        print(line(f'{iou} {title}', labels))
+        for name, groups in found.items():
+            print(line(name, [groups[grouping].get(label, math.nan) for label in labels]))

@@ -1,0 +1,231 @@
+"""`boxreg bench paper`: the paper's Table I beside ours, over several seeds, and two figures."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import math
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.accuracy import iou_and_group_values, iou_by_group, print_groups
+from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
+from boxreg_ros.bench.methods import add_method_argument, Methods, run_methods
+from boxreg_ros.errors import BoxregError, ConfigError
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.evaluate import match, Matches
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.structures import Floats, LENGTH, ROLL, WIDTH
+import numpy as np
+
+VARIABLES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+COLUMNS = (*VARIABLES, 'iou', 'iou_first', 'iou_last')
+
+# Table I of the paper: mean absolute errors [m, rad] and mean IoU.
+PUBLISHED: dict[str, dict[str, tuple[float, ...]]] = {
+    '3d': {
+        'initial, published': (0.392, 0.124, 0.082, 0.083, 0.1, 0.18, 0.573),
+        'refined, published': (0.121, 0.049, 0.012, 0.031, 0.034, 0.053, 0.816),
+    },
+    'bev': {
+        'initial, published': (0.392, 0.124, math.nan, math.nan, math.nan, 0.18, 0.618),
+        'refined, published': (0.054, 0.006, math.nan, math.nan, math.nan, 0.032, 0.896),
+    },
+}
+SCENARIOS = {'3d': 'paper', 'bev': 'paper-bev'}
+
+
+class ModeResult:
+    """
+    Rows of one mode, collected over the seeds.
+
+    Attributes
+    ----------
+    rows : dict of str to list
+        Per method: one `error_row` per seed, or the reason why the method did not run.
+    group_values : dict of str to list of arrays, shape (n, 3)
+        Per method: one `iou_and_group_values` per seed.
+
+    """
+
+    def __init__(self) -> None:
+        self.rows: dict[str, list[tuple[float, ...] | str]] = {}
+        self.group_values: dict[str, list[Floats]] = {}
+
+    def add(self, drive: Drive, methods: Methods, mode: str) -> None:
+        """Add the boxes of one seed."""
+        for name, boxes in methods.items():
+            rows = self.rows.setdefault(name, [])
+            if isinstance(boxes, str):
+                rows.append(boxes)
+                continue
+            matches = match(boxes, drive.truth)
+            rows.append(error_row(matches, mode))
+            values = iou_and_group_values(drive, matches, mode)
+            self.group_values.setdefault(name, []).append(values)
+
+    def means(self) -> dict[str, tuple[float, ...] | str]:
+        """Return per method the mean row over the seeds."""
+        return {name: _mean_row(rows) for name, rows in self.rows.items()}
+
+    def groups(self) -> dict[str, dict[str, dict[str, float]]]:
+        """Return per method the mean IoU by range and by number of points, of all seeds."""
+        return {
+            name: iou_by_group(np.concatenate(values))
+            for name, values in self.group_values.items()
+        }
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `boxreg bench paper`."""
+    parser.add_argument(
+        '--seeds', type=int, default=3, metavar='N', help='repetitions (default: 3)'
+    )
+    parser.add_argument(
+        '--steps', type=int, metavar='N', help='boxes per repetition (default: all 100)'
+    )
+    parser.add_argument(
+        '-o', '--output', type=Path, default=Path('out/bench'), metavar='DIR',
+        help='folder for the figures (default: out/bench)',
+    )  # fmt: skip
+    add_method_argument(parser)
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Print Table I and draw the two figures.
+
+    Raises
+    ------
+    ConfigError
+        If ``--seeds`` is below 1.
+    BoxregError
+        If matplotlib is not installed.
+
+    """
+    if args.seeds < 1:
+        raise ConfigError(f'--seeds: expected 1 or more, got {args.seeds}')
+    results: dict[str, ModeResult] = {}
+    with progress_bar(len(SCENARIOS) * args.seeds * len(args.methods), args) as bar:
+        for mode, scenario in SCENARIOS.items():
+            results[mode] = ModeResult()
+            for seed in range(args.seeds):
+                drive = Drive.from_scene(simulate(scenario, seed, args.steps))
+                methods = run_methods(drive, mode, args.methods, bar.update)
+                results[mode].add(drive, methods, mode)
+                if seed == 0:
+                    draw_figures(args.output, mode, methods, drive.truth)
+    if args.json:
+        print_json({mode: _report(mode, result) for mode, result in results.items()})
+        return 0
+    for mode, result in results.items():
+        _print_table(mode, result)
+    print(
+        f'{args.seeds} seeds. Mean absolute errors [m, rad], x along and y across the vehicle; '
+        f'mean IoU of all boxes, of the first and of the last box. Figures: {args.output}'
+    )
+    return 0
+
+
+def _report(mode: str, result: ModeResult) -> dict[str, Any]:
+    """Return the content of ``--json`` of one mode."""
+    groups = result.groups()
+    report: dict[str, Any] = {}
+    for name, row in (PUBLISHED[mode] | result.means()).items():
+        if isinstance(row, str):
+            report[name] = row
+        else:
+            report[name] = dict(zip(COLUMNS, row, strict=False)) | groups.get(name, {})
+    return report
+
+
+def _print_table(mode: str, result: ModeResult) -> None:
+    iou = 'IoU 3D' if mode == '3d' else 'IoU BEV'
+    print(line(f'Table I, {mode}', (*VARIABLES, iou, 'first', 'last')))
+    for name, row in (PUBLISHED[mode] | result.means()).items():
+        print(line(name, row))
+    print_groups(result.groups(), iou)
+    print()
+
+
+def error_row(matches: Matches, mode: str) -> tuple[float, ...]:
+    """Return six mean absolute errors [m, rad], and the IoU of all, the first and the last box."""
+    errors = np.abs(np.concatenate([matches.translation, matches.rotation], axis=1)).mean(axis=0)
+    iou = matches.iou_3d if mode == '3d' else matches.iou_bev
+    return (*map(float, errors), float(iou.mean()), float(iou[0]), float(iou[-1]))
+
+
+def _mean_row(found: Sequence[tuple[float, ...] | str]) -> tuple[float, ...] | str:
+    rows = [row for row in found if not isinstance(row, str)]
+    return tuple(np.mean(rows, axis=0).tolist()) if rows else str(found[0])
+
+
+def draw_figures(folder: Path, mode: str, methods: Methods, truth: BoxTable) -> None:
+    """
+    Draw trajectory and errors over time as PNG files: truth, input and the last method.
+
+    Raises
+    ------
+    BoxregError
+        If matplotlib is not installed.
+
+    """
+    try:
+        import matplotlib
+    except ImportError:
+        raise BoxregError('figures need matplotlib: pip install matplotlib') from None
+    matplotlib.use('Agg')
+
+    folder.mkdir(parents=True, exist_ok=True)
+    found = [boxes for boxes in methods.values() if isinstance(boxes, BoxTable)]
+    shown = {'truth': truth, 'initial': found[0], 'refined': found[-1]}
+    colors = {'truth': 'tab:red', 'initial': 'tab:green', 'refined': 'tab:blue'}
+    _draw_trajectory(folder / f'paper_{mode}_trajectory.png', mode, shown, colors)
+    _draw_errors(folder / f'paper_{mode}_errors.png', shown, colors)
+
+
+def _draw_trajectory(
+    path: Path, mode: str, shown: dict[str, BoxTable], colors: dict[str, str]
+) -> None:
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 9))
+    for name, boxes in shown.items():
+        for i, box in enumerate(boxes.boxes[::5]):
+            label = name if i == 0 else None
+            axes.plot(*_outline(box).T, color=colors[name], lw=0.9, label=label)
+    axes.set(aspect='equal', xlabel='x [m]', ylabel='y [m]', title=f'every fifth box, {mode}')
+    axes.legend()
+    figure.savefig(path, dpi=150, bbox_inches='tight')
+    pyplot.close(figure)
+
+
+def _draw_errors(path: Path, shown: dict[str, BoxTable], colors: dict[str, str]) -> None:
+    from matplotlib import pyplot
+
+    truth = shown['truth']
+    seconds = (truth.stamps_ns - truth.stamps_ns[0]) / 1e9
+    figure, panels = pyplot.subplots(3, 2, figsize=(11, 8), sharex=True)
+    for name in ('initial', 'refined'):
+        matches = match(shown[name], truth)
+        errors = np.concatenate([matches.translation, matches.rotation], axis=1)
+        for variable, panel, values in zip(VARIABLES, panels.T.flat, errors.T, strict=True):
+            panel.plot(seconds, values, color=colors[name], lw=0.9, label=name)
+            panel.set_ylabel(f'{variable} [{"m" if variable in "xyz" else "rad"}]')
+            panel.axhline(0, color='gray', lw=0.5)
+    panels[0, 0].legend()
+    for panel in panels[-1]:
+        panel.set_xlabel('time [s]')
+    figure.savefig(path, dpi=150, bbox_inches='tight')
+    pyplot.close(figure)
+
+
+def _outline(box: Floats) -> Floats:
+    """Return the outline (7, 2) of a box from above, with a stroke that points forward."""
+    corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [1.4, 0]])
+    R = matrix_from_rpy(box[ROLL:])[:2, :2]
+    outline: Floats = corners * box[[LENGTH, WIDTH]] / 2 @ R.T + box[:2]
+    return outline

@@ -1,0 +1,188 @@
+"""
+A batch of windows as padded tensors, its estimated variables, and its solution.
+
+The estimated variables of a window of N observations are x = (p_1, ..., p_N, s): poses p_i of six
+numbers each and the shared variables s, the same for all observations, see `State`.
+
+"""
+
+from dataclasses import fields
+from typing import NamedTuple
+
+from boxreg_ros.config import ClassConfig, Config
+from boxreg_ros.core.arrowhead import LINK
+from boxreg_ros.structures import POSE
+import torch
+from torch import Tensor
+
+CLASS_NUMBERS = [item.name for item in fields(ClassConfig)[1:]]
+"""Names of the columns of `Problem.class_numbers`."""
+POSE_ERRORS = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
+"""The settings of `ClassConfig` that are the deviations of an input pose: x y z roll pitch yaw."""
+
+SHARED = 22
+"""Shared variables: extent (3), input bias (6), labelling margins (6), pivot, shape anchor (6)."""
+EXTENT = slice(0, 3)
+BIAS = slice(3, 9)
+GAP = slice(9, 15)
+PIVOT = 15
+ANCHOR = slice(16, 22)
+
+PRIOR_POSES = 2
+"""Poses that the marginalisation prior refers to: no residual spans more than three poses."""
+PRIOR_SIZE = PRIOR_POSES * LINK + SHARED
+
+
+class Problem(NamedTuple):
+    """
+    A batch of padded windows; centres are relative to one point per window.
+
+    Attributes
+    ----------
+    boxes : Tensor, shape (B, N, 9)
+        Input boxes, yaw unwrapped along the window and 180° flips corrected [m, rad].
+    start : Tensor, shape (B, N, 9)
+        Start of the search: the input, or the estimate of the window before.
+    valid : Tensor, shape (B, N)
+        True for observations, False for padding.
+    times : Tensor, shape (B, N)
+        Time since the first observation, increasing over the padding too [s].
+    points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
+        Returns minus the centre of their input box [m]; True for returns. Padding is very far
+        away.
+    delays : Tensor, shape (B, N, M)
+        Measurement time of each return, relative to the stamp of its box [s].
+    origins : Tensor, shape (B, N, 3)
+        Sensor minus the centre of the input box [m]; NaN if unknown.
+    ground : Tensor, shape (B, N)
+        Height of the road minus that of the input centre [m]; NaN if unknown.
+    prior_mean, prior_information : Tensor, shapes (B, 34) and (B, 34, 34)
+        Marginalisation prior on the two oldest poses and the shared variables: the minimum of its
+        quadratic form, and its information matrix. The information is 0 without a prior.
+    marginalised_extents : Tensor, shape (B, 4)
+        Sum of the input extents of marginalised observations, and the number of these.
+    class_numbers : Tensor, shape (B, C)
+        The numbers of each window's `ClassConfig`, in the order of `CLASS_NUMBERS`.
+
+    """
+
+    boxes: Tensor
+    start: Tensor
+    valid: Tensor
+    times: Tensor
+    points: Tensor
+    mask: Tensor
+    delays: Tensor
+    origins: Tensor
+    ground: Tensor
+    prior_mean: Tensor
+    prior_information: Tensor
+    marginalised_extents: Tensor
+    class_numbers: Tensor
+
+    @property
+    def pose(self) -> Tensor:
+        """Input poses x y z roll pitch yaw, shape (B, N, 6)."""
+        return self.boxes[..., POSE]
+
+    @property
+    def length(self) -> int:
+        """Observations per window, padding included: N."""
+        return self.boxes.shape[1]
+
+    def of_class(self, *names: str) -> Tensor:
+        """Return the settings `names` of the class of each window, shape (B, number of names)."""
+        return self.class_numbers[:, [CLASS_NUMBERS.index(name) for name in names]]
+
+    def thinned(self, points: float) -> 'Problem':
+        """Return the problem with every n-th point: at least `points` per box, if there are."""
+        stride = max(1, int(self.points.shape[2] // points))
+        names = ('points', 'mask', 'delays')
+        return self._replace(**{name: getattr(self, name)[:, :, ::stride] for name in names})
+
+
+class State(NamedTuple):
+    """
+    The estimated variables: the poses of a window, and those shared by all its observations.
+
+    Attributes
+    ----------
+    pose : Tensor, shape (B, N, 6)
+        x y z roll pitch yaw [m, rad].
+    shared : Tensor, shape (B, 22)
+        Extent of the object [m]; bias of the input poses, along their axes [m, rad]; labelling
+        margin of each face, from its outermost points out to the face [m]; distance of the pivot
+        behind the centre, where the object has no sideways velocity [m]; anchor of the rigid
+        shape, a step of all poses in box axes [m, rad].
+
+    """
+
+    pose: Tensor
+    shared: Tensor
+
+    @classmethod
+    def unpack(cls, x: Tensor, length: int) -> 'State':
+        """Return views into variables `x` (B, 6 N + 22)."""
+        return cls(x[:, : LINK * length].unflatten(1, (length, LINK)), x[:, LINK * length :])
+
+    def pack(self) -> Tensor:
+        """Return the variables as one row per window, shape (B, 6 N + 22)."""
+        return torch.cat([self.pose.flatten(1), self.shared], 1)
+
+
+class MarginalPrior(NamedTuple):
+    """
+    The prior that the oldest observation of a window leaves behind, see `prior.marginalise`.
+
+    Attributes
+    ----------
+    state, step : Tensor, shape (B, 34)
+        The linearisation point, and the step from there to the minimum.
+    information : Tensor, shape (B, 34, 34)
+        The information matrix.
+
+    """
+
+    state: Tensor
+    step: Tensor
+    information: Tensor
+
+
+class Solution(NamedTuple):
+    """
+    A solved batch.
+
+    Attributes
+    ----------
+    state : State
+        Poses and shared variables.
+    covariances : Tensor, shape (B, N, 6, 6)
+        Covariances of the poses: blocks of the inverse of the Gauss-Newton curvature.
+    prior : MarginalPrior or None
+        What full sliding windows leave to the next one; NaN for windows that leave nothing.
+    marginalised_extents : Tensor or None, shape (B, 4)
+        `Problem.marginalised_extents` of the next window.
+    extent_evidence : Tensor, shape (B, 3, 3)
+        Evidence of the points alone about the extents, see `InputNoise`.
+
+    """
+
+    state: State
+    covariances: Tensor
+    prior: MarginalPrior | None = None
+    marginalised_extents: Tensor | None = None
+    extent_evidence: Tensor = torch.zeros(0)
+
+
+def free_variables(problem: Problem, config: Config) -> Tensor:
+    """Return 1 for every variable (B, 6 N + 22) that is estimated, 0 for those held fixed."""
+    pose = problem.valid[..., None].to(problem.boxes).expand(-1, -1, LINK).clone()
+    shared = pose.new_ones((len(pose), SHARED))
+    if config.mode == 'bev':
+        pose[..., [2, 3, 4]] = 0.0
+        shared[:, 2] = 0.0
+    if config.extent == 'fixed':
+        shared[:, EXTENT] = 0.0
+    if not config.ingredients.input_bias:
+        shared[:, BIAS] = 0.0
+    return State(pose, shared).pack()

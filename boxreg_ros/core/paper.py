@@ -1,0 +1,199 @@
+"""
+The paper's objective to the letter, Eq. 4 to 8, and its solver.
+
+Its terms are functions of boxes and points, differentiated automatically. The default objective
+is in `terms`; it shares no code with this one but the optimiser.
+
+"""
+
+from boxreg_ros.config import Config, PaperConfig
+from boxreg_ros.core.batch import EXTENT, free_variables, POSE_ERRORS, Problem, Solution, State
+from boxreg_ros.core.face_support import FaceOffsets
+from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
+from boxreg_ros.core.input_model import expect
+from boxreg_ros.core.lbfgs import minimize, select
+from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.structures import POSE
+import torch
+from torch import Tensor
+
+EPSILON = 1e-9
+"""Added inside square roots: the norms of Eq. 6 and 7 have a gradient at zero [m^2]. Chosen: the
+norm of a zero vector becomes 3e-5."""
+INITIAL_ROUNDING = 0.3
+"""Added inside the same roots in the first multiplier round [m^2]. Chosen."""
+ROUNDING_DECAY = 0.01
+"""Factor on the rounding from one multiplier round to the next. Chosen: it has reached `EPSILON`
+in the fifth."""
+TOLERANCE = 1e-9
+"""Relative decrease of the objective that ends the search of one multiplier round. Chosen."""
+FULL_STEP = 0.1
+"""Step from which on its direction counts in full in Eq. 7 [m]. Chosen."""
+
+
+def closeness(boxes: Tensor, points: Tensor, mask: Tensor, nearest: int) -> Tensor:
+    """
+    Return the squared distances of the K points closest to each visible face [Eq. 4].
+
+    Parameters
+    ----------
+    boxes : Tensor, shape (B, N, 9)
+        Boxes [m, rad].
+    points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
+        Points in the frame of the boxes [m]; False for padding.
+    nearest : int
+        K.
+
+    Returns
+    -------
+    loss : Tensor, shape (B,)
+        Mean over observations and K, summed over the three axes [m^2].
+
+    Notes
+    -----
+    One face per axis is visible, the one on the side of the points' centre of mass. The choice
+    of faces and of points follows the boxes at every evaluation. With fewer than K points the
+    mean is over those there are.
+
+    """
+    distances = face_distances(points, boxes)  # (B, N, M, 6)
+    weight = mask.to(boxes)
+    outward = (distances[..., 0::2] - distances[..., 1::2]) * weight[..., None]
+    front_is_seen = outward.sum(-2, keepdim=True) > 0
+    squares = torch.where(front_is_seen, distances[..., 0::2], distances[..., 1::2]) ** 2
+    squares = torch.where(mask[..., None], squares, torch.inf)
+    closest = squares.topk(min(nearest, squares.shape[-2]), dim=-2, largest=False).values
+    is_point = closest.isfinite()
+    mean = torch.where(is_point, closest, 0.0).sum(-2) / is_point.sum(-2).clamp(min=1)
+    return _mean(mean.sum(-1), mask.any(-1))
+
+
+def enclosure(boxes: Tensor, points: Tensor, mask: Tensor) -> Tensor:
+    """
+    Return the mean L1 distance from the points to the six faces, shape (B,) [m] [Eq. 5].
+
+    It is constant while a point is inside and grows once it leaves: only points outside have a
+    gradient.
+
+    """
+    weight = mask.to(boxes)
+    distances = face_distances(points, boxes).abs().mean(-1) * weight
+    return _mean(distances.sum(-1) / weight.sum(-1).clamp(min=1), mask.any(-1))
+
+
+def smoothness(boxes: Tensor, valid: Tensor, rounding: float = EPSILON) -> Tensor:
+    """
+    Return the mean change of the pose's step from box to box, shape (B,) [Eq. 6].
+
+    Notes
+    -----
+    Steps of the angles are wrapped; `rounding` inside the root gives equal steps a gradient.
+
+    """
+    pose = boxes[..., POSE]
+    step = pose[:, 1:] - pose[:, :-1]
+    step = torch.cat([step[..., :3], wrap_angle(step[..., 3:])], -1).abs()
+    change = (step[:, 1:] - step[:, :-1]).square().sum(-1)
+    return _mean((change + rounding).sqrt(), valid[:, 2:])
+
+
+def alignment(boxes: Tensor, valid: Tensor, rounding: float = EPSILON) -> Tensor:
+    """
+    Return the mean distance between heading and direction of motion, shape (B,) [Eq. 7].
+
+    Notes
+    -----
+    The direction of a step of length zero is undefined: the weight of a step grows linearly up
+    to `FULL_STEP`. A window that moves against its headings on the whole is taken for a reversing
+    object: its direction of motion is reversed. The paper also wraps its alpha, the roll, into
+    [-pi/2, pi/2]; this term does not depend on it.
+
+    """
+    heading = rotation_from_rpy(boxes[:, :-1, 6:9])[..., 0]
+    step = boxes[:, 1:, :3] - boxes[:, :-1, :3]
+    length = (step.square().sum(-1) + rounding).sqrt()
+    direction = step / length[..., None]
+    along = ((heading * step).sum(-1) * valid[:, 1:]).sum(-1)
+    forward = torch.where(along < 0, -1.0, 1.0)[:, None, None]
+    deviation = ((heading - forward * direction).square().sum(-1) + rounding).sqrt()
+    return _mean(deviation * (length / FULL_STEP).clamp(max=1.0), valid[:, 1:])
+
+
+def total(
+    boxes: Tensor, problem: Problem, weights: PaperConfig, multipliers: Tensor, rounding: float
+) -> tuple[Tensor, Tensor]:
+    """
+    Return the objective (B,) [Eq. 8] and the violation (B, 2) of its two constraints.
+
+    Notes
+    -----
+    The paper names weights and augmented Lagrange multipliers without saying how they are
+    combined. Here smoothness and alignment are constraints c = 0, each adding m c + w c^2 / 2
+    with its weight w and its multiplier m, a column of `multipliers` (B, 2).
+
+    """
+    points = problem.points + problem.boxes[..., None, :3]
+    constraints = [term(boxes, problem.valid, rounding) for term in (smoothness, alignment)]
+    violation = torch.stack(constraints, -1)
+    penalty = violation.new_tensor([weights.smoothness, weights.alignment])
+    loss = weights.closeness * closeness(boxes, points, problem.mask, weights.nearest)
+    loss = loss + weights.enclosure * enclosure(boxes, points, problem.mask)
+    return loss + (multipliers * violation + penalty * violation**2 / 2).sum(-1), violation
+
+
+def solve_paper(problem: Problem, config: Config) -> Solution:
+    """
+    Minimise the paper's objective (Eq. 8) by L-BFGS, with multiplier updates in between.
+
+    Returns the poses, the mean extents of the input, and the squared errors of the input as
+    covariances: the paper's terms have no scale from which any could be derived.
+
+    Notes
+    -----
+    A zigzag satisfies Eq. 6, and a search gets stuck at the kinks of norms that are not squared.
+    The norms of Eq. 6 and 7 are therefore rounded, less in every round; the last round minimises
+    the equations to the letter.
+
+    """
+    settings = config.paper
+    length = problem.length
+    shared = expect(problem, FaceOffsets(*torch.zeros(3, 6))).shared
+    extent = shared[:, None, EXTENT].expand(-1, length, -1)
+    free = free_variables(problem, config)[:, : 6 * length]
+    x = problem.pose.flatten(1)
+    every = torch.arange(len(x), device=x.device)
+    penalty = x.new_tensor([settings.smoothness, settings.alignment])
+    multipliers = penalty.repeat(len(x), 1)
+
+    def boxes(x: Tensor, rows: Tensor) -> Tensor:
+        pose = x.unflatten(1, (length, 6))
+        return torch.cat([pose[..., :3], extent[rows], pose[..., 3:]], -1)
+
+    for turn in range(settings.multiplier_rounds):
+        rounding = max(INITIAL_ROUNDING * ROUNDING_DECAY**turn, EPSILON)
+
+        def function(
+            x: Tensor,
+            rows: Tensor,
+            multipliers: Tensor = multipliers,
+            rounding: float = rounding,
+        ) -> tuple[Tensor, Tensor]:
+            with torch.enable_grad():
+                x = x.detach().requires_grad_()
+                part = select(problem, rows)
+                loss, _ = total(boxes(x, rows), part, settings, multipliers[rows], rounding)
+                (gradient,) = torch.autograd.grad(loss.sum(), x)
+            return loss.detach(), gradient * free[rows]
+
+        x = minimize(function, x, settings.iterations, config.solver.history, TOLERANCE).x
+        _, violation = total(boxes(x, every), problem, settings, multipliers, rounding)
+        multipliers = multipliers + violation * penalty
+    variance = problem.of_class(*POSE_ERRORS) ** 2
+    covariances = torch.diag_embed(variance)[:, None].expand(-1, length, -1, -1)
+    return Solution(State(x.unflatten(1, (length, 6)), shared), covariances)
+
+
+def _mean(values: Tensor, valid: Tensor) -> Tensor:
+    """Return the mean over the `valid` ones of `values` (B, n); 0 without any."""
+    weight = valid.to(values)
+    return (values * weight).sum(-1) / weight.sum(-1).clamp(min=1)

@@ -1,0 +1,277 @@
+"""
+The weights of all residuals in one round: expected deviations and robust functions.
+
+docs/method.md, section Weights, has the formulas (M19) to (M25).
+
+"""
+
+from math import inf
+
+from boxreg_ros.config import Config
+from boxreg_ros.core import terms
+from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Problem, State
+from boxreg_ros.core.face_support import FaceObservations
+from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
+from boxreg_ros.core.input_model import Expectation
+from boxreg_ros.core.terms import Term
+from boxreg_ros.structures import YAW
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+# Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
+# each of them.
+INPUT_OUTLIER = 3.0
+"""Deviation at which an input pose has weight 1/2, in standard deviations."""
+MOTION_OUTLIER = 3.0
+"""Deviation at which a motion residual has weight 1/4, in standard deviations."""
+GAP_OUTLIER = 2.0
+"""Deviation at which the prior of a labelling margin has weight 1/2, in standard deviations."""
+NEIGHBOUR_FACTOR = 3.0
+"""Deviation from neighbours over error of the input. Derived roughly: white noise of deviation s
+makes an extrapolation from two neighbours err by sqrt(1 + 4 + 1) s = 2.4 s."""
+
+# An object is parked if it is slower, moves less and turns less than this over its window.
+PARKED_SPEED = 0.3
+"""Largest mean speed [m/s]."""
+PARKED_DISTANCE = 0.7
+"""Largest distance moved [m]."""
+PARKED_TURN = 3.0
+"""Largest turn, in errors of the input yaw."""
+DRIVING_SPEED = 1.0
+"""A parked object drives where the medians of five boxes before and after move faster [m/s]."""
+DRIVING_SPAN = 5
+"""Boxes in these medians."""
+DRIVING_REACH = 4
+"""Steps before and after one where the object drives that are not held at rest either."""
+DRIFT_RATIOS = (1.0, 1.0, 0.5, 0.15, 0.15, 0.15)
+"""Deviation of the steps of a parked box in x y z [m] and roll pitch yaw [rad], over `drift`."""
+
+
+def weigh(
+    problem: Problem,
+    state: State,
+    observations: FaceObservations,
+    expected: Expectation,
+    config: Config,
+) -> list[Term]:
+    """
+    Return the terms of one round, weighted by deviations and robust functions.
+
+    Parameters
+    ----------
+    problem : Problem
+        B windows.
+    state : State
+        Boxes at the start of the round.
+    observations : FaceObservations
+        The outermost points of their faces.
+    expected : Expectation
+        Means and deviations of input and shared variables.
+    config : Config
+        Settings.
+
+    Returns
+    -------
+    terms : list of Term
+        Faces (M2), input (M3), acceleration (M5), zero motion (M6), slip (M7), shared variables
+        (M8) and marginalisation prior (M9).
+
+    """
+    valid = problem.valid.to(state.pose)
+    axes = rotation_from_rpy(state.pose[..., 3:])
+    given = problem.pose
+    off_track = neighbour_deviation(problem, axes)
+    face_weight = _face_weights(observations, off_track, valid, config)
+    at_input = terms.input_pose(state, given, axes)
+    input_weight = _input_weights(at_input.residual[:, :, 0], off_track, valid, expected, config)
+    shared_weight = _shared_weights(state, observations, face_weight, expected, config)
+    to_body = at_input.by_pose[:, :, 0]  # (B, N, 6, 6)
+    slip_weight = problem.of_class('slip', 'climb')[:, None] ** -2 * valid[:, 1:, None]
+    prior_information = problem.prior_information
+    if not config.ingredients.marginalisation:
+        prior_information = torch.zeros_like(prior_information)
+    return [
+        Term(
+            terms.faces,
+            observations.moments * face_weight[..., None, None],
+            (given, observations.inset),
+        ),
+        Term(terms.input_pose, _diagonal(input_weight), (given, axes)),
+        Term(
+            terms.acceleration,
+            _acceleration_weights(problem, to_body, valid)[:, :, None],
+            (problem.times,),
+        ),
+        Term(terms.slip, _diagonal(slip_weight), (problem.times,)),
+        Term(terms.zero_motion, _diagonal(_zero_motion_weights(problem, expected))),
+        Term(terms.shared_prior, _diagonal(shared_weight[:, None]), (expected.shared,)),
+        Term(
+            terms.marginalisation_prior,
+            prior_information[:, None, None],
+            (problem.prior_mean[:, None],),
+        ),
+    ]
+
+
+def robustify_motion(term: Term, state: State) -> Term:
+    """
+    Return a motion `term` down-weighted where `state` is far off it (M24) [for Eq. 6 and 7].
+
+    Without this, objects that brake hard, swerve or drift would be moved off their points, whose
+    faces then are down-weighted as outliers. The weight (B, n, 1, R, R) falls with the Mahalanobis
+    norm of the residual (B, n, 1, R), as the square of Cauchy's. A stencil is down-weighted no
+    more than the two before it: the newest boxes are nearly as noisy as their input.
+
+    """
+    r = term.linearise(state).residual[:, :, 0, :, None]
+    squared = (r.mT @ term.weight[:, :, 0] @ r)[..., None] / MOTION_OUTLIER**2
+    squared[:, 2:] = squared[:, 2:].minimum(squared[:, 1:-1]).minimum(squared[:, :-2])
+    return term._replace(weight=term.weight / (1 + squared) ** 2)
+
+
+def neighbour_deviation(problem: Problem, axes: Tensor) -> Tensor:
+    """
+    Return how far each input pose is off the track of its neighbours (M19), shape (B, N, 6).
+
+    Along `axes` [m, rad]. The smallest deviation from three predictions of constant velocity: by
+    the two poses before, the two after, and one on each side. All three contradict an outlier,
+    two at most any of its neighbours. It is divided by `NEIGHBOUR_FACTOR`, so that noise alone
+    gives no more than its own size.
+
+    """
+    time = problem.times.where(problem.valid, torch.nan)[..., None]
+    own = torch.cat([problem.pose, time], 2)
+    # (B, N, 7, 5): two before, the pose itself, two after; NaN outside the window.
+    five = pad(own.mT, (2, 2), value=torch.nan).unfold(2, 5, 1).transpose(1, 2)
+    a, b, here = five[..., [0, 1, 3]], five[..., [1, 3, 4]], five[..., 2:3]
+    off = here - a - (b - a) * (here - a)[..., 6:, :] / (b - a)[..., 6:, :]
+    off = torch.cat([axes.mT @ off[..., :3, :], off[..., 3:6, :]], 2).abs()
+    least = off.nan_to_num(torch.inf).amin(3).nan_to_num(posinf=0.0)
+    return least / NEIGHBOUR_FACTOR
+
+
+def parked_steps(problem: Problem, yaw_deviation: Tensor) -> Tensor:
+    """
+    Return 1 for the steps (B, N - 1) of parked objects, else 0 (M25).
+
+    `yaw_deviation` (B,) is the estimated error of the input yaw [rad]: noise alone is no turn. An
+    object that is parked on the whole may brake or drive off at an end of its window: those steps,
+    and `DRIVING_REACH` more around them, are 0.
+
+    """
+    valid = problem.valid.to(problem.times)
+    t = problem.times
+    # Linear regression of x, y and yaw over time.
+    centred = (t - (t * valid).sum(1, keepdim=True) / valid.sum(1, keepdim=True)) * valid
+    x_y_yaw = problem.boxes[..., [0, 1, YAW]]
+    rate = (centred[..., None] * x_y_yaw).sum(1) / (centred * t).sum(1)[:, None]
+    duration = (t * valid).amax(1)
+    speed = rate[:, :2].square().sum(1).sqrt()
+
+    where = torch.cat([problem.boxes[..., :2], t[..., None]], 2)
+    where = torch.where(problem.valid[..., None], where, torch.nan)
+    from_median = (where - where.nanmedian(1, keepdim=True).values)[..., :2].norm(dim=2)
+    moved = torch.maximum(speed * duration, 2 * from_median.nanmedian(1).values)
+    turned = rate[:, 2].abs() * duration
+    turned = turned / yaw_deviation.maximum(problem.of_class('heading')[:, 0])
+    is_parked = (speed < PARKED_SPEED) & (moved < PARKED_DISTANCE) & (turned < PARKED_TURN)
+
+    # (B, 3, N + 6): running medians of x, y and time; NaN outside the window.
+    padded = pad(where.mT, (DRIVING_SPAN, DRIVING_SPAN), value=torch.nan)
+    medians: Tensor = padded.unfold(2, DRIVING_SPAN, 1).median(3).values
+    step = medians[..., DRIVING_SPAN + 1 : -1] - medians[..., 1 : -DRIVING_SPAN - 1]
+    drives = (step[:, :2].norm(dim=1) > DRIVING_SPEED * step[:, 2]).to(t)
+    near_drive = torch.max_pool1d(drives, 2 * DRIVING_REACH + 1, 1, DRIVING_REACH)
+    return valid[:, 1:] * is_parked[:, None] * near_drive.eq(0)
+
+
+def _face_weights(
+    observations: FaceObservations, off_track: Tensor, valid: Tensor, config: Config
+) -> Tensor:
+    """
+    Return the weights of the faces (M20), shape (B, N, 6) [1/m^2].
+
+    The square of Cauchy's weight of their distance. And of how far the input box is off its track,
+    in metres: the points of a box there belong to another object.
+
+    """
+    settings = config.faces
+    deviation = torch.tensor(
+        [settings.ends] * 2 + [settings.sides] * 2 + [settings.top, settings.bottom]
+    ).to(valid)
+    robust = 1 / (1 + (observations.distance / settings.outlier) ** 2) ** 2
+    same_object = valid / (1 + off_track[..., :2].square().sum(2) ** 2) ** 2
+    return observations.weight * robust * same_object[..., None] / deviation**2
+
+
+def _input_weights(
+    residual: Tensor, off_track: Tensor, valid: Tensor, expected: Expectation, config: Config
+) -> Tensor:
+    """
+    Return the weights of the input poses (M21), shape (B, N, 6): Cauchy's.
+
+    Of the input `residual` (B, N, 6) and of `off_track` (B, N, 6).
+
+    """
+    outlier = INPUT_OUTLIER if config.ingredients.robust_weights else inf
+    off = (residual.abs() + off_track) / expected.pose_deviation[:, None]
+    inverse_variance = valid[..., None] / expected.widened_deviation[:, None] ** 2
+    return inverse_variance / (1 + (off / outlier) ** 2)
+
+
+def _shared_weights(
+    state: State,
+    observations: FaceObservations,
+    face_weight: Tensor,
+    expected: Expectation,
+    config: Config,
+) -> Tensor:
+    """
+    Return the weights of the shared variables (M22), shape (B, 22).
+
+    The deviation of a labelling margin is widened where the margin is far off the expected one, or
+    the points of a face are far off where they are expected: points of a load, or of a branch
+    above, must not lift the roof.
+
+    """
+    spread = config.faces.spread
+    outlier = GAP_OUTLIER if config.ingredients.robust_weights else inf
+    deviation = expected.deviation
+    # Points and the face of the input are apart by margin, bias and half the error of the extent.
+    face_variance = deviation[:, BIAS][:, :3] ** 2 + (deviation[:, EXTENT] / 2) ** 2
+    variance = spread**2 + face_variance[:, FACE_AXIS]
+    total = face_weight.sum(1)
+    mean_distance = (observations.distance * face_weight).sum(1) / total.clamp(min=1e-9)
+    gap_off = (state.shared - expected.shared)[:, GAP] ** 2 / spread**2
+    squared = gap_off.maximum(mean_distance**2 / variance)
+    gap = deviation[:, GAP] * spread * (1 + squared / outlier**2).sqrt()
+    return torch.cat([deviation[:, : GAP.start], gap, deviation[:, GAP.stop :]], 1) ** -2
+
+
+def _acceleration_weights(problem: Problem, to_body: Tensor, valid: Tensor) -> Tensor:
+    """
+    Return the weights of the accelerations (M23), shape (B, N - 2, 6, 6), in the fixed frame.
+
+    Their deviations are along body axes: `to_body` (B, N, 6, 6).
+
+    """
+    information = (
+        problem.of_class('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning')
+        ** -2
+    )
+    to_fixed = to_body.mT
+    weight = (to_fixed * information[:, None, None]) @ to_fixed.mT
+    return weight[:, 1:-1] * valid[:, 2:, None, None]
+
+
+def _zero_motion_weights(problem: Problem, expected: Expectation) -> Tensor:
+    """Return the weights of the steps of parked objects (M25), shape (B, N - 1, 6)."""
+    yaw_deviation = expected.pose_deviation[:, 5]
+    deviation = problem.of_class('drift') * yaw_deviation.new_tensor(DRIFT_RATIOS)
+    return deviation[:, None] ** -2 * parked_steps(problem, yaw_deviation)[..., None]
+
+
+def _diagonal(weight: Tensor) -> Tensor:
+    """Return diagonal weight matrices (B, n, 1, R, R) of `weight` (B, n, R)."""
+    return torch.diag_embed(weight)[:, :, None]

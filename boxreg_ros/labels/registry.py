@@ -1,0 +1,148 @@
+"""The table of label formats, and access to them by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import cast
+
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.labels.protocol import (
+    FormatModule,
+    LabelFrame,
+    LabelWriter,
+    Options,
+    Provenance,
+    ReadableModule,
+)
+
+FORMATS = {
+    'csv': 'boxreg_ros.labels.csv',
+    'parquet': 'boxreg_ros.labels.parquet',
+    'openlabel': 'boxreg_ros.labels.openlabel',
+    'kitti': 'boxreg_ros.labels.kitti',
+    'tracklets': 'boxreg_ros.labels.tracklets',
+    'nuscenes': 'boxreg_ros.labels.nuscenes',
+    't4': 'boxreg_ros.labels.t4',
+    'argoverse2': 'boxreg_ros.labels.argoverse2',
+    'waymo': 'boxreg_ros.labels.waymo',
+    'sustechpoints': 'boxreg_ros.labels.sustechpoints',
+    'datumaro': 'boxreg_ros.labels.datumaro',
+    'supervisely': 'boxreg_ros.labels.supervisely',
+    'xtreme1': 'boxreg_ros.labels.xtreme1',
+    'mcap': 'boxreg_ros.labels.mcap',
+}
+"""Name on the command line -> module that implements `protocol.FormatModule`."""
+IN_RESULT_FOLDER = ('csv', 'mcap')
+"""Formats of a single file that is written into the folder of results itself."""
+COMMAND_LINE_OPTIONS = ('camera', 'with_points', 'swap_axes')
+"""Fields of `protocol.Options` that a user sets by name."""
+
+
+def module_of(name: str) -> FormatModule:
+    """
+    Return the module of a format.
+
+    Raises
+    ------
+    ConfigError
+        If the format does not exist, or needs a package that is not installed.
+
+    """
+    module = _imported(name)
+    for package in module.FORMAT.packages:
+        try:
+            import_module(package.replace('-', '_'))
+        except ImportError as error:
+            raise ConfigError(
+                f'format {name!r} needs {package}: pip install {package} ({error})'
+            ) from None
+    return module
+
+
+def can_read(name: str) -> bool:
+    """Return whether label files of this format can be read back."""
+    return hasattr(_imported(name), 'read')
+
+
+def check_options(names: Sequence[str], options: Options) -> None:
+    """
+    Refuse options that none of the formats `names` uses.
+
+    Raises
+    ------
+    ConfigError
+        If an option is not used; the message lists the formats that use it. Also as
+        `module_of`.
+
+    """
+    used = {option for name in names for option in module_of(name).FORMAT.options}
+    for option in COMMAND_LINE_OPTIONS:
+        if getattr(options, option) and option not in used:
+            able = [name for name in FORMATS if option in _imported(name).FORMAT.options]
+            raise ConfigError(
+                f'--{option.replace("_", "-")}: expected a format that uses it '
+                f'({", ".join(able)}), got {", ".join(names)}; add one, or leave it out'
+            )
+
+
+def writer_for(
+    name: str, out: Path, provenance: Provenance, options: Options | None = None
+) -> LabelWriter:
+    """
+    Return a writer of this format for the folder of results `out`.
+
+    Raises
+    ------
+    ConfigError
+        As `module_of`, or if the format needs an option that is not given.
+
+    """
+    module = module_of(name)
+    folder = _folder_of(name, out)
+    folder.mkdir(exist_ok=True)
+    return module.Writer(folder, provenance, options or Options())
+
+
+def is_written(name: str, out: Path) -> bool:
+    """Return whether the first file of a format, or a folder with content, exists in `out`."""
+    first = _folder_of(name, out) / module_of(name).FORMAT.files.split(',')[0]
+    if 'STAMP' in first.name:  # one file per frame
+        first = first.parent
+    return first.is_file() or (first.is_dir() and any(first.iterdir()))
+
+
+def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
+    """
+    Yield the frames of a label file or folder.
+
+    Boxes whose file states no status or covariance have the status ``input`` and the unit
+    matrix.
+
+    Raises
+    ------
+    ConfigError
+        As `module_of`, or if the format cannot be read.
+    RecordingError
+        If the files do not exist or do not follow the format.
+
+    """
+    module = module_of(name)
+    if not can_read(name):
+        able = ', '.join(other for other in FORMATS if can_read(other))
+        raise ConfigError(f'format {name!r} can only be written; readable: {able}')
+    if not path.exists():
+        raise RecordingError(f'labels {str(path)!r}: no such file or folder')
+    return cast(ReadableModule, module).read(path)
+
+
+def _imported(name: str) -> FormatModule:
+    """Return the module of a format, whether or not the packages it needs are installed."""
+    if name not in FORMATS:
+        raise ConfigError(f'format {name!r}: expected one of {", ".join(FORMATS)}')
+    return cast(FormatModule, import_module(FORMATS[name]))
+
+
+def _folder_of(name: str, out: Path) -> Path:
+    return out if name in IN_RESULT_FOLDER else out / name

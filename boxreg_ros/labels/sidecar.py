@@ -1,0 +1,162 @@
+"""
+Stamps and poses beside labels whose format only counts frames.
+
+Three files: ``timestamps.txt`` with one stamp per frame [ns]; ``poses.txt`` with
+``T_fixed_sensor`` per frame, its upper three rows as twelve numbers, NaN if unknown; and
+``boxreg.json`` with the provenance and the names of frames and tracks.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import datetime, UTC
+from pathlib import Path
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.labels.files import frame_names, read_provenance, write_provenance
+from boxreg_ros.labels.protocol import LabelFrame, Provenance
+from boxreg_ros.structures import Floats, RefinedBoxes
+import numpy as np
+
+STAMPS_FILE = 'timestamps.txt'
+POSES_FILE = 'poses.txt'
+
+
+class SidecarWriter:
+    """Write the three files, frame by frame."""
+
+    def __init__(self, folder: Path, provenance: Provenance) -> None:
+        self._folder = folder
+        self._stamps = (folder / STAMPS_FILE).open('w', encoding='utf-8')
+        self._poses = (folder / POSES_FILE).open('w', encoding='utf-8')
+        self._content = asdict(provenance)
+
+    def add(self, frame: LabelFrame) -> None:
+        """Add the next frame."""
+        T = frame.T_fixed_sensor
+        rows = np.full((3, 4), np.nan) if T is None else T[:3]
+        self._stamps.write(f'{frame.refined.boxes.stamp_ns}\n')
+        self._poses.write(' '.join(map(repr, rows.ravel().tolist())) + '\n')
+        self._content['fixed_frame'] = frame.fixed_frame
+        self._content['sensor_frame'] = frame.sensor_frame
+
+    def close(self, tracks: Mapping[str, str] | None = None) -> None:
+        """Complete the files; `tracks` are track ids by the numbers in the labels."""
+        self._stamps.close()
+        self._poses.close()
+        if tracks:
+            self._content['tracks'] = tracks
+        write_provenance(self._folder, self._content)
+
+
+@dataclass(frozen=True, slots=True)
+class Sidecar:
+    """
+    The content of the three files.
+
+    Attributes
+    ----------
+    stamps_ns : list of int
+        Stamp per frame [ns].
+    poses : list of array, shape (4, 4), or None
+        ``T_fixed_sensor`` per frame; None if unknown.
+    fixed_frame, sensor_frame : str
+        Names of the frames.
+    tracks : dict
+        Track ids by the numbers in the labels.
+
+    """
+
+    stamps_ns: list[int]
+    poses: list[Floats | None]
+    fixed_frame: str
+    sensor_frame: str
+    tracks: dict[str, str]
+
+    def frame(self, index: int, refined: RefinedBoxes) -> LabelFrame:
+        """Return a frame with boxes in the sensor frame."""
+        return LabelFrame(refined, self.fixed_frame, self.sensor_frame, self.poses[index])
+
+
+def read_sidecar(folder: Path, count: int, stamps: Path | None = None) -> Sidecar:
+    """
+    Return the stamps and poses of at least `count` frames.
+
+    Raises
+    ------
+    RecordingError
+        If `stamps` (default: ``timestamps.txt``) is missing or has fewer stamps than frames.
+
+    """
+    path = stamps or folder / STAMPS_FILE
+    stamps_ns = read_stamps(path)
+    if len(stamps_ns) < count:
+        raise RecordingError(f'{path}: expected a stamp for {count} frames, got {len(stamps_ns)}')
+    fixed_frame, sensor_frame = frame_names(folder)
+    return Sidecar(
+        stamps_ns,
+        read_poses(folder / POSES_FILE, len(stamps_ns)),
+        fixed_frame,
+        sensor_frame,
+        read_provenance(folder).get('tracks', {}),
+    )
+
+
+def read_stamps(path: Path) -> list[int]:
+    """
+    Return the stamps of a file [ns]: integers, or date and time (UTC) as in KITTI raw.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such file, or a line is neither.
+
+    """
+    try:
+        lines = path.read_text(encoding='utf-8').split('\n')
+    except OSError:
+        raise RecordingError(
+            f'{path}: not found, and these labels have no stamps of their own; create it with '
+            f'one stamp per frame, as whole nanoseconds'
+        ) from None
+    stamps = []
+    for number, line in enumerate(filter(str.strip, lines), 1):
+        try:
+            stamps.append(_stamp_ns(line.strip()))
+        except ValueError:
+            raise RecordingError(
+                f'{path}:{number}: expected whole nanoseconds, got {line.strip()!r}'
+            ) from None
+    return stamps
+
+
+def read_poses(path: Path, count: int) -> list[Floats | None]:
+    """
+    Return ``T_fixed_sensor`` (4, 4) of `count` frames; None where the pose is unknown.
+
+    Raises
+    ------
+    RecordingError
+        If the file exists but is not `count` lines of twelve numbers.
+
+    """
+    if not path.exists() or not count:
+        return [None] * count
+    try:
+        rows = np.loadtxt(path, ndmin=2).reshape(-1, 3, 4)  # (frame, row, column)
+    except ValueError as error:
+        raise RecordingError(f'{path}: expected twelve numbers a line: {error}') from None
+    if len(rows) != count:
+        raise RecordingError(f'{path}: expected {count} poses, one per stamp, got {len(rows)}')
+    last_row = np.array([[0.0, 0.0, 0.0, 1.0]])
+    return [np.vstack([row, last_row]) if np.isfinite(row).all() else None for row in rows]
+
+
+def _stamp_ns(text: str) -> int:
+    if text.isdigit():
+        return int(text)
+    moment, _, fraction = text.partition('.')
+    seconds = int(datetime.fromisoformat(moment).replace(tzinfo=UTC).timestamp())
+    return seconds * 10**9 + int(fraction.ljust(9, '0')[:9] or 0)

@@ -1,0 +1,81 @@
+"""Choice of the message type of the boxes among those published on their topic."""
+
+from __future__ import annotations
+
+import time
+
+from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.live.topics import import_message, PATIENCE, Problem, Topics
+from diagnostic_msgs.msg import DiagnosticStatus
+from msg_adapters import adapter_for, ADAPTERS
+from msg_adapters.convention import Convention
+
+
+class BoxesTypeSearch:
+    """
+    Takes the first type, by name, that has an adapter and whose package is installed.
+
+    Parameters
+    ----------
+    topics : Topics
+        Reads the graph.
+    name : str
+        Resolved name of the topic, for problems.
+    convention : Convention
+        Convention of the boxes: decides whether types without track ids are accepted.
+
+    """
+
+    def __init__(self, topics: Topics, name: str, convention: Convention) -> None:
+        self._topics = topics
+        self._name = name
+        self._convention = convention
+        self._types: set[str] = set()
+        self._chosen = ''
+        self._since = time.monotonic()
+
+    def step(self) -> str:
+        """
+        Return the chosen type, or an empty text.
+
+        The choice waits until two calls in a row see the same types: discovery reports
+        publishers one by one.
+
+        """
+        types = self._topics.types_published('boxes')
+        is_stable = types == self._types
+        self._types = types
+        readable, _ = self._sorted_out(types)
+        if is_stable and readable:
+            self._chosen = readable[0]
+        return self._chosen
+
+    def problems(self) -> list[Problem]:
+        """Return why no type could be chosen, or which other types the topic has beside it."""
+        types = self._topics.types_published('boxes')
+        readable, errors = self._sorted_out(types)
+        if self._chosen:
+            others = [name for name in readable if name != self._chosen]
+            if not others or self._chosen not in types:
+                return []
+            text = f'also has boxes of type {", ".join(others)}: set boxes_type if these are meant'
+            return [Problem(DiagnosticStatus.WARN, f'{self._name}: {text}')]
+        if errors and not readable:
+            return [Problem(DiagnosticStatus.ERROR, f'{self._name}: {errors[0]}')]
+        if not types and time.monotonic() >= self._since + PATIENCE:
+            return [self._topics.unpublished('boxes', set(ADAPTERS))]
+        return []
+
+    def _sorted_out(self, types: set[str]) -> tuple[list[str], list[str]]:
+        """Return the types that can be read, sorted, and an error text for each of the others."""
+        readable = []
+        errors = []
+        for name in sorted(types):
+            try:
+                adapter_for(name, self._convention)
+                import_message(name)
+            except UnsupportedMessage as error:
+                errors.append(str(error))
+            else:
+                readable.append(name)
+        return readable, errors

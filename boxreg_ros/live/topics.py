@@ -1,0 +1,458 @@
+"""Subscriptions and publishers of the node, and the problems found on their topics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+import time
+from typing import Any, NamedTuple
+
+from boxreg_ros.errors import ConfigError, UnsupportedMessage
+from boxreg_ros.live.diagnostics import Health
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from msg_adapters import canonical
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import (
+    DurabilityPolicy,
+    LivelinessPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+PATIENCE = 10.0
+"""A topic without publishers or messages is reported this long after its subscription [s]."""
+QOS_OVERRIDES = QoSOverridingOptions(
+    (
+        QoSPolicyKind.HISTORY,
+        QoSPolicyKind.DEPTH,
+        QoSPolicyKind.RELIABILITY,
+        QoSPolicyKind.DURABILITY,
+    )
+)
+"""Policies that parameters ``qos_overrides.TOPIC.ENTITY.POLICY`` may set."""
+INFINITE_NS = 9223372036854775807
+"""Value of an infinite duration in rmw [ns]."""
+
+
+class Problem(NamedTuple):
+    """Something that keeps messages from arriving; `level` is one of DiagnosticStatus."""
+
+    level: bytes
+    text: str
+    is_qos: bool = False
+
+
+class Mismatch(NamedTuple):
+    """A QoS policy for which a publisher offers less than a subscription requests."""
+
+    policy: str
+    offered: str
+    requested: str
+
+
+@dataclass(eq=False, slots=True)
+class Endpoint:
+    """
+    A subscription or publisher of the node.
+
+    Attributes
+    ----------
+    topic, name : str
+        Topic before and after namespace and remaps.
+    type_name : str
+        Message type, as ``package/msg/Type``.
+    qos : QoSProfile
+        QoS profile; overrides are written into it when the entity is made.
+    callback : callable or None
+        Takes the messages of a subscription; None for a publisher.
+    is_required : bool
+        True if the node refines nothing without messages on it.
+    has_overrides : bool
+        True if parameters may override the QoS profile.
+    entity : Subscription or Publisher
+        The entity of rclpy, once made.
+    since : float
+        When the endpoint was made (monotonic) [s].
+    received : int
+        Number of received messages.
+
+    """
+
+    topic: str
+    name: str
+    type_name: str
+    qos: QoSProfile
+    callback: Callable[[Any], None] | None = None
+    is_required: bool = False
+    has_overrides: bool = True
+    entity: Any = None
+    since: float = field(default_factory=time.monotonic)
+    received: int = 0
+
+    @property
+    def is_input(self) -> bool:
+        """Return whether this is a subscription."""
+        return self.callback is not None
+
+
+class Topics:
+    """
+    Creates subscriptions and publishers, and compares them with those of other nodes.
+
+    Used by the thread of the executor only.
+
+    Parameters
+    ----------
+    node : Node
+        The node that owns them.
+    health : Health
+        Receives the counters of lost messages and of incompatible QoS.
+
+    """
+
+    def __init__(self, node: Node, health: Health) -> None:
+        self._node = node
+        self._health = health
+        self._endpoints: list[Endpoint] = []
+        self._logged: set[str] = set()
+
+    def subscribe(
+        self,
+        type_name: str,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile,
+        is_required: bool = False,
+        has_overrides: bool = True,
+    ) -> None:
+        """
+        Create a subscription.
+
+        With reliability ``BEST_AVAILABLE``, rclpy chooses by the publishers that exist when it
+        subscribes. The subscription is created anew when one comes that offers less.
+
+        Parameters
+        ----------
+        type_name : str
+            Message type.
+        topic : str
+            Topic before namespace and remaps.
+        callback : callable
+            Takes each message.
+        qos : QoSProfile
+            QoS profile before overrides.
+        is_required : bool
+            True to report that nothing is published or received on it.
+        has_overrides : bool
+            True to let parameters override the QoS profile.
+
+        Raises
+        ------
+        ConfigError
+            For a QoS override of the wrong type.
+        UnsupportedMessage
+            If the message package is not installed.
+
+        """
+        name = self._node.resolve_topic_name(topic)
+        endpoint = Endpoint(topic, name, type_name, qos, callback, is_required, has_overrides)
+        self._create_subscription(endpoint)
+        self._endpoints.append(endpoint)
+
+    def publish(self, type_name: str, topic: str, depth: int) -> Publisher:
+        """
+        Create a publisher; parameters may override its QoS profile.
+
+        Raises
+        ------
+        ConfigError
+            For a QoS override of the wrong type.
+        UnsupportedMessage
+            If the message package is not installed.
+
+        """
+        kind = import_message(type_name)
+        name = self._node.resolve_topic_name(topic)
+        endpoint = Endpoint(topic, name, type_name, QoSProfile(depth=depth))
+        events = PublisherEventCallbacks(incompatible_qos=self._on_incompatible_subscription)
+        with _checked_overrides(f'{name}.publisher'):
+            endpoint.entity = self._node.create_publisher(
+                kind, topic, endpoint.qos, event_callbacks=events,
+                qos_overriding_options=QOS_OVERRIDES,
+            )  # fmt: skip
+        self._endpoints.append(endpoint)
+        publisher: Publisher = endpoint.entity
+        return publisher
+
+    def description(self) -> str:
+        """Return one line with the resolved name, type and QoS of every topic."""
+        subscribed = [_described(item) for item in self._endpoints if item.is_input]
+        published = [_described(item) for item in self._endpoints if not item.is_input]
+        return f'subscribed to {"; ".join(subscribed)}. Publishing {"; ".join(published)}'
+
+    def types_published(self, topic: str) -> set[str]:
+        """Return the message types that other nodes publish on a topic."""
+        return {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)}
+
+    def problems(self) -> list[Problem]:
+        """Return what keeps messages from arriving now, on any topic of the node."""
+        found: list[Problem] = []
+        for endpoint in self._endpoints:
+            if endpoint.is_input:
+                peers = self._node.get_publishers_info_by_topic(endpoint.topic)
+            else:
+                peers = self._node.get_subscriptions_info_by_topic(endpoint.topic)
+            same_type = [peer for peer in peers if peer.topic_type == endpoint.type_name]
+            other_type = [peer for peer in peers if peer.topic_type != endpoint.type_name]
+            found += _qos_problems(endpoint, same_type)
+            if other_type and not (endpoint.is_input and same_type):
+                found.append(_type_problem(endpoint, other_type))
+            if endpoint.is_input:
+                found += self._silence(endpoint, peers)
+        return found
+
+    def report(self, name: str, further: list[Problem]) -> DiagnosticStatus:
+        """
+        Log new problems and return the state of all topics.
+
+        Parameters
+        ----------
+        name : str
+            Name of the status.
+        further : list of Problem
+            Problems found elsewhere.
+
+        """
+        problems = [*self.problems(), *further]
+        for problem in problems:
+            if problem.text not in self._logged:
+                self._log(problem)
+        self._logged = {problem.text for problem in problems}
+        values = {_label(item): _described(item) for item in self._endpoints}
+        values |= {f'problem {i}': problem.text for i, problem in enumerate(problems, start=1)}
+        return DiagnosticStatus(
+            name=name,
+            level=max((problem.level for problem in problems), default=DiagnosticStatus.OK),
+            message='; '.join(problem.text for problem in problems) or 'connected',
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+
+    def unpublished(self, topic: str, type_names: set[str]) -> Problem:
+        """Return the problem that nobody publishes a topic, with topics of the types wanted."""
+        name = self._node.resolve_topic_name(topic)
+        is_remapped = name != self._node.resolve_topic_name(topic, only_expand=True)
+        candidates = self._published_topics(type_names)
+        there = ', '.join(candidates) if candidates else 'none'
+        remedy = 'check the remap' if is_remapped else f'start the publisher or remap {topic}'
+        return Problem(
+            DiagnosticStatus.WARN,
+            f'{name}: nobody publishes it; published topics of a fitting type: {there}; {remedy}',
+        )
+
+    def _create_subscription(self, endpoint: Endpoint) -> None:
+        """Create the subscription of an endpoint, in place of the one it has."""
+        kind = import_message(endpoint.type_name)
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=partial(self._on_incompatible_publisher, endpoint),
+            message_lost=partial(self._on_lost, endpoint),
+        )
+        if endpoint.entity is not None:
+            self._node.destroy_subscription(endpoint.entity)
+        with _checked_overrides(f'{endpoint.name}.subscription'):
+            endpoint.entity = self._node.create_subscription(
+                kind, endpoint.topic, partial(self._on_message, endpoint), endpoint.qos,
+                event_callbacks=events,
+                qos_overriding_options=QOS_OVERRIDES if endpoint.has_overrides else None,
+            )  # fmt: skip
+
+    def _on_message(self, endpoint: Endpoint, message: Any) -> None:
+        assert endpoint.callback is not None  # only subscriptions have messages
+        endpoint.received += 1
+        endpoint.callback(message)
+
+    def _on_incompatible_publisher(self, endpoint: Endpoint, event: Any) -> None:
+        is_reliability = event.last_policy_kind == QoSPolicyKind.RELIABILITY
+        is_adaptive = endpoint.qos.reliability == ReliabilityPolicy.BEST_AVAILABLE
+        executor = self._node.executor
+        if is_reliability and is_adaptive and executor is not None:
+            executor.create_task(self._create_subscription, endpoint)
+        else:
+            self._health.count('qos_incompatible')
+
+    def _on_lost(self, endpoint: Endpoint, event: Any) -> None:
+        self._health.count(f'{endpoint.topic}_lost', event.total_count_change)
+
+    def _on_incompatible_subscription(self, event: Any) -> None:
+        self._health.count('qos_incompatible')
+
+    def _silence(self, endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterator[Problem]:
+        """Yield a problem if nothing was ever received on an endpoint that ought to have some."""
+        is_remapped = endpoint.name != self._node.resolve_topic_name(
+            endpoint.topic, only_expand=True
+        )
+        is_expected = endpoint.is_required or is_remapped
+        if not is_expected or endpoint.received or time.monotonic() < endpoint.since + PATIENCE:
+            return
+        if not peers:
+            yield self.unpublished(endpoint.topic, {endpoint.type_name})
+        elif any(peer.topic_type == endpoint.type_name for peer in peers):
+            yield Problem(
+                DiagnosticStatus.WARN,
+                f'{endpoint.name}: nothing received yet from {_nodes(peers)}; check that messages '
+                f'are sent, and shared memory and network in between',
+            )
+
+    def _published_topics(self, type_names: set[str]) -> list[str]:
+        """Return the topics of given types that nodes publish, without those of this node."""
+        own = (self._node.get_name(), self._node.get_namespace())
+        found = set()
+        for node in self._node.get_node_names_and_namespaces():
+            if node == own:
+                continue
+            try:
+                topics = self._node.get_publisher_names_and_types_by_node(*node)
+            except RuntimeError:  # it has ended in the meantime
+                continue
+            found |= {topic for topic, types in topics if type_names & set(types)}
+        return sorted(found)
+
+    def _log(self, problem: Problem) -> None:
+        if problem.is_qos:
+            self._health.is_due('qos_incompatible')  # this entry replaces the general one
+        if problem.level == DiagnosticStatus.ERROR:
+            self._node.get_logger().error(problem.text)
+        else:
+            self._node.get_logger().warning(problem.text)
+
+
+def import_message(type_name: str) -> type:
+    """
+    Return the class of a message type.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If its package is not installed; the message names it.
+
+    """
+    package, _, name = canonical(type_name).split('/')
+    try:
+        kind: type = getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError):
+        raise UnsupportedMessage(
+            f'message type {type_name} is not installed: install the ROS package {package} '
+            f'(apt: ros-jazzy-{package.replace("_", "-")}) or source the workspace that has it'
+        ) from None
+    return kind
+
+
+def mismatches(offered: QoSProfile, requested: QoSProfile) -> list[Mismatch]:
+    """
+    Return the policies for which a publisher offers less than a subscription requests.
+
+    Parameters
+    ----------
+    offered, requested : QoSProfile
+        Of the publisher and of the subscription. A policy that is ``BEST_AVAILABLE`` fits.
+
+    """
+    found = []
+    for policy, weaker, stronger in (
+        ('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
+        ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL),
+        ('liveliness', LivelinessPolicy.AUTOMATIC, LivelinessPolicy.MANUAL_BY_TOPIC),
+    ):
+        if (getattr(offered, policy), getattr(requested, policy)) == (weaker, stronger):
+            found.append(Mismatch(policy, weaker.name.lower(), stronger.name.lower()))
+    for policy in ('deadline', 'liveliness_lease_duration'):
+        offer = getattr(offered, policy).nanoseconds or INFINITE_NS  # 0: the default, infinite
+        request = getattr(requested, policy).nanoseconds or INFINITE_NS
+        if offer > request:
+            found.append(Mismatch(policy, _seconds(offer), _seconds(request)))
+    return found
+
+
+def _seconds(duration_ns: int) -> str:
+    return 'infinite' if duration_ns >= INFINITE_NS else f'{1e-9 * duration_ns:g} s'
+
+
+def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterator[Problem]:
+    """Yield a problem for each policy for which an endpoint and a peer do not match."""
+    for peer in peers:
+        publisher, subscription = peer.qos_profile, endpoint.qos
+        if not endpoint.is_input:
+            publisher, subscription = subscription, publisher
+        for policy, offered, requested in mismatches(publisher, subscription):
+            if endpoint.is_input:
+                text = (
+                    f'the publisher of {_nodes([peer])} offers {policy} {offered}, the '
+                    f'subscription of this node requests {requested}; set the parameter '
+                    f'qos_overrides.{endpoint.name}.subscription.{policy} to {offered}, or '
+                    f'change the publisher'
+                )
+            else:
+                text = (
+                    f'the subscription of {_nodes([peer])} requests {policy} {requested}, the '
+                    f'publisher of this node offers {offered}; set the parameter '
+                    f'qos_overrides.{endpoint.name}.publisher.{policy} to {requested}, or change '
+                    f'the subscription'
+                )
+            yield Problem(DiagnosticStatus.ERROR, f'{endpoint.name}: {text}', is_qos=True)
+
+
+def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Problem:
+    """Return the problem that other nodes use an endpoint's topic with another type."""
+    types = ', '.join(sorted({peer.topic_type for peer in peers}))
+    if not endpoint.is_input:
+        return Problem(
+            DiagnosticStatus.WARN,
+            f'{endpoint.name}: {_nodes(peers)} subscribes with type {types}, this node publishes '
+            f'{endpoint.type_name}; change the subscription',
+        )
+    remedy = f'remap {endpoint.topic} to a topic of the expected type'
+    if endpoint.topic == 'boxes':
+        remedy = 'set boxes_type, or restart the node if the type of the topic has changed'
+    return Problem(
+        DiagnosticStatus.ERROR,
+        f'{endpoint.name}: expected messages of type {endpoint.type_name}, got {types} from '
+        f'{_nodes(peers)}; {remedy}',
+    )
+
+
+def _nodes(peers: list[TopicEndpointInfo]) -> str:
+    """Return the full names of the nodes that endpoints belong to."""
+    names = {f'{peer.node_namespace.rstrip("/")}/{peer.node_name}' for peer in peers}
+    return ', '.join(sorted(names))
+
+
+def _label(endpoint: Endpoint) -> str:
+    return f'{"subscription" if endpoint.is_input else "publisher"} {endpoint.topic}'
+
+
+def _described(endpoint: Endpoint) -> str:
+    """Return resolved name, type and QoS profile of an endpoint."""
+    qos = endpoint.qos
+    policies = ' '.join(
+        item.name.lower() for item in (qos.reliability, qos.durability, qos.history)
+    )
+    return f'{endpoint.name} [{endpoint.type_name}] {policies} {qos.depth}'
+
+
+@contextmanager
+def _checked_overrides(name: str) -> Iterator[None]:
+    """Name the QoS override that is wrong: rclpy checks their types by bare assertions."""
+    try:
+        yield
+    except (AssertionError, AttributeError, RuntimeError, TypeError) as error:
+        raise ConfigError(
+            f'qos_overrides.{name}: expected a whole number for depth and policy names such as '
+            f'reliable for the others, got something else {error}'.rstrip()
+        ) from None

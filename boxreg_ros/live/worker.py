@@ -1,0 +1,299 @@
+"""Worker of the node: takes messages from the inbox, registers boxes and publishes them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from threading import Event
+import time
+from typing import Any
+
+from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.io.markers import MarkerBoard
+from boxreg_ros.io.session import is_placeholder
+from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
+from boxreg_ros.live.inbox import Inbox, Message
+from boxreg_ros.reasons import REASONS
+from msg_adapters import Adapter, pointcloud
+from msg_adapters.poses import stamp_ns
+from rclpy.duration import Duration
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import PointCloud2
+
+TRANSFORM_PERIOD = 0.02
+"""Longest pause between two looks whether the transforms of a message have arrived [s]."""
+HELD_PERIOD = 0.1
+"""Longest pause while boxes are held [s]."""
+IDLE_PERIOD = 1.0
+"""Longest pause while nothing is held [s]."""
+BOXES_PATIENCE = 10.0
+"""Boxes wait for the solver this many times longer than clouds before they pass through."""
+ACKNOWLEDGEMENT_TIME = 0.4
+"""Wait at shutdown for subscribers to acknowledge the last messages, over all publishers [s]."""
+
+
+class Worker:
+    """
+    Registers boxes in a thread of its own, from `run` until `stop`.
+
+    The worker alone uses the registrar, its transforms and the markers. It shares the inbox and
+    the counters with the executor's thread, which also sets `cloud_frame` and `cloud_received`.
+
+    Parameters
+    ----------
+    live : LiveRegistrar
+        Transforms, registers and makes the messages to publish.
+    inbox : Inbox
+        Source of messages and events.
+    health : Health
+        Counters and log.
+    logger : RcutilsLogger
+        Logger of the node.
+    backlog : float
+        How long a cloud may wait for the solver [s].
+    markers : Publisher
+        Of the markers.
+
+    Attributes
+    ----------
+    cloud_frame : str
+        Frame of the newest cloud; empty before the first.
+    cloud_received : float
+        When it arrived (monotonic) [s].
+    fixed_frame : str
+        Frame that boxes are refined in; empty until it is chosen.
+    tracks : int
+        Number of tracks in the newest boxes.
+    newest_transform_ns : int or None
+        Stamp of the newest transform or odometry.
+
+    """
+
+    def __init__(
+        self,
+        live: LiveRegistrar,
+        inbox: Inbox,
+        health: Health,
+        logger: RcutilsLogger,
+        backlog: float,
+        markers: Publisher,
+    ) -> None:
+        self.cloud_frame = ''
+        self.cloud_received = 0.0
+        self.fixed_frame = ''
+        self.tracks = 0
+        self.newest_transform_ns: int | None = None
+        self._live = live
+        self._inbox = inbox
+        self._health = health
+        self._logger = logger
+        self._backlog = backlog
+        self._idle_at = 0.0
+        self._waited = 0.0
+        self._board = MarkerBoard()
+        self._markers = markers
+        self._early: Publisher | None = None
+        self._final: Publisher | None = None
+        self._stopping = Event()
+        self._confirmed: deque[ReceivedMessage] = deque()
+
+    def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
+        """Set what reads and writes boxes; to be called before boxes are subscribed to."""
+        self._live.adapter = adapter
+        self._early = early
+        self._final = final
+
+    def facts(self) -> dict[str, object]:
+        """Return what /diagnostics reports about the boxes beside the counters."""
+        return self._live.facts
+
+    def stop(self) -> None:
+        """Make `run` return after the message at hand."""
+        self._stopping.set()
+        self._inbox.wake_up.set()
+
+    def run(self) -> None:
+        """Process messages until `stop`, each as soon as its transforms are available."""
+        item: ReceivedMessage | None = None
+        while True:
+            self._inbox.wake_up.clear()  # before `_stopping` is read: `stop` sets both
+            if self._stopping.is_set():
+                break
+            self._take_events()
+            self._release_boxes_without_cloud(item)
+            if item is None:
+                item = self._next()
+            self._live.cloud_frame = self.cloud_frame  # may arrive while boxes wait
+            if item is None:
+                self._pause()
+            elif self._live.is_ready(item, time.monotonic()):
+                self._process(item)
+                item = None
+            else:
+                self._inbox.wake_up.wait(TRANSFORM_PERIOD)
+                self._idle_at = time.monotonic()
+                self._waited = self._idle_at - item.received
+        self._finish(item)
+
+    def drop(self, message: Message) -> None:
+        """
+        Count a message that the solver has no time for, and pass boxes through.
+
+        Either thread may call this.
+
+        """
+        reason = f'{message.topic}_queue_full'
+        self._health.report(reason, REASONS[reason].remedy)
+        if message.topic == 'boxes':
+            self._publish([Outgoing(message.content, False)])
+            self._inbox.put_passing(message)  # the final copy, in the order of all
+        else:
+            self._inbox.put_event('lost', stamp_ns(message.content.header))
+
+    def _next(self) -> ReceivedMessage | None:
+        """Return the next message decoded, or None if there is none to process now."""
+        self._confirmed.extend(self._live.release(time.monotonic()))
+        if not self._confirmed:
+            self._take_message()
+        return self._confirmed.popleft() if self._confirmed else None
+
+    def _take_message(self) -> None:
+        """Take the next message from the inbox and decode it, unless it passes through."""
+        message = self._inbox.take()
+        if message is None:
+            return
+        if message.topic == 'passing':
+            self._publish(self._live.last(message.content))
+        elif self._is_overdue(message):
+            self.drop(message)
+        else:
+            item = self._decoded(message)
+            if item is not None:
+                self._publish(self._guarded(partial(self._confirm, item)))
+
+    def _confirm(self, item: ReceivedMessage) -> list[Outgoing]:
+        """Queue a message for processing; return what a time jump before it releases."""
+        confirmed, ready = self._live.confirm(item)
+        self._confirmed.extend(confirmed)
+        return ready
+
+    def _is_overdue(self, message: Message) -> bool:
+        """Return whether a message has waited too long for the solver."""
+        patience = self._backlog
+        if message.topic == 'boxes':
+            patience *= BOXES_PATIENCE
+        # What arrived while a transform was waited for may take as long again to be solved.
+        since = max(message.received, self._idle_at + self._waited)
+        return time.monotonic() > since + patience
+
+    def _decoded(self, message: Message) -> ReceivedMessage | None:
+        """Return a message decoded; boxes that cannot be decoded pass through."""
+        reader: Any = pointcloud if message.topic == 'points' else self._live.adapter
+        try:
+            content = reader.from_msg(message.content)
+        except UnsupportedMessage as error:
+            self._health.report('unreadable', f'{message.topic}: {error}')
+        except Exception as error:
+            self._health.report_failure(error)
+        else:
+            return ReceivedMessage(message.content, content, message.received)
+        if message.topic == 'boxes':
+            self._publish(self._live.passed_through(message.content))
+        return None
+
+    def _pause(self) -> None:
+        """Wait for messages, and release what is held if none arrive for long."""
+        if self._confirmed or any(self._inbox.sizes().values()):
+            return
+        now = time.monotonic()
+        if self._live.is_silent(now):
+            self._publish(self._guarded(self._live.flush))
+        if self._board.is_showing and self._live.has_ceased(now):
+            self._markers.publish(self._board.clear())
+        is_holding = self._live.is_holding
+        self._inbox.wake_up.wait(HELD_PERIOD if is_holding else IDLE_PERIOD)
+        self._idle_at = time.monotonic()
+        self._waited = 0.0
+
+    def _release_boxes_without_cloud(self, item: ReceivedMessage | None) -> None:
+        """Release boxes that have waited too long for a cloud, unless one is at hand."""
+        is_cloud = item is not None and isinstance(item.message, PointCloud2)
+        if is_cloud or self._inbox.sizes()['points_waiting']:
+            return
+        release = partial(self._live.lose_overdue, time.monotonic(), self.cloud_received)
+        self._publish(self._guarded(release))
+
+    def _take_events(self) -> None:
+        for kind, content in self._inbox.take_events():
+            if kind == 'odom':
+                self._live.tree.add_odometry(content)
+            elif kind == 'lost':
+                self._publish(self._guarded(partial(self._live.lose, content)))
+            elif kind == 'reset':
+                self._publish(self._guarded(self._live.reset))
+            elif kind == 'settings':
+                self._live.config, options = content
+                self._live.output_frame = options.output_frame.lstrip('/')
+                self._live.transform_timeout = options.transform_timeout
+            else:
+                self._live.tree.add_transforms(content, is_static=kind == '/tf_static')
+        self.newest_transform_ns = self._live.tree.newest_ns()
+
+    def _process(self, item: ReceivedMessage) -> None:
+        ready = self._guarded(partial(self._live.process, item), item)
+        if self.fixed_frame != self._live.fixed_frame:
+            self.fixed_frame = self._live.fixed_frame
+            self._logger.info(f'fixed frame is {self.fixed_frame!r}')
+        self._publish(ready)
+        if is_placeholder(item.content) and self._board.is_showing:
+            self._markers.publish(self._board.clear())
+
+    def _guarded(
+        self, task: Callable[[], list[Outgoing]], item: ReceivedMessage | None = None
+    ) -> list[Outgoing]:
+        """Return what a task returns; after an error, all that is held, unrefined."""
+        try:
+            return task()
+        except Exception as error:
+            self._health.report_failure(error)
+            return self._live.abandon(item)
+        finally:
+            self._health.set_core_counts(self._live.counts)
+
+    def _publish(self, ready: list[Outgoing]) -> None:
+        for out in ready:
+            publisher = self._final if out.is_final else self._early
+            assert publisher is not None  # made before boxes are subscribed to
+            publisher.publish(out.message)
+            self._health.count('final_published' if out.is_final else 'early_published')
+            if not out.is_final and out.received is not None:
+                self._health.add_latency(time.monotonic() - out.received)
+            if not out.is_final and out.given is not None:
+                self.tracks = len(set(out.given.track_ids) - {''})
+        if not self._markers.get_subscription_count():
+            return
+        for out in ready:  # after all boxes: making markers takes longer than publishing boxes
+            if not out.is_final and out.given is not None and out.refined is not None:
+                self._markers.publish(self._board.update(out.given, out.refined))
+
+    def _finish(self, item: ReceivedMessage | None) -> None:
+        """Publish what is held, and pass what still waits through without solving it."""
+        self._take_events()
+        self._publish(self._guarded(self._live.flush))
+        for waiting in (item, *self._confirmed, *self._live.release()):
+            if waiting is not None and not isinstance(waiting.message, PointCloud2):
+                self._publish(self._live.passed_through(waiting.message))
+        message = self._inbox.take()
+        while message is not None:
+            if message.topic == 'boxes':
+                self._publish(self._live.passed_through(message.content))
+            elif message.topic == 'passing':
+                self._publish(self._live.last(message.content))
+            message = self._inbox.take()
+        self._markers.publish(self._board.clear())
+        publishers = [p for p in (self._early, self._final, self._markers) if p is not None]
+        for publisher in publishers:
+            publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGEMENT_TIME / 3))

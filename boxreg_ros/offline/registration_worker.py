@@ -1,0 +1,112 @@
+"""Registration of windows in a worker process while this one reads the recording on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import islice
+import time
+from typing import Any, cast
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.observation import Observation
+from boxreg_ros.core.registrar import GetEstimates, Submit
+from boxreg_ros.core.registration import Estimate, register
+from boxreg_ros.core.window import Window
+from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
+import numpy as np
+
+
+@contextmanager
+def registration_worker(config: Config, clock: Stopwatch) -> Iterator[Submit | None]:
+    """
+    Yield a function that starts `register` in a worker process, for `BoxRegistrar`.
+
+    Yield None where a worker is no gain or cannot work: a sliding window is awaited before the
+    next sweep is taken, and only the CPU can be used after a fork.
+
+    Parameters
+    ----------
+    config : Config
+        Settings.
+    clock : Stopwatch
+        The time in `register` is added to its stage ``solve``.
+
+    """
+    if config.estimate != 'track' or config.device != 'cpu':
+        yield None
+        return
+    with run_in_worker(_serve, 'registers windows') as process:
+        yield _Dispatcher(process, clock)
+
+
+class _Dispatcher:
+    """Send windows to the worker and receive their estimates."""
+
+    def __init__(self, process: WorkerProcess, clock: Stopwatch) -> None:
+        self._process = process
+        self._clock = clock
+
+    def __call__(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
+        """Send windows; return a function that waits for their estimates."""
+        if not windows:
+            return list
+        self._process.send((_packed(windows), config, model))
+
+        def awaited() -> list[Estimate | None]:
+            estimates, state, seconds = self._process.receive()
+            vars(model).update(state)  # `register` has updated the copy in the worker
+            self._clock.add('solve', seconds)
+            return cast(list[Estimate | None], estimates)
+
+        return awaited
+
+
+def _serve(receive: Receive, send: Send) -> None:
+    """Register windows in the worker until the connection is closed."""
+    while True:
+        packed, config, model = receive()
+        begun = time.perf_counter()
+        estimates = register(_unpacked(*packed), config, model)
+        send((estimates, vars(model), time.perf_counter() - begun))
+
+
+def _packed(windows: Sequence[Window]) -> tuple[Any, ...]:
+    """
+    Return windows and the columns of all their observations.
+
+    A few large arrays are pickled faster than many small ones. In place of its observations a
+    window holds the number of points of each.
+
+    """
+    heads = []
+    for window in windows:
+        counts = [len(observation.points) for observation in window.observations]
+        heads.append(window._replace(observations=cast(Any, counts)))
+    observations = [o for window in windows for o in window.observations]
+    stamps, boxes, points, delays, origins, *others = zip(*observations, strict=True)
+    return (
+        heads,
+        stamps,
+        np.array(boxes),
+        np.concatenate(points),
+        np.concatenate(delays),
+        np.array(origins),
+        *others,
+    )
+
+
+def _unpacked(heads: list[Any], *columns: Any) -> list[Window]:
+    """Return the windows that `_packed` was given."""
+    stamps, boxes, points, delays, *others = columns
+    counts = [count for head in heads for count in head.observations]
+    ends = np.cumsum(counts)[:-1]
+    observations = map(
+        Observation, stamps, boxes, np.split(points, ends), np.split(delays, ends), *others
+    )
+    return [
+        head._replace(observations=list(islice(observations, len(head.observations))))
+        for head in heads
+    ]

@@ -1,0 +1,159 @@
+"""`boxreg relabel`: its command line. What takes long to import is imported when it runs."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+import sys
+from typing import Any, TYPE_CHECKING
+
+from boxreg_ros.offline.arguments import (
+    add_label_arguments,
+    add_recording_arguments,
+    config_from,
+    convention_from,
+)
+from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare
+
+if TYPE_CHECKING:
+    from boxreg_ros.offline.request import Request
+
+DONE = 0
+FAILED = 1
+BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `boxreg relabel`."""
+    add_recording_arguments(parser)
+    parser.add_argument(
+        '-o', '--out', type=Path, required=True,
+        help='result folder; it is written completely or not at all',
+    )  # fmt: skip
+    parser.add_argument(
+        '--associate', action='store_true',
+        help='replace the track ids of the input: associate boxes over time',
+    )  # fmt: skip
+    parser.add_argument(
+        '--fixed-frame', metavar='FRAME',
+        help='frame to refine in (default: topmost frame that the frame of the clouds moves in)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--formats', default='csv,openlabel', metavar='NAME,...', type=_names,
+        help='label formats to write, see `boxreg formats`; csv is always written '
+        '(default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--labels', type=_labels_argument, metavar='FORMAT:PATH',
+        help='read the boxes from label files instead of a topic',
+    )  # fmt: skip
+    add_label_arguments(parser)
+    parser.add_argument(
+        '--start', type=float, metavar='S',
+        help='start of the part to refine, from the beginning of the recording [s]',
+    )  # fmt: skip
+    parser.add_argument(
+        '--end', type=float, metavar='S',
+        help='end of the part to refine, from the beginning of the recording [s]',
+    )  # fmt: skip
+    parser.add_argument(
+        '--bridge', type=float, default=0.0, metavar='S',
+        help='interpolate missing boxes in gaps of a track up to this long [s] (default: none)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--report', action='store_true',
+        help='also write report.html: what was changed, and which tracks to check',
+    )  # fmt: skip
+    parser.add_argument(
+        '--resume', action='store_true',
+        help='do nothing if OUT holds the result of the same request, files and settings',
+    )  # fmt: skip
+    parser.add_argument(
+        '--workers', type=int, metavar='N', help='CPU cores of the solver (sets solver.threads)'
+    )
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Return the names of a list with commas."""
+    return tuple(name.strip() for name in text.split(','))
+
+
+def _labels_argument(text: str) -> tuple[str, Path]:
+    """Return format and path of ``FORMAT:PATH``."""
+    name, colon, path = text.partition(':')
+    if not name or not colon or not path:
+        raise argparse.ArgumentTypeError(f'expected FORMAT:PATH, got {text!r}')
+    return name, Path(path)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Relabel, print one closing line, and return the exit status.
+
+    Status 1 also if the recording has boxes and none was refined; the result is kept.
+
+    """
+    from boxreg_ros.offline.relabel import closing_line, has_failed, notes, relabel
+
+    request = _request(args)
+    earlier = earlier_summary(args.out)
+    if args.resume and earlier and _is_complete(earlier, request, args.out):
+        print(f'{args.out}: up to date, made from the same files with the same settings')
+        return FAILED if has_failed(earlier) else DONE
+    if args.config != args.out / CONFIG:  # this one is written again with the same content
+        spare(args.out, [args.config])
+    from tqdm import tqdm
+
+    is_hidden = not sys.stderr.isatty()
+    with tqdm(total=1.0, unit='s', disable=is_hidden, leave=False, bar_format=BAR) as bar:
+        summary = relabel(request, args.out, partial(_show, bar))
+    for note in notes(summary):
+        print(f'boxreg: {note}', file=sys.stderr)
+    print(closing_line(summary, args.out))
+    return FAILED if has_failed(summary) else DONE
+
+
+def _request(args: argparse.Namespace) -> Request:
+    """Return the request that the arguments describe."""
+    from boxreg_ros.labels import Options
+    from boxreg_ros.offline.request import Request
+
+    config = config_from(args)
+    if args.workers is not None:
+        config = config.updated({'solver.threads': args.workers})
+    return Request(
+        recordings=tuple(args.recordings),
+        points=args.points,
+        boxes=args.boxes,
+        odometry=args.odometry,
+        fixed_frame=args.fixed_frame,
+        formats=args.formats,
+        start=args.start,
+        end=args.end,
+        config=config,
+        options=Options(args.with_points, args.camera, args.swap_axes),
+        labels=args.labels,
+        label_frame=args.label_frame,
+        convention=convention_from(args, args.associate),
+        bridge=args.bridge,
+        report=args.report,
+    )
+
+
+def _is_complete(earlier: dict[str, Any], request: Request, out: Path) -> bool:
+    """Return whether `out` holds the result of the same request, with all its files."""
+    from boxreg_ros.labels import is_written
+    from boxreg_ros.review.report import REPORT
+
+    if earlier['fingerprint'] != request.fingerprint():
+        return False
+    if request.report and not (out / REPORT).exists():
+        return False
+    return all(is_written(name, out) for name in request.all_formats)
+
+
+def _show(bar: Any, done: float, total: float) -> None:
+    """Show the progress of a run [s of the recording]."""
+    bar.total = total
+    bar.update(max(0.0, done - bar.n))

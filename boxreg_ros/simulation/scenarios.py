@@ -1,0 +1,239 @@
+"""The scenarios of `boxreg simulate`: a street, and the paper's experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.simulation.noise import detector_noise, table_one_noise
+from boxreg_ros.simulation.raycast import (
+    Actor,
+    body,
+    Motion,
+    PERIOD,
+    revolution,
+    ROAD,
+    Sensor,
+    to_matrix,
+)
+from boxreg_ros.simulation.scene import boxes_of, is_near, make_scene, make_sweep, Scene
+from boxreg_ros.structures import Floats
+import numpy as np
+from numpy.typing import NDArray
+
+EXTENTS = {
+    'car': (4.4, 1.8, 1.5), 'suv': (4.7, 1.92, 1.72), 'van': (5.4, 2.0, 2.3),
+    'truck': (7.8, 2.45, 3.1), 'pedestrian': (0.6, 0.65, 1.75), 'cyclist': (1.75, 0.6, 1.75),
+}  # fmt: skip
+"""Length, width and height of each shape [m]."""
+ROAD_MARGIN = 1.6  # road points further than this from every box are left out [m]
+MISS_PROBABILITY = 0.068  # part of the boxes that the detector misses
+INTEGRATION_STEP = 0.01  # of a motion [s]
+
+STREET_SWEEPS = 50
+SENSOR_HEIGHT = 1.8  # in the street [m]
+PITCH_AMPLITUDE = 0.006  # of the vehicle that carries the sensor [rad]
+
+PAPER_STEPS = 100  # T of Eq. 10
+PAPER_SPEED = 5.0  # [m/s]
+
+Rate = Callable[[Floats], NDArray[Any]]
+"""A speed [m/s] or a yaw rate [rad/s] at times (G,) [s]."""
+Place = tuple[float, float, float]
+"""x, y [m] and yaw [rad]."""
+
+
+class Plan(NamedTuple):
+    """One road user of the street: class, shape, place at time 0, speed and yaw rate."""
+
+    class_name: str
+    shape: str
+    place: Place
+    speed: Rate
+    yaw_rate: Rate
+
+
+def zero(times: Floats) -> Floats:
+    """Return the rate of a parked object or of a straight path."""
+    return np.zeros_like(times)
+
+
+def constant(value: float) -> Rate:
+    """Return a constant rate."""
+    return lambda times: value + 0 * times
+
+
+TRAFFIC = (
+    Plan('car', 'car', (28, -1.8, 0), lambda t: 7 - 2 * np.sin(t), zero),
+    Plan('car', 'suv', (62, 1.6, np.pi), constant(9), zero),
+    Plan('truck', 'truck', (74, 1.9, np.pi), constant(7), zero),
+    # Turns into a side street.
+    Plan('car', 'car', (16, -1.8, 0), lambda t: np.maximum(6 - t, 4.2),
+         lambda t: -0.6 * (np.abs(t - 3.1) < 1.3)),
+    # Backs out of a parking space.
+    Plan('car', 'suv', (37, 11.5, np.pi / 2), lambda t: -1.3 * (t > 0.8),
+         lambda t: 0.25 * (t > 2)),
+    Plan('cyclist', 'cyclist', (47, 3.4, np.pi), constant(4.5), lambda t: 0.06 * np.sin(2 * t)),
+    Plan('pedestrian', 'pedestrian', (22, 7.2, np.pi), constant(1.3), zero),
+    Plan('pedestrian', 'pedestrian', (15, -6.9, 0), constant(1.5), lambda t: 0.1 * np.cos(t)),
+)  # fmt: skip
+PARKED = (
+    ('car', 7, -4.6), ('van', 13.2, -4.7), ('suv', 19, -4.6), ('car', 24.7, -4.7),
+    ('car', 41, -4.6), ('truck', 49, -4.9), ('suv', 57, -4.6), ('car', 11, 4.9),
+    ('suv', 17, 4.9), ('van', 23.5, 5.0), ('car', 30, 4.8), ('car', 45.5, 4.9),
+    ('car', 52, 4.8), ('van', 58.5, 5.0),
+)  # fmt: skip
+"""Shape, x and y [m] of the parked rows."""
+
+
+def street(rng: np.random.Generator, sweeps: int | None) -> Scene:
+    """Return a street with parked rows and traffic in both directions."""
+    count = sweeps or STREET_SWEEPS
+    plans = list(TRAFFIC)
+    for shape, x, y in PARKED:
+        place = (
+            x + rng.normal(0, 0.2),
+            y + rng.normal(0, 0.1),
+            np.pi * (y > 0) + rng.normal(0, 0.03),
+        )
+        plans.append(Plan('car' if shape == 'suv' else shape, shape, place, zero, zero))
+    actors = [_actor(str(i + 1), plan, count, rng) for i, plan in enumerate(plans)]
+    ego = drive(count * PERIOD, (4, -1.75, 0), constant(6), zero)
+    ego.poses[:, 2] = SENSOR_HEIGHT
+    ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
+    sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
+    return _scan(actors, ego, sensor, count, rng)
+
+
+def _actor(track_id: str, plan: Plan, count: int, rng: np.random.Generator) -> Actor:
+    """Return a road user with a random size, on its path for `count` sweeps."""
+    extent = np.array(EXTENTS[plan.shape]) * rng.uniform(0.95, 1.05, 3)
+    is_vehicle = plan.class_name in ('car', 'van', 'truck')
+    axle = 0.25 * extent[0] if is_vehicle else 0.0
+    motion = drive(count * PERIOD, plan.place, plan.speed, plan.yaw_rate, axle)
+    motion.poses[:, 2] = extent[2] / 2
+    return Actor(track_id, plan.class_name, plan.shape, extent, motion)
+
+
+def drive(duration: float, start: Place, speed: Rate, yaw_rate: Rate, axle: float = 0.0) -> Motion:
+    """
+    Return the motion of a body on a plane whose rear axle does not slip sideways.
+
+    Parameters
+    ----------
+    duration : float
+        Length of the motion [s].
+    start : tuple of float
+        x, y and yaw of the centre at time 0 [m, rad].
+    speed, yaw_rate : callable
+        Along the heading [m/s] and of the heading [rad/s], at times (G,) [s].
+    axle : float
+        Distance of the rear axle behind the centre [m].
+
+    """
+    times = np.arange(-PERIOD, duration + PERIOD, INTEGRATION_STEP)
+    yaw = np.cumsum(yaw_rate(times)) * INTEGRATION_STEP
+    yaw += start[2] - np.interp(0, times, yaw)
+    heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    path = np.cumsum(speed(times)[:, None] * heading, axis=0) * INTEGRATION_STEP
+    center = path + axle * heading
+    center += start[:2] - np.array([np.interp(0, times, column) for column in center.T])
+    flat = np.zeros_like(times)
+    return Motion(times, np.stack([center[:, 0], center[:, 1], flat, flat, flat, yaw], axis=1))
+
+
+def _scan(
+    actors: Sequence[Actor], ego: Motion, sensor: Sensor, count: int, rng: np.random.Generator
+) -> Scene:
+    """Return the scene of `count` revolutions of a sensor on `ego`."""
+    parts = [body(actor.shape, actor.extent) for actor in actors]
+    stamps = np.arange(count) * PERIOD
+    T_fixed_sensor = to_matrix(ego.at(stamps))
+    # (actors, sweeps, 9)
+    true_boxes = np.stack([boxes_of(actor, actor.motion.at(stamps)) for actor in actors])
+    sweeps = []
+    owners = []
+    for i, stamp in enumerate(stamps):
+        points, times, owner = revolution(actors, parts, ego, sensor, stamp, rng)
+        kept = owner != ROAD
+        for box in true_boxes[:, i]:
+            kept |= is_near(points, box, ROAD_MARGIN)
+        sweeps.append(make_sweep(stamp, points[kept], times[kept], T_fixed_sensor[i]))
+        owners.append(owner[kept])
+    return make_scene(
+        actors, true_boxes, sweeps, owners, T_fixed_sensor, detector_noise, MISS_PROBABILITY, rng
+    )
+
+
+def paper(rng: np.random.Generator, sweeps: int | None, is_flat: bool) -> Scene:
+    """
+    Return the paper's experiment: an SUV, scanned from its side, on the path of Eq. 10.
+
+    Notes
+    -----
+    Eq. 10 moves along x only, while Eq. 7 asks the vehicle to move along its heading and the
+    figures show a curve: we move it along its heading. T, v and the time step are not published:
+    100 steps of 0.1 s at 5 m/s. The cloud is one scan, the same at every step except for the
+    areas occluded at random, so the sensor moves along on the vehicle's right. The error of x in
+    Table I is three times that of y: we read them as along and across the vehicle, which also
+    gives the IoU of its initial boxes.
+
+    """
+    count = sweeps or PAPER_STEPS
+    extent = np.array(EXTENTS['suv'])
+    poses = _paper_poses(count, extent[2], is_flat)
+    stamps = np.arange(count) * PERIOD
+    suv = Actor('1', 'car', 'suv', extent, Motion(stamps, poses))
+
+    beside = Motion(np.zeros(1), np.array([[1.5, -7.0, 1.5, 0, 0, np.pi / 2]]))
+    parked = replace(suv, motion=Motion(np.zeros(1), poses[:1] * [0, 0, 1, 0, 0, 0]))
+    sensor = Sensor(np.radians(np.linspace(-25, 15, 80)), columns=1800, noise=0.01, dropout=0.0)
+    scan, _, owner = revolution([parked], [body('suv', extent)], beside, sensor, 0.0, rng)
+    scan = scan[owner != ROAD] - parked.motion.poses[0, :3]
+    T_box_sensor = to_matrix(beside.poses - parked.motion.poses)[0]
+    visible = [scan[~_occluded(scan, extent, rng)] for _ in stamps]
+    clouds = [
+        make_sweep(stamp, points, np.zeros(len(points)), T_box_sensor)
+        for stamp, points in zip(stamps, visible, strict=True)
+    ]
+    owners = [np.zeros(len(points), np.int64) for points in visible]
+    true_boxes = boxes_of(suv, poses)[None]  # (1, sweeps, 9)
+    T_fixed_sensor = to_matrix(poses) @ T_box_sensor
+    noise = table_one_noise(is_flat)
+    return make_scene([suv], true_boxes, clouds, owners, T_fixed_sensor, noise, 0.0, rng)
+
+
+def _paper_poses(count: int, height: float, is_flat: bool) -> Floats:
+    """Return the poses (n, 6) of Eq. 10; `is_flat` leaves roll and pitch at 0."""
+    T = PAPER_STEPS
+    phase = 2 * np.pi * np.arange(1, count) / T
+    rates = np.zeros((count, 3))  # of roll, pitch and yaw per step
+    rates[1:, 0] = np.sign(np.cos(phase)) * np.pi / (6 * T)
+    rates[1:, 1] = np.sign(np.cos(phase)) * np.pi / (3 * T)
+    rates[1:, 2] = np.sign(np.sin(phase)) * 2 * np.pi / T
+    rates[:, :2] *= not is_flat
+    angles = np.cumsum(rates, axis=0)
+    heading = matrix_from_rpy(angles)[:, :, 0]
+    center = np.array([0, 0, height / 2]) + np.cumsum(heading, axis=0) * PAPER_SPEED * PERIOD
+    return np.concatenate([center, angles], axis=1)
+
+
+def _occluded(points: Floats, extent: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Return which points (M, 3) are behind one of up to two random blocks."""
+    occluded = np.zeros(len(points), bool)
+    for _ in range(rng.integers(0, 3)):
+        size = rng.uniform(0.1, 0.5) * extent[0]
+        start = rng.uniform(-0.5 * extent[0], 0.5 * extent[0] - size)
+        top = rng.uniform(-0.2, 0.5) * extent[2]
+        is_within = np.abs(points[:, 0] - start - size / 2) < size / 2
+        occluded |= is_within & (points[:, 2] < top)
+    return occluded
+
+
+SCENARIOS: dict[str, Callable[[np.random.Generator, int | None], Scene]] = {
+    'street': street,
+    'paper': lambda rng, sweeps: paper(rng, sweeps, is_flat=False),
+    'paper-bev': lambda rng, sweeps: paper(rng, sweeps, is_flat=True),
+}

@@ -1,0 +1,178 @@
+"""A simulated scene in memory: sweeps, noisy boxes, poses of the sensor and the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from boxreg_ros.core.refine import Track
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
+from boxreg_ros.simulation.noise import Noise
+from boxreg_ros.simulation.raycast import Actor
+from boxreg_ros.structures import BoxArray, Floats, Ints, LENGTH, ROLL, Sweep, YAW
+import numpy as np
+from numpy.typing import NDArray
+
+FIXED_FRAME = 'odom'
+SENSOR_FRAME = 'lidar'
+START_NS = 1_700_000_000 * 10**9  # stamp of the first sweep
+RESOLUTION = 1 / 512  # of coordinates: finer than any sensor's, and compressible [m]
+MIN_RETURNS = 5  # an object with fewer is not detected
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """
+    A simulated scene.
+
+    Attributes
+    ----------
+    sweeps : tuple of n Sweep
+        In frame ``lidar``, with times.
+    owners : tuple of n arrays, shape (M,)
+        The object that each point belongs to: a row of `actors`, or `raycast.ROAD`.
+    detections : tuple of n BoxArray
+        Noisy boxes, in frame ``lidar``.
+    T_fixed_sensor : array, shape (n, 4, 4)
+        At the stamps.
+    truth : BoxTable
+        True boxes in frame ``odom``, from the first to the last return of each actor;
+        `num_points` counts its own returns.
+    actors : tuple of Actor
+        All road users.
+
+    """
+
+    sweeps: tuple[Sweep, ...]
+    owners: tuple[Ints, ...]
+    detections: tuple[BoxArray, ...]
+    T_fixed_sensor: Floats
+    truth: BoxTable
+    actors: tuple[Actor, ...]
+
+    def fixed_detections(self) -> list[BoxArray]:
+        """Return the noisy boxes in frame ``odom``."""
+        pairs = zip(self.detections, self.T_fixed_sensor, strict=True)
+        return [boxes_to_frame(boxes, T, FIXED_FRAME) for boxes, T in pairs]
+
+    def tracks(self, margin: float = 1.5) -> list[Track]:
+        """Return the noisy boxes as tracks, with the points within `margin` [m] of each."""
+        arrays = self.fixed_detections()
+        rows: dict[str, list[tuple[int, int]]] = {}  # sweep and row of each box of a track
+        for i, array in enumerate(arrays):
+            for j, track_id in enumerate(array.track_ids):
+                rows.setdefault(track_id, []).append((i, j))
+        points = [
+            sweep.points @ T[:3, :3].T + T[:3, 3]
+            for sweep, T in zip(self.sweeps, self.T_fixed_sensor, strict=True)
+        ]
+        tracks = []
+        for track_id, places in rows.items():
+            first, row = places[0]
+            boxes = np.array([arrays[i].boxes[j] for i, j in places])
+            near = [
+                points[i][is_near(points[i], box, margin)]
+                for (i, _), box in zip(places, boxes, strict=True)
+            ]
+            tracks.append(
+                Track(
+                    track_id,
+                    arrays[first].class_names[row],
+                    np.array([arrays[i].stamp_ns for i, _ in places]),
+                    boxes,
+                    near,
+                    np.array([self.T_fixed_sensor[i, :3, 3] for i, _ in places]),
+                    np.array([arrays[i].scores[j] for i, j in places]),
+                )
+            )
+        return tracks
+
+
+def make_scene(
+    actors: Sequence[Actor],
+    true_boxes: Floats,
+    sweeps: Sequence[Sweep],
+    owners: Sequence[Ints],
+    T_fixed_sensor: Floats,
+    noise: Noise,
+    miss_probability: float,
+    rng: np.random.Generator,
+) -> Scene:
+    """
+    Return a scene with its truth and its detections.
+
+    Parameters
+    ----------
+    actors : sequence of a Actor
+        All road users.
+    true_boxes : array, shape (a, n, 9)
+        Per actor and sweep, in the fixed frame.
+    sweeps, owners : sequences of n
+        As in `Scene`.
+    T_fixed_sensor : array, shape (n, 4, 4)
+        As in `Scene`.
+    noise : callable
+        Makes the noisy boxes of one track.
+    miss_probability : float
+        Part of the boxes that are not detected.
+    rng : Generator
+        Source of all random numbers.
+
+    """
+    returns = np.array([[np.sum(owner == a) for owner in owners] for a in range(len(actors))])
+    noisy = np.stack([noise(boxes, T_fixed_sensor[:, :3, 3], rng) for boxes in true_boxes])
+    is_detected = (returns >= MIN_RETURNS) & (rng.random(returns.shape) >= miss_probability)
+    scores = rng.uniform(0.5, 0.99, returns.shape).round(2)
+    most_before = np.maximum.accumulate(returns, axis=1)
+    most_after = np.maximum.accumulate(returns[:, ::-1], axis=1)[:, ::-1]
+    is_in_sight = (most_before > 0) & (most_after > 0)
+    detections = []
+    truth = []
+    for i, sweep in enumerate(sweeps):
+        rows = np.flatnonzero(is_detected[:, i])
+        detected = _box_array(sweep.stamp_ns, actors, rows, noisy[:, i], scores[:, i])
+        detections.append(boxes_to_frame(detected, inverse(T_fixed_sensor[i]), sweep.frame_id))
+        rows = np.flatnonzero(is_in_sight[:, i])
+        certain = np.ones(len(actors))
+        truth.append(_box_array(sweep.stamp_ns, actors, rows, true_boxes[:, i], certain))
+    table = BoxTable.from_arrays(truth, 'truth')
+    table = replace(table, num_points=returns.T[is_in_sight.T].astype(np.int64))
+    table.boxes[:, YAW] = wrap_angle(table.boxes[:, YAW])
+    return Scene(
+        tuple(sweeps), tuple(owners), tuple(detections), T_fixed_sensor, table, tuple(actors)
+    )
+
+
+def _box_array(
+    stamp_ns: int, actors: Sequence[Actor], rows: Ints, boxes: Floats, scores: Floats
+) -> BoxArray:
+    """Return the boxes (a, 9) of some of the actors in the fixed frame."""
+    return BoxArray(
+        stamp_ns,
+        FIXED_FRAME,
+        tuple(actors[row].track_id for row in rows),
+        tuple(actors[row].class_name for row in rows),
+        scores[rows],
+        boxes[rows],
+    )
+
+
+def make_sweep(stamp: float, points: Floats, times: Floats, T_fixed_sensor: Floats) -> Sweep:
+    """Return points (M, 3) of the fixed frame as a sweep; `stamp` [s] after `START_NS`."""
+    local = (points - T_fixed_sensor[:3, 3]) @ T_fixed_sensor[:3, :3]
+    local = (np.round(local / RESOLUTION) * RESOLUTION).astype(np.float32)
+    return Sweep(START_NS + round(stamp * 1e9), SENSOR_FRAME, local, times)
+
+
+def boxes_of(actor: Actor, poses: Floats) -> Floats:
+    """Return the boxes (n, 9) of an actor at poses (n, 6) x y z roll pitch yaw."""
+    extents = np.broadcast_to(actor.extent, (len(poses), 3))
+    return np.concatenate([poses[:, :3], extents, poses[:, 3:]], axis=1)
+
+
+def is_near(points: Floats, box: Floats, margin: float) -> NDArray[np.bool_]:
+    """Return which points (M, 3) are inside `box` (9,) grown by `margin` [m] on every side."""
+    offsets = np.abs((points - box[:3]) @ matrix_from_rpy(box[ROLL:]))
+    return np.asarray((offsets <= box[LENGTH:ROLL] / 2 + margin).all(axis=1))

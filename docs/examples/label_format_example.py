@@ -1,0 +1,73 @@
+"""Label format ``jsonl``: one line of JSON per stamp, boxes in the fixed frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+import json
+from pathlib import Path
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.files import to_json
+from boxreg_ros.labels.records import refined_boxes
+
+FORMAT = Format(
+    name='jsonl',
+    title='JSON lines',
+    frame='fixed',
+    reference='centre',
+    sizes='length width height',
+    rotation='roll pitch yaw, R = Rz Ry Rx',
+    files='boxes.jsonl',
+)
+
+
+class Writer:
+    """Write one line per stamp; nothing is kept in memory."""
+
+    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._file = (folder / 'boxes.jsonl').open('w', encoding='utf-8')
+
+    def write(self, frame: LabelFrame) -> None:
+        """Write the valid boxes in the fixed frame; the others are counted in `dropped`."""
+        rows, boxes = frame.boxes_in('fixed', self.dropped)
+        array = frame.refined.boxes
+        line = {
+            'stamp_ns': array.stamp_ns,
+            'frame_id': frame.fixed_frame,
+            'track_ids': [array.track_ids[row] for row in rows],
+            'class_names': [array.class_names[row] for row in rows],
+            'scores': array.scores[rows].tolist(),
+            'status': [frame.refined.status[row] for row in rows],
+            'boxes': boxes.tolist(),
+        }
+        self._file.write(to_json(line) + '\n')
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read(path: Path) -> Iterator[LabelFrame]:
+    """Yield the frames of a file, or of the file in a folder."""
+    if path.is_dir():
+        path = path / 'boxes.jsonl'
+    try:
+        for text in path.read_text(encoding='utf-8').splitlines():
+            line = json.loads(text)
+            refined = refined_boxes(
+                line['stamp_ns'],
+                line['frame_id'],
+                line['track_ids'],
+                line['class_names'],
+                line['boxes'],
+                line['scores'],
+                line['status'],
+            )
+            yield LabelFrame(refined, fixed_frame=line['frame_id'], sensor_frame='')
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(f'{path}: expected one JSON object per line: {error!r}') from None

@@ -1,0 +1,58 @@
+"""What an adapter of box messages offers."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from boxreg_ros.structures import BoxArray, Floats
+
+
+class Adapter(Protocol):
+    """
+    Reads boxes from messages of one family, and writes refined boxes into copies of them.
+
+    An adapter is a module with these two functions. It reads messages by attribute and imports
+    no message package.
+
+    """
+
+    def from_msg(self, msg: Any) -> BoxArray:
+        """
+        Return the boxes of a message, in the frame of the message.
+
+        A box whose orientation or numbers are not valid is part of the result with NaN in their
+        place: it is an invalid box, which is returned unchanged later.
+
+        Raises
+        ------
+        UnsupportedMessage
+            If the message lacks a field, contains values of a wrong type, or its parts
+            contradict each other.
+
+        """
+
+    def to_msg(
+        self,
+        msg: Any,
+        boxes: BoxArray,
+        covariances: Floats | None = None,
+        T_out_in: Floats | None = None,
+    ) -> Any:
+        """
+        Return a copy of an input message with its boxes replaced.
+
+        Parameters
+        ----------
+        msg : message
+            The message that `from_msg` has read. It is not modified; fields that are not part of
+            a `BoxArray` are copied.
+        boxes : BoxArray
+            As many boxes, in the same order, in the frame ``boxes.frame_id``.
+        covariances : array, shape (n, 6, 6), optional
+            Covariances of x y z roll pitch yaw [m, rad], written where the type has a field for
+            them. Where one is NaN, the covariance of the message remains.
+        T_out_in : array, shape (4, 4), optional
+            Transform from the frame of the message to that of `boxes`, if they differ. It is
+            applied to the copied fields.
+
+        """

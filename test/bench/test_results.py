@@ -1,0 +1,45 @@
+"""docs/results.md: made from the stored measurements, and from nothing else."""
+
+import json
+import runpy
+import shutil
+
+from paths import ROOT
+import pytest
+
+SCRIPT = runpy.run_path(str(ROOT / 'docs' / 'results.py'), run_name='results')
+STORE = ROOT / 'docs' / 'results'
+STORED = sorted(STORE.glob('*.json'))
+
+
+def test_page_is_made_from_the_stored_measurements():
+    assert (ROOT / 'docs' / 'results.md').read_text(encoding='utf-8') == SCRIPT['page'](STORE)
+
+
+def test_page_follows_the_measurements(tmp_path):
+    store = tmp_path / 'results'
+    shutil.copytree(STORE, store)
+    path = store / 'real_pandaset_002_a.json'
+    document = json.loads(path.read_text(encoding='utf-8'))
+    (methods,) = document['results'].values()
+    assert f'| ours, track | {methods["ours, track"]["iou_bev"]:.3f} |' in SCRIPT['page'](store)
+    methods['ours, track']['iou_bev'] = 0.12345
+    path.write_text(json.dumps(document), encoding='utf-8')
+    assert '| ours, track | 0.123 |' in SCRIPT['page'](store)
+
+
+@pytest.mark.parametrize('path', STORED, ids=lambda path: path.stem)
+def test_stored_measurement_names_version_and_command(path):
+    document = json.loads(path.read_text(encoding='utf-8'))
+    kind = path.stem.partition('_')[0]
+    assert document['command'].startswith(f'boxreg bench {kind}')
+    assert '/' not in document['command'].replace('out/bench', '')  # runs anywhere
+    assert document['version']
+    assert kind in SCRIPT['SECTIONS']
+
+
+@pytest.mark.parametrize('path', sorted(STORE.glob('real_*.json')), ids=lambda path: path.stem)
+def test_every_accuracy_table_shows_the_baselines(path):
+    (methods,) = json.loads(path.read_text(encoding='utf-8'))['results'].values()
+    rows = {'input', 'smoothing only', 'ICP on box points', 'paper, track', 'ours, track'}
+    assert rows <= methods.keys()

@@ -1,0 +1,196 @@
+"""The way of items to the registrar, which the live node and `boxreg relabel` share."""
+
+from dataclasses import replace
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.session import is_placeholder, JumpConfirmation, register, Session
+from boxreg_ros.offline.reader import RecordingReader
+from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.structures import BoxArray, Sweep
+from msg_adapters import adapter_for, pointcloud
+from msg_adapters.convention import Convention, STANDARD
+import numpy as np
+import pytest
+from ros_messages import DETECTIONS, Drive, SECOND, START, write_recording
+
+ASSOCIATE = Convention(associate=True)
+
+
+def array_of(stamp_ns, x=5.0, frame_id='map'):
+    """Return one box of a car."""
+    box = np.array([[x, 0, 0.8, 4.5, 1.9, 1.6, 0, 0, 0]])
+    return BoxArray(stamp_ns, frame_id, ('?',), ('car',), np.ones(1), box)
+
+
+def contents(drive, convention=STANDARD):
+    """Return all clouds and boxes of a drive, and its transforms."""
+    adapter = adapter_for(DETECTIONS, convention)
+    readers = {'/points': pointcloud, '/boxes': adapter}
+    items = [
+        readers[topic].from_msg(message) for topic, _, message in drive.items if topic in readers
+    ]
+    transforms = [
+        (message.transforms, topic == '/tf_static')
+        for topic, _, message in drive.items
+        if topic.startswith('/tf')
+    ]
+    return items, transforms
+
+
+def test_items_are_moved_into_the_fixed_frame_with_their_transform():
+    drive = Drive(sweeps=3)
+    items, transforms = contents(drive)
+    session = Session(STANDARD, Config(), '/odom')
+    for transform in transforms:
+        session.tree.add_transforms(*transform)
+    for item in items:
+        admitted = session.admit(item)
+        T = session.tree.lookup('odom', 'lidar', item.stamp_ns)
+        np.testing.assert_array_equal(admitted.T_fixed_item, T)
+        assert admitted.moved.frame_id == 'odom'
+        assert (admitted.reason, admitted.detail) == ('', '')
+        if isinstance(item, Sweep):
+            np.testing.assert_allclose(admitted.moved.origin, T[:3, 3])
+        else:
+            expected = item.boxes[:, :3] @ T[:3, :3].T + T[:3, 3]
+            np.testing.assert_allclose(admitted.moved.boxes[:, :3], expected)
+
+
+def test_items_without_transform_have_a_reason():
+    drive = Drive(sweeps=1, motion='none')
+    items, _ = contents(drive)
+    session = Session(STANDARD, Config(), 'odom')
+    admitted = [session.admit(item) for item in items]
+    assert [a.reason for a in admitted] == ['sweep_without_transform', 'no_transform']
+    assert all(a.moved is None and "'odom'" in a.detail for a in admitted)
+
+
+def test_fixed_frame_is_chosen_when_the_motion_of_the_clouds_is_known():
+    drive = Drive(sweeps=2)
+    items, transforms = contents(drive)
+    session = Session(STANDARD, Config())
+    with pytest.raises(TransformUnavailable, match='no point cloud has arrived'):
+        session.require_fixed_frame(items[1])
+    session.sensor_frame = 'lidar'
+    with pytest.raises(TransformUnavailable, match='fixed_frame:=lidar'):
+        session.require_fixed_frame(items[1])
+    for transform in transforms:
+        session.tree.add_transforms(*transform)
+    assert session.require_fixed_frame(items[1]) == session.fixed_frame == 'odom'
+
+
+def test_ids_are_assigned_only_if_asked_for():
+    boxes = array_of(START)
+    session = Session(STANDARD, Config(), 'map')
+    assert session.admit(boxes).moved.track_ids == ('?',)
+    assert session.facts == {'ids': 'of the input'}
+    session = Session(ASSOCIATE, Config(), 'map')
+    assert session.admit(boxes).moved.track_ids == ('1',)
+    assert session.facts == {'ids': 'by association', 'associated_tracks': 1}
+
+
+def test_a_restart_assigns_new_ids_and_max_gap_may_change():
+    session = Session(ASSOCIATE, Config(max_gap=0.5), 'map')
+    first, later = array_of(START), array_of(START + 8 * SECOND // 10)
+    assert session.admit(first).moved.track_ids == ('1',)
+    session.config = Config(max_gap=1.0)
+    assert session.admit(later).moved.track_ids == ('1',)
+    session.config = Config(max_gap=0.5)
+    session.restart()
+    assert session.admit(first).moved.track_ids == ('2',)
+    assert session.admit(later).moved.track_ids == ('3',)
+
+
+def sweep_at(seconds):
+    return Sweep(round(seconds * SECOND), 'lidar', np.zeros((0, 3)))
+
+
+def boxes_at(seconds):
+    return array_of(round(seconds * SECOND))
+
+
+@pytest.fixture
+def jumps():
+    """Return a confirmation that has seen a sweep and boxes at 100 s."""
+    jumps = JumpConfirmation()
+    for content in (sweep_at(100), boxes_at(100)):
+        assert jumps.add('item', content) == (['item'], False)
+    return jumps
+
+
+@pytest.mark.parametrize(
+    'kinds', [(sweep_at, boxes_at), (boxes_at, sweep_at), (sweep_at, sweep_at)]
+)
+def test_two_old_stamps_in_a_row_are_a_time_jump(jumps, kinds):
+    first, second = (make(5 + 0.1 * k) for k, make in enumerate(kinds))
+    assert jumps.add('first', first) == ([], False)
+    assert jumps.add('second', second) == (['first', 'second'], True)
+    for content in (sweep_at(5.2), boxes_at(5.2)):
+        assert jumps.add('next', content) == (['next'], False)
+
+
+def test_a_single_old_stamp_is_late_and_keeps_its_order(jumps):
+    assert jumps.add('late', boxes_at(5)) == ([], False)
+    assert jumps.held == 'late'
+    assert jumps.add('following', sweep_at(100.1)) == (['late', 'following'], False)
+    assert jumps.held is None
+
+
+def test_a_late_item_can_be_released_without_another(jumps):
+    jumps.add('late', boxes_at(5))
+    assert jumps.release() == ['late']
+    assert jumps.release() == []
+
+
+def test_stamps_less_than_a_second_old_are_not_held(jumps):
+    assert jumps.add('item', boxes_at(99.1)) == (['item'], False)
+
+
+def test_an_array_without_boxes_stamp_and_frame_is_a_placeholder():
+    session = Session(ASSOCIATE, Config(), 'map')
+    empty = np.zeros((0, 9))
+    placeholder = BoxArray(0, '', (), (), np.zeros(0), empty)
+    assert is_placeholder(placeholder)
+    for _ in range(3):
+        assert session.admit(placeholder) == (None, None, '', '')
+    assert not is_placeholder(replace(placeholder, stamp_ns=START, frame_id='map'))
+
+
+def test_the_pose_check_is_renewed_after_a_time_jump(tmp_path):
+    """A finding about the boxes before the jump does not hold for those after it."""
+    wrong, right = Drive(sweeps=12, start=START + 100 * SECOND), Drive(sweeps=12)
+    for _, _, message in wrong.items:
+        for detection in getattr(message, 'detections', []):
+            detection.bbox.center.position.z -= detection.bbox.size.z / 2
+    day = 86_400 * SECOND
+    later = [(topic, at + day, message) for topic, at, message in right.items]
+    path = write_recording(tmp_path / 'drive', [*wrong.items, *later])
+    findings = list(findings_of(path))
+    jumps = [k for k, (restarts, _) in enumerate(findings) if restarts]
+    assert len(jumps) == 1
+    assert 'pose_reference' in findings[jumps[0] - 1][1]
+    assert not any(finding for _, finding in findings[jumps[0] :])
+
+
+def findings_of(path):
+    request = Request((path,))
+    with request.recording() as recording:
+        reading = RecordingReader(recording, request, Stopwatch())
+        for item in reading:
+            yield item.restarts, reading.findings().warning
+
+
+def test_register_flushes_and_resets_at_a_time_jump():
+    registrar = BoxRegistrar(Config(estimate='final'))
+    sweep = Sweep(START, 'map', np.zeros((0, 3)))
+    assert register(registrar, sweep, restarts=False) == []
+    assert len(register(registrar, array_of(START), restarts=False)) == 1  # early
+    earlier = START - 60 * SECOND
+    ready = register(registrar, array_of(earlier), restarts=True)
+    assert [(r.boxes.stamp_ns, r.is_final) for r in ready] == [(START, True)]
+    ready = register(registrar, replace(sweep, stamp_ns=earlier), restarts=False)
+    assert [r.reasons for r in ready] != [('late',)]
+    assert register(registrar, None, restarts=True)[-1].boxes.stamp_ns == earlier

@@ -1,0 +1,95 @@
+"""Counters, levels and log entries of the node."""
+
+from boxreg_ros.live.diagnostics import Health
+from diagnostic_msgs.msg import DiagnosticStatus
+
+
+class Log:
+    """Records log entries as (severity, text)."""
+
+    def __init__(self):
+        self.entries = []
+
+    def __getattr__(self, severity):
+        return lambda text: self.entries.append((severity, text))
+
+    def take(self):
+        """Return severity and first word of the entries since the last call."""
+        entries = [(severity, text.split()[0]) for severity, text in self.entries]
+        self.entries.clear()
+        return entries
+
+
+def test_level_is_ok_while_boxes_are_refined_and_warn_in_silence():
+    health = Health(Log())
+    health.count('points_received')
+    health.count('boxes_received')
+    health.add_latency(0.05)
+    status = health.status('node', {'fixed_frame': 'odom'})
+    assert status.level == DiagnosticStatus.OK
+    values = {item.key: item.value for item in status.values}
+    assert values['latency median [ms]'] == '50.0'
+    assert values['fixed_frame'] == 'odom'
+    assert health.status('node', {}).level == DiagnosticStatus.WARN  # nothing more was received
+
+
+def test_level_and_message_are_those_of_the_gravest_reason_of_the_period():
+    health = Health(Log())
+    health.count('no_sweep', 3)
+    health.count('boxes_received')
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.message == 'no box was refined; nothing received on points'
+    health.count('points_received')
+    health.set_core_counts({'no_sweep': 3, 'refined': 5})
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message.startswith('no_sweep') and 'stamp' in status.message
+    health.count('failed')
+    assert health.status('node', {}).level == DiagnosticStatus.ERROR
+    for name, level in (('refined', DiagnosticStatus.WARN), ('kept', DiagnosticStatus.ERROR)):
+        health.count('boxes_received')
+        health.count('late')
+        health.count(name)
+        assert health.status('node', {}).level == level
+
+
+def test_message_names_the_most_frequent_reason_if_no_box_was_refined():
+    health = Health(Log())
+    for name in ('points_received', 'boxes_received', 'no_points', 'no_gain', 'no_gain'):
+        health.count(name)
+    health.count('kept', 3)
+    status = health.status('node', {})
+    assert status.level == DiagnosticStatus.WARN
+    assert 'no box was refined' in status.message and 'no_gain' in status.message
+
+
+def test_each_reason_is_logged_once_per_period():
+    log = Log()
+    health = Health(log)
+    health.count('failed')
+    health.count('late', 2)
+    health.set_core_counts({'no_sweep': 3, 'refined': 5})
+    health.log_counts()
+    assert log.take() == [('error', 'failed'), ('warning', 'no_sweep'), ('warning', 'late')]
+    health.count('late')
+    health.log_counts()
+    assert log.take() == []
+    health.report('unreadable', 'points: no field x')
+    health.report('unreadable', 'points: no field x')
+    assert log.take() == [('warning', 'unreadable:')]
+    health._logged_at.clear()  # as if the period were over
+    health.log_counts()
+    assert log.take() == [('warning', 'unreadable'), ('warning', 'late')]
+
+
+def test_internal_errors_are_logged_with_their_traceback_in_the_debug_log():
+    log = Log()
+    health = Health(log)
+    try:
+        {}['missing']
+    except KeyError as error:
+        health.report_failure(error)
+    (error_entry, debug_entry) = log.entries
+    assert error_entry == ('error', "failed: KeyError: 'missing'")
+    assert debug_entry[0] == 'debug' and 'test_diagnostics.py' in debug_entry[1]

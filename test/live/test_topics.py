@@ -1,0 +1,205 @@
+"""Topics of the real node over DDS: QoS, types, silence and remaps in log and /diagnostics."""
+
+from boxreg_ros.live.topics import import_message, mismatches
+from diagnostic_msgs.msg import DiagnosticStatus
+import pytest
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from ros_graph import graph_in, play, publishers_for, records_of, RELIABLE
+from ros_messages import DETECTIONS, Drive, MARKERS, POINTS
+from test_node import DIAGNOSTICS, ended_cleanly, QUICK, values_of
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture
+def graph(tmp_path):
+    with graph_in(tmp_path) as graph:
+        yield graph
+
+
+def topics_status(diagnostics):
+    """Return the newest status of the topics."""
+    if not diagnostics:
+        return DiagnosticStatus()
+    return diagnostics[-1].status[1]
+
+
+def reported(graph, node, diagnostics, *parts):
+    """Wait until log and /diagnostics hold a line with all parts; return that of the log."""
+
+    def line_of(text):
+        lines = text.splitlines()
+        return next((line for line in lines if all(part in line for part in parts)), '')
+
+    def is_reported():
+        values = topics_status(diagnostics).values
+        return line_of(node.output()) and line_of('\n'.join(item.value for item in values))
+
+    graph.wait(is_reported, f'a report of {parts}')
+    return line_of(node.output())
+
+
+def subscribe(graph, type_name, topic, qos):
+    """Subscribe without keeping what comes."""
+    graph.node.create_subscription(import_message(type_name), topic, lambda _: None, qos)
+
+
+def test_each_qos_mismatch_is_reported_with_topic_policy_and_side(graph):
+    graph.publisher(POINTS, '/points', is_reliable=False)
+    subscribe(graph, DETECTIONS, '/refined_boxes_final', LATCHED)
+    subscribe(graph, MARKERS, '/refined_markers', LATCHED)
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, '-p', f'boxes_type:={DETECTIONS}')
+    for parts in (
+        ('/points: the publisher of /neighbour offers reliability best_effort',
+         'requests reliable', 'qos_overrides./points.subscription.reliability to best_effort'),
+        ('/refined_boxes_final: the subscription of /neighbour requests durability',
+         'transient_local', 'offers volatile',
+         'qos_overrides./refined_boxes_final.publisher.durability'),
+        ('/refined_markers: the subscription of /neighbour requests durability transient_local',
+         'qos_overrides./refined_markers.publisher.durability to transient_local'),
+    ):  # fmt: skip
+        assert '[ERROR]' in reported(graph, node, diagnostics, *parts)
+    assert topics_status(diagnostics).level == DiagnosticStatus.ERROR
+    graph.wait(lambda: values_of(diagnostics).get('qos_incompatible') == '3', 'three counts')
+    assert ended_cleanly(node)
+
+
+def test_qos_overrides_apply_to_markers_and_durability(graph):
+    subscribe(graph, MARKERS, '/refined_markers', LATCHED)
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    overrides = {
+        'refined_markers.publisher.durability': 'transient_local',
+        'refined_markers.publisher.depth': 3,
+        'points.subscription.durability': 'transient_local',
+    }
+    options = [f'qos_overrides./{name}:={value}' for name, value in overrides.items()]
+    node = graph.start(*[part for text in options for part in ('-p', text)])
+    graph.wait(lambda: topics_status(diagnostics).values, 'diagnostics')
+    values = {item.key: item.value for item in topics_status(diagnostics).values}
+    assert values['publisher refined_markers'] == (
+        f'/refined_markers [{MARKERS}] reliable transient_local keep_last 3'
+    )
+    assert 'best_effort transient_local' in values['subscription points']
+    (info,) = graph.node.get_subscriptions_info_by_topic('/points')
+    assert info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert ended_cleanly(node)
+    assert 'ERROR' not in node.output()
+
+
+def test_wrong_message_type_is_reported(graph):
+    graph.publisher(DETECTIONS, '/points')
+    graph.publisher('std_msgs/msg/String', '/boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start()
+    parts = (f'/points: expected messages of type {POINTS}', f'got {DETECTIONS} from /neighbour')
+    assert '[ERROR]' in reported(graph, node, diagnostics, *parts)
+    assert '[ERROR]' in reported(graph, node, diagnostics, '/boxes', 'std_msgs/msg/String')
+    assert ended_cleanly(node)
+
+
+def test_mistyped_remaps_are_reported_with_the_topics_there_are(graph):
+    graph.publisher(POINTS, '/lidar/points')
+    graph.publisher(DETECTIONS, '/tracker/boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    remaps = ('points:=/lidar/pionts', 'boxes:=/tracker/boxs', 'odom:=/odometry')
+    node = graph.start(*[part for text in remaps for part in ('-r', text)])
+    for name, candidate in (
+        ('/lidar/pionts', '/lidar/points'),
+        ('/tracker/boxs', '/tracker/boxes'),
+        ('/odometry', 'none'),
+    ):
+        parts = (f'{name}: nobody publishes it', f'fitting type: {candidate}; check the remap')
+        assert '[WARN]' in reported(graph, node, diagnostics, *parts)
+    assert topics_status(diagnostics).level == DiagnosticStatus.WARN
+    assert ended_cleanly(node)
+
+
+def test_silent_publishers_are_reported_and_forgotten_once_they_speak(graph):
+    publisher = graph.publisher(POINTS, '/points')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start()
+    parts = ('/points: nothing received yet from /neighbour',)
+    assert '[WARN]' in reported(graph, node, diagnostics, *parts)
+    cloud = import_message(POINTS)()
+    cloud.header.frame_id = 'lidar'
+    publisher.publish(cloud)
+
+    def is_forgotten():
+        return '/points: nothing' not in topics_status(diagnostics).message
+
+    graph.wait(is_forgotten, 'a status without it')
+    assert node.output().count(parts[0]) == 1
+    assert ended_cleanly(node)
+
+
+def test_start_up_line_names_resolved_topics_with_type_and_qos(graph):
+    remaps = ('-r', '__ns:=/front', '-r', 'points:=/lidar/points', '-r', '__node:=refiner')
+    node = graph.start(*remaps, '-p', f'boxes_type:={DETECTIONS}')
+    graph.wait(lambda: 'boxes are' in node.output(), 'the start-up line')
+    # The outputs exist before anything is published.
+    for topic in ('refined_boxes', 'refined_boxes_final', 'refined_markers'):
+        graph.wait(lambda t=topic: graph.node.count_publishers(f'/front/{t}') == 1, topic)
+    assert ended_cleanly(node)
+    (line,) = (line for line in node.output().splitlines() if 'boxes are' in line)
+    for part in (
+        'front.refiner',
+        f'/lidar/points [{POINTS}] best_effort volatile keep_last 40',
+        f'/front/boxes [{DETECTIONS}] best_available volatile keep_last',
+        '/front/odom [nav_msgs/msg/Odometry] best_effort',
+        f'/front/refined_boxes [{DETECTIONS}] reliable volatile',
+        f'/front/refined_boxes_final [{DETECTIONS}] reliable volatile',
+        f'/front/refined_markers [{MARKERS}] reliable volatile keep_last 10',
+    ):
+        assert part in line
+
+
+ADAPTER_WITH_A_BUG = """
+import sys
+from msg_adapters import vision
+def from_msg(message):
+    return {}['a bug']
+vision.from_msg = from_msg
+from boxreg_ros.live.main import main
+sys.exit(main())
+"""
+
+
+def test_internal_errors_while_decoding_count_as_failed(graph, tmp_path):
+    records = records_of(Drive(sweeps=4).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    options = ('--log-level', 'boxreg_node:=debug')
+    node = graph.start(*RELIABLE, *QUICK, *options, command=('-c', ADAPTER_WITH_A_BUG))
+    graph.wait_until_connected()
+    play(graph, records, early)  # boxes pass through
+    graph.wait(lambda: values_of(diagnostics).get('failed') == '4', 'counters')
+    assert 'unreadable' not in values_of(diagnostics)
+    node.stop()
+    lines = node.output().splitlines()
+    (error,) = (line for line in lines if '[ERROR]' in line)
+    assert "failed: KeyError: 'a bug'" in error
+    (traceback, *_) = (i for i, line in enumerate(lines) if 'Traceback' in line)
+    assert '[DEBUG]' in lines[traceback]
+    assert 'in from_msg' in '\n'.join(lines[traceback : traceback + 10])
+
+
+@pytest.mark.parametrize(
+    ('policy', 'offered', 'requested'),
+    [
+        ('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
+        ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL),
+        ('liveliness', LivelinessPolicy.AUTOMATIC, LivelinessPolicy.MANUAL_BY_TOPIC),
+        ('deadline', Duration(seconds=2), Duration(seconds=1)),
+        ('deadline', Duration(), Duration(seconds=1)),
+        ('liveliness_lease_duration', Duration(seconds=2), Duration(seconds=1)),
+    ],
+)
+def test_a_policy_mismatches_in_one_direction_only(policy, offered, requested):
+    weak = QoSProfile(depth=1, **{policy: offered})
+    strong = QoSProfile(depth=1, **{policy: requested})
+    assert [item.policy for item in mismatches(weak, strong)] == [policy]
+    assert not mismatches(strong, weak)
+    assert not mismatches(weak, weak)

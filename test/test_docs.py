@@ -1,0 +1,149 @@
+"""The README and the documentation: links, commands, paths and generated tables."""
+
+import importlib.util
+import re
+import shlex
+import subprocess
+import sys
+
+from boxreg_ros.cli import parser
+from boxreg_ros.reasons import REASONS
+from paths import ROOT
+import pytest
+import yaml
+
+DOCS = ROOT / 'docs'
+README = ROOT / 'README.md'
+PAGES = [README, ROOT / 'CONTRIBUTING.md', *sorted(DOCS.rglob('*.md'))]
+
+
+def page_name(path):
+    return str(path.relative_to(ROOT))
+
+
+def generator():
+    spec = importlib.util.spec_from_file_location('generate', DOCS / 'generate.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+GENERATOR = generator()
+
+
+@pytest.mark.parametrize('page', GENERATOR.TABLES)
+def test_generated_tables_match_the_code(page):
+    text = (DOCS / page).read_text(encoding='utf-8')
+    assert text == GENERATOR.renewed(page), f'stale: run {GENERATOR.COMMAND}'
+
+
+def test_generator_refuses_a_page_without_marks(tmp_path, monkeypatch):
+    monkeypatch.setattr(GENERATOR, 'DOCS', tmp_path)
+    (tmp_path / 'parameters.md').write_text('# Parameters\n')
+    with pytest.raises(ValueError, match=r'parameters\.md'):
+        GENERATOR.renewed('parameters.md')
+
+
+def test_every_counted_reason_is_explained():
+    # A reason is a quoted word where it is counted, refused, reported or given for a kept box.
+    found = set()
+    for path in (ROOT / 'boxreg_ros').rglob('*.py'):
+        text = path.read_text(encoding='utf-8')
+        for pattern in (
+            r"counts\[f?'(\w+)'\]",
+            r"self\.reasons\[i\] = '(\w+)'",
+            r"_trouble\(\s*'(\w+)'",
+            r"tick\.reasons\[i\] = .*'(\w+)'$",
+            r"sink\.expect\(item, '(\w+)'",
+        ):
+            found |= set(re.findall(pattern, text))
+    totals = {'sweeps', 'boxes', 'box_arrays', 'frames'}
+    assert len(found) > 10
+    assert sorted(found - totals - set(REASONS)) == []
+
+
+def test_every_explained_reason_is_counted():
+    files = {*(ROOT / 'boxreg_ros').rglob('*.py')} - {ROOT / 'boxreg_ros' / 'reasons.py'}
+    source = ''.join(path.read_text(encoding='utf-8') for path in files)
+    for name in REASONS:
+        ending = f"}}_{name.partition('_')[2]}'"  # of a name that begins with the topic
+        assert f"'{name}'" in source or ending in source, name
+
+
+def test_remedies_name_existing_sections():
+    text = (DOCS / 'troubleshooting.md').read_text(encoding='utf-8')
+    for reason in REASONS.values():
+        for title in re.findall(r'see "([^"]+)"', reason.remedy):
+            assert f'\n## {title}\n' in text
+
+
+def commands_in(path):
+    """Yield the lines of a page's code blocks that start boxreg, with the options of each."""
+    for line in path.read_text(encoding='utf-8').splitlines():
+        if re.match(r'(    )?boxreg [a-z]', line):
+            yield line.strip()
+
+
+@pytest.mark.parametrize('path', PAGES, ids=page_name)
+def test_commands_are_valid(path):
+    for command in commands_in(path):
+        words = shlex.split(command, comments=True)[1:]
+        parser(words[0]).parse_args(words)
+
+
+def test_readme_has_commands():
+    assert len(list(commands_in(README))) >= 5
+
+
+@pytest.mark.parametrize('path', PAGES, ids=page_name)
+def test_links_lead_to_files(path):
+    links = re.findall(r'\]\(([^)\s]+)\)', path.read_text(encoding='utf-8'))
+    files = [link.partition('#')[0] for link in links if not link.startswith(('http', '#'))]
+    assert [link for link in files if not (path.parent / link).exists()] == []
+
+
+def anchors_of(path):
+    """Return the anchors of a page's headings, as GitHub and mkdocs make them."""
+    titles = re.findall(r'^#+ (.+)$', path.read_text(encoding='utf-8'), re.MULTILINE)
+    return {re.sub(r'[^\w\- ]', '', title).strip().lower().replace(' ', '-') for title in titles}
+
+
+@pytest.mark.parametrize('path', PAGES, ids=page_name)
+def test_anchors_exist(path):
+    for link in re.findall(r'\]\(([^)\s]*\.md)?#([^)\s]+)\)', path.read_text(encoding='utf-8')):
+        target = path.parent / link[0] if link[0] else path
+        assert link[1] in anchors_of(target), link
+
+
+# Pages in tasks/ also name files that their readers write.
+@pytest.mark.parametrize('path', [p for p in PAGES if p.parent.name != 'tasks'], ids=page_name)
+def test_named_files_exist(path):
+    text = path.read_text(encoding='utf-8')
+    named = set(re.findall(r'`((?:boxreg_ros|msg_adapters|test|bags|docs)/[\w./-]+)`', text))
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_readme_is_short():
+    text = README.read_text(encoding='utf-8')
+    assert len(text.splitlines()) <= 200
+    assert len(text.encode()) <= 12_000
+
+
+def test_every_page_is_in_the_navigation():
+    class Loader(yaml.SafeLoader):
+        """YAML with mkdocs' own tags, which are of no interest here."""
+
+    Loader.add_multi_constructor('tag:yaml.org,2002:python/name:', lambda *_: None)
+    configuration = yaml.load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'), Loader)
+    listed = set(re.findall(r"'([\w/-]+\.md)'", str(configuration['nav'])))
+    pages = {str(path.relative_to(DOCS)) for path in DOCS.rglob('*.md')}
+    assert listed == pages, 'add the page to "nav" in mkdocs.yml'
+
+
+def test_documentation_builds_without_a_warning(tmp_path):
+    if importlib.util.find_spec('mkdocs') is None or importlib.util.find_spec('material') is None:
+        pytest.skip('mkdocs-material is not installed')
+    command = [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / 'tasks' / 'relabel-a-bag' / 'index.html').is_file()

@@ -1,0 +1,81 @@
+"""The examples of the documentation run, and the pages show them as they are."""
+
+import re
+import subprocess
+import sys
+
+from paths import ROOT
+import pytest
+
+EXAMPLES = sorted((ROOT / 'docs' / 'examples').glob('*.py'))
+PAGE = ROOT / 'docs' / 'tasks' / 'use-from-python.md'
+ERROR = re.compile(r'^mean position error, (\w+): ([\d.]+) m', re.MULTILINE)
+
+
+def example(name):
+    return ROOT / 'docs' / 'examples' / f'{name}.py'
+
+
+def output_of(example):
+    done = subprocess.run(
+        [sys.executable, example], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def block_after(text, start):
+    """Return the content of the first fenced block of `text` that starts with `start`."""
+    first = text.index(start) + len(start)
+    return text[first : text.index('```\n', first)]
+
+
+@pytest.mark.parametrize('name', ['refine_tracks', 'stream'])
+def test_example_reduces_the_position_error(name):
+    errors = {name: float(value) for name, value in ERROR.findall(output_of(example(name)))}
+    refined = {name: value for name, value in errors.items() if name != 'input'}
+    assert refined
+    assert max(refined.values()) < 0.5 * errors['input']
+
+
+@pytest.mark.parametrize('name', ['refine_tracks', 'stream'])
+def test_page_shows_the_example_and_its_output(name):
+    page = PAGE.read_text(encoding='utf-8')
+    source = example(name).read_text(encoding='utf-8')
+    assert f'```python\n{source}```\n' in page
+    shown = block_after(page[page.index(source) :], '```text\n')
+    # Digits may differ between processors; names and counts may not.
+    assert re.sub(r'0\.\d+', '', shown) == re.sub(r'0\.\d+', '', output_of(example(name)))
+
+
+def test_examples_pass_the_type_checker():
+    pytest.importorskip('mypy')
+    done = subprocess.run(
+        [sys.executable, '-m', 'mypy', *EXAMPLES],
+        cwd=ROOT, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_public_names_are_imported_at_their_first_use():
+    code = """
+import sys
+import boxreg_ros
+assert not {'torch', 'numpy', 'scipy'} & set(sys.modules), 'imported too early'
+for name in boxreg_ros.__all__:
+    assert getattr(boxreg_ros, name).__name__ == name
+    assert name in dir(boxreg_ros)
+try:
+    boxreg_ros.no_such_name
+except AttributeError as error:
+    assert 'no_such_name' in str(error)
+else:
+    raise AssertionError('an unknown name was found')
+"""
+    subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=True, timeout=120)
+
+
+def test_packages_are_marked_as_typed():
+    for package in ('boxreg_ros', 'msg_adapters'):
+        assert (ROOT / package / 'py.typed').is_file()
+    assert "'py.typed'" in (ROOT / 'setup.py').read_text(encoding='utf-8')
