@@ -56,7 +56,7 @@ def linear_terms(problem, seed=1):
 
 def without_oldest(terms, state):
     """Return the terms of the window after its oldest observation has been marginalised."""
-    where, step, information = marginalise(terms, state)
+    where, step, information = marginalise(objective_of(terms, state), state)
     kept = [
         term
         if term.function is shared_prior

@@ -1,7 +1,7 @@
 """
 The outermost points on each face of each box, as their second moments, in plain loops.
 
-The torch twin is `boxreg_ros.core.face_support.support`.
+The torch twin is `boxreg_ros.core.face_support.observe_faces`.
 
 """
 
@@ -11,15 +11,15 @@ from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.rotation import fill_rotation
 import numpy as np
 
-FACES = 5  # front, back, left, right, top: the road stands for the bottom
-STRIPS = 3
-SECOND_AXIS = (1, 1, 0, 0, 1)
+FACES = 5
+"""Front, back, left, right, top: the bottom is observed by the road."""
 NOWHERE = 1e9
+"""Depth of points that are not on a face [m]."""
 
 
 @kernel
 def add_candidate(depth, index, best_depth, best_index, count):
-    """Insert a point into the `count` smallest depths, ascending; of equal ones the first stays."""
+    """Insert a point into the `count` smallest depths, ascending; equal ones keep their order."""
     place = count - 1
     while place > 0 and depth < best_depth[place - 1]:
         best_depth[place] = best_depth[place - 1]
@@ -42,7 +42,7 @@ def to_box_axes(points, shift, R, local):
 
 
 @kernel
-def fill_depths(local, half, level, limits, excess, strip, depth):
+def fill_depths(local, half, level, limits, strips, excess, strip, depth):
     """
     Write how far inside of the expected surface of each face each point is, (5, M) [m].
 
@@ -50,19 +50,23 @@ def fill_depths(local, half, level, limits, excess, strip, depth):
     (2, M) too; returns how many points are in and near the box.
 
     """
-    margin, beside, behind, deepest, fewest = limits
+    outside_margin, edge_margin, _, deepest, min_depth, _ = limits
     M = local.shape[1]
     for k in range(3):
         for i in range(M):
             excess[k, i] = abs(local[k, i]) - half[k]
     near = 0
     for i in range(M):
-        near += (excess[0, i] < margin) & (excess[1, i] < margin) & (excess[2, i] < margin)
+        near += (
+            (excess[0, i] < outside_margin)
+            & (excess[1, i] < outside_margin)
+            & (excess[2, i] < outside_margin)
+        )
     for k in range(2):
-        scale = STRIPS / 2 / half[k]
+        scale = strips / 2 / half[k]
         for i in range(M):
-            place = (local[k, i] + half[k]) * scale
-            strip[k, i] = (place >= 1.0) + (place >= 2.0)
+            place = min(max((local[k, i] + half[k]) * scale, 0.0), strips - 1.0)
+            strip[k, i] = int(place)
     for face in range(FACES):
         axis = face // 2
         one = 1 if axis == 0 else 0
@@ -70,14 +74,17 @@ def fill_depths(local, half, level, limits, excess, strip, depth):
         sign = 1.0 - 2.0 * (face % 2)
         surface = half[axis] - level[face]
         for i in range(M):
-            d = max(surface - sign * local[axis, i], -1.0)
-            counts = (excess[one, i] <= beside) & (excess[other, i] <= beside) & (d < deepest)
+            d = max(surface - sign * local[axis, i], min_depth)
+            counts = (excess[one, i] <= edge_margin) & (excess[other, i] <= edge_margin)
+            counts &= d < deepest
             depth[face, i] = d if counts else NOWHERE
     return near
 
 
 @kernel
-def support_of_box(points, depth, strip, wanted, limits, best_depth, best_index, moments, out):
+def outermost_points(
+    points, depth, strip, strip_axis, wanted, limits, best_depth, best_index, moments, out
+):
     """
     Find the outermost points of the five faces of one box.
 
@@ -85,25 +92,24 @@ def support_of_box(points, depth, strip, wanted, limits, best_depth, best_index,
     face.
 
     """
-    margin, beside, behind, deepest, fewest = limits
+    _, _, max_depth, deepest, _, _ = limits
     number = np.zeros(FACES, np.int64)
-    best_depth[:, :wanted] = NOWHERE
     for face in range(FACES):
-        own_strip = strip[SECOND_AXIS[face]]
+        own_strip = strip[strip_axis[face]]
         best_depth[:, :wanted] = NOWHERE
         for i in range(len(points)):
             d = depth[face, i]
             if d < best_depth[own_strip[i], wanted - 1]:
                 add_candidate(d, i, best_depth[own_strip[i]], best_index[own_strip[i]], wanted)
         limit = deepest
-        for s in range(STRIPS):
-            limit = min(limit, best_depth[s, 0] + behind)
+        for s in range(len(best_depth)):
+            limit = min(limit, best_depth[s, 0] + max_depth)
         total = 0.0
         moment = moments[face]
         for a in range(4):
             for b in range(4):
                 moment[a, b] = 0.0
-        for s in range(STRIPS):
+        for s in range(len(best_depth)):
             for rank in range(wanted):
                 if not best_depth[s, rank] <= limit:
                     break
@@ -125,52 +131,72 @@ def support_of_box(points, depth, strip, wanted, limits, best_depth, best_index,
 
 
 @kernel
-def support(
-    first, last, poses, given, extents, gaps, inset, base_weight, ground, points, counts, stride,
-    share, limits, moments, distance, weight, near,
+def observe_faces(
+    poses, given, extents, gaps, inset, base_weight, ground, points, counts, share, strip_axis,
+    strips, limits, moments, distance, weight, near,
 ):  # fmt: skip
     """
-    Write face observations of the windows `first` to `last`: see `face_support.support`.
+    Write the face observations of all windows.
 
-    `moments` (B, N, 6, 4, 4), signed distance (B, N, 6), weight (B, N, 6) and number of points in
-    and near the box (B, N). `counts` (B, N) of the points are real, every `stride`-th is used.
+    Parameters
+    ----------
+    poses, given : array, shape (B, N, 6)
+        Poses of this round and of the input.
+    extents, gaps : array, shapes (B, 3) and (B, 6)
+        Extents and labelling margins [m].
+    inset, base_weight : array, shape (B, N, 6)
+        How much further inside points are expected [m], and the weight of a face with points.
+    ground : array, shape (B, N)
+        Height of the road minus that of the input centre [m]; NaN if unknown.
+    points, counts : array, shapes (B, N, M, 3) and (B, N)
+        Points minus the input centre [m]; the first `counts` are not padding.
+    share : float
+        Part of the points of a box that is taken from each strip of a face.
+    strip_axis, strips : tuple of int and int
+        Axis along which the strips of each face lie, and their number.
+    limits : tuple of float
+        `OUTSIDE_MARGIN`, `EDGE_MARGIN`, `MAX_DEPTH`, largest depth, `MIN_DEPTH`, `MIN_POINTS`.
+    moments, distance, weight, near : array
+        Written: (B, N, 6, 4, 4), (B, N, 6) [m], (B, N, 6), and the points in and near each box
+        (B, N).
 
     """
-    most = 1 + (points.shape[2] - 1) // stride if points.shape[2] else 0
-    size = int(ceil(max(float(limits[4]), share * most))) + 1
-    best_depth = np.empty((STRIPS, size))
-    best_index = np.empty((STRIPS, size), np.int64)
-    local = np.empty((3, most))
-    excess = np.empty((3, most))
-    strip = np.empty((2, most), np.int64)
-    depth = np.empty((FACES, most))
+    B, N, M = points.shape[:3]
+    size = ceil(max(limits[5], share * M)) + 1
+    best_depth = np.empty((strips, size))
+    best_index = np.empty((strips, size), np.int64)
+    local = np.empty((3, M))
+    excess = np.empty((3, M))
+    strip = np.empty((2, M), np.int64)
+    depth = np.empty((FACES, M))
     R = np.empty((3, 3))
     half = np.empty(3)
     shift = np.empty(3)
     level = np.empty(6)
     mean_depth = np.empty(FACES)
-    for b in range(first, last):
+    for b in range(B):
         for k in range(3):
             half[k] = extents[b, k] / 2
-        for n in range(poses.shape[1]):
+        for n in range(N):
             pose = poses[b, n]
             fill_rotation(pose[3], pose[4], pose[5], R)
             for k in range(3):
                 shift[k] = pose[k] - given[b, n, k]
             for face in range(6):
                 level[face] = gaps[b, face] + inset[b, n, face]
-            M = (counts[b, n] + stride - 1) // stride
-            p = points[b, n, : counts[b, n] : stride]
-            to_box_axes(p, shift, R, local[:, :M])
+            m = counts[b, n]
+            to_box_axes(points[b, n, :m], shift, R, local[:, :m])
             near[b, n] = fill_depths(
-                local[:, :M], half, level, limits, excess[:, :M], strip[:, :M], depth[:, :M]
-            )
-            wanted = int(ceil(max(float(limits[4]), share * near[b, n])))
-            number = support_of_box(
-                p, depth, strip, wanted, limits, best_depth, best_index, moments[b, n], mean_depth
-            )
+                local[:, :m], half, level, limits, strips, excess[:, :m], strip[:, :m],
+                depth[:, :m],
+            )  # fmt: skip
+            wanted = ceil(max(limits[5], share * near[b, n]))
+            number = outermost_points(
+                points[b, n, :m], depth, strip, strip_axis, wanted, limits, best_depth,
+                best_index, moments[b, n], mean_depth,
+            )  # fmt: skip
             for face in range(FACES):
-                is_seen = number[face] >= limits[4]
+                is_seen = number[face] >= limits[5]
                 distance[b, n, face] = -mean_depth[face]
                 weight[b, n, face] = base_weight[b, n, face] if is_seen else 0.0
             add_road(shift, ground[b, n], half[2], gaps[b, 5], moments[b, n, 5], distance[b, n])

@@ -91,7 +91,9 @@ def add_faces(n, pose, shared, given, inset, W, scratch, gradient, band, border,
 
 
 @kernel
-def add_step(n, pose, shared, start, axes, wanted, W, part, gradient, band, border, corner, curved):
+def add_step(
+    n, pose, shared, start, axes, wanted, W, part, gradient, band, border, corner, curved
+):
     """
     Add the step of one pose from `start` along `axes` less six shared variables from `part` on.
 
@@ -169,15 +171,13 @@ def add_acceleration(n, poses, times, W, gradient, band, curved):
             for j in range(i, 3):
                 for k in range(6):
                     for m in range(6):
-                        add_block(
-                            band, 6 * (n + i), 6 * (n + j), k, m, c[i] * c[j] * W[k, m]
-                        )
+                        add_block(band, 6 * (n + i), 6 * (n + j), k, m, c[i] * c[j] * W[k, m])
     return value
 
 
 @kernel
-def add_slip(n, poses, times, pivot, w, scratch, gradient, band, border, corner, curved):
-    """Add the velocity of the pivot to the left and upward from pose n to n + 1; w (2,)."""
+def add_slip(n, poses, times, pivot, W, scratch, gradient, band, border, corner, curved):
+    """Add the velocity of the pivot to the left and upward from pose n to n + 1; W (2, 2)."""
     R0, dR0, R1, dR1, Rm, dRm, J = scratch
     before = poses[n]
     after = poses[n + 1]
@@ -189,19 +189,18 @@ def add_slip(n, poses, times, pivot, w, scratch, gradient, band, border, corner,
     dt = times[n + 1] - times[n]
     row = 6 * n
     first = len(border)
-    value = 0.0
+    r = np.zeros(2)
+    by_pivot = np.zeros(2)
     for side in range(2):
         axis = 1 + side
-        r = 0.0
-        by_pivot = 0.0
         for j in range(3):
             across = Rm[j, axis] / dt
             turned = R1[j, 0] - R0[j, 0]
             step = after[j] - before[j] - pivot * turned
-            r += across * step
-            by_pivot -= across * turned
-            J[j] = -across
-            J[6 + j] = across
+            r[side] += across * step
+            by_pivot[side] -= across * turned
+            J[side, j] = -across
+            J[side, 6 + j] = across
         for k in range(3):
             tilt = 0.0
             swing0 = 0.0
@@ -212,48 +211,62 @@ def add_slip(n, poses, times, pivot, w, scratch, gradient, band, border, corner,
                 tilt += step * dRm[k, j, axis] / dt / 2
                 swing0 += Rm[j, axis] / dt * dR0[k, j, 0]
                 swing1 += Rm[j, axis] / dt * dR1[k, j, 0]
-            J[3 + k] = tilt + pivot * swing0
-            J[9 + k] = tilt - pivot * swing1
-        pull = w[side] * r
-        value += 0.5 * r * pull
+            J[side, 3 + k] = tilt + pivot * swing0
+            J[side, 9 + k] = tilt - pivot * swing1
+    value = 0.0
+    for side in range(2):
+        pull = W[side, 0] * r[0] + W[side, 1] * r[1]
+        value += 0.5 * r[side] * pull
         for k in range(12):
-            gradient[row + k] += J[k] * pull
-        gradient[first + PIVOT] += by_pivot * pull
-        if curved:
+            gradient[row + k] += J[side, k] * pull
+        gradient[first + PIVOT] += by_pivot[side] * pull
+    if not curved:
+        return value
+    for side in range(2):
+        for other in range(2):
+            weight = W[side, other]
             for k in range(12):
                 for m in range(k, 12):
-                    band[row + k, m - k] += w[side] * J[k] * J[m]
-                border[row + k, PIVOT] += w[side] * J[k] * by_pivot
-            corner[PIVOT, PIVOT] += w[side] * by_pivot * by_pivot
+                    band[row + k, m - k] += weight * J[side, k] * J[other, m]
+                border[row + k, PIVOT] += weight * J[side, k] * by_pivot[other]
+            corner[PIVOT, PIVOT] += weight * by_pivot[side] * by_pivot[other]
     return value
 
 
 @kernel
-def add_rest(n, poses, w, gradient, band, curved):
-    """Add the step from pose n to n + 1; w (6,) are its weights."""
+def add_zero_motion(n, poses, W, gradient, band, curved):
+    """Add the step from pose n to n + 1; W (6, 6) is its weight."""
     value = 0.0
+    row = 6 * n
     for k in range(6):
-        r = poses[n + 1, k] - poses[n, k]
-        value += 0.5 * w[k] * r * r
-        gradient[6 * n + k] -= w[k] * r
-        gradient[6 * n + 6 + k] += w[k] * r
-        if curved:
-            band[6 * n + k, 0] += w[k]
-            band[6 * n + k, 6] -= w[k]
-            band[6 * n + 6 + k, 0] += w[k]
+        pull = 0.0
+        for m in range(6):
+            pull += W[k, m] * (poses[n + 1, m] - poses[n, m])
+        value += 0.5 * (poses[n + 1, k] - poses[n, k]) * pull
+        gradient[row + k] -= pull
+        gradient[row + 6 + k] += pull
+    if curved:
+        for k in range(6):
+            for m in range(6):
+                add_block(band, row, row, k, m, W[k, m])
+                add_block(band, row + 6, row + 6, k, m, W[k, m])
+                add_block(band, row, row + 6, k, m, -W[k, m])
     return value
 
 
 @kernel
-def add_shared_prior(shared, expected, w, gradient, first, corner, curved):
-    """Add the deviation of the shared variables from those expected; w (22,)."""
+def add_shared_prior(shared, expected, W, gradient, first, corner, curved):
+    """Add the deviation of the shared variables from those expected; W (22, 22)."""
     value = 0.0
     for s in range(SHARED):
-        r = shared[s] - expected[s]
-        value += 0.5 * w[s] * r * r
-        gradient[first + s] += w[s] * r
+        pull = 0.0
+        for t in range(SHARED):
+            pull += W[s, t] * (shared[t] - expected[t])
+        value += 0.5 * (shared[s] - expected[s]) * pull
+        gradient[first + s] += pull
         if curved:
-            corner[s, s] += w[s]
+            for t in range(s, SHARED):
+                corner[s, t] += W[s, t]
     return value
 
 
@@ -292,7 +305,7 @@ def rotation_scratch():
     faces = np.empty((3, 3)), np.empty((3, 3, 3)), np.empty((4, 6)), np.empty((4, 6))
     slip = (
         np.empty((3, 3)), np.empty((3, 3, 3)), np.empty((3, 3)), np.empty((3, 3, 3)),
-        np.empty((3, 3)), np.empty((3, 3, 3)), np.empty(12),
+        np.empty((3, 3)), np.empty((3, 3, 3)), np.empty((2, 12)),
     )  # fmt: skip
     return faces, slip
 
@@ -306,40 +319,37 @@ def add_window(poses, shared, last, data, gradient, band, border, corner, curved
     among them: it belongs to no observation.
 
     """
-    (given, axes, inset, W_faces, w_prior, shape_start, shape_axes, shape_wanted, W_shape, times,
-     W_acceleration, w_slip, w_rest, mean, information) = data  # fmt: skip
+    (given, inset, W_faces, input_pose, axes, W_input, shape_start, shape_axes, wanted, W_shape,
+     times, W_acceleration, W_slip, W_zero_motion, mean, information) = data  # fmt: skip
     faces_scratch, slip_scratch = rotation_scratch()
     nothing = np.zeros(6)
-    W = np.zeros((6, 6))
     value = 0.0
     for n in range(min(last, len(W_faces))):
         value += add_faces(
             n, poses[n], shared, given[n], inset[n], W_faces[n], faces_scratch, gradient, band,
             border, corner, curved,
         )  # fmt: skip
-    for n in range(min(last, len(w_prior))):
-        for k in range(6):
-            W[k, k] = w_prior[n, k]
+    for n in range(min(last, len(W_input))):
         value += add_step(
-            n, poses[n], shared, given[n], axes[n], nothing, W, BIAS, gradient, band, border,
+            n, poses[n], shared, input_pose[n], axes[n], nothing, W_input[n], BIAS, gradient, band, border,
             corner, curved,
         )  # fmt: skip
     for n in range(min(last, len(W_shape))):
         value += add_step(
-            n, poses[n], shared, shape_start[n], shape_axes[n], shape_wanted[n], W_shape[n],
+            n, poses[n], shared, shape_start[n], shape_axes[n], wanted[n], W_shape[n],
             ANCHOR, gradient, band, border, corner, curved,
         )  # fmt: skip
     for n in range(min(last, len(W_acceleration))):
         value += add_acceleration(n, poses, times, W_acceleration[n], gradient, band, curved)
-    for n in range(min(last, len(w_slip))):
-        if w_slip[n, 0] != 0.0 or w_slip[n, 1] != 0.0:
+    for n in range(min(last, len(W_slip))):
+        if W_slip[n, 0, 0] != 0.0:
             value += add_slip(
-                n, poses, times, shared[PIVOT], w_slip[n], slip_scratch, gradient, band, border,
+                n, poses, times, shared[PIVOT], W_slip[n], slip_scratch, gradient, band, border,
                 corner, curved,
             )  # fmt: skip
-    for n in range(min(last, len(w_rest))):
-        if w_rest[n, 0] != 0.0:
-            value += add_rest(n, poses, w_rest[n], gradient, band, curved)
+    for n in range(min(last, len(W_zero_motion))):
+        if W_zero_motion[n, 0, 0] != 0.0:
+            value += add_zero_motion(n, poses, W_zero_motion[n], gradient, band, curved)
     if len(information):
         value += add_marginal_prior(
             poses, shared, mean, information, gradient, band, border, corner, curved
@@ -348,7 +358,7 @@ def add_window(poses, shared, last, data, gradient, band, border, corner, curved
 
 
 @kernel
-def evaluate(x, rows, terms, shared_expected, w_shared, free, value, gradient):
+def evaluate(x, rows, terms, shared_expected, W_shared, free, value, gradient):
     """Write values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows` of `terms`."""
     for i in range(len(rows)):
         b = rows[i]
@@ -360,14 +370,14 @@ def evaluate(x, rows, terms, shared_expected, w_shared, free, value, gradient):
         value[i] = add_window(
             poses, shared, N, window_rows(terms, b), gradient[i], *unused, False
         ) + add_shared_prior(
-            shared, shared_expected[b], w_shared[b], gradient[i], 6 * N, unused[2], False
+            shared, shared_expected[b], W_shared[b], gradient[i], 6 * N, unused[2], False
         )
         for k in range(x.shape[1]):
             gradient[i, k] *= free[b, k]
 
 
 @kernel
-def linearise(x, terms, shared_expected, w_shared, free, value, gradient, band, border, corner):
+def linearise(x, terms, shared_expected, W_shared, free, value, gradient, band, border, corner):
     """
     Write values, gradients and the Cholesky factors of the Gauss-Newton matrices of all windows.
 
@@ -386,7 +396,7 @@ def linearise(x, terms, shared_expected, w_shared, free, value, gradient, band, 
             poses, shared, N, window_rows(terms, b), gradient[b], band[b], border[b], corner[b],
             True,
         ) + add_shared_prior(
-            shared, shared_expected[b], w_shared[b], gradient[b], 6 * N, corner[b], True
+            shared, shared_expected[b], W_shared[b], gradient[b], 6 * N, corner[b], True
         )  # fmt: skip
         for k in range(x.shape[1]):
             gradient[b, k] *= free[b, k]
@@ -400,12 +410,12 @@ def linearise(x, terms, shared_expected, w_shared, free, value, gradient, band, 
 @kernel
 def window_rows(terms, b):
     """Return the arrays of one window."""
-    (given, axes, inset, W_faces, w_prior, shape_start, shape_axes, shape_wanted, W_shape, times,
-     W_acceleration, w_slip, w_rest, mean, information) = terms  # fmt: skip
+    (given, inset, W_faces, input_pose, axes, W_input, shape_start, shape_axes, wanted, W_shape,
+     times, W_acceleration, W_slip, W_zero_motion, mean, information) = terms  # fmt: skip
     return (
-        given[b], axes[b], inset[b], W_faces[b], w_prior[b], shape_start[b], shape_axes[b],
-        shape_wanted[b], W_shape[b], times[b], W_acceleration[b], w_slip[b], w_rest[b], mean[b],
-        information[b],
+        given[b], inset[b], W_faces[b], input_pose[b], axes[b], W_input[b], shape_start[b],
+        shape_axes[b], wanted[b], W_shape[b], times[b], W_acceleration[b], W_slip[b], W_zero_motion[b],
+        mean[b], information[b],
     )  # fmt: skip
 
 

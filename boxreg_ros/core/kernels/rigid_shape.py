@@ -10,30 +10,25 @@ from boxreg_ros.core.kernels.face_support import to_box_axes
 from boxreg_ros.core.kernels.rotation import fill_rotation
 import numpy as np
 
-CELLS = (8, 3, 3)
-CELL_COUNT = 72
-RIDGE = 1e-3
-"""Information assumed of every step: observations that constrain nothing want no step."""
-
 
 @kernel
-def cell_of(x, y, z, half):
+def cell_of(x, y, z, half, cells):
     """Return the number of the cell that a point in box axes lies in."""
     cell = 0
     for k in range(3):
         value = (x, y, z)[k]
-        place = int(np.floor((value / half[k] + 1) * (CELLS[k] / 2)))
-        cell = cell * CELLS[k] + min(max(place, 0), CELLS[k] - 1)
+        place = int(np.floor((value / half[k] + 1) * (cells[k] / 2)))
+        cell = cell * cells[k] + min(max(place, 0), cells[k] - 1)
     return cell
 
 
 @kernel
-def fill_planes(sums, roughness, flatness, fewest, planes, thickness):
+def fill_planes(sums, roughness, flatness, min_points, planes, thickness):
     """Fit a plane (4,) to the moments (4, 4) of each cell; thickness 0 where there is none."""
     for cell in range(len(sums)):
         thickness[cell] = 0.0
         number = sums[cell, 3, 3]
-        if number < fewest:
+        if number < min_points:
             continue
         mean = sums[cell, :3, 3] / number
         covariance = sums[cell, :3, :3] / number - np.outer(mean, mean)
@@ -49,51 +44,68 @@ def fill_planes(sums, roughness, flatness, fewest, planes, thickness):
 
 @kernel
 def agreement(
-    first, last, poses, given, extents, points, counts, stride, roughness, limits, information,
-    wanted,
-):  # fmt: skip
-    """Write information (B, N, 6, 6) and wanted steps (B, N, 6) of the windows `first` to `last`."""
-    margin, flatness, fewest, independent = limits
-    N = poses.shape[1]
-    most = 1 + (points.shape[2] - 1) // stride
-    local = np.empty((N, 3, most))
+    poses, given, extents, points, counts, roughness, cells, limits, information, wanted
+):
+    """
+    Write information (B, N, 6, 6) and wanted steps (B, N, 6) of all windows.
+
+    Parameters
+    ----------
+    poses, given : array, shape (B, N, 6)
+        Poses of this round and of the input.
+    extents : array, shape (B, 3)
+        Extents [m].
+    points, counts : array, shapes (B, N, M, 3) and (B, N)
+        Points minus the input centre [m]; the first `counts` are not padding.
+    roughness : array, shape (B,)
+        How far the surface of each window's object is from rigid [m].
+    cells : tuple of int
+        Cells along each axis of a box.
+    limits : tuple of float
+        `SHAPE_MARGIN`, `MIN_FLATNESS`, `MIN_CELL_POINTS`, `EFFECTIVE_POINTS`, `STEP_RIDGE`.
+
+    """
+    margin, flatness, min_points, independent, ridge = limits
+    B, N, M = points.shape[:3]
+    cell_count = cells[0] * cells[1] * cells[2]
+    local = np.empty((N, 3, M))
     R = np.empty((3, 3))
     half = np.empty(3)
     shift = np.empty(3)
-    planes = np.empty((CELL_COUNT, 4))
-    thickness = np.empty(CELL_COUNT)
+    planes = np.empty((cell_count, 4))
+    thickness = np.empty(cell_count)
     lever = np.empty(6)
-    for b in range(first, last):
+    for b in range(B):
         for k in range(3):
             half[k] = extents[b, k] / 2
-        sums = np.zeros((CELL_COUNT, 4, 4))
+        sums = np.zeros((cell_count, 4, 4))
         for n in range(N):
-            M = (counts[b, n] + stride - 1) // stride
+            m = counts[b, n]
             fill_rotation(poses[b, n, 3], poses[b, n, 4], poses[b, n, 5], R)
             for k in range(3):
                 shift[k] = poses[b, n, k] - given[b, n, k]
-            to_box_axes(points[b, n, : counts[b, n] : stride], shift, R, local[n, :, :M])
-            for i in range(M):
+            to_box_axes(points[b, n, :m], shift, R, local[n, :, :m])
+            for i in range(m):
                 x, y, z = local[n, 0, i], local[n, 1, i], local[n, 2, i]
                 if not is_near(x, y, z, half, margin):
                     continue
-                moment = sums[cell_of(x, y, z, half)]
+                moment = sums[cell_of(x, y, z, half, cells)]
                 p = (x, y, z, 1.0)
                 for a in range(4):
                     for c in range(4):
                         moment[a, c] += p[a] * p[c]
-        fill_planes(sums, roughness[b], flatness, fewest, planes, thickness)
+        fill_planes(sums, roughness[b], flatness, min_points, planes, thickness)
         for n in range(N):
-            M = (counts[b, n] + stride - 1) // stride
+            m = counts[b, n]
             total = information[b, n]
             total[:] = 0.0
             pull = np.zeros(6)
             used = 0
-            for i in range(M):
+            for i in range(m):
                 x, y, z = local[n, 0, i], local[n, 1, i], local[n, 2, i]
                 if not is_near(x, y, z, half, margin):
                     continue
-                cell = cell_of(x, y, z, half)
+                cell = cell_of(x, y, z, half, cells)
                 if thickness[cell] == 0.0:
                     continue
                 used += 1
@@ -114,7 +126,7 @@ def agreement(
                 pull[j] *= scale
                 for k in range(6):
                     total[j, k] *= scale
-            step = np.linalg.solve(total + RIDGE * np.eye(6), pull)
+            step = np.linalg.solve(total + ridge * np.eye(6), pull)
             for j in range(6):
                 wanted[b, n, j] = step[j]
 
