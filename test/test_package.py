@@ -1,5 +1,6 @@
 """The package: versions, distributions that pip installs, and what colcon builds."""
 
+import ast
 import importlib.metadata
 import os
 from pathlib import Path
@@ -44,10 +45,11 @@ def imported_distributions():
     """Return the import names of third-party modules in the package, those of extras excluded."""
     names = set()
     for path in [*ROOT.glob('boxreg_ros/**/*.py'), *ROOT.glob('msg_adapters/*.py')]:
-        for line in path.read_text(encoding='utf-8').splitlines():
-            found = re.match(r'(?:from|import) (\w+)', line)  # at the top level of a module
-            if found:
-                names.add(found[1])
+        for node in ast.parse(path.read_text(encoding='utf-8')).body:  # the top level alone
+            if isinstance(node, ast.ImportFrom):
+                names.add(node.module.partition('.')[0])
+            elif isinstance(node, ast.Import):
+                names |= {alias.name.partition('.')[0] for alias in node.names}
     return names - sys.stdlib_module_names - {'boxreg_ros', 'msg_adapters'}
 
 

@@ -120,7 +120,7 @@ class Loss:
 
     @property
     def size(self) -> float:
-        """The larger of the two losses; infinite where a run failed."""
+        """Return the larger of the two losses; infinite where a run failed."""
         return float('inf') if self.failure else max(self.bev, self.volume)
 
 
@@ -143,9 +143,18 @@ def variations_of_settings(config: Config, kinds: Sequence[str] = KINDS) -> list
             continue
         for factor in FACTORS:
             value = _within_bounds(item, _scaled(default, factor))
-            if value != default:
+            if value != default and _is_allowed(config, item.name, value):
                 found.append(Variation(item.name, factor, default, value))
     return found
+
+
+def _is_allowed(config: Config, name: str, value: float) -> bool:
+    """Return whether a setting may have a value together with the others."""
+    try:
+        config.updated({name: value})
+    except ConfigError:
+        return False
+    return True
 
 
 def _within_bounds(item: Setting, value: float) -> float:

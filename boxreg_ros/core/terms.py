@@ -292,12 +292,12 @@ def _array(tensor: Tensor) -> Any:
 
 def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:
     """
-    Return the planes of the six faces (M2) as 4-vectors v: v . (q, 1) is a signed distance [m].
+    Return the planes of the six faces as 4-vectors (M2) [m].
 
-    The distance of a point q, relative to the centre of the `given` pose (B, N, 6), from where
-    the outermost surface points of the face are expected: the face less labelling margin and
-    `inset` (B, N, 6). Positive outside. The weight of this term is the second moment of the
-    points, so that its cost does not grow with their number.
+    For each, v . (q, 1) is the signed distance of a point q, relative to the centre of the `given`
+    pose (B, N, 6), from where the outermost surface points of the face are expected: the face
+    less labelling margin and `inset` (B, N, 6). Positive outside. The weight of this term is the
+    second moment of the points, so that its cost does not grow with their number.
 
     """
     R, dR = rotation_derivatives(state.pose[..., 3:])

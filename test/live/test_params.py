@@ -169,7 +169,7 @@ def test_relabel_ignores_parameters_of_the_node_only(tmp_path):
     path = tmp_path / 'params.yaml'
     own = [item.name for item in NODE_SETTINGS]
     assert NODE_OPTIONS[: len(own)] == tuple(own)
-    values = {name: 'x' for name in NODE_OPTIONS} | {'window': 12}
+    values = dict.fromkeys(NODE_OPTIONS, 'x') | {'window': 12}
     values['qos_overrides./points.subscription.depth'] = 3
     path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
     assert Config.from_yaml(path) == Config().updated({'window': 12})
