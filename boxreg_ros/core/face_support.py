@@ -30,8 +30,6 @@ INSIDE_EXTRA = 0.35
 """Points may be further inside a face than `OUTSIDE_MARGIN` by this much [m]."""
 MAX_DEPTH = 0.2
 """Points further behind the outermost one of a face are on another surface, e.g. a wheel [m]."""
-MIN_DEPTH = -1.0
-"""Points further outside than this count as that far outside [m]."""
 MIN_POINTS = 3
 """Fewest points that make a face observation, and that are taken from a strip. Three span a
 plane."""
@@ -246,7 +244,7 @@ def outermost_points_compiled(problem: Problem, state: State, search: Search) ->
         search.weight, problem.ground, search.points,
     )  # fmt: skip
     deepest = OUTSIDE_MARGIN + INSIDE_EXTRA
-    limits = (OUTSIDE_MARGIN, EDGE_MARGIN, MAX_DEPTH, deepest, MIN_DEPTH, float(MIN_POINTS))
+    limits = OUTSIDE_MARGIN, EDGE_MARGIN, MAX_DEPTH, deepest, float(MIN_POINTS)
     kernels.face_support.observe_faces(
         *(np.ascontiguousarray(tensor.numpy()) for tensor in inputs), counts, search.share,
         STRIP_AXIS, search.strips, limits, moments, distance, weight, near,
@@ -334,8 +332,9 @@ def _depth_in_faces(local: Tensor, half: Tensor, offset: Tensor) -> tuple[Tensor
     beside = torch.stack([beside_ends] * 2 + [beside_sides] * 2 + [beside_top], -2)
     x, y, z = local.unbind(-2)
     depth = torch.stack([-x, x, -y, y, -z], -2) - offset[..., :BOTTOM, :]
-    is_on_face = (beside <= EDGE_MARGIN) & (depth < OUTSIDE_MARGIN + INSIDE_EXTRA)
-    return torch.where(is_on_face, depth.clamp(min=MIN_DEPTH), FAR), num_points
+    is_on_face = (beside <= EDGE_MARGIN) & (depth >= -OUTSIDE_MARGIN)
+    is_on_face &= depth < OUTSIDE_MARGIN + INSIDE_EXTRA
+    return torch.where(is_on_face, depth, FAR), num_points
 
 
 def _second_moments(points: Tensor, index: Tensor, part: Tensor) -> Tensor:

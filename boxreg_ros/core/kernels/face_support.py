@@ -50,7 +50,7 @@ def fill_depths(local, half, level, limits, strips, excess, strip, depth):
     (2, M) too; returns how many points are in and near the box.
 
     """
-    outside_margin, edge_margin, _, deepest, min_depth, _ = limits
+    outside_margin, edge_margin, _, deepest, _ = limits
     M = local.shape[1]
     for k in range(3):
         for i in range(M):
@@ -74,9 +74,9 @@ def fill_depths(local, half, level, limits, strips, excess, strip, depth):
         sign = 1.0 - 2.0 * (face % 2)
         surface = half[axis] - level[face]
         for i in range(M):
-            d = max(surface - sign * local[axis, i], min_depth)
+            d = surface - sign * local[axis, i]
             counts = (excess[one, i] <= edge_margin) & (excess[other, i] <= edge_margin)
-            counts &= d < deepest
+            counts &= (d >= -outside_margin) & (d < deepest)
             depth[face, i] = d if counts else NOWHERE
     return near
 
@@ -92,7 +92,7 @@ def outermost_points(
     face.
 
     """
-    _, _, max_depth, deepest, _, _ = limits
+    _, _, max_depth, deepest, _ = limits
     number = np.zeros(FACES, np.int64)
     for face in range(FACES):
         own_strip = strip[strip_axis[face]]
@@ -155,14 +155,14 @@ def observe_faces(
     strip_axis, strips : tuple of int and int
         Axis along which the strips of each face lie, and their number.
     limits : tuple of float
-        `OUTSIDE_MARGIN`, `EDGE_MARGIN`, `MAX_DEPTH`, largest depth, `MIN_DEPTH`, `MIN_POINTS`.
+        `OUTSIDE_MARGIN`, `EDGE_MARGIN`, `MAX_DEPTH`, largest depth, `MIN_POINTS`.
     moments, distance, weight, near : array
         Written: (B, N, 6, 4, 4), (B, N, 6) [m], (B, N, 6), and the points in and near each box
         (B, N).
 
     """
     B, N, M = points.shape[:3]
-    size = ceil(max(limits[5], share * M)) + 1
+    size = ceil(max(limits[4], share * M)) + 1
     best_depth = np.empty((strips, size))
     best_index = np.empty((strips, size), np.int64)
     local = np.empty((3, M))
@@ -190,13 +190,13 @@ def observe_faces(
                 local[:, :m], half, level, limits, strips, excess[:, :m], strip[:, :m],
                 depth[:, :m],
             )  # fmt: skip
-            wanted = ceil(max(limits[5], share * near[b, n]))
+            wanted = ceil(max(limits[4], share * near[b, n]))
             number = outermost_points(
                 points[b, n, :m], depth, strip, strip_axis, wanted, limits, best_depth,
                 best_index, moments[b, n], mean_depth,
             )  # fmt: skip
             for face in range(FACES):
-                is_seen = number[face] >= limits[5]
+                is_seen = number[face] >= limits[4]
                 distance[b, n, face] = -mean_depth[face]
                 weight[b, n, face] = base_weight[b, n, face] if is_seen else 0.0
             add_road(shift, ground[b, n], half[2], gaps[b, 5], moments[b, n, 5], distance[b, n])

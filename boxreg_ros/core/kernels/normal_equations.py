@@ -331,8 +331,8 @@ def add_window(poses, shared, last, data, gradient, band, border, corner, curved
         )  # fmt: skip
     for n in range(min(last, len(W_input))):
         value += add_step(
-            n, poses[n], shared, input_pose[n], axes[n], nothing, W_input[n], BIAS, gradient, band, border,
-            corner, curved,
+            n, poses[n], shared, input_pose[n], axes[n], nothing, W_input[n], BIAS, gradient,
+            band, border, corner, curved,
         )  # fmt: skip
     for n in range(min(last, len(W_shape))):
         value += add_step(
@@ -414,8 +414,8 @@ def window_rows(terms, b):
      times, W_acceleration, W_slip, W_zero_motion, mean, information) = terms  # fmt: skip
     return (
         given[b], inset[b], W_faces[b], input_pose[b], axes[b], W_input[b], shape_start[b],
-        shape_axes[b], wanted[b], W_shape[b], times[b], W_acceleration[b], W_slip[b], W_zero_motion[b],
-        mean[b], information[b],
+        shape_axes[b], wanted[b], W_shape[b], times[b], W_acceleration[b], W_slip[b],
+        W_zero_motion[b], mean[b], information[b],
     )  # fmt: skip
 
 
