@@ -1,7 +1,7 @@
 """
 The outermost points on each face of each box, as their second moments, in plain loops.
 
-The torch twin is `boxreg_ros.core.face_support.observe_faces`.
+The torch twin is `boxreg_ros.core.face_support.outermost_points`.
 
 """
 

@@ -315,7 +315,7 @@ def add_window(poses, shared, last, data, gradient, band, border, corner, curved
     """
     Add all residuals of one window that begin at its first `last` observations.
 
-    `data` are the rows of this window in `WindowTerms`. The prior on the shared variables is not
+    `data` are the arrays of this window in `TermArrays`. The prior on the shared variables is not
     among them: it belongs to no observation.
 
     """

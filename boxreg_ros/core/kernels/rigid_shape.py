@@ -1,7 +1,7 @@
 """
 Agreement of each observation with the rigid shape of its track, in plain loops.
 
-The torch twin is `boxreg_ros.core.rigid_shape.agreement`, which has the formulas.
+The torch twin is `boxreg_ros.core.rigid_shape.agreement_torch`, which has the formulas.
 
 """
 
