@@ -62,8 +62,7 @@ docs: $(tests) ## write the generated pages and build the documentation into out
 	$(BIN)/mkdocs build --strict --quiet --site-dir out/site
 
 figures: $(tests) ## draw every picture again from runs of this machine (some minutes)
-	$(BIN)/boxreg bench paper --seeds 20 --methods smoothing paper ours -o out/bench
-	cp out/bench/paper.png bags/paper.png
+	$(BIN)/python docs/figures.py
 
 clean: ## remove environments and whatever builds and runs left
 	rm -rf $(VENV) $(VENV_JAZZY) .venv-consumers build dist install log out .coverage

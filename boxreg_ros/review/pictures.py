@@ -60,20 +60,52 @@ def track_picture(
     from matplotlib.figure import Figure
 
     figure = Figure((WIDTH_INCHES, 4.2))
-    _draw_points(track, figure, before, after, is_object)
+    _draw_points(track, figure, before, after, is_object, left=0.04, right=0.6)
     _draw_changes(track, figure, begin_ns)
     return _png(figure)
 
 
+def points_picture(track: TrackChanges, before: Floats, after: Floats, is_object: Mask) -> str:
+    """
+    Draw the points of a track in its boxes, without the changes over time.
+
+    Parameters
+    ----------
+    track : TrackChanges
+        The track.
+    before, after : array, shape (M, 3)
+        Points of all sweeps in the frame of the input boxes and of the refined boxes [m].
+    is_object : array, shape (M,)
+        False for points that may be road; the top view leaves them out.
+
+    Returns
+    -------
+    picture : str
+        A PNG file as base64.
+
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure((8, 4.5))
+    _draw_points(track, figure, before, after, is_object, left=0.07, right=0.99)
+    return _png(figure, dpi=150)
+
+
 def _draw_points(
-    track: TrackChanges, figure: Any, before: Floats, after: Floats, is_object: Mask
+    track: TrackChanges,
+    figure: Any,
+    before: Floats,
+    after: Floats,
+    is_object: Mask,
+    left: float,
+    right: float,
 ) -> None:
     """Draw points and the median box from above and from the side, before and after."""
     given = np.nanmedian(track.given[:, EXTENT], axis=0)
     refined = np.nanmedian(track.boxes[:, EXTENT], axis=0)
     reach_x, *reaches = np.maximum(given, refined) / 2 + MARGIN
     grid = figure.add_gridspec(
-        2, 2, left=0.04, right=0.6, top=0.93, bottom=0.09, hspace=0.1, wspace=0.04,
+        2, 2, left=left, right=right, top=0.93, bottom=0.09, hspace=0.1, wspace=0.04,
         height_ratios=reaches,
     )  # fmt: skip
     panels: Any = grid.subplots(sharex=True, sharey='row')  # (view, before or after)
@@ -181,8 +213,8 @@ def _outline(length: float, width: float) -> Floats:
     return np.asarray(corners * [length, width] / 2)
 
 
-def _png(figure: Any) -> str:
+def _png(figure: Any, dpi: int = 100) -> str:
     """Return a figure as a PNG file in base64."""
     buffer = BytesIO()
-    figure.savefig(buffer, format='png', dpi=100)
+    figure.savefig(buffer, format='png', dpi=dpi)
     return b64encode(buffer.getvalue()).decode('ascii')

@@ -19,22 +19,19 @@ from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import EXTENT
-from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.review.changes import mean, median, TrackChanges
 from boxreg_ros.review.pictures import STYLE, top_view, track_picture
-from boxreg_ros.review.track_points import BoxPoints, gather_points, in_box_frame
+from boxreg_ros.review.track_points import BoxPoints, gather_points, points_before_and_after
 from boxreg_ros.structures import (
     BoxArray,
     Floats,
-    HEIGHT,
     INTERPOLATED,
     KEPT,
     REFINED,
     Sweep,
     X,
-    Z,
 )
 import numpy as np
 
@@ -189,10 +186,7 @@ def select_tracks(tracks: Sequence[TrackChanges]) -> dict[str, str]:
 
 def _picture(track: TrackChanges, points: Sequence[BoxPoints], begin_ns: int) -> dict[str, Any]:
     """Return the picture of a track, and the cells that its points fill before and after."""
-    before = in_box_frame(points, track.given, track.is_flipped)
-    after = in_box_frame(points, track.boxes, np.zeros_like(track.is_flipped))
-    half_height = np.nanmedian(track.boxes[:, HEIGHT]) / 2
-    is_object = after[:, Z] > GROUND_CLEARANCE - half_height  # lower points may be road
+    before, after, is_object = points_before_and_after(track, points)
     return {
         'picture': track_picture(track, before, after, is_object, begin_ns),
         'sweeps': len(points),

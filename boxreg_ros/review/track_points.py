@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import Pair, StampMatcher
-from boxreg_ros.core.observation import crop
+from boxreg_ros.core.observation import crop, GROUND_CLEARANCE
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BoxArray, Floats, ROLL, Sweep, X, Z
+from boxreg_ros.structures import BoxArray, Floats, HEIGHT, ROLL, Sweep, X, Z
 import numpy as np
 from numpy.typing import NDArray
 
@@ -98,6 +98,35 @@ def in_box_frame(
         sign = np.array([-1, -1, 1]) if is_flipped[row] else 1
         local.append((fixed - boxes[row, : Z + 1]) @ R * sign)
     return np.concatenate(local)
+
+
+def points_before_and_after(
+    track: TrackChanges, points: Sequence[BoxPoints]
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """
+    Return the points of all sweeps in the frames of the input boxes and of the refined boxes.
+
+    Parameters
+    ----------
+    track : TrackChanges
+        The track.
+    points : sequence of BoxPoints
+        Its points in the fixed frame.
+
+    Returns
+    -------
+    before, after : array, shape (M, 3)
+        Points [m]; x forward, y left, z up from the centre of the box. Input boxes whose heading
+        was flipped are flipped here too.
+    is_object : array, shape (M,)
+        False for points near the lower face of the refined box, which may be road.
+
+    """
+    before = in_box_frame(points, track.given, track.is_flipped)
+    after = in_box_frame(points, track.boxes, np.zeros_like(track.is_flipped))
+    half_height = np.nanmedian(track.boxes[:, HEIGHT]) / 2
+    is_object = after[:, Z] > GROUND_CLEARANCE - half_height
+    return before, after, is_object
 
 
 def _pairs(
