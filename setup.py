@@ -33,6 +33,7 @@ setup(
     python_requires='>=3.11',
     install_requires=[
         'mcap>=1.6,<2',
+        'numba>=0.59',
         'numpy>=1.26,<3',
         'orjson>=3.9',
         'pyyaml>=6',

@@ -133,8 +133,12 @@ def problem_of(boxes, **changes):
         given['class_numbers'][:, CLASS_NUMBERS.index(name)] = torch.as_tensor(values)
     more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
     problem = Problem(**{**given, **more})
-    problem.points[~problem.mask] = PADDING_POSITION
-    return problem
+    # Padding comes last.
+    order = (~problem.mask).to(torch.int8).argsort(dim=2, stable=True)
+    points = problem.points.gather(2, order[..., None].expand(-1, -1, -1, 3))
+    mask = problem.mask.gather(2, order)
+    points[~mask] = PADDING_POSITION
+    return problem._replace(points=points, mask=mask, delays=problem.delays.gather(2, order))
 
 
 def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):

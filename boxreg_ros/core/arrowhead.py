@@ -9,6 +9,7 @@ docs/decisions/arrowhead-curvature.md.
 
 from typing import NamedTuple
 
+from boxreg_ros.core.kernels import compiled
 import numpy as np
 import torch
 from torch import Tensor
@@ -181,6 +182,57 @@ class Factor(NamedTuple):
             ahead[:, :NEXT, NEXT:] = across[:, :NEXT, NEXT:]
             ahead[:, NEXT:, :NEXT] = across[:, :NEXT, NEXT:].mT
         return torch.cat(found, 1)[:, :length]
+
+
+class BandedFactor(NamedTuple):
+    """
+    Cholesky factors U, A = U' U, as the kernels of `arrowhead` keep them.
+
+    Attributes
+    ----------
+    band : Tensor, shape (B, 6 N, 18)
+        U[i, i + k] of the chain.
+    border : Tensor, shape (B, 6 N, S)
+        Columns of the border.
+    upper : Tensor, shape (B, S, S)
+        Factor of the border; what lies below its diagonal is of no meaning.
+
+    """
+
+    band: Tensor
+    border: Tensor
+    upper: Tensor
+
+    @classmethod
+    def empty(cls, B: int, D: int, S: int) -> 'BandedFactor':
+        """Return room for B factors of D variables, S of them of the border."""
+        n = D - S
+        parts = np.empty((B, n, 3 * LINK)), np.empty((B, n, S)), np.empty((B, S, S))
+        return cls(*(torch.from_numpy(part) for part in parts))
+
+    @property
+    def corner(self) -> Tensor:
+        """Lower factor of the border, shape (B, S, S), as `Factor` has it."""
+        return self.upper.mT
+
+    def solve_rows(self, b: Tensor, rows: Tensor) -> Tensor:
+        """Return the solutions (r, 6 N + S) for right sides `b` of the windows `rows` (r,)."""
+        x = np.empty(b.shape)
+        kernels = compiled(b)
+        assert kernels is not None
+        arrays = (part.numpy() for part in self)
+        kernels.arrowhead.solve_rows(rows.numpy(), *arrays, np.ascontiguousarray(b.numpy()), x)
+        return torch.from_numpy(x)
+
+    def inverse_of_links(self, length: int) -> Tensor:
+        """Return the blocks of the first `length` links in the inverse, (B, N, 6, 6)."""
+        B, S = self.border.shape[0], self.border.shape[2]
+        blocks = np.empty((B, length, LINK, LINK))
+        kernels = compiled(self.band)
+        assert kernels is not None
+        arrays = (np.ascontiguousarray(part.numpy()) for part in self)
+        kernels.arrowhead.invert_rows(np.arange(B), *arrays, blocks, np.empty((B, S, S)))
+        return torch.from_numpy(blocks)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:

@@ -48,8 +48,8 @@ class Problem(NamedTuple):
     times : Tensor, shape (B, N)
         Time since the first observation, increasing over the padding too [s].
     points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
-        Returns minus the centre of their input box [m]; True for returns. Padding is very far
-        away.
+        Returns minus the centre of their input box [m]; True for returns. Padding comes last, and
+        is very far away.
     delays : Tensor, shape (B, N, M)
         Measurement time of each return, relative to the stamp of its box [s].
     origins : Tensor, shape (B, N, 3)

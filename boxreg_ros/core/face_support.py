@@ -12,6 +12,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, GAP, Problem, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
+from boxreg_ros.core.kernels import compiled
 import numpy as np
 import torch
 from torch import Tensor
@@ -186,39 +187,120 @@ def observe_faces(
     tangent = visibility(problem)
     shares = inset_shares(problem, tangent, config)
     range_inset = shares[1] * offsets.range_inset.to(shares)
-    inset = shares[0] * offsets.occlusion_inset.to(shares) + range_inset
-    half = (state.shared[:, EXTENT] / 2).to(points)[:, None, :, None]  # (B, 1, 3, 1)
-    margin = (state.shared[:, None, GAP] + inset).to(points)[..., None]
+    inset = (shares[0] * offsets.occlusion_inset.to(shares) + range_inset).to(state.pose)
+    occluded_weight = OCCLUDED_FACE_WEIGHT if config.ingredients.occluded_faces else 0.0
+    weight = torch.where(tangent > 0, 1.0, occluded_weight).to(state.pose)
+    weight = weight / (1 + (range_inset / RANGE_INSET_HALF_WEIGHT) ** 2)
+    weight[..., BOTTOM] = (problem.ground.isfinite() & problem.valid).to(weight)
+    strips = STRIPS if config.ingredients.strips else 1
+    search = Search(points, inset, weight, config.faces.outermost / strips, strips)
+    find = outermost_points
+    if compiled(points) is not None:
+        find = outermost_points_compiled
+    moments, distance, weight, num_points = find(problem, state, search)
+    return FaceObservations(moments, distance, weight, inset, shares, num_points)
+
+
+class Search(NamedTuple):
+    """
+    Inputs of the search for the outermost points of all faces, beside the boxes.
+
+    Attributes
+    ----------
+    points : Tensor, shape (B, N, M, 3)
+        Points minus the centre of their input box, motion-compensated [m].
+    inset, weight : Tensor, shape (B, N, 6)
+        How much further inside than the labelling margin points are expected [m]; weight of each
+        face if it has points.
+    share : float
+        Part of the points of a box that is taken from each strip.
+    strips : int
+        Strips of each face.
+
+    """
+
+    points: Tensor
+    inset: Tensor
+    weight: Tensor
+    share: float
+    strips: int
+
+
+Found = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def outermost_points_compiled(problem: Problem, state: State, search: Search) -> Found:
+    """Return the same as `outermost_points`, by the kernel."""
+    kernels = compiled(search.points)
+    assert kernels is not None
+    B, N = problem.valid.shape
+    counts = problem.mask.sum(-1).numpy()  # valid points come first
+    moments = np.empty((B, N, 6, 4, 4))
+    distance = np.empty((B, N, 6))
+    weight = np.empty((B, N, 6))
+    near = np.empty((B, N))
+    inputs = (
+        state.pose, problem.pose, state.shared[:, EXTENT], state.shared[:, GAP], search.inset,
+        search.weight, problem.ground, search.points,
+    )  # fmt: skip
+    deepest = OUTSIDE_MARGIN + INSIDE_EXTRA
+    limits = OUTSIDE_MARGIN, EDGE_MARGIN, MAX_DEPTH, deepest, float(MIN_POINTS)
+    kernels.face_support.observe_faces(
+        *(np.ascontiguousarray(tensor.numpy()) for tensor in inputs), counts, search.share,
+        STRIP_AXIS, search.strips, limits, moments, distance, weight, near,
+    )  # fmt: skip
+    return (
+        torch.from_numpy(moments),
+        torch.from_numpy(distance),
+        torch.from_numpy(weight),
+        torch.from_numpy(near),
+    )
+
+
+def outermost_points(problem: Problem, state: State, search: Search) -> Found:
+    """
+    Find the outermost points in every strip of every face.
+
+    Returns
+    -------
+    moments : Tensor, shape (B, N, 6, 4, 4)
+        Second moments of these points.
+    distance, weight : Tensor, shape (B, N, 6)
+        Their mean signed distance from where they are expected [m], and the weight of the face.
+    num_points : Tensor, shape (B, N)
+        Points in and near the box.
+
+    """
+    points = search.points.to(state.pose)
+    half = (state.shared[:, EXTENT] / 2)[:, None, :, None]  # (B, 1, 3, 1)
+    margin = (state.shared[:, None, GAP] + search.inset)[..., None]
     local = to_box_frame(points, problem, state.pose)  # (B, N, 3, M)
     depth, num_points = _depth_in_faces(local, half, margin - half[..., FACE_AXIS, :])
 
-    strips = STRIPS if config.ingredients.strips else 1
-    share = config.faces.outermost / strips
-    most = max(MIN_POINTS, int(share * points.shape[2]) + 1)
-    strip = (local[..., :2, :] / half[..., :2, :]).add_(1).mul_(strips / 2).clamp_(0, strips - 1)
-    depth, index = outermost_in_strips(depth, strip.floor_(), strips, most)  # (B, N, 5, 3, K)
+    strips = search.strips
+    strip = ((local[..., :2, :] / half[..., :2, :] + 1) * (strips / 2)).clamp(0, strips - 1)
+    own_strip = strip.floor()[..., list(STRIP_AXIS), :]  # (B, N, 5, M)
+    most = min(points.shape[2], max(MIN_POINTS, int(search.share * points.shape[2]) + 1))
+    in_strip = [torch.where(own_strip == k, depth, FAR) for k in range(strips)]
+    depth, index = torch.stack(in_strip, 3).topk(most, -1, largest=False)  # (B, N, 5, strips, K)
     limit = (depth.amin((-1, -2), keepdim=True) + MAX_DEPTH).clamp(
         max=OUTSIDE_MARGIN + INSIDE_EXTRA
     )
-    wanted = (share * num_points).clamp(min=MIN_POINTS)[..., None, None, None]
+    wanted = (search.share * num_points).clamp(min=MIN_POINTS)[..., None, None, None]
     chosen = (depth <= limit) & (torch.arange(most, device=index.device) < wanted)
 
     number = chosen.sum((-1, -2))
     part = chosen / number.clamp(min=1)[..., None, None].to(points)
     moments = _second_moments(points, index, part)
     distance = -(torch.where(chosen, depth, 0.0) * part).sum((-1, -2))
-    occluded_weight = OCCLUDED_FACE_WEIGHT if config.ingredients.occluded_faces else 0.0
-    weight = (number >= MIN_POINTS) * torch.where(tangent[..., :BOTTOM] > 0, 1.0, occluded_weight)
-    weight = weight / (1 + (range_inset[..., :BOTTOM] / RANGE_INSET_HALF_WEIGHT) ** 2)
-
-    road_moments, road_distance, has_road = _road_observation(problem, state)
-    return FaceObservations(
-        torch.cat([moments.to(road_moments), road_moments[:, :, None]], 2),
-        torch.cat([distance.to(road_distance), road_distance[:, :, None]], 2),
-        torch.cat([weight.to(road_distance), has_road[:, :, None].to(road_distance)], 2),
-        inset,
-        shares,
-        num_points.to(road_distance),
+    weight = search.weight.clone()
+    weight[..., :BOTTOM] *= number >= MIN_POINTS
+    road_moments, road_distance = _road_observation(problem, state)
+    return (
+        torch.cat([moments, road_moments[:, :, None]], 2),
+        torch.cat([distance, road_distance[:, :, None]], 2),
+        weight,
+        num_points.to(distance),
     )
 
 
@@ -239,22 +321,20 @@ def _depth_in_faces(local: Tensor, half: Tensor, offset: Tensor) -> tuple[Tensor
     Returns
     -------
     depth : Tensor, shape (B, N, 5, M)
-        Float32; points beside a face are very far inside.
+        `FAR` for points that are not on the face.
     num_points : Tensor, shape (B, N)
         Points in and near the box.
 
     """
-    x, y, z = local.abs().sub_(half).unbind(-2)
+    x, y, z = (local.abs() - half).unbind(-2)
     num_points = (x.maximum(y).maximum(z) < OUTSIDE_MARGIN).sum(-1)
-    # Masks cost five times as much as sums: points beside a face get a large depth instead.
-    beside = [y.maximum(z), x.maximum(z), x.maximum(y)]
-    aside = torch.stack(beside, -2).sub_(EDGE_MARGIN).mul_(FAR)
+    beside_ends, beside_sides, beside_top = y.maximum(z), x.maximum(z), x.maximum(y)
+    beside = torch.stack([beside_ends] * 2 + [beside_sides] * 2 + [beside_top], -2)
     x, y, z = local.unbind(-2)
-    depth = torch.stack([-x, x, -y, y, -z], -2).sub_(offset[..., :BOTTOM, :]).float()
-    front_left_top, back_right = depth[..., 0::2, :], depth[..., 1::2, :]
-    torch.maximum(front_left_top, aside, out=front_left_top)
-    torch.maximum(back_right, aside[..., :2, :], out=back_right)
-    return depth, num_points
+    depth = torch.stack([-x, x, -y, y, -z], -2) - offset[..., :BOTTOM, :]
+    is_on_face = (beside <= EDGE_MARGIN) & (depth >= -OUTSIDE_MARGIN)
+    is_on_face &= depth < OUTSIDE_MARGIN + INSIDE_EXTRA
+    return torch.where(is_on_face, depth, FAR), num_points
 
 
 def _second_moments(points: Tensor, index: Tensor, part: Tensor) -> Tensor:
@@ -272,71 +352,20 @@ def _second_moments(points: Tensor, index: Tensor, part: Tensor) -> Tensor:
     return product((chosen * part[..., None]).flatten(3, 4).mT, chosen.flatten(3, 4))
 
 
-def _road_observation(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor]:
+def _road_observation(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     """
     Return the observation of the bottom: one point of the road under the centre of each box.
 
-    Its moments (B, N, 4, 4), its signed distance from the bottom (B, N) [m], and where there is
-    one (B, N).
+    Its moments (B, N, 4, 4) and its signed distance from the bottom (B, N) [m].
 
     """
     shift = state.pose[..., :3] - problem.pose[..., :3]
-    has_road = problem.ground.isfinite() & problem.valid
-    road = torch.nan_to_num(problem.ground)
+    road = torch.where(problem.ground.isfinite(), problem.ground, 0.0)
     point = torch.stack([shift[..., 0], shift[..., 1], road, torch.ones_like(road)], -1)
     height = state.shared[:, None, 2]
     gap = state.shared[:, None, GAP][..., BOTTOM]
     distance = shift[..., 2] - road - height / 2 + gap
-    return point[..., None] * point[..., None, :], distance, has_road
-
-
-def outermost_in_strips(
-    depth: Tensor, strip: Tensor, strips: int, count: int
-) -> tuple[Tensor, Tensor]:
-    """
-    Find the outermost points in every strip of every face.
-
-    Parameters
-    ----------
-    depth : Tensor, shape (..., 5, M)
-        How far inside of each face but the bottom each point is [m], float32; overwritten.
-    strip : Tensor, shape (..., 2, M)
-        Index of the strip each point is in, along x and along y of the box; overwritten.
-    strips : int
-        Number of strips.
-    count : int
-        K, points wanted of each strip.
-
-    Returns
-    -------
-    depth : Tensor, shape (..., 5, strips, K)
-        Smallest depths of each strip, ascending [m]; above 2 where there are fewer points.
-    index : Tensor, shape (..., 5, strips, K)
-        Indices of these points among the M.
-
-    Notes
-    -----
-    One 32-bit integer holds strip, depth and index of a point: numpy sorts these faster than
-    torch finds the smallest depths. Fresh memory would cost more than the arithmetic, so `depth`
-    is reused.
-
-    """
-    size = depth.shape[-1]
-    device = depth.device
-    bits = max(8, (size - 1).bit_length())
-    scale = 2.0 ** (27 - bits)  # of a number below 12 [1/m]
-    strip.mul_(4 * scale).add_(scale + 2**23)  # above it a float ends in the bits of its integer
-    for values, axis in zip(depth.clamp_(-1, 2.5).unbind(-2), STRIP_AXIS, strict=True):
-        torch.add(strip[..., axis, :], values, alpha=scale, out=values)
-    places = torch.arange(size, dtype=torch.int32, device=device)  # 64 bits would cost a third
-    keys = depth.view(torch.int32).bitwise_left_shift_(bits).add_(places)
-    keys = torch.from_numpy(np.sort(keys.numpy())) if keys.is_cpu else keys.sort().values
-    edges = 4 * torch.arange(strips, device=device)
-    first = ((edges + 1 - OUTSIDE_MARGIN) * scale).int().expand(*keys.shape[:-1], -1) << bits
-    places = torch.searchsorted(keys, first)[..., None] + torch.arange(count, device=device)
-    keys = keys.gather(-1, places.clamp(max=size - 1).flatten(-2)).unflatten(-1, (strips, count))
-    depth = torch.where(places < size, (keys >> bits) / scale - edges[:, None] - 1, FAR)
-    return depth, (keys & (1 << bits) - 1).long()
+    return point[..., None] * point[..., None, :], distance
 
 
 def to_box_frame(points: Tensor, problem: Problem, pose: Tensor) -> Tensor:

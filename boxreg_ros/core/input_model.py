@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import FaceConfig
-from boxreg_ros.core.arrowhead import Factor
+from boxreg_ros.core.arrowhead import BandedFactor, Factor
 from boxreg_ros.core.batch import EXTENT, POSE_ERRORS, Problem, State
 from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
 from boxreg_ros.core.geometry import rotation_from_rpy
@@ -313,7 +313,7 @@ def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
 
 
 def evidence_of_extents(
-    given: Tensor, expected: Expectation, state: State, factor: Factor
+    given: Tensor, expected: Expectation, state: State, factor: Factor | BandedFactor
 ) -> Tensor:
     """
     Return the evidence of the points alone about the extents (M17), shape (B, 2, 3).
@@ -326,7 +326,7 @@ def evidence_of_extents(
         Logarithms of the mean extents of the input.
     expected : Expectation
         Prior of the fit: its part in that is removed.
-    state, factor : State, Factor
+    state, factor : State, Factor or BandedFactor
         The fit, and the factor of its curvature.
 
     """

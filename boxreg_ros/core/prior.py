@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from boxreg_ros.core.arrowhead import cholesky, LINK
 from boxreg_ros.core.batch import MarginalPrior, PRIOR_POSES, PRIOR_SIZE, SHARED, State
-from boxreg_ros.core.terms import shared_prior, Term
+from boxreg_ros.core.terms import Objective, shared_prior, Term
 import torch
 from torch.linalg import solve_triangular
 from torch.nn.functional import pad
@@ -25,7 +25,19 @@ PRIOR_RIDGE = 1e-6
 information stay at the linearisation point. Chosen: the information of a deviation of 1000."""
 
 
-def marginalise(terms: Sequence[Term], state: State) -> MarginalPrior:
+def marginalise(objective: Objective, state: State) -> MarginalPrior:
+    """
+    Return the prior that is left when the oldest observation is eliminated (M13), at `state`.
+
+    By the kernels where the objective has arrays for them, else by torch.
+
+    """
+    if objective.arrays is not None:
+        return MarginalPrior(*objective.arrays.marginalise(state.pack()))
+    return marginalised_terms(objective.terms, state)
+
+
+def marginalised_terms(terms: Sequence[Term], state: State) -> MarginalPrior:
     """
     Return the quadratic form that remains when the oldest observation is eliminated (M13).
 

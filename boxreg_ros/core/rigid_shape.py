@@ -8,6 +8,8 @@ docs/method.md (M4) has the residual that comes of it.
 from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, Problem, State
 from boxreg_ros.core.face_support import motion_compensated, to_box_frame
+from boxreg_ros.core.kernels import compiled
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -54,8 +56,36 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     is kept, as in point-to-plane ICP.
 
     """
-    local = to_box_frame(motion_compensated(problem, state), problem, state.pose)
-    half = (state.shared[:, EXTENT] / 2).to(local)[:, None, :, None]
+    points = motion_compensated(problem, state)
+    if compiled(points) is not None:
+        return agreement_compiled(points, problem, state)
+    return agreement_torch(points, problem, state)
+
+
+def agreement_compiled(points: Tensor, problem: Problem, state: State) -> tuple[Tensor, Tensor]:
+    """Return the same as `agreement`, by the kernel; `points` (B, N, M, 3)."""
+    kernels = compiled(points)
+    assert kernels is not None
+    B, N = problem.valid.shape
+    counts = problem.mask.sum(-1).numpy()  # valid points come first
+    information = np.empty((B, N, 6, 6))
+    wanted = np.empty((B, N, 6))
+    inputs = state.pose, problem.pose, state.shared[:, EXTENT], points
+    deviation = problem.of_class('shape')[:, 0]
+    limits = (
+        SHAPE_MARGIN, MIN_FLATNESS, float(MIN_CELL_POINTS), EFFECTIVE_POINTS, STEP_RIDGE
+    )  # fmt: skip
+    kernels.rigid_shape.agreement(
+        *(np.ascontiguousarray(tensor.numpy()) for tensor in inputs), counts,
+        np.ascontiguousarray(deviation.numpy()), CELLS, limits, information, wanted,
+    )  # fmt: skip
+    return torch.from_numpy(information), torch.from_numpy(wanted)
+
+
+def agreement_torch(points: Tensor, problem: Problem, state: State) -> tuple[Tensor, Tensor]:
+    """Return the same as `agreement`, by torch; `points` (B, N, M, 3)."""
+    local = to_box_frame(points.to(state.pose), problem, state.pose)
+    half = (state.shared[:, EXTENT] / 2)[:, None, :, None]
     B, N, _, M = local.shape
     # Points that are not near the box, or not finite, count as zeros in the first cell;
     # coordinates are rows. That is several times as fast as selecting points.

@@ -248,7 +248,7 @@ def run_round(
     prior = None
     is_full = plan.marginalises and problem.length == config.window
     if is_full and len(done):
-        prior = _prior_of_full(weighted, found, problem)
+        prior = _prior_of_full(objective, found, problem)
     evidence = evidence_of_extents(log_extent, expected, found, objective.factor)
     return RoundResult(rows, found, is_done, evidence, covariances, prior)
 
@@ -281,9 +281,9 @@ def _weighted_terms(
     return weighted
 
 
-def _prior_of_full(weighted: list[Term], found: State, problem: Problem) -> MarginalPrior:
+def _prior_of_full(objective: Objective, found: State, problem: Problem) -> MarginalPrior:
     """Return what full windows leave to the next ones, NaN for those that are padded."""
-    prior = marginalise(weighted, found)
+    prior = marginalise(objective, found)
     is_padded = ~problem.valid.all(1)
     prior.state[is_padded] = torch.nan
     prior.step[is_padded] = torch.nan

@@ -9,9 +9,9 @@ the sum of J' W J.
 """
 
 from collections.abc import Callable, Sequence
-from typing import cast, NamedTuple
+from typing import Any, cast, NamedTuple
 
-from boxreg_ros.core.arrowhead import Chain, Factor, LINK, product
+from boxreg_ros.core.arrowhead import BandedFactor, Chain, Factor, LINK, product
 from boxreg_ros.core.batch import (
     ANCHOR,
     BIAS,
@@ -24,7 +24,9 @@ from boxreg_ros.core.batch import (
     State,
 )
 from boxreg_ros.core.geometry import rotation_derivatives, rotation_from_rpy
+from boxreg_ros.core.kernels import compiled, Kernels
 from boxreg_ros.core.lbfgs import select
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -119,6 +121,8 @@ class Objective:
     """
     The sum of all terms as a function to minimise, with fixed weights: one round.
 
+    Runs by the kernels where they are available, else by torch.
+
     Parameters
     ----------
     terms : sequence of Term
@@ -130,32 +134,160 @@ class Objective:
 
     Attributes
     ----------
-    factor : Factor
+    factor : Factor or BandedFactor
         Cholesky factor of the Gauss-Newton curvature at the start.
+    terms : sequence of Term
+        The terms.
+    arrays : TermArrays or None
+        The same for the kernels; None where torch is used.
 
     """
 
+    factor: Factor | BandedFactor
+
     def __init__(self, terms: Sequence[Term], start: Tensor, length: int, free: Tensor) -> None:
-        self._terms = terms
+        self.terms = terms
         self._start = start
         self._length = length
         self._free = free
-        curvature = Chain.zeros(start, length)
-        value, gradient = value_and_gradient(terms, start, length, curvature)
+        kernels = compiled(start)
+        self.arrays = TermArrays.of(terms, start, length, free) if kernels else None
+        if self.arrays is not None:
+            value, gradient, self.factor = self.arrays.linearise(start)
+        else:
+            curvature = Chain.zeros(start, length)
+            value, gradient = value_and_gradient(terms, start, length, curvature)
+            self.factor = curvature.factorised(free)
         self._at_start = value, gradient * free
-        self.factor = curvature.factorised(free)
 
     def __call__(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`."""
         if x is self._start:
             return self._at_start
-        terms, free = select((self._terms, self._free), rows)
+        if self.arrays is not None:
+            return self.arrays.evaluate(x, rows)
+        terms, free = select((self.terms, self._free), rows)
         value, gradient = value_and_gradient(terms, x, self._length)
         return value, gradient * free
 
     def newton(self, vector: Tensor, rows: Tensor) -> Tensor:
         """Return the inverse curvature at the start times `vector` (b, D), for `rows`."""
+        if isinstance(self.factor, BandedFactor):
+            return self.factor.solve_rows(vector, rows)
         return cast(Factor, select(self.factor, rows)).solve(vector)
+
+
+class TermArrays:
+    """
+    The terms of one round as arrays, as the kernels of `normal_equations` take them.
+
+    Parameters
+    ----------
+    kernels : Kernels
+        The compiled functions.
+    terms : tuple of array
+        Data and weights of the residuals (M2) to (M7) and (M9), in the order of the kernels;
+        terms without weight have no rows.
+    expected, shared_weight : array, shapes (B, 22) and (B, 22, 22)
+        Mean and weight of the shared variables (M8).
+    free : array, shape (B, D)
+        1 for variables that are estimated.
+
+    """
+
+    def __init__(
+        self,
+        kernels: Kernels,
+        terms: tuple[Any, ...],
+        expected: Any,
+        shared_weight: Any,
+        free: Any,
+    ) -> None:
+        self._kernels = kernels
+        self._terms = terms
+        self._expected = expected
+        self._shared_weight = shared_weight
+        self._free = free
+
+    @classmethod
+    def of(cls, terms: Sequence[Term], start: Tensor, length: int, free: Tensor) -> 'TermArrays':
+        """Return the arrays of `terms`, whose search starts at `start` (B, D)."""
+        kernels = compiled(start)
+        assert kernels is not None
+        B = len(start)
+        by_function = {term.function: term for term in terms}
+
+        def weight(function: Callable[..., Linearised], size: int) -> Any:
+            """Return W, shape (B, n, size, size); n is 0 without the term."""
+            term = by_function.get(function)
+            return np.zeros((B, 0, size, size)) if term is None else _array(term.weight[:, :, 0])
+
+        def data(function: Callable[..., Linearised], *absent: tuple[int, ...]) -> list[Any]:
+            """Return the data of a term; zeros of shapes (B, ...) where it is `absent`."""
+            term = by_function.get(function)
+            if term is None:
+                return [np.zeros((B, *shape)) for shape in absent]
+            return [_array(part) for part in term.data]
+
+        given, inset = data(faces, (0, 6), (0, 6))
+        face_term = by_function.get(faces)
+        face_weight = np.zeros((B, 0, 6, 4, 4)) if face_term is None else _array(face_term.weight)
+        pose, axes = data(input_pose, (0, 6), (0, 3, 3))
+        shape_start, wanted = data(rigid_shape, (0, 6), (0, 6))
+        shape_axes = _array(rotation_from_rpy(torch.from_numpy(shape_start)[..., 3:]))
+        (times,) = data(slip, (length,))
+        if slip not in by_function and acceleration in by_function:
+            (times,) = data(acceleration)
+        (mean,) = data(marginalisation_prior, (1, PRIOR_SIZE))
+        information = np.zeros((B, 0, PRIOR_SIZE))
+        if marginalisation_prior in by_function:
+            information = weight(marginalisation_prior, PRIOR_SIZE)[:, 0]
+        (expected,) = data(shared_prior, (SHARED,))
+        shared_weight = np.zeros((B, SHARED, SHARED))
+        if shared_prior in by_function:
+            shared_weight = weight(shared_prior, SHARED)[:, 0]
+        arrays = (
+            given, inset, face_weight, pose, axes, weight(input_pose, 6), shape_start, shape_axes,
+            wanted, weight(rigid_shape, 6), times, weight(acceleration, 6), weight(slip, 2),
+            weight(zero_motion, 6), mean[:, 0], information,
+        )  # fmt: skip
+        return cls(kernels, arrays, expected, shared_weight, _array(free))
+
+    def linearise(self, x: Tensor) -> tuple[Tensor, Tensor, BandedFactor]:
+        """Return values (B,), gradients (B, D) and the factor of the curvature at `x` (B, D)."""
+        B, D = x.shape
+        value = np.empty(B)
+        gradient = np.empty((B, D))
+        factor = BandedFactor.empty(B, D, SHARED)
+        self._kernels.normal_equations.linearise(
+            _array(x), self._terms, self._expected, self._shared_weight, self._free, value,
+            gradient, *(part.numpy() for part in factor),
+        )  # fmt: skip
+        return torch.from_numpy(value), torch.from_numpy(gradient), factor
+
+    def evaluate(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`."""
+        value = np.empty(len(x))
+        gradient = np.empty(x.shape)
+        self._kernels.normal_equations.evaluate(
+            _array(x), rows.numpy(), self._terms, self._expected, self._shared_weight, self._free,
+            value, gradient,
+        )  # fmt: skip
+        return torch.from_numpy(value), torch.from_numpy(gradient)
+
+    def marginalise(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the `MarginalPrior` of the windows at `x` (B, D), see `prior.marginalise`."""
+        B = len(x)
+        prior = np.empty((B, PRIOR_SIZE)), np.empty((B, PRIOR_SIZE))
+        information = np.empty((B, PRIOR_SIZE, PRIOR_SIZE))
+        self._kernels.normal_equations.marginalise(_array(x), self._terms, *prior, information)
+        mean, step = (torch.from_numpy(part) for part in prior)
+        return mean, step, torch.from_numpy(information)
+
+
+def _array(tensor: Tensor) -> Any:
+    """Return a contiguous array of float64 for a kernel."""
+    return np.ascontiguousarray(tensor.numpy(), dtype=np.float64)
 
 
 def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:

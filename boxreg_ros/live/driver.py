@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, NamedTuple
 
-from boxreg_ros import refine, Track
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
@@ -436,9 +435,10 @@ def refined_to_frame(refined: RefinedBoxes, T_frame_boxes: Floats, frame_id: str
 
 def warm_up(config: Config) -> None:
     """
-    Solve a synthetic track, so that the first real one does not wait for lazy imports.
+    Register a synthetic stream, so that the first real one does not wait.
 
-    A few iterations of the solver are enough.
+    Libraries are imported and kernels loaded, or compiled at the very first start. Six stamps of
+    a window of four cover cold, warm and full windows; a few iterations of the solver are enough.
 
     Raises
     ------
@@ -447,12 +447,15 @@ def warm_up(config: Config) -> None:
 
     """
     rng = np.random.default_rng(0)
-    boxes = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0] for k in range(4)])
-    points = [rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + box[:3] for box in boxes]
-    track = Track('1', 'car', np.arange(4) * 10**8, boxes, points, np.zeros((4, 3)))
     quick = Config(
-        objective=config.objective, mode=config.mode, device=config.device,
-        solver=SolverConfig(rounds=1, iterations=2),
+        objective=config.objective, mode=config.mode, device=config.device, estimate='final',
+        window=4, lag=3, solver=SolverConfig(rounds=1, iterations=2),
         paper=PaperConfig(multiplier_rounds=1, iterations=2),
     )  # fmt: skip
-    refine([track], quick)
+    registrar = BoxRegistrar(quick)
+    for k in range(6):
+        stamp_ns = k * 10**8
+        box = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0]])
+        points = rng.uniform(-1, 1, (64, 3)) * [2, 1, 0.7] + box[0, :3]
+        registrar.add_sweep(Sweep(stamp_ns, 'map', points.astype(np.float32)))
+        registrar.add_boxes(BoxArray(stamp_ns, 'map', ('1',), ('car',), np.ones(1), box))

@@ -1,0 +1,185 @@
+"""
+Factorisation of one arrowhead matrix: a banded chain of poses with a border, in plain loops.
+
+The matrix A of n = 6 N chain variables and S border variables is kept as `band` (n, 18), where
+band[i, k] = A[i, i + k], `border` (n, S) and `corner` (S, S), upper triangles. A pose is coupled
+to the two after it: nothing lies beyond the band. Its Cholesky factor U, A = U' U, has the same
+shape and replaces it.
+
+"""
+
+from math import sqrt
+
+from boxreg_ros.core.kernels.compile import kernel
+import numpy as np
+
+POSE = 6
+BAND = 3 * POSE
+RIDGE = 1e-9
+"""Added to the diagonal: an unobserved variable does not break the factorisation."""
+
+
+@kernel
+def fix_variables(band, border, corner, free):
+    """Make rows and columns of variables that are not `free` (n + S,) those of the identity."""
+    n, S = border.shape
+    for i in range(n):
+        for k in range(min(BAND, n - i)):
+            band[i, k] *= free[i] * free[i + k]
+        for s in range(S):
+            border[i, s] *= free[i] * free[n + s]
+        band[i, 0] += 1.0 - free[i] + RIDGE
+    for s in range(S):
+        for t in range(s, S):
+            corner[s, t] *= free[n + s] * free[n + t]
+        corner[s, s] += 1.0 - free[n + s] + RIDGE
+
+
+@kernel
+def factorise(band, border, corner):
+    """Replace a matrix by its Cholesky factor; return False where it is not positive definite."""
+    n, S = border.shape
+    for i in range(n):
+        if not band[i, 0] > 0.0:
+            return False
+        root = sqrt(band[i, 0])
+        last = min(BAND, n - i)
+        for k in range(last):
+            band[i, k] /= root
+        for s in range(S):
+            border[i, s] /= root
+        for k in range(1, last):
+            factor = band[i, k]
+            if factor != 0.0:
+                for j in range(k, last):
+                    band[i + k, j - k] -= factor * band[i, j]
+                for s in range(S):
+                    border[i + k, s] -= factor * border[i, s]
+        for s in range(S):
+            factor = border[i, s]
+            if factor != 0.0:
+                for t in range(s, S):
+                    corner[s, t] -= factor * border[i, t]
+    for s in range(S):
+        if not corner[s, s] > 0.0:
+            return False
+        root = sqrt(corner[s, s])
+        for t in range(s, S):
+            corner[s, t] /= root
+        for t in range(s + 1, S):
+            factor = corner[s, t]
+            for u in range(t, S):
+                corner[t, u] -= factor * corner[s, u]
+    return True
+
+
+@kernel
+def solve(band, border, corner, x):
+    """Replace a right side `x` (n + S,) by the solution of U' U x = b."""
+    n, S = border.shape
+    for i in range(n):
+        x[i] /= band[i, 0]
+        value = x[i]
+        for k in range(1, min(BAND, n - i)):
+            x[i + k] -= band[i, k] * value
+        for s in range(S):
+            x[n + s] -= border[i, s] * value
+    for s in range(S):
+        x[n + s] /= corner[s, s]
+        for t in range(s + 1, S):
+            x[n + t] -= corner[s, t] * x[n + s]
+    for s in range(S - 1, -1, -1):
+        for t in range(s + 1, S):
+            x[n + s] -= corner[s, t] * x[n + t]
+        x[n + s] /= corner[s, s]
+    for i in range(n - 1, -1, -1):
+        value = x[i]
+        for k in range(1, min(BAND, n - i)):
+            value -= band[i, k] * x[i + k]
+        for s in range(S):
+            value -= border[i, s] * x[n + s]
+        x[i] = value / band[i, 0]
+
+
+@kernel
+def invert_corner(corner, inverse):
+    """Write the inverse (S, S) of U' U of a corner's factor."""
+    S = len(corner)
+    for column in range(S):
+        for s in range(S):
+            inverse[s, column] = 0.0
+        inverse[column, column] = 1.0
+        for s in range(column, S):
+            inverse[s, column] /= corner[s, s]
+            for t in range(s + 1, S):
+                inverse[t, column] -= corner[s, t] * inverse[s, column]
+        for s in range(S - 1, -1, -1):
+            for t in range(s + 1, S):
+                inverse[s, column] -= corner[s, t] * inverse[t, column]
+            inverse[s, column] /= corner[s, s]
+
+
+@kernel
+def invert_poses(band, border, corner, blocks, corner_inverse):
+    """
+    Write the diagonal blocks (N, 6, 6) of the poses in the inverse, and that of the border.
+
+    The entries of the inverse Z within the pattern of U follow from the last variable backward
+    (Takahashi): Z[i, j] = (delta_ij / u_ii - sum over k > i of u_ik Z[k, j]) / u_ii.
+
+    """
+    n, S = border.shape
+    invert_corner(corner, corner_inverse)
+    Z_band = np.zeros((n, BAND))
+    Z_border = np.zeros((n, S))
+    # Row i of Z, columns i + 1 to i + 17, as far as it is known when row i is worked out.
+    known = np.zeros((BAND, BAND))
+    for i in range(n - 1, -1, -1):
+        last = min(BAND, n - i)
+        scale = -1.0 / band[i, 0]
+        for k in range(1, last):
+            for s in range(S):
+                Z_border[i, s] += band[i, k] * Z_border[i + k, s]
+        for t in range(S):
+            for s in range(S):
+                Z_border[i, s] += border[i, t] * corner_inverse[t, s]
+        for s in range(S):
+            Z_border[i, s] *= scale
+        for j in range(1, last):
+            for k in range(j, last):
+                known[j, k] = Z_band[i + j, k - j]
+                known[k, j] = known[j, k]
+        total = 0.0
+        for j in range(1, last):
+            entry = 0.0
+            for k in range(1, last):
+                entry += band[i, k] * known[j, k]
+            for t in range(S):
+                entry += border[i, t] * Z_border[i + j, t]
+            Z_band[i, j] = entry * scale
+            total += band[i, j] * Z_band[i, j]
+        for t in range(S):
+            total += border[i, t] * Z_border[i, t]
+        Z_band[i, 0] = (1.0 / band[i, 0] - total) / band[i, 0]
+    for pose in range(n // POSE):
+        for a in range(POSE):
+            for b in range(a, POSE):
+                value = Z_band[POSE * pose + a, b - a]
+                blocks[pose, a, b] = value
+                blocks[pose, b, a] = value
+
+
+@kernel
+def solve_rows(rows, band, border, corner, b, x):
+    """Write the solutions x (r, n + S) for right sides `b` of the windows `rows` (r,)."""
+    for i in range(len(rows)):
+        x[i] = b[i]
+        solve(band[rows[i]], border[rows[i]], corner[rows[i]], x[i])
+
+
+@kernel
+def invert_rows(rows, band, border, corner, blocks, corner_inverse):
+    """Write, for the windows `rows`, the blocks of the inverse (r, N, 6, 6) and (r, S, S)."""
+    for i in range(len(rows)):
+        row = rows[i]
+        invert_poses(band[row], border[row], corner[row], blocks[i], corner_inverse[i])

@@ -1,0 +1,39 @@
+"""How kernels are compiled: by numba, once, kept on disk."""
+
+from collections.abc import Callable
+from typing import Any, cast, TypeVar
+from warnings import warn
+
+import numba
+
+REORDER = {'contract', 'reassoc'}
+"""Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
+
+_F = TypeVar('_F', bound=Callable[..., Any])
+
+
+def kernel(function: _F) -> _F:
+    """
+    Compile a function of numbers and arrays at its first call.
+
+    It runs without the interpreter's lock, so that threads can share the windows of a batch. As
+    no window depends on another, the results do not depend on the number of threads. Numba's own
+    threads are not used: they do not survive a fork, and workers of `boxreg relabel` are forked.
+
+    """
+    options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'fastmath': REORDER}
+    try:
+        return cast(_F, numba.njit(function, cache=True, **options))
+    except RuntimeError as error:  # no folder for the cache can be written
+        if function.__name__ == FIRST_KERNEL:
+            warn(
+                f'numba cache: expected a folder that can be written, got {error}; every process '
+                f'compiles the solver again, which takes some seconds: set NUMBA_CACHE_DIR',
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return cast(_F, numba.njit(function, **options))
+
+
+FIRST_KERNEL = 'fill_rotation'
+"""The kernel that is compiled first: one warning is enough."""

@@ -1,0 +1,213 @@
+"""The compiled searches against their torch twins, fallbacks, and independence of windows."""
+
+import subprocess
+import sys
+
+from boxreg_ros.config import Config
+from boxreg_ros.core import batch, kernels, prior, rigid_shape
+from boxreg_ros.core.arrowhead import BandedFactor
+from boxreg_ros.core.batch import EXTENT, SHARED, State
+from boxreg_ros.core.face_support import FAR, outermost_points, outermost_points_compiled, Search
+from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.registration import register
+from boxreg_ros.core.terms import Objective
+import numpy as np
+from paths import ROOT
+import pytest
+from scenes import (
+    drive,
+    problem_of,
+    random_problem,
+    random_variables,
+    terms_of,
+    track_of,
+    window_of,
+)
+import torch
+
+D = torch.float64
+pytest.importorskip('numba')
+
+
+def assert_equal(found, known, tolerance=1e-9):
+    """Check that arrays are equal up to a part of the largest entry of `known`."""
+    found, known = np.asarray(found), np.asarray(known)
+    scale = np.abs(known[np.isfinite(known)]).max(initial=1e-300)
+    np.testing.assert_allclose(found, known, rtol=0, atol=tolerance * scale)
+
+
+def surfaces(seed, B=3, N=5, M=90):
+    """Return points (B, N, M, 3) on and near the faces of boxes of 4 x 2 x 1.6 m."""
+    rng = np.random.default_rng(seed)
+    half = np.array([2.0, 1.0, 0.8])
+    points = rng.uniform(-1, 1, (B, N, M, 3))
+    axis, sign = rng.integers(0, 3, (B, N, M, 1)), rng.choice([-1.0, 1.0], (B, N, M, 1))
+    np.put_along_axis(points, axis, sign, 3)
+    return points * half + 0.15 * rng.normal(size=points.shape)
+
+
+def cases():
+    """Yield the name of each case, its points and mask, and changes of the problem."""
+    rng = np.random.default_rng(1)
+    points = surfaces(0)
+    shape = points.shape[:3]
+    every = np.ones(shape, bool)
+    yield 'usual', points, rng.random(shape) < 0.8, {}
+    yield 'no points', points, ~every, {}
+    yield 'one point', points, np.arange(shape[2]) < np.ones((*shape[:2], 1)), {}
+    yield 'all points equal', np.broadcast_to(points[:, :, :1], points.shape), every, {}
+    yield 'all far away', points + 100.0, every, {}
+    yield 'a road', points, every, {'ground': np.full(shape[:2], -0.85)}
+    broken = points.copy()
+    broken[1] = np.nan
+    yield 'one window not finite', broken, every, {}
+
+
+CASES = {name: rest for name, *rest in cases()}
+
+
+def searched(case):
+    """Return the problem of a case, and boxes near those of the input."""
+    points, mask, changes = CASES[case]
+    B, N = mask.shape[:2]
+    rng = np.random.default_rng(2)
+    boxes = np.zeros((B, N, 9))
+    boxes[..., 3:6] = [4.0, 2.0, 1.6]
+    boxes[..., 8] = rng.uniform(-3, 3, (B, N))
+    problem = problem_of(boxes, points=points, mask=mask, class_numbers={'shape': 0.03}, **changes)
+    pose = problem.pose + 0.1 * torch.from_numpy(rng.normal(size=(B, N, 6)))
+    shared = torch.zeros(B, SHARED, dtype=D)
+    shared[:, EXTENT] = torch.tensor([4.1, 1.9, 1.7], dtype=D)
+    return problem, State(pose, shared)
+
+
+@pytest.mark.parametrize('strips', [1, 3])
+@pytest.mark.parametrize('share', [0.02, 0.3])
+@pytest.mark.parametrize('case', CASES)
+def test_outermost_points_equal_those_of_torch(case, share, strips):
+    problem, state = searched(case)
+    rng = np.random.default_rng(5)
+    inset, weight = (torch.from_numpy(rng.random((*problem.valid.shape, 6))) for _ in range(2))
+    search = Search(problem.points, 0.2 * inset, weight, share, strips)
+    found = outermost_points_compiled(problem, state, search)
+    known = outermost_points(problem, state, search)
+    is_seen = (known[2] > 0)[..., None, None]
+    assert_equal(torch.where(is_seen, found[0], 0.0), torch.where(is_seen, known[0], 0.0))
+    assert_equal(found[1] * is_seen[..., 0, 0], known[1] * is_seen[..., 0, 0])
+    np.testing.assert_array_equal(found[2], known[2])
+    np.testing.assert_array_equal(found[3], known[3])
+    if case == 'usual':
+        assert is_seen.sum() > 30
+
+
+@pytest.mark.parametrize('case', CASES)
+def test_rigid_shape_equals_that_of_torch(case):
+    problem, state = searched(case)
+    found = rigid_shape.agreement_compiled(problem.points, problem, state)
+    known = rigid_shape.agreement_torch(problem.points, problem, state)
+    for a, b in zip(found, known, strict=True):
+        assert_equal(a, b, 1e-8)
+    if case == 'usual':
+        assert np.abs(known[0]).max() > 10
+
+
+def test_constants_of_the_kernels_are_those_of_their_twins():
+    loops = kernels.compiled(torch.zeros(1))
+    equations = loops.normal_equations
+    found = equations.EXTENT, equations.BIAS, equations.GAP, equations.PIVOT, equations.ANCHOR
+    known = EXTENT.start, batch.BIAS.start, batch.GAP.start, batch.PIVOT, batch.ANCHOR.start
+    assert (*found, equations.SHARED) == (*known, SHARED)
+    assert equations.UNKNOWN_RIDGE == prior.PRIOR_RIDGE
+    assert loops.arrowhead.RIDGE == prior.POSE_RIDGE
+    assert loops.face_support.NOWHERE == FAR
+
+
+def test_curvature_that_is_not_positive_definite_has_no_factor():
+    terms, x = terms_of(random_problem()), random_variables(random_problem())
+    negative = [term._replace(weight=-term.weight) for term in terms.values()]
+    factor = Objective(negative, x, 6, torch.ones_like(x)).factor
+    assert isinstance(factor, BandedFactor)
+    assert factor.band.isnan().all()
+
+
+def test_non_finite_values_leave_other_windows_bitwise_unchanged():
+    problem = random_problem()
+    terms, x = list(terms_of(problem).values()), random_variables(problem)
+    free, rows, others = torch.ones_like(x), torch.arange(3), [0, 2]
+    broken = x.clone()
+    broken[1, 7] = torch.nan
+    known, found = Objective(terms, x, 6, free), Objective(terms, broken, 6, free)
+    assert torch.equal(found(broken, rows)[1][others], known(x, rows)[1][others])
+    blocks = (objective.factor.inverse_of_links(6)[others] for objective in (found, known))
+    assert torch.equal(*blocks)
+    assert not found(broken, rows)[0][1].isfinite()
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    rng = np.random.default_rng(3)
+    config = Config(estimate='final')
+    windows = [window_of(track_of(drive(10), rng, str(i)), config) for i in range(300)]
+    known, found = (
+        register(windows, changed, InputModel(changed.faces))
+        for changed in (config.updated({'solver.threads': n}) for n in (1, 2))
+    )
+    for a, b in zip(known, found, strict=True):
+        np.testing.assert_array_equal(a.boxes, b.boxes)
+        np.testing.assert_array_equal(a.covariances, b.covariances)
+
+
+REFINE = """
+import sys, warnings
+import numpy as np
+PREPARE
+warnings.simplefilter('always')
+with warnings.catch_warnings(record=True) as caught:
+    from boxreg_ros import Config, Track, refine
+    rng = np.random.default_rng(0)
+    boxes = np.array([[10.0 + i, 0, 0, 4, 1.8, 1.5, 0, 0, 0] for i in range(6)])
+    surface = rng.uniform(-1, 1, (200, 3)) * [2, 0.9, 0.75]
+    surface[:100, 0], surface[100:, 1] = -2.0, 0.9
+    points = [box[:3] + surface for box in boxes]
+    boxes += 0.1 * rng.normal(size=boxes.shape)
+    track = Track('7', 'car', np.arange(6) * 10**8, boxes, points, np.zeros((6, 3)))
+    (refined,) = refine([track], Config())
+texts = [str(w.message) for w in caught if 'numba' in str(w.message)]
+print(len(texts), *texts, sep='\\n')
+print(*refined.boxes.ravel().tolist())
+"""
+WITHOUT_NUMBA = """
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] == 'numba':
+            raise ModuleNotFoundError('No module named numba')
+sys.meta_path.insert(0, Absent())
+"""
+WITHOUT_CACHE = """
+import numba.core.caching
+# As where neither the package, nor NUMBA_CACHE_DIR, nor the home folder can be written.
+numba.core.caching.CacheImpl._locator_classes = []
+"""
+
+
+def refined(prepare=''):
+    """Return the warnings about numba, and the boxes, of a small refinement in a process."""
+    done = subprocess.run(
+        [sys.executable, '-c', REFINE.replace('PREPARE', prepare)],
+        cwd=ROOT, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    count, *texts, boxes = done.stdout.splitlines()
+    assert len(texts) == int(count)
+    return texts, np.array(boxes.split(), float)
+
+
+@pytest.mark.parametrize(
+    ('prepare', 'remedy'), [(WITHOUT_NUMBA, 'pip install'), (WITHOUT_CACHE, 'NUMBA_CACHE_DIR')]
+)
+def test_without_numba_or_its_cache_results_are_the_same_and_one_warning_says_so(prepare, remedy):
+    texts, known = refined()
+    assert texts == []
+    texts, found = refined(prepare)
+    assert len(texts) == 1
+    assert remedy in texts[0]
+    np.testing.assert_allclose(found, known, atol=1e-6)
