@@ -25,13 +25,15 @@ RENAMED = {
     'faces.depth_sides': 'faces.inset_sides',
 }
 """Settings of earlier versions by their old names: the error names the new one."""
+REMOVED = {'solver.history': 'no result depends on it'}
+"""Settings of earlier versions that are gone, and why."""
 
 NODE_OPTIONS = (
     *('boxes_type', 'pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
     *('output_frame', 'transform_timeout', 'backlog', 'config_file'),
     *('use_sim_time', 'start_type_description_service', 'qos_overrides'),
 )
-"""Parameters of the node that parameter files of ROS may hold beside those of `Config`."""
+"""Parameters of the node that a parameter file of ROS may contain in addition to `Config`."""
 
 
 DEFAULT_LAG = 9
@@ -126,7 +128,6 @@ class SolverConfig:
         15, 'most rounds; each renews the outermost points and the weights', '', 1, 100
     )
     iterations: int = setting(1, 'most L-BFGS iterations per round', '', 1, 10000)
-    history: int = setting(6, 'curvature pairs that L-BFGS keeps', '', 1, 100)
     threads: int = setting(
         0, 'threads that share the windows of a batch; 0: one per core', '', 0, 256
     )
@@ -449,6 +450,10 @@ def _filled(default: _T, value: Any, name: str) -> _T:
         if key not in known:
             if prefix + key in RENAMED:
                 raise ConfigError(f'{prefix}{key}: was renamed; set {RENAMED[prefix + key]}')
+            if prefix + key in REMOVED:
+                raise ConfigError(
+                    f'{prefix}{key}: was removed, {REMOVED[prefix + key]}; leave it out'
+                )
             names = ', '.join(sorted(known))
             raise ConfigError(f'{prefix}{key}: no such setting; expected one of {names}')
     changes = {key: _filled(known[key], inner, prefix + key) for key, inner in value.items()}

@@ -85,6 +85,11 @@ def test_unknown_keys_are_refused_by_name(values, name):
         Config.from_dict(values)
 
 
+def test_a_removed_setting_is_refused_with_the_reason():
+    with pytest.raises(ConfigError, match=r'solver\.history: was removed, no result depends'):
+        Config.from_dict({'solver': {'history': 3}})
+
+
 def test_a_renamed_setting_is_refused_with_its_new_name():
     with pytest.raises(ConfigError, match=r'set faces\.inset_ends'):
         Config().updated({'faces.depth_ends': 0.3})

@@ -36,7 +36,7 @@ class Ingredient:
     Attributes
     ----------
     meaning : str
-        What is done without it.
+        Description of the method without it.
     settings : mapping
         Values of `Config` that switch it off, by dotted name.
 

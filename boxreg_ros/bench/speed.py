@@ -30,7 +30,7 @@ from boxreg_ros.core import observation as sampling
 from boxreg_ros.core.batch import EXTENT, free_variables, Problem, Solution, State
 from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.input_model import expect, InputModel
-from boxreg_ros.core.lbfgs import minimize, Minimum, select
+from boxreg_ros.core.lbfgs import HISTORY, minimize, Minimum, select
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.registrar import BoxRegistrar
@@ -163,7 +163,7 @@ def fixed(problem: Problem, config: Config, references: int) -> dict[str, float]
         objective = Objective(terms, x, length, free)
         settings = config.solver
         iterations = settings.rounds * settings.iterations
-        return minimize(objective, x, iterations, settings.history, 0.0, objective.newton)
+        return minimize(objective, x, iterations, HISTORY, 0.0, objective.newton)
 
     result = {'fixed, ours': 1e3 * _time(ours, config) / len(x)}
     begin = perf_counter()
@@ -403,7 +403,7 @@ def _torch_minimum(
     search = torch.optim.LBFGS(
         [x],
         max_iter=REFERENCE_ITERATIONS,
-        history_size=config.solver.history,
+        history_size=HISTORY,
         line_search_fn='strong_wolfe',
     )
 

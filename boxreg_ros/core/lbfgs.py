@@ -25,6 +25,9 @@ MAX_BACKTRACKS = 12
 """Most trials of one direction. Chosen: the last step is 2^-11 of the first, or shorter."""
 SYNC_INTERVAL = 4
 """Turns after which a GPU is asked for the number of running rows. Chosen: asking waits for it."""
+HISTORY = 6
+"""Curvature pairs that are kept. Literature: 3 to 20 (Nocedal & Wright, section 7.2). With one
+iteration in a round, as by default, none is used."""
 
 Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Metric = Callable[[Tensor, Tensor], Tensor]

@@ -11,7 +11,7 @@ from boxreg_ros.core.batch import EXTENT, free_variables, POSE_ERRORS, Problem, 
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
 from boxreg_ros.core.input_model import expect
-from boxreg_ros.core.lbfgs import minimize, select
+from boxreg_ros.core.lbfgs import HISTORY, minimize, select
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import POSE
 import torch
@@ -185,7 +185,7 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
                 (gradient,) = torch.autograd.grad(loss.sum(), x)
             return loss.detach(), gradient * free[rows]
 
-        x = minimize(function, x, settings.iterations, config.solver.history, TOLERANCE).x
+        x = minimize(function, x, settings.iterations, HISTORY, TOLERANCE).x
         _, violation = total(boxes(x, every), problem, settings, multipliers, rounding)
         multipliers = multipliers + violation * penalty
     variance = problem.of_class(*POSE_ERRORS) ** 2

@@ -36,7 +36,7 @@ from boxreg_ros.core.input_model import (
     InputModel,
     InputNoise,
 )
-from boxreg_ros.core.lbfgs import minimize, select
+from boxreg_ros.core.lbfgs import HISTORY, minimize, select
 from boxreg_ros.core.prior import marginalise
 from boxreg_ros.core.rigid_shape import agreement
 from boxreg_ros.core.terms import Objective, Term
@@ -236,7 +236,7 @@ def run_round(
 
     x = state.pack()
     objective = Objective(weighted, x, problem.length, free)
-    limits = config.solver.iterations, config.solver.history, config.solver.tolerance
+    limits = config.solver.iterations, HISTORY, config.solver.tolerance
     found = State.unpack(minimize(objective, x, *limits, objective.newton).x, problem.length)
 
     step = (found.pose - state.pose) / problem.of_class(*POSE_ERRORS)[:, None]
