@@ -438,8 +438,8 @@ def test_unfit_observations_are_not_learnt_from(unfit):
 
 
 def test_occlusion_insets_are_learnt_from_occluded_faces_only():
-    # The whole expected depth of inset: faces hidden. Outwardness 0 confirms the depth, and
-    # is no evidence of the margin of visible faces.
+    # All faces are occluded. A distance of 0 confirms the occlusion inset, and is no evidence
+    # for the margin of visible faces.
     model = InputModel(FACES)
     show_faces(model, [str(i) for i in range(50)], 0.0, hidden=1.0, further=-0.05)
     found = model.offsets()
@@ -478,7 +478,7 @@ def test_without_distant_objects_there_is_no_range_inset():
 
 def test_learning_of_margins_can_be_switched_off():
     # Margins and occlusion insets are fixed then. The range inset is learnt all the same:
-    # what near and far boxes have in common, such as being too large, does not matter for that.
+    # a common error of near and far boxes, such as a size error, cancels in it.
     model = InputModel(FaceConfig(learn=False))
     far_and_near(model, 0.04, 0.12)
     show_faces(model, [f'hidden {i}' for i in range(50)], 0.0, hidden=1.0, further=-0.05)

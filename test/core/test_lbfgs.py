@@ -1,4 +1,4 @@
-"""Batched L-BFGS: known minima, those of torch's own L-BFGS, and each row by itself."""
+"""Batched L-BFGS: known minima, comparison with torch's own, and independence of rows."""
 
 from boxreg_ros.core.lbfgs import minimize, Status
 import numpy as np

@@ -232,7 +232,7 @@ def parked(boxes, heading=0.0):
 
 
 def test_an_object_that_returns_is_not_parked():
-    # 4 m forward and back: on average it goes nowhere.
+    # 4 m forward and back: the mean speed is zero.
     boxes = drive(60, 0.0, 0.0)
     boxes[:, 0] += 2.0 * (1 - np.cos(np.linspace(0, 2 * np.pi, 60)))
     assert parked(drive(60, 0.0, 0.0)).all()
@@ -422,7 +422,7 @@ def patch_observe_faces(monkeypatch, function):
 
 @pytest.mark.parametrize('estimate', ['final', 'track'])
 def test_all_points_are_used_in_the_last_round_only(monkeypatch, estimate):
-    # Of some 1,000 points about 256 until the boxes rest, then all; nothing is lost by that.
+    # About 256 of some 1,000 points until the boxes are settled, then all: the same accuracy.
     config = ALONE.updated({'estimate': estimate, 'sampling.points': 2000})
     rng, truth = np.random.default_rng(0), drive(10)
     points = [returns(box, rng, 1800) for box in truth]
@@ -514,7 +514,7 @@ def extents_used(monkeypatch):
     ('changes', 'held'), [({'extent': 'fixed'}, [0, 1, 2]), ({'mode': 'bev'}, [2]), ({}, [])]
 )
 def test_a_warm_window_uses_the_extents_of_the_tick_before(extents_used, changes, held):
-    # What is not to be solved for is the mean of the input, the rest as the tick before left it.
+    # Extents that are held fixed are the mean of the input; free ones start from the tick before.
     config, found = ALONE.updated(changes), [4.0, 2.0, 1.3]
     whole = window(drive(6), extent=0.05)
     start = given(whole)[:-1]
@@ -538,7 +538,7 @@ def test_a_cold_window_starts_from_the_mean_extents_of_the_input(extents_used, r
 
 
 def test_full_windows_leave_a_marginalisation_prior():
-    # Of ten, the length of a window, the first is to leave; shorter ones are to grow.
+    # A full window of ten observations marginalises the first; a shorter window leaves no prior.
     many = windows()
     found = register(many, ALONE, InputModel(ALONE.faces))
     assert [estimate.prior is not None for estimate in found] == [True, False, False, False]
@@ -597,8 +597,8 @@ def test_prior_is_invariant_to_whole_turns(turns):
 
 
 def test_a_failed_window_leaves_no_prior():
-    # All of one stamp, as the registrar lets none through: no speed is finite. Its neighbour
-    # remembers.
+    # All observations have one stamp, which the registrar refuses: no speed is finite. The other
+    # window still leaves a prior.
     many = [window(drive(10), 0), window(drive(10, start=(-9.0, 3.0, -1.0)), 1)]
     bad = [o._replace(stamp_ns=0) for o in many[0].observations]
     many[0] = many[0]._replace(observations=bad)

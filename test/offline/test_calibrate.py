@@ -191,7 +191,7 @@ def test_short_tracks_give_no_errors():
     assert calibrated(Config(), found) == {}
 
 
-def test_settings_that_are_written():
+def test_written_settings():
     rule = {f'vehicle.{name}': Measured(gap, 0.01, 3) for name, gap in RULE.items()}
     # Two tracks of a kind are too few for margins; those of other kinds are fixed all the same.
     rule |= {f'cyclist.{name}': Measured(0.4, 0.01, 2) for name in RULE}
@@ -223,7 +223,7 @@ def street(tmp_path_factory, scene):
     return path
 
 
-def test_what_is_written_is_what_relabel_reads(street, scene, tmp_path, capsys):
+def test_relabel_reads_the_written_settings(street, scene, tmp_path, capsys):
     rule, out = tmp_path / 'rule.yaml', tmp_path / 'out'
     truth = street.with_name('truth.csv')
     arguments = ['calibrate', street, '--truth', truth, '-o', rule, '--set', 'solver.rounds=2']

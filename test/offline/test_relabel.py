@@ -534,7 +534,7 @@ def test_spool_returns_clouds_within_the_maximum_time_offset(tmp_path):
     assert spool.take(START - SECOND * 70 // 1000, 'lidar', np.eye(4))[0] is None
 
 
-def test_missing_clouds_beside_labels_are_a_note(tmp_path):
+def test_label_frames_without_cloud_are_a_note(tmp_path):
     drive = Drive(sweeps=6)
     gone = drive.stamps[2:4]
     drive.items = [item for item in drive.items if item[0] != '/points' or item[1] not in gone]

@@ -287,7 +287,7 @@ def test_overlay_without_a_recording_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_clouds_are_written_beside_labels(tmp_path):
+def test_overlay_with_points_writes_clouds(tmp_path):
     """--with-points writes points and intensities of the recording as PCD files."""
     drive = Drive(sweeps=3)
     m = drive.messages
