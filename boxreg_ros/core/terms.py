@@ -256,33 +256,44 @@ class TermArrays:
     def linearise(self, x: Tensor) -> tuple[Tensor, Tensor, BandedFactor]:
         """Return values (B,), gradients (B, D) and the factor of the curvature at `x` (B, D)."""
         B, D = x.shape
-        value = np.empty(B)
-        gradient = np.empty((B, D))
-        factor = BandedFactor.empty(B, D, SHARED)
-        self._kernels.normal_equations.linearise(
-            _array(x), self._terms, self._expected, self._shared_weight, self._free, value,
-            gradient, *(part.numpy() for part in factor),
-        )  # fmt: skip
-        return torch.from_numpy(value), torch.from_numpy(gradient), factor
+        curvature = BandedFactor.empty(B, D, SHARED)
+        length = (D - SHARED) // LINK
+        value, gradient = self._accumulate(x, np.arange(B), length, curvature)
+        arrays = (part.numpy() for part in curvature)
+        self._kernels.normal_equations.factorise_windows(self._free, *arrays)
+        return torch.from_numpy(value), torch.from_numpy(gradient * self._free), curvature
 
     def evaluate(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`."""
-        value = np.empty(len(x))
-        gradient = np.empty(x.shape)
-        self._kernels.normal_equations.evaluate(
-            _array(x), rows.numpy(), self._terms, self._expected, self._shared_weight, self._free,
-            value, gradient,
-        )  # fmt: skip
-        return torch.from_numpy(value), torch.from_numpy(gradient)
+        D = x.shape[1]
+        nothing = BandedFactor.empty(0, D, SHARED)
+        length = (D - SHARED) // LINK
+        value, gradient = self._accumulate(x, rows.numpy(), length, nothing)
+        return torch.from_numpy(value), torch.from_numpy(gradient * self._free[rows.numpy()])
 
     def marginalise(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the `MarginalPrior` of the windows at `x` (B, D), see `prior.marginalise`."""
-        B = len(x)
-        prior = np.empty((B, PRIOR_SIZE)), np.empty((B, PRIOR_SIZE))
+        B, D = x.shape
+        curvature = BandedFactor.empty(B, D, SHARED)
+        _, gradient = self._accumulate(x, np.arange(B), 1, curvature)
+        mean = np.empty((B, PRIOR_SIZE))
+        step = np.empty((B, PRIOR_SIZE))
         information = np.empty((B, PRIOR_SIZE, PRIOR_SIZE))
-        self._kernels.normal_equations.marginalise(_array(x), self._terms, *prior, information)
-        mean, step = (torch.from_numpy(part) for part in prior)
-        return mean, step, torch.from_numpy(information)
+        arrays = (part.numpy() for part in curvature)
+        self._kernels.normal_equations.marginalise(
+            _array(x), gradient, *arrays, mean, step, information
+        )
+        return torch.from_numpy(mean), torch.from_numpy(step), torch.from_numpy(information)
+
+    def _accumulate(self, x: Tensor, rows: Any, last: int, curvature: BandedFactor) -> Any:
+        """Return values and gradients at `x`, and write the curvature; see the kernel."""
+        value = np.empty(len(x))
+        gradient = np.empty(tuple(x.shape))
+        self._kernels.normal_equations.accumulate(
+            _array(x), rows, last, self._terms, self._expected, self._shared_weight, value,
+            gradient, *(part.numpy() for part in curvature),
+        )  # fmt: skip
+        return value, gradient
 
 
 def _array(tensor: Tensor) -> Any:

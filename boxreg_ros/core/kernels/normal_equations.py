@@ -358,48 +358,56 @@ def add_window(poses, shared, last, data, gradient, band, border, corner, curved
 
 
 @kernel
-def evaluate(x, rows, terms, shared_expected, W_shared, free, value, gradient):
-    """Write values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows` of `terms`."""
+def accumulate(x, rows, last, terms, expected, W_shared, value, gradient, band, border, corner):
+    """
+    Write the sums of the residuals of windows, at `x` (b, D) of the windows `rows` of `terms`.
+
+    Parameters
+    ----------
+    last : int
+        Only residuals that begin at the first `last` observations; less than N leaves out the
+        prior on the shared variables too, which belongs to no observation.
+    value, gradient : array, shapes (b,) and (b, D)
+        Written.
+    band, border, corner : array, shapes (b, 6 N, 18), (b, 6 N, S) and (b, S, S)
+        Gauss-Newton matrices, written; of length b = 0 where they are not wanted.
+
+    """
+    curved = len(band) > 0
+    N = (x.shape[1] - SHARED) // 6
+    no_band = np.empty((0, BAND))
+    no_border = np.empty((6 * N, 0))
+    no_corner = np.empty((0, 0))
     for i in range(len(rows)):
         b = rows[i]
-        N = (x.shape[1] - SHARED) // 6
         poses = x[i, : 6 * N].reshape(N, 6)
         shared = x[i, 6 * N :]
-        unused = np.empty((0, BAND)), np.empty((6 * N, 0)), np.empty((0, 0))
         gradient[i] = 0.0
+        own_band, own_border, own_corner = no_band, no_border, no_corner
+        if curved:
+            band[i] = 0.0
+            border[i] = 0.0
+            corner[i] = 0.0
+            own_band, own_border, own_corner = band[i], border[i], corner[i]
         value[i] = add_window(
-            poses, shared, N, window_rows(terms, b), gradient[i], *unused, False
-        ) + add_shared_prior(
-            shared, shared_expected[b], W_shared[b], gradient[i], 6 * N, unused[2], False
-        )
-        for k in range(x.shape[1]):
-            gradient[i, k] *= free[b, k]
+            poses, shared, last, window_rows(terms, b), gradient[i], own_band, own_border,
+            own_corner, curved,
+        )  # fmt: skip
+        if last >= N:
+            value[i] += add_shared_prior(
+                shared, expected[b], W_shared[b], gradient[i], 6 * N, own_corner, curved
+            )
 
 
 @kernel
-def linearise(x, terms, shared_expected, W_shared, free, value, gradient, band, border, corner):
+def factorise_windows(free, band, border, corner):
     """
-    Write values, gradients and the Cholesky factors of the Gauss-Newton matrices of all windows.
+    Replace Gauss-Newton matrices by their Cholesky factors in the `free` variables (B, D).
 
     Factors of a matrix that is not positive definite are NaN.
 
     """
-    for b in range(len(x)):
-        N = (x.shape[1] - SHARED) // 6
-        poses = x[b, : 6 * N].reshape(N, 6)
-        shared = x[b, 6 * N :]
-        gradient[b] = 0.0
-        band[b] = 0.0
-        border[b] = 0.0
-        corner[b] = 0.0
-        value[b] = add_window(
-            poses, shared, N, window_rows(terms, b), gradient[b], band[b], border[b], corner[b],
-            True,
-        ) + add_shared_prior(
-            shared, shared_expected[b], W_shared[b], gradient[b], 6 * N, corner[b], True
-        )  # fmt: skip
-        for k in range(x.shape[1]):
-            gradient[b, k] *= free[b, k]
+    for b in range(len(band)):
         fix_variables(band[b], border[b], corner[b], free[b])
         if not factorise(band[b], border[b], corner[b]):
             band[b] = np.nan
@@ -420,38 +428,34 @@ def window_rows(terms, b):
 
 
 @kernel
-def marginalise(x, terms, mean, step, information):
+def marginalise(x, gradient, band, border, corner, mean, step, information):
     """
     Write the quadratic form that stands for the oldest observation of each window.
 
     In the next two poses and the shared variables: where they are (B, 34), the step from there to
-    the minimum (B, 34), and the curvature (B, 34, 34).
+    the minimum (B, 34), and the curvature (B, 34, 34). The sums of the residuals of the oldest
+    observation, from `accumulate`, are the input.
 
     """
+    N = (x.shape[1] - SHARED) // 6
+    head = min(3, N)
+    size = 12 + SHARED
     for b in range(len(x)):
-        N = (x.shape[1] - SHARED) // 6
-        head = min(3, N)
-        size = 12 + SHARED
         poses = x[b, : 6 * N].reshape(N, 6)
         shared = x[b, 6 * N :]
-        gradient = np.zeros(6 * N + SHARED)
-        band = np.zeros((6 * N, BAND))
-        border = np.zeros((6 * N, SHARED))
-        corner = np.zeros((SHARED, SHARED))
-        add_window(poses, shared, 1, window_rows(terms, b), gradient, band, border, corner, True)
         # Dense, in the order: oldest pose, two next poses, shared variables.
         form = np.zeros((18 + SHARED, 18 + SHARED))
         pull = np.zeros(18 + SHARED)
         for i in range(6 * head):
-            pull[i] = gradient[i]
+            pull[i] = gradient[b, i]
             for k in range(min(BAND, 6 * head - i)):
-                form[i, i + k] = band[i, k]
+                form[i, i + k] = band[b, i, k]
             for s in range(SHARED):
-                form[i, 18 + s] = border[i, s]
+                form[i, 18 + s] = border[b, i, s]
         for s in range(SHARED):
-            pull[18 + s] = gradient[6 * N + s]
+            pull[18 + s] = gradient[b, 6 * N + s]
             for t in range(s, SHARED):
-                form[18 + s, 18 + t] = corner[s, t]
+                form[18 + s, 18 + t] = corner[b, s, t]
         for i in range(6):
             form[i, i] += RIDGE
         is_definite = eliminate(form, pull, 6)
