@@ -360,13 +360,19 @@ def add_window(poses, shared, last, data, gradient, band, border, corner, curved
 @kernel
 def accumulate(x, rows, last, terms, expected, W_shared, value, gradient, band, border, corner):
     """
-    Write the sums of the residuals of windows, at `x` (b, D) of the windows `rows` of `terms`.
+    Write the sums of the residuals of some windows.
 
     Parameters
     ----------
+    x, rows : array, shapes (b, D) and (b,)
+        Variables, and which windows of `terms` they are of.
     last : int
         Only residuals that begin at the first `last` observations; less than N leaves out the
         prior on the shared variables too, which belongs to no observation.
+    terms : tuple of array
+        As in `boxreg_ros.core.terms.TermArrays`.
+    expected, W_shared : array, shapes (B, 22) and (B, 22, 22)
+        Mean and weight of the shared variables.
     value, gradient : array, shapes (b,) and (b, D)
         Written.
     band, border, corner : array, shapes (b, 6 N, 18), (b, 6 N, S) and (b, S, S)

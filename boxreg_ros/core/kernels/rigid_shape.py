@@ -63,6 +63,8 @@ def agreement(
         Cells along each axis of a box.
     limits : tuple of float
         `SHAPE_MARGIN`, `MIN_FLATNESS`, `MIN_CELL_POINTS`, `EFFECTIVE_POINTS`, `STEP_RIDGE`.
+    information, wanted : array, shapes (B, N, 6, 6) and (B, N, 6)
+        Written.
 
     """
     margin, flatness, min_points, independent, ridge = limits
