@@ -86,6 +86,15 @@ class Graph:
                 assert process.popen.poll() is None or process.is_ending, self.outputs()
             self.executor.spin_once(timeout_sec=0.02)
 
+    def spin_until_quiet(self):
+        """Handle all messages that have arrived: until none is handled for 0.2 s."""
+        last_handled = time.monotonic()
+        while time.monotonic() < last_handled + 0.2:
+            begun = time.monotonic()
+            self.executor.spin_once(timeout_sec=0.02)
+            if time.monotonic() < begun + 0.015:  # it did not wait to the end: there was work
+                last_handled = time.monotonic()
+
     def wait_until_connected(self):
         """Wait until each publisher here has a subscriber, and each subscription a publisher."""
         for topic, publisher in self.publishers.items():
@@ -135,8 +144,7 @@ class NodeProcess:
         self.popen.send_signal(number)
         self._graph.wait(lambda: self.popen.poll() is not None, 'the node to end', 10.0)
         took = time.monotonic() - begun
-        for _ in range(20):  # for messages on their way
-            self._graph.executor.spin_once(timeout_sec=0.01)
+        self._graph.spin_until_quiet()
         return took
 
     def kill(self):
