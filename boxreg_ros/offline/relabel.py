@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from boxreg_ros import __version__
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import register
+from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader
 from boxreg_ros.offline.registration_worker import registration_worker
@@ -175,6 +176,8 @@ def _summary(
         'recorded_apart': {t: round(late, 3) for t, late in findings.apart.items()},
         'heading_flips': sink.heading_flips,
         'dropped': _dropped(registered, findings),
+        'without_stamp': _without_stamp(findings),
+        'damage': [damage._asdict() for damage in findings.damages],
         'first_missing_transform': findings.first_missing_transform,
         'first_unreadable': findings.first_unreadable,
         'warning': findings.warning or ('' if sink.boxes_in else NO_BOXES),
@@ -201,6 +204,12 @@ def _dropped(registered: Counter[str], findings: Findings) -> dict[str, int]:
     counts['sweep_without_transform'] = findings.counts['sweep_without_transform']
     counts['unreadable'] = findings.unreadable
     return {name: count for name, count in sorted(counts.items()) if count}
+
+
+def _without_stamp(findings: Findings) -> dict[str, int]:
+    """Return the number of clouds and box arrays whose header has no stamp."""
+    counts = {name: findings.counts[f'{name}_without_stamp'] for name in ('sweeps', 'box_arrays')}
+    return {name: count for name, count in counts.items() if count}
 
 
 def _versions() -> dict[str, str]:
@@ -239,6 +248,14 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
 
 def notes(summary: dict[str, Any]) -> Iterator[str]:
     """Yield warnings about the input and the results, one line each."""
+    if summary['damage']:
+        yield _damage_line(summary['damage'])
+    if summary['without_stamp']:
+        counts = ' and '.join(f'{n:,} {kind}' for kind, n in summary['without_stamp'].items())
+        yield (
+            f'{counts} have the stamp 0 in their header and cannot be used: receive times do not '
+            f'replace stamps; let the publishers set them'
+        ).replace('box_arrays', 'box arrays')
     if summary['warning']:
         yield summary['warning']
     if summary['first_missing_transform']:
@@ -258,6 +275,23 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
         )
     if has_failed(summary):
         yield _why_none_was_refined(summary)
+
+
+def is_complete(summary: dict[str, Any]) -> bool:
+    """Return whether all messages of the recording were read, with usable stamps."""
+    return not (
+        summary['damage'] or summary['without_stamp'] or 'unreadable' in summary['dropped']
+    )
+
+
+def _damage_line(damages: list[dict[str, Any]]) -> str:
+    """Return all damages of a recording in one line."""
+    count = len(damages)
+    parts = f'{count:,} parts' if count > 1 else 'a part'
+    return (
+        f'{parts} of the recording cannot be read; the rest was used; first: '
+        f'{Damage(**damages[0])}; {SUMMARY} lists {"all" if count > 1 else "it"} under "damage"'
+    )
 
 
 def has_failed(summary: dict[str, Any]) -> bool:

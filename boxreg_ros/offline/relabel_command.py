@@ -70,6 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='do nothing if OUT holds the result of the same request, files and settings',
     )  # fmt: skip
     parser.add_argument(
+        '--strict', action='store_true',
+        help='exit with status 1 if a part of the recording could not be read, or has no stamps',
+    )  # fmt: skip
+    parser.add_argument(
         '--workers', type=int, metavar='N', help='CPU cores of the solver (sets solver.threads)'
     )
 
@@ -94,13 +98,13 @@ def run(args: argparse.Namespace) -> int:
     Status 1 also if the recording has boxes and none was refined; the result is kept.
 
     """
-    from boxreg_ros.offline.relabel import closing_line, has_failed, notes, relabel
+    from boxreg_ros.offline.relabel import closing_line, notes, relabel
 
     request = _request(args)
     earlier = earlier_summary(args.out)
     if args.resume and earlier and _is_complete(earlier, request, args.out):
         print(f'{args.out}: up to date, made from the same files with the same settings')
-        return FAILED if has_failed(earlier) else DONE
+        return _status(earlier, args.strict)
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
     from tqdm import tqdm
@@ -111,7 +115,14 @@ def run(args: argparse.Namespace) -> int:
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))
-    return FAILED if has_failed(summary) else DONE
+    return _status(summary, args.strict)
+
+
+def _status(summary: dict[str, Any], is_strict: bool) -> int:
+    """Return the exit status of a run with this summary."""
+    from boxreg_ros.offline.relabel import has_failed, is_complete
+
+    return FAILED if has_failed(summary) or (is_strict and not is_complete(summary)) else DONE
 
 
 def _request(args: argparse.Namespace) -> Request:
