@@ -8,7 +8,7 @@ import json
 import os
 from pathlib import Path
 import shutil
-from typing import Any
+from typing import Any, TextIO
 from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
@@ -95,6 +95,18 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
             os.replace(earlier, out)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(earlier, ignore_errors=True)
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[TextIO]:
+    """Yield a file that replaces `path` on success and is deleted on failure."""
+    partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
+    try:
+        with partial.open('w', encoding='utf-8', newline='') as file:
+            yield file
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _check_replaceable(out: Path) -> None:
