@@ -13,7 +13,7 @@ REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
 
 DIGEST_LENGTH = 12
-"""Letters of the digest of the sources: two versions have the same one with 1 in 10^14 (chosen)."""
+"""Letters of the digest of the sources. Chosen: 48 bits."""
 
 _F = TypeVar('_F', bound=Callable[..., Any])
 
