@@ -32,6 +32,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.11',
     install_requires=[
+        'lz4>=4',
         'mcap>=1.6,<2',
         'numba>=0.59',
         'numpy>=1.26,<3',
@@ -41,6 +42,7 @@ setup(
         'scipy>=1.11',
         'torch>=2.3',
         'tqdm>=4.60',
+        'zstandard>=0.21',
     ],
     extras_require={
         # A baseline of `boxreg bench`, and its figures.

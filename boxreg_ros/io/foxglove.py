@@ -19,7 +19,7 @@ from mcap.records import Schema
 
 FOXGLOVE_ENCODINGS = ('protobuf', 'json')
 """Encodings of messages with a schema of Foxglove."""
-TYPES = {
+ROS_TYPES = {
     'foxglove.SceneUpdate': 'foxglove_msgs/msg/SceneUpdate',
     'foxglove.PointCloud': 'sensor_msgs/msg/PointCloud2',
     'foxglove.FrameTransform': 'tf2_msgs/msg/TFMessage',
@@ -64,7 +64,7 @@ A field whose name ends with ``?`` may be null.
 
 def ros_type(schema_name: str) -> str:
     """Return the ROS type that messages of a schema are read as; else the name of the schema."""
-    return TYPES.get(schema_name, schema_name)
+    return ROS_TYPES.get(schema_name, schema_name)
 
 
 def decoder_of(origin: str, topic: str, schema: Schema) -> Callable[[bytes], Any]:

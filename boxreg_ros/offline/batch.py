@@ -37,7 +37,7 @@ JOBS = 'jobs'
 """Folder with the key and the log of each job."""
 MANIFESTS = ('.txt', '.lst')
 Process = subprocess.Popen[bytes]
-COLUMNS = (
+INDEX_COLUMNS = (
     'drive', 'status', 'exit_status', 'attempts', 'seconds', 'sweeps', 'boxes_in', 'refined',
     'kept', 'damages', 'last_line', 'key',
 )  # fmt: skip
@@ -347,7 +347,7 @@ def _write_results(out: Path, jobs: list[Job], shard: str) -> None:
     """Write the index, the merged summary and the report over all drives."""
     rows = [job.row() for job in jobs]
     with written_whole(out / f'index{shard}.csv') as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator='\n')
+        writer = csv.DictWriter(file, INDEX_COLUMNS, lineterminator='\n')
         writer.writeheader()
         writer.writerows(rows)
     totals = {

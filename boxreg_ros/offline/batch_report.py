@@ -10,9 +10,9 @@ from typing import Any, TextIO
 
 REVIEW = 'review.csv'
 RISK = 'risk'
-MAX_TRACKS = 100
+MAX_LISTED_TRACKS = 100
 """Tracks in the report; a page of more is not read."""
-STYLE = (
+PAGE_STYLE = (
     'body{font-family:sans-serif;margin:2em}table{border-collapse:collapse}'
     'td,th{border:1px solid #ccc;padding:.2em .5em;text-align:left}.failed{background:#fdd}'
 )
@@ -33,7 +33,9 @@ def write_batch_report(file: TextIO, out: Path, rows: Sequence[dict[str, Any]]) 
 
     """
     tracks = _riskiest(out, [row['drive'] for row in rows])
-    file.write(f'<!doctype html><meta charset="utf-8"><title>boxreg</title><style>{STYLE}</style>')
+    file.write(
+        f'<!doctype html><meta charset="utf-8"><title>boxreg</title><style>{PAGE_STYLE}</style>'
+    )
     file.write(f'<h1>{len(rows):,} drives</h1>')
     if tracks:
         file.write('<h2>Tracks to look at first</h2>')
@@ -59,7 +61,7 @@ def _riskiest(out: Path, drives: Iterable[str]) -> list[dict[str, Any]]:
                 except (KeyError, TypeError, ValueError):
                     continue  # a review without this column has no order
     found.sort(key=lambda item: -item[0])
-    return [row for _, row in found[:MAX_TRACKS]]
+    return [row for _, row in found[:MAX_LISTED_TRACKS]]
 
 
 def _write_table(file: TextIO, rows: Sequence[dict[str, Any]]) -> None:

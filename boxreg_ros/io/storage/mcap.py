@@ -32,7 +32,7 @@ from rosbags.interfaces import (
 from rosbags.typesys.msg import normalize_msgtype
 import zstandard
 
-MAGIC = b'\x89MCAP0\r\n'
+MCAP_MAGIC = b'\x89MCAP0\r\n'
 HEAD_BYTES = 9
 """Operation code (1 byte) and length (8 bytes) in front of each record."""
 FOOTER_BYTES = HEAD_BYTES + 20
@@ -42,7 +42,7 @@ COMPRESSIONS = ('', 'lz4', 'zstd')
 GROUP_BYTES = 2**22
 """Messages outside of chunks are grouped to chunks of this size [bytes], as writers do."""
 SEARCH_BYTES = 2**20
-DEFINITIONS = {
+SCHEMA_FORMATS = {
     'ros2msg': MessageDefinitionFormat.MSG,
     'ros1msg': MessageDefinitionFormat.MSG,
     'ros2idl': MessageDefinitionFormat.IDL,
@@ -121,10 +121,10 @@ class McapFile(ChunkedFile):
         schema = self._schemas.get(channel.schema_id)
         kind = schema.name if schema else channel.message_encoding
         definition = MessageDefinition(MessageDefinitionFormat.NONE, '')
-        if schema and schema.encoding in DEFINITIONS:
+        if schema and schema.encoding in SCHEMA_FORMATS:
             kind = normalize_msgtype(kind)
             text = schema.data.decode(errors='replace')
-            definition = MessageDefinition(DEFINITIONS[schema.encoding], text)
+            definition = MessageDefinition(SCHEMA_FORMATS[schema.encoding], text)
         return Connection(
             channel.id, channel.topic, kind, definition, '', count,
             ConnectionExtRosbag2(channel.message_encoding, []), self,
@@ -173,9 +173,9 @@ class McapFile(ChunkedFile):
         return statistics.channel_message_counts
 
     def _summary_records(self) -> list[records.McapRecord]:
-        footer_byte = self.size - FOOTER_BYTES - len(MAGIC)
+        footer_byte = self.size - FOOTER_BYTES - len(MCAP_MAGIC)
         end = self._bytes(footer_byte, self.size)
-        if self._bytes(0, len(MAGIC)) != MAGIC or end[FOOTER_BYTES:] != MAGIC:
+        if self._bytes(0, len(MCAP_MAGIC)) != MCAP_MAGIC or end[FOOTER_BYTES:] != MCAP_MAGIC:
             raise RecordingError('expected the magic bytes of MCAP at begin and end')
         footer = records.Footer.read(ReadDataStream(BytesIO(end[HEAD_BYTES:])))
         summary = self._bytes(footer.summary_start, footer_byte)
@@ -232,7 +232,7 @@ class McapFile(ChunkedFile):
 
     def _places(self) -> Iterator[_Place]:
         """Yield the records up to the end of the data; skip and note what is no record."""
-        first_byte = len(MAGIC)
+        first_byte = len(MCAP_MAGIC)
         while first_byte < self.size:
             place = self._place_at(first_byte)
             if place is None:

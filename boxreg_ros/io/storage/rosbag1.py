@@ -22,7 +22,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, normalize, RecordType
 from rosbags.typesys.msg import normalize_msgtype
 
-MAGIC = b'#ROSBAG V2.0\n'
+BAG_MAGIC = b'#ROSBAG V2.0\n'
 CHUNK_MARK = b'op=\x05'
 """The field of a record's header that marks a chunk."""
 MAX_HEAD_BYTES = 128
@@ -42,7 +42,7 @@ class Rosbag1File(ChunkedFile):
     """
 
     def _open(self) -> None:
-        if self._bytes(0, len(MAGIC)) != MAGIC:
+        if self._bytes(0, len(BAG_MAGIC)) != BAG_MAGIC:
             raise RecordingError(f'{self.name}: expected a ROS 1 bag of version 2.0')
         if not self._read_index():
             self._scan()
@@ -69,7 +69,7 @@ class Rosbag1File(ChunkedFile):
     def _scan(self) -> None:
         """Find all chunks and connections without the index."""
         self._found: dict[int, Connection] = {}
-        first_byte = len(MAGIC)
+        first_byte = len(BAG_MAGIC)
         while first_byte < self.size:
             place = self._record_at(first_byte)
             if place is None:

@@ -29,7 +29,10 @@ from rosbags.interfaces import (
 from rosbags.rosbag2.metadata import parse_qos
 
 WAL_SUFFIX = '-wal'
-DEFINITIONS = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
+DEFINITION_FORMATS = {
+    'ros2msg': MessageDefinitionFormat.MSG,
+    'ros2idl': MessageDefinitionFormat.IDL,
+}
 MAX_ID = 2**62
 MIN_STEPS = 10**6
 STEPS_PER_BYTE = 2
@@ -151,9 +154,9 @@ class SqliteFile:
         except sqlite3.OperationalError:  # no such table
             return {}
         return {
-            kind: MessageDefinition(DEFINITIONS[encoding], text)
+            kind: MessageDefinition(DEFINITION_FORMATS[encoding], text)
             for kind, encoding, text in rows
-            if encoding in DEFINITIONS and isinstance(text, str)
+            if encoding in DEFINITION_FORMATS and isinstance(text, str)
         }
 
     def _counts(self) -> dict[int, int]:
