@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 import time
-from typing import Any, cast
+from typing import Any, cast, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
@@ -14,13 +15,18 @@ from boxreg_ros.core.observation import Observation
 from boxreg_ros.core.registrar import GetEstimates, Submit
 from boxreg_ros.core.registration import Estimate, register
 from boxreg_ros.core.window import Window
+from boxreg_ros.io.warm_up import warm_up
+from boxreg_ros.offline.compilation import announced_compilation
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
 import numpy as np
+import torch
 
 
 @contextmanager
-def registration_worker(config: Config, clock: Stopwatch) -> Iterator[Submit | None]:
+def registration_worker(
+    config: Config, clock: Stopwatch, announce: Callable[[str], None]
+) -> Iterator[Submit | None]:
     """
     Yield a function that starts `register` in a worker process, for `BoxRegistrar`.
 
@@ -33,21 +39,27 @@ def registration_worker(config: Config, clock: Stopwatch) -> Iterator[Submit | N
         Settings.
     clock : Stopwatch
         The time in `register` is added to its stage ``solve``.
+    announce : callable
+        Called with what is waited for where that takes long.
 
     """
     if config.estimate != 'track' or config.device != 'cpu':
-        yield None
+        with announced_compilation(announce):
+            yield None
         return
-    with run_in_worker(_serve, 'registers windows') as process:
-        yield _Dispatcher(process, clock)
+    with run_in_worker(partial(_serve, config), 'registers windows') as process:
+        yield _Dispatcher(process, clock, announce)
 
 
 class _Dispatcher:
     """Send windows to the worker and receive their estimates."""
 
-    def __init__(self, process: WorkerProcess, clock: Stopwatch) -> None:
+    def __init__(
+        self, process: WorkerProcess, clock: Stopwatch, announce: Callable[[str], None]
+    ) -> None:
         self._process = process
         self._clock = clock
+        self._announce = announce
 
     def __call__(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
         """Send windows; return a function that waits for their estimates."""
@@ -56,7 +68,11 @@ class _Dispatcher:
         self._process.send((_packed(windows), config, model))
 
         def awaited() -> list[Estimate | None]:
-            estimates, state, seconds = self._process.receive()
+            answer = self._process.receive()
+            while isinstance(answer, _Activity):
+                self._announce(answer.text)
+                answer = self._process.receive()
+            estimates, state, seconds = answer
             vars(model).update(state)  # `register` has updated the copy in the worker
             self._clock.add('solve', seconds)
             return cast(list[Estimate | None], estimates)
@@ -64,8 +80,17 @@ class _Dispatcher:
         return awaited
 
 
-def _serve(receive: Receive, send: Send) -> None:
+class _Activity(NamedTuple):
+    """What the worker does before it can answer."""
+
+    text: str
+
+
+def _serve(config: Config, receive: Receive, send: Send) -> None:
     """Register windows in the worker until the connection is closed."""
+    torch.set_num_threads(1)  # the solver divides the windows among threads of its own
+    with announced_compilation(lambda text: send(_Activity(text))):
+        warm_up(config)  # while the recording is read up to the first full window
     while True:
         packed, config, model = receive()
         begun = time.perf_counter()

@@ -19,7 +19,6 @@ from typing import Any
 
 from boxreg_ros.errors import BoxregError
 import numpy as np
-import torch
 
 Receive = Callable[[], Any]
 Send = Callable[[Any], None]
@@ -131,7 +130,6 @@ def _run(serve: Serve, connection: Connection) -> None:
     """Run the function in the worker and send back the exception it raises."""
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the parent handles them and ends the worker
-    torch.set_num_threads(1)
 
     def receive() -> Any:
         return _receive(connection)

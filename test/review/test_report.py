@@ -231,7 +231,9 @@ def test_missing_package_is_refused_before_reading(tmp_path, monkeypatch, capsys
 def test_progress_counts_both_passes(tmp_path):
     shown = []
     request = Request((Drive(sweeps=4).write(tmp_path / 'drive'),), config=QUICK, report=True)
-    relabel(request, tmp_path / 'out', lambda done, total: shown.append(done / total))
+    progress = Progress()
+    progress.show = lambda done, total: shown.append(done / total)
+    relabel(request, tmp_path / 'out', progress)
     assert shown == sorted(shown)
     assert 0.4 < shown[len(shown) // 2 - 1] <= 0.5
     assert shown[-1] == pytest.approx(1.0)
