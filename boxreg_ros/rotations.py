@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
     from torch import Tensor
 
 GIMBAL_LOCK = 1e-9
@@ -127,7 +126,17 @@ def rpy_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
 
 def quaternion_from_rpy(rpy: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), x y z w with w >= 0, of roll, pitch, yaw (..., 3)."""
-    return quaternion_from_matrix(matrix_from_rpy(rpy))
+    half = np.asarray(rpy, float) / 2
+    cr, cp, cy = np.moveaxis(np.cos(half), -1, 0)
+    sr, sp, sy = np.moveaxis(np.sin(half), -1, 0)
+    parts = [
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ]
+    quaternions = np.stack(parts, -1)
+    return np.where(quaternions[..., 3:] < 0, -quaternions, quaternions)
 
 
 def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: float) -> Floats:
@@ -154,7 +163,7 @@ def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: f
 
 
 @cache
-def _scipy() -> type[Rotation]:
+def _scipy() -> Any:
     """Return SciPy's class; its import takes 0.3 s, which `boxreg --help` does not need."""
     from scipy.spatial.transform import Rotation
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 import time
-from typing import Any, cast, NamedTuple
+from typing import Any, cast
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
@@ -21,6 +21,9 @@ from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
 import numpy as np
 import torch
+
+WARM = ''
+"""Activity of a worker that is ready for windows."""
 
 
 @contextmanager
@@ -60,37 +63,38 @@ class _Dispatcher:
         self._process = process
         self._clock = clock
         self._announce = announce
+        self._is_warm = False
 
     def __call__(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
         """Send windows; return a function that waits for their estimates."""
         if not windows:
             return list
+        self._wait_until_warm()
         self._process.send((_packed(windows), config, model))
 
         def awaited() -> list[Estimate | None]:
-            answer = self._process.receive()
-            while isinstance(answer, _Activity):
-                self._announce(answer.text)
-                answer = self._process.receive()
-            estimates, state, seconds = answer
+            estimates, state, seconds = self._process.receive()
             vars(model).update(state)  # `register` has updated the copy in the worker
             self._clock.add('solve', seconds)
             return cast(list[Estimate | None], estimates)
 
         return awaited
 
-
-class _Activity(NamedTuple):
-    """What the worker does before it can answer."""
-
-    text: str
+    def _wait_until_warm(self) -> None:
+        """Announce what the worker does before it takes its first windows."""
+        while not self._is_warm:
+            activity = self._process.receive()
+            if activity:
+                self._announce(activity)
+            self._is_warm = activity == WARM
 
 
 def _serve(config: Config, receive: Receive, send: Send) -> None:
     """Register windows in the worker until the connection is closed."""
     torch.set_num_threads(1)  # the solver divides the windows among threads of its own
-    with announced_compilation(lambda text: send(_Activity(text))):
+    with announced_compilation(send):
         warm_up(config)  # while the recording is read up to the first full window
+    send(WARM)
     while True:
         packed, config, model = receive()
         begun = time.perf_counter()

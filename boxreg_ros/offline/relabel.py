@@ -79,6 +79,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             registration_worker(request.config, clock, progress.announce)
         )
         recording = ReadAhead(process)
+        clock.begun('start')
         registrar = BoxRegistrar(request.config, submit)
         shown = _Passes(progress, recording.source.seconds, 2 if request.report else 1)
         with whole_folder(out, request.inputs()) as folder:

@@ -13,6 +13,7 @@ import sys
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.relabel import closing_line, relabel, Request
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.report import MAX_SHOWN, select_tracks, write_report
