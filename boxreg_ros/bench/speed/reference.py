@@ -27,10 +27,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-REFERENCE_ROUNDS = 8
-"""Most renewals of correspondences and weights of the reference. Chosen with the next one."""
-REFERENCE_ITERATIONS = 5
-"""Iterations of the reference in each round: 40 in all, as many as a plain fit is given."""
+REFERENCE_ROUNDS = 2
+"""Most renewals of correspondences and weights. Swept with 40 iterations in all, on six windows:
+20, 8, 4 and 2 rounds reach 3D IoU .738, .783, .796 and .798; two are the fastest as well."""
+REFERENCE_ITERATIONS = 20
+"""Iterations in each round."""
 REFERENCE_HISTORY = 10
 """Curvature pairs of the reference. Literature: 3 to 20 (Nocedal & Wright, section 7.2)."""
 
