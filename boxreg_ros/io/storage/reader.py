@@ -124,8 +124,9 @@ class Reader:
                 f'{msgtype.split("/")[0]} and record it again, or convert the recording'
             )
         decode = self.typestore.deserialize_cdr if self.is2 else self.typestore.deserialize_ros1
+        view: Any = memoryview(data)  # parts of it are no copies
         try:
-            return decode(data, msgtype)
+            return decode(view, msgtype)
         # rosbags turns all errors of malformed bytes into SerdeError; the others mean that a
         # definition refers to a type without one.
         except (SerdeError, TypesysError, KeyError) as error:
