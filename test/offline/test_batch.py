@@ -4,8 +4,9 @@ import csv
 import json
 
 from boxreg_ros.cli import main
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.batch import jobs_of
+from boxreg_ros.offline.result_folder import whole_folder
 import pytest
 from ros_messages import Drive
 
@@ -83,3 +84,12 @@ def test_shards_cover_all_drives_once(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(['batch', 'x.mcap', '-o', str(tmp_path), '--shard=3/2'])
     assert 'expected I/N' in capsys.readouterr().err
+
+
+def test_a_full_disk_is_named_and_nothing_is_written(tmp_path):
+    out = tmp_path / 'out'
+    with pytest.raises(RecordingError, match=r"output '.*/out'.*No space left"):  # noqa: SIM117
+        with whole_folder(out) as folder:
+            (folder / 'boxes.csv').symlink_to('/dev/full')
+            (folder / 'boxes.csv').write_text('x')
+    assert list(tmp_path.iterdir()) == []
