@@ -54,6 +54,10 @@ class Estimate(NamedTuple):
         One of `REASONS` for kept boxes, '' for refined ones.
     covariances : array, shape (N, 6, 6)
         Of x y z roll pitch yaw [m, rad]; the identity for kept boxes.
+    extent_covariances : array, shape (N, 3, 3)
+        Of length, width and height [m]; the identity for kept boxes.
+    face_distances : array, shape (N, 6)
+        As in `RefinedBoxes` [m].
     prior : MarginalisationPrior or None
         For the next window, if this one is full and was solved.
 
@@ -63,6 +67,8 @@ class Estimate(NamedTuple):
     status: tuple[str, ...]
     reasons: tuple[str, ...]
     covariances: Floats
+    extent_covariances: Floats
+    face_distances: Floats
     prior: MarginalisationPrior | None = None
 
 
@@ -154,25 +160,29 @@ def _accepted(
     extent = _extents(problem, solution.state, config)
     pose = solution.state.pose
     boxes = torch.cat([pose[..., :3], extent, wrap_angle(pose[..., 3:])], -1)
-    failed = _failed_tests(problem, boxes, pose, extent, solution.covariances)
+    failed = _failed_tests(problem, boxes, pose, extent, solution.posterior.poses)
     is_kept = failed.any(0)
     reasons = np.select(failed, REASONS, '')
     status = np.where(is_kept, KEPT, REFINED)
     # Before input boxes are put in: on a CPU the arrays share memory with the tensors.
     is_solved = (boxes.isfinite().all(-1) & (extent > 0).all(-1)).all(1)
-    is_solved &= solution.covariances.isfinite().all((1, 2, 3))
+    is_solved &= solution.posterior.poses.isfinite().all((1, 2, 3))
     priors = _priors(base, solution, is_solved)
     found = boxes.cpu().numpy()
     found[..., :3] += base[:, None]
-    covariances = solution.covariances.cpu().numpy()
+    covariances, extents, distances = (part.cpu().numpy() for part in solution.posterior)
+    extent_covariances = np.repeat(extents[:, None], found.shape[1], axis=1)
     for b, i in np.argwhere(problem.valid.cpu().numpy() & is_kept).tolist():
         found[b, i] = windows[b].observations[i].box
         covariances[b, i] = np.eye(6)
+        extent_covariances[b, i] = np.eye(3)
+        distances[b, i] = 0.0
     estimates = []
     for b, window in enumerate(windows):
         n = len(window.observations)
         words = tuple(status[b, :n].tolist()), tuple(reasons[b, :n].tolist())
-        estimates.append(Estimate(found[b, :n], *words, covariances[b, :n], priors[b]))
+        columns = covariances[b, :n], extent_covariances[b, :n], distances[b, :n]
+        estimates.append(Estimate(found[b, :n], *words, *columns, priors[b]))
     return estimates
 
 

@@ -61,8 +61,8 @@ class Sink:
         Refined headings that differ from the input by more than 90 degrees.
     without_cloud : int
         Box arrays without a cloud, where clouds are to be written.
-    changes : Changes or None
-        Boxes before and after, for the report.
+    changes : Changes
+        Boxes before and after, for the report and the tables of tracks.
 
     """
 
@@ -80,7 +80,7 @@ class Sink:
             name: writer_for(name, folder, provenance, options) for name in request.all_formats
         }
         self._bridge: Bridge[_Slot] = Bridge(request.bridge, self._fixed_frame, request.config)
-        self.changes = Changes(self._fixed_frame) if request.report else None
+        self.changes = Changes(self._fixed_frame)
         self._by_stamp: list[_Slot] = []  # not yet written
         self._by_ticket: dict[object, _Slot] = {}  # without a result
         self._last_ticket = 0
@@ -171,8 +171,7 @@ class Sink:
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
         self.heading_flips += _heading_flips(slot.boxes, refined)
-        if self.changes is not None:
-            self.changes.add(slot.boxes, refined)
+        self.changes.add(slot.boxes, refined)
         with self._clock('write'):
             frame = self._frame(refined, slot)
             for writer in self._writers.values():

@@ -9,7 +9,7 @@ Every box of the recording is written exactly once: refined, or unchanged with t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 import json
@@ -27,8 +27,9 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import REASONS
-from boxreg_ros.review.changes import Changes
+from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.review.report import REPORT, write_report
+from boxreg_ros.review.tables import assessed, write_tables
 from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, Sweep
 import yaml
 
@@ -83,8 +84,11 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary |= {'fingerprint': fingerprint, 'seconds': clock.seconds()}
-            if sink.changes is not None:
-                _report(folder, out, request, summary, sink.changes, clock, shown)
+            tracks = sink.changes.tracks()
+            with clock('write'):
+                write_tables(folder, assessed(tracks))
+            if request.report:
+                _report(folder, out, request, summary, tracks, clock, shown)
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
             (folder / CONFIG).write_text(settings, encoding='utf-8')
             (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
@@ -127,7 +131,7 @@ def _report(
     out: Path,
     request: Request,
     summary: dict[str, Any],
-    changes: Changes,
+    tracks: Sequence[TrackChanges],
     clock: Stopwatch,
     progress: _Progress,
 ) -> None:
@@ -135,7 +139,7 @@ def _report(
     with clock('report'):
         line = closing_line(summary, out)
         items = _items(request, progress)
-        write_report(folder / REPORT, line, summary, request.config, changes.tracks(), items)
+        write_report(folder / REPORT, line, summary, request.config, tracks, items)
     summary['seconds'] = clock.seconds()
 
 
