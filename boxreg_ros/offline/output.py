@@ -14,7 +14,16 @@ from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.review.changes import Changes
-from boxreg_ros.structures import BoxArray, Floats, INTERPOLATED, KEPT, REFINED, RefinedBoxes, YAW
+from boxreg_ros.structures import (
+    BoxArray,
+    Floats,
+    INTERPOLATED,
+    KEPT,
+    REFINED,
+    RefinedBoxes,
+    Sweep,
+    YAW,
+)
 from boxreg_ros.tracks.bridge import Bridge
 import numpy as np
 
@@ -61,6 +70,10 @@ class Sink:
         Refined headings that differ from the input by more than 90 degrees.
     without_cloud : int
         Box arrays without a cloud, where clouds are to be written.
+    time_ranges : dict
+        First and last stamp [ns] of the ``boxes`` and of the ``clouds``.
+    unknown_classes : Counter
+        Boxes by class name, of the names that no group of settings has.
     changes : Changes
         Boxes before and after, for the report and the tables of tracks.
 
@@ -71,6 +84,9 @@ class Sink:
         self._sensor_frame = source.sensor_frame
         self._writes_early = request.config.estimate == 'early'
         self._clock = clock
+        self._config = request.config
+        self.time_ranges: dict[str, tuple[int, int]] = {}
+        self.unknown_classes: Counter[str] = Counter()
         self._spool: Spool | None = None
         if request.options.with_points:
             self._spool = Spool(folder, request.config)
@@ -101,6 +117,7 @@ class Sink:
             The same for the registrar; boxes carry a ticket.
 
         """
+        self._note_time(item.given or item.moved)
         if isinstance(item.given, BoxArray):
             return self._reserve(item, item.given)
         if self._spool and item.given is not None and item.T_fixed_given is not None:
@@ -148,10 +165,22 @@ class Sink:
         """Return the number of input boxes that have not been written."""
         return self.boxes_in - (self.boxes_out - self.status[INTERPOLATED])
 
+    def _note_time(self, content: Sweep | BoxArray | None) -> None:
+        """Widen the time range of clouds or boxes by a message; empty box arrays count."""
+        if content is None:
+            return
+        name = 'boxes' if isinstance(content, BoxArray) else 'clouds'
+        stamp_ns = content.stamp_ns
+        first, last = self.time_ranges.get(name, (stamp_ns, stamp_ns))
+        self.time_ranges[name] = min(first, stamp_ns), max(last, stamp_ns)
+
     def _reserve(self, item: ReadItem, given: BoxArray) -> ReadItem:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
+        for name in given.class_names:
+            if not self._config.knows_class(name):
+                self.unknown_classes[name] += 1
         if isinstance(item.moved, BoxArray):
             slot = _Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
             self._last_ticket += 1

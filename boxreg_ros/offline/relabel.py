@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict
+from datetime import datetime, UTC
 from importlib.metadata import version
 import json
 from pathlib import Path
@@ -36,6 +38,9 @@ import yaml
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
 NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
+
+FEW_REFINED = 0.5
+"""A run that refines a smaller part of its boxes says why."""
 
 Progress = Callable[[float, float], None]
 
@@ -178,6 +183,8 @@ def _summary(
         'time_jumps': findings.counts['time_jump'],
         'recorded_apart': {t: round(late, 3) for t, late in findings.apart.items()},
         'heading_flips': sink.heading_flips,
+        'time_ranges': sink.time_ranges,
+        'unknown_classes': dict(sink.unknown_classes.most_common()),
         'dropped': _dropped(registered, findings),
         'first_missing_transform': findings.first_missing_transform,
         'first_unreadable': findings.first_unreadable,
@@ -260,8 +267,14 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
             f'{summary["frames_without_cloud"]:,} of {summary["box_arrays"]:,} box arrays have no '
             f'cloud to write beside them'
         )
-    if has_failed(summary):
-        yield _why_none_was_refined(summary)
+    if summary['unknown_classes']:
+        names = ', '.join(repr(name) for name in summary['unknown_classes'])
+        yield (
+            f'unknown class names are treated as vehicles: {names} ({_sum(summary)} boxes); name '
+            f'them in vehicle.names, cyclist.names or pedestrian.names'
+        )
+    if part_refined(summary) < FEW_REFINED:
+        yield _why_few_were_refined(summary)
 
 
 def has_failed(summary: dict[str, Any]) -> bool:
@@ -269,15 +282,37 @@ def has_failed(summary: dict[str, Any]) -> bool:
     return bool(summary['boxes_in']) and not summary['status'].get(REFINED)
 
 
-def _why_none_was_refined(summary: dict[str, Any]) -> str:
-    """Return the most frequent reason why boxes were kept, and its remedy."""
+def part_refined(summary: dict[str, Any]) -> float:
+    """Return the part of the input boxes that were refined; 1 without boxes."""
+    boxes = int(summary['boxes_in'])
+    return int(summary['status'].get(REFINED, 0)) / boxes if boxes else 1.0
+
+
+def _why_few_were_refined(summary: dict[str, Any]) -> str:
+    """Return the most frequent reason why boxes were kept, its remedy, and both time ranges."""
     name, count = next(iter(summary['reasons'].items()))  # sorted by count
     reason = REASONS[name]
-    line = (
-        f'none of {summary["boxes_in"]:,} boxes was refined; most frequent reason: {name} '
-        f'({count:,} boxes): {reason.meaning}'
-    )
-    return f'{line}; remedy: {reason.remedy}' if reason.remedy else line
+    refined = summary['status'].get(REFINED, 0)
+    part = f'only {refined:,} of {summary["boxes_in"]:,} boxes were refined'
+    if not refined:
+        part = f'none of {summary["boxes_in"]:,} boxes was refined'
+    line = f'{part}; most frequent reason: {name} ({count:,} boxes): {reason.meaning}'
+    if reason.remedy:
+        line += f'; remedy: {reason.remedy}'
+    ranges = [f'{name} {_time_range(*r)}' for name, r in sorted(summary['time_ranges'].items())]
+    return f'{line}; time ranges: {", ".join(ranges)}'
+
+
+def _time_range(first_ns: int, last_ns: int) -> str:
+    """Return two stamps as seconds with the date of the first."""
+    with suppress(OverflowError, ValueError, OSError):
+        date = datetime.fromtimestamp(first_ns * 1e-9, UTC).strftime('%Y-%m-%d')
+        return f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s ({date})'
+    return f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s'
+
+
+def _sum(summary: dict[str, Any]) -> str:
+    return f'{sum(summary["unknown_classes"].values()):,}'
 
 
 def _counts(counts: dict[str, int]) -> str:
