@@ -20,6 +20,7 @@ import platform
 from typing import Any, NamedTuple
 
 from boxreg_ros import __version__
+from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.output import Sink
@@ -31,6 +32,8 @@ from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.review.report import REPORT, write_report
+from boxreg_ros.review.rules import counts
+from boxreg_ros.review.rules.protocol import LabelTrack
 from boxreg_ros.review.tables import assessed, write_tables
 from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, Sweep
 import yaml
@@ -92,6 +95,7 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
             tracks = sink.changes.tracks()
             with clock('write'):
                 write_tables(folder, assessed(tracks))
+                summary['rules'] = _rules(tracks, request.config)
             if request.report:
                 _report(folder, out, request, summary, tracks, clock, shown)
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
@@ -129,6 +133,17 @@ def _register(
     with clock('registrar'):
         ready = registrar.flush()
     sink.take(ready)
+
+
+def _rules(tracks: Sequence[TrackChanges], config: Config) -> dict[str, dict[str, int]]:
+    """Return how often each rule of `boxreg check` is violated ``before`` and ``after``."""
+    before = []
+    after = []
+    for track in tracks:
+        names = track.track_id, track.class_name, config, track.stamps_ns
+        before.append(LabelTrack.of(*names, track.given, track.num_points))
+        after.append(LabelTrack.of(*names, track.boxes, track.num_points))
+    return {'before': counts(before), 'after': counts(after)}
 
 
 def _report(
