@@ -1,5 +1,5 @@
 """
-`boxreg bench review`: does the review list show the bad tracks first?
+`boxreg bench review`: how early the review list shows the bad tracks.
 
 Bad tracks are those with the worst mean 3D IoU against the truth. Two inputs of each recording
 are refined: its own boxes, and its true boxes with errors planted in some tracks.
@@ -120,8 +120,7 @@ def planted(drive: Drive) -> Drive:
         rows = np.flatnonzero(names == track_id)
         error = ERRORS[number % len(ERRORS)]
         if error == 'swap':
-            other = rng.choice([name for name in tracks if name != track_id])
-            _swap(names, rows, np.flatnonzero(names == other), truth.stamps_ns)
+            _swap(names, rows, truth.stamps_ns)
         else:
             boxes[rows] = _with_error(boxes[rows], error, rng)
     arrays = []
@@ -156,12 +155,18 @@ def _with_error(boxes: Floats, error: str, rng: np.random.Generator) -> Floats:
     return changed
 
 
-def _swap(names: Any, rows: Any, others: Any, stamps_ns: Any) -> None:
-    """Swap the ids of two tracks from the middle of the first one on."""
+def _swap(names: Any, rows: Any, stamps_ns: Any) -> None:
+    """Swap the id of a track with that of another one in the middle of both, if there is one."""
     middle_ns = np.median(stamps_ns[rows])
-    first, second = names[rows[0]], names[others[0]]
-    names[rows[stamps_ns[rows] > middle_ns]] = second
-    names[others[stamps_ns[others] > middle_ns]] = first
+    first = names[rows[0]]
+    before = set(names[stamps_ns < middle_ns])
+    for second in sorted(set(names[stamps_ns > middle_ns]) & before - {first}):
+        is_later = stamps_ns > middle_ns
+        mine = is_later & np.equal(names, first)
+        others = is_later & np.equal(names, second)
+        names[mine] = second
+        names[others] = first
+        return
 
 
 def _mean_overlap(drive: Drive, tracks: Sequence[TrackChanges]) -> Floats:

@@ -297,7 +297,8 @@ class _PendingArray:
     ----------
     input : BoxArray
         As added.
-    boxes, status, reasons, num_points, covariances, extent_covariances, face_distances
+    boxes, status, reasons, num_points, covariances, extent_covariances, face_distances,
+    outside
         As in `RefinedBoxes`, row by row with the input.
     num_unsettled : int
         Boxes whose estimate may still change; the array is settled at 0 or less.
@@ -316,6 +317,7 @@ class _PendingArray:
         self.covariances = np.tile(np.eye(6), (n, 1, 1))
         self.extent_covariances = np.tile(np.eye(3), (n, 1, 1))
         self.face_distances = np.zeros((n, 6))
+        self.outside = np.zeros(n)
         self.num_unsettled = 0
         self.is_observed = False
 
@@ -346,6 +348,7 @@ class _PendingArray:
             is_final,
             self.extent_covariances.copy(),
             self.face_distances.copy(),
+            self.outside.copy(),
         )
 
 
@@ -371,6 +374,7 @@ class _Entry:
             array.covariances[row] = estimate.covariances[i]
             array.extent_covariances[row] = estimate.extent_covariances[i]
             array.face_distances[row] = estimate.face_distances[i]
+            array.outside[row] = estimate.outside[i]
 
     def settle(self) -> None:
         """Let the estimate in the box array change no more."""

@@ -34,8 +34,8 @@ class TrackChanges:
         refined.
     extent_deviations : array, shape (n, 3)
         Standard deviations of length, width and height [m]; NaN for boxes that are not refined.
-    face_distances : array, shape (n, 6)
-        As in `RefinedBoxes` [m].
+    face_distances, outside : array, shapes (n, 6) and (n,)
+        As in `RefinedBoxes`.
     is_flipped : array, shape (n,)
         True where the heading was flipped by 180 degrees.
     status : array of str, shape (n,)
@@ -56,6 +56,7 @@ class TrackChanges:
     deviations: Floats
     extent_deviations: Floats
     face_distances: Floats
+    outside: Floats
     is_flipped: NDArray[np.bool_]
     status: NDArray[np.str_]
     reasons: Counter[str]
@@ -96,7 +97,8 @@ class Changes:
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
         self._names: list[tuple[str, str, str, str]] = []  # id, class, status, reason
-        # Rows of given (9), boxes (9), deviations (4), extent deviations (3), face distances (6).
+        # Rows of given (9), boxes (9), deviations (4), extent deviations (3), face distances (6),
+        # part of the points outside (1).
         self._numbers: list[Floats] = []
         self._counts: list[Ints] = []  # rows of stamp, number of points
 
@@ -124,7 +126,16 @@ class Changes:
         variances = np.diagonal(refined.extent_covariances, axis1=1, axis2=2)
         extent_deviations = np.sqrt(variances.clip(0))
         self._numbers.append(
-            np.hstack([before, after, deviations, extent_deviations, refined.face_distances])
+            np.column_stack(
+                [
+                    before,
+                    after,
+                    deviations,
+                    extent_deviations,
+                    refined.face_distances,
+                    refined.outside,
+                ]
+            )
         )
         self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
         self._names += zip(
@@ -133,10 +144,10 @@ class Changes:
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
-        numbers = np.concatenate([np.zeros((0, 31)), *self._numbers])
+        numbers = np.concatenate([np.zeros((0, 32)), *self._numbers])
         counts = np.concatenate([np.zeros((0, 2), np.int64), *self._counts])
-        given, boxes, deviations, extent_deviations, face_distances = np.split(
-            numbers, [9, 18, 22, 25], axis=1
+        given, boxes, deviations, extent_deviations, face_distances, outside = np.split(
+            numbers, [9, 18, 22, 25, 31], axis=1
         )
         errors = pose_errors(given, boxes)  # of the input, in the axes of the result
         yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
@@ -157,6 +168,7 @@ class Changes:
                     deviations=deviations[rows] + unknown,
                     extent_deviations=extent_deviations[rows] + unknown,
                     face_distances=face_distances[rows],
+                    outside=outside[rows, 0],
                     is_flipped=errors.is_flipped[rows] & is_refined,
                     status=np.array(status),
                     reasons=Counter(filter(None, reasons)),

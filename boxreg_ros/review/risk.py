@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.review.changes import TrackChanges
-from boxreg_ros.structures import Floats, KEPT
+from boxreg_ros.structures import Floats, KEPT, LENGTH, X, Y
 import numpy as np
 
 REFERENCE_LENGTH = 4.5
@@ -24,6 +24,19 @@ MAX_LOSS = 1.0
 """Largest loss of 3D IoU."""
 KEPT_LOSS = 0.25
 """Loss to expect of an input box that is kept: 1 - 3D IoU of the inputs of docs/results.md."""
+USUAL_MISFIT = 0.05
+"""Distance of a face from its points that is noise [m]. Measured: the median of true boxes."""
+USUAL_OUTSIDE = 0.2
+"""Part of the points in and near a box that are of other things. Measured: the upper quartile of
+tracks with true boxes on PandaSet."""
+NEAR_MARGIN = 0.6
+"""How far outside of a box points count as near [m]: the default of `sampling.margin`."""
+USUAL_FILL = 0.34
+"""Part of its volume with that margin that a car fills; smaller objects fill less. Derived."""
+SWITCH_SPEED = 10.0
+"""Deviation from constant velocity that is an id switch [m/s], as in `core.registrar`."""
+SWITCH_LOSS = 0.5
+"""Loss to expect where the id of a track has switched: half its boxes are of another object."""
 FEW_POINTS = 10
 """Boxes with fewer points are reported as such. Chosen."""
 
@@ -64,17 +77,18 @@ def assess(track: TrackChanges) -> Risk:
     shift = 2 * track.deviations[:, :3] / extents
     size = track.extent_deviations / extents
     turn = track.deviations[:, 3] * length / (2 * width)
-    misfit = _misfit(track) / length
     is_refined = track.is_refined
     losses = {
         'uncertain position': MEAN_OF_NORMAL * shift.sum(axis=1),
         'uncertain heading': MEAN_OF_NORMAL * turn,
         'uncertain size': MEAN_OF_NORMAL * size.sum(axis=1),
-        'faces off their points': misfit,
+        'faces off their points': _misfit(track, extents),
+        'points left outside': _left_outside(track, extents),
     }
     losses = {reason: np.where(is_refined, loss, 0.0) for reason, loss in losses.items()}
     is_kept = track.status == KEPT
     losses['kept as in the input'] = np.where(is_kept, KEPT_LOSS, 0.0)
+    losses['id switch'] = np.full(len(is_kept), SWITCH_LOSS * _has_id_switch(track))
     parts = {reason: np.nan_to_num(loss) * REFERENCE_LENGTH / 2 for reason, loss in losses.items()}
     total = np.sum(list(parts.values()), axis=0)
     return Risk(total.clip(max=MAX_LOSS * REFERENCE_LENGTH / 2), parts)
@@ -94,9 +108,38 @@ def reasons_of(track: TrackChanges, risk: Risk, row: int | None = None) -> str:
     return '; '.join(words)
 
 
-def _misfit(track: TrackChanges) -> Floats:
-    """Return how far the points of the faces are off where they are expected, (n,) [m]."""
-    squared = np.square(track.face_distances)
-    observed = track.face_distances != 0
-    count = observed.sum(axis=1).clip(min=1)
-    return np.asarray(np.sqrt(squared.sum(axis=1) / count))
+def _misfit(track: TrackChanges, extents: Floats) -> Floats:
+    """
+    Return the loss of 3D IoU if the points of the faces were right, shape (n,).
+
+    A face that is off by d costs d / L, L the extent across it; `USUAL_MISFIT` of d is noise.
+
+    """
+    excess = (np.abs(track.face_distances) - USUAL_MISFIT).clip(0)
+    return np.asarray((excess / np.repeat(extents, 2, axis=1)).sum(axis=1))
+
+
+def _left_outside(track: TrackChanges, extents: Floats) -> Floats:
+    """
+    Return the loss of 3D IoU that points outside of each box are evidence for, shape (n,).
+
+    Of a box off its object, the part of the points that is outside is about the loss. The space
+    around a small object has more room for points of others: they count less.
+
+    """
+    excess = (track.outside - USUAL_OUTSIDE).clip(0)
+    fill = (extents / (extents + 2 * NEAR_MARGIN)).prod(axis=1) / USUAL_FILL
+    return np.asarray(excess * fill.clip(max=1.0))
+
+
+def _has_id_switch(track: TrackChanges) -> bool:
+    """Return whether the boxes jump by more than half a length off constant velocity."""
+    is_known = np.isfinite(track.boxes[:, X])
+    boxes = track.boxes[is_known]
+    seconds = np.diff(track.stamps_ns[is_known]) * 1e-9
+    if len(seconds) < 2 or (seconds <= 0).any():
+        return False
+    velocity = np.diff(boxes[:, [X, Y]], axis=0) / seconds[:, None]
+    jump = np.linalg.norm(np.diff(velocity, axis=0), axis=1) * seconds[1:]
+    gate = boxes[1:-1, LENGTH] / 2 + SWITCH_SPEED * seconds[1:]
+    return bool((jump > gate).any())

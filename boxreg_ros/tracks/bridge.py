@@ -167,6 +167,7 @@ class _Held(Generic[_T]):
                 [old.extent_covariances, [box.extent_covariance for box in self.added]]
             ),
             face_distances=np.concatenate([old.face_distances, np.zeros((n, 6))]),
+            outside=np.append(old.outside, np.zeros(n)),
         )
         return complete, self.item
 
