@@ -33,7 +33,7 @@ BAD_PART = 0.1
 """Part of the tracks that is bad."""
 PLANTED_PART = 0.2
 """Part of the tracks that get an error; chosen: enough of each kind of error."""
-ERRORS = ('size', 'yaw', 'shift', 'swap', 'drift')
+PLANTED_ERRORS = ('size', 'yaw', 'shift', 'swap', 'drift')
 SEED = 0
 
 
@@ -118,7 +118,7 @@ def planted(drive: Drive) -> Drive:
     chosen = rng.permutation(tracks)[: max(1, round(PLANTED_PART * len(tracks)))]
     for number, track_id in enumerate(chosen):
         rows = np.flatnonzero(names == track_id)
-        error = ERRORS[number % len(ERRORS)]
+        error = PLANTED_ERRORS[number % len(PLANTED_ERRORS)]
         if error == 'swap':
             _swap(names, rows, truth.stamps_ns)
         else:

@@ -197,7 +197,7 @@ def _failed_tests(
     """
     Return the acceptance tests that each refined box fails (M27), shape (3, B, N).
 
-In the order of `KEPT_REASONS`: its window has points; box and covariance are finite and the
+    In the order of `KEPT_REASONS`: its window has points; box and covariance are finite and the
     extent is positive; it holds nearly as many points as its input box, which the objective does
     not ask for: `after` (B, N).
 

@@ -15,8 +15,8 @@ import numpy as np
 COVARIANCES = 'covariances.csv'
 POSE_NAMES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
 EXTENT_NAMES = ('length', 'width', 'height')
-KEY_COLUMNS = ('stamp_ns', 'track_id', 'range')
-NUMBER_COLUMNS = tuple(
+COVARIANCE_KEYS = ('stamp_ns', 'track_id', 'range')
+COVARIANCE_NUMBERS = tuple(
     f'{a}_{b}'
     for names in (POSE_NAMES, EXTENT_NAMES)
     for a, b in combinations_with_replacement(names, 2)
@@ -53,7 +53,7 @@ class CovarianceWriter:
     def __init__(self, path: Path) -> None:
         self._file = path.open('w', newline='', encoding='utf-8')
         self._table = csv.writer(self._file, lineterminator='\n')
-        self._table.writerow((*KEY_COLUMNS, *NUMBER_COLUMNS))
+        self._table.writerow((*COVARIANCE_KEYS, *COVARIANCE_NUMBERS))
 
     def write(self, refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> None:
         """Add a row for each box with an estimate: kept boxes have none."""
@@ -105,7 +105,7 @@ def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:
 def _rows(reader: csv.DictReader[str]) -> Iterator[tuple[tuple[int, str], BoxCovariance]]:
     """Yield stamp and track id, and the covariances, of each row."""
     for row in reader:
-        numbers = np.array([float(row[name]) for name in NUMBER_COLUMNS])
+        numbers = np.array([float(row[name]) for name in COVARIANCE_NUMBERS])
         pose = _symmetric(numbers[:NUM_POSE], 6)
         extent = _symmetric(numbers[NUM_POSE:], 3)
         key = int(row['stamp_ns']), row['track_id']

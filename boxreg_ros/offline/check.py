@@ -17,7 +17,7 @@ from boxreg_ros.structures import BoxArray, Floats, Ints
 import numpy as np
 
 RECORDING_SUFFIXES = ('.mcap', '.db3', '.bag')
-SUFFIXES = {'.csv': 'csv', '.parquet': 'parquet'}
+LABEL_SUFFIXES = {'.csv': 'csv', '.parquet': 'parquet'}
 """Label files whose format follows from their suffix."""
 
 
@@ -97,8 +97,8 @@ def _format_of(source: str) -> tuple[str, Path]:
     path = Path(source)
     if (path / 'boxes.csv').is_file():
         return 'csv', path
-    if path.suffix in SUFFIXES:
-        return SUFFIXES[path.suffix], path
+    if path.suffix in LABEL_SUFFIXES:
+        return LABEL_SUFFIXES[path.suffix], path
     name, colon, rest = source.partition(':')
     if colon and rest:
         return name, Path(rest)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from boxreg_ros.io.box_table import BoxTable
     from boxreg_ros.offline.evaluate import Matches
 
-VARIABLES = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
+CONSISTENCY_VARIABLES = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
 RANGE_BINS = (0.0, 20.0, 40.0, math.inf)
 """Limits of the groups by distance from the sensor [m]."""
 MIN_VARIANCE = 1e-12
@@ -87,10 +87,10 @@ def consistency(
 def table(groups: Mapping[str, Consistency]) -> str:
     """Return the groups as a text table: coverage, then NEES, of each variable."""
     width = max(len(name) for name in groups)
-    titles = ''.join(f'{name:>13}' for name in VARIABLES)
+    titles = ''.join(f'{name:>13}' for name in CONSISTENCY_VARIABLES)
     lines = [' ' * width + f'{"boxes":>8}{titles}']
     for name, group in groups.items():
-        cells = [f'{group.coverage[v]:7.2f}{group.nees[v]:6.2f}' for v in VARIABLES]
+        cells = [f'{group.coverage[v]:7.2f}{group.nees[v]:6.2f}' for v in CONSISTENCY_VARIABLES]
         lines.append(f'{name:{width}}{group.boxes:8d}{"".join(cells)}')
     lines.append(
         'part of the errors within 2 sigma (0.95 is consistent), mean of squared error over '
@@ -121,5 +121,7 @@ def _over(squared: Floats, chosen: NDArray[np.bool_]) -> Consistency:
     part = squared[chosen]
     coverage = (part <= 4).mean(axis=0).tolist()
     nees = part.mean(axis=0).tolist()
-    by_name = (dict(zip(VARIABLES, values, strict=True)) for values in (coverage, nees))
+    by_name = (
+        dict(zip(CONSISTENCY_VARIABLES, values, strict=True)) for values in (coverage, nees)
+    )
     return Consistency(len(part), *by_name)

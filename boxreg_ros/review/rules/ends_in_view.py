@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation, WARNING
 
-MIN_POINTS = 50
+MIN_POINTS_IN_VIEW = 50
 """Fewest points of an object in view. Chosen: boxes with fewer may be lost by a detector."""
 MIN_TIME_LEFT = 1.0
 """Shortest time from the end of the track to that of the recording [s]."""
@@ -20,7 +20,7 @@ def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
             continue
         last_ns = int(track.stamps_ns[-1])
         left = (end_ns - last_ns) * 1e-9
-        if left > MIN_TIME_LEFT and track.num_points[-1] >= MIN_POINTS:
+        if left > MIN_TIME_LEFT and track.num_points[-1] >= MIN_POINTS_IN_VIEW:
             text = f'ends {left:.1f} s before the labels with {track.num_points[-1]} points'
             yield Violation(track.track_id, last_ns, text)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation, WARNING
 import numpy as np
 
-MIN_POINTS = 5
+MIN_LABEL_POINTS = 5
 """Fewest points of a box. Literature: as Waymo leaves out boxes with fewer at its harder level."""
 MAX_PART = 0.5
 """Part of the boxes of a track that may have fewer. Chosen."""
@@ -17,9 +17,9 @@ def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
     """Yield tracks most of whose boxes have too few points; unknown numbers are left out."""
     for track in tracks:
         known = track.num_points >= 0
-        few = known & (track.num_points < MIN_POINTS)
+        few = known & (track.num_points < MIN_LABEL_POINTS)
         if known.any() and few.sum() > MAX_PART * known.sum():
-            text = f'{few.sum()} of {known.sum()} boxes have fewer than {MIN_POINTS} points'
+            text = f'{few.sum()} of {known.sum()} boxes have fewer than {MIN_LABEL_POINTS} points'
             yield Violation(track.track_id, int(track.stamps_ns[np.argmax(few)]), text)
 
 

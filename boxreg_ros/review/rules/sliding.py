@@ -12,7 +12,7 @@ MAX_SIDEWAYS = 1.0
 """Largest median sideways speed over a second [m/s]. Chosen: far above the slip of a tyre."""
 MAX_SLOPE = 0.2
 """Largest sideways over forward speed. Derived: the centre is half a wheelbase off the axle."""
-SPAN = 5
+SLIDING_STEPS = 5
 """Steps of the running median. Chosen: noise of single boxes is no slide."""
 
 
@@ -20,19 +20,19 @@ def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
     """Yield the place where each vehicle or cyclist slides fastest."""
     for track in tracks:
         steps = track.steps()
-        if track.kind == PEDESTRIAN or len(steps.rows) < SPAN:
+        if track.kind == PEDESTRIAN or len(steps.rows) < SLIDING_STEPS:
             continue
         yaw = track.boxes[steps.rows, YAW]
         x, y = steps.velocity[:, :2].T
         forward = np.abs(x * np.cos(yaw) + y * np.sin(yaw))
         sideways = np.abs(y * np.cos(yaw) - x * np.sin(yaw))
         excess = sideways - MAX_SLOPE * forward
-        windows = np.lib.stride_tricks.sliding_window_view(excess, SPAN)
+        windows = np.lib.stride_tricks.sliding_window_view(excess, SLIDING_STEPS)
         medians = np.median(windows, axis=1)
         row = int(np.argmax(medians))
         if medians[row] > MAX_SIDEWAYS:
-            middle = steps.rows[row + SPAN // 2]
-            text = f'moves sideways at {sideways[row + SPAN // 2]:.1f} m/s'
+            middle = steps.rows[row + SLIDING_STEPS // 2]
+            text = f'moves sideways at {sideways[row + SLIDING_STEPS // 2]:.1f} m/s'
             yield Violation(track.track_id, int(track.stamps_ns[middle]), text)
 
 
