@@ -247,8 +247,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     ),
     'review': (
         'Review list',
-        'Share of the tracks with the worst 3D IoU within the first part of the list, by risk, by\n'
-        'points, by deviation, and by chance. Inputs: noisy boxes, and true boxes with errors\n'
+        'Share of the tracks with the worst 3D IoU within the first part of the list, by risk,\n'
+        'by points, by deviation, and by chance. Inputs: noisy boxes, and true boxes with errors\n'
         'planted in a fifth of the tracks.',
         _review,
     ),
