@@ -198,7 +198,7 @@ def _summary(
         'time_jumps': findings.counts['time_jump'],
         'recorded_apart': {t: round(late, 3) for t, late in findings.apart.items()},
         'heading_flips': sink.heading_flips,
-        'time_ranges': sink.time_ranges,
+        'time_ranges': {name: list(ends) for name, ends in sink.time_ranges.items()},
         'unknown_classes': dict(sink.unknown_classes.most_common()),
         'dropped': _dropped(registered, findings),
         'first_missing_transform': findings.first_missing_transform,

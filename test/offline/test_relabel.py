@@ -108,7 +108,8 @@ def test_output_folder_contents(tmp_path):
     summary, _ = run(path, tmp_path / 'out', settings={'solver.iterations': 2})
     out = tmp_path / 'out'
     assert sorted(item.name for item in out.iterdir()) == [
-        'boxes.csv', 'config.yaml', 'openlabel', 'summary.json',
+        'boxes.csv', 'config.yaml', 'covariances.csv', 'openlabel', 'review.csv', 'summary.json',
+        'tracks.csv',
     ]  # fmt: skip
     assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.iterations': 2})
     assert json.loads((out / 'summary.json').read_text()) == summary
