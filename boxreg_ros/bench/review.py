@@ -17,14 +17,14 @@ from typing import Any
 
 from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
 from boxreg_ros.config import Config
-from boxreg_ros.core.metrics import BOX_EXTENT, iou_3d
+from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, median, TrackChanges
 from boxreg_ros.review.risk import assess
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BoxArray, Floats, ROLL, Sweep, X, YAW, Z
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
 import numpy as np
 
 CUTS = (0.01, 0.05, 0.1, 0.2)

@@ -13,7 +13,7 @@ import sys
 from typing import Any
 
 from boxreg_ros.config import words_of
-from boxreg_ros.core.metrics import BOX_EXTENT, iou_3d, iou_bev, pose_errors
+from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
@@ -22,7 +22,7 @@ from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
 from boxreg_ros.offline.result_folder import earlier_summary
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, Ints, is_valid_box, YAW
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, is_valid_box, YAW
 import numpy as np
 from numpy.typing import NDArray
 

@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline.cloud_spool import Spool
 from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
-from boxreg_ros.review.changes import Changes
 from boxreg_ros.structures import (
     BoxArray,
     Floats,
@@ -26,6 +26,9 @@ from boxreg_ros.structures import (
 )
 from boxreg_ros.tracks.bridge import Bridge
 import numpy as np
+
+if TYPE_CHECKING:
+    pass
 
 
 @dataclass(eq=False, slots=True)
@@ -96,6 +99,10 @@ class Sink:
             name: writer_for(name, folder, provenance, options) for name in request.all_formats
         }
         self._bridge: Bridge[_Slot] = Bridge(request.bridge, self._fixed_frame, request.config)
+        from boxreg_ros.review.changes import (
+            Changes,  # imports torch, after the fork of the reader
+        )
+
         self.changes = Changes(self._fixed_frame)
         self._by_stamp: list[_Slot] = []  # not yet written
         self._by_ticket: dict[object, _Slot] = {}  # without a result

@@ -9,34 +9,32 @@ Every box of the recording is written exactly once: refined, or unchanged with t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from datetime import datetime, UTC
 from importlib.metadata import version
 import json
 from pathlib import Path
 import platform
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.output import Sink
+from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader
-from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import REASONS
-from boxreg_ros.review.changes import TrackChanges
-from boxreg_ros.review.report import REPORT, write_report
-from boxreg_ros.review.rules import counts
-from boxreg_ros.review.rules.protocol import LabelTrack
-from boxreg_ros.review.tables import assessed, write_tables
 from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, Sweep
 import yaml
+
+if TYPE_CHECKING:
+    from boxreg_ros.core.registrar import BoxRegistrar
+    from boxreg_ros.review.changes import TrackChanges
 
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
@@ -45,14 +43,8 @@ NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --s
 FEW_REFINED = 0.5
 """A run that refines a smaller part of its boxes says why."""
 
-Progress = Callable[[float, float], None]
 
-
-def no_progress(done: float, total: float) -> None:
-    """Show no progress."""
-
-
-def relabel(request: Request, out: Path, progress: Progress = no_progress) -> dict[str, Any]:
+def relabel(request: Request, out: Path, progress: Progress | None = None) -> dict[str, Any]:
     """
     Refine all boxes of a recording and write ``boxes.csv``, ``summary.json`` and other files.
 
@@ -62,9 +54,9 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
         Inputs and options.
     out : Path
         Result folder. It appears complete or not at all; an earlier result is replaced.
-    progress : callable, optional
-        Called with the duration of the recording that has been read and its whole duration [s].
-        With a report the recording is read twice, and both count twice.
+    progress : Progress, optional
+        Shows the duration of the recording that has been read and its whole duration [s]. With a
+        report the recording is read twice, and both count twice.
 
     Returns
     -------
@@ -80,11 +72,21 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
 
     """
     clock = Stopwatch()
+    progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
-    with registration_worker(request.config, clock) as begin, reader(request) as process:
+    with ExitStack() as workers:
+        process = workers.enter_context(reader(request))
+        # The recording is opened while this process imports torch, which takes a second.
+        from boxreg_ros.core.registrar import BoxRegistrar
+        from boxreg_ros.offline.registration_worker import registration_worker
+
+        submit = workers.enter_context(
+            registration_worker(request.config, clock, progress.announce)
+        )
         recording = ReadAhead(process)
-        registrar = BoxRegistrar(request.config, begin)
-        shown = _Progress(progress, recording.source.seconds, 2 if request.report else 1)
+        clock.begun('start')
+        registrar = BoxRegistrar(request.config, submit)
+        shown = _Passes(progress, recording.source.seconds, 2 if request.report else 1)
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
                 _register(recording, registrar, sink, clock, shown)
@@ -94,8 +96,7 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
             summary |= {'fingerprint': fingerprint, 'seconds': clock.seconds()}
             tracks = sink.changes.tracks()
             with clock('write'):
-                write_tables(folder, assessed(tracks))
-                summary['rules'] = _rules(tracks, request.config)
+                summary['rules'] = _write_tables(folder, tracks, request.config)
             if request.report:
                 _report(folder, out, request, summary, tracks, clock, shown)
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
@@ -104,16 +105,16 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
     return summary
 
 
-class _Progress(NamedTuple):
+class _Passes(NamedTuple):
     """Progress over one or two passes through a recording of `seconds`."""
 
-    callback: Progress
+    progress: Progress
     seconds: float
     passes: int
 
     def show(self, seconds: float, passes_done: int = 0) -> None:
         """Report the time of the recording that has been read in this pass [s]."""
-        self.callback(passes_done * self.seconds + seconds, self.passes * self.seconds)
+        self.progress.show(passes_done * self.seconds + seconds, self.passes * self.seconds)
 
 
 def _register(
@@ -121,7 +122,7 @@ def _register(
     registrar: BoxRegistrar,
     sink: Sink,
     clock: Stopwatch,
-    progress: _Progress,
+    progress: _Passes,
 ) -> None:
     """Read the recording, register its boxes and write them."""
     for item in recording:
@@ -135,8 +136,15 @@ def _register(
     sink.take(ready)
 
 
-def _rules(tracks: Sequence[TrackChanges], config: Config) -> dict[str, dict[str, int]]:
-    """Return how often each rule of `boxreg check` is violated ``before`` and ``after``."""
+def _write_tables(
+    folder: Path, tracks: Sequence[TrackChanges], config: Config
+) -> dict[str, dict[str, int]]:
+    """Write the tables of tracks; return violations of rules ``before`` and ``after`` the run."""
+    from boxreg_ros.review.rules import counts
+    from boxreg_ros.review.rules.protocol import LabelTrack
+    from boxreg_ros.review.tables import assessed, write_tables
+
+    write_tables(folder, assessed(tracks))
     before = []
     after = []
     for track in tracks:
@@ -153,9 +161,11 @@ def _report(
     summary: dict[str, Any],
     tracks: Sequence[TrackChanges],
     clock: Stopwatch,
-    progress: _Progress,
+    progress: _Passes,
 ) -> None:
     """Write the report and add its time to the summary."""
+    from boxreg_ros.review.report import REPORT, write_report
+
     with clock('report'):
         line = closing_line(summary, out)
         items = _items(request, progress)
@@ -163,7 +173,7 @@ def _report(
     summary['seconds'] = clock.seconds()
 
 
-def _items(request: Request, progress: _Progress) -> Iterator[Sweep | BoxArray]:
+def _items(request: Request, progress: _Passes) -> Iterator[Sweep | BoxArray]:
     """Read the recording a second time; yield its clouds and boxes in the fixed frame."""
     with reader(request) as process:
         for item in ReadAhead(process):

@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.review.changes import TrackChanges
-from boxreg_ros.structures import Floats, KEPT, LENGTH, X, Y
+from boxreg_ros.structures import BOX_EXTENT, Floats, KEPT, LENGTH, X, Y
 import numpy as np
 
 REFERENCE_LENGTH = 4.5

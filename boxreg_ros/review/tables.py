@@ -7,10 +7,9 @@ import csv
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.review.changes import median, TrackChanges
 from boxreg_ros.review.risk import assess, reasons_of, Risk
-from boxreg_ros.structures import INTERPOLATED, KEPT, REFINED
+from boxreg_ros.structures import BOX_EXTENT, INTERPOLATED, KEPT, REFINED
 import numpy as np
 
 TRACKS = 'tracks.csv'

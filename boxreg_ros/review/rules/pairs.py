@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.review.rules.protocol import LabelTrack
-from boxreg_ros.structures import Floats, Ints, X, Z
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, X, Z
 import numpy as np
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.review.rules.protocol import LabelTrack, Rule, VEHICLE, Violation, WARNING
+from boxreg_ros.structures import BOX_EXTENT
 import numpy as np
 
 MAX_CHANGE = 0.1

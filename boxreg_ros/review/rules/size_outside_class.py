@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.review.rules.protocol import (
     CYCLIST,
     LabelTrack,
@@ -14,6 +13,7 @@ from boxreg_ros.review.rules.protocol import (
     Violation,
     WARNING,
 )
+from boxreg_ros.structures import BOX_EXTENT
 import numpy as np
 
 BOUNDS = {
