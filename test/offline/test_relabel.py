@@ -117,7 +117,7 @@ def test_output_folder_contents(tmp_path):
     assert summary['fixed_frame'] == 'odom'
     assert set(summary['versions']) >= {'boxreg_ros', 'torch', 'numpy', 'rosbags'}
     assert set(summary['seconds']) == {
-        'read', 'decode', 'transform', 'registrar', 'solve', 'write', 'total',
+        'start', 'read', 'decode', 'transform', 'registrar', 'solve', 'write', 'total',
     }  # fmt: skip
     label = json.loads((out / 'openlabel' / 'labels.json').read_text())['openlabel']
     assert len(label['frames']) == 4
