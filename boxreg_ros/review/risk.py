@@ -24,9 +24,9 @@ MAX_LOSS = 1.0
 KEPT_LOSS = 0.25
 """Loss to expect of an input box that is kept: 1 - 3D IoU of the inputs of docs/results.md."""
 USUAL_MISFIT = 0.05
-"""Distance of a face from its points that is noise [m]. Measured: the median of true boxes."""
+"""Distance of a face from its points that is noise [m]. Chosen: near the median of true boxes."""
 USUAL_OUTSIDE = 0.2
-"""Part of the points in and near a box that are of other things. Measured: the upper quartile of
+"""Part of the points in and near a box that are of other things. Chosen: near the upper quartile of
 tracks with true boxes on PandaSet."""
 NEAR_MARGIN = 0.6
 """How far outside of a box points count as near [m]: the default of `sampling.margin`."""
