@@ -83,6 +83,13 @@ def opened(path: Path) -> StorageFile:
         raise RecordingError(
             f'{str(path)!r}: expected an .mcap, .db3 or .bag file, or a rosbag2 folder'
         )
+    try:
+        path.open('rb').close()
+    except PermissionError as error:
+        raise RecordingError(
+            f'{path}: expected a file that may be read, got {error.strerror}; change its '
+            f'permissions (chmod u+r) or the user'
+        ) from None
     if path.suffix not in COMPRESSED:
         return opener(path, None)
     with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
