@@ -34,7 +34,7 @@ DEFINITION_FORMATS = {
     'ros2idl': MessageDefinitionFormat.IDL,
 }
 MAX_ID = 2**62
-MIN_STEPS = 10**6
+QUERY_STEPS = 10**6
 STEPS_PER_BYTE = 2
 """
 Steps of sqlite's machine that a query over a whole table may take, and more for each byte.
@@ -189,14 +189,14 @@ class SqliteFile:
         raised.
 
         """
-        left = MIN_STEPS + STEPS_PER_BYTE * self._size
+        left = QUERY_STEPS + STEPS_PER_BYTE * self._size
 
         def has_ended() -> bool:
             nonlocal left
-            left -= MIN_STEPS
+            left -= QUERY_STEPS
             return left < 0
 
-        self._database.set_progress_handler(has_ended, MIN_STEPS)
+        self._database.set_progress_handler(has_ended, QUERY_STEPS)
         try:
             yield from self._database.execute(query)
         finally:
