@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 REVIEW = 'review.csv'
-RISK = 'risk'
+RISK = 'risk_m'
 MAX_LISTED_TRACKS = 100
 """Tracks in the report; a page of more is not read."""
 PAGE_STYLE = (

@@ -26,8 +26,8 @@ KEPT_LOSS = 0.25
 USUAL_MISFIT = 0.05
 """Distance of a face from its points that is noise [m]. Chosen: near the median of true boxes."""
 USUAL_OUTSIDE = 0.2
-"""Part of the points in and near a box that are of other things. Chosen: near the upper quartile of
-tracks with true boxes on PandaSet."""
+"""Part of the points in and near a box that are of other things. Chosen: near the upper quartile
+of tracks with true boxes on PandaSet."""
 NEAR_MARGIN = 0.6
 """How far outside of a box points count as near [m]: the default of `sampling.margin`."""
 USUAL_FILL = 0.34

@@ -40,7 +40,7 @@ def test_failures_are_isolated_and_a_second_run_does_what_is_left(tmp_path, caps
     before = {name: (out / name / 'boxes.csv').stat().st_mtime_ns for name in ('one', 'two')}
     paths[0].touch()
     Drive(sweeps=7).write(tmp_path / 'other').replace(paths[1])
-    (out / 'one' / 'review.csv').write_text('track,risk\n7,0.25\n8,0.75\n')
+    (out / 'one' / 'review.csv').write_text('rank,track_id,risk_m\n1,7,0.25\n1,8,0.75\n')
     assert main([*command[:-3], '--workers=1', *QUICK]) == 1
     rows = index_of(out)
     # `--workers` is no setting: it changes no result.
