@@ -53,6 +53,8 @@ setup(
         'foxglove': ['mcap-protobuf-support'],
         # The pictures and the page of `boxreg relabel --report`.
         'report': ['jinja2', 'matplotlib'],
+        # HOTA and IDF1 of `boxreg evaluate`.
+        'tracking': ['trackeval>=1.3,<2'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -86,6 +88,7 @@ setup(
             'ruff',
             'shapely',
             'small-gicp',
+            'trackeval>=1.3,<2',
         ],
         # What test/build_interfaces.py builds message types with.
         'interfaces': [

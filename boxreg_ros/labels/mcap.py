@@ -30,7 +30,7 @@ from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Definition
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.structures import BoxArray, INTERPOLATED, RefinedBoxes
+from boxreg_ros.structures import ADDED, BoxArray, RefinedBoxes
 from mcap.records import Attachment
 from mcap.writer import Writer as McapWriter
 from msg_adapters.poses import turned_covariances
@@ -129,7 +129,7 @@ class Writer:
 
     def write(self, frame: LabelFrame) -> None:
         """Add the boxes of a message, and copy messages up to the next missing boxes."""
-        if _without_interpolated(frame.refined).status:
+        if _without_added(frame.refined).status:
             stamp_ns = frame.refined.boxes.stamp_ns
             self._waiting.setdefault(stamp_ns, deque()).append(frame)
         self._copy(is_end=False)
@@ -214,7 +214,7 @@ class Writer:
         frame = waiting.popleft()
         if not waiting:
             del self._waiting[given.stamp_ns]
-        refined = _without_interpolated(frame.refined)
+        refined = _without_added(frame.refined)
         T = frame.T_fixed_given
         if refined.boxes.frame_id != given.frame_id and T is not None:
             refined = replace(
@@ -290,9 +290,9 @@ def _new_message(store: Typestore, kind: str, **fields: Any) -> Any:
     return store.types[kind](**fields)
 
 
-def _without_interpolated(refined: RefinedBoxes) -> RefinedBoxes:
-    """Return the boxes without interpolated ones, for which the message has no entry."""
-    rows = [i for i, status in enumerate(refined.status) if status != INTERPOLATED]
+def _without_added(refined: RefinedBoxes) -> RefinedBoxes:
+    """Return the boxes without added ones, for which the message has no entry."""
+    rows = [i for i, status in enumerate(refined.status) if status not in ADDED]
     if len(rows) == len(refined.status):
         return refined
     boxes = refined.boxes

@@ -1,8 +1,8 @@
 """
 Refine the boxes of a recording and write them as label files.
 
-Every box of the recording is written exactly once: refined, or unchanged with the reason. With
-`Request.bridge`, interpolated boxes are added.
+Every box of the recording is written exactly once: refined, or unchanged with the reason. With a
+step of `Config.complete`, the recording is read twice and its tracks are completed.
 
 """
 
@@ -17,7 +17,7 @@ from importlib.metadata import version
 import json
 from pathlib import Path
 import platform
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
@@ -25,17 +25,29 @@ from boxreg_ros.io.session import register
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress
-from boxreg_ros.offline.reader import Findings, ReadAhead, reader
+from boxreg_ros.offline.reader import Findings, ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
-from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, Sweep
+from boxreg_ros.structures import (
+    BoxArray,
+    EXTENDED,
+    INTERPOLATED,
+    KEPT,
+    REFINED,
+    RefinedBoxes,
+    REJECTED,
+    Sweep,
+)
 import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar
+    from boxreg_ros.offline.completion import Completion
     from boxreg_ros.review.changes import TrackChanges
+    from boxreg_ros.tracks.complete import Plan
 
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
@@ -56,8 +68,9 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     out : Path
         Result folder. It appears complete or not at all; an earlier result is replaced.
     progress : Progress, optional
-        Shows the duration of the recording that has been read and its whole duration [s]. With a
-        report the recording is read twice, and both count twice.
+        Shows the duration of the recording that has been read and its whole duration [s]. Both
+        count once for each time that the recording is read: with completed tracks and with a
+        report once more each.
 
     Returns
     -------
@@ -75,6 +88,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     clock = Stopwatch()
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
+    shown = _Passes(progress, 1 + bool(request.config.complete.steps) + request.report)
+    plan, completion = _survey(request, clock, shown)
     with ExitStack() as workers:
         process = workers.enter_context(reader(request))
         # The recording is opened while this process imports torch, which takes a second.
@@ -85,19 +100,20 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             registration_worker(request.config, clock, progress.announce)
         )
         recording = ReadAhead(process)
-        clock.begun('start')
+        if plan is None:
+            clock.begun('start')
         registrar = BoxRegistrar(request.config, submit)
-        shown = _Passes(progress, recording.source.seconds, 2 if request.report else 1)
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
-                _register(recording, registrar, sink, clock, shown)
+                _register(recording, registrar, completion, sink, clock, shown)
             summary = _summary(request, recording, registrar.counts, sink)
+            summary['complete'] = _completed(plan)
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary |= {'fingerprint': fingerprint, 'seconds': clock.seconds()}
             tracks = sink.changes.tracks()
             with clock('write'):
-                summary['rules'] = _write_tables(folder, tracks, request.config)
+                summary['rules'] = _write_tables(folder, tracks, request.config, plan)
             if request.report:
                 _report(folder, out, request, summary, tracks, clock, shown)
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
@@ -106,46 +122,104 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     return summary
 
 
-class _Passes(NamedTuple):
-    """Progress over one or two passes through a recording of `seconds`."""
+class _Passes:
+    """Progress over several passes through a recording."""
 
-    progress: Progress
-    seconds: float
-    passes: int
+    def __init__(self, progress: Progress, passes: int) -> None:
+        self.progress = progress
+        self._passes = passes
+        self._done = 0
 
-    def show(self, seconds: float, passes_done: int = 0) -> None:
-        """Report the time of the recording that has been read in this pass [s]."""
-        self.progress.show(passes_done * self.seconds + seconds, self.passes * self.seconds)
+    def each(self, recording: ReadAhead) -> Iterator[ReadItem]:
+        """Yield the items of one pass, and show the time that has been read [s]."""
+        seconds = recording.source.seconds
+        for item in recording:
+            self.progress.show(self._done * seconds + item.seconds, self._passes * seconds)
+            yield item
+        self._done += 1
+
+
+def _survey(
+    request: Request, clock: Stopwatch, progress: _Passes
+) -> tuple[Plan | None, Completion | None]:
+    """Register the recording a first time and plan its whole tracks; None without steps."""
+    if not request.config.complete.steps:
+        return None, None
+    with ExitStack() as workers:
+        process = workers.enter_context(reader(request))
+        from boxreg_ros.offline.completion import Completion, survey
+        from boxreg_ros.offline.registration_worker import registration_worker
+
+        submit = workers.enter_context(
+            registration_worker(request.config, clock, progress.progress.announce)
+        )
+        recording = ReadAhead(process)
+        clock.begun('start')
+        items = ((item.moved, item.restarts) for item in progress.each(recording))
+        plan = survey(items, recording.source.fixed_frame, request.config, submit)
+        return plan, Completion(plan, request.config)
 
 
 def _register(
     recording: ReadAhead,
     registrar: BoxRegistrar,
+    completion: Completion | None,
     sink: Sink,
     clock: Stopwatch,
     progress: _Passes,
 ) -> None:
-    """Read the recording, register its boxes and write them."""
-    for item in recording:
-        progress.show(item.seconds)
+    """Read the recording, register its boxes, with those of `completion`, and write them."""
+    for item in progress.each(recording):
         with_ticket = sink.expect(item)
+        moved = with_ticket.moved
         with clock('registrar'):
-            ready = register(registrar, with_ticket.moved, with_ticket.restarts)
-        sink.take(ready)
+            if completion is not None:
+                moved = completion.to_register(moved, item.restarts)
+            ready = register(registrar, moved, item.restarts)
+        _take(ready, completion, sink)
     with clock('registrar'):
         ready = registrar.flush()
-    sink.take(ready)
+    _take(ready, completion, sink)
+    if completion is not None:
+        sink.take(completion.finished())
+
+
+def _take(ready: list[RefinedBoxes], completion: Completion | None, sink: Sink) -> None:
+    """Hand results on; those of completed tracks wait for the end of the recording."""
+    if completion is None:
+        sink.take(ready)
+    else:
+        completion.add(ready)
+
+
+def _completed(plan: Plan | None) -> dict[str, int]:
+    """Return what each step did to how many tracks and boxes; empty without steps."""
+    if plan is None:
+        return {}
+    tracks = plan.tracks
+    return {
+        'tracks': len(tracks),
+        'joined': sum(track.fragments - 1 for track in tracks),
+        'ambiguous': sum(bool(track.ambiguous) for track in tracks),
+        'rejected': sum(track.rejected for track in tracks),
+        'filled': sum(track.filled for track in tracks),
+        'extended': sum(track.extended for track in tracks),
+        'reclassified': sum(track.reclassified for track in tracks),
+    }
 
 
 def _write_tables(
-    folder: Path, tracks: Sequence[TrackChanges], config: Config
+    folder: Path, tracks: Sequence[TrackChanges], config: Config, plan: Plan | None
 ) -> dict[str, dict[str, int]]:
     """Write the tables of tracks; return violations of rules ``before`` and ``after`` the run."""
     from boxreg_ros.review.rules import counts
     from boxreg_ros.review.rules.protocol import LabelTrack
     from boxreg_ros.review.tables import assessed, write_tables
 
-    write_tables(folder, assessed(tracks))
+    if plan is None:
+        write_tables(folder, assessed(tracks))
+    else:
+        write_tables(folder, assessed(tracks), STEP_COLUMNS, step_cells(plan.tracks))
     before = []
     after = []
     for track in tracks:
@@ -175,10 +249,9 @@ def _report(
 
 
 def _items(request: Request, progress: _Passes) -> Iterator[Sweep | BoxArray]:
-    """Read the recording a second time; yield its clouds and boxes in the fixed frame."""
+    """Read the recording once more; yield its clouds and boxes in the fixed frame."""
     with reader(request) as process:
-        for item in ReadAhead(process):
-            progress.show(item.seconds, passes_done=1)
+        for item in progress.each(ReadAhead(process)):
             if item.moved is not None:
                 yield item.moved
 
@@ -268,8 +341,9 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
         parts[-1] += f' ({_counts(summary["reasons"])})'
     if summary['heading_flips']:
         parts.append(f'{summary["heading_flips"]:,} heading flips corrected')
-    if INTERPOLATED in status:
-        parts.append(f'{status[INTERPOLATED]:,} interpolated')
+    for word in (REJECTED, INTERPOLATED, EXTENDED):
+        if word in status:
+            parts.append(f'{status[word]:,} {word}')
     line = (
         f'{out}: {", ".join(parts)} from {summary["sweeps"]:,} sweeps in '
         f'{summary["seconds"]["total"]:.1f} s, fixed frame {summary["fixed_frame"]}'

@@ -7,6 +7,7 @@ from pathlib import Path
 import sys
 from typing import Any, Self, TYPE_CHECKING
 
+from boxreg_ros.config import COMPLETE_STEPS
 from boxreg_ros.offline.arguments import (
     add_label_arguments,
     add_recording_arguments,
@@ -58,9 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='end of the part to refine, from the beginning of the recording [s]',
     )  # fmt: skip
     parser.add_argument(
-        '--bridge', type=float, default=0.0, metavar='S',
-        help='interpolate missing boxes in gaps of a track up to this long [s] (default: none)',
+        '--complete', action='store_true',
+        help='complete the tracks: join fragments, reject ghosts, add missing boxes (sets '
+        ' complete.stitch, static, prune, fill and extend)',
     )  # fmt: skip
+    parser.add_argument('--bridge', nargs='?', action=_Removed, help=argparse.SUPPRESS)
     parser.add_argument(
         '--report', action='store_true',
         help='also write report.html: what was changed, and which tracks to check',
@@ -80,6 +83,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--workers', type=int, metavar='N', help='CPU cores of the solver (sets solver.threads)'
     )
+
+
+class _Removed(argparse.Action):
+    """An option of earlier versions: its error names what replaces it."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        _namespace: argparse.Namespace,
+        _values: object,
+        option_string: str | None = None,
+    ) -> None:
+        """Refuse the option."""
+        parser.error(
+            f'{option_string}: was removed; use --complete, or for missing boxes alone '
+            f'--set complete.fill=true --set complete.fill_gap=SECONDS'
+        )
 
 
 def _part(text: str) -> float:
@@ -151,6 +171,8 @@ def _request(args: argparse.Namespace) -> Request:
     from boxreg_ros.offline.request import Request
 
     config = config_from(args)
+    if args.complete:
+        config = config.updated({f'complete.{step}': True for step in COMPLETE_STEPS})
     if args.workers is not None:
         config = config.updated({'solver.threads': args.workers})
     return Request(
@@ -167,7 +189,6 @@ def _request(args: argparse.Namespace) -> Request:
         labels=args.labels,
         label_frame=args.label_frame,
         convention=convention_from(args, args.associate),
-        bridge=args.bridge,
         report=args.report,
     )
 

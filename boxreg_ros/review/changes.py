@@ -25,7 +25,7 @@ class TrackChanges:
         Header stamps [ns].
     given, boxes : array, shape (n, 9)
         Input and result in the fixed frame; NaN where a box is invalid or in another frame, and
-        in `given` for interpolated boxes.
+        in `given` for added boxes.
     change : array, shape (n, 4)
         Result minus input along the axes of the box [m] and in yaw [rad], without 180 degree
         flips.
@@ -111,7 +111,7 @@ class Changes:
         given : BoxArray
             The input.
         refined : RefinedBoxes
-            The result; interpolated boxes stand behind those of the input.
+            The result; added boxes stand behind those of the input.
 
         """
         boxes = refined.boxes

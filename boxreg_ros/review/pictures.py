@@ -11,11 +11,13 @@ from boxreg_ros.review.changes import known, median, TrackChanges
 from boxreg_ros.review.track_points import SHOWN_MARGIN
 from boxreg_ros.structures import (
     BOX_EXTENT,
+    EXTENDED,
     Floats,
     INTERPOLATED,
     KEPT,
     LENGTH,
     REFINED,
+    REJECTED,
     WIDTH,
     X,
     Y,
@@ -27,7 +29,13 @@ from numpy.typing import NDArray
 
 Mask = NDArray[np.bool_]
 STYLE: Any = {'font.size': 8, 'axes.spines.top': False, 'axes.spines.right': False}
-COLOURS = {REFINED: '#1769aa', KEPT: '#e07b00', INTERPOLATED: '#8e44ad'}
+COLOURS = {
+    REFINED: '#1769aa',
+    KEPT: '#e07b00',
+    INTERPOLATED: '#8e44ad',
+    EXTENDED: '#2a9d8f',
+    REJECTED: '#c0392b',
+}
 INPUT_COLOUR = '#9a9a9a'
 WIDTH_INCHES = 13
 MIN_CHANGE = 0.02

@@ -24,10 +24,10 @@ from boxreg_ros.review.changes import mean, median, TrackChanges
 from boxreg_ros.review.pictures import STYLE, top_view, track_picture
 from boxreg_ros.review.track_points import BoxPoints, gather_points, points_before_and_after
 from boxreg_ros.structures import (
+    ADDED,
     BOX_EXTENT,
     BoxArray,
     Floats,
-    INTERPOLATED,
     KEPT,
     REFINED,
     Sweep,
@@ -202,13 +202,13 @@ def _filled_cells(points: Floats) -> int:
 def _numbers(track: TrackChanges) -> dict[str, Any]:
     """Return the numbers of a track on the page."""
     counts = Counter(track.status.tolist())
-    boxes = len(track.status) - counts[INTERPOLATED]
-    is_input = track.status != INTERPOLATED
+    is_input = ~np.isin(track.status, ADDED)
+    boxes = int(is_input.sum())
     return {
         'track_id': track.track_id,
         'class_name': track.class_name,
         'boxes': boxes,
-        'interpolated': counts[INTERPOLATED],
+        'interpolated': len(track.status) - boxes,
         'seconds': (track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
         'points': median(track.num_points[is_input]),
         'refined': counts[REFINED] / boxes if boxes else np.nan,

@@ -164,18 +164,19 @@ def spoiled(drive):
 @pytest.mark.filterwarnings('error::RuntimeWarning')
 def test_unusual_boxes_are_counted_and_escaped(tmp_path):
     recording = spoiled(Drive(sweeps=18)).write(tmp_path / 'drive')
-    summary, page = run(recording, tmp_path / 'out', bridge=0.5)
+    config = QUICK.updated({'complete.fill': True})
+    summary, page = run(recording, tmp_path / 'out', config=config)
     assert summary['status']['interpolated'] == 2
     assert set(summary['reasons']) >= {
-        'no_transform', 'invalid_box', 'no_track_id', 'duplicate_track_id', 'no_points',
+        'no_transform', 'invalid_box', 'no_track_id', 'no_points',
     }  # fmt: skip
     assert 'script' not in page.tags
     rows = {row['track']: row for row in page.table('track', 'class', 'boxes')}
     assert set(rows) == {
-        f'A {SCRIPT}', 'B 1', 'empty', 'once', 'flat', 'nowhere', 'no id',
+        f'A {SCRIPT}', 'B 1', '1_2', 'empty', 'once', 'flat', 'nowhere', 'no id',
     }  # fmt: skip
     assert rows[f'A {SCRIPT}']['class'] == '<b>$car$</b>'
-    assert rows['B 1']['boxes'] == '17 + 2'
+    assert rows['B 1']['boxes'] == '16 + 2'
     assert rows['flat']['shift [m]'] == '\N{EN DASH}'
     assert sum(int(row['boxes'].split()[0]) for row in rows.values()) == summary['boxes_in']
     assert page.text.count('First missing transform') == 1
