@@ -11,7 +11,10 @@ from typing import NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.arrowhead import LINK
+from boxreg_ros.core.kernels import contiguous
+from boxreg_ros.core.kernels.arrays import WindowArrays
 from boxreg_ros.structures import POSE
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -93,6 +96,21 @@ class Problem(NamedTuple):
     def of_class(self, *names: str) -> Tensor:
         """Return the settings `names` of the class of each window, shape (B, number of names)."""
         return self.class_numbers[:, [CLASS_NUMBERS.index(name) for name in names]]
+
+    def arrays(self) -> WindowArrays:
+        """Return the windows for the kernels, which take no padding."""
+        M = self.points.shape[2]
+        return WindowArrays(
+            contiguous(self.boxes),
+            contiguous(self.valid.sum(1)),
+            contiguous(self.times),
+            contiguous(self.origins),
+            contiguous(self.ground),
+            contiguous(self.points).reshape(-1, 3),
+            contiguous(self.delays).reshape(-1),
+            M * np.arange(self.valid.numel()).reshape(self.valid.shape),
+            contiguous(self.mask.sum(2)),  # valid points come first
+        )
 
     def thinned(self, points: float) -> 'Problem':
         """Return the problem with every n-th point: at least `points` per box, if there are."""

@@ -8,7 +8,8 @@ docs/method.md (M4) has the residual that comes of it.
 from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, Problem, State
 from boxreg_ros.core.face_support import motion_compensated, to_box_frame
-from boxreg_ros.core.kernels import compiled
+from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels.arrays import TermArrays
 import numpy as np
 import torch
 from torch import Tensor
@@ -62,6 +63,17 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     return agreement_torch(points, problem, state)
 
 
+def with_rigid_shape(terms: TermArrays, problem: Problem, state: State) -> TermArrays:
+    """Return `terms` with the rigid shape of each track (M4)."""
+    information, wanted = agreement(problem, state)
+    return terms._replace(
+        shape_start=contiguous(state.pose),
+        shape_axes=terms.axes,
+        wanted=contiguous(wanted),
+        W_shape=contiguous(information),
+    )
+
+
 def agreement_compiled(points: Tensor, problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     """Return the same as `agreement`, by the kernel; `points` (B, N, M, 3)."""
     kernels = compiled(points)
@@ -75,9 +87,9 @@ def agreement_compiled(points: Tensor, problem: Problem, state: State) -> tuple[
     limits = (
         SHAPE_MARGIN, MIN_FLATNESS, float(MIN_CELL_POINTS), EFFECTIVE_POINTS, STEP_RIDGE
     )  # fmt: skip
-    kernels.rigid_shape.agreement(
-        *(np.ascontiguousarray(tensor.numpy()) for tensor in inputs), counts,
-        np.ascontiguousarray(deviation.numpy()), CELLS, limits, information, wanted,
+    run(
+        kernels.rigid_shape.agreement, B, *(contiguous(part) for part in inputs), counts,
+        contiguous(deviation), CELLS, limits, information, wanted,
     )  # fmt: skip
     return torch.from_numpy(information), torch.from_numpy(wanted)
 

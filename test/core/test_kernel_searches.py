@@ -1,5 +1,6 @@
 """The compiled searches against their torch twins, fallbacks, and independence of windows."""
 
+from dataclasses import fields
 import subprocess
 import sys
 
@@ -7,10 +8,17 @@ from boxreg_ros.config import Config
 from boxreg_ros.core import batch, kernels, prior, rigid_shape
 from boxreg_ros.core.arrowhead import BandedFactor
 from boxreg_ros.core.batch import EXTENT, SHARED, State
-from boxreg_ros.core.face_support import FAR, outermost_points, outermost_points_compiled, Search
-from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.face_support import (
+    FaceOffsets,
+    FAR,
+    observe_faces_compiled,
+    observe_faces_torch,
+)
+from boxreg_ros.core.input_model import expect, InputModel
 from boxreg_ros.core.registration import register
-from boxreg_ros.core.terms import Objective
+from boxreg_ros.core.solver import MOTION_TERMS
+from boxreg_ros.core.terms import Objective, term_arrays
+from boxreg_ros.core.weights import robustify_motion, weigh, weigh_compiled
 import numpy as np
 from paths import ROOT
 import pytest
@@ -81,23 +89,108 @@ def searched(case):
     return problem, State(pose, shared)
 
 
-@pytest.mark.parametrize('strips', [1, 3])
-@pytest.mark.parametrize('share', [0.02, 0.3])
+OFFSETS = FaceOffsets(
+    torch.zeros(6, dtype=D),
+    torch.tensor([0.3, 0.3, 0.2, 0.2, 0.0, 0.0], dtype=D),
+    torch.tensor([0.1, 0.1, 0.05, 0.05, 0.0, 0.0], dtype=D),
+)
+
+
+def assert_same_faces(problem, state, config):
+    """Check the face observations by the kernel; return which faces have a weight."""
+    found = observe_faces_compiled(problem, state, OFFSETS, config)
+    known = observe_faces_torch(problem, state, OFFSETS, config)
+    is_seen = (known.weight > 0) & problem.valid[..., None]
+    for name in ('moments', 'distance', 'inset'):
+        pair = (getattr(side, name)[is_seen] for side in (found, known))
+        assert_equal(*pair)
+    assert_equal(found.weight[problem.valid], known.weight[problem.valid].nan_to_num())
+    is_valid = problem.valid[..., None].expand_as(is_seen)
+    for found_share, known_share in zip(found.inset_shares, known.inset_shares, strict=True):
+        assert_equal(found_share[is_valid], known_share[is_valid])
+    assert_equal(found.num_points[problem.valid], known.num_points[problem.valid])
+    return is_seen
+
+
+@pytest.mark.parametrize('strips', [False, True])
+@pytest.mark.parametrize('share', [0.02, 0.9])
 @pytest.mark.parametrize('case', CASES)
-def test_outermost_points_equal_those_of_torch(case, share, strips):
+def test_face_observations_equal_those_of_torch(case, share, strips):
     problem, state = searched(case)
-    rng = np.random.default_rng(5)
-    inset, weight = (torch.from_numpy(rng.random((*problem.valid.shape, 6))) for _ in range(2))
-    search = Search(problem.points, 0.2 * inset, weight, share, strips)
-    found = outermost_points_compiled(problem, state, search)
-    known = outermost_points(problem, state, search)
-    is_seen = (known[2] > 0)[..., None, None]
-    assert_equal(torch.where(is_seen, found[0], 0.0), torch.where(is_seen, known[0], 0.0))
-    assert_equal(found[1] * is_seen[..., 0, 0], known[1] * is_seen[..., 0, 0])
-    np.testing.assert_array_equal(found[2], known[2])
-    np.testing.assert_array_equal(found[3], known[3])
+    config = Config().updated({'faces.outermost': share, 'ingredients.strips': strips})
+    is_seen = assert_same_faces(problem, state, config)
     if case == 'usual':
         assert is_seen.sum() > 30
+
+
+@pytest.mark.parametrize('far', [10.0, 60.0])
+def test_observed_faces_from_a_known_sensor_equal_those_of_torch(far):
+    problem, state = searched('a road')
+    rng = np.random.default_rng(6)
+    origins = far * torch.from_numpy(rng.normal(size=(*problem.valid.shape, 3)))
+    origins[0, 0] = torch.nan
+    valid = problem.valid.clone()
+    valid[1, 3:] = False
+    mask = problem.mask & valid[..., None]
+    delays = torch.from_numpy(rng.normal(size=problem.mask.shape)) * mask
+    problem = problem._replace(
+        origins=origins, valid=valid, mask=mask, delays=0.05 * delays, times=problem.times
+    )
+    assert_same_faces(problem, state, Config())
+    assert_same_faces(problem, state, Config().updated({'ingredients.range_inset': False}))
+
+
+def weighed(problem, state, config):
+    """Return the terms of a problem by torch, and by the kernel, with robust motion."""
+    observations = observe_faces_torch(problem, state, OFFSETS, config)
+    expected = expect(problem, OFFSETS)
+    known = [
+        robustify_motion(term, state) if term.function in MOTION_TERMS else term
+        for term in weigh(problem, state, observations, expected, config)
+    ]
+    return known, weigh_compiled(problem, state, observations, expected, config, True)
+
+
+def drives(kind, N=12):
+    """Return a problem of three cars, one with two boxes less, and boxes near the input."""
+    rng = np.random.default_rng(4)
+    boxes = np.array([drive(N, speed=speed, turn=0.1) for speed in (3, 5, 9)])
+    if kind in ('still', 'drives off'):
+        boxes[:2] = boxes[:2, :1]
+    if kind == 'drives off':
+        boxes[0, -3:, 0] += [0.05, 0.25, 0.6]
+    if kind == 'one outlier':
+        boxes[0, 5, :2] += 8.0
+        boxes[0, 5, 8] += 1.6
+    boxes += 0.02 * rng.normal(size=boxes.shape)
+    valid = np.ones((3, N), bool)
+    valid[1, N - 2 :] = False
+    points = surfaces(7, 3, N)
+    mask = np.broadcast_to(valid[..., None], points.shape[:3])
+    problem = problem_of(
+        boxes, points=points, mask=mask, valid=valid, ground=np.full((3, N), -0.8),
+        class_numbers={
+            field.name: getattr(Config().vehicle, field.name)
+            for field in fields(Config().vehicle)[1:]
+        },
+    )  # fmt: skip
+    pose = problem.pose + 0.05 * torch.from_numpy(rng.normal(size=(3, N, 6)))
+    shared = expect(problem, OFFSETS).shared
+    return problem, State(pose, shared + 0.02 * torch.from_numpy(rng.normal(size=shared.shape)))
+
+
+@pytest.mark.parametrize('kind', ['usual', 'still', 'drives off', 'one outlier', 'two boxes'])
+@pytest.mark.parametrize('robust', [True, False])
+def test_weights_equal_those_of_torch(kind, robust):
+    problem, state = drives(kind, 4 if kind == 'two boxes' else 12)
+    config = Config().updated({'ingredients.robust_weights': robust})
+    known, found = weighed(problem, state, config)
+    known = term_arrays(known, state.pack(), problem.length)
+    for name in found._fields:
+        if not name.startswith('shape'):
+            assert_equal(getattr(found, name), getattr(known, name))
+    if kind in ('still', 'drives off'):
+        assert 0 < (found.W_zero_motion[..., 0, 0] > 0).mean() < 1
 
 
 @pytest.mark.parametrize('case', CASES)

@@ -170,16 +170,15 @@ def invert_poses(band, border, corner, blocks, corner_inverse):
 
 
 @kernel
-def solve_rows(rows, band, border, corner, b, x):
-    """Write the solutions x (r, n + S) for right sides `b` of the windows `rows` (r,)."""
-    for i in range(len(rows)):
+def solve_rows(begin, end, rows, band, border, corner, b, x):
+    """Write the solutions x (r, n + S) for right sides `b` of the windows `rows[begin:end]`."""
+    for i in range(begin, end):
         x[i] = b[i]
         solve(band[rows[i]], border[rows[i]], corner[rows[i]], x[i])
 
 
 @kernel
-def invert_rows(rows, band, border, corner, blocks, corner_inverse):
-    """Write, for the windows `rows`, the blocks of the inverse (r, N, 6, 6) and (r, S, S)."""
-    for i in range(len(rows)):
-        row = rows[i]
-        invert_poses(band[row], border[row], corner[row], blocks[i], corner_inverse[i])
+def invert_windows(begin, end, band, border, corner, blocks, corner_inverse):
+    """Write the blocks of the inverse, (B, N, 6, 6) and (B, S, S), of windows `begin` to `end`."""
+    for b in range(begin, end):
+        invert_poses(band[b], border[b], corner[b], blocks[b], corner_inverse[b])

@@ -44,10 +44,10 @@ def fill_planes(sums, roughness, flatness, min_points, planes, thickness):
 
 @kernel
 def agreement(
-    poses, given, extents, points, counts, roughness, cells, limits, information, wanted
+    begin, end, poses, given, extents, points, counts, roughness, cells, limits, information, wanted
 ):
     """
-    Write information (B, N, 6, 6) and wanted steps (B, N, 6) of all windows.
+    Write information (B, N, 6, 6) and wanted steps (B, N, 6) of windows `begin` to `end`.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def agreement(
 
     """
     margin, flatness, min_points, independent, ridge = limits
-    B, N, M = points.shape[:3]
+    _, N, M = points.shape[:3]
     cell_count = cells[0] * cells[1] * cells[2]
     local = np.empty((N, 3, M))
     R = np.empty((3, 3))
@@ -77,7 +77,7 @@ def agreement(
     planes = np.empty((cell_count, 4))
     thickness = np.empty(cell_count)
     lever = np.empty(6)
-    for b in range(B):
+    for b in range(begin, end):
         for k in range(3):
             half[k] = extents[b, k] / 2
         sums = np.zeros((cell_count, 4, 4))
