@@ -4,6 +4,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.kernels import load
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints, ROLL, Sweep
 import numpy as np
@@ -167,6 +168,17 @@ def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
     R = matrix_from_rpy(boxes[:, ROLL:])  # (n, 3, 3)
     half = boxes[:, 3:6] / 2
     reach = (np.abs(R) @ (half + margin)[..., None])[..., 0]  # half the upright bounding box
+    kernels = load()
+    if kernels is None:
+        return crop_numpy(points, boxes, reach)
+    columns = np.ascontiguousarray(points.T)
+    return Crop(*kernels.crop.crop(columns, boxes[:, :3].copy(), R, half, reach, margin))
+
+
+def crop_numpy(points: NDArray[np.floating], boxes: Floats, reach: Floats) -> Crop:
+    """Return the same as `crop` and some more pairs; `reach` (n, 3) as in the kernel."""
+    R = matrix_from_rpy(boxes[:, ROLL:])
+    half = boxes[:, 3:6] / 2
     index, owner = _pairs(points, boxes[:, :2], reach[:, :2])
     offset = points.T.take(index, 1).astype(np.float64) - boxes[:, :3].T.take(owner, 1)
     outside = np.empty_like(offset)

@@ -24,6 +24,7 @@ class Kernels(NamedTuple):
     """The modules with compiled functions."""
 
     arrowhead: ModuleType
+    crop: ModuleType
     face_support: ModuleType
     normal_equations: ModuleType
     rigid_shape: ModuleType
@@ -90,14 +91,16 @@ def contiguous(tensor: Tensor) -> Any:
 
 def compiled(like: Tensor) -> Kernels | None:
     """Return the kernels for tensors as `like`; None on a GPU, and where numba does not work."""
-    return _load() if like.is_cpu else None
+    return load() if like.is_cpu else None
 
 
 @cache
-def _load() -> Kernels | None:
+def load() -> Kernels | None:
+    """Return the kernels; None where numba does not work, with one warning."""
     try:
         from boxreg_ros.core.kernels import (
             arrowhead,
+            crop,
             face_support,
             normal_equations,
             rigid_shape,
@@ -112,4 +115,4 @@ def _load() -> Kernels | None:
             stacklevel=2,
         )
         return None
-    return Kernels(arrowhead, face_support, normal_equations, rigid_shape, weights)
+    return Kernels(arrowhead, crop, face_support, normal_equations, rigid_shape, weights)

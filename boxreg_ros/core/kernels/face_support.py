@@ -155,11 +155,10 @@ def centre_of(points, centre):
 def fill_visibility(box, origin, points, numbers, R, tangent):
     """Write how openly the sensor sees each face of one input box, (6,)."""
     toward = np.empty(3)
-    if isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2]):
-        toward[:] = origin
-    else:
-        centre_of(points, toward)
-        toward *= FAR_SENSOR
+    centre_of(points, toward)
+    is_known = isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2])
+    for k in range(3):
+        toward[k] = origin[k] if is_known else FAR_SENSOR * toward[k]
     fill_rotation(box[6], box[7], box[8], R)
     for face in range(4):
         axis = face // 2

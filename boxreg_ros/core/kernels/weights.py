@@ -48,7 +48,13 @@ def fill_neighbour_deviation(boxes, times, length, axes, numbers, off_track):
 @kernel
 def lower_median(values):
     """Return the median of values (n,), the lower one of two; the values are sorted."""
-    values.sort()
+    for i in range(1, len(values)):
+        value = values[i]
+        place = i
+        while place > 0 and values[place - 1] > value:
+            values[place] = values[place - 1]
+            place -= 1
+        values[place] = value
     return values[(len(values) - 1) // 2]
 
 
@@ -65,10 +71,9 @@ def is_parked(boxes, times, length, yaw_deviation, numbers):
         for k in range(3):
             rate[k] += (times[n] - mean) * boxes[n, x_y_yaw[k]]
         power += (times[n] - mean) * times[n]
-    rate /= power
     duration = times[length - 1]
-    speed = hypot(rate[0], rate[1])
-    turned = abs(rate[2]) * duration / yaw_deviation
+    speed = hypot(rate[0], rate[1]) / abs(power)
+    turned = abs(rate[2] / power) * duration / yaw_deviation
     x = lower_median(boxes[:length, 0].copy())
     y = lower_median(boxes[:length, 1].copy())
     distance = np.empty(length)
@@ -136,6 +141,15 @@ def fill_face_weights(distance, weight, off_track, length, numbers, face_weight)
 
 
 @kernel
+def scale_moments(moments, weight, W):
+    """Write the weights of the planes of one box, (6, 4, 4): weighted second moments."""
+    for face in range(6):
+        for i in range(4):
+            for j in range(4):
+                W[face, i, j] = moments[face, i, j] * weight[face]
+
+
+@kernel
 def fill_shared_weights(shared, expected, deviation, distance, face_weight, length, numbers, W):
     """Write the weights of the shared variables (M22), (22, 22)."""
     for s in range(SHARED):
@@ -188,7 +202,10 @@ def scale_by_neighbours(squared, count, outlier, W):
         least = squared[n]
         if n >= 2:
             least = min(squared[n], squared[n - 1], squared[n - 2])
-        W[n] /= (1 + least / outlier**2) ** 2
+        scale = 1 / (1 + least / outlier**2) ** 2
+        for j in range(W.shape[1]):
+            for k in range(W.shape[2]):
+                W[n, j, k] *= scale
 
 
 @kernel
@@ -247,8 +264,7 @@ def weigh_windows(begin, end, windows, poses, shared, faces, expected, motion, n
         distance = faces.distance[b]
         fill_face_weights(distance, faces.weight[b], off_track, length, numbers, face_weight)
         for n in range(length):
-            for face in range(6):
-                terms.W_faces[b, n, face] = faces.moments[b, n, face] * face_weight[n, face]
+            scale_moments(faces.moments[b, n], face_weight[n], terms.W_faces[b, n])
         deviation = expected.pose_deviation[b]
         fill_input_weights(
             boxes, poses[b], shared[b, BIAS:GAP], length, axes, off_track, deviation,
