@@ -170,3 +170,19 @@ class WeightNumbers(NamedTuple):
     spread: float
     face_deviations: tuple[float, ...]
     is_robust: bool
+
+
+class CropNumbers(NamedTuple):
+    """Constants and settings of `boxreg_ros.core.observation`; there they are described."""
+
+    margin: float
+    own_margin: float
+    ownership_tolerance: float
+    clearance: float
+    has_road: bool
+    road_width: float
+    road_gap: float
+    road_range: float
+    road_quantiles: tuple[float, ...]
+    road_flatness: float
+    min_road_points: int

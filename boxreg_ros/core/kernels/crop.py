@@ -56,9 +56,24 @@ def raster(centers, reach):
 
 
 @kernel
+def near_points(points, first):
+    """Return the points (3, M) in cells that boxes touch, with their cells."""
+    near = np.empty(points.shape[1], np.int32)
+    cells = np.empty(points.shape[1], np.int32)
+    count = 0
+    for i in range(points.shape[1]):
+        cell = cell_of(metre(points[0, i]), metre(points[1, i]))
+        if first[cell + 1] > first[cell]:
+            near[count] = i
+            cells[count] = cell
+            count += 1
+    return near[:count], cells[:count]
+
+
+@kernel
 def crop(points, centers, rotations, half, reach, margin):
     """
-    Find the pairs of a point and a box within `margin` of each other, ascending by box.
+    Find the pairs of a point and a box within `margin` of each other, ascending by point.
 
     Parameters
     ----------
@@ -73,30 +88,23 @@ def crop(points, centers, rotations, half, reach, margin):
 
     Returns
     -------
-    row, owner, offset, outside : array
-        As in `boxreg_ros.core.observation.Crop`.
+    row, owner : array, shape (P,)
+        Point and box of each pair.
+    offset, outside : array, shape (P, 3)
+        Point minus centre, and distance outside of the faces [m].
 
     """
     first, boxes = raster(centers, reach)
-    M = points.shape[1]
-    near = np.empty(M, np.int32)
-    cells = np.empty(M, np.int32)
-    num_near = 0
+    near, cells = near_points(points, first)
     capacity = 0
-    for i in range(M):
-        cell = cell_of(metre(points[0, i]), metre(points[1, i]))
-        count = first[cell + 1] - first[cell]
-        if count:
-            near[num_near] = i
-            cells[num_near] = cell
-            num_near += 1
-            capacity += count
-    # Pairs in the order of the points, then sorted by box.
-    pairs = np.empty((capacity, 2), np.int64)
-    places = np.empty((capacity, 6))
-    counts = np.zeros(len(centers) + 1, np.int64)
+    for cell in cells:
+        capacity += first[cell + 1] - first[cell]
+    row = np.empty(capacity, np.int64)
+    owner = np.empty(capacity, np.int64)
+    offset = np.empty((capacity, 3))
+    outside = np.empty((capacity, 3))
     P = 0
-    for k in range(num_near):
+    for k in range(len(near)):
         i = near[k]
         for place in range(first[cells[k]], first[cells[k] + 1]):
             box = boxes[place]
@@ -110,24 +118,112 @@ def crop(points, centers, rotations, half, reach, margin):
             v = abs(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) - half[box, 1]
             w = abs(R[0, 2] * x + R[1, 2] * y + R[2, 2] * z) - half[box, 2]
             if max(u, v, w) < margin:
-                pairs[P, 0], pairs[P, 1] = i, box
-                places[P, 0], places[P, 1], places[P, 2] = x, y, z
-                places[P, 3], places[P, 4], places[P, 5] = u, v, w
-                counts[box + 1] += 1
+                row[P], owner[P] = i, box
+                offset[P, 0], offset[P, 1], offset[P, 2] = x, y, z
+                outside[P, 0], outside[P, 1], outside[P, 2] = u, v, w
                 P += 1
-    row = np.empty(P, np.int64)
-    owner = np.empty(P, np.int64)
-    offset = np.empty((3, P))
-    outside = np.empty((3, P))
-    for box in range(len(centers)):
-        counts[box + 1] += counts[box]
-    for k in range(P):
-        box = pairs[k, 1]
-        place = counts[box]
-        counts[box] += 1
-        row[place] = pairs[k, 0]
-        owner[place] = box
-        for axis in range(3):
-            offset[axis, place] = places[k, axis]
-            outside[axis, place] = places[k, 3 + axis]
-    return row, owner, offset, outside
+    return row[:P], owner[:P], offset[:P], outside[:P]
+
+
+@kernel
+def flat_height(heights, quantiles, flatness, min_points):
+    """Return the height of a road from heights beside a box; NaN where it is not flat."""
+    n = len(heights)
+    heights.sort()
+    if n < min_points:
+        return np.nan
+    low = heights[int(quantiles[0] * n)]
+    high = heights[int(quantiles[2] * n)]
+    return heights[int(quantiles[1] * n)] if high - low < flatness else np.nan
+
+
+@kernel
+def road_heights(owner, height, offset, outside, half, numbers):
+    """Return the height of the road beside each of n boxes (n,); NaN where not found [m]."""
+    n = len(half)
+    beside = np.empty(len(owner), np.bool_)
+    first = np.zeros(n + 1, np.int64)
+    for k in range(len(owner)):
+        box = owner[k]
+        aside = max(outside[k, 0], outside[k, 1])
+        square = np.hypot(half[box, 0], half[box, 1]) + numbers.road_width
+        beside[k] = (
+            aside > numbers.road_gap
+            and max(aside, outside[k, 2]) < numbers.road_width
+            and abs(height[k]) < numbers.road_range
+            and max(abs(offset[k, 0]), abs(offset[k, 1])) < square
+        )
+        first[box + 1] += beside[k]
+    for box in range(n):
+        first[box + 1] += first[box]
+    place = first[:-1].copy()
+    levels = np.empty(first[-1])
+    for k in range(len(owner)):
+        if beside[k]:
+            levels[place[owner[k]]] = height[k]
+            place[owner[k]] += 1
+    road = np.empty(n)
+    for box in range(n):
+        road[box] = flat_height(
+            levels[first[box] : first[box + 1]], numbers.road_quantiles, numbers.road_flatness,
+            numbers.min_road_points,
+        )  # fmt: skip
+    return road
+
+
+@kernel
+def own_points(points, centers, rotations, half, reach, numbers):
+    """
+    Find the points that belong to each box, and the height of the road beside it.
+
+    Parameters
+    ----------
+    points, centers, rotations, half, reach : array
+        As for `crop`, with the margin `numbers.margin`.
+    numbers : CropNumbers
+        Constants and settings.
+
+    Returns
+    -------
+    row, owner, x : array, shape (P,)
+        Point and box of each pair, and the x coordinate of the point from the centre [m].
+    road : array, shape (n,)
+        Height of the road above the bottom of each box, along its z axis [m]; NaN if unknown.
+    num_inside : array, shape (n,)
+        Points inside each box.
+
+    """
+    row, owner, offset, outside = crop(points, centers, rotations, half, reach, numbers.margin)
+    height = np.empty(len(row))
+    depth = np.empty(len(row))
+    least = np.empty(len(row))
+    num_inside = np.zeros(len(half), np.int64)
+    start = 0
+    for k in range(len(row)):
+        R = rotations[owner[k]]
+        height[k] = half[owner[k], 2]
+        for j in range(3):
+            height[k] += R[j, 2] * offset[k, j]
+        depth[k] = max(outside[k, 0], outside[k, 1], outside[k, 2])
+        num_inside[owner[k]] += depth[k] <= 0.0
+        if row[k] != row[start]:
+            start = k
+        least[k] = depth[k]
+        for other in range(start, k):  # the same point in other boxes
+            least[other] = min(least[other], depth[k])
+            least[k] = min(least[k], depth[other])
+    road = np.full(len(half), np.nan)
+    if numbers.has_road:
+        road = road_heights(owner, height, offset, outside, half, numbers)
+    P = 0
+    x = np.empty(len(row))
+    for k in range(len(row)):
+        ground = road[owner[k]] if road[owner[k]] == road[owner[k]] else 0.0
+        if (
+            depth[k] < numbers.own_margin
+            and depth[k] <= least[k] + numbers.ownership_tolerance
+            and height[k] > ground + numbers.clearance
+        ):
+            row[P], owner[P], x[P] = row[k], owner[k], offset[k, 0]
+            P += 1
+    return row[:P], owner[:P], x[:P], road, num_inside
