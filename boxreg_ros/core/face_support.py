@@ -123,8 +123,9 @@ def visibility(problem: Problem) -> Tensor:
     toward = problem.origins
     is_known = toward.isfinite().all(-1, keepdim=True)
     if not is_known.all():
-        weight = problem.mask.to(problem.points)[..., None]
-        mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
+        points, mask, _ = problem.padded()
+        weight = mask.to(points)[..., None]
+        mean = (points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
         toward = torch.where(is_known, toward, 1e6 * mean)
     toward = (toward[..., None, :] @ R)[..., 0, :]
     half = problem.boxes[..., 3:6] / 2
@@ -224,7 +225,7 @@ def observe_faces_compiled(
         max_range_share=MAX_RANGE_SHARE if ingredients.range_inset else 0.0,
         range_half_weight=RANGE_INSET_HALF_WEIGHT,
         min_along=MIN_ALONG,
-        is_moving=bool(problem.delays.any()),
+        is_moving=problem.returns.is_moving,
     )
     run(
         kernels.face_support.observe_faces, B, problem.arrays(), contiguous(state.pose),
@@ -413,10 +414,11 @@ def motion_compensated(problem: Problem, state: State) -> Tensor:
     none.
 
     """
-    if not bool(problem.delays.any()):
-        return problem.points
+    points, _, delays = problem.padded()
+    if not problem.returns.is_moving:
+        return points
     position_and_time = torch.cat([state.pose[..., :3], problem.times[..., None]], -1)
     steps = position_and_time.diff(dim=1) * problem.valid[:, 1:, None]  # padding has none
     change = pad(steps, (0, 0, 1, 0)) + pad(steps, (0, 0, 0, 1))
     velocity = change[..., :3] / change[..., 3:].clamp(min=1e-9)
-    return problem.points - velocity[..., None, :].to(problem.points) * problem.delays[..., None]
+    return points - velocity[..., None, :].to(points) * delays[..., None]

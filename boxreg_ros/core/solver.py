@@ -223,7 +223,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
             turn += 1
             if plan.estimates_noise:
                 noise = _estimated_noise(noise, known, problem, solution, turn, config)
-            if not len(rows) and 2 * points <= problem.points.shape[2]:
+            if not len(rows) and 2 * points <= problem.returns.width:
                 rows, points = every, inf  # settled on few points: once more with all
     return solution
 

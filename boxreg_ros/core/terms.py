@@ -179,9 +179,7 @@ class Objective:
         return cast(Factor, select(self.factor, rows)).solve(vector)
 
 
-def linearise(
-    terms: TermArrays, x: Tensor, free: Tensor
-) -> tuple[Tensor, Tensor, BandedFactor]:
+def linearise(terms: TermArrays, x: Tensor, free: Tensor) -> tuple[Tensor, Tensor, BandedFactor]:
     """Return values (B,), gradients (B, D) and the factor of the curvature at `x` (B, D)."""
     B, D = x.shape
     factor = BandedFactor.empty(B, D, SHARED)

@@ -27,6 +27,7 @@ from scenes import (
     problem_of,
     random_problem,
     random_variables,
+    returns_of,
     terms_of,
     track_of,
     window_of,
@@ -131,11 +132,10 @@ def test_observed_faces_from_a_known_sensor_equal_those_of_torch(far):
     origins[0, 0] = torch.nan
     valid = problem.valid.clone()
     valid[1, 3:] = False
-    mask = problem.mask & valid[..., None]
-    delays = torch.from_numpy(rng.normal(size=problem.mask.shape)) * mask
-    problem = problem._replace(
-        origins=origins, valid=valid, mask=mask, delays=0.05 * delays, times=problem.times
-    )
+    points, mask, _ = problem.padded()
+    mask = mask & valid[..., None]
+    delays = 0.05 * torch.from_numpy(rng.normal(size=mask.shape))
+    problem = problem._replace(origins=origins, valid=valid, **returns_of(points, mask, delays))
     assert_same_faces(problem, state, Config())
     assert_same_faces(problem, state, Config().updated({'ingredients.range_inset': False}))
 
@@ -196,8 +196,8 @@ def test_weights_equal_those_of_torch(kind, robust):
 @pytest.mark.parametrize('case', CASES)
 def test_rigid_shape_equals_that_of_torch(case):
     problem, state = searched(case)
-    found = rigid_shape.agreement_compiled(problem.points, problem, state)
-    known = rigid_shape.agreement_torch(problem.points, problem, state)
+    found = rigid_shape.agreement_compiled(problem, state)
+    known = rigid_shape.agreement_torch(problem, state)
     for a, b in zip(found, known, strict=True):
         assert_equal(a, b, 1e-8)
     if case == 'usual':

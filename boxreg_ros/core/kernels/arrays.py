@@ -28,6 +28,8 @@ class WindowArrays(NamedTuple):
         the stamp of the box [s].
     first, counts : array, shape (B, N)
         First point of each observation, and their number.
+    stride : int
+        Every n-th point is used.
 
     """
 
@@ -40,6 +42,7 @@ class WindowArrays(NamedTuple):
     delays: Any
     first: Any
     counts: Any
+    stride: int
 
 
 class FaceArrays(NamedTuple):

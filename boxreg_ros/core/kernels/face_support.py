@@ -93,9 +93,7 @@ def fill_depths(local, half, level, numbers, excess, strip, depth):
 
 
 @kernel
-def outermost_points(
-    points, depth, strip, wanted, numbers, best_depth, best_index, moments, out
-):
+def outermost_points(points, depth, strip, wanted, numbers, best_depth, best_index, moments, out):
     """
     Find the outermost points of the five faces of one box.
 
@@ -141,6 +139,13 @@ def outermost_points(
 
 
 @kernel
+def returns_of(windows, values, b, n):
+    """Return the values of the points of one observation."""
+    first = windows.first[b, n]
+    return values[first : first + windows.counts[b, n] * windows.stride : windows.stride]
+
+
+@kernel
 def centre_of(points, centre):
     """Write the mean of points (M, 3); zero without points."""
     centre[:] = 0.0
@@ -175,9 +180,7 @@ def fill_visibility(box, origin, points, numbers, R, tangent):
 
 
 @kernel
-def fill_insets(
-    origin, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight
-):
+def fill_insets(origin, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight):
     """Write the shares (2, 6) of the two insets, their sum (6,), and the weights of faces (6,)."""
     reach = sqrt(origin[0] ** 2 + origin[1] ** 2)
     beyond = 0.0 if isnan(reach) else (reach - numbers.near_range) / numbers.range_span
@@ -266,7 +269,11 @@ def observe_faces(
         for k in range(3):
             half[k] = shared[b, EXTENT + k] / 2
         for n in range(poses.shape[1]):
-            moments, distance, weight = faces.moments[b, n], faces.distance[b, n], faces.weight[b, n]
+            moments, distance, weight = (
+                faces.moments[b, n],
+                faces.distance[b, n],
+                faces.weight[b, n],
+            )
             inset, shares = faces.inset[b, n], faces.inset_shares[:, b, n]
             if n >= length:
                 moments[:] = 0.0
@@ -276,11 +283,13 @@ def observe_faces(
                 shares[:] = 0.0
                 faces.num_points[b, n] = 0.0
                 continue
-            first, m = windows.first[b, n], windows.counts[b, n]
-            points = windows.points[first : first + m]
+            m = windows.counts[b, n]
+            points = returns_of(windows, windows.points, b, n)
             box, pose, origin = windows.boxes[b, n], poses[b, n], windows.origins[b, n]
             fill_visibility(box, origin, points, numbers, R, tangent)
-            fill_insets(origin, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight)
+            fill_insets(
+                origin, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight
+            )
             for k in range(3):
                 shift[k] = pose[k] - box[k]
             for face in range(6):
@@ -289,8 +298,8 @@ def observe_faces(
                 fill_velocity(poses[b], windows.times[b], n, length, velocity)
             fill_rotation(pose[3], pose[4], pose[5], R)
             to_own_axes(
-                points, windows.delays[first : first + m], velocity, shift, R, numbers.is_moving,
-                moved[:m], local[:, :m],
+                points, returns_of(windows, windows.delays, b, n), velocity, shift, R,
+                numbers.is_moving, moved[:m], local[:, :m],
             )  # fmt: skip
             near = fill_depths(
                 local[:, :m], half, level, numbers, excess[:, :m], strip[:, :m], depth[:, :m]
@@ -304,7 +313,40 @@ def observe_faces(
                 distance[face] = -mean_depth[face]
                 if number[face] < numbers.min_points:
                     weight[face] = 0.0
-            add_road(shift, windows.ground[b, n], half[2], shared[b, GAP + BOTTOM],
-                     moments[BOTTOM], distance)
+            add_road(
+                shift,
+                windows.ground[b, n],
+                half[2],
+                shared[b, GAP + BOTTOM],
+                moments[BOTTOM],
+                distance,
+            )
             weight[BOTTOM] = 1.0 if isfinite(windows.ground[b, n]) else 0.0
             faces.num_points[b, n] = near
+
+
+@kernel
+def count_held(begin, end, windows, poses, extents, margin, held):
+    """
+    Write how many points are in each box, or less than `margin` outside of it, (B, N).
+
+    Boxes at `poses` (B, N, 6) of `extents` (B, N, 3); windows `begin` to `end`.
+
+    """
+    R = np.empty((3, 3))
+    for b in range(begin, end):
+        for n in range(windows.lengths[b]):
+            pose, extent, box = poses[b, n], extents[b, n], windows.boxes[b, n]
+            fill_rotation(pose[3], pose[4], pose[5], R)
+            points = returns_of(windows, windows.points, b, n)
+            count = 0
+            for i in range(len(points)):
+                x = points[i, 0] - (pose[0] - box[0])
+                y = points[i, 1] - (pose[1] - box[1])
+                z = points[i, 2] - (pose[2] - box[2])
+                outside = -margin
+                for k in range(3):
+                    along = R[0, k] * x + R[1, k] * y + R[2, k] * z
+                    outside = max(outside, abs(along) - extent[k] / 2)
+                count += outside < margin
+            held[b, n] = count

@@ -5,7 +5,7 @@ The torch twins are the functions of `boxreg_ros.core.weights`; the formulas are
 
 """
 
-from math import hypot, inf, sqrt
+from math import hypot, inf
 
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.normal_equations import BIAS, EXTENT, GAP, PIVOT, SHARED, slip_of
