@@ -7,6 +7,7 @@ numbers each and the shared variables s, the same for all observations, see `Sta
 """
 
 from dataclasses import dataclass, fields, replace
+from operator import attrgetter
 from typing import NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
@@ -19,6 +20,8 @@ from torch import Tensor
 
 CLASS_NUMBERS = [item.name for item in fields(ClassConfig)[1:]]
 """Names of the columns of `Problem.class_numbers`."""
+numbers_of = attrgetter(*CLASS_NUMBERS)
+"""Returns the numbers of a `ClassConfig`, in this order."""
 POSE_ERRORS = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
 """The settings of `ClassConfig` that are the deviations of an input pose: x y z roll pitch yaw."""
 

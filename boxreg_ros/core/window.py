@@ -1,12 +1,11 @@
 """Windows of observations, and batches of windows as padded tensors."""
 
 from collections.abc import Sequence
-from dataclasses import astuple
 from functools import partial
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import PRIOR_SIZE, Problem, Returns, SHARED
+from boxreg_ros.core.batch import numbers_of, PRIOR_SIZE, Problem, Returns, SHARED
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
@@ -43,6 +42,15 @@ PRIOR_ANGLES = [3, 4, 5, 9, 10, 11]
 """Angles among the variables of the marginalisation prior: of its two poses."""
 
 
+NO_PRIOR = (
+    np.full(PRIOR_SIZE, np.nan),
+    np.zeros(PRIOR_SIZE),
+    np.zeros((PRIOR_SIZE, PRIOR_SIZE)),
+    np.zeros(4),
+)
+"""State, step, information and extents of a prior without information."""
+
+
 class MarginalisationPrior(NamedTuple):
     """
     Quadratic prior on a window from observations that have been marginalised.
@@ -74,9 +82,7 @@ class MarginalisationPrior(NamedTuple):
     @classmethod
     def none(cls, base: Floats) -> 'MarginalisationPrior':
         """Return a prior without information, NaN as its linearisation point."""
-        zeros = np.zeros(PRIOR_SIZE)
-        information = np.zeros((PRIOR_SIZE, PRIOR_SIZE))
-        return cls(base, np.full(PRIOR_SIZE, np.nan), zeros, information, np.zeros(4))
+        return cls(base, *NO_PRIOR)
 
 
 class Window(NamedTuple):
@@ -187,15 +193,23 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]
     minimum, is_usable = _prior_minimum(start, state, step)
-    information = information * PRIOR_DECAY * is_usable[:, None, None]
+    information *= PRIOR_DECAY * is_usable[:, None, None]
     first, counts = _places_of_returns(windows, valid)
-    arrays = boxes, start, valid, times
-    more = first, counts, origins, ground, np.nan_to_num(minimum), information, extents
-    to_device = partial(_tensor, device=config.device)
+    on_device = partial(_tensor, device=config.device)
     problem = Problem(
-        *map(to_device, arrays),
-        _returns(windows, config),
-        *map(to_device, (*more, _class_numbers(windows, config))),
+        boxes=on_device(boxes),
+        start=on_device(start),
+        valid=on_device(valid),
+        times=on_device(times),
+        returns=_returns(windows, config),
+        first=on_device(first),
+        counts=on_device(counts),
+        origins=on_device(origins),
+        ground=on_device(ground),
+        prior_mean=on_device(np.nan_to_num(minimum)),
+        prior_information=on_device(information),
+        marginalised_extents=on_device(extents),
+        class_numbers=on_device(_class_numbers(windows, config)),
     )
     return problem, base
 
@@ -296,7 +310,7 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
 def _class_numbers(windows: Sequence[Window], config: Config) -> Floats:
     """Return the numbers of each window's `ClassConfig`, in the order of its fields, (B, D)."""
     names = {window.class_name for window in windows}
-    rows = {name: astuple(config.class_config(name))[1:] for name in names}
+    rows = {name: numbers_of(config.class_config(name)) for name in names}
     return np.array([rows[window.class_name] for window in windows], dtype=np.float64)
 
 

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from itertools import pairwise
 from types import ModuleType
 from typing import Any, NamedTuple
 from warnings import warn
@@ -37,16 +38,16 @@ MIN_WINDOWS_PER_THREAD = 8
 
 class _Threads(NamedTuple):
     pool: ThreadPoolExecutor
-    count: int
+    workers: int
 
 
 _threads: ContextVar[_Threads | None] = ContextVar('threads', default=None)
 
 
 @contextmanager
-def shared_by(pool: ThreadPoolExecutor, count: int) -> Iterator[None]:
-    """Let `run` share the windows of each kernel between the caller and `count` - 1 threads."""
-    token = _threads.set(_Threads(pool, count))
+def shared_by(pool: ThreadPoolExecutor, workers: int) -> Iterator[None]:
+    """Let `run` share the windows of each kernel between the caller and `workers` - 1 threads."""
+    token = _threads.set(_Threads(pool, workers))
     try:
         yield
     finally:
@@ -70,14 +71,13 @@ def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
 
     """
     threads = _threads.get()
-    parts = 1 if threads is None else min(threads.count, windows // MIN_WINDOWS_PER_THREAD)
+    parts = 1 if threads is None else min(threads.workers, windows // MIN_WINDOWS_PER_THREAD)
     if threads is None or parts < 2:
         kernel(0, windows, *arguments)
         return
     ends = [windows * part // parts for part in range(parts + 1)]
     others = [
-        threads.pool.submit(kernel, begin, end, *arguments)
-        for begin, end in zip(ends[1:-1], ends[2:], strict=True)
+        threads.pool.submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])
     ]
     kernel(0, ends[1], *arguments)
     for other in others:

@@ -53,8 +53,8 @@ def factorise(band, border, corner):
         for k in range(1, last):
             factor = band[i, k]
             if factor != 0.0:
-                for j in range(k, last):
-                    band[i + k, j - k] -= factor * band[i, j]
+                for j in range(last - k):
+                    band[i + k, j] -= factor * band[i, k + j]
                 for s in range(S):
                     border[i + k, s] -= factor * border[i, s]
         for s in range(S):

@@ -29,9 +29,10 @@ def cell_of(x, y):
 @kernel
 def raster(centers, reach):
     """
-    Return which boxes touch each cell of 1 m: the boxes of cell c are boxes[first[c]:first[c + 1]].
+    Return which boxes touch each cell of 1 m, as `first` and `boxes`.
 
-    `centers` and `reach` are (n, 3) [m], `reach` half the upright bounding boxes.
+    Those of cell c are boxes[first[c]:first[c + 1]]. `centers` and `reach` are (n, 3) [m], `reach`
+    half the upright bounding boxes.
 
     """
     first = np.zeros(SIDE * SIDE + 1, np.int64)

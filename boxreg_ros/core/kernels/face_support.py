@@ -38,18 +38,6 @@ def add_candidate(depth, index, best_depth, best_index, count):
 
 
 @kernel
-def to_box_axes(points, shift, R, local):
-    """Write points (M, 3) in box axes (3, M); the box is `shift` (3,) from their origin [m]."""
-    for i in range(len(points)):
-        x = points[i, 0] - shift[0]
-        y = points[i, 1] - shift[1]
-        z = points[i, 2] - shift[2]
-        local[0, i] = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
-        local[1, i] = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
-        local[2, i] = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
-
-
-@kernel
 def fill_depths(local, half, level, numbers, excess, strip, depth):
     """
     Write how far inside of the expected surface of each face each point is, (5, M) [m].
@@ -160,10 +148,13 @@ def centre_of(points, centre):
 def fill_visibility(box, origin, points, numbers, R, tangent):
     """Write how openly the sensor sees each face of one input box, (6,)."""
     toward = np.empty(3)
-    centre_of(points, toward)
-    is_known = isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2])
-    for k in range(3):
-        toward[k] = origin[k] if is_known else FAR_SENSOR * toward[k]
+    if isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2]):
+        for k in range(3):
+            toward[k] = origin[k]
+    else:
+        centre_of(points, toward)
+        for k in range(3):
+            toward[k] *= FAR_SENSOR
     fill_rotation(box[6], box[7], box[8], R)
     for face in range(4):
         axis = face // 2
@@ -207,13 +198,22 @@ def fill_velocity(poses, times, n, length, velocity):
 
 
 @kernel
-def to_own_axes(points, delays, velocity, shift, R, is_moving, moved, local):
-    """Write points (M, 3) at the stamp of their box (M12), and in its axes (3, M) [m]."""
+def to_box_axes(points, delays, velocity, shift, R, moved, local):
+    """
+    Write points at the stamp of their box (M12), (M, 3), and in its axes, (3, M) [m].
+
+    The box is `shift` (3,) from the origin of the points.
+
+    """
     for i in range(len(points)):
-        delay = delays[i] if is_moving else 0.0
         for k in range(3):
-            moved[i, k] = points[i, k] - velocity[k] * delay
-    to_box_axes(moved, shift, R, local)
+            moved[i, k] = points[i, k] - velocity[k] * delays[i]
+        x = moved[i, 0] - shift[0]
+        y = moved[i, 1] - shift[1]
+        z = moved[i, 2] - shift[2]
+        local[0, i] = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
+        local[1, i] = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+        local[2, i] = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
 
 
 @kernel
@@ -297,9 +297,9 @@ def observe_faces(
             if numbers.is_moving:
                 fill_velocity(poses[b], windows.times[b], n, length, velocity)
             fill_rotation(pose[3], pose[4], pose[5], R)
-            to_own_axes(
-                points, returns_of(windows, windows.delays, b, n), velocity, shift, R,
-                numbers.is_moving, moved[:m], local[:, :m],
+            to_box_axes(
+                points, returns_of(windows, windows.delays, b, n), velocity, shift, R, moved[:m],
+                local[:, :m],
             )  # fmt: skip
             near = fill_depths(
                 local[:, :m], half, level, numbers, excess[:, :m], strip[:, :m], depth[:, :m]

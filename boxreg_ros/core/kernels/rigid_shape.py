@@ -6,7 +6,7 @@ The torch twin is `boxreg_ros.core.rigid_shape.agreement_torch`, which has the f
 """
 
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.face_support import fill_velocity, returns_of, to_own_axes
+from boxreg_ros.core.kernels.face_support import fill_velocity, returns_of, to_box_axes
 from boxreg_ros.core.kernels.rotation import fill_rotation
 import numpy as np
 
@@ -93,10 +93,10 @@ def agreement(
                 shift[k] = poses[b, n, k] - windows.boxes[b, n, k]
             if is_moving:
                 fill_velocity(poses[b], windows.times[b], n, windows.lengths[b], velocity)
-            to_own_axes(
+            to_box_axes(
                 returns_of(windows, windows.points, b, n),
-                returns_of(windows, windows.delays, b, n), velocity, shift, R, is_moving,
-                moved[:m], local[n, :, :m],
+                returns_of(windows, windows.delays, b, n), velocity, shift, R, moved[:m],
+                local[n, :, :m],
             )  # fmt: skip
             for i in range(m):
                 x, y, z = local[n, 0, i], local[n, 1, i], local[n, 2, i]
