@@ -40,12 +40,12 @@ def parameters() -> str:
 
 def label_formats() -> str:
     """Return one row for each label format."""
-    return table(formats.HEAD, formats.rows())
+    return table(formats.FORMAT_COLUMNS, formats.rows())
 
 
 def messages() -> str:
     """Return one row for each message type with boxes."""
-    return table(registry.HEAD, registry.rows())
+    return table(registry.MESSAGE_COLUMNS, registry.rows())
 
 
 def counters() -> str:

@@ -16,7 +16,7 @@ from msg_adapters import poses
 import numpy as np
 
 BOX = 1
-CLASSES = (
+CLASS_NAMES = (
     'unknown', 'unknown_small', 'unknown_medium', 'unknown_big', 'pedestrian', 'bike', 'car',
     'truck', 'motorcycle', 'other_vehicle', 'barrier', 'sign',
 )  # fmt: skip
@@ -98,7 +98,7 @@ def _class_name(o: Any) -> str:
     if not o.object_classified:
         return ''
     number = o.classification
-    return CLASSES[number] if number < len(CLASSES) else f'class_{number}'
+    return CLASS_NAMES[number] if number < len(CLASS_NAMES) else f'class_{number}'
 
 
 def _score(o: Any) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 CLASS_KEYS = ('class', 'class_name', 'category', 'label', 'type', 'classification')
 SCORE_KEYS = ('score', 'confidence', 'probability')
 OTHER_PRIMITIVES = ('arrows', 'spheres', 'cylinders', 'lines', 'triangles', 'texts', 'models')
-TIME_FIELDS = (('sec', 'nanosec'), ('sec', 'nsec'), ('seconds', 'nanos'))
+TIME_FIELD_PAIRS = (('sec', 'nanosec'), ('sec', 'nsec'), ('seconds', 'nanos'))
 """Names of seconds and nanoseconds in ROS, JSON and protobuf."""
 MAX_TIME_NS = 2**63
 """Stamps are 64-bit integers."""
@@ -118,7 +118,7 @@ def _items(owner: Any, name: str) -> Sequence[Any]:
 
 def _time_ns(time: Any) -> int:
     """Return a time of ROS, JSON or protobuf [ns]."""
-    for seconds, nanoseconds in TIME_FIELDS:
+    for seconds, nanoseconds in TIME_FIELD_PAIRS:
         if hasattr(time, seconds) and hasattr(time, nanoseconds):
             try:
                 time_ns = int(getattr(time, seconds)) * 10**9 + int(getattr(time, nanoseconds))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 """``PointField.datatype`` -> dtype of numpy."""
-TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time')
+POINT_TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time')
 TIME_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 """Possible units of point times [s], coarsest first."""
 INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
@@ -48,7 +48,7 @@ def from_msg(msg: Any) -> Sweep:
     if not msg.width * msg.height:
         return Sweep(stamp, msg.header.frame_id, np.zeros((0, 3), np.float32))
     fields = _fields(msg)
-    time_field = _first(TIME_FIELDS, fields)
+    time_field = _first(POINT_TIME_FIELDS, fields)
     names = ['x', 'y', 'z']
     if time_field is not None:
         names.append(time_field)

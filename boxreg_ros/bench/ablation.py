@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 KINDS = ('vehicle', 'cyclist', 'pedestrian')
 WHOLE = 'nothing'
-COLUMNS = ('BEV', '3D', 'R@0.8', 'flips')
+SCORES = ('BEV', '3D', 'R@0.8', 'flips')
 UNLIMITED = 1e3
 """Highest bound of the deviations of motion: the residual has no weight."""
 
@@ -173,13 +173,13 @@ def without(ingredient: Ingredient, drive: Drive, estimate: str = 'track') -> Bo
 
 
 def figures(scores: Scores) -> list[float]:
-    """Return the scores of `COLUMNS`."""
+    """Return the scores of `SCORES`."""
     return [scores.iou_bev, scores.iou_3d, scores.recall_3d[-1], scores.flips]
 
 
 def table(rows: Mapping[str, Sequence[float]]) -> list[str]:
     """Return lines of scores, each followed by its loss against that of `WHOLE`."""
-    lines = [line('without', [cell for name in COLUMNS for cell in (name, '')])]
+    lines = [line('without', [cell for name in SCORES for cell in (name, '')])]
     for name, row in rows.items():
         worse = np.subtract(rows[WHOLE], row) * [1, 1, 1, -1]  # of flips, more are worse
         costs = ['' if name == WHOLE else f'({cost:+.3f})' for cost in worse.round(3) + 0.0]

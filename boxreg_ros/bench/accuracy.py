@@ -29,8 +29,8 @@ from boxreg_ros.offline.evaluate import Matches, RECALLS, summarise
 from boxreg_ros.structures import Floats
 import numpy as np
 
-RANGE_BINS = (0, 20, 40, 80, math.inf)  # [m]
-POINT_BINS = (0, 30, 100, 300, 1000, math.inf)
+RANGE_GROUPS = (0, 20, 40, 80, math.inf)  # [m]
+POINT_GROUPS = (0, 30, 100, 300, 1000, math.inf)
 GROUPINGS = {'by_range': 'by range [m]', 'by_points': 'by points'}
 
 Groups = dict[str, dict[str, float]]
@@ -113,7 +113,9 @@ def iou_by_group(rows: Floats) -> Groups:
     """Return mean IoU by range and by number of points, of the `iou_and_group_values` (n, 3)."""
     iou, *columns = rows[np.isfinite(rows).all(axis=1)].T
     groups: Groups = {}
-    for grouping, values, edges in zip(GROUPINGS, columns, (RANGE_BINS, POINT_BINS), strict=True):
+    for grouping, values, edges in zip(
+        GROUPINGS, columns, (RANGE_GROUPS, POINT_GROUPS), strict=True
+    ):
         groups[grouping] = {}
         for low, high in pairwise(edges):
             label = f'{low:g}-{high:g}' if math.isfinite(high) else f'{low:g}+'

@@ -23,18 +23,18 @@ POSITION_DEVIATION = 0.3  # of the centre of an input box [m]
 ANGLE_DEVIATION = 0.2  # of its roll, pitch and yaw [rad]
 ACCELERATION = 1.2  # in the plane [m/s^2], half of it in z
 ANGULAR_ACCELERATION = 0.4  # of yaw [rad/s^2], half of it of roll and pitch
-PARKED_DISTANCE = 0.15  # a track whose ends are closer than this is parked [m]
+MIN_TRAVEL = 0.15  # a track whose ends are closer than this is parked [m]
 REWEIGHTINGS = 5  # iterations of the robust fit
 
 # Rectangle fit and ICP: which points are used.
-POINT_MARGIN = 0.4  # points this far outside the box are used [m]
+SCAN_MARGIN = 0.4  # points this far outside the box are used [m]
 ROAD_CLEARANCE = 0.3  # points lower than this above the bottom are not [m]
-MIN_POINTS = 20  # with fewer the box is left as it is
+MIN_SCAN_POINTS = 20  # with fewer the box is left as it is
 MIN_GAP = 0.03  # gaps below this count as this in the closeness criterion [m]
 FACE_SPACING = 0.1  # of the points on the faces that ICP aligns to [m]
 ICP_DISTANCE = 0.5  # largest distance of two matched points [m]
 ICP_ITERATIONS = 30
-SENSOR_HEIGHT = 2.0  # of the assumed sensor above a box, if its position is unknown [m]
+ASSUMED_SENSOR_HEIGHT = 2.0  # of the assumed sensor above a box, if its position is unknown [m]
 
 
 def smoothed(track: Track) -> Floats:
@@ -84,7 +84,7 @@ def _is_parked(boxes: Floats) -> bool:
     third = -(-len(boxes) // 3)
     first = np.median(boxes[:third, :2], axis=0)
     last = np.median(boxes[-third:, :2], axis=0)
-    return bool(np.linalg.norm(last - first) < PARKED_DISTANCE)
+    return bool(np.linalg.norm(last - first) < MIN_TRAVEL)
 
 
 def _without_flips(yaw: Floats) -> Floats:
@@ -136,13 +136,13 @@ def l_shaped(track: Track) -> Floats:
     Yaw is found by search-based rectangle fitting with the closeness criterion: the angle at
     which most points are near an edge of their bounding rectangle. The rectangle gets the extents
     of the input and is placed at the corner nearest to the sensor. z, roll and pitch are
-    unchanged, and so are boxes with fewer than `MIN_POINTS` points.
+    unchanged, and so are boxes with fewer than `MIN_SCAN_POINTS` points.
 
     """
     boxes = track.boxes.copy()
     for i, box in enumerate(boxes):
         points = _body_points(track, i)
-        if len(points) < MIN_POINTS:
+        if len(points) < MIN_SCAN_POINTS:
             continue
         flat = points[:, :2] - box[:2]
         angle = _closest_angle(flat)
@@ -196,7 +196,7 @@ def icp(track: Track) -> Floats:
     boxes = track.boxes.copy()
     for i, box in enumerate(boxes):
         points = _body_points(track, i)
-        if len(points) < MIN_POINTS:
+        if len(points) < MIN_SCAN_POINTS:
             continue
         R = matrix_from_rpy(box[ROLL:])
         local = (points - box[:3]) @ R
@@ -211,7 +211,7 @@ def icp(track: Track) -> Floats:
             max_iterations=ICP_ITERATIONS,
         ).T_target_source
         is_finite = np.isfinite(T_box_points).all()
-        if not is_finite or np.abs(T_box_points[:3, 3]).max() > 2 * POINT_MARGIN:
+        if not is_finite or np.abs(T_box_points[:3, 3]).max() > 2 * SCAN_MARGIN:
             continue  # diverged
         turned = R @ T_box_points[:3, :3].T
         box[:2] -= (turned @ T_box_points[:3, 3])[:2]
@@ -239,7 +239,7 @@ def _body_points(track: Track, i: int) -> Floats:
     box = track.boxes[i]
     points = track.points[i]
     offsets = (points - box[:3]) @ matrix_from_rpy(box[ROLL:])
-    is_near = (np.abs(offsets) < box[BOX_EXTENT] / 2 + POINT_MARGIN).all(axis=1)
+    is_near = (np.abs(offsets) < box[BOX_EXTENT] / 2 + SCAN_MARGIN).all(axis=1)
     is_above = offsets[:, 2] > ROAD_CLEARANCE - box[HEIGHT] / 2
     body: Floats = points[is_near & is_above]
     return body
@@ -248,6 +248,6 @@ def _body_points(track: Track, i: int) -> Floats:
 def _sensor_origin(track: Track, i: int) -> Floats:
     """Return the position of the sensor (3,), or a point above the box if it is unknown."""
     if track.sensor_origins is None:
-        return track.boxes[i, :3] + [0.0, 0.0, SENSOR_HEIGHT]
+        return track.boxes[i, :3] + [0.0, 0.0, ASSUMED_SENSOR_HEIGHT]
     origin: Floats = track.sensor_origins[i]
     return origin

@@ -32,7 +32,7 @@ import numpy as np
 PROFILE = Path(__file__).parents[1] / 'share' / 'fastdds.xml'
 CIRCLE_PERIOD = 5.0  # time until a car is back where it began [s]
 TRACK_LIFETIME = 200  # sweeps until a track gets a new id
-SETTLING_TIME = 5.0  # not measured at the beginning [s]
+STARTUP_TIME = 5.0  # not measured at the beginning [s]
 CAR_EXTENT = (4.5, 1.9, 1.6)  # length, width and height of every car [m]
 CAR_SPACING = 14.0  # of the centres of the circles [m]
 CIRCLE_RADIUS = 4.0  # [m]
@@ -273,7 +273,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 def results(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, float]:
     """
-    Return the published shares and the latencies after `SETTLING_TIME`.
+    Return the published shares and the latencies after `STARTUP_TIME`.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def results(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, float
         Box arrays per second.
 
     """
-    measured = sent[round(SETTLING_TIME * rate) :]
+    measured = sent[round(STARTUP_TIME * rate) :]
     latencies = []
     for stamp_ns, sent_ns in measured.tolist():
         arrival_ns = arrivals['early'].get(stamp_ns)
@@ -326,7 +326,7 @@ def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
 
     """
     end = len(samples) - 1
-    begin = min(round(SETTLING_TIME / SAMPLE_PERIOD), end // 3)
+    begin = min(round(STARTUP_TIME / SAMPLE_PERIOD), end // 3)
     rows = {'at the start': begin, 'in the middle': (begin + end) // 2, 'at the end': end}
     cpu_time = samples[end][3] - samples[begin][3]
     return {

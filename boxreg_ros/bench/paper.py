@@ -21,7 +21,7 @@ from boxreg_ros.structures import Floats, LENGTH, ROLL, WIDTH
 import numpy as np
 
 VARIABLES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
-COLUMNS = (*VARIABLES, 'iou', 'iou_first', 'iou_last')
+ERROR_COLUMNS = (*VARIABLES, 'iou', 'iou_first', 'iou_last')
 
 # Table I of the paper: mean absolute errors [m, rad] and mean IoU.
 PUBLISHED: dict[str, dict[str, tuple[float, ...]]] = {
@@ -34,7 +34,7 @@ PUBLISHED: dict[str, dict[str, tuple[float, ...]]] = {
         'refined, published': (0.054, 0.006, math.nan, math.nan, math.nan, 0.032, 0.896),
     },
 }
-SCENARIOS = {'3d': 'paper', 'bev': 'paper-bev'}
+PAPER_SCENARIOS = {'3d': 'paper', 'bev': 'paper-bev'}
 
 
 class ModeResult:
@@ -109,8 +109,8 @@ def run(args: argparse.Namespace) -> int:
     if args.seeds < 1:
         raise ConfigError(f'--seeds: expected 1 or more, got {args.seeds}')
     results: dict[str, ModeResult] = {}
-    with progress_bar(len(SCENARIOS) * args.seeds * len(args.methods), args) as bar:
-        for mode, scenario in SCENARIOS.items():
+    with progress_bar(len(PAPER_SCENARIOS) * args.seeds * len(args.methods), args) as bar:
+        for mode, scenario in PAPER_SCENARIOS.items():
             results[mode] = ModeResult()
             for seed in range(args.seeds):
                 drive = Drive.from_scene(simulate(scenario, seed, args.steps))
@@ -138,7 +138,7 @@ def _report(mode: str, result: ModeResult) -> dict[str, Any]:
         if isinstance(row, str):
             report[name] = row
         else:
-            report[name] = dict(zip(COLUMNS, row, strict=False)) | groups.get(name, {})
+            report[name] = dict(zip(ERROR_COLUMNS, row, strict=False)) | groups.get(name, {})
     return report
 
 

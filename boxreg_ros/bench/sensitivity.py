@@ -54,7 +54,7 @@ CONSTANT_NAME = re.compile(r'_?[A-Z][A-Z0-9_]*')
 KINDS = ('vehicle', 'cyclist', 'pedestrian')
 OTHER_OBJECTIVE = 'paper'  # group of settings that the default objective does not read
 
-Place = tuple[str, int, int]
+SourcePlace = tuple[str, int, int]
 """Where a number stands in a source: module, line and column."""
 
 
@@ -71,7 +71,7 @@ class Variation:
         Factor that was asked for: one of `FACTORS`.
     default, value : int or float
         The number as it is and as it is for this run, within its bounds.
-    place : Place, optional
+    place : SourcePlace, optional
         Where a constant stands; None for settings.
 
     """
@@ -80,7 +80,7 @@ class Variation:
     factor: float
     default: float
     value: float
-    place: Place | None = None
+    place: SourcePlace | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +285,7 @@ def _upper_names(node: ast.expr) -> set[str]:
 class _ReplaceNumber(ast.NodeTransformer):
     """Puts a value in the place of the number at a line and a column."""
 
-    def __init__(self, place: Place, value: float) -> None:
+    def __init__(self, place: SourcePlace, value: float) -> None:
         self.place = place
         self.value = value
 
@@ -298,7 +298,7 @@ class _ReplaceNumber(ast.NodeTransformer):
 class _Loader(SourceFileLoader):
     """Loads one module from its source with one number replaced."""
 
-    def __init__(self, name: str, path: str, place: Place, value: float) -> None:
+    def __init__(self, name: str, path: str, place: SourcePlace, value: float) -> None:
         super().__init__(name, path)
         self.change = _ReplaceNumber(place, value)
 
@@ -312,7 +312,7 @@ class _Loader(SourceFileLoader):
 class _Finder:
     """Finds the one module of which a number is to be replaced."""
 
-    def __init__(self, place: Place, value: float) -> None:
+    def __init__(self, place: SourcePlace, value: float) -> None:
         self.place = place
         self.value = value
 
@@ -329,7 +329,7 @@ class _Finder:
 
 
 @contextmanager
-def changed_constant(place: Place, value: float) -> Iterator[None]:
+def changed_constant(place: SourcePlace, value: float) -> Iterator[None]:
     """
     Import the packages of `boxreg_ros` again, with one number replaced, while a context lasts.
 

@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 import torch
 from torch import Tensor
 
-PERIOD = 0.1
+SWEEP_PERIOD = 0.1
 """Period of the sensor of a live stream [s]."""
 SPEED = 4.0
 """Speed of all traffic, the sensor included [m/s]."""
@@ -228,8 +228,8 @@ def traffic(tracks: int, points: int, count: int) -> Iterator[Instant]:
     cloud = np.concatenate([*(surface + box[:3] for box in true), road]).astype(np.float32)
     names = tuple(str(i) for i in range(tracks)), ('car',) * tracks, np.ones(tracks)
     for i in range(count):
-        stamp, T = i * round(PERIOD * 1e9), np.eye(4)
-        T[0, 3] = SPEED * PERIOD * i
+        stamp, T = i * round(SWEEP_PERIOD * 1e9), np.eye(4)
+        T[0, 3] = SPEED * SWEEP_PERIOD * i
         noise = rng.standard_normal(cloud.shape, dtype=np.float32) * np.float32(0.01)
         boxes = true + rng.normal(0, 1, true.shape) * [0.1, 0.1, 0.05, *[0.1] * 3, 0, 0, 0.03]
         yield Instant(stamp, T, cloud + noise, BoxArray(stamp, 'lidar', *names, boxes))
@@ -325,7 +325,9 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
     result: dict[str, float] = {}
     with tempfile.TemporaryDirectory(prefix='boxreg-') as name:
         path, out = Path(name) / 'drive.mcap', Path(name) / 'out'
-        has_room = disk_usage(name).free > 2 * BYTES_PER_POINT * points * 10 * seconds / PERIOD
+        has_room = (
+            disk_usage(name).free > 2 * BYTES_PER_POINT * points * 10 * seconds / SWEEP_PERIOD
+        )
         few = points if has_room else points // 5
         result['few'] = few
         # The first case is a warm-up, too: first accesses to memory of a virtual machine, and to
@@ -336,7 +338,7 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
             ('compressed', points, seconds),
             ('memory', points, seconds),
         ):
-            a, b, c, d = tee(traffic(tracks, size, round(length / PERIOD)), 4)
+            a, b, c, d = tee(traffic(tracks, size, round(length / SWEEP_PERIOD)), 4)
             write_recording(
                 path,
                 (Sweep(i.stamp_ns, 'lidar', i.points) for i in a),
@@ -543,7 +545,7 @@ def _text(report: dict[str, Any]) -> str:
     lines.append(f'windows per second        {rates}')
     stages = ('decode', 'transform', 'crop and sample', 'solve', 'encode')
     shares = ', '.join(f'{k} {t[k]:.1f} ({t[k] / t["total"]:.0%})' for k in stages)
-    lines.append(f'one tick: {t["total"]:.1f} ms of {1e3 * PERIOD:.0f}: {shares}')
+    lines.append(f'one tick: {t["total"]:.1f} ms of {1e3 * SWEEP_PERIOD:.0f}: {shares}')
     lines.append(
         f'the first tick of the process that solves: {t["first"]:.0f} ms, '
         f'that of the first full window: {t["first full"]:.0f} ms'

@@ -31,7 +31,7 @@ INSIDE_EXTRA = 0.35
 """Points may be further inside a face than `OUTSIDE_MARGIN` by this much [m]."""
 MAX_DEPTH = 0.2
 """Points further behind the outermost one of a face are on another surface, e.g. a wheel [m]."""
-MIN_POINTS = 3
+MIN_FACE_POINTS = 3
 """Fewest points that make a face observation, and that are taken from a strip. Three span a
 plane."""
 STRIPS = 3
@@ -48,9 +48,9 @@ EDGE_LEAD = (0.0, 0.0, 0.2, 0.2, 0.0, 0.0)
 NEAR_RANGE = 20.0
 """Up to this range points reach the outermost parts of a surface [m]."""
 RANGE_SPAN = 50.0
-"""The range inset is learnt for this much more range [m]: at 70 m."""
+"""The range inset is that of an object this much beyond `NEAR_RANGE` [m]: at 70 m."""
 MAX_RANGE_SHARE = 1.5
-"""Largest multiple of the learnt range inset."""
+"""Largest multiple of the range inset."""
 RANGE_INSET_HALF_WEIGHT = 0.1
 """A face whose points have this range inset has weight 1/2 [m]."""
 MIN_ALONG = 0.5
@@ -61,7 +61,7 @@ FAR = 1e9
 
 class FaceOffsets(NamedTuple):
     """
-    Offsets of the outermost points from the face of a label, as learnt from the input.
+    Offsets of the outermost points from the face of a label, as estimated from the input.
 
     Attributes
     ----------
@@ -213,7 +213,7 @@ def observe_faces_compiled(
         edge_margin=EDGE_MARGIN,
         max_depth=MAX_DEPTH,
         deepest=OUTSIDE_MARGIN + INSIDE_EXTRA,
-        min_points=float(MIN_POINTS),
+        min_points=float(MIN_FACE_POINTS),
         share=config.faces.outermost / strips,
         strips=strips,
         strip_axis=STRIP_AXIS,
@@ -306,13 +306,13 @@ def outermost_points(problem: Problem, state: State, search: Search) -> Found:
     strips = search.strips
     strip = ((local[..., :2, :] / half[..., :2, :] + 1) * (strips / 2)).clamp(0, strips - 1)
     own_strip = strip.floor()[..., list(STRIP_AXIS), :]  # (B, N, 5, M)
-    most = min(points.shape[2], max(MIN_POINTS, int(search.share * points.shape[2]) + 1))
+    most = min(points.shape[2], max(MIN_FACE_POINTS, int(search.share * points.shape[2]) + 1))
     in_strip = [torch.where(own_strip == k, depth, FAR) for k in range(strips)]
     depth, index = torch.stack(in_strip, 3).topk(most, -1, largest=False)  # (B, N, 5, strips, K)
     limit = (depth.amin((-1, -2), keepdim=True) + MAX_DEPTH).clamp(
         max=OUTSIDE_MARGIN + INSIDE_EXTRA
     )
-    wanted = (search.share * num_points).clamp(min=MIN_POINTS)[..., None, None, None]
+    wanted = (search.share * num_points).clamp(min=MIN_FACE_POINTS)[..., None, None, None]
     chosen = (depth <= limit) & (torch.arange(most, device=index.device) < wanted)
 
     number = chosen.sum((-1, -2))
@@ -320,7 +320,7 @@ def outermost_points(problem: Problem, state: State, search: Search) -> Found:
     moments = _second_moments(points, index, part)
     distance = -(torch.where(chosen, depth, 0.0) * part).sum((-1, -2))
     weight = search.weight.clone()
-    weight[..., :BOTTOM] *= number >= MIN_POINTS
+    weight[..., :BOTTOM] *= number >= MIN_FACE_POINTS
     road_moments, road_distance = _road_observation(problem, state)
     return (
         torch.cat([moments, road_moments[:, :, None]], 2),

@@ -32,16 +32,16 @@ FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
 GAP_DEVIATIONS = (0.05, 0.05, 0.05, 0.15)
 """Prior deviation of the margin of each group from the one its class lets expect [m]."""
 MIN_TRACK_OBSERVATIONS = 3
-"""Fewest face observations of a track, and tracks, that a margin is learnt from."""
+"""Fewest face observations of a track, and tracks, that a margin is estimated from."""
 MIN_GAP_DEVIATION = 0.02
 """Added to the interquartile range of margins: few tracks may agree by chance [m]."""
 MIDMEAN_FACTOR = 1.1
 """Error of the mean of the middle half over that of the mean. Derived: sqrt(1.2), the efficiency
 of the midmean of a Gaussian."""
-MAX_LEARNT_DISTANCE = 0.5
-"""No margin is learnt from points further than this from where they are expected [m]."""
+MAX_FACE_DISTANCE = 0.5
+"""No margin is estimated from points further than this from where they are expected [m]."""
 MIN_BOX_POINTS = 30
-"""No margin is learnt from near boxes with fewer points."""
+"""No margin is estimated from near boxes with fewer points."""
 MAX_VISIBLE_SHARE = 0.25
 """A face with a smaller share of the occlusion inset counts as visible."""
 MIN_OCCLUDED_SHARE = 0.5
@@ -288,7 +288,7 @@ def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
 
     Notes
     -----
-    Learnt detectors shrink extents toward those of the majority, noise spreads them. Tracks with
+    Trained detectors shrink extents toward those of the majority, noise spreads them. Tracks with
     evidence about their extents show which, and by how much: a ridge regression of their
     corrections on the distance of all three extents from the medians, in logarithms and in
     proportion to the square of the error, so that low-noise input is left as it is. Objects
@@ -343,24 +343,24 @@ def evidence_of_extents(
 
 class InputModel:
     """
-    Labelling margins, noise and population of extents, learnt from the input of a stream.
+    Labelling margins, noise and population of extents, estimated from the input of a stream.
 
     A labelling margin is the gap between a face of the label and its outermost points. Each track
     gives one value per face: the mean over its observations of the gap, less the one expected of
     its class. The mean of the middle half of all tracks is weighed against a correction of zero
     (M18). Errors of the boxes that exceed the margin do not matter if they have no preferred
-    direction. Faces beyond 45 m give the range inset; it is learnt even where the margins are
-    stated, since a common error of all boxes cancels in the difference.
+    direction. Faces beyond 45 m give the range inset; it is estimated even where the margins are
+    set, since a common error of all boxes cancels in the difference.
 
     Parameters
     ----------
     config : FaceConfig
-        Expected insets, and whether margins are learnt.
+        Expected insets, and whether margins are estimated.
 
     """
 
     def __init__(self, config: FaceConfig) -> None:
-        self._learns = config.learn
+        self._estimates_margins = config.learn
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
         # Of each track: sums over its face observations, see `add_face_observations`; its last
         # input residuals; its extent evidence.
@@ -376,7 +376,7 @@ class InputModel:
         offsets: FaceOffsets,
     ) -> None:
         """
-        Learn from face observations at input boxes.
+        Add face observations at input boxes.
 
         Parameters
         ----------
@@ -403,7 +403,7 @@ class InputModel:
             has_points & (occluded > MIN_OCCLUDED_SHARE),
             is_visible & is_distant,
         ])  # fmt: skip
-        counts &= (observations.weight > 0) & (distance.abs() < MAX_LEARNT_DISTANCE)
+        counts &= (observations.weight > 0) & (distance.abs() < MAX_FACE_DISTANCE)
         counts &= new[..., None]
         values = torch.stack([
             0 * occluded, occluded * occlusion_inset, distant * range_inset
@@ -428,10 +428,12 @@ class InputModel:
         known = np.array(list(self._faces.values())).reshape(-1, 3, 3, 6)
         none = (0.0,) * len(FACE_GROUPS)
         gaps = self._pooled(known[:, 0], none)
-        occlusion_insets = self._pooled(self._learns * known[:, 1], self._occlusion_insets)
+        occlusion_insets = self._pooled(
+            self._estimates_margins * known[:, 1], self._occlusion_insets
+        )
         known[:, 2, 0] -= gaps.numpy() * known[:, 2, 1]
         range_insets = self._pooled(known[:, 2], none)
-        return FaceOffsets(self._learns * gaps, occlusion_insets, range_insets)
+        return FaceOffsets(self._estimates_margins * gaps, occlusion_insets, range_insets)
 
     def gaps_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
         """Return gap corrections of some `faces` [m], one array per track that has any."""

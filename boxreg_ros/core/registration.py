@@ -37,7 +37,7 @@ MIN_HELD_PART = 0.5
 MAX_LOST_POINTS = 3
 HELD_MARGIN = 0.05
 """Points up to this far outside a box count as held by it [m]. Chosen."""
-REASONS = ('no_points', 'not_finite', 'no_gain')
+KEPT_REASONS = ('no_points', 'not_finite', 'no_gain')
 """Why a box is kept, in the order of `_failed_tests`."""
 
 
@@ -52,7 +52,7 @@ class Estimate(NamedTuple):
     status : tuple of N str
         ``refined`` or ``kept``.
     reasons : tuple of N str
-        One of `REASONS` for kept boxes, '' for refined ones.
+        One of `KEPT_REASONS` for kept boxes, '' for refined ones.
     covariances : array, shape (N, 6, 6)
         Of x y z roll pitch yaw [m, rad]; the identity for kept boxes.
     prior : MarginalisationPrior or None
@@ -90,7 +90,7 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
     estimates: dict[int, Estimate] = {}
     groups = group_windows(windows, config)
     for rows in groups:
-        _learn_offsets(model, [windows[i] for i in rows], config)
+        _update_offsets(model, [windows[i] for i in rows], config)
     for rows in groups:
         part = [windows[i] for i in rows]
         problem, base = stack_windows(part, config)
@@ -98,14 +98,14 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
             solution = solve_paper(problem, config)
         else:
             solution = solve(problem, config, model, part[0].is_warm)
-            _learn_noise(model, part, problem, solution, config)
+            _update_noise(model, part, problem, solution, config)
         found = _accepted(part, problem, base, solution, config)
         estimates.update(zip(rows, found, strict=True))
     return [estimates.get(i) for i in range(len(windows))]
 
 
 @torch.inference_mode()
-def _learn_offsets(model: InputModel, windows: Sequence[Window], config: Config) -> None:
+def _update_offsets(model: InputModel, windows: Sequence[Window], config: Config) -> None:
     """
     Update the labelling margins with new observations, their faces as in the input boxes.
 
@@ -113,7 +113,7 @@ def _learn_offsets(model: InputModel, windows: Sequence[Window], config: Config)
     box with a wrong yaw are its corners, further outside than its faces.
 
     """
-    new_parts = [window.learning_part() for window in windows if window.num_new > 0]
+    new_parts = [window.margin_part() for window in windows if window.num_new > 0]
     if not new_parts:
         return
     problem, _ = stack_windows(new_parts, config)
@@ -127,7 +127,7 @@ def _learn_offsets(model: InputModel, windows: Sequence[Window], config: Config)
 
 
 @torch.inference_mode()
-def _learn_noise(
+def _update_noise(
     model: InputModel,
     windows: Sequence[Window],
     problem: Problem,
@@ -157,7 +157,7 @@ def _accepted(
     boxes = torch.cat([pose[..., :3], extent, wrap_angle(pose[..., 3:])], -1)
     failed = _failed_tests(problem, boxes, pose, extent, solution.covariances)
     is_kept = failed.any(0)
-    reasons = np.select(failed, REASONS, '')
+    reasons = np.select(failed, KEPT_REASONS, '')
     status = np.where(is_kept, KEPT, REFINED)
     # Before input boxes are put in: on a CPU the arrays share memory with the tensors.
     is_solved = (boxes.isfinite().all(-1) & (extent > 0).all(-1)).all(1)
@@ -183,9 +183,9 @@ def _failed_tests(
     """
     Return the acceptance tests that each refined box fails (M27), shape (3, B, N).
 
-    In the order of `REASONS`: its window has points; box and covariance are finite and the extent
-    is positive; it holds nearly as many points as its input box, which the objective does not
-    ask for.
+    In the order of `KEPT_REASONS`: its window has points; box and covariance are finite and the
+    extent is positive; it holds nearly as many points as its input box, which the objective does
+    not ask for.
 
     """
     is_finite = boxes.isfinite().all(-1) & (extent > 0).all(-1)

@@ -23,8 +23,8 @@ after 23 observations.
 """
 PADDING_PERIOD = 0.1
 """Time step of padding observations [s]; any positive number keeps times increasing."""
-LEARNING_OBSERVATIONS = 30
-"""Observations of a window that the labelling rule is learnt from; measured: 130 add nothing."""
+MARGIN_OBSERVATIONS = 30
+"""Observations of a window that give labelling margins; measured: 130 add nothing."""
 MAX_REVERSE_SPEED = 6.0
 """A faster object moves forward [m/s]; chosen: no road vehicle reverses at 22 km/h."""
 KNOWN_FLIP_SHARE = 0.75
@@ -116,16 +116,16 @@ class Window(NamedTuple):
         """Return whether all observations but the newest have an estimate to start from."""
         return self.num_new == 1 and len(self.start) == len(self.observations) - 1 > 1
 
-    def learning_part(self) -> 'Window':
+    def margin_part(self) -> 'Window':
         """
-        Return the observations to learn from, each of which is in one such part only.
+        Return the observations for the labelling margins, each in one such part only.
 
         The newest is left to the next window, which has an estimate to start from. Of many, every
-        n-th is taken so that about `LEARNING_OBSERVATIONS` remain.
+        n-th is taken so that about `MARGIN_OBSERVATIONS` remain.
 
         """
         last = len(self.observations) - 1
-        stride = 1 + self.num_new // LEARNING_OBSERVATIONS
+        stride = 1 + self.num_new // MARGIN_OBSERVATIONS
         part = slice(max(0, last - self.num_new), last, stride)
         return Window(
             self.track_id,

@@ -28,7 +28,7 @@ from rosbags.interfaces import (
 from rosbags.typesys import get_types_from_msg
 
 ROS_ENCODINGS = ('ros2msg', 'ros2idl', 'omgidl', '')
-TYPES = {
+ROS_TYPES = {
     'foxglove.SceneUpdate': 'foxglove_msgs/msg/SceneUpdate',
     'foxglove.PointCloud': 'sensor_msgs/msg/PointCloud2',
     'foxglove.FrameTransform': 'tf2_msgs/msg/TFMessage',
@@ -106,7 +106,7 @@ class FoxgloveFile:
             name = schema.name if schema else channel.message_encoding
             msgtype = name
             if schema and channel.message_encoding in ('protobuf', 'json'):
-                msgtype = TYPES.get(name, name)
+                msgtype = ROS_TYPES.get(name, name)
                 self.decoders[msgtype] = _Decoder(path, channel.topic, schema)
             self.connections.append(
                 Connection(

@@ -22,7 +22,7 @@ from msg_adapters.poses import quaternions_of
 import numpy as np
 
 Colour = tuple[float, float, float, float]
-GREY: Colour = (0.7, 0.7, 0.7, 0.25)
+TRANSLUCENT_GREY: Colour = (0.7, 0.7, 0.7, 0.25)
 GREEN = (0.1, 0.8, 0.3, 0.45)
 ORANGE = (1.0, 0.6, 0.1, 0.45)
 BLUE = (0.2, 0.5, 1.0, 0.6)
@@ -89,7 +89,7 @@ class MarkerBoard:
             colour = GREEN if is_refined else ORANGE
             spread = refined.covariances[i, :2, :2] if is_refined else np.zeros((2, 2))
             markers += [
-                _cube(m, header, 'input', number, given.boxes[i], before[i], GREY),
+                _cube(m, header, 'input', number, given.boxes[i], before[i], TRANSLUCENT_GREY),
                 _cube(m, header, 'refined', number, box, after[i], colour),
                 _arrow(m, header, number, box, after[i]),
                 _text(m, header, number, box, track_id),

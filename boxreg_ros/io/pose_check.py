@@ -24,9 +24,9 @@ DECISIVE_BOXES = 12
 """Number of boxes with points that the result needs."""
 MAX_BOXES = 300
 """After this number of boxes, with points or without, the check ends."""
-MIN_POINTS = 10
+MIN_POINTS_OF_POSE = 10
 """Points that the best convention must have in a box for the box to be counted."""
-POINT_MARGIN = 0.1
+HELD_POINT_MARGIN = 0.1
 """Points up to this distance outside of a box count as inside [m]: range noise and labels."""
 EQUIVALENT_SHARE = 0.85
 """A convention with this share of the points of the best one counts as equal to it."""
@@ -109,7 +109,7 @@ class PoseCheck:
             reach = 1.5 * np.linalg.norm(rows[0][LENGTH : HEIGHT + 1])
             near = points[(np.abs(points - rows[0][X : Z + 1]) < reach).all(axis=1)]
             counts = [_inside(near, box) for box in rows]
-            if max(counts) >= MIN_POINTS:
+            if max(counts) >= MIN_POINTS_OF_POSE:
                 self._counts.append(counts)
 
     def _result(self) -> str:
@@ -155,4 +155,6 @@ def _inside(points: NDArray[np.floating], box: Floats) -> int:
     """Count the points in a box, a margin around it included."""
     R = matrix_from_rpy(box[ROLL:])
     local = (points - box[X : Z + 1]) @ R
-    return int((np.abs(local) <= box[LENGTH : HEIGHT + 1] / 2 + POINT_MARGIN).all(axis=1).sum())
+    return int(
+        (np.abs(local) <= box[LENGTH : HEIGHT + 1] / 2 + HELD_POINT_MARGIN).all(axis=1).sum()
+    )

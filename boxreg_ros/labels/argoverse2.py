@@ -47,7 +47,7 @@ ANNOTATION_COLUMNS = {
     **POSE_COLUMNS,
     'num_interior_pts': 'int64',
 }
-EVIDENCE_COLUMNS = {
+STATUS_COLUMNS = {
     'status': 'string',
     'reason': 'string',
     'score': 'double',
@@ -56,7 +56,7 @@ EVIDENCE_COLUMNS = {
 """Additional columns; the devkit ignores them."""
 POINT_COLUMNS = {'intensity': 'uint8', 'laser_number': 'uint8', 'offset_ns': 'int32'}
 ANNOTATIONS_FILE = 'annotations.feather'
-POSES_FILE = 'city_SE3_egovehicle.feather'
+EGO_POSES_FILE = 'city_SE3_egovehicle.feather'
 LIDAR_NAME = 'up_lidar'
 
 
@@ -72,10 +72,10 @@ class Writer:
             self._clouds.mkdir(parents=True)
         self._annotations = Table(
             folder / ANNOTATIONS_FILE,
-            ANNOTATION_COLUMNS | EVIDENCE_COLUMNS,
+            ANNOTATION_COLUMNS | STATUS_COLUMNS,
             to_json(self._provenance),
         )
-        self._poses = Table(folder / POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
+        self._poses = Table(folder / EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
         (folder / 'calibration').mkdir()
         path = folder / 'calibration' / 'egovehicle_SE3_sensor.feather'
         calibration = Table(path, {'sensor_name': 'string'} | POSE_COLUMNS)
@@ -126,7 +126,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     missing = [name for name in ANNOTATION_COLUMNS if rows and name not in rows[0]]
     if missing:
         raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
-    pose_file = folder / POSES_FILE
+    pose_file = folder / EGO_POSES_FILE
     poses = read_rows(pose_file) if pose_file.exists() else []
     T_city_ego = {row['timestamp_ns']: matrix(_xyz_xyzw(row)) for row in poses}
     fixed_frame, sensor_frame = frame_names(folder, 'city', 'egovehicle')

@@ -36,7 +36,7 @@ FORMAT = Format(
     options=('camera', 'with_points'),
 )
 SEQUENCE = '0000'
-CLASSES = {
+KITTI_CLASSES = {
     name.lower(): name
     for name in ('Car', 'Van', 'Truck', 'Pedestrian', 'Person_sitting', 'Cyclist', 'Tram', 'Misc')
 }
@@ -191,4 +191,4 @@ def _write_calibration(camera: Camera, path: Path) -> None:
 def _kitti_class(class_name: str) -> str:
     """Return a class name without spaces, as the benchmark spells it."""
     name = '_'.join(class_name.split()) or 'Misc'
-    return CLASSES.get(name.lower(), name)
+    return KITTI_CLASSES.get(name.lower(), name)

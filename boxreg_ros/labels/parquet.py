@@ -38,7 +38,7 @@ FORMAT = Format(
 )
 TEXT_COLUMNS = ('frame_id', 'track_id', 'class_name', 'status')
 INTEGER_COLUMNS = ('stamp_ns', 'num_points')
-TYPES = {
+COLUMN_TYPES = {
     **dict.fromkeys(COLUMNS, 'double'),
     **dict.fromkeys(TEXT_COLUMNS, 'string'),
     **dict.fromkeys(INTEGER_COLUMNS, 'int64'),
@@ -58,7 +58,7 @@ class Writer:
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
         self.dropped: Counter[str] = Counter()
-        self._table = Table(folder / 'boxes.parquet', TYPES, to_json(asdict(provenance)))
+        self._table = Table(folder / 'boxes.parquet', COLUMN_TYPES, to_json(asdict(provenance)))
 
     def write(self, frame: LabelFrame) -> None:
         """Add one row per box."""
@@ -128,7 +128,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
 def _rows(path: Path) -> list[dict[str, Any]]:
     """
-    Return the rows of a file, with columns converted to `TYPES`.
+    Return the rows of a file, with columns converted to `COLUMN_TYPES`.
 
     Other writers use other types: pandas stores ids as numbers, and stamps may be timestamps of
     any unit. Null becomes '' in text and 0 in integers.
@@ -141,7 +141,7 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     if missing:
         raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
     for i, name in enumerate(table.column_names):
-        kind = TYPES.get(name)
+        kind = COLUMN_TYPES.get(name)
         if kind not in NULL_VALUES:
             continue
         column = table[name]

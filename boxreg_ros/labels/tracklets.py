@@ -60,7 +60,7 @@ ESCAPED_HYPHEN = '&#45;'
 """Replaces a hyphen in a comment where XML forbids it: beside another, or at the end."""
 INVALID_CHARACTERS = re.compile('[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
 """Characters that XML forbids, or changes (carriage returns)."""
-HEAD = """\
+XML_HEAD = """\
 <?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
 <!DOCTYPE boost_serialization>
 <!--{origin}-->
@@ -150,7 +150,7 @@ class Writer:
         self._body.seek(0)
         with self._path.open('w', encoding='utf-8') as file:
             origin = _comment(to_json(self._provenance))
-            file.write(HEAD.format(origin=origin, count=self._count))
+            file.write(XML_HEAD.format(origin=origin, count=self._count))
             shutil.copyfileobj(self._body, file)
             file.write(TAIL)
         self._body.close()

@@ -38,19 +38,23 @@ FORMAT = Format(
 SEGMENT = 'key.segment_context_name'
 MICROSECONDS = 'key.frame_timestamp_micros'
 OBJECT = 'key.laser_object_id'
-BOX = '[LiDARBoxComponent].'
-CENTER = [f'{BOX}box.center.{axis}' for axis in 'xyz']
-SIZE = [f'{BOX}box.size.{axis}' for axis in 'xyz']
-HEADING = f'{BOX}box.heading'
-TYPE = f'{BOX}type'
-NUM_POINTS = f'{BOX}num_lidar_points_in_box'
+BOX_COMPONENT = '[LiDARBoxComponent].'
+CENTER = [f'{BOX_COMPONENT}box.center.{axis}' for axis in 'xyz']
+SIZE = [f'{BOX_COMPONENT}box.size.{axis}' for axis in 'xyz']
+HEADING = f'{BOX_COMPONENT}box.heading'
+TYPE = f'{BOX_COMPONENT}type'
+NUM_POINTS = f'{BOX_COMPONENT}num_lidar_points_in_box'
 UNUSED_COLUMNS = {
-    f'{BOX}num_top_lidar_points_in_box': 'int64',
-    **{f'{BOX}{name}.{axis}': 'double' for name in ('speed', 'acceleration') for axis in 'xyz'},
-    **{f'{BOX}difficulty_level.{name}': 'int8' for name in ('detection', 'tracking')},
+    f'{BOX_COMPONENT}num_top_lidar_points_in_box': 'int64',
+    **{
+        f'{BOX_COMPONENT}{name}.{axis}': 'double'
+        for name in ('speed', 'acceleration')
+        for axis in 'xyz'
+    },
+    **{f'{BOX_COMPONENT}difficulty_level.{name}': 'int8' for name in ('detection', 'tracking')},
 }
 """Columns of the data set that are written as null."""
-EVIDENCE_COLUMNS = {
+BOXREG_COLUMNS = {
     'boxreg.stamp_ns': 'int64',
     'boxreg.class_name': 'string',
     'boxreg.status': 'string',
@@ -59,16 +63,16 @@ EVIDENCE_COLUMNS = {
     'boxreg.covariance': 'double[]',
 }
 KEY_COLUMNS = {SEGMENT: 'string', MICROSECONDS: 'int64'}
-COLUMNS = (
+BOX_COLUMNS = (
     KEY_COLUMNS
     | {OBJECT: 'string'}
     | dict.fromkeys([*CENTER, *SIZE, HEADING], 'double')
     | {TYPE: 'int8', NUM_POINTS: 'int64'}
     | UNUSED_COLUMNS
-    | EVIDENCE_COLUMNS
+    | BOXREG_COLUMNS
 )
-POSE = '[VehiclePoseComponent].world_from_vehicle.transform'
-TYPES = ('', 'vehicle', 'pedestrian', 'sign', 'cyclist')
+VEHICLE_POSE = '[VehiclePoseComponent].world_from_vehicle.transform'
+TYPE_NAMES = ('', 'vehicle', 'pedestrian', 'sign', 'cyclist')
 """Names of the values of the type column; '' is unknown."""
 
 
@@ -85,8 +89,10 @@ class Writer:
         for name in ('lidar_box', 'vehicle_pose'):
             (folder / name).mkdir()
         file = f'{self._segment}.parquet'
-        self._boxes = Table(folder / 'lidar_box' / file, COLUMNS, to_json(self._provenance))
-        self._poses = Table(folder / 'vehicle_pose' / file, KEY_COLUMNS | {POSE: 'double[16]'})
+        self._boxes = Table(folder / 'lidar_box' / file, BOX_COLUMNS, to_json(self._provenance))
+        self._poses = Table(
+            folder / 'vehicle_pose' / file, KEY_COLUMNS | {VEHICLE_POSE: 'double[16]'}
+        )
 
     def write(self, frame: LabelFrame) -> None:
         """Add a row per box, and the pose."""
@@ -135,13 +141,15 @@ def read(path: Path) -> Iterator[LabelFrame]:
         path = require_single(found, path, 'segment, lidar_box/NAME.parquet')
     folder = absolute(path).parent.parent
     rows = read_rows(path)
-    optional = {*UNUSED_COLUMNS, *EVIDENCE_COLUMNS}
-    missing = [name for name in COLUMNS if rows and name not in {*rows[0], *optional}]
+    optional = {*UNUSED_COLUMNS, *BOXREG_COLUMNS}
+    missing = [name for name in BOX_COLUMNS if rows and name not in {*rows[0], *optional}]
     if missing:
         raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
     pose_file = folder / 'vehicle_pose' / path.name
     poses = read_rows(pose_file) if pose_file.exists() else []
-    T_world_vehicle = {row[MICROSECONDS]: np.array(row[POSE]).reshape(4, 4) for row in poses}
+    T_world_vehicle = {
+        row[MICROSECONDS]: np.array(row[VEHICLE_POSE]).reshape(4, 4) for row in poses
+    }
     fixed_frame, sensor_frame = frame_names(folder, 'world', 'vehicle')
     rows.sort(key=_stamp_ns)
     for stamp_ns, group in groupby(rows, _stamp_ns):
@@ -153,7 +161,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             stamp_ns,
             sensor_frame,
             [item[OBJECT] for item in items],
-            [item.get('boxreg.class_name') or TYPES[item[TYPE]] for item in items],
+            [item.get('boxreg.class_name') or TYPE_NAMES[item[TYPE]] for item in items],
             boxes,
             [item.get('boxreg.score') for item in items],
             [item.get('boxreg.status') for item in items],
@@ -182,5 +190,5 @@ def _type(class_name: str) -> int:
     words = words_of(class_name)
     for name, class_names in names_by_type.items():
         if words.intersection(class_names):
-            return TYPES.index(name)
+            return TYPE_NAMES.index(name)
     return 0

@@ -7,11 +7,21 @@ from importlib import import_module
 
 from boxreg_ros.labels import can_read, Format, FORMATS
 
-HEAD = ('name', 'format', 'read', 'frame', 'position', 'sizes', 'rotation', 'files', 'needs')
+FORMAT_COLUMNS = (
+    'name',
+    'format',
+    'read',
+    'frame',
+    'position',
+    'sizes',
+    'rotation',
+    'files',
+    'needs',
+)
 
 
 def rows() -> list[tuple[str, ...]]:
-    """Return the conventions of each format, in the columns of `HEAD`."""
+    """Return the conventions of each format, in the columns of `FORMAT_COLUMNS`."""
     table: list[tuple[str, ...]] = []
     for name, path in FORMATS.items():
         # Not `module_of`: the table lists formats whose packages are not installed too.
@@ -40,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     """Print a paragraph per format."""
     for name, title, is_readable, *conventions, needs in rows():
         print(f'{name}: {title}' + ('' if is_readable else ' (written only)'))
-        for column, text in zip(HEAD[3:], conventions, strict=False):
+        for column, text in zip(FORMAT_COLUMNS[3:], conventions, strict=False):
             print(f'    {column:9} {text}')
         if needs:
             print(f'    needs     pip install {needs}')

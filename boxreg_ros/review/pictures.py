@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 Mask = NDArray[np.bool_]
 STYLE: Any = {'font.size': 8, 'axes.spines.top': False, 'axes.spines.right': False}
 COLOURS = {REFINED: '#1769aa', KEPT: '#e07b00', INTERPOLATED: '#8e44ad'}
-GREY = '#9a9a9a'
+INPUT_COLOUR = '#9a9a9a'
 WIDTH_INCHES = 13
 MIN_CHANGE = 0.02
 """Smallest half range of an axis of changes [m or deg]."""
@@ -109,7 +109,7 @@ def _draw_points(
         height_ratios=reaches,
     )  # fmt: skip
     panels: Any = grid.subplots(sharex=True, sharey='row')  # (view, before or after)
-    columns = ((before, given, GREY), (after, refined, COLOURS[REFINED]))
+    columns = ((before, given, INPUT_COLOUR), (after, refined, COLOURS[REFINED]))
     for k, (points, extent, colour) in enumerate(columns):
         for panel, axis, reach in zip(panels[:, k], (Y, Z), reaches, strict=True):
             shown = points[is_object] if axis == Y else points
@@ -135,7 +135,7 @@ def _draw_changes(track: TrackChanges, figure: Any, begin_ns: int) -> None:
     bands = 2 * track.deviations * scale
     seconds = (track.stamps_ns - begin_ns) * 1e-9
     for panel, name, values, band in zip(panels, names, changes.T, bands.T, strict=True):
-        panel.axhline(0, color=GREY, lw=0.6)
+        panel.axhline(0, color=INPUT_COLOUR, lw=0.6)
         panel.fill_between(seconds, -band, band, color=COLOURS[REFINED], alpha=0.15, lw=0)
         for status in (REFINED, KEPT):
             is_shown = track.status == status
@@ -178,7 +178,7 @@ def top_view(tracks: Sequence[TrackChanges], letters: Mapping[str, str], origins
     height_inches = float(np.clip(WIDTH_INCHES * depth / width, 4, 8))
     figure = Figure((WIDTH_INCHES, height_inches))
     axes = figure.add_axes((0.05, 0.08, 0.94, 0.9))
-    axes.plot(given[:, X], given[:, Y], color=GREY, lw=0.7, label='input')
+    axes.plot(given[:, X], given[:, Y], color=INPUT_COLOUR, lw=0.7, label='input')
     for name, colour in COLOURS.items():
         shown = boxes[status == name]
         if len(shown):
@@ -203,7 +203,7 @@ def _draw_middle_box(axes: Any, track: TrackChanges, letter: str) -> None:
     if letter:
         axes.annotate(
             letter, box[[X, Y]], (5, 5), textcoords='offset points', fontweight='bold',
-            bbox={'boxstyle': 'round,pad=0.2', 'fc': 'w', 'ec': GREY, 'lw': 0.5},
+            bbox={'boxstyle': 'round,pad=0.2', 'fc': 'w', 'ec': INPUT_COLOUR, 'lw': 0.5},
         )  # fmt: skip
 
 

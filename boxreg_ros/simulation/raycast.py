@@ -18,7 +18,7 @@ from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
-PERIOD = 0.1  # of a revolution [s]; the stamp is its middle
+SWEEP_PERIOD = 0.1  # of a revolution [s]; the stamp is its middle
 ROAD = -1  # owner of returns from the road
 
 View = list[tuple[float, float]]
@@ -40,28 +40,28 @@ def _wheel(x: float, radius_x: float, radius_z: float) -> tuple[View, View, View
     side = [
         (x + scale * radius_x * np.cos(a), radius_z + scale * radius_z * np.sin(a)) for a in turns
     ]
-    return side, _top([(-0.5, -0.47), (0.5, -0.47)]), BLOCK
+    return side, _top([(-0.5, -0.47), (0.5, -0.47)]), RECTANGLE
 
 
 ROUNDED = _top([
     (-0.5, -0.34), (-0.46, -0.46), (-0.36, -0.5), (0.3, -0.5), (0.43, -0.45), (0.5, -0.28),
 ])  # fmt: skip
 SQUARE = _top([(-0.5, -0.5), (0.5, -0.5)])
-BLOCK = _front([(0.5, 0.0), (0.5, 1.0)])
+RECTANGLE = _front([(0.5, 0.0), (0.5, 1.0)])
 TAPERED = _front([(0.44, 0.0), (0.5, 0.45), (0.35, 1.0)])
 OVAL = _top([(-0.5, -0.2), (-0.2, -0.5), (0.2, -0.5), (0.5, -0.2)])
 
 BODIES: dict[str, list[tuple[View, View, View]]] = {
     'car': [
         ([(-0.49, 0.2), (-0.4, 0.14), (0.42, 0.14), (0.49, 0.2), (0.5, 0.36), (0.45, 0.48),
-          (0.22, 0.58), (-0.44, 0.64), (-0.5, 0.5)], ROUNDED, BLOCK),
+          (0.22, 0.58), (-0.44, 0.64), (-0.5, 0.5)], ROUNDED, RECTANGLE),
         ([(-0.45, 0.5), (0.26, 0.5), (0.06, 0.94), (-0.03, 1.0), (-0.18, 1.0), (-0.3, 0.94)],
          ROUNDED, TAPERED),
         _wheel(0.31, 0.07, 0.21), _wheel(-0.3, 0.07, 0.21),
     ],
     'suv': [
         ([(-0.5, 0.24), (-0.4, 0.15), (0.43, 0.15), (0.5, 0.24), (0.5, 0.42), (0.45, 0.54),
-          (0.2, 0.62), (-0.48, 0.64), (-0.5, 0.55)], ROUNDED, BLOCK),
+          (0.2, 0.62), (-0.48, 0.64), (-0.5, 0.55)], ROUNDED, RECTANGLE),
         ([(-0.49, 0.5), (0.25, 0.5), (0.1, 0.93), (0.0, 1.0), (-0.36, 1.0), (-0.43, 0.96)],
          ROUNDED, TAPERED),
         _wheel(0.3, 0.078, 0.21), _wheel(-0.3, 0.078, 0.21),
@@ -73,7 +73,7 @@ BODIES: dict[str, list[tuple[View, View, View]]] = {
         _wheel(0.32, 0.065, 0.165), _wheel(-0.29, 0.065, 0.165),
     ],
     'truck': [
-        ([(-0.5, 0.3), (0.26, 0.3), (0.26, 1.0), (-0.5, 1.0)], SQUARE, BLOCK),
+        ([(-0.5, 0.3), (0.26, 0.3), (0.26, 1.0), (-0.5, 1.0)], SQUARE, RECTANGLE),
         ([(-0.48, 0.16), (0.4, 0.16), (0.4, 0.3), (-0.48, 0.3)],
          SQUARE, _front([(0.4, 0.0), (0.4, 1.0)])),
         ([(0.29, 0.12), (0.49, 0.12), (0.5, 0.2), (0.5, 0.42), (0.47, 0.78), (0.42, 0.84),
@@ -84,7 +84,7 @@ BODIES: dict[str, list[tuple[View, View, View]]] = {
         ([(-0.3, 0.0), (0.3, 0.0), (0.2, 0.52), (-0.2, 0.52)],
          OVAL, _front([(0.25, 0.0), (0.3, 0.52)])),
         ([(-0.25, 0.45), (0.25, 0.45), (0.5, 0.6), (0.3, 0.85), (-0.3, 0.85), (-0.5, 0.6)],
-         OVAL, BLOCK),
+         OVAL, RECTANGLE),
         ([(-0.28, 0.85), (0.28, 0.85), (0.28, 1.0), (-0.28, 1.0)],
          OVAL, _front([(0.2, 0.0), (0.2, 1.0)])),
     ],
@@ -93,7 +93,7 @@ BODIES: dict[str, list[tuple[View, View, View]]] = {
          _front([(0.06, 0.0), (0.06, 1.0)])),
         ([(-0.2, 0.15), (0.12, 0.15), (0.08, 0.6), (-0.15, 0.6)],
          OVAL, _front([(0.35, 0.0), (0.35, 1.0)])),
-        ([(-0.2, 0.52), (0.1, 0.55), (0.25, 0.62), (0.12, 0.86), (0.0, 0.86)], SQUARE, BLOCK),
+        ([(-0.2, 0.52), (0.1, 0.55), (0.25, 0.62), (0.12, 0.86), (0.0, 0.86)], SQUARE, RECTANGLE),
         ([(-0.02, 0.84), (0.13, 0.84), (0.13, 1.0), (-0.02, 1.0)],
          SQUARE, _front([(0.17, 0.0), (0.17, 1.0)])),
     ],
@@ -222,7 +222,7 @@ def revolution(
     beams = len(sensor.elevations)
     phase = (np.arange(columns) + 0.5) / columns - 0.5
     azimuth = 2 * np.pi * phase
-    times = PERIOD * phase
+    times = SWEEP_PERIOD * phase
     poses = ego.at(stamp + times)
     flat = np.cos(sensor.elevations)
     rise = np.sin(sensor.elevations)

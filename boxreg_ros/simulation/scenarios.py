@@ -12,10 +12,10 @@ from boxreg_ros.simulation.raycast import (
     Actor,
     body,
     Motion,
-    PERIOD,
     revolution,
     ROAD,
     Sensor,
+    SWEEP_PERIOD,
     to_matrix,
 )
 from boxreg_ros.simulation.scene import boxes_of, is_near, make_scene, make_sweep, Scene
@@ -100,7 +100,7 @@ def street(rng: np.random.Generator, sweeps: int | None) -> Scene:
         )
         plans.append(Plan('car' if shape == 'suv' else shape, shape, place, zero, zero))
     actors = [_actor(str(i + 1), plan, count, rng) for i, plan in enumerate(plans)]
-    ego = drive(count * PERIOD, (4, -1.75, 0), constant(6), zero)
+    ego = drive(count * SWEEP_PERIOD, (4, -1.75, 0), constant(6), zero)
     ego.poses[:, 2] = SENSOR_HEIGHT
     ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
     sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
@@ -112,7 +112,7 @@ def _actor(track_id: str, plan: Plan, count: int, rng: np.random.Generator) -> A
     extent = np.array(EXTENTS[plan.shape]) * rng.uniform(0.95, 1.05, 3)
     is_vehicle = plan.class_name in ('car', 'van', 'truck')
     axle = 0.25 * extent[0] if is_vehicle else 0.0
-    motion = drive(count * PERIOD, plan.place, plan.speed, plan.yaw_rate, axle)
+    motion = drive(count * SWEEP_PERIOD, plan.place, plan.speed, plan.yaw_rate, axle)
     motion.poses[:, 2] = extent[2] / 2
     return Actor(track_id, plan.class_name, plan.shape, extent, motion)
 
@@ -133,7 +133,7 @@ def drive(duration: float, start: Place, speed: Rate, yaw_rate: Rate, axle: floa
         Distance of the rear axle behind the centre [m].
 
     """
-    times = np.arange(-PERIOD, duration + PERIOD, INTEGRATION_STEP)
+    times = np.arange(-SWEEP_PERIOD, duration + SWEEP_PERIOD, INTEGRATION_STEP)
     yaw = np.cumsum(yaw_rate(times)) * INTEGRATION_STEP
     yaw += start[2] - np.interp(0, times, yaw)
     heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
@@ -149,7 +149,7 @@ def _scan(
 ) -> Scene:
     """Return the scene of `count` revolutions of a sensor on `ego`."""
     parts = [body(actor.shape, actor.extent) for actor in actors]
-    stamps = np.arange(count) * PERIOD
+    stamps = np.arange(count) * SWEEP_PERIOD
     T_fixed_sensor = to_matrix(ego.at(stamps))
     # (actors, sweeps, 9)
     true_boxes = np.stack([boxes_of(actor, actor.motion.at(stamps)) for actor in actors])
@@ -184,7 +184,7 @@ def paper(rng: np.random.Generator, sweeps: int | None, is_flat: bool) -> Scene:
     count = sweeps or PAPER_STEPS
     extent = np.array(EXTENTS['suv'])
     poses = _paper_poses(count, extent[2], is_flat)
-    stamps = np.arange(count) * PERIOD
+    stamps = np.arange(count) * SWEEP_PERIOD
     suv = Actor('1', 'car', 'suv', extent, Motion(stamps, poses))
 
     beside = Motion(np.zeros(1), np.array([[1.5, -7.0, 1.5, 0, 0, np.pi / 2]]))
@@ -216,7 +216,7 @@ def _paper_poses(count: int, height: float, is_flat: bool) -> Floats:
     rates[:, :2] *= not is_flat
     angles = np.cumsum(rates, axis=0)
     heading = matrix_from_rpy(angles)[:, :, 0]
-    center = np.array([0, 0, height / 2]) + np.cumsum(heading, axis=0) * PAPER_SPEED * PERIOD
+    center = np.array([0, 0, height / 2]) + np.cumsum(heading, axis=0) * PAPER_SPEED * SWEEP_PERIOD
     return np.concatenate([center, angles], axis=1)
 
 

@@ -9,7 +9,7 @@ from boxreg_ros import __version__, cli
 from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
-from boxreg_ros.bench.paper import COLUMNS, error_row
+from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.evaluate import evaluate, match
@@ -144,7 +144,7 @@ def test_paper_prints_table_one_and_draws_figures(tmp_path, capsys):
     assert set(report) == {'3d', 'bev'}
     for rows in report.values():
         row = rows['smoothing only']
-        assert set(row) == {*COLUMNS, *GROUPINGS}
+        assert set(row) == {*ERROR_COLUMNS, *GROUPINGS}
         assert row['x'] > 0
         assert rows['refined, published']['x'] in (0.121, 0.054)
     with pytest.raises(ConfigError, match='--seeds: expected 1 or more, got 0'):

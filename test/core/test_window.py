@@ -164,7 +164,7 @@ def test_priors_are_stacked():
     np.testing.assert_array_equal(problem.prior_mean[1], 0)
     np.testing.assert_array_equal(problem.prior_information[1], 0)
     assert prior.information[3, 3] == 4  # the input is not changed
-    assert with_prior(one).learning_part().prior is None
+    assert with_prior(one).margin_part().prior is None
 
 
 @pytest.mark.parametrize('turns', [2 * np.pi, -2 * np.pi, 6 * np.pi])
@@ -201,10 +201,10 @@ def test_a_solved_window_starts_from_its_estimates():
     known[:3, 0] = 0.2
     np.testing.assert_allclose(problem.start[0] - problem.boxes[0], known, atol=1e-12)
     # The newest of the window before is learnt from now, at its estimate.
-    learning = window.learning_part()
+    learning = window.margin_part()
     assert learning.observations == window.observations[2:3]
     np.testing.assert_array_equal(learning.start, solved[2:])
-    first = window._replace(num_new=4, start=solved[:0]).learning_part()
+    first = window._replace(num_new=4, start=solved[:0]).margin_part()
     assert first.observations == window.observations[:3]
     np.testing.assert_array_equal(
         stack_windows([first], CONFIG)[0].start, stack_windows([first], CONFIG)[0].boxes

@@ -8,7 +8,7 @@ from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import is_valid_box
-from msg_adapters import adapter_for, ADAPTERS, HEAD, rows, WITHOUT_IDS
+from msg_adapters import adapter_for, ADAPTERS, MESSAGE_COLUMNS, rows, WITHOUT_IDS
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import pytest
@@ -446,5 +446,5 @@ def test_boxes_with_invalid_sizes_remain_in_the_array(type_name, size):
 
 def test_table_of_message_types():
     assert [name for name, *_ in rows()] == list(ADAPTERS)
-    assert {len(row) for row in rows()} == {len(HEAD)}
+    assert {len(row) for row in rows()} == {len(MESSAGE_COLUMNS)}
     assert set(WITHOUT_IDS) == {BOXES, DETECTED, JSK}

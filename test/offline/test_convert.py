@@ -9,7 +9,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import input_boxes
 from boxreg_ros.labels import FORMATS, frames_of, Options
 from boxreg_ros.offline.convert import Conversion, convert
-from boxreg_ros.offline.formats import HEAD, rows
+from boxreg_ros.offline.formats import FORMAT_COLUMNS, rows
 from boxreg_ros.offline.relabel import relabel, Request
 import numpy as np
 import pytest
@@ -278,4 +278,4 @@ def test_formats_command_lists_all_formats(capsys):
     for name in FORMATS:
         assert f'\n{name}: ' in f'\n{text}'
     assert 'pip install pyarrow' in text
-    assert {len(row) for row in rows()} == {len(HEAD)}
+    assert {len(row) for row in rows()} == {len(FORMAT_COLUMNS)}

@@ -1,6 +1,9 @@
 """How kernels are compiled: by numba, once, kept on disk."""
 
 from collections.abc import Callable
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, cast, TypeVar
 from warnings import warn
 
@@ -8,6 +11,9 @@ import numba
 
 REORDER = {'contract', 'reassoc'}
 """Sums may be reordered for vector instructions; NaN and infinity are handled as usual."""
+
+DIGEST_LENGTH = 12
+"""Letters of the digest of the sources. Chosen: 48 bits."""
 
 _F = TypeVar('_F', bound=Callable[..., Any])
 
@@ -20,7 +26,16 @@ def kernel(function: _F) -> _F:
     no window depends on another, the results do not depend on the number of threads. Numba's own
     threads are not used: they do not survive a fork, and workers of `boxreg relabel` are forked.
 
+    Notes
+    -----
+    Numba compiles the kernels that a kernel calls into its cache file, but compares the file with
+    the source of the caller only. The qualified name, which numba puts into the name of the cache
+    file, therefore gets a digest of all sources in the folder. Modules of kernels import functions
+    and constants from their own folder only.
+
     """
+    folder = Path(function.__code__.co_filename).parent
+    function.__qualname__ += f'_{sources_digest(folder)}'
     options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'fastmath': REORDER}
     try:
         return cast(_F, numba.njit(function, cache=True, **options))
@@ -37,3 +52,12 @@ def kernel(function: _F) -> _F:
 
 FIRST_KERNEL = 'fill_rotation'
 """The kernel that is compiled first: one warning is enough."""
+
+
+@cache
+def sources_digest(folder: Path) -> str:
+    """Return a digest of all Python sources that lie directly in a folder."""
+    digest = sha256()
+    for path in sorted(folder.glob('*.py')):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:DIGEST_LENGTH]
