@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 from boxreg_ros.config import Config
-from boxreg_ros.core import batch, kernels, prior, rigid_shape
+from boxreg_ros.core import batch, kernels, prior, registration, rigid_shape
 from boxreg_ros.core.arrowhead import BandedFactor
 from boxreg_ros.core.batch import EXTENT, SHARED, State
 from boxreg_ros.core.face_support import (
@@ -15,10 +15,12 @@ from boxreg_ros.core.face_support import (
     observe_faces_torch,
 )
 from boxreg_ros.core.input_model import expect, InputModel
+from boxreg_ros.core.observation import own_points, own_points_numpy
 from boxreg_ros.core.registration import register
 from boxreg_ros.core.solver import MOTION_TERMS
 from boxreg_ros.core.terms import Objective, term_arrays
 from boxreg_ros.core.weights import robustify_motion, weigh, weigh_compiled
+from boxreg_ros.structures import Sweep
 import numpy as np
 from paths import ROOT
 import pytest
@@ -158,7 +160,7 @@ def drives(kind, N=12):
     if kind in ('still', 'drives off'):
         boxes[:2] = boxes[:2, :1]
     if kind == 'drives off':
-        boxes[0, -3:, 0] += [0.05, 0.25, 0.6]
+        boxes[0, -5:, 0] += 0.2 * np.arange(1, 6)
     if kind == 'one outlier':
         boxes[0, 5, :2] += 8.0
         boxes[0, 5, 8] += 1.6
@@ -182,15 +184,48 @@ def drives(kind, N=12):
 @pytest.mark.parametrize('kind', ['usual', 'still', 'drives off', 'one outlier', 'two boxes'])
 @pytest.mark.parametrize('robust', [True, False])
 def test_weights_equal_those_of_torch(kind, robust):
-    problem, state = drives(kind, 4 if kind == 'two boxes' else 12)
+    problem, state = drives(kind, {'two boxes': 4, 'drives off': 24}.get(kind, 12))
     config = Config().updated({'ingredients.robust_weights': robust})
     known, found = weighed(problem, state, config)
     known = term_arrays(known, state.pack(), problem.length)
     for name in found._fields:
         if not name.startswith('shape'):
             assert_equal(getattr(found, name), getattr(known, name))
-    if kind in ('still', 'drives off'):
-        assert 0 < (found.W_zero_motion[..., 0, 0] > 0).mean() < 1
+    is_held = found.W_zero_motion[:2, :, 0, 0] > 0
+    if kind == 'still':
+        assert is_held[0].all()
+    if kind == 'drives off':
+        assert is_held[0, 0]
+        assert not is_held[0, -5:].any()
+
+
+@pytest.mark.parametrize('road', [True, False])
+@pytest.mark.parametrize('ownership', [True, False])
+def test_points_of_boxes_equal_those_of_numpy(road, ownership):
+    # Boxes that overlap, lie apart, and share cells of the raster; a road under some of them.
+    rng = np.random.default_rng(8)
+    boxes = np.zeros((12, 9))
+    boxes[:, :2] = rng.uniform(-12, 12, (12, 2)) + 256 * rng.integers(-1, 2, (12, 2))
+    boxes[:, 3:6] = [4.5, 1.9, 1.6]
+    boxes[:, 6:] = rng.normal(size=(12, 3)) * [0.05, 0.05, 2.0]
+    points = rng.uniform(-6, 6, (20_000, 3)) + boxes[rng.integers(0, 12, 20_000), :3]
+    points[::2, 2] = -0.8 + 0.02 * rng.normal(size=10_000)
+    sweep = Sweep(0, 'odom', points.astype(np.float32))
+    config = Config().updated({'ingredients.road': road, 'ingredients.point_ownership': ownership})
+    found, known = own_points(sweep, boxes, config), own_points_numpy(sweep, boxes, config)
+    order = np.lexsort((found.row, found.owner)), np.lexsort((known.row, known.owner))
+    for a, b in zip(found[:3], known[:3], strict=True):
+        assert_equal(a[order[0]], b[order[1]])
+    assert_equal(found.road, known.road)
+    np.testing.assert_array_equal(found.num_inside, known.num_inside)
+    assert np.isfinite(known.road).any() == road
+
+
+def test_held_points_are_counted_as_by_torch():
+    problem, state = searched('usual')
+    extent = state.shared[:, None, EXTENT].expand(*problem.valid.shape, 3)
+    found = registration._held(problem, state.pose, extent)
+    np.testing.assert_array_equal(found, registration._held_torch(problem, state.pose, extent))
 
 
 @pytest.mark.parametrize('case', CASES)

@@ -1,23 +1,24 @@
 """
 Pairs of a point and a box that are near each other, in plain loops.
 
-The numpy twin is `boxreg_ros.core.observation.crop_numpy`.
+The numpy twins are `crop_numpy` and `own_points_numpy` of `boxreg_ros.core.observation`.
 
 """
 
 from boxreg_ros.core.kernels.compile import kernel
+from boxreg_ros.core.kernels.sorting import sort
 import numpy as np
 
 SIDE = 256
 """Cells of the raster along x and y; those of far places share a cell."""
-FAR = 1e9
+LARGEST = 1e9
 """Coordinates are limited to this, so that they fit an integer [m]."""
 
 
 @kernel
 def metre(value):
     """Return a coordinate as whole metres, truncated: the order of coordinates is kept."""
-    return int(min(max(value, -FAR), FAR))
+    return int(min(max(value, -LARGEST), LARGEST))
 
 
 @kernel
@@ -130,7 +131,7 @@ def crop(points, centers, rotations, half, reach, margin):
 def flat_height(heights, quantiles, flatness, min_points):
     """Return the height of a road from heights beside a box; NaN where it is not flat."""
     n = len(heights)
-    heights.sort()
+    sort(heights)
     if n < min_points:
         return np.nan
     low = heights[int(quantiles[0] * n)]

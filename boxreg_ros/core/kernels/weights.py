@@ -10,6 +10,7 @@ from math import hypot, inf
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.normal_equations import BIAS, EXTENT, GAP, PIVOT, SHARED, slip_of
 from boxreg_ros.core.kernels.rotation import fill_rotation
+from boxreg_ros.core.kernels.sorting import lower_median
 import numpy as np
 
 POSE = (0, 1, 2, 6, 7, 8)
@@ -43,19 +44,6 @@ def fill_neighbour_deviation(boxes, times, length, axes, numbers, off_track):
         for k in range(6):
             is_known = off_track[n, k] < inf
             off_track[n, k] = off_track[n, k] / numbers.neighbour_factor if is_known else 0.0
-
-
-@kernel
-def lower_median(values):
-    """Return the median of values (n,), the lower one of two; the values are sorted."""
-    for i in range(1, len(values)):
-        value = values[i]
-        place = i
-        while place > 0 and values[place - 1] > value:
-            values[place] = values[place - 1]
-            place -= 1
-        values[place] = value
-    return values[(len(values) - 1) // 2]
 
 
 @kernel
