@@ -2,6 +2,8 @@
 
 PYTHON ?= python3
 VENV ?= .venv
+# Processes that share the tests.
+WORKERS ?= 2
 # Python 3.12 for `make test-jazzy`: the first of these that runs.
 PYTHON_JAZZY ?= $(firstword $(foreach python,python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python),\
     $(shell $(python) -c 'import ensurepip, venv' 2>/dev/null && echo $(python))))
@@ -26,6 +28,9 @@ jazzy := $(VENV_JAZZY)/.done
 JAZZY_TESTS := --ignore test/core/test_refine.py test/test_config.py test/core test/io test/msg_adapters \
     test/labels/test_labels.py test/offline/test_evaluate.py test/offline/test_relabel.py test/live/test_driver.py
 
+# Each worker begins with one end of the suite and takes tests of the other when it is done.
+SHARED := -n $(WORKERS) --dist worksteal
+
 .PHONY: help demo test test-main test-jazzy lint format docs figures clean
 
 help: ## list the commands
@@ -42,13 +47,13 @@ demo: $(runtime) ## set up, refine the sample recording, print accuracy before a
 test: test-main test-jazzy ## set up, run the whole suite, and a part of it as on Ubuntu 24.04
 
 test-main: $(tests) $(consumers)
-	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered
+	$(BIN)/python -m pytest $(SHARED) --cov --cov-report=term:skip-covered
 
 test-jazzy: $(if $(PYTHON_JAZZY),$(jazzy)) ## run a part of the suite with the versions of Ubuntu 24.04
 	@[ -n '$(PYTHON_JAZZY)' ] || { \
 	    echo 'NOT RUN: the tests with the versions of Ubuntu 24.04 need Python 3.12, and none was found.'; \
 	    echo 'Install it, or name it: make test-jazzy PYTHON_JAZZY=/path/to/python3.12'; }
-	$(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python -m pytest -q --durations=3 $(JAZZY_TESTS))
+	$(if $(PYTHON_JAZZY),$(VENV_JAZZY)/bin/python -m pytest -q $(SHARED) --durations=3 $(JAZZY_TESTS))
 
 lint: $(tests) ## run the linters alone
 	$(BIN)/python -m pytest test/test_lint.py
@@ -92,5 +97,5 @@ $(jazzy): constraints.txt constraints-jazzy.txt setup.py package.xml
 	    constraints-jazzy.txt constraints.txt > $(VENV_JAZZY)/constraints.txt
 	$(VENV_JAZZY)/bin/python -m pip $(QUIET) -c $(VENV_JAZZY)/constraints.txt setuptools
 	$(VENV_JAZZY)/bin/python -m pip $(QUIET) $(BUILD) -c $(VENV_JAZZY)/constraints.txt \
-	    -e '.[ros,report]' pytest shapely
+	    -e '.[ros,report]' pytest pytest-xdist shapely
 	@touch $@

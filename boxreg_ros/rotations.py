@@ -9,12 +9,12 @@ leading dimensions, also none and empty ones; NaN gives NaN.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, overload, TYPE_CHECKING
 
 from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -104,7 +104,7 @@ def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
     is_finite = np.isfinite(q).all(-1)
     R = np.full((*q.shape[:-1], 3, 3), np.nan)
     if is_finite.any():  # versions of SciPy differ on empty arrays and on NaN
-        R[is_finite] = Rotation.from_quat(q[is_finite]).as_matrix()
+        R[is_finite] = _scipy().from_quat(q[is_finite]).as_matrix()
     return R
 
 
@@ -114,7 +114,7 @@ def quaternion_from_matrix(R: ArrayLike) -> Floats:
     is_finite = np.isfinite(R).all((-2, -1))
     quaternions = np.full((*R.shape[:-2], 4), np.nan)
     if is_finite.any():  # versions of SciPy differ on empty arrays
-        found = Rotation.from_matrix(R[is_finite]).as_quat()
+        found = _scipy().from_matrix(R[is_finite]).as_quat()
         quaternions[is_finite] = np.where(found[..., 3:] < 0, -found, found)
     return quaternions
 
@@ -126,7 +126,17 @@ def rpy_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
 
 def quaternion_from_rpy(rpy: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), x y z w with w >= 0, of roll, pitch, yaw (..., 3)."""
-    return quaternion_from_matrix(matrix_from_rpy(rpy))
+    half = np.asarray(rpy, float) / 2
+    cr, cp, cy = np.moveaxis(np.cos(half), -1, 0)
+    sr, sp, sy = np.moveaxis(np.sin(half), -1, 0)
+    parts = [
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ]
+    quaternions = np.stack(parts, -1)
+    return np.where(quaternions[..., 3:] < 0, -quaternions, quaternions)
 
 
 def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: float) -> Floats:
@@ -146,6 +156,15 @@ def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: f
         Rotation matrix.
 
     """
-    first, second = Rotation.from_quat(np.asarray([first_xyzw, second_xyzw], float))
+    rotation = _scipy()
+    first, second = rotation.from_quat(np.asarray([first_xyzw, second_xyzw], float))
     step = (first.inv() * second).as_rotvec()
-    return np.asarray((first * Rotation.from_rotvec(share * step)).as_matrix())
+    return np.asarray((first * rotation.from_rotvec(share * step)).as_matrix())
+
+
+@cache
+def _scipy() -> Any:
+    """Return SciPy's class; its import takes 0.3 s, which `boxreg --help` does not need."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation

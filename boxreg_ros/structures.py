@@ -22,6 +22,8 @@ Ints = NDArray[np.int64]
 
 X, Y, Z, LENGTH, WIDTH, HEIGHT, ROLL, PITCH, YAW = range(9)
 POSE = [X, Y, Z, ROLL, PITCH, YAW]
+BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
+"""Columns of the extents of a box."""
 
 REFINED, KEPT, INTERPOLATED = 'refined', 'kept', 'interpolated'
 

@@ -236,7 +236,12 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'better.',
         _sensitivity,
     ),
-    'speed': ('Speed', 'Times in ms unless the name says otherwise.', _figures),
+    'speed': (
+        'Speed',
+        'Times in ms unless the name says otherwise. CUDA has not been run: the torch twins of\n'
+        'the kernels are tested on the CPU only.',
+        _figures,
+    ),
     'node': ('The live node', 'Publisher, node and observer each a process, over DDS.', _figures),
 }
 

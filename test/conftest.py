@@ -6,11 +6,13 @@ import signal
 import sys
 import tempfile
 
+import pytest
+from ros_domain import next_domain
 import torch
 
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
-os.environ['ROS_LOG_DIR'] = str(Path(tempfile.gettempdir(), 'boxreg_ros_test_log'))
+os.environ['ROS_DOMAIN_ID'] = str(next_domain())
+os.environ['ROS_LOG_DIR'] = str(Path(tempfile.gettempdir(), f'boxreg_ros_test_log_{os.getpid()}'))
 # Read when a message class is imported; without it misspelt fields and wrong types pass.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 # The wheels of ROS need it where ROS itself is not installed.
@@ -22,3 +24,13 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The problems of the tests are small: several threads are slower than one.
 torch.set_num_threads(1)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes():
+    """Compile the kernels once, before the workers start nodes that wait for them."""
+    # Imported here: messages are imported after their checks are switched on.
+    from boxreg_ros.config import Config
+    from boxreg_ros.live.driver import warm_up
+
+    warm_up(Config())

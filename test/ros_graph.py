@@ -1,7 +1,6 @@
 """A ROS graph for tests: a node of the test, and processes of the node and of a player."""
 
 from contextlib import contextmanager
-import itertools
 import os
 from pathlib import Path
 import signal
@@ -15,6 +14,7 @@ from paths import ROOT
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_domain import next_domain
 from rosbags.highlevel import AnyReader
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
@@ -26,7 +26,6 @@ RELIABLE = [
 ]
 QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=60.0')
 """Arguments for short windows; no box is dropped on a busy machine."""
-_domains = itertools.count(os.getpid())
 
 
 class Graph:
@@ -34,7 +33,7 @@ class Graph:
 
     def __init__(self, folder, domain=None):
         self.folder = folder
-        self.domain = domain or 1 + next(_domains) % 100
+        self.domain = domain or next_domain()
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=self.domain)
         self.node = rclpy.create_node('neighbour', context=self.context)

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.core.refine import Track
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix, wrap_angle
-from boxreg_ros.structures import Floats, HEIGHT, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
+from boxreg_ros.structures import BOX_EXTENT, Floats, HEIGHT, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded

@@ -19,7 +19,7 @@ MEASUREMENTS = {
     'real': Measurement('accuracy', 'accuracy on recordings with known truth'),
     'ablation': Measurement('ablation', 'accuracy without each ingredient of the method'),
     'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),
-    'speed': Measurement('speed', 'time per tick, per box and per window'),
+    'speed': Measurement('speed.command', 'time per tick, per box and per window'),
     'node': Measurement('node', 'latency and memory of the live node, over DDS'),
 }
 

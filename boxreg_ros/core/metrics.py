@@ -4,15 +4,13 @@ from typing import NamedTuple
 
 from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import checked, Floats, HEIGHT, LENGTH, ROLL
+from boxreg_ros.structures import BOX_EXTENT, checked, Floats, HEIGHT, ROLL
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 import torch
 
 MAX_PAIRS = 1000
 """Pairs whose intersection is computed at once; derived: about 100 MB of temporary arrays."""
-BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
-"""Columns of the extents."""
 FACE_OFFSET = 1e-9
 """The second box is larger by this on each side [m], so that no two faces are coplanar; derived:
 far above float64 rounding at 1 km, far below any error of interest."""

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
-from boxreg_ros.structures import BoxArray, Floats, Ints, ROLL
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL
 import numpy as np
 
 COLUMNS = (

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 from boxreg_ros.structures import BoxArray, Floats, HEIGHT, is_valid_box, LENGTH, X, Z
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 CENTER_STD = 0.3
 """Standard deviation of a detected centre [m]."""
@@ -109,6 +108,8 @@ class Tracker:
             In a fixed frame.
 
         """
+        from scipy.optimize import linear_sum_assignment  # slow, and only association needs it
+
         stamp_ns, max_gap_ns = boxes.stamp_ns, round(self.max_gap * 1e9)
         if self._newest_ns is not None and stamp_ns < self._newest_ns - max_gap_ns:
             self.forget()  # a recording in a loop

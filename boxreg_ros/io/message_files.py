@@ -122,9 +122,10 @@ class Reader:
                 f'{msgtype.split("/")[0]} and record it again, or convert the recording'
             )
         try:
+            view: Any = memoryview(data)  # parts of it are no copies
             if self._ros is not None:
-                return self._ros.deserialize(data, msgtype)
-            return self.typestore.deserialize_cdr(data, msgtype)
+                return self._ros.deserialize(view, msgtype)
+            return self.typestore.deserialize_cdr(view, msgtype)
         # rosbags turns all errors of malformed bytes into SerdeError or AnyReaderError; the others
         # mean that a definition refers to a type without one.
         except (SerdeError, AnyReaderError, TypesysError, KeyError) as error:

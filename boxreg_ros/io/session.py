@@ -10,10 +10,9 @@ reading and writing.
 
 from __future__ import annotations
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.id_assignment import Tracker
 from boxreg_ros.io.pose_check import PoseCheck
@@ -21,6 +20,9 @@ from boxreg_ros.io.transforms import move_to_frame, TIME_JUMP, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
+
+if TYPE_CHECKING:  # it imports torch, which a process that only reads does not need
+    from boxreg_ros.core.registrar import BoxRegistrar
 
 _T = TypeVar('_T')
 

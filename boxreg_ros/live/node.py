@@ -10,9 +10,10 @@ import time
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
+from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.live.driver import LiveRegistrar, warm_up
+from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
 from boxreg_ros.live.topics import Topics

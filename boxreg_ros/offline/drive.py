@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import RecordingError, TransformUnavailable
@@ -18,6 +17,7 @@ from boxreg_ros.io.transforms import sweep_to_frame, to_fixed_frame, TransformTr
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.scene import Scene
 from boxreg_ros.structures import (
+    BOX_EXTENT,
     BoxArray,
     Floats,
     Ints,

@@ -13,12 +13,12 @@ import sys
 from typing import Any
 
 from boxreg_ros.config import words_of
-from boxreg_ros.core.metrics import BOX_EXTENT, iou_3d, iou_bev, pose_errors
+from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.arguments import add_topic_arguments, convention_from
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, Ints, is_valid_box, YAW
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, is_valid_box, YAW
 import numpy as np
 from numpy.typing import NDArray
 

@@ -7,16 +7,19 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline.cloud_spool import Spool
 from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
-from boxreg_ros.review.changes import Changes
 from boxreg_ros.structures import BoxArray, Floats, INTERPOLATED, KEPT, REFINED, RefinedBoxes, YAW
 from boxreg_ros.tracks.bridge import Bridge
 import numpy as np
+
+if TYPE_CHECKING:
+    from boxreg_ros.review.changes import Changes
 
 
 @dataclass(eq=False, slots=True)
@@ -80,7 +83,11 @@ class Sink:
             name: writer_for(name, folder, provenance, options) for name in request.all_formats
         }
         self._bridge: Bridge[_Slot] = Bridge(request.bridge, self._fixed_frame, request.config)
-        self.changes = Changes(self._fixed_frame) if request.report else None
+        self.changes: Changes | None = None
+        if request.report:
+            from boxreg_ros.review.changes import Changes
+
+            self.changes = Changes(self._fixed_frame)
         self._by_stamp: list[_Slot] = []  # not yet written
         self._by_ticket: dict[object, _Slot] = {}  # without a result
         self._last_ticket = 0

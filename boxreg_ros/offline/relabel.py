@@ -9,41 +9,37 @@ Every box of the recording is written exactly once: refined, or unchanged with t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import asdict
 from importlib.metadata import version
 import json
 from pathlib import Path
 import platform
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros import __version__
-from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.output import Sink
+from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader
-from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import REASONS
-from boxreg_ros.review.changes import Changes
-from boxreg_ros.review.report import REPORT, write_report
 from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, Sweep
 import yaml
+
+if TYPE_CHECKING:
+    from boxreg_ros.core.registrar import BoxRegistrar
+    from boxreg_ros.review.changes import Changes
 
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
 NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
 
-Progress = Callable[[float, float], None]
 
-
-def no_progress(done: float, total: float) -> None:
-    """Show no progress."""
-
-
-def relabel(request: Request, out: Path, progress: Progress = no_progress) -> dict[str, Any]:
+def relabel(request: Request, out: Path, progress: Progress | None = None) -> dict[str, Any]:
     """
     Refine all boxes of a recording and write ``boxes.csv``, ``summary.json`` and other files.
 
@@ -53,9 +49,9 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
         Inputs and options.
     out : Path
         Result folder. It appears complete or not at all; an earlier result is replaced.
-    progress : callable, optional
-        Called with the duration of the recording that has been read and its whole duration [s].
-        With a report the recording is read twice, and both count twice.
+    progress : Progress, optional
+        Shows the duration of the recording that has been read and its whole duration [s]. With a
+        report the recording is read twice, and both count twice.
 
     Returns
     -------
@@ -71,11 +67,21 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
 
     """
     clock = Stopwatch()
+    progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
-    with registration_worker(request.config, clock) as begin, reader(request) as process:
+    with ExitStack() as workers:
+        process = workers.enter_context(reader(request))
+        # The recording is opened while this process imports torch, which takes a second.
+        from boxreg_ros.core.registrar import BoxRegistrar
+        from boxreg_ros.offline.registration_worker import registration_worker
+
+        submit = workers.enter_context(
+            registration_worker(request.config, clock, progress.announce)
+        )
         recording = ReadAhead(process)
-        registrar = BoxRegistrar(request.config, begin)
-        shown = _Progress(progress, recording.source.seconds, 2 if request.report else 1)
+        clock.begun('start')
+        registrar = BoxRegistrar(request.config, submit)
+        shown = _Passes(progress, recording.source.seconds, 2 if request.report else 1)
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
                 _register(recording, registrar, sink, clock, shown)
@@ -91,16 +97,16 @@ def relabel(request: Request, out: Path, progress: Progress = no_progress) -> di
     return summary
 
 
-class _Progress(NamedTuple):
+class _Passes(NamedTuple):
     """Progress over one or two passes through a recording of `seconds`."""
 
-    callback: Progress
+    progress: Progress
     seconds: float
     passes: int
 
     def show(self, seconds: float, passes_done: int = 0) -> None:
         """Report the time of the recording that has been read in this pass [s]."""
-        self.callback(passes_done * self.seconds + seconds, self.passes * self.seconds)
+        self.progress.show(passes_done * self.seconds + seconds, self.passes * self.seconds)
 
 
 def _register(
@@ -108,7 +114,7 @@ def _register(
     registrar: BoxRegistrar,
     sink: Sink,
     clock: Stopwatch,
-    progress: _Progress,
+    progress: _Passes,
 ) -> None:
     """Read the recording, register its boxes and write them."""
     for item in recording:
@@ -129,9 +135,11 @@ def _report(
     summary: dict[str, Any],
     changes: Changes,
     clock: Stopwatch,
-    progress: _Progress,
+    progress: _Passes,
 ) -> None:
     """Write the report and add its time to the summary."""
+    from boxreg_ros.review.report import REPORT, write_report
+
     with clock('report'):
         line = closing_line(summary, out)
         items = _items(request, progress)
@@ -139,7 +147,7 @@ def _report(
     summary['seconds'] = clock.seconds()
 
 
-def _items(request: Request, progress: _Progress) -> Iterator[Sweep | BoxArray]:
+def _items(request: Request, progress: _Passes) -> Iterator[Sweep | BoxArray]:
     """Read the recording a second time; yield its clouds and boxes in the fixed frame."""
     with reader(request) as process:
         for item in ReadAhead(process):

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from pathlib import Path
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any, Self, TYPE_CHECKING
 
 from boxreg_ros.offline.arguments import (
     add_label_arguments,
@@ -14,6 +13,7 @@ from boxreg_ros.offline.arguments import (
     config_from,
     convention_from,
 )
+from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 DONE = 0
 FAILED = 1
-BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left'
+BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left {desc}'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -103,11 +103,8 @@ def run(args: argparse.Namespace) -> int:
         return FAILED if has_failed(earlier) else DONE
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
-    from tqdm import tqdm
-
-    is_hidden = not sys.stderr.isatty()
-    with tqdm(total=1.0, unit='s', disable=is_hidden, leave=False, bar_format=BAR) as bar:
-        summary = relabel(request, args.out, partial(_show, bar))
+    with ProgressBar() as bar:
+        summary = relabel(request, args.out, bar)
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))
@@ -153,7 +150,27 @@ def _is_complete(earlier: dict[str, Any], request: Request, out: Path) -> bool:
     return all(is_written(name, out) for name in request.all_formats)
 
 
-def _show(bar: Any, done: float, total: float) -> None:
-    """Show the progress of a run [s of the recording]."""
-    bar.total = total
-    bar.update(max(0.0, done - bar.n))
+class ProgressBar(Progress):
+    """A bar on stderr, where that is a terminal; use as a context manager."""
+
+    def __enter__(self) -> Self:
+        """Show the bar."""
+        from tqdm import tqdm
+
+        is_hidden = not sys.stderr.isatty()
+        self._bar = tqdm(total=1.0, unit='s', disable=is_hidden, leave=False, bar_format=BAR)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the bar."""
+        self._bar.close()
+
+    def show(self, done: float, total: float) -> None:
+        """Show the progress of a run [s of the recording]."""
+        self._bar.set_description_str('', refresh=False)
+        self._bar.total = total
+        self._bar.update(max(0.0, done - self._bar.n))
+
+    def announce(self, activity: str) -> None:
+        """Show what the run waits for beside the bar."""
+        self._bar.set_description_str(f'({activity})')

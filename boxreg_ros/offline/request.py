@@ -15,7 +15,6 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import check_options, module_of, Options
 from boxreg_ros.offline.labelled_recording import LabelledRecording
-from boxreg_ros.review.report import check_packages
 from msg_adapters.convention import Convention, STANDARD
 
 
@@ -86,6 +85,8 @@ class Request:
             )
         check_options(self.formats, self.options)
         if self.report:
+            from boxreg_ros.review.report import check_packages  # imports torch
+
             check_packages()
 
     def _check_boxes(self) -> None:

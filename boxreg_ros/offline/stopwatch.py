@@ -45,6 +45,10 @@ class Stopwatch:
                 return
             yield item  # type: ignore[misc]
 
+    def begun(self, stage: str) -> None:
+        """Add the time since construction to a stage: what was done before work began."""
+        self.add(stage, time.perf_counter() - self._begun)
+
     def stages(self) -> dict[str, float]:
         """Return the time of each stage [s]."""
         return {name: round(seconds, 4) for name, seconds in self._seconds.items()}

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
 import os
 import pickle
 import signal
+import socket
+import struct
 from traceback import format_exc
 from typing import Any
 
 from boxreg_ros.errors import BoxregError
 import numpy as np
-import torch
 
 Receive = Callable[[], Any]
 Send = Callable[[Any], None]
@@ -35,14 +34,14 @@ class WorkerProcess:
 
     Parameters
     ----------
-    connection : Connection
+    connection : socket
         Connection to the worker.
     purpose : str
         The work of the process as a verb phrase, as in 'reads the recording'; used in errors.
 
     """
 
-    def __init__(self, connection: Connection, purpose: str) -> None:
+    def __init__(self, connection: socket.socket, purpose: str) -> None:
         self._connection = connection
         self._purpose = purpose
 
@@ -108,7 +107,7 @@ def run_in_worker(serve: Serve, purpose: str) -> Iterator[WorkerProcess]:
         The work of the process as a verb phrase; used in errors.
 
     """
-    parent_end, worker_end = Pipe()
+    parent_end, worker_end = socket.socketpair()
     pid = os.fork()
     if pid == 0:
         parent_end.close()
@@ -127,11 +126,10 @@ def run_in_worker(serve: Serve, purpose: str) -> Iterator[WorkerProcess]:
             os.waitpid(pid, 0)
 
 
-def _run(serve: Serve, connection: Connection) -> None:
+def _run(serve: Serve, connection: socket.socket) -> None:
     """Run the function in the worker and send back the exception it raises."""
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the parent handles them and ends the worker
-    torch.set_num_threads(1)
 
     def receive() -> Any:
         return _receive(connection)
@@ -147,33 +145,45 @@ def _run(serve: Serve, connection: Connection) -> None:
             send(error)
 
 
-def _send(connection: Connection, item: Any) -> None:
+def _send(connection: socket.socket, item: Any) -> None:
     """
-    Send the sizes of large arrays, the pickled item without them, and each large array.
+    Send the pickled item without its large arrays, and each large array as it lies in memory.
 
-    `Connection.send` is not used: it would place tensors in shared memory.
+    `multiprocessing.Connection` is not used: it would copy each array once more on either side,
+    and place tensors in shared memory.
 
     """
-    large: list[pickle.PickleBuffer] = []
+    large: list[memoryview] = []
 
     def keep_in_message(buffer: pickle.PickleBuffer) -> bool:
         if buffer.raw().nbytes < LARGE_BYTES:
             return True
-        large.append(buffer)
+        large.append(buffer.raw())
         return False
 
     message = pickle.dumps(item, pickle.HIGHEST_PROTOCOL, buffer_callback=keep_in_message)
-    connection.send_bytes(pickle.dumps([buffer.raw().nbytes for buffer in large]))
-    connection.send_bytes(message)
+    sizes = [len(message), *(buffer.nbytes for buffer in large)]
+    connection.sendall(struct.pack(f'<Q{len(sizes)}Q', len(sizes), *sizes))
+    connection.sendall(message)
     for buffer in large:
-        connection.send_bytes(buffer.raw())
+        connection.sendall(buffer)
 
 
-def _receive(connection: Connection) -> Any:
+def _receive(connection: socket.socket) -> Any:
     """Return the next item that `_send` sent."""
-    sizes = pickle.loads(connection.recv_bytes())
-    message = connection.recv_bytes()
-    buffers = [np.empty(size, np.uint8) for size in sizes]
-    for buffer in buffers:
-        connection.recv_bytes_into(buffer)
+    (count,) = struct.unpack('<Q', _received(connection, 8))
+    sizes = struct.unpack(f'<{count}Q', _received(connection, 8 * count))
+    message, *buffers = (_received(connection, size) for size in sizes)
     return pickle.loads(message, buffers=buffers)
+
+
+def _received(connection: socket.socket, size: int) -> memoryview:
+    """Return the next `size` bytes."""
+    buffer = np.empty(size, np.uint8).data  # not zeroed, as a bytearray would be
+    rest = buffer
+    while len(rest):
+        received = connection.recv_into(rest, 0, socket.MSG_WAITALL)
+        if not received:
+            raise EOFError('the other end of the connection is closed')
+        rest = rest[received:]
+    return buffer

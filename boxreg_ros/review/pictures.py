@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Any
 
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.review.changes import known, median, TrackChanges
 from boxreg_ros.review.track_points import SHOWN_MARGIN
 from boxreg_ros.structures import (
+    BOX_EXTENT,
     Floats,
     INTERPOLATED,
     KEPT,

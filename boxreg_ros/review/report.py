@@ -18,13 +18,13 @@ from string import ascii_uppercase
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.metrics import BOX_EXTENT
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.review.changes import mean, median, TrackChanges
 from boxreg_ros.review.pictures import STYLE, top_view, track_picture
 from boxreg_ros.review.track_points import BoxPoints, gather_points, points_before_and_after
 from boxreg_ros.structures import (
+    BOX_EXTENT,
     BoxArray,
     Floats,
     INTERPOLATED,

@@ -16,6 +16,7 @@ import pytest
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_domain import next_domain
 from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
@@ -313,7 +314,7 @@ def test_malformed_messages_are_counted_and_others_are_refined(graph, tmp_path):
 @pytest.fixture
 def domain():
     """Return the environment with another ROS domain."""
-    return {**os.environ, 'ROS_DOMAIN_ID': str(101 + os.getpid() % 100)}
+    return {**os.environ, 'ROS_DOMAIN_ID': str(next_domain())}
 
 
 BENCH = [sys.executable, '-m', 'boxreg_ros.cli', 'bench', 'node', '--tracks=3', '--points=3000']

@@ -12,6 +12,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.offline import registration_worker as registration
+from boxreg_ros.offline.compilation import announced_compilation, COMPILING
 from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.stopwatch import Stopwatch
@@ -175,7 +176,7 @@ def test_registration_worker_returns_the_same_boxes(stream, offset_ns):
     direct = BoxRegistrar(SHORT)
     expected = fed(direct, stream) + direct.flush()
     clock = Stopwatch()
-    with registration_worker(SHORT, clock) as begin:
+    with registration_worker(SHORT, clock, print) as begin:
         registrar = BoxRegistrar(SHORT, begin)
         early = fed(registrar, stream)
         assert 0 < len(early) < len(stream)  # some boxes are returned before the end
@@ -211,8 +212,46 @@ def test_registrar_takes_input_while_windows_are_registered(stream):
 
 @pytest.mark.parametrize('changes', [{'estimate': 'final'}, {'device': 'meta'}])
 def test_no_worker_for_sliding_windows_or_other_devices(changes):
-    with registration_worker(SHORT.updated(changes), Stopwatch()) as begin:
+    with registration_worker(SHORT.updated(changes), Stopwatch(), print) as begin:
         assert begin is None
+
+
+def compile_something(_):
+    numba = pytest.importorskip('numba')
+    numba.njit(lambda x: x + 1)(1)
+
+
+def test_the_first_compilation_is_announced():
+    texts = []
+    with announced_compilation(texts.append):
+        assert texts == []
+        compile_something(None)
+        compile_something(None)
+    assert texts == [COMPILING]
+    compile_something(None)
+    assert texts == [COMPILING]
+
+
+def test_compilation_in_the_worker_is_announced_while_it_is_waited_for(stream, monkeypatch):
+    texts = []
+    monkeypatch.setattr(registration, 'warm_up', compile_something)  # the fork copies it
+    with registration_worker(SHORT, Stopwatch(), texts.append) as begin:
+        registrar = BoxRegistrar(SHORT, begin)
+        fed(registrar, stream[:3])
+        assert texts == []
+        registrar.flush()
+    assert texts == [COMPILING]
+
+
+def test_the_reader_imports_no_solver():
+    # Its start and its memory: torch takes a second and 200 MB.
+    code = (
+        'import sys; import boxreg_ros.offline.relabel; from boxreg_ros.labels import FORMATS, '
+        "module_of; [module_of(name) for name in ('csv', 'openlabel')]; "
+        "print(*sorted({'numba', 'torch'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ('\n', '')
 
 
 def test_relabel_writes_the_same_files_with_a_worker(tmp_path):
@@ -240,12 +279,14 @@ def test_exception_in_the_worker_ends_relabel(tmp_path, monkeypatch):
 def test_killed_worker_is_an_error_with_a_remedy(tmp_path, monkeypatch, which):
     recording = Drive(sweeps=30).write(tmp_path / 'drive')
     added = []
-    others = set(children_of(os.getpid()))  # of earlier tests
+    parent = os.getpid()
+    others = set(children_of(parent))  # of earlier tests
 
     def killing(self, boxes):
-        if not added:  # like the kernel when memory runs out
-            pids = sorted({*children_of(os.getpid())} - others)
-            os.kill(pids[which == 'reads the recording'], signal.SIGKILL)
+        # The worker adds boxes too, when it warms up. Killed as by the kernel without memory.
+        if not added and os.getpid() == parent:
+            pids = sorted({*children_of(parent)} - others)
+            os.kill(pids[which == 'registers windows'], signal.SIGKILL)
         added.append(boxes)
         return add(self, boxes)
 

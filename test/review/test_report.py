@@ -13,6 +13,7 @@ import sys
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.relabel import closing_line, relabel, Request
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.report import MAX_SHOWN, select_tracks, write_report
@@ -231,7 +232,9 @@ def test_missing_package_is_refused_before_reading(tmp_path, monkeypatch, capsys
 def test_progress_counts_both_passes(tmp_path):
     shown = []
     request = Request((Drive(sweeps=4).write(tmp_path / 'drive'),), config=QUICK, report=True)
-    relabel(request, tmp_path / 'out', lambda done, total: shown.append(done / total))
+    progress = Progress()
+    progress.show = lambda done, total: shown.append(done / total)
+    relabel(request, tmp_path / 'out', progress)
     assert shown == sorted(shown)
     assert 0.4 < shown[len(shown) // 2 - 1] <= 0.5
     assert shown[-1] == pytest.approx(1.0)

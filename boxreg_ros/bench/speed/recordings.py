@@ -1,0 +1,113 @@
+"""Time and memory of `boxreg relabel`, in processes of its own."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from itertools import tee
+import json
+import os
+from pathlib import Path
+from shutil import disk_usage
+import subprocess
+import sys
+import tempfile
+from time import sleep
+
+from boxreg_ros.bench.speed.streams import SWEEP_PERIOD, traffic
+from boxreg_ros.simulation.recorder import write_recording
+from boxreg_ros.structures import Sweep
+import numpy as np
+
+BYTES_PER_POINT = 20
+"""Size of a point in a recording."""
+CLI = 'boxreg_ros.cli'
+
+
+def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
+    """
+    Return time and memory of `boxreg relabel` on a recording of `seconds` at 10 Hz.
+
+    It runs in processes of its own. ``total`` is the elapsed time [s]; the times of the stages add
+    up to more, since reading and solving overlap. ``start`` is the time until the recording is
+    open [s], ``faster`` the length of the recording over ``total``, ``compressed`` the same for
+    a recording packed by zstd, ``rest`` the part of the total in which nothing is solved.
+    ``memory`` is the peak of all processes [MB], ``memory, shared once`` the same with pages that
+    they share counted once, ``short`` and ``long`` are peaks for recordings of this length and of
+    ten times that, with sweeps of ``few`` points: a fifth of all if the disk has no room for more.
+    ``faster, long`` and ``rest, long`` are those of the latter.
+
+    """
+    result: dict[str, float] = {}
+    with tempfile.TemporaryDirectory(prefix='boxreg-') as name:
+        path, out = Path(name) / 'drive.mcap', Path(name) / 'out'
+        has_room = (
+            disk_usage(name).free > 2 * BYTES_PER_POINT * points * 10 * seconds / SWEEP_PERIOD
+        )
+        few = points if has_room else points // 5
+        result['few'] = few
+        # The first case is a warm-up, too: first accesses to memory of a virtual machine, and to
+        # files, are not to be measured.
+        for case, size, length in (
+            ('short', few, seconds),
+            ('long', few, 10 * seconds),
+            ('compressed', points, seconds),
+            ('memory', points, seconds),
+        ):
+            a, b, c, d = tee(traffic(tracks, size, round(length / SWEEP_PERIOD)), 4)
+            write_recording(
+                path,
+                (Sweep(i.stamp_ns, 'lidar', i.points) for i in a),
+                (np.zeros(len(i.points)) for i in b),
+                (i.boxes for i in c),
+                (i.T_fixed_sensor for i in d),
+                'odom',
+                is_compressed=case == 'compressed',
+            )
+            with path.open('rb') as file:
+                os.fsync(file.fileno())  # else the disk still writes while it is read
+            result[case], shared_once = _peaks(
+                [sys.executable, '-m', CLI, 'relabel', str(path), '-o', str(out)]
+            )
+            spent = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['seconds']
+            faster, rest = length / spent['total'], 1 - spent['solve'] / spent['total']
+            if case == 'memory':
+                result |= {**spent, 'faster': faster, 'rest': rest}
+                result['memory, shared once'] = shared_once
+            elif case == 'compressed':
+                result[case] = faster
+            elif case == 'long':
+                result |= {'faster, long': faster, 'rest, long': rest}
+    return result
+
+
+def _peaks(command: list[str]) -> tuple[float, float]:
+    """
+    Run a command and return the peak memory of its processes [MB].
+
+    First the sum of the peak of each process, where shared memory, such as libraries, counts for
+    each; then the peak of the sum of their proportional set sizes, where it counts once.
+
+    """
+    peaks: dict[str, int] = {}
+    shared_once = 0
+    with tempfile.TemporaryFile('w+') as output:
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
+        while process.poll() is None:
+            with suppress(OSError, IndexError):  # a process may have ended
+                children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text()
+                sizes = 0
+                for pid in (str(process.pid), *children.split()):
+                    folder = Path(f'/proc/{pid}')
+                    peaks[pid] = _kilobytes(folder / 'status', 'VmHWM:')
+                    sizes += _kilobytes(folder / 'smaps_rollup', 'Pss:')
+                shared_once = max(shared_once, sizes)
+            sleep(0.02)
+        if process.returncode:
+            output.seek(0)
+            raise RuntimeError(f'{" ".join(command)} failed: {output.read()}')
+    return sum(peaks.values()) / 1024, shared_once / 1024
+
+
+def _kilobytes(file: Path, name: str) -> int:
+    """Return one value of a file of /proc [kB]."""
+    return int(file.read_text().partition(name)[2].split()[0])

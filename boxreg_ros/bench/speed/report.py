@@ -1,0 +1,149 @@
+"""The report of `boxreg bench speed` as text and pictures, and beside an earlier one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.speed.streams import SWEEP_PERIOD
+import numpy as np
+
+
+def text(report: dict[str, Any]) -> str:
+    """Return the report of `command.measure` as text."""
+    s, t, c, r = (report[name] for name in ('solver', 'tick', 'crop', 'relabel'))
+    lines = [
+        f'on {report["device"]}, load of the machine {report["load"]:.1f} when it began',
+        *_solver_lines(s, report['windows']),
+    ]
+    for name, rows in report['scaling'].items():
+        cells = '   '.join(f'{x}: {y:.2f}' for x, y in rows)
+        lines.append(f'ms per window over {name:8s} {cells}')
+    rates = '   '.join(f'{x}: {1e3 / y:,.0f}' for x, y in report['scaling']['windows'])
+    lines.append(f'windows per second        {rates}')
+    stages = ('decode', 'transform', 'crop and sample', 'solve', 'encode')
+    shares = ', '.join(f'{k} {t[k]:.1f} ({t[k] / t["total"]:.0%})' for k in stages)
+    lines.append(f'one tick: {t["total"]:.1f} ms of {1e3 * SWEEP_PERIOD:.0f}: {shares}')
+    lines.append(
+        f'the first tick of the process that solves: {t["first"]:.0f} ms, '
+        f'that of the first full window: {t["first full"]:.0f} ms'
+    )
+    for tracks, found in report['ticks'].items():
+        lines.append(f'one tick of {tracks} tracks: {found:.1f} ms')
+    lines.append(
+        f'tracks held at {1 / SWEEP_PERIOD:.0f} Hz, none dropped: {report["held tracks"]}'
+    )
+    times = ', '.join(f'{name} {ms:.0f} ms' for name, ms in report['cores'].items())
+    lines.append(f'{report["most windows"]} windows: {times}')
+    lines += _roofline_lines(report['roofline'])
+    open3d = c['Open3D, box by box']
+    lines.append(
+        f'crop of all boxes: {c["ours"]:.1f} ms; box by box with numpy '
+        f'{c["numpy, box by box"]:.0f} ms ({c["numpy, box by box"] / c["ours"]:.0f} times), '
+        + (
+            f'with Open3D {open3d:.0f} ms ({open3d / c["ours"]:.0f} times)'
+            if open3d
+            else c['reason']
+        )
+    )
+    busy = ('read', 'decode', 'transform', 'registrar', 'solve', 'write')
+    lines.append(
+        f'relabel: {r["faster"]:.1f} times faster than the recording lasts ({r["total"]:.1f} s; '
+        f'{r["compressed"]:.1f} times where it is compressed; busy, partly at once: '
+        + ', '.join(f'{k} {r[k]:.1f}' for k in busy)
+        + f'), all but the solve {r["rest"]:.0%}'
+    )
+    lines.append(
+        f'ten times as long, sweeps of {r["few"]:,} points: {r["faster, long"]:.1f} times faster '
+        f'than it lasts, all but the solve {r["rest, long"]:.0%}'
+    )
+    lines.append(
+        f'the recording is open after {r["start"]:.1f} s; peak of all its processes: '
+        f'{r["memory"]:.0f} MB, shared pages counted once {r["memory, shared once"]:.0f} MB; '
+        f'sweeps of {r["few"]:,} points {r["short"]:.0f} MB, ten times as long {r["long"]:.0f} MB'
+    )
+    return '\n'.join(lines)
+
+
+def _solver_lines(found: dict[str, float], count: int) -> list[str]:
+    """Return the lines of the solver and of the reference."""
+    lines = ['one window of 10 boxes x 128 points, 3d']
+    for name, label, time in (
+        ('input', 'input', ''),
+        ('reference', 'one fit by torch.optim.LBFGS', f'{found["reference"]:.3f} ms'),
+        ('ours', f'refine, {count} at once', f'{found["refine"]:.3f} ms'),
+    ):
+        lines.append(
+            f'  {label:30s} {time:>12s}   IoU {found[f"IoU, {name}"]:.3f}   '
+            f'value {found[f"value, {name}"]:.2f}'
+        )
+    lines.append(
+        f'  refine is {found["reference"] / found["refine"]:.0f} times faster; the solver alone '
+        f'takes {found["cold"]:.3f} ms cold, {found["warm"]:.3f} ms warm'
+    )
+    lines.append(
+        f'  IoU of ours less that of the reference: '
+        f'{found["IoU, ours"] - found["IoU, reference"]:+.3f} +- {found["IoU, error"]:.3f}'
+    )
+    return lines
+
+
+def _roofline_lines(found: dict[str, Any]) -> list[str]:
+    lines = [
+        f'limit of one core: {found["bandwidth"]:.1f} GB/s, {found["peak"]:.0f} Gflop/s (float64)'
+    ]
+    for name, stage in found['stages'].items():
+        lines.append(
+            f'  {name:28s} {stage["ms"]:8.2f} ms   {stage["MB"]:7.2f} MB   '
+            f'{stage["Mflop"]:7.2f} Mflop   {stage["share"]:.1%} of the limit'
+        )
+    return lines
+
+
+def beside(earlier: dict[str, Any], report: dict[str, Any]) -> str:
+    """Return all numbers of an earlier report and of this one in columns, with ratios."""
+    before = dict(_numbers(earlier))
+    lines = [f'{"":44}{"before":>12}{"after":>12}{"ratio":>8}']
+    for name, value in _numbers(report):
+        if name in before:
+            ratio = f'{before[name] / value:8.2f}' if value else f'{"-":>8}'
+            lines.append(f'{name:44}{before[name]:12.4g}{value:12.4g}{ratio}')
+    return '\n'.join(lines)
+
+
+def _numbers(value: Any, name: str = '') -> Iterator[tuple[str, float]]:
+    """Yield the name and value of every number in a report."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield from _numbers(part, f'{name}: {key}' if name else str(key))
+    elif isinstance(value, list):
+        for key, part in value:
+            yield from _numbers(part, f'{name}: {key}')
+    elif isinstance(value, int | float):
+        yield name, float(value)
+
+
+def draw_scaling(table: dict[str, list[tuple[int, float]]], path: Path) -> Path:
+    """Draw the time per window and return the path of the picture."""
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+
+    figure, panels = pyplot.subplots(
+        1, len(table), figsize=(4 * len(table), 3.6), sharey=True, squeeze=False,
+        layout='constrained',
+    )  # fmt: skip
+    for panel, (name, rows) in zip(panels[0], table.items(), strict=True):
+        x, y = np.array(rows).T
+        panel.loglog(x, y, 'o-')
+        panel.set_xlabel(
+            {'length': 'boxes per window', 'points': 'points per box'}.get(name, name)
+        )
+        panel.set_xticks(x, [f'{value:g}' for value in x])
+        panel.set_xticks([], minor=True)
+        panel.grid(which='both', alpha=0.3)
+    panels[0, 0].set_ylabel('ms per window')
+    figure.savefig(path, dpi=120)
+    return path

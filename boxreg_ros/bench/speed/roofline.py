@@ -1,0 +1,111 @@
+"""Share of the limit of the machine that the stages of a round reach: a roofline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.speed.streams import make_windows, shortest
+from boxreg_ros.config import Config
+from boxreg_ros.core.arrowhead import LINK
+from boxreg_ros.core.batch import free_variables, SHARED, State
+from boxreg_ros.core.face_support import observe_faces
+from boxreg_ros.core.input_model import expect, InputModel
+from boxreg_ros.core.terms import Objective
+from boxreg_ros.core.weights import weigh
+from boxreg_ros.core.window import stack_windows
+import numpy as np
+import torch
+
+FLOPS_PER_POINT = 27
+"""Derived: 15 to turn a point into box axes, 12 to compare it with the outermost of six faces."""
+BAND = 3 * LINK
+"""Derived: a residual spans at most three poses."""
+COPY_BYTES = 256 << 20
+"""Size of the array whose copy measures the memory bandwidth. Chosen: larger than all caches."""
+MATRIX_SIZE = 1024
+"""Rows of the matrices whose product measures the peak of arithmetic. Chosen."""
+
+
+def roofline(config: Config, count: int) -> dict[str, Any]:
+    """
+    Return bandwidth [GB/s] and peak [Gflop/s] of one core, and the share of each stage of them.
+
+    The least bytes that a stage touches and the least operations that it does are computed by
+    formula. The limit is the larger of the times of both, ``share`` is the limit over the time.
+
+    """
+    source = np.ones(COPY_BYTES // 8)
+    target = np.empty_like(source)
+    copying = shortest(lambda: np.copyto(target, source), config)
+    matrix = torch.ones(MATRIX_SIZE, MATRIX_SIZE, dtype=torch.float64)
+    multiplying = shortest(lambda: matrix @ matrix, config)
+    bandwidth = 2 * COPY_BYTES / copying
+    peak = 2 * MATRIX_SIZE**3 / multiplying
+    stages = {}
+    for name, (run, size, flops) in _stages(config, count).items():
+        seconds = shortest(run, config)
+        limit = max(size / bandwidth, flops / peak)
+        stages[name] = {
+            'ms': 1e3 * seconds,
+            'MB': 1e-6 * size,
+            'Mflop': 1e-6 * flops,
+            'share': limit / seconds,
+        }
+    return {'bandwidth': 1e-9 * bandwidth, 'peak': 1e-9 * peak, 'stages': stages}
+
+
+def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object], float, float]]:
+    """Return function, bytes and operations of each stage of one round of `count` windows."""
+    windows, _ = make_windows(count, config.window, 128, config)
+    problem, _ = stack_windows(windows, config)
+    offsets = InputModel(config.faces).offsets()
+    expected = expect(problem, offsets)
+    state = State(problem.pose, expected.shared)
+    observations = observe_faces(problem, state, offsets, config)
+    terms = weigh(problem, state, observations, expected, config)
+    free = free_variables(problem, config)
+    x = state.pack()
+    weights = sum(term.weight.numel() * term.weight.element_size() for term in terms)
+    points = float(problem.mask.sum())
+    border = BAND + SHARED
+    factor_size = 8.0 * count * config.window * LINK * border
+    return {
+        'face observations': (
+            lambda: observe_faces(problem, state, offsets, config),
+            points * 3 * problem.points.element_size(),
+            points * FLOPS_PER_POINT,
+        ),
+        'weights': (
+            lambda: weigh(problem, state, observations, expected, config),
+            float(weights),
+            float(weights) / 8,
+        ),
+        'normal equations and factor': (
+            lambda: Objective(terms, x, problem.length, free).newton(x, torch.arange(count)),
+            weights + factor_size,
+            2.0 * count * config.window * LINK * border**2,
+        ),
+    }
+
+
+def draw(found: dict[str, Any], path: Path) -> Path:
+    """Draw the roofline with its stages and return the path of the picture."""
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+
+    figure, panel = pyplot.subplots(figsize=(6, 4), layout='constrained')
+    intensity = np.logspace(-2, 2, 100)  # [flop/byte]
+    panel.loglog(intensity, np.minimum(found['peak'], found['bandwidth'] * intensity), 'k-')
+    for name, stage in found['stages'].items():
+        x = stage['Mflop'] / stage['MB']
+        panel.plot(x, stage['Mflop'] / stage['ms'], 'o', label=f'{name}: {stage["share"]:.0%}')
+    panel.set_xlabel('flop per byte')
+    panel.set_ylabel('Gflop/s of one core')
+    panel.grid(which='both', alpha=0.3)
+    panel.legend()
+    figure.savefig(path, dpi=120)
+    return path
