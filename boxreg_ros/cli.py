@@ -35,6 +35,7 @@ COMMANDS = {
     'convert': Command('offline.convert', 'convert label files to other formats'),
     'formats': Command('offline.formats', 'list the label formats and their conventions'),
     'evaluate': Command('offline.evaluate', 'compare boxes with true boxes'),
+    'check': Command('offline.check', 'check labels against rules'),
     'calibrate': Command(
         'offline.calibrate', 'estimate the labelling margins from labelled tracks'
     ),
