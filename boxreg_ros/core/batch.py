@@ -113,6 +113,8 @@ class Problem(NamedTuple):
         Sum of the input extents of marginalised observations, and the number of these.
     class_numbers : Tensor, shape (B, C)
         The numbers of each window's `ClassConfig`, in the order of `CLASS_NUMBERS`.
+    kind : Tensor, shape (B,)
+        Index of the kind of each window's object among `KINDS`.
 
     """
 
@@ -129,6 +131,7 @@ class Problem(NamedTuple):
     prior_information: Tensor
     marginalised_extents: Tensor
     class_numbers: Tensor
+    kind: Tensor
 
     @property
     def pose(self) -> Tensor:
@@ -272,7 +275,7 @@ class Solution(NamedTuple):
     marginalised_extents : Tensor or None, shape (B, 4)
         `Problem.marginalised_extents` of the next window.
     extent_evidence : Tensor, shape (B, 3, 3)
-        Evidence of the points alone about the extents, see `InputNoise`.
+        Evidence of the points alone about the extents, see `Population`.
 
     """
 

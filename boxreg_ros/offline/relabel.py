@@ -106,7 +106,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
                 _register(recording, registrar, completion, sink, clock, shown)
-            summary = _summary(request, recording, registrar.counts, sink)
+            summary = _summary(request, recording, registrar, sink)
             summary['complete'] = _completed(plan)
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
@@ -115,7 +115,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             with clock('write'):
                 summary['rules'] = _write_tables(folder, tracks, request.config, plan)
             if request.report:
-                _report(folder, out, request, summary, tracks, clock, shown)
+                config = registrar.box_time.resolved(request.config)
+                _report(folder, out, request, config, summary, tracks, clock, shown)
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
             (folder / CONFIG).write_text(settings, encoding='utf-8')
             (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
@@ -233,6 +234,7 @@ def _report(
     folder: Path,
     out: Path,
     request: Request,
+    config: Config,
     summary: dict[str, Any],
     tracks: Sequence[TrackChanges],
     clock: Stopwatch,
@@ -244,7 +246,7 @@ def _report(
     with clock('report'):
         line = closing_line(summary, out)
         items = _items(request, progress)
-        write_report(folder / REPORT, line, summary, request.config, tracks, items)
+        write_report(folder / REPORT, line, summary, config, tracks, items)
     summary['seconds'] = clock.seconds()
 
 
@@ -257,7 +259,7 @@ def _items(request: Request, progress: _Passes) -> Iterator[Sweep | BoxArray]:
 
 
 def _summary(
-    request: Request, recording: ReadAhead, registered: Counter[str], sink: Sink
+    request: Request, recording: ReadAhead, registrar: BoxRegistrar, sink: Sink
 ) -> dict[str, Any]:
     """Return the content of summary.json, without the fingerprint and the times."""
     if sink.missing():
@@ -282,9 +284,10 @@ def _summary(
         'time_jumps': findings.counts['time_jump'],
         'recorded_apart': {t: round(late, 3) for t, late in findings.apart.items()},
         'heading_flips': sink.heading_flips,
+        'box_time': registrar.box_time.summary(request.config),
         'time_ranges': {name: list(ends) for name, ends in sink.time_ranges.items()},
         'unknown_classes': dict(sink.unknown_classes.most_common()),
-        'dropped': _dropped(registered, findings),
+        'dropped': _dropped(registrar.counts, findings),
         'without_stamp': _without_stamp(findings),
         'damage': [damage._asdict() for damage in findings.damages],
         'first_missing_transform': findings.first_missing_transform,

@@ -160,7 +160,8 @@ def _points_near(track: TrackChanges, row: int, sweep: Sweep, config: Config) ->
     index = np.unique(index[outside.max(0) < SHOWN_MARGIN])
     step = max(1, -(-len(index) // MAX_POINTS))
     index = index[::step]
-    if config.sampling.deskew and sweep.times is not None:
+    is_at_stamp = config.sampling.deskew and config.sampling.box_time == 'stamp'
+    if is_at_stamp and sweep.times is not None:
         delay = delay + sweep.times[index]
     return np.asarray(sweep.points[index] + _motion_to_stamp(track, row, delay))
 
