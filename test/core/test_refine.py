@@ -93,8 +93,9 @@ def braking(n=40, speed=14.0, brake=8.0, start=1.5):
 @pytest.mark.parametrize('estimate, most', [('final', 1.05), ('track', 0.5)])
 def test_hard_braking_is_followed(estimate, most):
     # The motion model expects 1.5 m/s^2: over a window of 0.9 s it is wrong by
-    # 6.5 * 0.9^2 / 2 = 2.6 m. The points must outweigh it. Live, accurate input gains nothing here:
-    # over twelve seeds the loss of IoU is 1.02 times that of the input, of whole tracks 0.28.
+    # 6.5 * 0.9^2 / 2 = 2.6 m. The points must outweigh it. Live, accurate input gains nothing
+    # here: over twelve seeds the loss of IoU is 1.02 times that of the input, of whole
+    # tracks 0.28.
     missing = []
     for seed in range(3):
         track, truth = a_track(seed, truth=braking(), position=0.05, heading=0.01)
