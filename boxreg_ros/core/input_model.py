@@ -6,11 +6,12 @@ docs/method.md, section Input model, has the formulas (M14) to (M18).
 """
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
 from boxreg_ros.config import FaceConfig, KINDS
 from boxreg_ros.core.arrowhead import BandedFactor, Factor
-from boxreg_ros.core.batch import EXTENT, POSE_ERRORS, Problem, State
+from boxreg_ros.core.batch import EXTENT, GAP, PIVOT, POSE_ERRORS, Problem, SHARED, State
 from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
 from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
 from boxreg_ros.structures import Floats, ROLL
@@ -183,11 +184,14 @@ class InputNoise(NamedTuple):
         seen is expected to err as the others do, in proportion to the settings of its kind.
 
         """
-        by_kind = []
-        for k in range(len(KINDS)):
-            is_own = kind == k
-            own = cls.estimate(residuals[is_own])
-            by_kind.append(own._with_prior(cls.estimate(residuals[~is_own])))
+        seen = frozenset(kind.tolist())
+        # Often all tracks are of one kind, and the same set is needed for several kinds.
+        sets = [(seen & {k}, seen - {k}) for k in range(len(KINDS))]
+        estimates = {
+            kinds: cls.estimate(residuals[torch.isin(kind, kind.new_tensor(list(kinds)))])
+            for kinds in set(chain.from_iterable(sets))
+        }
+        by_kind = [estimates[own]._with_prior(estimates[others]) for own, others in sets]
         return cls(*(torch.stack(parts) for parts in zip(*by_kind, strict=True)))
 
     def _with_prior(self, others: 'InputNoise') -> 'InputNoise':
@@ -389,23 +393,34 @@ def expect(
     bias = usual * usual.new_tensor([1, 1, 1, 1, 1, YAW_BIAS]) * slow[:, :6] * constant
 
     # Extents: the mean of the input, corrected by the population.
-    mean = _mean_input_extents(problem)
+    mean = mean_input_extents(problem)
     part = usual_extent * slow[:, 6:] * (2 * constant[:, :3]).clamp(max=1)
     extent = mean * population.factors(problem, mean, part)
 
     one = torch.ones_like(usual)
-    length = mean[:, :1]
-    gaps = problem.of_class(*FACE_GAPS) + offsets.of(problem).gap_correction
     size = (mean / mean.new_tensor(LARGE_EXTENT)).clamp(min=1)[:, FACE_AXIS]
     spread = problem.of_class('gap_spread') * size * (2 - 2 * constant[:, :1]).clamp(1)
-    shared = [extent, 0 * one, gaps, length * problem.of_class('pivot'), 0 * one]
-    deviations = [extent * part, bias, spread, length * PIVOT_DEVIATION, one]
-    return Expectation(
-        torch.cat(shared, 1), torch.cat(deviations, 1), deviation, deviation * widening
-    )
+    shared = expected_shared(problem, offsets, mean)
+    shared[:, EXTENT] = extent
+    deviations = [extent * part, bias, spread, mean[:, :1] * PIVOT_DEVIATION, one]
+    return Expectation(shared, torch.cat(deviations, 1), deviation, deviation * widening)
 
 
-def _mean_input_extents(problem: Problem) -> Tensor:
+def expected_shared(problem: Problem, offsets: FaceOffsets, extent: Tensor) -> Tensor:
+    """
+    Return the means of the shared variables, (B, 22), see `State`, without a population.
+
+    Given the margins of the input, and the mean extents (B, 3) of `mean_input_extents`.
+
+    """
+    shared = extent.new_zeros((len(extent), SHARED))
+    shared[:, EXTENT] = extent
+    shared[:, GAP] = problem.of_class(*FACE_GAPS) + offsets.of(problem).gap_correction
+    shared[:, PIVOT] = extent[:, 0] * problem.of_class('pivot')[:, 0]
+    return shared
+
+
+def mean_input_extents(problem: Problem) -> Tensor:
     """Return the mean extents of the input, marginalised observations included, (B, 3) [m]."""
     valid = problem.valid
     total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1)
@@ -592,9 +607,11 @@ class InputModel:
     def offsets(self) -> FaceOffsets:
         """Return the labelling margins and insets to expect of each kind."""
         rows = [self._offsets(k) for k in range(len(KINDS))]
-        return FaceOffsets(*(torch.stack(parts) for parts in zip(*rows, strict=True)))
+        parts = map(np.stack, zip(*rows, strict=True))
+        return FaceOffsets(*map(torch.from_numpy, parts))
 
-    def _offsets(self, kind: int) -> FaceOffsets:
+    def _offsets(self, kind: int) -> tuple[Floats, Floats, Floats]:
+        """Return the columns of `FaceOffsets` for one kind, (6,) each."""
         known = np.array(list(self._faces[kind].values())).reshape(-1, 3, 3, 6)
         none = (0.0,) * len(FACE_GROUPS)
         deviations = GAP_DEVIATIONS[KINDS[kind]]
@@ -602,9 +619,9 @@ class InputModel:
         occlusion_insets = _pooled(
             self._estimates_margins * known[:, 1], self._occlusion_insets, deviations
         )
-        known[:, 2, 0] -= gaps.numpy() * known[:, 2, 1]
+        known[:, 2, 0] -= gaps * known[:, 2, 1]
         range_insets = _pooled(known[:, 2], none, deviations)
-        return FaceOffsets(self._estimates_margins * gaps, occlusion_insets, range_insets)
+        return self._estimates_margins * gaps, occlusion_insets, range_insets
 
     def gaps_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
         """Return gap corrections of some `faces` [m], one array per track that has any."""
@@ -635,9 +652,9 @@ class InputModel:
         return means
 
 
-def _pooled(known: Floats, expected: Sequence[float], deviations: Sequence[float]) -> Tensor:
+def _pooled(known: Floats, expected: Sequence[float], deviations: Sequence[float]) -> Floats:
     """Weigh the tracks' sums (n, 3, 6) of a quantity against its prior (M18), (6,)."""
-    values = torch.zeros(6, dtype=torch.float64)
+    values = np.zeros(6)
     for faces, prior, deviation in zip(FACE_GROUPS, expected, deviations, strict=True):
         total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
         is_known = count >= MIN_TRACK_OBSERVATIONS

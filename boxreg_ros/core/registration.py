@@ -19,7 +19,13 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
 from boxreg_ros.core.face_support import motion_compensated, observe_faces, to_box_frame
-from boxreg_ros.core.input_model import expect, InputModel, normalised_residuals, smoothed_angles
+from boxreg_ros.core.input_model import (
+    expected_shared,
+    InputModel,
+    mean_input_extents,
+    normalised_residuals,
+    smoothed_angles,
+)
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.solver import COARSE_POINTS, solve
@@ -126,7 +132,8 @@ def _update_offsets(model: InputModel, windows: Sequence[Window], config: Config
     problem = problem.thinned(COARSE_POINTS)
     offsets = model.offsets()
     pose = torch.cat([problem.boxes[..., :3], smoothed_angles(problem)], -1)
-    state = State(pose, expect(problem, offsets).shared)
+    shared = expected_shared(problem, offsets, mean_input_extents(problem))
+    state = State(pose, shared)
     observations = observe_faces(problem, state, offsets, config)
     track_ids = [window.track_id for window in new_parts]
     model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)

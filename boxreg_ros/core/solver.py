@@ -34,8 +34,10 @@ from boxreg_ros.core.input_model import (
     evidence_of_extents,
     expect,
     Expectation,
+    expected_shared,
     InputModel,
     InputNoise,
+    mean_input_extents,
     normalised_residuals,
     UNKNOWN_NOISE,
     UNKNOWN_POPULATION,
@@ -313,7 +315,7 @@ def _prior_of_full(objective: Objective, found: State, problem: Problem) -> Marg
 def _start(problem: Problem, config: Config, offsets: FaceOffsets, plan: Plan) -> Solution:
     """Return the state that the first round starts from, without covariances and prior."""
     pose = problem.start[..., POSE].clone()
-    shared = expect(problem, offsets).shared
+    shared = expected_shared(problem, offsets, mean_input_extents(problem))
     log_extent = shared[:, EXTENT].log()
     if plan.starts_from_fit:
         is_free = free_variables(problem, config)[:, -SHARED:][:, EXTENT]
