@@ -1,6 +1,6 @@
 """Covariances of the estimate, and the residuals of its faces: once per window, at its end."""
 
-from boxreg_ros.core.arrowhead import BandedFactor, Factor
+from boxreg_ros.core.arrowhead import BandedFactor, Factor, product
 from boxreg_ros.core.batch import EXTENT, GAP, Posterior, Problem, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
 import torch
@@ -27,6 +27,7 @@ def posterior(
     inset: Tensor,
     weight: Tensor,
     factor: Factor | BandedFactor,
+    covariance: Tensor,
 ) -> Posterior:
     """
     Return the covariances of settled windows (M26, M28), and the residuals of their faces.
@@ -41,32 +42,39 @@ def posterior(
         Of the `FaceObservations` of the last round.
     factor : Factor or BandedFactor
         Of the Gauss-Newton curvature of the last round.
+    covariance : Tensor, shape (B, 22, 22)
+        Of the shared variables: their block of the inverse of that curvature.
 
     """
-    poses = factor.inverse_of_links(problem.length) + _pose_model_covariance(state)
-    extents = torch.cholesky_inverse(factor.corner)[:, EXTENT, EXTENT]
+    R = rotation_from_rpy(state.pose[..., 3:])
+    poses = factor.inverse_of_links(problem.length)
+    _add_pose_model_covariance(poses, R)
+    extents = covariance[:, EXTENT, EXTENT]
     extents = extents + torch.diag(extents.new_tensor(EXTENT_MODEL_DEVIATION) ** 2)
-    distances = _face_distances(problem, state, moments[..., 3, :3], inset)
+    distances = _face_distances(problem, state, R, moments[..., 3, :3], inset)
     return Posterior(poses, extents, torch.where(weight > 0, distances, 0.0))
 
 
-def _pose_model_covariance(state: State) -> Tensor:
-    """Return the covariance of the model errors in the fixed frame (M28), (B, N, 6, 6)."""
-    axes = torch.eye(6).to(state.pose).repeat(*state.pose.shape[:2], 1, 1)
-    axes[..., :3, :3] = rotation_from_rpy(state.pose[..., 3:])
-    return axes * axes.new_tensor(POSE_MODEL_DEVIATION) ** 2 @ axes.mT
+def _add_pose_model_covariance(poses: Tensor, R: Tensor) -> None:
+    """Add the model errors of boxes with axes `R` (B, N, 3, 3) to `poses` (B, N, 6, 6) (M28)."""
+    variance = poses.new_tensor(POSE_MODEL_DEVIATION) ** 2
+    poses[..., :3, :3] += product(R * variance[:3], R.mT)
+    poses[..., 3:, 3:] += torch.diag(variance[3:])
 
 
-def _face_distances(problem: Problem, state: State, centroid: Tensor, inset: Tensor) -> Tensor:
+def _face_distances(
+    problem: Problem, state: State, R: Tensor, centroid: Tensor, inset: Tensor
+) -> Tensor:
     """
     Return the mean of (M2) over the outermost points of each face, shape (B, N, 6) [m].
 
-    `centroid` (B, N, 6, 3) is that of the points, from the centre of the input box [m].
+    `R` (B, N, 3, 3) are the axes of the boxes, `centroid` (B, N, 6, 3) is that of the points, from
+    the centre of the input box [m].
 
     """
+    normals = R.mT[..., FACE_AXIS, :] * FACE_SIGN.to(R)[:, None]  # (B, N, 6, 3)
     shift = (state.pose - problem.pose)[..., None, :3]
-    local = (centroid - shift) @ rotation_from_rpy(state.pose[..., 3:])
-    outward = local[..., range(6), FACE_AXIS] * FACE_SIGN.to(local)
+    outward = ((centroid - shift) * normals).sum(-1)
     half = state.shared[:, EXTENT][:, FACE_AXIS] / 2
     surface = (half - state.shared[:, GAP])[:, None] - inset
     return outward - surface

@@ -10,7 +10,6 @@ from itertools import chain
 from typing import NamedTuple
 
 from boxreg_ros.config import FaceConfig, KINDS
-from boxreg_ros.core.arrowhead import BandedFactor, Factor
 from boxreg_ros.core.batch import EXTENT, GAP, PIVOT, POSE_ERRORS, Problem, SHARED, State
 from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
 from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
@@ -468,7 +467,7 @@ def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
 
 
 def evidence_of_extents(
-    given: Tensor, expected: Expectation, state: State, factor: Factor | BandedFactor
+    given: Tensor, expected: Expectation, state: State, covariance: Tensor
 ) -> Tensor:
     """
     Return the evidence of the points alone about the extents (M17), shape (B, 2, 3).
@@ -481,13 +480,15 @@ def evidence_of_extents(
         Logarithms of the mean extents of the input.
     expected : Expectation
         Prior of the fit: its part in that is removed.
-    state, factor : State, Factor or BandedFactor
-        The fit, and the factor of its curvature.
+    state : State
+        The fit.
+    covariance : Tensor, shape (B, 22, 22)
+        Of its shared variables.
 
     """
     mean = expected.shared[:, EXTENT]
     deviation = expected.deviation[:, EXTENT]
-    variance = torch.cholesky_inverse(factor.corner).diagonal(dim1=1, dim2=2)[:, EXTENT]
+    variance = covariance.diagonal(dim1=1, dim2=2)[:, EXTENT]
     gain = 1 - variance / deviation**2
     power = (deviation / mean) ** 2
     by_points = (state.shared[:, EXTENT] / mean).log() / gain + mean.log()

@@ -261,12 +261,13 @@ def run_round(
     is_done = is_settled | (turn + 1 >= plan.rounds)
     done = is_done.nonzero()[:, 0]
     faces = observations.moments, observations.inset, observations.weight
-    settled = select((problem, found, *faces, objective.factor), done)
+    covariance = torch.cholesky_inverse(objective.factor.corner)
+    settled = select((problem, found, *faces, objective.factor, covariance), done)
     prior = None
     is_full = plan.marginalises and problem.length == config.window
     if is_full and len(done):
         prior = _prior_of_full(objective, found, problem)
-    evidence = evidence_of_extents(log_extent, expected, found, objective.factor)
+    evidence = evidence_of_extents(log_extent, expected, found, covariance)
     return RoundResult(rows, found, is_done, evidence, posterior(*settled), prior)
 
 

@@ -1,7 +1,6 @@
 """The input model, from input whose labelling margins and noise are known."""
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
-from boxreg_ros.core.arrowhead import Factor
 from boxreg_ros.core.batch import State
 from boxreg_ros.core.face_support import FaceObservations, FaceOffsets, observe_faces
 from boxreg_ros.core.input_model import (
@@ -273,10 +272,9 @@ def fitted(given, measured, own, part=0.05):
     )
     known = own**-2 / precision[:, :3]
     shared = shared_of((given * (measured / given) ** known)[0].tolist())
-    factor = Factor([], torch.diag_embed(precision.sqrt()))
-    return evidence_of_extents(given.log(), expected, State(torch.zeros(1, 1, 6), shared), factor)[
-        0
-    ]
+    covariance = torch.diag_embed(1 / precision)
+    state = State(torch.zeros(1, 1, 6), shared)
+    return evidence_of_extents(given.log(), expected, state, covariance)[0]
 
 
 def test_evidence_of_extents_by_hand():
