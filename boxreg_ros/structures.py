@@ -26,6 +26,8 @@ BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
 """Columns of the extents of a box."""
 
 REFINED, KEPT, INTERPOLATED = 'refined', 'kept', 'interpolated'
+HUMAN = 'human'
+"""Status of a box that a person has corrected and pinned."""
 
 
 def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
@@ -126,6 +128,9 @@ class BoxArray:
         As defined in the docstring of the module; invalid boxes are allowed and returned as kept.
     ticket : object
         Any object of the caller; returned unchanged with the refined boxes, in their ``boxes``.
+    pinned : array, shape (n,), or None
+        True for boxes that a person has corrected: they are held, and the rest of their track
+        follows them. None for none.
 
     """
 
@@ -136,6 +141,7 @@ class BoxArray:
     scores: Floats
     boxes: Floats
     ticket: object = field(default=None, compare=False, repr=False)
+    pinned: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         """Check that all columns have one length."""
@@ -144,6 +150,8 @@ class BoxArray:
         checked('scores', self.scores, (n,))
         if len(self.class_names) != n:
             raise ShapeError(f'class_names: expected {n}, got {len(self.class_names)}')
+        if self.pinned is not None and self.pinned.shape != (n,):
+            raise ShapeError(f'pinned: expected shape ({n},), got {self.pinned.shape}')
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +164,8 @@ class RefinedBoxes:
     boxes : BoxArray
         Refined boxes, otherwise as in the input: stamp, frame, ids, scores and ticket.
     status : tuple of n str
-        ``refined``, ``kept`` (the input box is returned unchanged) or ``interpolated``.
+        ``refined``, ``kept`` (the input box is returned unchanged), ``interpolated`` or ``human``
+        (a pinned box).
     reasons : tuple of n str
         Why a box was kept; empty for the others.
     num_points : array, shape (n,)

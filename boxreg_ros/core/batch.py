@@ -63,6 +63,8 @@ class Problem(NamedTuple):
         Sum of the input extents of marginalised observations, and the number of these.
     class_numbers : Tensor, shape (B, C)
         The numbers of each window's `ClassConfig`, in the order of `CLASS_NUMBERS`.
+    pinned : Tensor, shape (B, N)
+        True for boxes that a person has corrected.
 
     """
 
@@ -79,6 +81,7 @@ class Problem(NamedTuple):
     prior_information: Tensor
     marginalised_extents: Tensor
     class_numbers: Tensor
+    pinned: Tensor
 
     @property
     def pose(self) -> Tensor:

@@ -68,6 +68,8 @@ class Observation(NamedTuple):
         Height of the road beside the box minus z of the centre [m]; NaN where not found.
     num_points : int
         Sweep points inside the input box.
+    is_pinned : bool
+        Whether a person has corrected the box.
 
     """
 
@@ -78,6 +80,7 @@ class Observation(NamedTuple):
     origin: Floats
     ground: float
     num_points: int
+    is_pinned: bool = False
 
 
 def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[Observation]:

@@ -216,10 +216,13 @@ class BoxRegistrar:
             at_sweep[:, X : Z + 1] += offset * np.array(velocities)
         observations = observe(sweep, at_sweep, boxes.stamp_ns, self.config)
         for row, track, box, observation in zip(rows, tracks, given, observations, strict=True):
+            is_pinned = boxes.pinned is not None and bool(boxes.pinned[row])
             array.num_points[row] = observation.num_points
             array.reasons[row] = 'short_track'  # until there is an estimate
             array.num_unsettled += 1
-            track.entries.append(_Entry(observation._replace(box=box), array, row))
+            track.entries.append(
+                _Entry(observation._replace(box=box, is_pinned=is_pinned), array, row)
+            )
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])

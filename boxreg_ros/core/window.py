@@ -180,8 +180,10 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     base, state, step, information, extents = (
         np.array(part) for part in zip(*priors, strict=True)
     )
+    pinned = np.zeros(valid.shape, bool)
+    pinned[valid] = [o.is_pinned for window in windows for o in window.observations]
     if config.ingredients.heading_sign:
-        boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, state[:, 5])
+        boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, pinned, state[:, 5])
     else:
         boxes[..., YAW] = np.unwrap(boxes[..., YAW])
     start = _starting_boxes(windows, boxes)
@@ -190,7 +192,13 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     minimum, is_usable = _prior_minimum(start, state, step)
     information = information * PRIOR_DECAY * is_usable[:, None, None]
     arrays = [boxes, start, valid, times, points, mask, delays, origins, ground]
-    arrays += [np.nan_to_num(minimum), information, extents, _class_numbers(windows, config)]
+    arrays += [
+        np.nan_to_num(minimum),
+        information,
+        extents,
+        _class_numbers(windows, config),
+        pinned,
+    ]
     return Problem(*(torch.from_numpy(array).to(config.device) for array in arrays)), base
 
 
@@ -248,10 +256,21 @@ def _stack_points(
 
 
 def _resolved_angles(
-    boxes: Floats, times: Floats, valid: NDArray[np.bool_], known_yaw: Floats
+    boxes: Floats,
+    times: Floats,
+    valid: NDArray[np.bool_],
+    pinned: NDArray[np.bool_],
+    known_yaw: Floats,
 ) -> Floats:
-    """Return roll, pitch and yaw (B, N, 3) of `boxes` (B, N, 9) with 180° flips corrected."""
+    """
+    Return roll, pitch and yaw (B, N, 3) of `boxes` (B, N, 9) with 180° flips corrected.
+
+    A pinned box decides on the heading of its window.
+
+    """
     yaw = resolve_headings(boxes, times, valid, known_yaw)
+    is_contrary = np.any(pinned & (np.cos(yaw - boxes[..., YAW]) < 0), axis=1, keepdims=True)
+    yaw = np.where(is_contrary, yaw + np.pi, yaw)
     # A half turn about the z axis of the box changes the signs of roll and pitch.
     is_same = np.sign(np.cos(yaw - boxes[..., YAW]))
     tilt = boxes[..., ROLL:YAW] * is_same[..., None]
