@@ -49,8 +49,8 @@ setup(
         'formats': ['pyarrow'],
         # MCAP files whose boxes are protobuf.
         'foxglove': ['mcap-protobuf-support'],
-        # The pictures and the page of `boxreg relabel --report`.
-        'report': ['jinja2', 'matplotlib'],
+        # The page of `boxreg relabel --report` and `boxreg review`.
+        'report': ['jinja2', 'plotly>=6'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -75,6 +75,8 @@ setup(
             'mkdocs-material',
             'mypy',
             'openlabel-checker',
+            'playwright',
+            'plotly',
             'pyarrow',
             'pytest',
             'pytest-cov',

@@ -34,6 +34,7 @@ COMMANDS = {
     ),
     'convert': Command('offline.convert', 'convert label files to other formats'),
     'formats': Command('offline.formats', 'list the label formats and their conventions'),
+    'review': Command('review.server', 'look at a result in the browser, decide and correct'),
     'evaluate': Command('offline.evaluate', 'compare boxes with true boxes'),
     'calibrate': Command(
         'offline.calibrate', 'estimate the labelling margins from labelled tracks'

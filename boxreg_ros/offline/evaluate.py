@@ -375,12 +375,13 @@ def _why_none_matches(predicted: BoxTable, truth: BoxTable, matches: Matches) ->
     return (
         f'no predicted box has the stamp and the track id of a true one: {len(stamps)} stamps and '
         f'{len(tracks)} track ids are in both; stamps of predicted boxes: '
-        f'{_time_range(predicted.stamps_ns)}, of true boxes: {_time_range(truth.stamps_ns)}; '
+        f'{time_range(predicted.stamps_ns)}, of true boxes: {time_range(truth.stamps_ns)}; '
         f'compare boxes of one recording with the ids of one tracker'
     )
 
 
-def _time_range(stamps_ns: Ints) -> str:
+def time_range(stamps_ns: Ints) -> str:
+    """Return the first and the last of stamps [ns] as text [s]."""
     return f'{stamps_ns.min() * 1e-9:.3f} to {stamps_ns.max() * 1e-9:.3f} s'
 
 

@@ -14,12 +14,14 @@ from boxreg_ros.offline.cloud_spool import Spool
 from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.review.decisions import Corrections, read_decisions
 from boxreg_ros.structures import BoxArray, Floats, INTERPOLATED, KEPT, REFINED, RefinedBoxes, YAW
 from boxreg_ros.tracks.bridge import Bridge
 import numpy as np
 
 if TYPE_CHECKING:
     from boxreg_ros.review.changes import Changes
+    from boxreg_ros.review.track_points import PointCollector
 
 
 @dataclass(eq=False, slots=True)
@@ -66,6 +68,10 @@ class Sink:
         Box arrays without a cloud, where clouds are to be written.
     changes : Changes or None
         Boxes before and after, for the report.
+    corrections : Corrections
+        Rejected tracks and pinned boxes.
+    points : PointCollector or None
+        Points around the input boxes, for the report.
 
     """
 
@@ -82,12 +88,18 @@ class Sink:
         self._writers = {
             name: writer_for(name, folder, provenance, options) for name in request.all_formats
         }
+        self.corrections = Corrections(
+            read_decisions(request.decisions) if request.decisions is not None else ()
+        )
         self._bridge: Bridge[_Slot] = Bridge(request.bridge, self._fixed_frame, request.config)
         self.changes: Changes | None = None
+        self.points: PointCollector | None = None
         if request.report:
             from boxreg_ros.review.changes import Changes
+            from boxreg_ros.review.track_points import PointCollector
 
             self.changes = Changes(self._fixed_frame)
+            self.points = PointCollector(request.config)
         self._by_stamp: list[_Slot] = []  # not yet written
         self._by_ticket: dict[object, _Slot] = {}  # without a result
         self._last_ticket = 0
@@ -108,6 +120,9 @@ class Sink:
             The same for the registrar; boxes carry a ticket.
 
         """
+        if self.points is not None and item.moved is not None:
+            with self._clock('report'):
+                self.points.add(item.moved)
         if isinstance(item.given, BoxArray):
             return self._reserve(item, item.given)
         if self._spool and item.given is not None and item.T_fixed_given is not None:
@@ -121,7 +136,7 @@ class Sink:
             if refined.is_final or self._writes_early:
                 slot = self._by_ticket.pop(refined.boxes.ticket, None)
                 if slot is not None:  # otherwise its early result has been taken
-                    slot.result = refined
+                    slot.result = self.corrections.apply(slot.boxes, refined)
         while self._by_stamp:
             first = self._by_stamp[0]
             if first.result is None:
@@ -138,6 +153,8 @@ class Sink:
         """Complete the files; after a failure the caller deletes them."""
         if failure is not None:
             return
+        if self.points is not None:
+            self.points.flush()
         for refined, slot in self._bridge.flush():
             self._put(refined, slot)
         with self._clock('write'):
@@ -163,7 +180,7 @@ class Sink:
             slot = _Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
             self._last_ticket += 1
             self._by_ticket[self._last_ticket] = slot
-            moved = replace(item.moved, ticket=self._last_ticket)
+            moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
             item = item._replace(moved=moved)
         elif count:
             slot = _Slot(given, item.T_fixed_sensor, item.T_fixed_given, _kept(given))

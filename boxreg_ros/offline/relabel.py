@@ -9,16 +9,18 @@ Every box of the recording is written exactly once: refined, or unchanged with t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from importlib.metadata import version
 import json
 from pathlib import Path
 import platform
-from typing import Any, NamedTuple, TYPE_CHECKING
+from shutil import copyfile
+from typing import Any, TYPE_CHECKING
 
 from boxreg_ros import __version__
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress
@@ -27,13 +29,17 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.reasons import REASONS
-from boxreg_ros.structures import BoxArray, INTERPOLATED, KEPT, REFINED, Sweep
+from boxreg_ros.review.decisions import DECISIONS
+from boxreg_ros.structures import INTERPOLATED, KEPT, REFINED
+import numpy as np
 import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar
-    from boxreg_ros.review.changes import Changes
+    from boxreg_ros.review.changes import TrackChanges
 
+MAX_NAMED = 5
+"""Most tracks that a warning names; chosen."""
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
 NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
@@ -50,8 +56,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     out : Path
         Result folder. It appears complete or not at all; an earlier result is replaced.
     progress : Progress, optional
-        Shows the duration of the recording that has been read and its whole duration [s]. With a
-        report the recording is read twice, and both count twice.
+        Shows the duration of the recording that has been read and its whole duration [s].
 
     Returns
     -------
@@ -81,32 +86,20 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         recording = ReadAhead(process)
         clock.begun('start')
         registrar = BoxRegistrar(request.config, submit)
-        shown = _Passes(progress, recording.source.seconds, 2 if request.report else 1)
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
-                _register(recording, registrar, sink, clock, shown)
+                _register(recording, registrar, sink, clock, progress)
             summary = _summary(request, recording, registrar.counts, sink)
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary |= {'fingerprint': fingerprint, 'seconds': clock.seconds()}
-            if sink.changes is not None:
-                _report(folder, out, request, summary, sink.changes, clock, shown)
+            _report(folder, out, request, summary, sink, clock)
+            if request.decisions is not None:
+                copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
             (folder / CONFIG).write_text(settings, encoding='utf-8')
             (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
     return summary
-
-
-class _Passes(NamedTuple):
-    """Progress over one or two passes through a recording of `seconds`."""
-
-    progress: Progress
-    seconds: float
-    passes: int
-
-    def show(self, seconds: float, passes_done: int = 0) -> None:
-        """Report the time of the recording that has been read in this pass [s]."""
-        self.progress.show(passes_done * self.seconds + seconds, self.passes * self.seconds)
 
 
 def _register(
@@ -114,11 +107,11 @@ def _register(
     registrar: BoxRegistrar,
     sink: Sink,
     clock: Stopwatch,
-    progress: _Passes,
+    progress: Progress,
 ) -> None:
     """Read the recording, register its boxes and write them."""
     for item in recording:
-        progress.show(item.seconds)
+        progress.show(item.seconds, recording.source.seconds)
         with_ticket = sink.expect(item)
         with clock('registrar'):
             ready = register(registrar, with_ticket.moved, with_ticket.restarts)
@@ -133,27 +126,48 @@ def _report(
     out: Path,
     request: Request,
     summary: dict[str, Any],
-    changes: Changes,
+    sink: Sink,
     clock: Stopwatch,
-    progress: _Passes,
 ) -> None:
-    """Write the report and add its time to the summary."""
-    from boxreg_ros.review.report import REPORT, write_report
+    """Write the report, if it is wanted, and add its time to the summary."""
+    if sink.changes is None or sink.points is None:
+        return
+    from boxreg_ros.review.report import write_report
 
     with clock('report'):
+        tracks = sink.changes.tracks()
+        truth = _truth(request, tracks, summary)
         line = closing_line(summary, out)
-        items = _items(request, progress)
-        write_report(folder / REPORT, line, summary, request.config, changes.tracks(), items)
+        write_report(folder, line, summary, request.config, tracks, sink.points, truth)
     summary['seconds'] = clock.seconds()
 
 
-def _items(request: Request, progress: _Passes) -> Iterator[Sweep | BoxArray]:
-    """Read the recording a second time; yield its clouds and boxes in the fixed frame."""
-    with reader(request) as process:
-        for item in ReadAhead(process):
-            progress.show(item.seconds, passes_done=1)
-            if item.moved is not None:
-                yield item.moved
+def _truth(
+    request: Request, tracks: Sequence[TrackChanges], summary: dict[str, Any]
+) -> BoxTable | None:
+    """Return the true boxes for the report; None, with a warning, where they do not fit."""
+    if request.truth is None:
+        return None
+    from boxreg_ros.offline.evaluate import time_range
+
+    truth = BoxTable.read(request.truth)
+    stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
+    names = {track.track_id for track in tracks}
+    problem = ''
+    if truth.frame_id != summary['fixed_frame']:
+        problem = f'frame {summary["fixed_frame"]!r}, got {truth.frame_id!r}'
+    elif len(stamps) and not np.isin(stamps, truth.stamps_ns).any():
+        problem = f'boxes of {time_range(stamps)}, got {time_range(truth.stamps_ns)}'
+    elif names.isdisjoint(truth.track_ids):
+        problem = f'tracks {sorted(names)[:MAX_NAMED]}, got {truth.track_ids[:MAX_NAMED]}'
+    if not problem:
+        return truth
+    line = (
+        f'truth {str(request.truth)!r}: expected {problem}; the report is written without it: '
+        f'give the true boxes of this drive to --truth'
+    )
+    summary['warning'] = '; '.join(filter(None, (summary['warning'], line)))
+    return None
 
 
 def _summary(
@@ -188,6 +202,7 @@ def _summary(
         'warning': findings.warning or ('' if sink.boxes_in else NO_BOXES),
         **findings.facts,
         'left_out_of_labels': sink.left_out(),
+        'unused_decisions': sink.corrections.unused(),
         'frames_without_cloud': sink.without_cloud,
         'versions': _versions(),
     }
@@ -259,6 +274,13 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
     for name, found in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
         yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
+    if summary['unused_decisions']:
+        names = ', '.join(summary['unused_decisions'][:MAX_NAMED])
+        yield (
+            f'decisions: expected tracks and boxes of this recording, got '
+            f'{len(summary["unused_decisions"]):,} others, which are not used: {names}; give the '
+            f'decisions of this recording to --decisions'
+        )
     if summary['frames_without_cloud']:
         yield (
             f'{summary["frames_without_cloud"]:,} of {summary["box_arrays"]:,} box arrays have no '

@@ -48,7 +48,11 @@ class Request:
     bridge : float
         Longest gap of a track that is filled with interpolated boxes [s]; 0 fills none.
     report : bool
-        Also write ``report.html``; the recording is then read twice.
+        Also write ``report.html``.
+    decisions : Path or None
+        Decisions of `boxreg review`: rejected tracks and pinned boxes.
+    truth : Path or None
+        True boxes that the report shows, in the columns of ``boxes.csv``.
 
     Raises
     ------
@@ -72,6 +76,8 @@ class Request:
     convention: Convention = STANDARD
     bridge: float = 0.0
     report: bool = False
+    truth: Path | None = None
+    decisions: Path | None = None
 
     def __post_init__(self) -> None:
         """Check the options."""
@@ -144,6 +150,7 @@ class Request:
             paths.append(self.options.camera)
         if self.labels is not None:
             paths.append(self.labels[1])
+        paths += filter(None, (self.truth, self.decisions))
         return tuple(paths)
 
     def fingerprint(self) -> str:

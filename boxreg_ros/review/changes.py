@@ -7,7 +7,16 @@ from dataclasses import dataclass
 
 from boxreg_ros.core.metrics import pose_errors
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, REFINED, RefinedBoxes, YAW
+from boxreg_ros.structures import (
+    BoxArray,
+    Floats,
+    HUMAN,
+    Ints,
+    is_valid_box,
+    REFINED,
+    RefinedBoxes,
+    YAW,
+)
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -36,8 +45,8 @@ class TrackChanges:
         True where the heading was flipped by 180 degrees.
     status : array of str, shape (n,)
         As in `RefinedBoxes`.
-    reasons : Counter
-        Why boxes were kept.
+    reasons : array of str, shape (n,)
+        Why a box was kept; empty for the others.
     num_points : array, shape (n,)
         Points inside the input boxes.
 
@@ -52,13 +61,13 @@ class TrackChanges:
     deviations: Floats
     is_flipped: NDArray[np.bool_]
     status: NDArray[np.str_]
-    reasons: Counter[str]
+    reasons: NDArray[np.str_]
     num_points: Ints
 
     @property
     def is_refined(self) -> NDArray[np.bool_]:
-        """Return which boxes are refined, shape (n,)."""
-        return np.asarray(self.status == REFINED)
+        """Return which boxes are refined or pinned, shape (n,)."""
+        return np.isin(self.status, (REFINED, HUMAN))
 
     @property
     def shift(self) -> float:
@@ -131,7 +140,7 @@ class Changes:
         found = []
         for track_id, rows in self._rows_by_track(counts[:, 0]).items():
             _, classes, status, reasons = zip(*(self._names[row] for row in rows), strict=True)
-            is_refined = np.array(status) == REFINED
+            is_refined = np.isin(status, (REFINED, HUMAN))
             found.append(
                 TrackChanges(
                     track_id=track_id,
@@ -143,7 +152,7 @@ class Changes:
                     deviations=np.where(is_refined[:, None], deviations[rows], np.nan),
                     is_flipped=errors.is_flipped[rows] & is_refined,
                     status=np.array(status),
-                    reasons=Counter(filter(None, reasons)),
+                    reasons=np.array(reasons),
                     num_points=counts[rows, 1],
                 )
             )
