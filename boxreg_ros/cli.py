@@ -36,6 +36,7 @@ COMMANDS = {
     'formats': Command('offline.formats', 'list the label formats and their conventions'),
     'review': Command('review.server', 'look at a result in the browser, decide and correct'),
     'evaluate': Command('offline.evaluate', 'compare boxes with true boxes'),
+    'check': Command('offline.check', 'check labels against rules'),
     'calibrate': Command(
         'offline.calibrate', 'estimate the labelling margins from labelled tracks'
     ),

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from difflib import get_close_matches
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -353,6 +354,12 @@ class Config:
                 return group
         return self.vehicle
 
+    def knows_class(self, class_name: str) -> bool:
+        """Return whether `class_name` has a word of some group; others are vehicles by default."""
+        words = words_of(class_name)
+        groups = (self.vehicle, self.cyclist, self.pedestrian)
+        return any(not words.isdisjoint(name.lower() for name in group.names) for group in groups)
+
     def updated(self, changes: Mapping[str, Any]) -> Config:
         """
         Return a copy with some settings changed.
@@ -455,7 +462,9 @@ def _filled(default: _T, value: Any, name: str) -> _T:
                     f'{prefix}{key}: was removed, {REMOVED[prefix + key]}; leave it out'
                 )
             names = ', '.join(sorted(known))
-            raise ConfigError(f'{prefix}{key}: no such setting; expected one of {names}')
+            similar = get_close_matches(str(key), known, 1)
+            proposal = f'; did you mean {prefix}{similar[0]}?' if similar else ''
+            raise ConfigError(f'{prefix}{key}: no such setting; expected one of {names}{proposal}')
     changes = {key: _filled(known[key], inner, prefix + key) for key, inner in value.items()}
     return replace(default, **changes)  # type: ignore[type-var]
 

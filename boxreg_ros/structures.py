@@ -174,6 +174,13 @@ class RefinedBoxes:
         Covariance of x y z roll pitch yaw [m, rad]; always finite, identity for kept boxes.
     is_final : bool
         False for an early estimate (the newest box of its window), True for the last estimate.
+    extent_covariances : array, shape (n, 3, 3)
+        Covariance of length, width and height [m]; always finite, identity for kept boxes.
+    face_distances : array, shape (n, 6)
+        Signed distance of the outermost points of each face (front, rear, left, right, top,
+        bottom) from where the estimate expects them, positive outside [m]; 0 without points.
+    outside : array, shape (n,)
+        Part of the points in and near the box, the road left out, that are outside of it.
 
     """
 
@@ -183,3 +190,16 @@ class RefinedBoxes:
     num_points: Ints
     covariances: Floats
     is_final: bool = True
+    extent_covariances: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    face_distances: Floats = field(default_factory=lambda: np.zeros((0, 6)))
+    outside: Floats = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        """Complete the columns that label files and messages do not have."""
+        n = len(self.status)
+        if len(self.extent_covariances) != n:
+            object.__setattr__(self, 'extent_covariances', np.tile(np.eye(3), (n, 1, 1)))
+        if len(self.face_distances) != n:
+            object.__setattr__(self, 'face_distances', np.zeros((n, 6)))
+        if len(self.outside) != n:
+            object.__setattr__(self, 'outside', np.zeros(n))

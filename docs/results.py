@@ -201,6 +201,15 @@ def _figures(results: Any) -> Iterable[str]:
     yield _table(['', ''], _flat(results))
 
 
+def _review(results: Any) -> Iterable[str]:
+    """Yield the share of bad tracks at the top of each list, per recording and input."""
+    for recording, inputs in results.items():
+        for name, found in inputs.items():
+            rows = [[order, *map(_number, shares)] for order, shares in found['shares'].items()]
+            head = f'{recording}, {name}: worst {found["bad"]} of {found["tracks"]}'
+            yield _table([head, '1 %', '5 %', '10 %', '20 %'], rows)
+
+
 def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
     for name, value in results.items():
         if isinstance(value, dict):
@@ -235,6 +244,13 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'One setting or constant halved or doubled. A positive loss means that the default is '
         'better.',
         _sensitivity,
+    ),
+    'review': (
+        'Review list',
+        'Share of the tracks with the worst 3D IoU within the first part of the list, by risk,\n'
+        'by points, by deviation, and by chance. Inputs: noisy boxes, and true boxes with errors\n'
+        'planted in a fifth of the tracks.',
+        _review,
     ),
     'speed': (
         'Speed',

@@ -156,6 +156,35 @@ def test_unknown_command_proposes_a_similar_one(capsys):
     assert 'did you mean' not in err
 
 
+def test_fail_under_fails_and_keeps_the_result(tmp_path, capsys):
+    recording = Drive(sweeps=5).write(tmp_path / 'drive')
+    command = ['relabel', recording, '-o', tmp_path / 'out', *QUICK, '--fail-under']
+    status, _, err = boxreg(capsys, *command, '1.0', '--set', 'min_observations=6')
+    assert status == 1
+    assert '--fail-under: expected at least 100.0% of the boxes refined, got ' in err
+    assert (tmp_path / 'out' / 'review.csv').exists()
+    assert boxreg(capsys, *command, '0.0')[0] == 0
+    status, _, err = boxreg(capsys, *command, '90')
+    assert status == 2
+    assert "expected a part from 0 to 1, got '90'" in err
+
+
+def test_the_same_recording_twice_is_refused(tmp_path, capsys):
+    recording = Drive(sweeps=5).write(tmp_path / 'drive')
+    again = recording.parent / '..' / recording.parent.name / recording.name
+    status, _, err = boxreg(capsys, 'relabel', recording, again, '-o', tmp_path / 'out')
+    assert status == 2
+    assert 'recordings: expected each recording once' in err
+
+
+def test_an_unknown_setting_proposes_a_similar_one(tmp_path, capsys):
+    recording = Drive(sweeps=5).write(tmp_path / 'drive')
+    setting = ['--set', 'solver.round=2']
+    status, _, err = boxreg(capsys, 'relabel', recording, '-o', tmp_path / 'out', *setting)
+    assert status == 2
+    assert err.endswith('; did you mean solver.rounds?\n')
+
+
 def test_run_that_refines_no_box_fails_and_keeps_the_result(tmp_path, capsys):
     drive = Drive(sweeps=5)
     drive.items = [item for item in drive.items if item[0] != '/points' or item[1] < 0]
@@ -168,10 +197,12 @@ def test_run_that_refines_no_box_fails_and_keeps_the_result(tmp_path, capsys):
     assert ': 10 boxes in, 0 refined, 10 kept (no_sweep 8, short_track 2)' in out
     (line,) = err.splitlines()
     reason = REASONS['no_sweep']
-    assert line == (
+    expected = (
         f'boxreg: none of 10 boxes was refined; most frequent reason: no_sweep (8 boxes): '
-        f'{reason.meaning}; remedy: {reason.remedy}'
+        f'{reason.meaning}; remedy: {reason.remedy}; time ranges: boxes '
     )
+    assert line.startswith(expected)
+    assert ', clouds ' in line
     assert (tmp_path / 'out' / 'boxes.csv').exists()
     status, out, _ = boxreg(capsys, *command)
     assert status == 1

@@ -19,6 +19,7 @@ MEASUREMENTS = {
     'real': Measurement('accuracy', 'accuracy on recordings with known truth'),
     'ablation': Measurement('ablation', 'accuracy without each ingredient of the method'),
     'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),
+    'review': Measurement('review', 'how early the review list shows the bad tracks'),
     'speed': Measurement('speed.command', 'time per tick, per box and per window'),
     'node': Measurement('node', 'latency and memory of the live node, over DDS'),
 }

@@ -151,6 +151,33 @@ class MarginalPrior(NamedTuple):
     information: Tensor
 
 
+class Posterior(NamedTuple):
+    """
+    Covariances of the estimate of B windows, and the residuals of its faces.
+
+    Attributes
+    ----------
+    poses : Tensor, shape (B, N, 6, 6)
+        Covariances of x y z roll pitch yaw [m, rad].
+    extents : Tensor, shape (B, 3, 3)
+        Covariances of length, width and height [m].
+    face_distances : Tensor, shape (B, N, 6)
+        Signed distance of the outermost points of each face from where the estimate expects
+        them, positive outside [m]; 0 without points.
+
+    """
+
+    poses: Tensor
+    extents: Tensor
+    face_distances: Tensor
+
+    @classmethod
+    def zeros(cls, pose: Tensor) -> 'Posterior':
+        """Return zeros for windows with the poses `pose` (B, N, 6)."""
+        B, N, _ = pose.shape
+        return cls(pose.new_zeros(B, N, 6, 6), pose.new_zeros(B, 3, 3), pose.new_zeros(B, N, 6))
+
+
 class Solution(NamedTuple):
     """
     A solved batch.
@@ -159,8 +186,8 @@ class Solution(NamedTuple):
     ----------
     state : State
         Poses and shared variables.
-    covariances : Tensor, shape (B, N, 6, 6)
-        Covariances of the poses: blocks of the inverse of the Gauss-Newton curvature.
+    posterior : Posterior
+        Covariances of poses and extents, and residuals of the faces.
     prior : MarginalPrior or None
         What full sliding windows leave to the next one; NaN for windows that leave nothing.
     marginalised_extents : Tensor or None, shape (B, 4)
@@ -171,7 +198,7 @@ class Solution(NamedTuple):
     """
 
     state: State
-    covariances: Tensor
+    posterior: Posterior
     prior: MarginalPrior | None = None
     marginalised_extents: Tensor | None = None
     extent_evidence: Tensor = torch.zeros(0)

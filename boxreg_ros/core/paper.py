@@ -7,7 +7,15 @@ is in `terms`; it shares no code with this one but the optimiser.
 """
 
 from boxreg_ros.config import Config, PaperConfig
-from boxreg_ros.core.batch import EXTENT, free_variables, POSE_ERRORS, Problem, Solution, State
+from boxreg_ros.core.batch import (
+    EXTENT,
+    free_variables,
+    POSE_ERRORS,
+    Posterior,
+    Problem,
+    Solution,
+    State,
+)
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
 from boxreg_ros.core.input_model import expect
@@ -189,8 +197,12 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
         _, violation = total(boxes(x, every), problem, settings, multipliers, rounding)
         multipliers = multipliers + violation * penalty
     variance = problem.of_class(*POSE_ERRORS) ** 2
-    covariances = torch.diag_embed(variance)[:, None].expand(-1, length, -1, -1)
-    return Solution(State(x.unflatten(1, (length, 6)), shared), covariances)
+    pose = x.unflatten(1, (length, 6))
+    found = Posterior.zeros(pose)
+    found.poses[:] = torch.diag_embed(variance)[:, None]
+    extent_deviation = shared[:, EXTENT] * problem.of_class('extent')
+    found.extents[:] = torch.diag_embed(extent_deviation**2)
+    return Solution(State(pose, shared), found)
 
 
 def _mean(values: Tensor, valid: Tensor) -> Tensor:

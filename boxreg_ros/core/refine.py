@@ -147,6 +147,8 @@ class RefinedTrack:
         Why a box was kept or interpolated; empty for refined boxes.
     covariances : array, shape (N, 6, 6)
         Of x y z roll pitch yaw [m, rad].
+    extent_covariances : array, shape (N, 3, 3)
+        Of length, width and height [m].
 
     """
 
@@ -155,6 +157,7 @@ class RefinedTrack:
     status: tuple[str, ...]
     reasons: tuple[str, ...]
     covariances: Floats
+    extent_covariances: Floats
 
 
 class _Place(NamedTuple):
@@ -254,6 +257,7 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
     status = [result.status[i] for result, i in rows]
     reasons = [result.reasons[i] for result, i in rows]
     covariances = np.array([result.covariances[i] for result, i in rows]).reshape(-1, 6, 6)
+    extents = np.array([result.extent_covariances[i] for result, i in rows]).reshape(-1, 3, 3)
     is_valid = np.array([reason != 'invalid_box' for reason in reasons], dtype=bool)
     if rows and not is_valid.any():
         raise ShapeError(
@@ -270,7 +274,8 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
     for row in np.flatnonzero(_pins(track)):
         boxes[row] = track.boxes[row]
         status[row], reasons[row] = HUMAN, ''
-    return RefinedTrack(track.track_id, boxes, tuple(status), tuple(reasons), covariances)
+    columns = tuple(status), tuple(reasons), covariances, extents
+    return RefinedTrack(track.track_id, boxes, *columns)
 
 
 def _interpolated(stamps_ns: Ints, boxes: Floats, wanted_ns: Ints) -> Floats:

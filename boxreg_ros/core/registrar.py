@@ -300,7 +300,8 @@ class _PendingArray:
     ----------
     input : BoxArray
         As added.
-    boxes, status, reasons, num_points, covariances
+    boxes, status, reasons, num_points, covariances, extent_covariances, face_distances,
+    outside
         As in `RefinedBoxes`, row by row with the input.
     num_unsettled : int
         Boxes whose estimate may still change; the array is settled at 0 or less.
@@ -316,7 +317,10 @@ class _PendingArray:
         self.status = [KEPT] * n
         self.reasons = [''] * n
         self.num_points = np.zeros(n, int)
-        self.covariances = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()
+        self.covariances = np.tile(np.eye(6), (n, 1, 1))
+        self.extent_covariances = np.tile(np.eye(3), (n, 1, 1))
+        self.face_distances = np.zeros((n, 6))
+        self.outside = np.zeros(n)
         self.num_unsettled = 0
         self.is_observed = False
 
@@ -345,6 +349,9 @@ class _PendingArray:
             self.num_points.copy(),
             self.covariances.copy(),
             is_final,
+            self.extent_covariances.copy(),
+            self.face_distances.copy(),
+            self.outside.copy(),
         )
 
 
@@ -358,14 +365,19 @@ class _Entry:
     estimate: Floats | None = None
     is_settled: bool = False
 
-    def write(self, box: Floats, status: str, reason: str, covariance: Floats) -> None:
-        """Write an estimate to the box array unless the present one is settled."""
-        self.estimate = box
+    def write(self, estimate: Estimate, i: int) -> None:
+        """Write box i of an estimate to the box array unless the present one is settled."""
+        self.estimate = estimate.boxes[i]
         if not self.is_settled:
-            self.array.boxes[self.row] = box
-            self.array.status[self.row] = status
-            self.array.reasons[self.row] = reason
-            self.array.covariances[self.row] = covariance
+            array = self.array
+            row = self.row
+            array.boxes[row] = estimate.boxes[i]
+            array.status[row] = estimate.status[i]
+            array.reasons[row] = estimate.reasons[i]
+            array.covariances[row] = estimate.covariances[i]
+            array.extent_covariances[row] = estimate.extent_covariances[i]
+            array.face_distances[row] = estimate.face_distances[i]
+            array.outside[row] = estimate.outside[i]
 
     def settle(self) -> None:
         """Let the estimate in the box array change no more."""
@@ -433,9 +445,8 @@ class _Track:
     def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
         """Write the estimate of the window of `entries` to their box arrays."""
         self.prior = estimate.prior
-        columns = estimate.boxes, estimate.status, estimate.reasons, estimate.covariances
-        for entry, *values in zip(entries, *columns, strict=True):
-            entry.write(*values)
+        for i, entry in enumerate(entries):
+            entry.write(estimate, i)
 
 
 class _SubmittedTrack(NamedTuple):

@@ -54,6 +54,10 @@ class Estimate(NamedTuple):
         One of `KEPT_REASONS` for kept boxes, '' for refined ones.
     covariances : array, shape (N, 6, 6)
         Of x y z roll pitch yaw [m, rad]; the identity for kept boxes.
+    extent_covariances : array, shape (N, 3, 3)
+        Of length, width and height [m]; the identity for kept boxes.
+    face_distances, outside : array, shapes (N, 6) and (N,)
+        As in `RefinedBoxes`.
     prior : MarginalisationPrior or None
         For the next window, if this one is full and was solved.
 
@@ -63,6 +67,9 @@ class Estimate(NamedTuple):
     status: tuple[str, ...]
     reasons: tuple[str, ...]
     covariances: Floats
+    extent_covariances: Floats
+    face_distances: Floats
+    outside: Floats
     prior: MarginalisationPrior | None = None
 
 
@@ -154,43 +161,50 @@ def _accepted(
     extent = _extents(problem, solution.state, config)
     pose = solution.state.pose
     boxes = torch.cat([pose[..., :3], extent, wrap_angle(pose[..., 3:])], -1)
-    failed = _failed_tests(problem, boxes, pose, extent, solution.covariances)
+    held = _held(problem, pose, extent)
+    failed = _failed_tests(problem, boxes, extent, solution.posterior.poses, held)
     is_kept = failed.any(0)
     reasons = np.select(failed, KEPT_REASONS, '')
     status = np.where(is_kept, KEPT, REFINED)
     # Before input boxes are put in: on a CPU the arrays share memory with the tensors.
     is_solved = (boxes.isfinite().all(-1) & (extent > 0).all(-1)).all(1)
-    is_solved &= solution.covariances.isfinite().all((1, 2, 3))
+    is_solved &= solution.posterior.poses.isfinite().all((1, 2, 3))
     priors = _priors(base, solution, is_solved)
     found = boxes.cpu().numpy()
     found[..., :3] += base[:, None]
-    covariances = solution.covariances.cpu().numpy()
+    covariances, extents, distances = (part.cpu().numpy() for part in solution.posterior)
+    count = problem.mask.sum(-1).clamp(min=1)
+    outside = (1 - held / count).clamp(0, 1).cpu().numpy()
+    extent_covariances = np.repeat(extents[:, None], found.shape[1], axis=1)
     for b, i in np.argwhere(problem.valid.cpu().numpy() & is_kept).tolist():
         found[b, i] = windows[b].observations[i].box
         covariances[b, i] = np.eye(6)
+        extent_covariances[b, i] = np.eye(3)
+        distances[b, i] = 0.0
+        outside[b, i] = 0.0
     estimates = []
     for b, window in enumerate(windows):
         n = len(window.observations)
         words = tuple(status[b, :n].tolist()), tuple(reasons[b, :n].tolist())
-        estimates.append(Estimate(found[b, :n], *words, covariances[b, :n], priors[b]))
+        columns = covariances[b, :n], extent_covariances[b, :n], distances[b, :n], outside[b, :n]
+        estimates.append(Estimate(found[b, :n], *words, *columns, priors[b]))
     return estimates
 
 
 def _failed_tests(
-    problem: Problem, boxes: Tensor, pose: Tensor, extent: Tensor, covariances: Tensor
+    problem: Problem, boxes: Tensor, extent: Tensor, covariances: Tensor, after: Tensor
 ) -> NDArray[np.bool_]:
     """
     Return the acceptance tests that each refined box fails (M27), shape (3, B, N).
 
     In the order of `KEPT_REASONS`: its window has points; box and covariance are finite and the
     extent is positive; it holds nearly as many points as its input box, which the objective does
-    not ask for.
+    not ask for: `after` (B, N).
 
     """
     is_finite = boxes.isfinite().all(-1) & (extent > 0).all(-1)
     is_finite &= covariances.isfinite().all((2, 3))
     is_blind = ~problem.mask.any((1, 2))[:, None].expand_as(is_finite)
-    after = _held(problem, pose, extent)
     before = problem.mask.sum(-1)  # at most: counting those of the input boxes takes time
     if (after < MIN_HELD_PART * before - MAX_LOST_POINTS).any():
         before = _held(problem, problem.pose, problem.boxes[..., 3:6])

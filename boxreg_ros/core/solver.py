@@ -22,12 +22,14 @@ from boxreg_ros.core.batch import (
     free_variables,
     MarginalPrior,
     POSE_ERRORS,
+    Posterior,
     Problem,
     SHARED,
     Solution,
     State,
 )
-from boxreg_ros.core.face_support import FaceOffsets, observe_faces
+from boxreg_ros.core.covariance import posterior
+from boxreg_ros.core.face_support import FaceObservations, FaceOffsets, observe_faces
 from boxreg_ros.core.input_model import (
     evidence_of_extents,
     expect,
@@ -150,7 +152,7 @@ class RoundResult(NamedTuple):
         Whether a window is settled, or this was the last round.
     extent_evidence : Tensor, shape (b, 2, 3)
         Corrections of extents by the points alone, and their weights.
-    covariances : Tensor, shape (d, N, 6, 6)
+    posterior : Posterior
         Of the d windows that are done.
     prior : MarginalPrior or None
         What the full ones among these leave to the next window, NaN for others.
@@ -161,7 +163,7 @@ class RoundResult(NamedTuple):
     state: State
     is_done: Tensor
     extent_evidence: Tensor
-    covariances: Tensor
+    posterior: Posterior
     prior: MarginalPrior | None
 
 
@@ -232,7 +234,8 @@ def run_round(
     shared = state.shared.clone()
     shared[:, ANCHOR] = 0.0
     state = State(state.pose, shared)
-    weighted = _weighted_terms(problem, state, expected, offsets, plan, turn, config)
+    observations = observe_faces(problem, state, offsets, config)
+    weighted = _weighted_terms(problem, state, expected, observations, plan, turn, config)
 
     x = state.pack()
     objective = Objective(weighted, x, problem.length, free)
@@ -244,26 +247,26 @@ def run_round(
     is_settled = (moved <= SETTLED_STEP**2) & (turn > 0)
     is_done = is_settled | (turn + 1 >= plan.rounds)
     done = is_done.nonzero()[:, 0]
-    covariances = select(objective.factor, done).inverse_of_links(problem.length)
+    faces = observations.moments, observations.inset, observations.weight
+    settled = select((problem, found, *faces, objective.factor), done)
     prior = None
     is_full = plan.marginalises and problem.length == config.window
     if is_full and len(done):
         prior = _prior_of_full(objective, found, problem)
     evidence = evidence_of_extents(log_extent, expected, found, objective.factor)
-    return RoundResult(rows, found, is_done, evidence, covariances, prior)
+    return RoundResult(rows, found, is_done, evidence, posterior(*settled), prior)
 
 
 def _weighted_terms(
     problem: Problem,
     state: State,
     expected: Expectation,
-    offsets: FaceOffsets,
+    observations: FaceObservations,
     plan: Plan,
     turn: int,
     config: Config,
 ) -> list[Term]:
-    """Return the terms of one round: face observations, weights, robust motion, rigid shape."""
-    observations = observe_faces(problem, state, offsets, config)
+    """Return the terms of one round: weights, robust motion, rigid shape."""
     weighted = weigh(problem, state, observations, expected, config)
     # Terms without any weight, such as zero motion, are dropped (`any` takes three times as long).
     weighted = [term for term in weighted if term.weight.norm()]
@@ -298,7 +301,6 @@ def _start(problem: Problem, config: Config, offsets: FaceOffsets, plan: Plan) -
     if plan.starts_from_fit:
         is_free = free_variables(problem, config)[:, -SHARED:][:, EXTENT]
         shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], is_free)
-    covariances = pose.new_zeros((*pose.shape, 6))
     prior = extents = None
     if plan.marginalises:
         unknown = torch.full_like(problem.prior_mean, torch.nan)
@@ -306,7 +308,7 @@ def _start(problem: Problem, config: Config, offsets: FaceOffsets, plan: Plan) -
         first = pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
         extents = problem.marginalised_extents + first
     evidence = pad(log_extent[:, None], (0, 0, 0, 2))  # (B, 3, 3)
-    return Solution(State(pose, shared), covariances, prior, extents, evidence)
+    return Solution(State(pose, shared), Posterior.zeros(pose), prior, extents, evidence)
 
 
 def _store(result: RoundResult, solution: Solution) -> Tensor:
@@ -315,10 +317,12 @@ def _store(result: RoundResult, solution: Solution) -> Tensor:
     solution.state.pose[rows] = result.state.pose
     solution.state.shared[rows] = result.state.shared
     solution.extent_evidence[rows, 1:] = result.extent_evidence
-    solution.covariances[rows[result.is_done]] = result.covariances
+    done = rows[result.is_done]
+    for whole, part in zip(solution.posterior, result.posterior, strict=True):
+        whole[done] = part
     if result.prior is not None and solution.prior is not None:
         for whole, part in zip(solution.prior, result.prior, strict=True):
-            whole[rows[result.is_done]] = part[result.is_done]
+            whole[done] = part[result.is_done]
     return rows[~result.is_done]
 
 

@@ -150,6 +150,11 @@ def readable(origin: str) -> Iterator[None]:
         yield
     except BoxregError:
         raise
+    except PermissionError as error:
+        raise RecordingError(
+            f'{error.filename or origin}: expected a file that may be read, got '
+            f'{error.strerror}; change its permissions (chmod u+r) or the user'
+        ) from None
     except Exception as error:
         raise RecordingError(
             f'{origin}: {one_line(error)}; expected a whole MCAP file, rosbag2 folder, .db3 file '

@@ -52,6 +52,7 @@ STATUS_COLUMNS = {
     'reason': 'string',
     'score': 'double',
     'covariance': 'double[]',
+    'extent_covariance': 'double[]',
 }
 """Additional columns; the devkit ignores them."""
 POINT_COLUMNS = {'intensity': 'uint8', 'laser_number': 'uint8', 'offset_ns': 'int32'}
@@ -101,6 +102,7 @@ class Writer:
                 refined.reasons[row],
                 finite_or_none(array.scores[row]),
                 refined.covariances[row].ravel().tolist(),
+                refined.extent_covariances[row].ravel().tolist(),
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(array.stamp_ns, *_pose_values(frame.T_fixed_sensor))
@@ -146,6 +148,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             [item['num_interior_pts'] for item in items],
             [item.get('covariance') for item in items],
             [item.get('reason') for item in items],
+            [item.get('extent_covariance') for item in items],
         )
         yield LabelFrame(refined, fixed_frame, sensor_frame, T_city_ego.get(stamp_ns))
 

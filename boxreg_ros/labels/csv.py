@@ -1,4 +1,4 @@
-"""``boxes.csv``: one row per box, with the name of its frame."""
+"""``boxes.csv``: one row per box, with its frame; ``covariances.csv``: how certain each is."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import csv
 from pathlib import Path
 
 from boxreg_ros.io.box_table import BoxTable, COLUMNS
+from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.structures import HEIGHT, LENGTH, X, Z
@@ -21,7 +22,7 @@ FORMAT = Format(
     reference='centre',
     sizes='length width height',
     rotation='quaternion x y z w',
-    files='boxes.csv',
+    files='boxes.csv, covariances.csv',
 )
 
 
@@ -40,12 +41,14 @@ class Writer:
         self._file = self._path.open('w', newline='', encoding='utf-8')
         self._table = csv.writer(self._file, lineterminator='\n')
         self._table.writerow(COLUMNS)
+        self._covariances = CovarianceWriter(folder / COVARIANCES)
         self._newest_ns: int | None = None
         self._is_sorted = True
 
     def write(self, frame: LabelFrame) -> None:
         """Add one row per box."""
         refined = frame.refined
+        self._covariances.write(refined, frame.T_fixed_sensor)
         boxes = refined.boxes
         stamp_ns = boxes.stamp_ns
         if self._newest_ns is not None and stamp_ns < self._newest_ns:
@@ -77,6 +80,7 @@ class Writer:
     def close(self) -> None:
         """Close the file; sort it if boxes arrived late."""
         self._file.close()
+        self._covariances.close()
         if self._is_sorted:
             return
         with self._path.open(newline='', encoding='utf-8') as file:

@@ -70,7 +70,7 @@ class Cuboid:
         By axis: centre in the sensor frame [m], R = Rx Ry Rz [rad], full extents [m].
     evidence : dict
         Status, reason, num_points, score, and the upper triangle of the covariance of x y z
-        roll pitch yaw in the fixed frame, row by row.
+        roll pitch yaw in the fixed frame, row by row; the covariance of length width height.
 
     """
 
@@ -114,6 +114,7 @@ def _evidence(refined: RefinedBoxes, row: int) -> dict[str, Any]:
         'num_points': int(refined.num_points[row]),
         'score': finite_or_none(refined.boxes.scores[row]),
         'covariance': refined.covariances[row][UPPER_TRIANGLE].tolist(),
+        'extent_covariance': refined.extent_covariances[row].ravel().tolist(),
     }
 
 
@@ -212,6 +213,7 @@ def read_frames(
             [int(item.get('num_points', 0)) for item in evidence],
             [_covariance(item.get('covariance')) for item in evidence],
             [str(item.get('reason', '')) for item in evidence],
+            [item.get('extent_covariance') for item in evidence],
         )
         yield sidecar.frame(index, refined).moved('fixed')
 

@@ -194,6 +194,7 @@ class Writer:
                 'reason': refined.reasons[row],
                 'score': finite_or_none(array.scores[row]),
                 'covariance': refined.covariances[row].ravel().tolist(),
+                'extent_covariance': refined.extent_covariances[row].ravel().tolist(),
                 'stamp_ns': array.stamp_ns,
             }
             if is_single:
@@ -345,6 +346,7 @@ def _read_tables(tables: Path) -> Iterator[LabelFrame]:
             [item['num_lidar_pts'] for item in items],
             [item.get('covariance') for item in items],
             [item.get('reason') for item in items],
+            [item.get('extent_covariance') for item in items],
         )
         yield LabelFrame(refined, fixed_frame, sensor_frame, poses.get(sample['token']))
 

@@ -48,6 +48,7 @@ OBJECT_DATA_POINTER = {
         'num_points': 'num',
         'score': 'num',
         'covariance': 'vec',
+        'extent_covariance': 'vec',
     },
 }
 
@@ -160,6 +161,7 @@ def _cuboids(refined: RefinedBoxes, is_valid: Mask) -> Iterator[dict[str, Any]]:
     extent = boxes.boxes[:, LENGTH : HEIGHT + 1]
     values = np.hstack([position, quaternions_of(boxes.boxes), extent])
     covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS).tolist()
+    extents = refined.extent_covariances.reshape(-1, 9).round(COVARIANCE_DIGITS).tolist()
     for i in np.flatnonzero(is_valid):
         texts = {'status': refined.status[i], 'reason': refined.reasons[i]}
         numbers: dict[str, float] = {'num_points': int(refined.num_points[i])}
@@ -168,7 +170,10 @@ def _cuboids(refined: RefinedBoxes, is_valid: Mask) -> Iterator[dict[str, Any]]:
         attributes = {
             'text': [{'name': name, 'val': value} for name, value in texts.items()],
             'num': [{'name': name, 'val': value} for name, value in numbers.items()],
-            'vec': [{'name': 'covariance', 'val': covariances[i]}],
+            'vec': [
+                {'name': 'covariance', 'val': covariances[i]},
+                {'name': 'extent_covariance', 'val': extents[i]},
+            ],
         }
         yield {
             'name': 'box',
@@ -237,6 +242,7 @@ def _read_frame(
             [found.get('num_points', 0) for found in attributes],
             [found.get('covariance') for found in attributes],
             [found.get('reason') for found in attributes],
+            [found.get('extent_covariance') for found in attributes],
         )
         fixed_frame, sensor_frame, T_fixed_sensor = _pose(system, transforms)
         yield LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor)

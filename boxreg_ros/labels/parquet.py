@@ -44,6 +44,7 @@ COLUMN_TYPES = {
     **dict.fromkeys(INTEGER_COLUMNS, 'int64'),
     'reason': 'string',
     'covariance': 'double[]',
+    'extent_covariance': 'double[]',
     'fixed_frame': 'string',
     'sensor_frame': 'string',
     'T_fixed_sensor': 'double[]',
@@ -85,6 +86,7 @@ class Writer:
                 int(refined.num_points[i]),
                 refined.reasons[i],
                 refined.covariances[i].ravel().tolist(),
+                refined.extent_covariances[i].ravel().tolist(),
                 frame.fixed_frame,
                 frame.sensor_frame,
                 pose,
@@ -116,6 +118,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             [item['num_points'] for item in items],
             [item.get('covariance') for item in items],
             [item.get('reason') for item in items],
+            [item.get('extent_covariance') for item in items],
         )
         T = items[0].get('T_fixed_sensor')
         yield LabelFrame(

@@ -17,7 +17,7 @@ MIN_QUATERNION_NORM = 1e-6
 """A shorter quaternion states no orientation."""
 
 
-def refined_boxes(
+def refined_boxes(  # noqa: PLR0913 (one argument per column of a label file)
     stamp_ns: int,
     frame_id: str,
     track_ids: Sequence[str],
@@ -28,12 +28,13 @@ def refined_boxes(
     num_points: ArrayLike | None = None,
     covariances: Sequence[ArrayLike | None] | None = None,
     reasons: Sequence[str | None] | None = None,
+    extent_covariances: Sequence[ArrayLike | None] | None = None,
 ) -> RefinedBoxes:
     """
     Return the n boxes of one stamp as read from a file.
 
     Columns and entries that are None get defaults: score NaN, status `INPUT_STATUS`, 0 points,
-    the unit matrix as covariance, no reason.
+    unit matrices as covariances, no reason.
 
     """
     n = len(track_ids)
@@ -42,6 +43,9 @@ def refined_boxes(
     matrices = np.zeros((n, 6, 6))  # (n, row, column)
     for i, covariance in enumerate(covariances or missing):
         matrices[i] = np.eye(6) if covariance is None else np.reshape(covariance, (6, 6))
+    extents = np.zeros((n, 3, 3))  # (n, row, column)
+    for i, covariance in enumerate(extent_covariances or missing):
+        extents[i] = np.eye(3) if covariance is None else np.reshape(covariance, (3, 3))
     return RefinedBoxes(
         BoxArray(
             stamp_ns,
@@ -55,6 +59,7 @@ def refined_boxes(
         tuple(item or '' for item in reasons or missing),
         numbers,
         matrices,
+        extent_covariances=extents,
     )
 
 

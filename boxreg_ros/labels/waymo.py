@@ -61,6 +61,7 @@ BOXREG_COLUMNS = {
     'boxreg.reason': 'string',
     'boxreg.score': 'double',
     'boxreg.covariance': 'double[]',
+    'boxreg.extent_covariance': 'double[]',
 }
 KEY_COLUMNS = {SEGMENT: 'string', MICROSECONDS: 'int64'}
 BOX_COLUMNS = (
@@ -116,6 +117,7 @@ class Writer:
                 refined.reasons[row],
                 finite_or_none(array.scores[row]),
                 refined.covariances[row].ravel().tolist(),
+                refined.extent_covariances[row].ravel().tolist(),
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(*key, frame.T_fixed_sensor.ravel().tolist())
@@ -168,6 +170,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             [item[NUM_POINTS] for item in items],
             [item.get('boxreg.covariance') for item in items],
             [item.get('boxreg.reason') for item in items],
+            [item.get('boxreg.extent_covariance') for item in items],
         )
         T = T_world_vehicle.get(items[0][MICROSECONDS])
         yield LabelFrame(refined, fixed_frame, sensor_frame, T)

@@ -9,11 +9,14 @@ import time
 import traceback
 
 from boxreg_ros.reasons import FAULTS, REASONS
+from boxreg_ros.structures import REFINED
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 LOG_PERIOD = 10.0
 """The same reason is logged at most once in this time [s]."""
+WAITING = 'waiting'
+"""Name of the log entry that says what the node waits for."""
 REASONS_WITHOUT_CLOUDS = ('no_transform', 'no_sweep')
 """Reasons that boxes get when no cloud arrives at all."""
 RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')
@@ -41,7 +44,7 @@ class Health:
         self._core_counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
         self._logged: Counter[str] = Counter()
-        self._logged_at: dict[str, float] = {}
+        self._logged_at = {WAITING: time.monotonic()}
         self._latencies: list[float] = []
         self._since = time.monotonic()
 
@@ -91,6 +94,21 @@ class Health:
                 text = f'{name} ({unlogged[name]} more): {reason.meaning}; {reason.remedy}'
                 self._log(name, text)
 
+    def log_waiting(self, fixed_frame: str) -> None:
+        """
+        Log what the node waits for, every `LOG_PERIOD` until its first refined box.
+
+        Parameters
+        ----------
+        fixed_frame : str
+            Frame to refine in; '' while it is not known.
+
+        """
+        with self._lock:
+            counts = self._counts + self._core_counts
+        if not counts[REFINED] and self.is_due(WAITING):
+            self._logger.info(f'waiting for {_awaited(counts, fixed_frame)}; no box refined yet')
+
     def status(self, name: str, facts: Mapping[str, object]) -> DiagnosticStatus:
         """
         Return the state since the last call.
@@ -127,6 +145,20 @@ class Health:
             self._logger.error(text)
         else:
             self._logger.warning(text)
+
+
+def _awaited(counts: Mapping[str, int], fixed_frame: str) -> str:
+    """Return what the first refined box still needs, the most basic thing first."""
+    missing = [name for name in ('points', 'boxes') if not counts.get(f'{name}_received')]
+    if missing:
+        return f'messages on {" and ".join(missing)}'
+    if not fixed_frame:
+        return 'transforms from the frame of the clouds to a fixed frame'
+    reasons = [name for name, reason in REASONS.items() if reason.unit == 'box']
+    why = max(reasons, key=lambda name: counts.get(name, 0))
+    if not counts.get(why):
+        return 'enough observations of a track'
+    return f'boxes that can be refined; so far most often {why}: {REASONS[why].meaning}'
 
 
 def _latency_values(latencies: list[float]) -> dict[str, str]:

@@ -224,6 +224,7 @@ class BoxregNode(Node):
         further = [] if self._search is None else self._search.problems()
         topics = self._topics.report(f'{name}: topics', further)
         self._health.log_counts()
+        self._health.log_waiting(self.worker.fixed_frame or '')
         now = self.get_clock().now()
         newest_ns = self.worker.newest_transform_ns
         age = 'none'

@@ -16,7 +16,11 @@ from boxreg_ros.config import words_of
 from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
 from boxreg_ros.offline.arguments import add_topic_arguments, convention_from
+from boxreg_ros.offline.consistency import consistency
+from boxreg_ros.offline.consistency import table as consistency_table
+from boxreg_ros.offline.result_folder import earlier_summary
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, is_valid_box, YAW
 import numpy as np
@@ -294,11 +298,32 @@ def run(args: argparse.Namespace) -> int:
     if len(predicted.boxes) and not matches.is_matched.any():
         _warn(_why_none_matches(predicted, truth, matches))
     overall = summarise(matches)
+    certainty = consistency(matches, truth, _covariances(args.predicted))
     if args.json:
-        print(json.dumps(finite(_report(overall, groups(matches)))))
+        report = _report(overall, groups(matches))
+        if certainty:
+            report['consistency'] = {name: group._asdict() for name, group in certainty.items()}
+        print(json.dumps(finite(report)))
     else:
         _print_tables(overall, groups(matches))
-    return 0
+        if certainty:
+            print(f'\ncovariances of the {_estimate(args.predicted)} estimate')
+            print(consistency_table(certainty))
+    return 0 if matches.is_matched.any() else 1
+
+
+def _covariances(source: Path) -> dict[tuple[int, str], BoxCovariance]:
+    """Return the covariances beside a table of boxes; none for other sources."""
+    folder = source if source.is_dir() else source.parent
+    path = folder / COVARIANCES
+    is_table = source.name == 'boxes.csv' or (source / 'boxes.csv').is_file()
+    return read_covariances(path) if is_table and path.is_file() else {}
+
+
+def _estimate(source: Path) -> str:
+    """Return the estimate of a result folder, as in its summary; 'written' without one."""
+    folder = source if source.is_dir() else source.parent
+    return str((earlier_summary(folder) or {}).get('estimate', 'written'))
 
 
 def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline.cloud_spool import Spool
@@ -15,13 +14,18 @@ from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.review.decisions import Corrections, read_decisions
-from boxreg_ros.structures import BoxArray, Floats, INTERPOLATED, KEPT, REFINED, RefinedBoxes, YAW
+from boxreg_ros.structures import (
+    BoxArray,
+    Floats,
+    INTERPOLATED,
+    KEPT,
+    REFINED,
+    RefinedBoxes,
+    Sweep,
+    YAW,
+)
 from boxreg_ros.tracks.bridge import Bridge
 import numpy as np
-
-if TYPE_CHECKING:
-    from boxreg_ros.review.changes import Changes
-    from boxreg_ros.review.track_points import PointCollector
 
 
 @dataclass(eq=False, slots=True)
@@ -66,8 +70,12 @@ class Sink:
         Refined headings that differ from the input by more than 90 degrees.
     without_cloud : int
         Box arrays without a cloud, where clouds are to be written.
-    changes : Changes or None
-        Boxes before and after, for the report.
+    time_ranges : dict
+        First and last stamp [ns] of the ``boxes`` and of the ``clouds``.
+    unknown_classes : Counter
+        Boxes by class name, of the names that no group of settings has.
+    changes : Changes
+        Boxes before and after, for the report and the tables of tracks.
     corrections : Corrections
         Rejected tracks and pinned boxes.
     points : PointCollector or None
@@ -80,6 +88,9 @@ class Sink:
         self._sensor_frame = source.sensor_frame
         self._writes_early = request.config.estimate == 'early'
         self._clock = clock
+        self._config = request.config
+        self.time_ranges: dict[str, tuple[int, int]] = {}
+        self.unknown_classes: Counter[str] = Counter()
         self._spool: Spool | None = None
         if request.options.with_points:
             self._spool = Spool(folder, request.config)
@@ -92,14 +103,12 @@ class Sink:
             read_decisions(request.decisions) if request.decisions is not None else ()
         )
         self._bridge: Bridge[_Slot] = Bridge(request.bridge, self._fixed_frame, request.config)
-        self.changes: Changes | None = None
-        self.points: PointCollector | None = None
-        if request.report:
-            from boxreg_ros.review.changes import Changes
-            from boxreg_ros.review.track_points import PointCollector
+        # These import torch, after the fork of the reader.
+        from boxreg_ros.review.changes import Changes
+        from boxreg_ros.review.track_points import PointCollector
 
-            self.changes = Changes(self._fixed_frame)
-            self.points = PointCollector(request.config)
+        self.changes = Changes(self._fixed_frame)
+        self.points = PointCollector(request.config) if request.report else None
         self._by_stamp: list[_Slot] = []  # not yet written
         self._by_ticket: dict[object, _Slot] = {}  # without a result
         self._last_ticket = 0
@@ -123,6 +132,7 @@ class Sink:
         if self.points is not None and item.moved is not None:
             with self._clock('report'):
                 self.points.add(item.moved)
+        self._note_time(item.given or item.moved)
         if isinstance(item.given, BoxArray):
             return self._reserve(item, item.given)
         if self._spool and item.given is not None and item.T_fixed_given is not None:
@@ -172,10 +182,22 @@ class Sink:
         """Return the number of input boxes that have not been written."""
         return self.boxes_in - (self.boxes_out - self.status[INTERPOLATED])
 
+    def _note_time(self, content: Sweep | BoxArray | None) -> None:
+        """Widen the time range of clouds or boxes by a message; empty box arrays count."""
+        if content is None:
+            return
+        name = 'boxes' if isinstance(content, BoxArray) else 'clouds'
+        stamp_ns = content.stamp_ns
+        first, last = self.time_ranges.get(name, (stamp_ns, stamp_ns))
+        self.time_ranges[name] = min(first, stamp_ns), max(last, stamp_ns)
+
     def _reserve(self, item: ReadItem, given: BoxArray) -> ReadItem:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
+        for name in given.class_names:
+            if not self._config.knows_class(name):
+                self.unknown_classes[name] += 1
         if isinstance(item.moved, BoxArray):
             slot = _Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
             self._last_ticket += 1
@@ -195,8 +217,7 @@ class Sink:
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
         self.heading_flips += _heading_flips(slot.boxes, refined)
-        if self.changes is not None:
-            self.changes.add(slot.boxes, refined)
+        self.changes.add(slot.boxes, refined)
         with self._clock('write'):
             frame = self._frame(refined, slot)
             for writer in self._writers.values():

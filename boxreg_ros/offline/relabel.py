@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
+from datetime import datetime, UTC
 from importlib.metadata import version
 import json
 from pathlib import Path
@@ -20,6 +21,7 @@ from shutil import copyfile
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros import __version__
+from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.output import Sink
@@ -37,12 +39,16 @@ import yaml
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar
     from boxreg_ros.review.changes import TrackChanges
+    from boxreg_ros.review.track_points import PointCollector
 
 MAX_NAMED = 5
 """Most tracks that a warning names; chosen."""
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
 NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
+
+FEW_REFINED = 0.5
+"""A run that refines a smaller part of its boxes says why."""
 
 
 def relabel(request: Request, out: Path, progress: Progress | None = None) -> dict[str, Any]:
@@ -93,7 +99,11 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary |= {'fingerprint': fingerprint, 'seconds': clock.seconds()}
-            _report(folder, out, request, summary, sink, clock)
+            tracks = sink.changes.tracks()
+            with clock('write'):
+                summary['rules'] = _write_tables(folder, tracks, request.config)
+            if sink.points is not None:
+                _report(folder, out, request, summary, tracks, sink.points, clock)
             if request.decisions is not None:
                 copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
@@ -121,24 +131,40 @@ def _register(
     sink.take(ready)
 
 
+def _write_tables(
+    folder: Path, tracks: Sequence[TrackChanges], config: Config
+) -> dict[str, dict[str, int]]:
+    """Write the tables of tracks; return violations of rules ``before`` and ``after`` the run."""
+    from boxreg_ros.review.rules import counts
+    from boxreg_ros.review.rules.protocol import LabelTrack
+    from boxreg_ros.review.tables import assessed, write_tables
+
+    write_tables(folder, assessed(tracks))
+    before = []
+    after = []
+    for track in tracks:
+        names = track.track_id, track.class_name, config, track.stamps_ns
+        before.append(LabelTrack.of(*names, track.given, track.num_points))
+        after.append(LabelTrack.of(*names, track.boxes, track.num_points))
+    return {'before': counts(before), 'after': counts(after)}
+
+
 def _report(
     folder: Path,
     out: Path,
     request: Request,
     summary: dict[str, Any],
-    sink: Sink,
+    tracks: Sequence[TrackChanges],
+    points: PointCollector,
     clock: Stopwatch,
 ) -> None:
-    """Write the report, if it is wanted, and add its time to the summary."""
-    if sink.changes is None or sink.points is None:
-        return
+    """Write the report and add its time to the summary."""
     from boxreg_ros.review.report import write_report
 
     with clock('report'):
-        tracks = sink.changes.tracks()
         truth = _truth(request, tracks, summary)
         line = closing_line(summary, out)
-        write_report(folder, line, summary, request.config, tracks, sink.points, truth)
+        write_report(folder, line, summary, request.config, tracks, points, truth)
     summary['seconds'] = clock.seconds()
 
 
@@ -196,6 +222,8 @@ def _summary(
         'time_jumps': findings.counts['time_jump'],
         'recorded_apart': {t: round(late, 3) for t, late in findings.apart.items()},
         'heading_flips': sink.heading_flips,
+        'time_ranges': {name: list(ends) for name, ends in sink.time_ranges.items()},
+        'unknown_classes': dict(sink.unknown_classes.most_common()),
         'dropped': _dropped(registered, findings),
         'first_missing_transform': findings.first_missing_transform,
         'first_unreadable': findings.first_unreadable,
@@ -286,8 +314,14 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
             f'{summary["frames_without_cloud"]:,} of {summary["box_arrays"]:,} box arrays have no '
             f'cloud to write beside them'
         )
-    if has_failed(summary):
-        yield _why_none_was_refined(summary)
+    if summary['unknown_classes']:
+        names = ', '.join(repr(name) for name in summary['unknown_classes'])
+        yield (
+            f'unknown class names are treated as vehicles: {names} ({_sum(summary)} boxes); name '
+            f'them in vehicle.names, cyclist.names or pedestrian.names'
+        )
+    if part_refined(summary) < FEW_REFINED:
+        yield _why_few_were_refined(summary)
 
 
 def has_failed(summary: dict[str, Any]) -> bool:
@@ -295,15 +329,37 @@ def has_failed(summary: dict[str, Any]) -> bool:
     return bool(summary['boxes_in']) and not summary['status'].get(REFINED)
 
 
-def _why_none_was_refined(summary: dict[str, Any]) -> str:
-    """Return the most frequent reason why boxes were kept, and its remedy."""
+def part_refined(summary: dict[str, Any]) -> float:
+    """Return the part of the input boxes that were refined; 1 without boxes."""
+    boxes = int(summary['boxes_in'])
+    return int(summary['status'].get(REFINED, 0)) / boxes if boxes else 1.0
+
+
+def _why_few_were_refined(summary: dict[str, Any]) -> str:
+    """Return the most frequent reason why boxes were kept, its remedy, and both time ranges."""
     name, count = next(iter(summary['reasons'].items()))  # sorted by count
     reason = REASONS[name]
-    line = (
-        f'none of {summary["boxes_in"]:,} boxes was refined; most frequent reason: {name} '
-        f'({count:,} boxes): {reason.meaning}'
-    )
-    return f'{line}; remedy: {reason.remedy}' if reason.remedy else line
+    refined = summary['status'].get(REFINED, 0)
+    part = f'only {refined:,} of {summary["boxes_in"]:,} boxes were refined'
+    if not refined:
+        part = f'none of {summary["boxes_in"]:,} boxes was refined'
+    line = f'{part}; most frequent reason: {name} ({count:,} boxes): {reason.meaning}'
+    if reason.remedy:
+        line += f'; remedy: {reason.remedy}'
+    ranges = [f'{name} {_time_range(*r)}' for name, r in sorted(summary['time_ranges'].items())]
+    return f'{line}; time ranges: {", ".join(ranges)}'
+
+
+def _time_range(first_ns: int, last_ns: int) -> str:
+    """Return two stamps as seconds with the date of the first."""
+    with suppress(OverflowError, ValueError, OSError):
+        date = datetime.fromtimestamp(first_ns * 1e-9, UTC).strftime('%Y-%m-%d')
+        return f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s ({date})'
+    return f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s'
+
+
+def _sum(summary: dict[str, Any]) -> str:
+    return f'{sum(summary["unknown_classes"].values()):,}'
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -78,8 +78,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='do nothing if OUT holds the result of the same request, files and settings',
     )  # fmt: skip
     parser.add_argument(
+        '--fail-under', type=_part, default=0.0, metavar='PART',
+        help='exit with 1, the results kept, if a smaller part of the boxes is refined, as in 0.9',
+    )  # fmt: skip
+    parser.add_argument(
         '--workers', type=int, metavar='N', help='CPU cores of the solver (sets solver.threads)'
     )
+
+
+def _part(text: str) -> float:
+    """Return a number from 0 to 1."""
+    try:
+        part = float(text)
+    except ValueError:
+        part = -1.0
+    if not 0 <= part <= 1:
+        raise argparse.ArgumentTypeError(f'expected a part from 0 to 1, got {text!r}')
+    return part
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -102,13 +117,13 @@ def run(args: argparse.Namespace) -> int:
     Status 1 also if the recording has boxes and none was refined; the result is kept.
 
     """
-    from boxreg_ros.offline.relabel import closing_line, has_failed, notes, relabel
+    from boxreg_ros.offline.relabel import closing_line, notes, relabel
 
     request = _request(args)
     earlier = earlier_summary(args.out)
     if args.resume and earlier and _is_complete(earlier, request, args.out):
         print(f'{args.out}: up to date, made from the same files with the same settings')
-        return FAILED if has_failed(earlier) else DONE
+        return _status(earlier, args.fail_under)
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
     with ProgressBar() as bar:
@@ -116,6 +131,21 @@ def run(args: argparse.Namespace) -> int:
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))
+    return _status(summary, args.fail_under)
+
+
+def _status(summary: dict[str, Any], fail_under: float) -> int:
+    """Return the exit status of a run; say on stderr if it misses ``--fail-under``."""
+    from boxreg_ros.offline.relabel import has_failed, part_refined
+
+    part = part_refined(summary)
+    if part < fail_under:
+        print(
+            f'boxreg: --fail-under: expected at least {fail_under:.1%} of the boxes refined, got '
+            f'{part:.1%}; the results are kept, see "reasons" in summary.json',
+            file=sys.stderr,
+        )
+        return FAILED
     return FAILED if has_failed(summary) else DONE
 
 

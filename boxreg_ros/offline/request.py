@@ -81,6 +81,7 @@ class Request:
 
     def __post_init__(self) -> None:
         """Check the options."""
+        self._check_recordings()
         self._check_boxes()
         self._check_part()
         if not 0 <= self.bridge <= self.config.max_gap:
@@ -94,6 +95,17 @@ class Request:
             from boxreg_ros.review.report import check_packages  # imports torch
 
             check_packages()
+
+    def _check_recordings(self) -> None:
+        """Refuse a recording that is named twice: its boxes would be refined twice."""
+        known: dict[Path, Path] = {}
+        for path in self.recordings:
+            other = known.setdefault(path.resolve(), path)
+            if other is not path:
+                raise ConfigError(
+                    f'recordings: expected each recording once, got {str(other)!r} and '
+                    f'{str(path)!r}, which are the same; leave one out'
+                )
 
     def _check_boxes(self) -> None:
         """Check where the boxes come from."""

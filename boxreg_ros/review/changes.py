@@ -41,6 +41,10 @@ class TrackChanges:
     deviations : array, shape (n, 4)
         Standard deviations of the result along the same axes; NaN for boxes that are not
         refined.
+    extent_deviations : array, shape (n, 3)
+        Standard deviations of length, width and height [m]; NaN for boxes that are not refined.
+    face_distances, outside : array, shapes (n, 6) and (n,)
+        As in `RefinedBoxes`.
     is_flipped : array, shape (n,)
         True where the heading was flipped by 180 degrees.
     status : array of str, shape (n,)
@@ -59,6 +63,9 @@ class TrackChanges:
     boxes: Floats
     change: Floats
     deviations: Floats
+    extent_deviations: Floats
+    face_distances: Floats
+    outside: Floats
     is_flipped: NDArray[np.bool_]
     status: NDArray[np.str_]
     reasons: NDArray[np.str_]
@@ -99,7 +106,9 @@ class Changes:
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
         self._names: list[tuple[str, str, str, str]] = []  # id, class, status, reason
-        self._numbers: list[Floats] = []  # rows of given (9), boxes (9), deviations (4)
+        # Rows of given (9), boxes (9), deviations (4), extent deviations (3), face distances (6),
+        # part of the points outside (1).
+        self._numbers: list[Floats] = []
         self._counts: list[Ints] = []  # rows of stamp, number of points
 
     def add(self, given: BoxArray, refined: RefinedBoxes) -> None:
@@ -123,7 +132,20 @@ class Changes:
         before[~is_usable] = np.nan
         after[~is_usable] = np.nan
         deviations = _deviations(after, refined.covariances)
-        self._numbers.append(np.hstack([before, after, deviations]))
+        variances = np.diagonal(refined.extent_covariances, axis1=1, axis2=2)
+        extent_deviations = np.sqrt(variances.clip(0))
+        self._numbers.append(
+            np.column_stack(
+                [
+                    before,
+                    after,
+                    deviations,
+                    extent_deviations,
+                    refined.face_distances,
+                    refined.outside,
+                ]
+            )
+        )
         self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
         self._names += zip(
             boxes.track_ids, boxes.class_names, refined.status, refined.reasons, strict=True
@@ -131,9 +153,11 @@ class Changes:
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
-        numbers = np.concatenate([np.zeros((0, 22)), *self._numbers])
+        numbers = np.concatenate([np.zeros((0, 32)), *self._numbers])
         counts = np.concatenate([np.zeros((0, 2), np.int64), *self._counts])
-        given, boxes, deviations = np.split(numbers, [9, 18], axis=1)
+        given, boxes, deviations, extent_deviations, face_distances, outside = np.split(
+            numbers, [9, 18, 22, 25, 31], axis=1
+        )
         errors = pose_errors(given, boxes)  # of the input, in the axes of the result
         yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
         change = -np.column_stack([errors.translation, yaw_change])
@@ -141,6 +165,7 @@ class Changes:
         for track_id, rows in self._rows_by_track(counts[:, 0]).items():
             _, classes, status, reasons = zip(*(self._names[row] for row in rows), strict=True)
             is_refined = np.isin(status, (REFINED, HUMAN))
+            unknown = np.where(is_refined, 0.0, np.nan)[:, None]
             found.append(
                 TrackChanges(
                     track_id=track_id,
@@ -149,7 +174,10 @@ class Changes:
                     given=given[rows],
                     boxes=boxes[rows],
                     change=change[rows],
-                    deviations=np.where(is_refined[:, None], deviations[rows], np.nan),
+                    deviations=deviations[rows] + unknown,
+                    extent_deviations=extent_deviations[rows] + unknown,
+                    face_distances=face_distances[rows],
+                    outside=outside[rows, 0],
                     is_flipped=errors.is_flipped[rows] & is_refined,
                     status=np.array(status),
                     reasons=np.array(reasons),

@@ -112,7 +112,7 @@ class TrackPart:
         self.after = quality(track, track.boxes, self._points, truth.iou_after)
 
     def row(self, begin_ns: int, risk: Mapping[str, str]) -> dict[str, Any]:
-        """Return the row of the list; `risk` is the row of ``tracks.csv``, empty without."""
+        """Return the row of the list; `risk` is the row of ``review.csv``, empty without."""
         track = self._track
         status = Counter(track.status.tolist())
         is_input = track.status != INTERPOLATED

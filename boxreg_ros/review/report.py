@@ -30,7 +30,6 @@ from boxreg_ros.structures import REFINED
 import numpy as np
 
 REPORT = 'report.html'
-TRACKS = 'tracks.csv'
 REVIEW = 'review.csv'
 PACKAGES = ('jinja2', 'plotly')
 SHARE = Path(__file__).parents[1] / 'share'
@@ -74,8 +73,7 @@ def write_report(
     Parameters
     ----------
     folder : Path
-        Result folder. The risks of its ``tracks.csv`` and the order of its ``review.csv`` are
-        shown, if it has these files.
+        Result folder. The risks and the order of its ``review.csv`` are shown, if it has one.
     line : str
         The closing line of the run.
     summary : mapping
@@ -94,7 +92,8 @@ def write_report(
 
     begin_ns = min((int(track.stamps_ns[0]) for track in tracks), default=0)
     max_points = points_per_box(sum(len(track.stamps_ns) for track in tracks))
-    risks = {row['track_id']: row for row in _rows_of(folder / TRACKS)}
+    review = list(_rows_of(folder / REVIEW))
+    risks = {row['track_id']: row for row in review}
     rows = []
     parts = []
     qualities = []
@@ -111,7 +110,7 @@ def write_report(
         'has_truth': truth is not None,
         'has_risk': bool(risks),
         'tracks': rows,
-        'review': list(_rows_of(folder / REVIEW)),
+        'review': review,
         'sensor': np.round(points.origins[::stride, :2], 2),
         'total': [_total([pair[k] for pair in qualities]) for k in range(2)],
     }

@@ -119,7 +119,7 @@ class Bridge(Generic[_T]):
 
 
 class _TrackBox(NamedTuple):
-    """A box of a track with its covariance, shape (6, 6), of x y z roll pitch yaw."""
+    """A box of a track with its covariances, of x y z roll pitch yaw and of the extents."""
 
     track_id: str
     stamp_ns: int
@@ -127,6 +127,7 @@ class _TrackBox(NamedTuple):
     score: float
     box: Floats
     covariance: Floats
+    extent_covariance: Floats
 
 
 @dataclass(eq=False, slots=True)
@@ -162,6 +163,11 @@ class _Held(Generic[_T]):
             num_points=np.append(old.num_points, np.zeros(n, np.int64)),
             covariances=np.concatenate([old.covariances, [box.covariance for box in self.added]]),
             is_final=old.is_final,
+            extent_covariances=np.concatenate(
+                [old.extent_covariances, [box.extent_covariance for box in self.added]]
+            ),
+            face_distances=np.concatenate([old.face_distances, np.zeros((n, 6))]),
+            outside=np.append(old.outside, np.zeros(n)),
         )
         return complete, self.item
 
@@ -173,7 +179,7 @@ def _track_boxes(refined: RefinedBoxes) -> Iterator[_TrackBox]:
         if track_id and is_valid_box(boxes.boxes[i]):
             yield _TrackBox(
                 track_id, boxes.stamp_ns, boxes.class_names[i], boxes.scores[i], boxes.boxes[i],
-                refined.covariances[i],
+                refined.covariances[i], refined.extent_covariances[i],
             )  # fmt: skip
 
 
@@ -200,7 +206,8 @@ def _interpolated(before: _TrackBox, after: _TrackBox, stamp_ns: int, config: Co
     deviations = _accelerations(before.class_name, config) * half_product
     covariance = covariance + np.diag(deviations**2)
     score = (1 - fraction) * before.score + fraction * after.score
-    return _TrackBox(before.track_id, stamp_ns, before.class_name, score, box, covariance)
+    extents = (1 - fraction) * before.extent_covariance + fraction * after.extent_covariance
+    return _TrackBox(before.track_id, stamp_ns, before.class_name, score, box, covariance, extents)
 
 
 def _accelerations(class_name: str, config: Config) -> Floats:

@@ -736,9 +736,9 @@ def test_multipliers_reduce_constraint_violations():
     # Smoothness and alignment are constraints: after the rounds they are violated less than at
     # the input, and the objective at the multipliers of the first round is lower.
     problem, x, total = paper_problem()
-    state, covariances, prior, *_ = solve_paper(problem, PAPER)
+    state, found, prior, *_ = solve_paper(problem, PAPER)
     assert prior is None
-    assert covariances.shape == (*problem.valid.shape, 6, 6)
+    assert found.poses.shape == (*problem.valid.shape, 6, 6)
     rows, none = torch.arange(4), torch.zeros(4, 2, dtype=D)
     before, violation = total(x, rows, none)
     after, rest = total(state.pose.flatten(1), rows, none)

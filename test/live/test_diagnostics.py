@@ -93,3 +93,29 @@ def test_internal_errors_are_logged_with_their_traceback_in_the_debug_log():
     (error_entry, debug_entry) = log.entries
     assert error_entry == ('error', "failed: KeyError: 'missing'")
     assert debug_entry[0] == 'debug' and 'test_diagnostics.py' in debug_entry[1]
+
+
+def test_node_says_what_it_waits_for_until_its_first_refined_box(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr('boxreg_ros.live.diagnostics.time.monotonic', lambda: now[0])
+    log = Log()
+    health = Health(log)
+
+    def text_after(seconds, frame='odom'):
+        now[0] += seconds
+        health.log_waiting(frame)
+        found = ' '.join(text for _, text in log.entries)
+        log.entries.clear()
+        return found
+
+    assert text_after(5) == ''
+    assert text_after(5) == 'waiting for messages on points and boxes; no box refined yet'
+    assert text_after(5) == ''
+    health.count('points_received')
+    assert 'messages on boxes' in text_after(5)
+    health.count('boxes_received')
+    assert 'transforms' in text_after(10, frame='')
+    health.set_core_counts({'short_track': 3})
+    assert 'short_track' in text_after(10)
+    health.set_core_counts({'refined': 1})
+    assert text_after(10) == ''

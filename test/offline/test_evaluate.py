@@ -234,7 +234,7 @@ def test_tables_without_a_common_stamp_are_explained(tmp_path, capsys):
     truth = truth_table()
     truth.write(tmp_path / 'truth.csv')
     replace(truth, stamps_ns=truth.stamps_ns + 10**12).write(tmp_path / 'boxes.csv')
-    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 0
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 1
     assert (
         '0 stamps and 2 track ids are in both; stamps of predicted boxes: 1000.000 to '
         '1000.900 s, of true boxes: 0.000 to 0.900 s'
@@ -261,7 +261,7 @@ def test_tables_with_invalid_predictions_only_are_explained(tmp_path, capsys):
     boxes = truth.boxes.copy()
     boxes[:, 0] = np.inf
     replace(truth, boxes=boxes).write(tmp_path / 'boxes.csv')
-    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'car') == 0
+    assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv', '--classes', 'car') == 1
     printed = capsys.readouterr()
     assert (
         'all 10 predicted boxes with the stamp and the track id of a true one are' in printed.err

@@ -108,7 +108,8 @@ def test_output_folder_contents(tmp_path):
     summary, _ = run(path, tmp_path / 'out', settings={'solver.iterations': 2})
     out = tmp_path / 'out'
     assert sorted(item.name for item in out.iterdir()) == [
-        'boxes.csv', 'config.yaml', 'openlabel', 'summary.json',
+        'boxes.csv', 'config.yaml', 'covariances.csv', 'openlabel', 'review.csv', 'summary.json',
+        'tracks.csv',
     ]  # fmt: skip
     assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.iterations': 2})
     assert json.loads((out / 'summary.json').read_text()) == summary
@@ -116,7 +117,7 @@ def test_output_folder_contents(tmp_path):
     assert summary['fixed_frame'] == 'odom'
     assert set(summary['versions']) >= {'boxreg_ros', 'torch', 'numpy', 'rosbags'}
     assert set(summary['seconds']) == {
-        'read', 'decode', 'transform', 'registrar', 'solve', 'write', 'total',
+        'start', 'read', 'decode', 'transform', 'registrar', 'solve', 'write', 'total',
     }  # fmt: skip
     label = json.loads((out / 'openlabel' / 'labels.json').read_text())['openlabel']
     assert len(label['frames']) == 4

@@ -85,7 +85,8 @@ def street(tmp_path_factory):
 def test_page_needs_no_other_file(street):
     out, _, page = street
     assert sorted(item.name for item in out.iterdir()) == [
-        'boxes.csv', 'config.yaml', 'report.html', 'summary.json',
+        'boxes.csv', 'config.yaml', 'covariances.csv', 'report.html', 'review.csv',
+        'summary.json', 'tracks.csv',
     ]  # fmt: skip
     assert all(link.startswith(('#', 'data:')) for link in page.links)
     assert not set(page.tags) & {'iframe', 'object', 'img'}
@@ -256,10 +257,6 @@ def test_truth_of_another_drive_is_left_out_with_a_warning(tmp_path, capsys):
 
 
 def test_risks_of_the_result_folder_are_shown(tmp_path):
-    path = tmp_path / 'tracks.csv'
-    path.write_text(
-        'track_id,class_name,boxes,refined,kept,risk_m,reasons\n7,car,3,3,0,0.25,far\n'
-    )
     order = tmp_path / 'review.csv'
     order.write_text('rank,track_id,class_name,stamp_ns,risk_m,reasons\n1,7,car,12,0.25,far\n')
     truth = drive(12)

@@ -1,0 +1,119 @@
+"""``covariances.csv``: how certain each box of ``boxes.csv`` is, one row per refined box."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import csv
+from itertools import combinations_with_replacement
+from pathlib import Path
+from typing import NamedTuple
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
+import numpy as np
+
+COVARIANCES = 'covariances.csv'
+POSE_NAMES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+EXTENT_NAMES = ('length', 'width', 'height')
+COVARIANCE_KEYS = ('stamp_ns', 'track_id', 'range')
+COVARIANCE_NUMBERS = tuple(
+    f'{a}_{b}'
+    for names in (POSE_NAMES, EXTENT_NAMES)
+    for a, b in combinations_with_replacement(names, 2)
+)
+"""Upper triangles of the two matrices, row by row [m^2, m rad, rad^2]."""
+POSE_TRIANGLE = np.triu_indices(6)
+EXTENT_TRIANGLE = np.triu_indices(3)
+NUM_POSE = len(POSE_TRIANGLE[0])
+
+
+class BoxCovariance(NamedTuple):
+    """
+    The row of one box.
+
+    Attributes
+    ----------
+    range : float
+        Horizontal distance of the box from the sensor [m]; NaN if unknown.
+    pose : array, shape (6, 6)
+        Of x y z roll pitch yaw, in the frame of the box's row in ``boxes.csv`` [m, rad].
+    extent : array, shape (3, 3)
+        Of length, width and height [m].
+
+    """
+
+    range: float
+    pose: Floats
+    extent: Floats
+
+
+class CovarianceWriter:
+    """Write the covariances of refined boxes, with seven significant digits."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open('w', newline='', encoding='utf-8')
+        self._table = csv.writer(self._file, lineterminator='\n')
+        self._table.writerow((*COVARIANCE_KEYS, *COVARIANCE_NUMBERS))
+
+    def write(self, refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> None:
+        """Add a row for each box with an estimate: kept boxes have none."""
+        boxes = refined.boxes
+        for i, status in enumerate(refined.status):
+            if status == KEPT:
+                continue
+            distance = ''
+            if T_fixed_sensor is not None:
+                offset = boxes.boxes[i, [X, Y]] - T_fixed_sensor[:2, 3]
+                distance = f'{np.hypot(*offset):.3f}'
+            numbers = (
+                *refined.covariances[i][POSE_TRIANGLE],
+                *refined.extent_covariances[i][EXTENT_TRIANGLE],
+            )
+            cells = (f'{number:.7g}' for number in numbers)
+            self._table.writerow((boxes.stamp_ns, boxes.track_ids[i], distance, *cells))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:
+    """
+    Read a table of covariances; of rows with one stamp and track id the first counts.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, or a column or a number is missing.
+
+    """
+    try:
+        with path.open(newline='', encoding='utf-8-sig') as file:
+            found: dict[tuple[int, str], BoxCovariance] = {}
+            for key, covariance in _rows(csv.DictReader(file)):
+                found.setdefault(key, covariance)
+            return found
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise RecordingError(
+            f'{path}: expected the columns of covariances.csv with a number in each cell, got '
+            f'{error}; relabel again, or delete the file'
+        ) from None
+
+
+def _rows(reader: csv.DictReader[str]) -> Iterator[tuple[tuple[int, str], BoxCovariance]]:
+    """Yield stamp and track id, and the covariances, of each row."""
+    for row in reader:
+        numbers = np.array([float(row[name]) for name in COVARIANCE_NUMBERS])
+        pose = _symmetric(numbers[:NUM_POSE], 6)
+        extent = _symmetric(numbers[NUM_POSE:], 3)
+        key = int(row['stamp_ns']), row['track_id']
+        yield key, BoxCovariance(float(row['range'] or 'nan'), pose, extent)
+
+
+def _symmetric(upper: Floats, size: int) -> Floats:
+    """Return the symmetric matrix of an upper triangle."""
+    matrix = np.zeros((size, size))
+    matrix[np.triu_indices(size)] = upper
+    return matrix + np.triu(matrix, 1).T

@@ -1,0 +1,129 @@
+"""`boxreg check`: rules that labels should keep, on label files or the boxes of a recording."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterable
+import json
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.review.rules import RULES, violations
+from boxreg_ros.review.rules.protocol import LabelTrack, Violation
+from boxreg_ros.structures import BoxArray, Floats, Ints
+import numpy as np
+
+RECORDING_SUFFIXES = ('.mcap', '.db3', '.bag')
+LABEL_SUFFIXES = {'.csv': 'csv', '.parquet': 'parquet'}
+"""Label files whose format follows from their suffix."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `boxreg check`."""
+    parser.add_argument(
+        'source', metavar='LABELS|RECORDING',
+        help='result folder, boxes.csv, boxes.parquet, FORMAT:PATH of other label files, or a '
+        'recording',
+    )  # fmt: skip
+    parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.add_argument('--strict', action='store_true', help='exit with 1 if a rule is violated')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the violations of all rules; return 1 with ``--strict`` if there are any."""
+    config = Config() if args.config is None else Config.from_yaml(args.config)
+    tracks = _tracks(args.source, config)
+    if not tracks:
+        raise RecordingError(f'{args.source}: expected boxes with a track id, got none')
+    found = violations(tracks)
+    if args.json:
+        print(json.dumps(_report(tracks, found)))
+    else:
+        _print(tracks, found)
+    return int(args.strict and bool(found))
+
+
+def _report(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> dict[str, Any]:
+    """Return tracks, boxes and all violations as plain values."""
+    return {
+        'tracks': len(tracks),
+        'boxes': sum(len(track.boxes) for track in tracks),
+        'rules': {
+            name: {
+                'severity': rule.severity,
+                'meaning': rule.meaning,
+                'remedy': rule.remedy,
+                'violations': [item._asdict() for item in found.get(name, ())],
+            }
+            for name, rule in RULES.items()
+        },
+    }
+
+
+def _print(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> None:
+    """Print the violations by rule, and one closing line."""
+    for name, items in found.items():
+        rule = RULES[name]
+        print(f'{rule.severity}: {name}: {rule.meaning}; {rule.remedy}')
+        for item in items:
+            print(f'  track {item.track_id} at {item.stamp_ns}: {item.text}')
+    boxes = sum(len(track.boxes) for track in tracks)
+    total = sum(map(len, found.values()))
+    kinds = f'{len(found)} of {len(RULES)} rules violated' if found else 'no rule violated'
+    print(f'{len(tracks):,} tracks, {boxes:,} boxes: {kinds}, {total:,} findings')
+
+
+def _tracks(source: str, config: Config) -> list[LabelTrack]:
+    """Read the tracks of label files or of a recording."""
+    path = Path(source)
+    if path.suffix in RECORDING_SUFFIXES or (path / 'metadata.yaml').is_file():
+        from boxreg_ros.io.recording import input_boxes  # slow to import: it reads bags
+
+        arrays, _ = input_boxes(path)
+        return _grouped(((array, None) for array in arrays), config)
+    from boxreg_ros.labels import frames_of
+
+    name, path = _format_of(source)
+    frames = (frame.moved('fixed').refined for frame in frames_of(name, path))
+    return _grouped(((refined.boxes, refined.num_points) for refined in frames), config)
+
+
+def _format_of(source: str) -> tuple[str, Path]:
+    """Return format and path of label files."""
+    path = Path(source)
+    if (path / 'boxes.csv').is_file():
+        return 'csv', path
+    if path.suffix in LABEL_SUFFIXES:
+        return LABEL_SUFFIXES[path.suffix], path
+    name, colon, rest = source.partition(':')
+    if colon and rest:
+        return name, Path(rest)
+    raise ConfigError(
+        f'{source}: expected a result folder, boxes.csv, boxes.parquet, a recording or '
+        f'FORMAT:PATH, as in kitti:{source}; see boxreg formats'
+    )
+
+
+def _grouped(arrays: Iterable[tuple[BoxArray, Ints | None]], config: Config) -> list[LabelTrack]:
+    """Return the tracks of box arrays with their numbers of points; boxes without id are none."""
+    rows: dict[str, list[tuple[int, str, Floats, int]]] = {}
+    for array, num_points in arrays:
+        numbers = np.full(len(array.boxes), -1) if num_points is None else num_points
+        for i, track_id in enumerate(array.track_ids):
+            if track_id:
+                row = array.stamp_ns, array.class_names[i], array.boxes[i], int(numbers[i])
+                rows.setdefault(track_id, []).append(row)
+    # Files without the number of points give 0 for all boxes.
+    is_known = any(row[3] > 0 for items in rows.values() for row in items)
+    tracks = []
+    for track_id, items in rows.items():
+        stamps_ns, classes, boxes, given = zip(*items, strict=True)
+        points = np.array(given) if is_known else np.full(len(items), -1)
+        name = Counter(classes).most_common(1)[0][0]
+        stamps = np.array(stamps_ns, np.int64)
+        tracks.append(LabelTrack.of(track_id, name, config, stamps, np.array(boxes), points))
+    return tracks

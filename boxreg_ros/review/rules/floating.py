@@ -1,0 +1,48 @@
+"""A box above or below the ground of its neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation, WARNING
+from boxreg_ros.structures import HEIGHT, X, Y, Z
+import numpy as np
+
+NEIGHBOURHOOD = 15.0
+"""Boxes within this distance share their ground [m]. Chosen: 1 m off at a slope of 7 %."""
+MIN_NEIGHBOURS = 3
+MAX_OFFSET = 1.0
+"""Largest distance of the bottom of a box from the median of its neighbours [m]. Chosen."""
+
+
+def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
+    """Yield the first box of each track that is off the bottoms of the boxes around it."""
+    stamps_ns = np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)])
+    boxes = np.concatenate([np.zeros((0, 9)), *(t.boxes for t in tracks)])
+    owner = np.repeat(np.arange(len(tracks)), [len(t.boxes) for t in tracks])
+    bottom = boxes[:, Z] - boxes[:, HEIGHT] / 2
+    reported: set[int] = set()
+    order = np.argsort(stamps_ns, kind='stable')
+    starts = np.flatnonzero(np.diff(stamps_ns[order])) + 1
+    for rows in np.split(order, starts):
+        offset = boxes[rows][:, None, [X, Y]] - boxes[rows][None, :, [X, Y]]
+        near = np.linalg.norm(offset, axis=2) < NEIGHBOURHOOD
+        np.fill_diagonal(near, False)
+        for i, row in enumerate(rows):
+            index = int(owner[row])
+            if near[i].sum() < MIN_NEIGHBOURS or index in reported:
+                continue
+            height = bottom[row] - np.median(bottom[rows[near[i]]])
+            if abs(height) > MAX_OFFSET:
+                reported.add(index)
+                text = f'bottom {height:+.2f} m off those of {near[i].sum()} boxes around it'
+                yield Violation(tracks[index].track_id, int(stamps_ns[row]), text)
+
+
+RULE = Rule(
+    'floating',
+    WARNING,
+    'a box floats above, or is sunk below, the ground of the boxes around it',
+    'correct its height; ignore it on bridges and slopes',
+    find,
+)

@@ -1,0 +1,49 @@
+"""Pairs of boxes of one stamp that may overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from boxreg_ros.review.rules.protocol import LabelTrack
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, X, Z
+import numpy as np
+
+
+class Pairs(NamedTuple):
+    """
+    Pairs of boxes of two tracks.
+
+    Attributes
+    ----------
+    tracks : array, shape (k, 2)
+        Indices of the two tracks, ascending.
+    stamps_ns : array, shape (k,)
+        Their stamp [ns].
+    first, second : array, shape (k, 9)
+        Their boxes.
+
+    """
+
+    tracks: Ints
+    stamps_ns: Ints
+    first: Floats
+    second: Floats
+
+
+def near_pairs(tracks: Sequence[LabelTrack]) -> Pairs:
+    """Return the pairs whose bounding spheres intersect."""
+    stamps_ns = np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)])
+    boxes = np.concatenate([np.zeros((0, 9)), *(t.boxes for t in tracks)])
+    owner = np.repeat(np.arange(len(tracks)), [len(t.boxes) for t in tracks])
+    radius = np.linalg.norm(boxes[:, BOX_EXTENT], axis=1) / 2
+    order = np.argsort(stamps_ns, kind='stable')
+    found = [np.zeros((0, 2), np.int64)]
+    for rows in np.split(order, np.flatnonzero(np.diff(stamps_ns[order])) + 1):
+        centres = boxes[rows, X : Z + 1]
+        distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+        is_near = distance < radius[rows][:, None] + radius[rows]
+        i, j = np.nonzero(is_near & (owner[rows][:, None] < owner[rows]))
+        found.append(np.column_stack([rows[i], rows[j]]))
+    a, b = np.concatenate(found).T
+    return Pairs(np.column_stack([owner[a], owner[b]]), stamps_ns[a], boxes[a], boxes[b])

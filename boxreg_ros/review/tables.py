@@ -1,0 +1,101 @@
+"""``tracks.csv``, one row per track, and ``review.csv``, what a person should look at first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import csv
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from boxreg_ros.review.changes import median, TrackChanges
+from boxreg_ros.review.risk import assess, reasons_of, Risk
+from boxreg_ros.structures import BOX_EXTENT, INTERPOLATED, KEPT, REFINED
+import numpy as np
+
+TRACKS = 'tracks.csv'
+REVIEW = 'review.csv'
+
+
+class TrackRow(NamedTuple):
+    """What a row of ``tracks.csv`` is made of: the track, and its risk."""
+
+    track: TrackChanges
+    risk: Risk
+
+
+def _count(status: str) -> Callable[[TrackRow], int]:
+    return lambda row: int((row.track.status == status).sum())
+
+
+def _extent(axis: int) -> Callable[[TrackRow], float]:
+    return lambda row: median(row.track.boxes[:, BOX_EXTENT][:, axis])
+
+
+TRACK_COLUMNS: Mapping[str, Callable[[TrackRow], Any]] = {
+    'track_id': lambda row: row.track.track_id,
+    'class_name': lambda row: row.track.class_name,
+    'boxes': lambda row: int((row.track.status != INTERPOLATED).sum()),
+    'refined': _count(REFINED),
+    'kept': _count(KEPT),
+    'risk_m': lambda row: row.risk.track,
+    'interpolated': _count(INTERPOLATED),
+    'first_stamp_ns': lambda row: int(row.track.stamps_ns[0]),
+    'last_stamp_ns': lambda row: int(row.track.stamps_ns[-1]),
+    'median_points': lambda row: median(row.track.num_points),
+    'flips': lambda row: int(row.track.is_flipped.sum()),
+    'length': _extent(0),
+    'width': _extent(1),
+    'height': _extent(2),
+    'reasons': lambda row: reasons_of(row.track, row.risk),
+}
+"""Columns of ``tracks.csv`` in their order: name, and how the cell follows from a row."""
+REVIEW_COLUMNS = ('rank', 'track_id', 'class_name', 'stamp_ns', 'risk_m', 'reasons')
+
+
+def assessed(tracks: Sequence[TrackChanges]) -> list[TrackRow]:
+    """Return the rows of all tracks, largest risk first, ties by track id."""
+    rows = [TrackRow(track, assess(track)) for track in tracks]
+    return sorted(rows, key=lambda row: (-row.risk.track, row.track.track_id))
+
+
+def write_tables(folder: Path, rows: Sequence[TrackRow]) -> None:
+    """
+    Write ``tracks.csv`` and ``review.csv`` into a folder of results.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    rows : sequence of TrackRow
+        As `assessed` returns them.
+
+    """
+    _write(
+        folder / TRACKS,
+        list(TRACK_COLUMNS),
+        [[cell(row) for cell in TRACK_COLUMNS.values()] for row in rows],
+    )
+    _write(folder / REVIEW, REVIEW_COLUMNS, [_review_row(i, row) for i, row in enumerate(rows, 1)])
+
+
+def _review_row(rank: int, row: TrackRow) -> list[Any]:
+    """Return the cells of ``review.csv``; the stamp is that of the riskiest box."""
+    track = row.track
+    worst = int(np.argmax(row.risk.boxes))
+    stamp_ns = int(track.stamps_ns[worst])
+    reasons = reasons_of(track, row.risk)
+    return [rank, track.track_id, track.class_name, stamp_ns, row.risk.track, reasons]
+
+
+def _write(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Write a table; metres have three decimals, numbers that are not finite are empty cells."""
+    with path.open('w', newline='', encoding='utf-8', errors='backslashreplace') as file:
+        table = csv.writer(file, lineterminator='\n')
+        table.writerow(header)
+        table.writerows([_cell(value) for value in row] for row in rows)
+
+
+def _cell(value: Any) -> Any:
+    if not isinstance(value, float):
+        return value
+    return f'{value:.3f}' if np.isfinite(value) else ''

@@ -1,0 +1,79 @@
+"""`boxreg check` and the consistency of `boxreg evaluate`, from the command line."""
+
+import json
+from pathlib import Path
+
+from boxreg_ros.cli import main
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.covariance_table import CovarianceWriter, read_covariances
+from boxreg_ros.structures import BoxArray, RefinedBoxes
+import numpy as np
+import pytest
+
+BAGS = Path(__file__).parents[2] / 'bags'
+
+
+def flipped_table(path):
+    """Write labels of one track with one flipped heading."""
+    boxes = np.tile([0.0, 0.0, 0.75, 4.5, 1.8, 1.5, 0.0, 0.0, 0.0], (10, 1))
+    boxes[:, 0] = np.arange(10)
+    boxes[5, 8] = np.pi
+    arrays = [
+        BoxArray(i * 10**8, 'odom', ('7',), ('car',), np.ones(1), boxes[i : i + 1])
+        for i in range(10)
+    ]
+    BoxTable.from_arrays(arrays).write(path)
+
+
+def test_check_prints_violations_and_fails_with_strict_only(tmp_path, capsys):
+    path = tmp_path / 'boxes.csv'
+    flipped_table(path)
+    assert main(['check', str(path)]) == 0
+    assert 'track 7 at 500000000: turns by 180 degrees' in capsys.readouterr().out
+    assert main(['check', str(path), '--strict', '--json']) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report['boxes'] == 10
+    assert len(report['rules']['spin']['violations']) == 1
+    assert report['rules']['jump']['violations'] == []
+
+
+def test_check_reads_recordings_and_refuses_what_it_cannot_read(tmp_path, capsys):
+    assert main(['check', str(BAGS / 'street.mcap')]) == 0
+    assert 'spin' in capsys.readouterr().out
+    assert main(['check', str(tmp_path / 'labels')]) == 2
+    assert 'FORMAT:PATH' in capsys.readouterr().err
+
+
+def refined_with(errors, deviation):
+    """Return refined boxes of one stamp each, with an error along x, and their truth."""
+    count = len(errors)
+    truth = np.tile([0.0, 0.0, 0.75, 4.5, 1.8, 1.5, 0.0, 0.0, 0.0], (count, 1))
+    boxes = truth.copy()
+    boxes[:, 0] += errors
+    names = tuple(map(str, range(count)))
+    array = BoxArray(0, 'odom', names, ('car',) * count, np.ones(count), boxes)
+    covariances = np.tile(deviation**2 * np.eye(6), (count, 1, 1))
+    columns = ('refined',) * count, ('',) * count, np.ones(count, int), covariances
+    refined = RefinedBoxes(array, *columns)
+    true = BoxArray(0, 'odom', names, ('car',) * count, np.ones(count), truth)
+    return refined, BoxTable.from_arrays([true])
+
+
+def test_evaluate_prints_coverage_and_nees(tmp_path, capsys):
+    refined, truth = refined_with(np.array([0.1, -0.1, 0.1, 0.5]), 0.1)
+    truth.write(tmp_path / 'truth.csv')
+    BoxTable.from_arrays([refined.boxes]).write(tmp_path / 'boxes.csv')
+    writer = CovarianceWriter(tmp_path / 'covariances.csv')
+    writer.write(refined, np.eye(4))
+    writer.close()
+    known = read_covariances(tmp_path / 'covariances.csv')[0, '3']
+    np.testing.assert_allclose(known.pose, 0.01 * np.eye(6))
+    assert known.range == pytest.approx(0.5)
+    paths = [str(tmp_path / name) for name in ('boxes.csv', 'truth.csv')]
+    assert main(['evaluate', *paths, '--json']) == 0
+    found = json.loads(capsys.readouterr().out)['consistency']
+    assert found['all']['coverage']['along'] == 0.75
+    assert found['all']['nees']['along'] == pytest.approx((3 + 25) / 4)
+    assert found['car']['boxes'] == found['0-20 m']['boxes'] == 4
+    assert main(['evaluate', *paths]) == 0
+    assert 'part of the errors within 2 sigma' in capsys.readouterr().out

@@ -1,0 +1,90 @@
+"""Rules on labels with one known fault each."""
+
+from boxreg_ros.config import Config
+from boxreg_ros.review.rules import counts, RULES, violations
+from boxreg_ros.review.rules.protocol import ERROR, LabelTrack, WARNING
+import numpy as np
+import pytest
+
+N = 30
+STAMPS = np.arange(N, dtype=np.int64) * 10**8
+
+
+def track(name='1', y=0.0, class_name='car', points=100, n=N):
+    """Return a car that drives straight along x at 10 m/s."""
+    boxes = np.tile([0.0, y, 0.75, 4.5, 1.8, 1.5, 0.0, 0.0, 0.0], (n, 1))
+    boxes[:, 0] = np.arange(n)
+    numbers = np.full(n, points)
+    return LabelTrack.of(name, class_name, Config(), STAMPS[:n], boxes, numbers)
+
+
+def changed(rows, column, value, **kwargs):
+    """Return that track with some values changed."""
+    found = track(**kwargs)
+    found.boxes[rows, column] += value
+    return found
+
+
+def test_good_labels_violate_no_rule():
+    good = [track(str(i), y=4.0 * i) for i in range(5)]
+    assert violations(good) == {}
+    assert counts(good) == dict.fromkeys(RULES, 0)
+    assert counts([]) == dict.fromkeys(RULES, 0)
+
+
+def sideways():
+    found = track()
+    found.boxes[:, 1] = found.boxes[:, 0]
+    return found
+
+
+def backward():
+    found = track()
+    found.boxes[:, 8] = np.pi
+    return found
+
+
+def twice():
+    found = track()
+    found.stamps_ns[1:] = found.stamps_ns[:-1].copy()
+    return found
+
+
+ROAD = [track(str(i), y=3.0 * i) for i in range(4)]
+
+FAULTS = {
+    'size-outside-class': ([changed(slice(None), 3, 30.0)], 0),
+    'size-changes': ([changed(7, 3, 1.0)], 7),
+    'jump': ([changed(8, 1, 2.0)], 8),
+    'spin': ([changed(9, 8, np.pi)], 9),
+    'sliding': ([sideways()], None),
+    'floating': ([*ROAD, changed(5, 2, 2.0, name='f', y=-3.0)], 5),
+    'overlap': ([track('a'), track('b', y=1.0)], None),
+    'duplicate': ([track('a'), track('b', y=0.1)], 0),
+    'few-points': ([track(points=2)], 0),
+    'backward': ([backward()], 0),
+    'ends-in-view': ([track('a'), track('b', y=9.0, n=10)], 9),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', RULES)
+def test_each_rule_finds_its_fault_at_its_stamp(name):
+    tracks, row = FAULTS[name]
+    found = violations(tracks)
+    assert name in found
+    if row is not None:
+        assert found[name][0].stamp_ns == STAMPS[row]
+    assert RULES[name].severity in (ERROR, WARNING)
+    assert RULES[name].id == name
+
+
+def test_an_id_that_occurs_twice_at_a_stamp_is_a_duplicate():
+    (first,) = violations([twice()])['duplicate']
+    assert 'occurs twice' in first.text
+
+
+def test_invalid_boxes_are_left_out():
+    boxes = np.full((3, 9), np.nan)
+    empty = LabelTrack.of('1', 'car', Config(), STAMPS[:3], boxes, np.zeros(3, int))
+    assert len(empty.boxes) == 0
+    assert violations([empty]) == {}
