@@ -392,7 +392,7 @@ def test_results_are_written_to_their_array_by_ticket(tmp_path, monkeypatch):
             return [*held, *super().flush()][::-1]
 
     held = []
-    monkeypatch.setattr('boxreg_ros.offline.relabel.BoxRegistrar', ReversingRegistrar)
+    monkeypatch.setattr('boxreg_ros.core.registrar.BoxRegistrar', ReversingRegistrar)
     assert run(path, tmp_path / 'out')[1] == expected
 
 
