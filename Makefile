@@ -36,8 +36,8 @@ SHARED := -n $(WORKERS) --dist worksteal
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
 
-demo: $(runtime) ## set up, refine the sample recording, print accuracy before and after
-	$(BIN)/boxreg relabel bags/street.mcap -o out/demo --report
+demo: $(runtime) ## set up, refine the sample recording and complete its tracks, print accuracy before and after
+	$(BIN)/boxreg relabel bags/street.mcap -o out/demo --complete --report
 	@echo; echo 'Before:'
 	$(BIN)/boxreg evaluate bags/street.mcap bags/street_truth.csv
 	@echo; echo 'After:'
@@ -77,11 +77,11 @@ $(runtime): constraints.txt setup.py package.xml
 	@echo 'Setting up $(VENV): the first time takes some minutes'
 	[ "$$($(BIN)/python -V 2>&1)" = 'Python $(version)' ] || $(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip $(QUIET) -c constraints.txt setuptools
-	$(INSTALL) -e '.[ros,report]'
+	$(INSTALL) -e '.[ros,report,tracking]'
 	@touch $@
 
 $(tests): $(runtime) $(shell find test/interfaces test/build_interfaces.py -type f)
-	$(INSTALL) -e '.[ros,report,bench,test,interfaces]'
+	$(INSTALL) -e '.[ros,report,tracking,bench,test,interfaces]'
 	$(BIN)/python test/build_interfaces.py
 	@touch $@
 

@@ -32,6 +32,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.11',
     install_requires=[
+        'lz4>=4',
         'mcap>=1.6,<2',
         'numba>=0.59',
         'numpy>=1.26,<3',
@@ -41,6 +42,7 @@ setup(
         'scipy>=1.11',
         'torch>=2.3',
         'tqdm>=4.60',
+        'zstandard>=0.21',
     ],
     extras_require={
         # A baseline of `boxreg bench`, and its figures.
@@ -51,6 +53,8 @@ setup(
         'foxglove': ['mcap-protobuf-support'],
         # The page of `boxreg relabel --report` and `boxreg review`.
         'report': ['jinja2', 'plotly>=6'],
+        # HOTA and IDF1 of `boxreg evaluate`.
+        'tracking': ['trackeval>=1.3,<2'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -86,6 +90,7 @@ setup(
             'ruff',
             'shapely',
             'small-gicp',
+            'trackeval>=1.3,<2',
         ],
         # What test/build_interfaces.py builds message types with.
         'interfaces': [

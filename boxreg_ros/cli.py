@@ -32,6 +32,10 @@ COMMANDS = {
     'relabel': Command(
         'offline.relabel_command', 'refine the boxes of recordings and write label files'
     ),
+    'inspect': Command(
+        'offline.inspect', 'show what is in a recording, and the relabel command to run'
+    ),
+    'batch': Command('offline.batch', 'relabel many recordings with several workers'),
     'convert': Command('offline.convert', 'convert label files to other formats'),
     'formats': Command('offline.formats', 'list the label formats and their conventions'),
     'review': Command('review.server', 'look at a result in the browser, decide and correct'),

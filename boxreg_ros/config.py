@@ -37,6 +37,8 @@ NODE_OPTIONS = (
 """Parameters of the node that a parameter file of ROS may contain in addition to `Config`."""
 
 
+COMPLETE_STEPS = ('stitch', 'static', 'prune', 'fill', 'extend')
+"""Switches of `CompleteConfig`, in the order of execution."""
 DEFAULT_LAG = 9
 """The whole default window. It may exceed a shorter window, which then limits it."""
 
@@ -228,6 +230,32 @@ class ClassConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class CompleteConfig:
+    """Steps from tracks to whole tracks of recordings; `boxreg relabel --complete` sets all."""
+
+    stitch: bool = setting(False, 'join fragments of one object')
+    static: bool = setting(False, 'join parked tracks that are one object with pauses')
+    prune: bool = setting(False, 'reject ghosts and duplicates')
+    fill: bool = setting(False, 'add missing boxes between two boxes of a track')
+    extend: bool = setting(False, 'add boxes before and after a track while points support them')
+    stitch_gap: float = setting(
+        2.0, 'longest time between two fragments of one object', 's', 0.0, 1e3
+    )
+    fill_gap: float = setting(2.0, 'longest gap of a moving object that is filled', 's', 0.0, 1e3)
+    extend_time: float = setting(
+        1.0, 'longest extension of a moving object at each end', 's', 0.0, 1e3
+    )
+    extend_parked: float = setting(
+        4.0, 'longest extension of a parked object at each end', 's', 0.0, 1e3
+    )
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """Return the names of the steps that are on, in the order of their execution."""
+        return tuple(name for name in COMPLETE_STEPS if getattr(self, name))
+
+
+@dataclass(frozen=True, slots=True)
 class Ingredients:
     """
     Parts of the method that `boxreg bench ablation` switches off, one at a time.
@@ -317,6 +345,7 @@ class Config:
     faces: FaceConfig = FaceConfig()
     solver: SolverConfig = SolverConfig()
     paper: PaperConfig = PaperConfig()
+    complete: CompleteConfig = CompleteConfig()
     ingredients: Ingredients = Ingredients()
     vehicle: ClassConfig = ClassConfig(
         names=('car', 'van', 'truck', 'bus', 'vehicle', 'trailer', 'suv', 'pickup', 'tram')

@@ -134,6 +134,8 @@ REASONS = {
     'no_gain': Reason(
         'box', 'the refined box contains far fewer of the points than the input box does'
     ),
+    'ghost': Reason('box', 'rejected: its track is short, without consistent points or motion'),
+    'duplicate': Reason('box', 'rejected: overlaps the boxes of a track with more evidence'),
     'short_track': Reason('box', 'its window has fewer than `min_observations` observations'),
 }
 """By counter, most important first. Each `kept` box and each unused cloud has one reason."""

@@ -25,7 +25,10 @@ POSE = [X, Y, Z, ROLL, PITCH, YAW]
 BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
 """Columns of the extents of a box."""
 
-REFINED, KEPT, INTERPOLATED = 'refined', 'kept', 'interpolated'
+REFINED, KEPT = 'refined', 'kept'
+INTERPOLATED, EXTENDED, REJECTED = 'interpolated', 'extended', 'rejected'
+ADDED = (INTERPOLATED, EXTENDED)
+"""Status of boxes that the input does not have."""
 HUMAN = 'human'
 """Status of a box that a person has corrected and pinned."""
 
@@ -164,10 +167,11 @@ class RefinedBoxes:
     boxes : BoxArray
         Refined boxes, otherwise as in the input: stamp, frame, ids, scores and ticket.
     status : tuple of n str
-        ``refined``, ``kept`` (the input box is returned unchanged), ``interpolated`` or ``human``
-        (a pinned box).
+        ``refined``, ``kept`` (the input box is returned unchanged), ``rejected`` (likewise, and
+        no object), ``interpolated`` or ``extended`` (the input has no such box), or ``human`` (a
+        pinned box).
     reasons : tuple of n str
-        Why a box was kept; empty for the others.
+        Why a box was kept or rejected; empty for the others.
     num_points : array, shape (n,)
         Sweep points inside the input box.
     covariances : array, shape (n, 6, 6)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 INTERFACES = Path(__file__).resolve().parent / 'interfaces'
@@ -311,11 +311,14 @@ ITEMS = {
 }
 
 
-def write_recording(path, items, storage='mcap', messages=None):
+def write_recording(
+    path, items, storage='mcap', messages=None, compression=None, chunk_bytes=None
+):
     """
     Write (topic, received_ns, message) as a recording and return its path.
 
     `storage` is ``mcap`` (one file), ``mcap-folder``, ``sqlite3`` (a folder) or ``rosbag1``.
+    rosbag2 folders may have a `compression` by zstd, ROS 1 bags chunks of another size.
 
     """
     path = Path(path)
@@ -323,9 +326,12 @@ def write_recording(path, items, storage='mcap', messages=None):
     if storage == 'rosbag1':
         path = path.with_suffix('.bag')
         writer = Writer1(path)
+        writer.chunk_threshold = chunk_bytes or writer.chunk_threshold
     else:
         plugin = StoragePlugin.SQLITE3 if storage == 'sqlite3' else StoragePlugin.MCAP
         writer = Writer(path, version=9, storage_plugin=plugin)
+        if compression is not None:
+            writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         connections = {}
         for topic, received_ns, message in items:

@@ -2,11 +2,19 @@
 
 from boxreg_ros.core import batch, terms
 from boxreg_ros.core.arrowhead import LINK
-from boxreg_ros.core.batch import CLASS_NUMBERS, PRIOR_SIZE, Problem, SHARED, State
+from boxreg_ros.core.batch import (
+    CLASS_NUMBERS,
+    PADDING_POSITION,
+    PRIOR_SIZE,
+    Problem,
+    Returns,
+    SHARED,
+    State,
+)
 from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.refine import Track
-from boxreg_ros.core.window import PADDING_POSITION, Window
+from boxreg_ros.core.window import Window
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -119,9 +127,6 @@ def problem_of(boxes, **changes):
         'start': boxes,
         'valid': torch.ones(B, N, dtype=torch.bool),
         'times': 0.1 * torch.arange(N, dtype=torch.float64).expand(B, N),
-        'points': points,
-        'mask': points[..., 0] != PADDING_POSITION,
-        'delays': torch.zeros(points.shape[:3], dtype=torch.float64),
         'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
         'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
         'prior_mean': torch.zeros(B, PRIOR_SIZE, dtype=torch.float64),
@@ -132,14 +137,23 @@ def problem_of(boxes, **changes):
     }
     for name, values in changes.pop('class_numbers', {}).items():
         given['class_numbers'][:, CLASS_NUMBERS.index(name)] = torch.as_tensor(values)
+    mask = torch.as_tensor(changes.pop('mask', points[..., 0] != PADDING_POSITION))
+    delays = torch.as_tensor(changes.pop('delays', torch.zeros(mask.shape, dtype=torch.float64)))
     more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
-    problem = Problem(**{**given, **more})
-    # Padding comes last.
-    order = (~problem.mask).to(torch.int8).argsort(dim=2, stable=True)
-    points = problem.points.gather(2, order[..., None].expand(-1, -1, -1, 3))
-    mask = problem.mask.gather(2, order)
-    points[~mask] = PADDING_POSITION
-    return problem._replace(points=points, mask=mask, delays=problem.delays.gather(2, order))
+    return Problem(**{**given, **more, **returns_of(points, mask, delays)})
+
+
+def returns_of(points, mask, delays=None):
+    """Return the fields of a `Problem` for padded points (B, N, M, 3) with a mask (B, N, M)."""
+    delays = torch.zeros(mask.shape, dtype=torch.float64) if delays is None else delays
+    counts = mask.sum(-1)
+    delays = delays[mask]
+    returns = Returns(points[mask], delays, bool(delays.any()), max(1, int(counts.max())))
+    return {
+        'returns': returns,
+        'first': counts.flatten().cumsum(0).view(counts.shape) - counts,
+        'counts': counts,
+    }
 
 
 def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):

@@ -17,6 +17,7 @@ class Measurement(NamedTuple):
 MEASUREMENTS = {
     'paper': Measurement('paper', "the paper's experiment: its Table I and two figures"),
     'real': Measurement('accuracy', 'accuracy on recordings with known truth'),
+    'tracks': Measurement('tracks', 'broken tracks before and after each completing step'),
     'ablation': Measurement('ablation', 'accuracy without each ingredient of the method'),
     'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),
     'review': Measurement('review', 'how early the review list shows the bad tracks'),

@@ -9,7 +9,7 @@ docs/decisions/arrowhead-curvature.md.
 
 from typing import NamedTuple
 
-from boxreg_ros.core.kernels import compiled
+from boxreg_ros.core.kernels import compiled, run
 import numpy as np
 import torch
 from torch import Tensor
@@ -221,7 +221,10 @@ class BandedFactor(NamedTuple):
         kernels = compiled(b)
         assert kernels is not None
         arrays = (part.numpy() for part in self)
-        kernels.arrowhead.solve_rows(rows.numpy(), *arrays, np.ascontiguousarray(b.numpy()), x)
+        run(
+            kernels.arrowhead.solve_rows, len(b), rows.numpy(), *arrays,
+            np.ascontiguousarray(b.numpy()), x,
+        )  # fmt: skip
         return torch.from_numpy(x)
 
     def inverse_of_links(self, length: int) -> Tensor:
@@ -231,7 +234,7 @@ class BandedFactor(NamedTuple):
         kernels = compiled(self.band)
         assert kernels is not None
         arrays = (np.ascontiguousarray(part.numpy()) for part in self)
-        kernels.arrowhead.invert_rows(np.arange(B), *arrays, blocks, np.empty((B, S, S)))
+        run(kernels.arrowhead.invert_windows, B, *arrays, blocks, np.empty((B, S, S)))
         return torch.from_numpy(blocks)
 
 

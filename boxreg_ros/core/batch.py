@@ -6,17 +6,22 @@ numbers each and the shared variables s, the same for all observations, see `Sta
 
 """
 
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
+from operator import attrgetter
 from typing import NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.arrowhead import LINK
+from boxreg_ros.core.kernels import contiguous
+from boxreg_ros.core.kernels.arrays import WindowArrays
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor
 
 CLASS_NUMBERS = [item.name for item in fields(ClassConfig)[1:]]
 """Names of the columns of `Problem.class_numbers`."""
+numbers_of = attrgetter(*CLASS_NUMBERS)
+"""Returns the numbers of a `ClassConfig`, in this order."""
 POSE_ERRORS = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
 """The settings of `ClassConfig` that are the deviations of an input pose: x y z roll pitch yaw."""
 
@@ -28,9 +33,55 @@ GAP = slice(9, 15)
 PIVOT = 15
 ANCHOR = slice(16, 22)
 
+PADDING_POSITION = 1e6
+"""Coordinate of padding points [m]; derived: near no box, and finite in float32."""
+
 PRIOR_POSES = 2
 """Poses that the marginalisation prior refers to: no residual spans more than three poses."""
 PRIOR_SIZE = PRIOR_POSES * LINK + SHARED
+
+
+@dataclass(frozen=True, slots=True)
+class Returns:
+    """
+    The returns of all observations of a batch, one observation after the other.
+
+    Attributes
+    ----------
+    points : Tensor, shape (P, 3)
+        Returns minus the centre of their input box [m].
+    delays : Tensor, shape (P,)
+        Their measurement times relative to the stamp of their box [s].
+    is_moving : bool
+        Whether any delay is not zero.
+    width : int
+        Most returns of an observation, at least 1: M.
+    stride : int
+        Every n-th return of an observation is used.
+
+    """
+
+    points: Tensor
+    delays: Tensor
+    is_moving: bool
+    width: int
+    stride: int = 1
+
+    def padded(self, first: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """
+        Return points (B, N, M, 3), which are valid (B, N, M), and delays (B, N, M).
+
+        `first` and `counts` (B, N) as in `Problem`. Padding comes last, at `PADDING_POSITION`.
+
+        """
+        place = torch.arange(self.width, device=counts.device)
+        mask = place < counts[..., None]
+        index = (first[..., None] + self.stride * place)[mask]
+        points = self.points.new_full((*mask.shape, 3), PADDING_POSITION)
+        points[mask] = self.points[index]
+        delays = self.delays.new_zeros(mask.shape)
+        delays[mask] = self.delays[index]
+        return points, mask, delays
 
 
 class Problem(NamedTuple):
@@ -47,11 +98,10 @@ class Problem(NamedTuple):
         True for observations, False for padding.
     times : Tensor, shape (B, N)
         Time since the first observation, increasing over the padding too [s].
-    points, mask : Tensor, shapes (B, N, M, 3) and (B, N, M)
-        Returns minus the centre of their input box [m]; True for returns. Padding comes last, and
-        is very far away.
-    delays : Tensor, shape (B, N, M)
-        Measurement time of each return, relative to the stamp of its box [s].
+    returns : Returns
+        The returns of all observations.
+    first, counts : Tensor, shape (B, N)
+        First of the returns of each observation, and their number.
     origins : Tensor, shape (B, N, 3)
         Sensor minus the centre of the input box [m]; NaN if unknown.
     ground : Tensor, shape (B, N)
@@ -72,9 +122,9 @@ class Problem(NamedTuple):
     start: Tensor
     valid: Tensor
     times: Tensor
-    points: Tensor
-    mask: Tensor
-    delays: Tensor
+    returns: Returns
+    first: Tensor
+    counts: Tensor
     origins: Tensor
     ground: Tensor
     prior_mean: Tensor
@@ -93,15 +143,47 @@ class Problem(NamedTuple):
         """Observations per window, padding included: N."""
         return self.boxes.shape[1]
 
+    def padded(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return points (B, N, M, 3), which are valid (B, N, M), and delays, see `Returns`."""
+        return self.returns.padded(self.first, self.counts)
+
+    @property
+    def points(self) -> Tensor:
+        """Returns minus the centre of their input box, padded, shape (B, N, M, 3) [m]."""
+        return self.padded()[0]
+
+    @property
+    def mask(self) -> Tensor:
+        """Which of the padded `points` are returns, shape (B, N, M)."""
+        return self.padded()[1]
+
     def of_class(self, *names: str) -> Tensor:
         """Return the settings `names` of the class of each window, shape (B, number of names)."""
         return self.class_numbers[:, [CLASS_NUMBERS.index(name) for name in names]]
 
+    def arrays(self) -> WindowArrays:
+        """Return the windows for the kernels, which take no padding."""
+        return WindowArrays(
+            contiguous(self.boxes),
+            contiguous(self.valid.sum(1)),
+            contiguous(self.times),
+            contiguous(self.origins),
+            contiguous(self.ground),
+            contiguous(self.returns.points),
+            contiguous(self.returns.delays),
+            contiguous(self.first),
+            contiguous(self.counts),
+            self.returns.stride,
+        )
+
     def thinned(self, points: float) -> 'Problem':
         """Return the problem with every n-th point: at least `points` per box, if there are."""
-        stride = max(1, int(self.points.shape[2] // points))
-        names = ('points', 'mask', 'delays')
-        return self._replace(**{name: getattr(self, name)[:, :, ::stride] for name in names})
+        returns = self.returns
+        stride = max(1, int(returns.width // points))
+        width = -(-returns.width // stride)
+        counts = -(-self.counts // stride)
+        returns = replace(returns, width=width, stride=stride * returns.stride)
+        return self._replace(returns=returns, counts=counts)
 
 
 class State(NamedTuple):

@@ -12,7 +12,8 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, GAP, Problem, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
-from boxreg_ros.core.kernels import compiled
+from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels.arrays import FaceArrays, FaceNumbers
 import numpy as np
 import torch
 from torch import Tensor
@@ -122,8 +123,9 @@ def visibility(problem: Problem) -> Tensor:
     toward = problem.origins
     is_known = toward.isfinite().all(-1, keepdim=True)
     if not is_known.all():
-        weight = problem.mask.to(problem.points)[..., None]
-        mean = (problem.points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
+        points, mask, _ = problem.padded()
+        weight = mask.to(points)[..., None]
+        mean = (points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
         toward = torch.where(is_known, toward, 1e6 * mean)
     toward = (toward[..., None, :] @ R)[..., 0, :]
     half = problem.boxes[..., 3:6] / 2
@@ -183,6 +185,60 @@ def observe_faces(
     of their box.
 
     """
+    observe = observe_faces_torch
+    if compiled(problem.boxes) is not None:
+        observe = observe_faces_compiled
+    return observe(problem, state, offsets, config)
+
+
+def observe_faces_compiled(
+    problem: Problem, state: State, offsets: FaceOffsets, config: Config
+) -> FaceObservations:
+    """Return the same as `observe_faces`, by the kernel."""
+    kernels = compiled(problem.boxes)
+    assert kernels is not None
+    B, N = problem.valid.shape
+    faces = FaceArrays(
+        moments=np.empty((B, N, 6, 4, 4)),
+        distance=np.empty((B, N, 6)),
+        weight=np.empty((B, N, 6)),
+        inset=np.empty((B, N, 6)),
+        inset_shares=np.empty((2, B, N, 6)),
+        num_points=np.empty((B, N)),
+    )
+    ingredients = config.ingredients
+    strips = STRIPS if ingredients.strips else 1
+    numbers = FaceNumbers(
+        outside_margin=OUTSIDE_MARGIN,
+        edge_margin=EDGE_MARGIN,
+        max_depth=MAX_DEPTH,
+        deepest=OUTSIDE_MARGIN + INSIDE_EXTRA,
+        min_points=float(MIN_FACE_POINTS),
+        share=config.faces.outermost / strips,
+        strips=strips,
+        strip_axis=STRIP_AXIS,
+        occluded_weight=OCCLUDED_FACE_WEIGHT if ingredients.occluded_faces else 0.0,
+        softness=VISIBILITY_SOFTNESS,
+        edge_lead=EDGE_LEAD,
+        near_range=NEAR_RANGE,
+        range_span=RANGE_SPAN,
+        max_range_share=MAX_RANGE_SHARE if ingredients.range_inset else 0.0,
+        range_half_weight=RANGE_INSET_HALF_WEIGHT,
+        min_along=MIN_ALONG,
+        is_moving=problem.returns.is_moving,
+    )
+    run(
+        kernels.face_support.observe_faces, B, problem.arrays(), contiguous(state.pose),
+        contiguous(state.shared), contiguous(offsets.occlusion_inset),
+        contiguous(offsets.range_inset), numbers, faces,
+    )  # fmt: skip
+    return FaceObservations(*(torch.from_numpy(part) for part in faces))
+
+
+def observe_faces_torch(
+    problem: Problem, state: State, offsets: FaceOffsets, config: Config
+) -> FaceObservations:
+    """Return the same as `observe_faces`, by torch."""
     points = motion_compensated(problem, state)
     tangent = visibility(problem)
     shares = inset_shares(problem, tangent, config)
@@ -194,10 +250,8 @@ def observe_faces(
     weight[..., BOTTOM] = (problem.ground.isfinite() & problem.valid).to(weight)
     strips = STRIPS if config.ingredients.strips else 1
     search = Search(points, inset, weight, config.faces.outermost / strips, strips)
-    find = outermost_points
-    if compiled(points) is not None:
-        find = outermost_points_compiled
-    moments, distance, weight, num_points = find(problem, state, search)
+    found = outermost_points(problem, state, search)
+    moments, distance, weight, num_points = found
     return FaceObservations(moments, distance, weight, inset, shares, num_points)
 
 
@@ -227,34 +281,6 @@ class Search(NamedTuple):
 
 
 Found = tuple[Tensor, Tensor, Tensor, Tensor]
-
-
-def outermost_points_compiled(problem: Problem, state: State, search: Search) -> Found:
-    """Return the same as `outermost_points`, by the kernel."""
-    kernels = compiled(search.points)
-    assert kernels is not None
-    B, N = problem.valid.shape
-    counts = problem.mask.sum(-1).numpy()  # valid points come first
-    moments = np.empty((B, N, 6, 4, 4))
-    distance = np.empty((B, N, 6))
-    weight = np.empty((B, N, 6))
-    near = np.empty((B, N))
-    inputs = (
-        state.pose, problem.pose, state.shared[:, EXTENT], state.shared[:, GAP], search.inset,
-        search.weight, problem.ground, search.points,
-    )  # fmt: skip
-    deepest = OUTSIDE_MARGIN + INSIDE_EXTRA
-    limits = OUTSIDE_MARGIN, EDGE_MARGIN, MAX_DEPTH, deepest, float(MIN_FACE_POINTS)
-    kernels.face_support.observe_faces(
-        *(np.ascontiguousarray(tensor.numpy()) for tensor in inputs), counts, search.share,
-        STRIP_AXIS, search.strips, limits, moments, distance, weight, near,
-    )  # fmt: skip
-    return (
-        torch.from_numpy(moments),
-        torch.from_numpy(distance),
-        torch.from_numpy(weight),
-        torch.from_numpy(near),
-    )
 
 
 def outermost_points(problem: Problem, state: State, search: Search) -> Found:
@@ -388,10 +414,11 @@ def motion_compensated(problem: Problem, state: State) -> Tensor:
     none.
 
     """
-    if not bool(problem.delays.any()):
-        return problem.points
+    points, _, delays = problem.padded()
+    if not problem.returns.is_moving:
+        return points
     position_and_time = torch.cat([state.pose[..., :3], problem.times[..., None]], -1)
     steps = position_and_time.diff(dim=1) * problem.valid[:, 1:, None]  # padding has none
     change = pad(steps, (0, 0, 1, 0)) + pad(steps, (0, 0, 0, 1))
     velocity = change[..., :3] / change[..., 3:].clamp(min=1e-9)
-    return problem.points - velocity[..., None, :].to(problem.points) * problem.delays[..., None]
+    return points - velocity[..., None, :].to(points) * delays[..., None]

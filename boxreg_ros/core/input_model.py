@@ -184,7 +184,7 @@ def input_residuals(problem: Problem, state: State) -> Tensor:
     residuals = torch.cat([along, difference[..., 3:], extent], -1)
     # The first box is compared with the last one: a track that is held throughout is left out.
     change = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1)
-    is_new = problem.mask.any(-1) & ~(change < REPEATED_BOX_TOLERANCE)
+    is_new = (problem.counts > 0) & ~(change < REPEATED_BOX_TOLERANCE)
     return torch.where(is_new[..., None], residuals, torch.nan)
 
 

@@ -4,6 +4,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.kernels import load
+from boxreg_ros.core.kernels.arrays import CropNumbers
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints, ROLL, Sweep
 import numpy as np
@@ -111,28 +113,16 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     """
     n = len(boxes)
     centers = boxes[:, :3]
-    half = boxes[:, 3:6] / 2
-    near = crop(sweep.points, boxes, max(ROAD_SEARCH_WIDTH, config.sampling.margin))
-    depth = near.outside.max(0)  # of the face the point is least inside of, (P,)
-    up = matrix_from_rpy(boxes[:, ROLL:])[:, :, 2]
-    # Above the bottom of the box, along its z axis: also valid on a slope. (P,)
-    height = (near.offset * up.T.take(near.owner, 1)).sum(0) + half[:, 2].take(near.owner)
-    road = np.full(n, np.nan)
-    if config.ingredients.road:
-        road = _road_heights(near, height, depth, half)
-
-    is_own = depth < config.sampling.margin
-    if config.ingredients.point_ownership:
-        is_own &= depth <= _least_depth(near, depth, len(sweep.points)) + OWNERSHIP_TOLERANCE
-    is_own &= height > (np.nan_to_num(road) + GROUND_CLEARANCE).take(near.owner)
-    rows, owner = _sampled(near, np.flatnonzero(is_own), sweep, n, config)
+    find = own_points if load() is not None else own_points_numpy
+    own = find(sweep, boxes, config)
+    rows, owner = _sampled(own, sweep, n, config)
 
     points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
     delays = np.zeros(len(rows), np.float32)
     if config.sampling.deskew and sweep.times is not None:
         delays = sweep.times[rows].astype(np.float32)
-    ground = (road - half[:, 2]) / up[:, 2].clip(0.1)  # along z of the fixed frame
-    num_inside = np.bincount(near.owner.take(np.flatnonzero(depth <= 0)), minlength=n)
+    up = matrix_from_rpy(boxes[:, ROLL:])[:, 2, 2]
+    ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
     parts = _slices(owner, n)
     columns = zip(
         boxes,
@@ -140,17 +130,91 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
         [delays[part] for part in parts],
         sweep.origin - centers,
         ground.tolist(),
-        num_inside.tolist(),
+        own.num_inside.tolist(),
         strict=True,
     )
     return [Observation(stamp_ns, *values) for values in columns]
+
+
+class OwnPoints(NamedTuple):
+    """
+    The points that belong to each of n boxes, as P pairs, and the road beside them.
+
+    Attributes
+    ----------
+    row, owner : array, shape (P,)
+        Row of the point in its sweep, and of the box.
+    x : array, shape (P,)
+        Its x coordinate from the centre of the box [m].
+    road : array, shape (n,)
+        Height of the road above the bottom of each box, along its z axis [m]; NaN if unknown.
+    num_inside : array, shape (n,)
+        Sweep points inside each box.
+
+    """
+
+    row: Ints
+    owner: Ints
+    x: Floats
+    road: Floats
+    num_inside: Ints
+
+
+def own_points(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
+    """Return the points that belong to each box of `boxes` (n, 9), by the kernel."""
+    kernels = load()
+    assert kernels is not None
+    numbers = CropNumbers(
+        margin=max(ROAD_SEARCH_WIDTH, config.sampling.margin),
+        own_margin=config.sampling.margin,
+        ownership_tolerance=OWNERSHIP_TOLERANCE if config.ingredients.point_ownership else np.inf,
+        clearance=GROUND_CLEARANCE,
+        has_road=config.ingredients.road,
+        road_width=ROAD_SEARCH_WIDTH,
+        road_gap=ROAD_SIDE_GAP,
+        road_range=ROAD_HEIGHT_RANGE,
+        road_quantiles=ROAD_QUANTILES,
+        road_flatness=ROAD_FLATNESS,
+        min_road_points=MIN_ROAD_POINTS,
+    )
+    columns = np.ascontiguousarray(sweep.points.T)
+    return OwnPoints(*kernels.crop.own_points(columns, *_shapes(boxes, numbers.margin), numbers))
+
+
+def own_points_numpy(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
+    """Return the same as `own_points`, by numpy."""
+    n = len(boxes)
+    half = boxes[:, 3:6] / 2
+    near = crop_numpy(sweep.points, boxes, max(ROAD_SEARCH_WIDTH, config.sampling.margin))
+    depth = near.outside.max(0)  # of the face the point is least inside of, (P,)
+    up = matrix_from_rpy(boxes[:, ROLL:])[:, :, 2]
+    # Above the bottom of the box, along its z axis: also valid on a slope. (P,)
+    height = (near.offset * up.T.take(near.owner, 1)).sum(0) + half[:, 2].take(near.owner)
+    road = np.full(n, np.nan)
+    if config.ingredients.road:
+        road = _road_heights(near, height, depth, half)
+    is_own = depth < config.sampling.margin
+    if config.ingredients.point_ownership:
+        is_own &= depth <= _least_depth(near, depth, len(sweep.points)) + OWNERSHIP_TOLERANCE
+    is_own &= height > (np.nan_to_num(road) + GROUND_CLEARANCE).take(near.owner)
+    own = np.flatnonzero(is_own)
+    num_inside = np.bincount(near.owner.take(np.flatnonzero(depth <= 0)), minlength=n)
+    return OwnPoints(near.row[own], near.owner[own], near.offset[0, own], road, num_inside)
+
+
+def _shapes(boxes: Floats, margin: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return centres, rotations, half extents and half upright bounding boxes of `boxes`."""
+    R = matrix_from_rpy(boxes[:, ROLL:])  # (n, 3, 3)
+    half = boxes[:, 3:6] / 2
+    reach = (np.abs(R) @ (half + margin)[..., None])[..., 0]
+    return boxes[:, :3].copy(), R, half, reach
 
 
 def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
     """
     Return all pairs of a point and a box within `margin` of each other.
 
-    Some pairs that are farther apart are returned, too.
+    Without numba some pairs that are farther apart are returned, too.
 
     Parameters
     ----------
@@ -167,9 +231,18 @@ def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
         The pairs.
 
     """
-    R = matrix_from_rpy(boxes[:, ROLL:])  # (n, 3, 3)
-    half = boxes[:, 3:6] / 2
-    reach = (np.abs(R) @ (half + margin)[..., None])[..., 0]  # half the upright bounding box
+    kernels = load()
+    if kernels is None:
+        return crop_numpy(points, boxes, margin)
+    columns = np.ascontiguousarray(points.T)
+    row, owner, offset, outside = kernels.crop.crop(columns, *_shapes(boxes, margin), margin)
+    order = np.argsort(owner, kind='stable')
+    return Crop(row[order], owner[order], offset[order].T, outside[order].T)
+
+
+def crop_numpy(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
+    """Return the same as `crop`, and some more pairs, by numpy."""
+    _, R, half, reach = _shapes(boxes, margin)
     index, owner = _pairs(points, boxes[:, :2], reach[:, :2])
     offset = points.T.take(index, 1).astype(np.float64) - boxes[:, :3].T.take(owner, 1)
     outside = np.empty_like(offset)
@@ -186,12 +259,12 @@ def _least_depth(near: Crop, depth: Floats, num_points: int) -> Floats:
     return least.take(near.row)
 
 
-def _sampled(near: Crop, own: Ints, sweep: Sweep, n: int, config: Config) -> tuple[Ints, Ints]:
-    """Return sweep row and box of the points that are kept, of the pairs `own`; (P,) each."""
-    owner = near.owner.take(own)
-    x = near.offset[0].take(own)
-    rows = _sorted_by_x(near.row.take(own), owner, x / np.abs(x).max(initial=1.0), n)
-    kept = [_thinned(rows[part], sweep.points, config) for part in _slices(owner, n)]
+def _sampled(own: OwnPoints, sweep: Sweep, n: int, config: Config) -> tuple[Ints, Ints]:
+    """Return sweep row and box of the points that are kept, ascending by box; (P,) each."""
+    rows = _sorted_by_x(own.row, own.owner, own.x / np.abs(own.x).max(initial=1.0), n)
+    ends = np.cumsum(np.bincount(own.owner, minlength=n)).tolist()
+    parts = [slice(first, last) for first, last in pairwise([0, *ends])]
+    kept = [_thinned(rows[part], sweep.points, config) for part in parts]
     counts = [len(part) for part in kept]
     return np.concatenate(kept), np.repeat(np.arange(n), counts)
 

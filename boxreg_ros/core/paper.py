@@ -140,12 +140,13 @@ def total(
     with its weight w and its multiplier m, a column of `multipliers` (B, 2).
 
     """
-    points = problem.points + problem.boxes[..., None, :3]
+    points, mask, _ = problem.padded()
+    points = points + problem.boxes[..., None, :3]
     constraints = [term(boxes, problem.valid, rounding) for term in (smoothness, alignment)]
     violation = torch.stack(constraints, -1)
     penalty = violation.new_tensor([weights.smoothness, weights.alignment])
-    loss = weights.closeness * closeness(boxes, points, problem.mask, weights.nearest)
-    loss = loss + weights.enclosure * enclosure(boxes, points, problem.mask)
+    loss = weights.closeness * closeness(boxes, points, mask, weights.nearest)
+    loss = loss + weights.enclosure * enclosure(boxes, points, mask)
     return loss + (multipliers * violation + penalty * violation**2 / 2).sum(-1), violation
 
 

@@ -8,9 +8,12 @@ the Schur complement, as in fixed-lag smoothing: docs/method.md (M13).
 
 from collections.abc import Sequence
 
-from boxreg_ros.core.arrowhead import cholesky, LINK
+from boxreg_ros.core.arrowhead import BandedFactor, cholesky, LINK
 from boxreg_ros.core.batch import MarginalPrior, PRIOR_POSES, PRIOR_SIZE, SHARED, State
-from boxreg_ros.core.terms import Objective, shared_prior, Term
+from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels.arrays import TermArrays
+from boxreg_ros.core.terms import accumulate, Objective, shared_prior, Term
+import numpy as np
 import torch
 from torch.linalg import solve_triangular
 from torch.nn.functional import pad
@@ -32,9 +35,27 @@ def marginalise(objective: Objective, state: State) -> MarginalPrior:
     By the kernels where the objective has arrays for them, else by torch.
 
     """
-    if objective.arrays is not None:
-        return MarginalPrior(*objective.arrays.marginalise(state.pack()))
+    if isinstance(objective.terms, TermArrays):
+        return marginalised_arrays(objective.terms, state)
     return marginalised_terms(objective.terms, state)
+
+
+def marginalised_arrays(terms: TermArrays, state: State) -> MarginalPrior:
+    """Return the same as `marginalised_terms`, by the kernels."""
+    x = state.pack()
+    kernels = compiled(x)
+    assert kernels is not None
+    B, D = x.shape
+    curvature = BandedFactor.empty(B, D, SHARED)
+    _, gradient = accumulate(terms, x, torch.arange(B), 1, curvature)
+    mean = np.empty((B, PRIOR_SIZE))
+    step = np.empty((B, PRIOR_SIZE))
+    information = np.empty((B, PRIOR_SIZE, PRIOR_SIZE))
+    run(
+        kernels.normal_equations.marginalise, B, contiguous(x), gradient.numpy(),
+        *(part.numpy() for part in curvature), mean, step, information,
+    )  # fmt: skip
+    return MarginalPrior(*(torch.from_numpy(part) for part in (mean, step, information)))
 
 
 def marginalised_terms(terms: Sequence[Term], state: State) -> MarginalPrior:

@@ -20,6 +20,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
 from boxreg_ros.core.face_support import observe_faces, to_box_frame
 from boxreg_ros.core.input_model import expect, input_residuals, InputModel
+from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.solver import COARSE_POINTS, solve
 from boxreg_ros.core.window import group_windows, MarginalisationPrior, stack_windows, Window
@@ -173,7 +174,7 @@ def _accepted(
     found = boxes.cpu().numpy()
     found[..., :3] += base[:, None]
     covariances, extents, distances = (part.cpu().numpy() for part in solution.posterior)
-    count = problem.mask.sum(-1).clamp(min=1)
+    count = problem.counts.clamp(min=1)
     outside = (1 - held / count).clamp(0, 1).cpu().numpy()
     extent_covariances = np.repeat(extents[:, None], found.shape[1], axis=1)
     for b, i in np.argwhere(problem.valid.cpu().numpy() & is_kept).tolist():
@@ -204,8 +205,8 @@ def _failed_tests(
     """
     is_finite = boxes.isfinite().all(-1) & (extent > 0).all(-1)
     is_finite &= covariances.isfinite().all((2, 3))
-    is_blind = ~problem.mask.any((1, 2))[:, None].expand_as(is_finite)
-    before = problem.mask.sum(-1)  # at most: counting those of the input boxes takes time
+    is_blind = (problem.counts.sum(1) == 0)[:, None].expand_as(is_finite)
+    before = problem.counts  # at most: counting those of the input boxes takes time
     if (after < MIN_HELD_PART * before - MAX_LOST_POINTS).any():
         before = _held(problem, problem.pose, problem.boxes[..., 3:6])
     has_lost = after < MIN_HELD_PART * before - MAX_LOST_POINTS
@@ -223,6 +224,19 @@ def _extents(problem: Problem, state: State, config: Config) -> Tensor:
 
 def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     """Return how many points are in boxes at `pose` (B, N, 6) of `extent` (B, N, 3), (B, N)."""
+    kernels = compiled(pose)
+    if kernels is not None:
+        held = np.zeros(problem.counts.shape, np.int64)
+        run(
+            kernels.face_support.count_held, len(held), problem.arrays(), contiguous(pose),
+            contiguous(extent), HELD_MARGIN, held,
+        )  # fmt: skip
+        return torch.from_numpy(held)
+    return _held_torch(problem, pose, extent)
+
+
+def _held_torch(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
+    """Return the same as `_held`, by torch."""
     local = to_box_frame(problem.points, problem, pose).abs_()
     outside = local.sub_(extent[..., None].to(local) / 2).amax(-2)
     return (outside < HELD_MARGIN).sum(-1)

@@ -8,7 +8,8 @@ docs/method.md (M4) has the residual that comes of it.
 from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, Problem, State
 from boxreg_ros.core.face_support import motion_compensated, to_box_frame
-from boxreg_ros.core.kernels import compiled
+from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels.arrays import TermArrays
 import numpy as np
 import torch
 from torch import Tensor
@@ -56,34 +57,43 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     is kept, as in point-to-plane ICP.
 
     """
-    points = motion_compensated(problem, state)
-    if compiled(points) is not None:
-        return agreement_compiled(points, problem, state)
-    return agreement_torch(points, problem, state)
+    if compiled(state.pose) is not None:
+        return agreement_compiled(problem, state)
+    return agreement_torch(problem, state)
 
 
-def agreement_compiled(points: Tensor, problem: Problem, state: State) -> tuple[Tensor, Tensor]:
-    """Return the same as `agreement`, by the kernel; `points` (B, N, M, 3)."""
-    kernels = compiled(points)
+def with_rigid_shape(terms: TermArrays, problem: Problem, state: State) -> TermArrays:
+    """Return `terms` with the rigid shape of each track (M4)."""
+    information, wanted = agreement(problem, state)
+    return terms._replace(
+        shape_start=contiguous(state.pose),
+        shape_axes=terms.axes,
+        wanted=contiguous(wanted),
+        W_shape=contiguous(information),
+    )
+
+
+def agreement_compiled(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
+    """Return the same as `agreement`, by the kernel."""
+    kernels = compiled(state.pose)
     assert kernels is not None
     B, N = problem.valid.shape
-    counts = problem.mask.sum(-1).numpy()  # valid points come first
     information = np.empty((B, N, 6, 6))
     wanted = np.empty((B, N, 6))
-    inputs = state.pose, problem.pose, state.shared[:, EXTENT], points
-    deviation = problem.of_class('shape')[:, 0]
     limits = (
         SHAPE_MARGIN, MIN_FLATNESS, float(MIN_CELL_POINTS), EFFECTIVE_POINTS, STEP_RIDGE
     )  # fmt: skip
-    kernels.rigid_shape.agreement(
-        *(np.ascontiguousarray(tensor.numpy()) for tensor in inputs), counts,
-        np.ascontiguousarray(deviation.numpy()), CELLS, limits, information, wanted,
+    run(
+        kernels.rigid_shape.agreement, B, problem.arrays(), contiguous(state.pose),
+        contiguous(state.shared[:, EXTENT]), problem.returns.is_moving,
+        contiguous(problem.of_class('shape')[:, 0]), CELLS, limits, information, wanted,
     )  # fmt: skip
     return torch.from_numpy(information), torch.from_numpy(wanted)
 
 
-def agreement_torch(points: Tensor, problem: Problem, state: State) -> tuple[Tensor, Tensor]:
-    """Return the same as `agreement`, by torch; `points` (B, N, M, 3)."""
+def agreement_torch(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
+    """Return the same as `agreement`, by torch."""
+    points = motion_compensated(problem, state)
     local = to_box_frame(points.to(state.pose), problem, state.pose)
     half = (state.shared[:, EXTENT] / 2)[:, None, :, None]
     B, N, _, M = local.shape

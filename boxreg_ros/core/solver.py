@@ -38,11 +38,13 @@ from boxreg_ros.core.input_model import (
     InputModel,
     InputNoise,
 )
+from boxreg_ros.core.kernels import compiled, shared_by
+from boxreg_ros.core.kernels.arrays import TermArrays
 from boxreg_ros.core.lbfgs import HISTORY, minimize, select
 from boxreg_ros.core.prior import marginalise
-from boxreg_ros.core.rigid_shape import agreement
+from boxreg_ros.core.rigid_shape import agreement, with_rigid_shape
 from boxreg_ros.core.terms import Objective, Term
-from boxreg_ros.core.weights import robustify_motion, weigh
+from boxreg_ros.core.weights import robustify_motion, weigh, weigh_compiled
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor
@@ -205,7 +207,10 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     every = torch.arange(len(free), device=free.device)
     rows, turn, points = every, 0, plan.coarse_points
     workers = config.solver.threads or cpu_count()
-    with ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool:
+    with (
+        ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool,
+        shared_by(pool, workers),
+    ):
         while len(rows):
             expected = expect(problem, offsets, noise)
             log_extent = solution.extent_evidence[:, 0]
@@ -220,7 +225,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
             turn += 1
             if plan.estimates_noise:
                 noise = _estimated_noise(noise, known, problem, solution, turn, config)
-            if not len(rows) and 2 * points <= problem.points.shape[2]:
+            if not len(rows) and 2 * points <= problem.returns.width:
                 rows, points = every, inf  # settled on few points: once more with all
     return solution
 
@@ -265,19 +270,25 @@ def _weighted_terms(
     plan: Plan,
     turn: int,
     config: Config,
-) -> list[Term]:
+) -> list[Term] | TermArrays:
     """Return the terms of one round: weights, robust motion, rigid shape."""
+    # The motion of a cold window is at first as noisy as its input.
+    is_smooth = turn > 0 or plan.starts_from_fit
+    uses_rigid_shape = turn > 0 and plan.uses_rigid_shape
+    if compiled(state.pose) is not None:
+        arrays = weigh_compiled(problem, state, observations, expected, config, is_smooth)
+        if uses_rigid_shape:
+            arrays = with_rigid_shape(arrays, problem.thinned(SHAPE_POINTS), state)
+        return arrays
     weighted = weigh(problem, state, observations, expected, config)
     # Terms without any weight, such as zero motion, are dropped (`any` takes three times as long).
     weighted = [term for term in weighted if term.weight.norm()]
-    # The motion of a cold window is at first as noisy as its input.
-    is_smooth = turn > 0 or plan.starts_from_fit
     if is_smooth and config.ingredients.robust_motion:
         weighted = [
             robustify_motion(term, state) if term.function in MOTION_TERMS else term
             for term in weighted
         ]
-    if turn > 0 and plan.uses_rigid_shape:
+    if uses_rigid_shape:
         information, wanted = agreement(problem.thinned(SHAPE_POINTS), state)
         data = state.pose, wanted
         weighted.append(Term(terms.rigid_shape, information[:, :, None], data))

@@ -24,7 +24,8 @@ from boxreg_ros.core.batch import (
     State,
 )
 from boxreg_ros.core.geometry import rotation_derivatives, rotation_from_rpy
-from boxreg_ros.core.kernels import compiled, Kernels
+from boxreg_ros.core.kernels import compiled, contiguous, Kernels, run
+from boxreg_ros.core.kernels.arrays import TermArrays
 from boxreg_ros.core.lbfgs import select
 import numpy as np
 import torch
@@ -125,8 +126,8 @@ class Objective:
 
     Parameters
     ----------
-    terms : sequence of Term
-        The terms.
+    terms : sequence of Term, or TermArrays
+        The terms; as arrays, where the kernels are available.
     start, free : Tensor, shape (B, D)
         Start of the search; 1 for the variables it may change, 0 for the others.
     length : int
@@ -136,24 +137,24 @@ class Objective:
     ----------
     factor : Factor or BandedFactor
         Cholesky factor of the Gauss-Newton curvature at the start.
-    terms : sequence of Term
-        The terms.
-    arrays : TermArrays or None
-        The same for the kernels; None where torch is used.
+    terms : sequence of Term, or TermArrays
+        The terms; arrays wherever the kernels are used.
 
     """
 
     factor: Factor | BandedFactor
 
-    def __init__(self, terms: Sequence[Term], start: Tensor, length: int, free: Tensor) -> None:
+    def __init__(
+        self, terms: Sequence[Term] | TermArrays, start: Tensor, length: int, free: Tensor
+    ) -> None:
+        if not isinstance(terms, TermArrays) and compiled(start) is not None:
+            terms = term_arrays(terms, start, length)
         self.terms = terms
         self._start = start
         self._length = length
         self._free = free
-        kernels = compiled(start)
-        self.arrays = TermArrays.of(terms, start, length, free) if kernels else None
-        if self.arrays is not None:
-            value, gradient, self.factor = self.arrays.linearise(start)
+        if isinstance(terms, TermArrays):
+            value, gradient, self.factor = linearise(terms, start, free)
         else:
             curvature = Chain.zeros(start, length)
             value, gradient = value_and_gradient(terms, start, length, curvature)
@@ -164,8 +165,9 @@ class Objective:
         """Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`."""
         if x is self._start:
             return self._at_start
-        if self.arrays is not None:
-            return self.arrays.evaluate(x, rows)
+        if isinstance(self.terms, TermArrays):
+            value, gradient = accumulate(self.terms, x, rows, self._length)
+            return value, gradient * select(self._free, rows)
         terms, free = select((self.terms, self._free), rows)
         value, gradient = value_and_gradient(terms, x, self._length)
         return value, gradient * free
@@ -177,123 +179,95 @@ class Objective:
         return cast(Factor, select(self.factor, rows)).solve(vector)
 
 
-class TermArrays:
+def linearise(terms: TermArrays, x: Tensor, free: Tensor) -> tuple[Tensor, Tensor, BandedFactor]:
+    """Return values (B,), gradients (B, D) and the factor of the curvature at `x` (B, D)."""
+    B, D = x.shape
+    factor = BandedFactor.empty(B, D, SHARED)
+    length = (D - SHARED) // LINK
+    value, gradient = accumulate(terms, x, torch.arange(B), length, factor)
+    kernel = _kernels(x).normal_equations.factorise_windows
+    run(kernel, B, contiguous(free), *(part.numpy() for part in factor))
+    return value, gradient, factor
+
+
+def accumulate(
+    terms: TermArrays, x: Tensor, rows: Tensor, last: int, curvature: BandedFactor | None = None
+) -> tuple[Tensor, Tensor]:
     """
-    The terms of one round as arrays, as the kernels of `normal_equations` take them.
+    Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`, by the kernel.
 
-    Parameters
-    ----------
-    kernels : Kernels
-        The compiled functions.
-    terms : tuple of array
-        Data and weights of the residuals (M2) to (M7) and (M9), in the order of the kernels;
-        terms without weight have no rows.
-    expected, shared_weight : array, shapes (B, 22) and (B, 22, 22)
-        Mean and weight of the shared variables (M8).
-    free : array, shape (B, D)
-        1 for variables that are estimated.
+    Of the residuals that begin at the first `last` observations. Their Gauss-Newton matrix is
+    written to `curvature`, if that is given.
 
     """
+    if curvature is None:
+        curvature = BandedFactor.empty(0, x.shape[1], SHARED)
+    value = np.empty(len(x))
+    gradient = np.empty(tuple(x.shape))
+    run(
+        _kernels(x).normal_equations.accumulate, len(x), contiguous(x), rows.numpy(), last, terms,
+        value, gradient, *(part.numpy() for part in curvature),
+    )  # fmt: skip
+    return torch.from_numpy(value), torch.from_numpy(gradient)
 
-    def __init__(
-        self,
-        kernels: Kernels,
-        terms: tuple[Any, ...],
-        expected: Any,
-        shared_weight: Any,
-        free: Any,
-    ) -> None:
-        self._kernels = kernels
-        self._terms = terms
-        self._expected = expected
-        self._shared_weight = shared_weight
-        self._free = free
 
-    @classmethod
-    def of(cls, terms: Sequence[Term], start: Tensor, length: int, free: Tensor) -> 'TermArrays':
-        """Return the arrays of `terms`, whose search starts at `start` (B, D)."""
-        kernels = compiled(start)
-        assert kernels is not None
-        B = len(start)
-        by_function = {term.function: term for term in terms}
+def _kernels(like: Tensor) -> Kernels:
+    kernels = compiled(like)
+    assert kernels is not None
+    return kernels
 
-        def weight(function: Callable[..., Linearised], size: int) -> Any:
-            """Return W, shape (B, n, size, size); n is 0 without the term."""
-            term = by_function.get(function)
-            return np.zeros((B, 0, size, size)) if term is None else _array(term.weight[:, :, 0])
 
-        def data(function: Callable[..., Linearised], *absent: tuple[int, ...]) -> list[Any]:
-            """Return the data of a term; zeros of shapes (B, ...) where it is `absent`."""
-            term = by_function.get(function)
-            if term is None:
-                return [np.zeros((B, *shape)) for shape in absent]
-            return [_array(part) for part in term.data]
+def term_arrays(terms: Sequence[Term], start: Tensor, length: int) -> TermArrays:
+    """Return `terms`, whose search starts at `start` (B, D), as the kernels take them."""
+    B = len(start)
+    by_function = {term.function: term for term in terms}
 
-        given, inset = data(faces, (0, 6), (0, 6))
-        face_term = by_function.get(faces)
-        face_weight = np.zeros((B, 0, 6, 4, 4)) if face_term is None else _array(face_term.weight)
-        pose, axes = data(input_pose, (0, 6), (0, 3, 3))
-        shape_start, wanted = data(rigid_shape, (0, 6), (0, 6))
-        shape_axes = _array(rotation_from_rpy(torch.from_numpy(shape_start)[..., 3:]))
-        (times,) = data(slip, (length,))
-        if slip not in by_function and acceleration in by_function:
-            (times,) = data(acceleration)
-        (mean,) = data(marginalisation_prior, (1, PRIOR_SIZE))
-        information = np.zeros((B, 0, PRIOR_SIZE))
-        if marginalisation_prior in by_function:
-            information = weight(marginalisation_prior, PRIOR_SIZE)[:, 0]
-        (expected,) = data(shared_prior, (SHARED,))
-        shared_weight = np.zeros((B, SHARED, SHARED))
-        if shared_prior in by_function:
-            shared_weight = weight(shared_prior, SHARED)[:, 0]
-        arrays = (
-            given, inset, face_weight, pose, axes, weight(input_pose, 6), shape_start, shape_axes,
-            wanted, weight(rigid_shape, 6), times, weight(acceleration, 6), weight(slip, 2),
-            weight(zero_motion, 6), mean[:, 0], information,
-        )  # fmt: skip
-        return cls(kernels, arrays, expected, shared_weight, _array(free))
+    def weight(function: Callable[..., Linearised], size: int) -> Any:
+        """Return W, shape (B, n, size, size); n is 0 without the term."""
+        term = by_function.get(function)
+        return np.zeros((B, 0, size, size)) if term is None else _array(term.weight[:, :, 0])
 
-    def linearise(self, x: Tensor) -> tuple[Tensor, Tensor, BandedFactor]:
-        """Return values (B,), gradients (B, D) and the factor of the curvature at `x` (B, D)."""
-        B, D = x.shape
-        curvature = BandedFactor.empty(B, D, SHARED)
-        length = (D - SHARED) // LINK
-        value, gradient = self._accumulate(x, np.arange(B), length, curvature)
-        arrays = (part.numpy() for part in curvature)
-        self._kernels.normal_equations.factorise_windows(self._free, *arrays)
-        return torch.from_numpy(value), torch.from_numpy(gradient * self._free), curvature
+    def data(function: Callable[..., Linearised], *absent: tuple[int, ...]) -> list[Any]:
+        """Return the data of a term; zeros of shapes (B, ...) where it is `absent`."""
+        term = by_function.get(function)
+        if term is None:
+            return [np.zeros((B, *shape)) for shape in absent]
+        return [_array(part) for part in term.data]
 
-    def evaluate(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`."""
-        D = x.shape[1]
-        nothing = BandedFactor.empty(0, D, SHARED)
-        length = (D - SHARED) // LINK
-        value, gradient = self._accumulate(x, rows.numpy(), length, nothing)
-        return torch.from_numpy(value), torch.from_numpy(gradient * self._free[rows.numpy()])
+    def dense_weight(function: Callable[..., Linearised], size: int) -> Any:
+        """Return W of a term with one stencil, shape (B, size, size); 0 without the term."""
+        has_term = function in by_function
+        return weight(function, size)[:, 0] if has_term else np.zeros((B, size, size))
 
-    def marginalise(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the `MarginalPrior` of the windows at `x` (B, D), see `prior.marginalise`."""
-        B, D = x.shape
-        curvature = BandedFactor.empty(B, D, SHARED)
-        _, gradient = self._accumulate(x, np.arange(B), 1, curvature)
-        mean = np.empty((B, PRIOR_SIZE))
-        step = np.empty((B, PRIOR_SIZE))
-        information = np.empty((B, PRIOR_SIZE, PRIOR_SIZE))
-        arrays = (part.numpy() for part in curvature)
-        self._kernels.normal_equations.marginalise(
-            _array(x), gradient, *arrays, mean, step, information
-        )
-        return torch.from_numpy(mean), torch.from_numpy(step), torch.from_numpy(information)
-
-    def _accumulate(self, x: Tensor, rows: Any, last: int, curvature: BandedFactor) -> Any:
-        """Return values and gradients at `x`, and write the curvature; see the kernel."""
-        value = np.empty(len(x))
-        gradient = np.empty(tuple(x.shape))
-        self._kernels.normal_equations.accumulate(
-            _array(x), rows, last, self._terms, self._expected, self._shared_weight, value,
-            gradient, *(part.numpy() for part in curvature),
-        )  # fmt: skip
-        return value, gradient
+    given, inset = data(faces, (0, 6), (0, 6))
+    face_term = by_function.get(faces)
+    face_weight = np.zeros((B, 0, 6, 4, 4)) if face_term is None else _array(face_term.weight)
+    pose, axes = data(input_pose, (0, 6), (0, 3, 3))
+    shape_start, wanted = data(rigid_shape, (0, 6), (0, 6))
+    timed = acceleration if acceleration in by_function else slip
+    (times,) = data(timed, (length,))
+    (mean,) = data(marginalisation_prior, (1, PRIOR_SIZE))
+    (expected,) = data(shared_prior, (SHARED,))
+    return TermArrays(
+        given=given,
+        inset=inset,
+        W_faces=face_weight,
+        input_pose=pose,
+        axes=axes,
+        W_input=weight(input_pose, LINK),
+        shape_start=shape_start,
+        shape_axes=_array(rotation_from_rpy(torch.from_numpy(shape_start)[..., 3:])),
+        wanted=wanted,
+        W_shape=weight(rigid_shape, LINK),
+        times=times,
+        W_acceleration=weight(acceleration, LINK),
+        W_slip=weight(slip, 2),
+        W_zero_motion=weight(zero_motion, LINK),
+        prior_mean=np.ascontiguousarray(mean[:, 0]),
+        W_prior=dense_weight(marginalisation_prior, PRIOR_SIZE),
+        expected=expected,
+        W_shared=dense_weight(shared_prior, SHARED),
+    )
 
 
 def _array(tensor: Tensor) -> Any:

@@ -9,12 +9,21 @@ from math import inf
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import terms
-from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Problem, State
+from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Problem, SHARED, State
 from boxreg_ros.core.face_support import FaceObservations
 from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
 from boxreg_ros.core.input_model import Expectation
+from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels.arrays import (
+    ExpectedArrays,
+    FaceArrays,
+    MotionDeviations,
+    TermArrays,
+    WeightNumbers,
+)
 from boxreg_ros.core.terms import Term
 from boxreg_ros.structures import YAW
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -46,6 +55,8 @@ DRIVING_SPAN = 5
 """Boxes in these medians."""
 DRIVING_REACH = 4
 """Steps before and after one where the object drives that are not held at rest either."""
+ACCELERATIONS = ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning')
+"""Settings of `ClassConfig` that are the deviations of the accelerations of a pose."""
 DRIFT_RATIOS = (1.0, 1.0, 0.5, 0.15, 0.15, 0.15)
 """Deviation of the steps of a parked box in x y z [m] and roll pitch yaw [rad], over `drift`."""
 
@@ -115,6 +126,83 @@ def weigh(
             (problem.prior_mean[:, None],),
         ),
     ]
+
+
+def weigh_compiled(
+    problem: Problem,
+    state: State,
+    observations: FaceObservations,
+    expected: Expectation,
+    config: Config,
+    is_smooth: bool,
+) -> TermArrays:
+    """
+    Return the same terms as `weigh`, as arrays, by the kernel.
+
+    With `is_smooth` the motion terms are robust, as by `robustify_motion`.
+
+    """
+    kernels = compiled(state.pose)
+    assert kernels is not None
+    B, N = problem.valid.shape
+    given = contiguous(problem.pose)
+    prior_information = problem.prior_information
+    if not config.ingredients.marginalisation:
+        prior_information = torch.zeros_like(prior_information)
+    terms = TermArrays(
+        given=given,
+        inset=contiguous(observations.inset),
+        W_faces=np.zeros((B, N, 6, 4, 4)),
+        input_pose=given,
+        axes=np.empty((B, N, 3, 3)),
+        W_input=np.zeros((B, N, 6, 6)),
+        shape_start=np.zeros((B, 0, 6)),
+        shape_axes=np.zeros((B, 0, 3, 3)),
+        wanted=np.zeros((B, 0, 6)),
+        W_shape=np.zeros((B, 0, 6, 6)),
+        times=contiguous(problem.times),
+        W_acceleration=np.zeros((B, max(0, N - 2), 6, 6)),
+        W_slip=np.zeros((B, N - 1, 2, 2)),
+        W_zero_motion=np.zeros((B, N - 1, 6, 6)),
+        prior_mean=contiguous(problem.prior_mean),
+        W_prior=contiguous(prior_information),
+        expected=contiguous(expected.shared),
+        W_shared=np.zeros((B, SHARED, SHARED)),
+    )
+    settings, ingredients = config.faces, config.ingredients
+    numbers = WeightNumbers(
+        input_outlier=INPUT_OUTLIER if ingredients.robust_weights else inf,
+        motion_outlier=MOTION_OUTLIER,
+        gap_outlier=GAP_OUTLIER if ingredients.robust_weights else inf,
+        neighbour_factor=NEIGHBOUR_FACTOR,
+        parked_speed=PARKED_SPEED,
+        parked_distance=PARKED_DISTANCE,
+        parked_turn=PARKED_TURN,
+        driving_speed=DRIVING_SPEED,
+        driving_span=DRIVING_SPAN,
+        driving_reach=DRIVING_REACH,
+        face_outlier=settings.outlier,
+        spread=settings.spread,
+        face_deviations=_face_deviations(config),
+        is_robust=is_smooth and ingredients.robust_motion,
+    )
+    drift = problem.of_class('drift')
+    motion = MotionDeviations(
+        acceleration=contiguous(problem.of_class(*ACCELERATIONS)),
+        slip=contiguous(problem.of_class('slip', 'climb')),
+        zero_motion=contiguous(drift * drift.new_tensor(DRIFT_RATIOS)),
+        heading=contiguous(problem.of_class('heading')[:, 0]),
+    )
+    columns = {name: contiguous(getattr(expected, name)) for name in ExpectedArrays._fields}
+    run(
+        kernels.weights.weigh_windows, B, problem.arrays(), contiguous(state.pose),
+        contiguous(state.shared), FaceArrays(*map(contiguous, observations)),
+        ExpectedArrays(**columns), motion, numbers, terms,
+    )  # fmt: skip
+    if problem.pinned.any():
+        weight = torch.from_numpy(terms.W_input).diagonal(dim1=2, dim2=3)
+        weight.copy_(_with_pins(weight, problem, expected))
+    return terms
 
 
 def robustify_motion(term: Term, state: State) -> Term:
@@ -200,9 +288,7 @@ def _face_weights(
 
     """
     settings = config.faces
-    deviation = torch.tensor(
-        [settings.ends] * 2 + [settings.sides] * 2 + [settings.top, settings.bottom]
-    ).to(valid)
+    deviation = valid.new_tensor(_face_deviations(config))
     robust = 1 / (1 + (observations.distance / settings.outlier) ** 2) ** 2
     same_object = valid / (1 + off_track[..., :2].square().sum(2) ** 2) ** 2
     return observations.weight * robust * same_object[..., None] / deviation**2
@@ -280,10 +366,7 @@ def _acceleration_weights(problem: Problem, to_body: Tensor, valid: Tensor) -> T
     Their deviations are along body axes: `to_body` (B, N, 6, 6).
 
     """
-    information = (
-        problem.of_class('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning')
-        ** -2
-    )
+    information = problem.of_class(*ACCELERATIONS) ** -2
     to_fixed = to_body.mT
     weight = (to_fixed * information[:, None, None]) @ to_fixed.mT
     return weight[:, 1:-1] * valid[:, 2:, None, None]
@@ -294,6 +377,12 @@ def _zero_motion_weights(problem: Problem, expected: Expectation) -> Tensor:
     yaw_deviation = expected.pose_deviation[:, 5]
     deviation = problem.of_class('drift') * yaw_deviation.new_tensor(DRIFT_RATIOS)
     return deviation[:, None] ** -2 * parked_steps(problem, yaw_deviation)[..., None]
+
+
+def _face_deviations(config: Config) -> tuple[float, ...]:
+    """Return the deviation of one observation of each face, (6,) [m]."""
+    faces = config.faces
+    return faces.ends, faces.ends, faces.sides, faces.sides, faces.top, faces.bottom
 
 
 def _diagonal(weight: Tensor) -> Tensor:

@@ -1,16 +1,17 @@
 """Windows of observations, and batches of windows as padded tensors."""
 
 from collections.abc import Sequence
-from dataclasses import astuple
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import PRIOR_SIZE, Problem, SHARED
+from boxreg_ros.core.batch import numbers_of, PRIOR_SIZE, Problem, Returns, SHARED
 from boxreg_ros.core.observation import Observation
-from boxreg_ros.structures import Floats, ROLL, YAW
+from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
 from numpy.typing import NDArray
 import torch
+from torch import Tensor
 
 PRIOR_DECAY = 0.97
 """
@@ -20,8 +21,6 @@ An error model that is constant over a track holds for a limited time: 0.97 halv
 after 23 observations.
 
 """
-PADDING_POSITION = 1e6
-"""Coordinate of padding points [m]; derived: near no box, and finite in float32."""
 PADDING_PERIOD = 0.1
 """Time step of padding observations [s]; any positive number keeps times increasing."""
 MARGIN_OBSERVATIONS = 30
@@ -41,6 +40,15 @@ VALUES_PER_POINT = 18
 """Values held per point while a batch is solved; estimated from the temporary tensors."""
 PRIOR_ANGLES = [3, 4, 5, 9, 10, 11]
 """Angles among the variables of the marginalisation prior: of its two poses."""
+
+
+NO_PRIOR = (
+    np.full(PRIOR_SIZE, np.nan),
+    np.zeros(PRIOR_SIZE),
+    np.zeros((PRIOR_SIZE, PRIOR_SIZE)),
+    np.zeros(4),
+)
+"""State, step, information and extents of a prior without information."""
 
 
 class MarginalisationPrior(NamedTuple):
@@ -74,9 +82,7 @@ class MarginalisationPrior(NamedTuple):
     @classmethod
     def none(cls, base: Floats) -> 'MarginalisationPrior':
         """Return a prior without information, NaN as its linearisation point."""
-        zeros = np.zeros(PRIOR_SIZE)
-        information = np.zeros((PRIOR_SIZE, PRIOR_SIZE))
-        return cls(base, np.full(PRIOR_SIZE, np.nan), zeros, information, np.zeros(4))
+        return cls(base, *NO_PRIOR)
 
 
 class Window(NamedTuple):
@@ -175,7 +181,6 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     lengths = np.array([len(window.observations) for window in windows])
     valid = np.arange(lengths.max()) < lengths[:, None]  # (B, N)
     boxes, times, origins, ground = _stack_observations(windows, valid)
-    points, mask, delays = _stack_points(windows, valid)
     priors = [w.prior or MarginalisationPrior.none(w.observations[0].box[:3]) for w in windows]
     base, state, step, information, extents = (
         np.array(part) for part in zip(*priors, strict=True)
@@ -190,16 +195,30 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     boxes[..., :3] -= base[:, None]
     start[..., :3] -= base[:, None]
     minimum, is_usable = _prior_minimum(start, state, step)
-    information = information * PRIOR_DECAY * is_usable[:, None, None]
-    arrays = [boxes, start, valid, times, points, mask, delays, origins, ground]
-    arrays += [
-        np.nan_to_num(minimum),
-        information,
-        extents,
-        _class_numbers(windows, config),
-        pinned,
-    ]
-    return Problem(*(torch.from_numpy(array).to(config.device) for array in arrays)), base
+    information *= PRIOR_DECAY * is_usable[:, None, None]
+    first, counts = _places_of_returns(windows, valid)
+    on_device = partial(_tensor, device=config.device)
+    problem = Problem(
+        boxes=on_device(boxes),
+        start=on_device(start),
+        valid=on_device(valid),
+        times=on_device(times),
+        returns=_returns(windows, config),
+        first=on_device(first),
+        counts=on_device(counts),
+        origins=on_device(origins),
+        ground=on_device(ground),
+        prior_mean=on_device(np.nan_to_num(minimum)),
+        prior_information=on_device(information),
+        marginalised_extents=on_device(extents),
+        class_numbers=on_device(_class_numbers(windows, config)),
+        pinned=on_device(pinned),
+    )
+    return problem, base
+
+
+def _tensor(array: NDArray[Any], device: str) -> Tensor:
+    return torch.from_numpy(array).to(device)
 
 
 def _stack_observations(
@@ -233,26 +252,24 @@ def _stack_observations(
     return boxes[row, source], times, origins, ground
 
 
-def _stack_points(
-    windows: Sequence[Window], valid: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """
-    Return points, which of them are valid, and their delays, padded.
+def _places_of_returns(windows: Sequence[Window], valid: NDArray[np.bool_]) -> tuple[Ints, Ints]:
+    """Return where the returns of each observation begin in `_returns`, and how many; (B, N)."""
+    counts = np.zeros(valid.shape, dtype=np.int64)
+    counts[valid] = [len(o.points) for window in windows for o in window.observations]
+    first = np.cumsum(counts).reshape(counts.shape) - counts
+    return first, counts
 
-    Shapes (B, N, M, 3), (B, N, M) and (B, N, M), M the most points of an observation, at least 1.
 
-    """
+def _returns(windows: Sequence[Window], config: Config) -> Returns:
+    """Return the returns of all observations, one after the other."""
     every = [observation for window in windows for observation in window.observations]
-    counts = np.array([len(observation.points) for observation in every])
-    mask = np.zeros((*valid.shape, max(1, counts.max())), dtype=bool)
-    mask[valid] = np.arange(mask.shape[2]) < counts[:, None]
-    points = np.full((*mask.shape, 3), PADDING_POSITION, dtype=np.float32)
-    # One axis at a time: all three at once take six times as long.
-    for axis, values in enumerate(np.concatenate([o.points for o in every]).T):
-        points[..., axis][mask] = values
-    delays = np.zeros(mask.shape, dtype=np.float32)
-    delays[mask] = np.concatenate([observation.delays for observation in every])
-    return points, mask, delays
+    delays = np.concatenate([observation.delays for observation in every])
+    return Returns(
+        _tensor(np.concatenate([observation.points for observation in every]), config.device),
+        _tensor(delays, config.device),
+        is_moving=bool(delays.any()),
+        width=max(1, *(len(observation.points) for observation in every)),
+    )
 
 
 def _resolved_angles(
@@ -307,7 +324,7 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
 def _class_numbers(windows: Sequence[Window], config: Config) -> Floats:
     """Return the numbers of each window's `ClassConfig`, in the order of its fields, (B, D)."""
     names = {window.class_name for window in windows}
-    rows = {name: astuple(config.class_config(name))[1:] for name in names}
+    rows = {name: numbers_of(config.class_config(name)) for name in names}
     return np.array([rows[window.class_name] for window in windows], dtype=np.float64)
 
 

@@ -12,6 +12,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL
 import numpy as np
+from numpy.typing import NDArray
 
 COLUMNS = (
     'stamp_ns', 'frame_id', 'track_id', 'class_name', 'score', 'x', 'y', 'z',
@@ -157,6 +158,20 @@ class BoxTable:
             boxes,
             tuple(row['status'] for row in rows),
             num_points,
+        )
+
+    def rows(self, keep: NDArray[np.bool_]) -> BoxTable:
+        """Return the rows where `keep` (n,) is True."""
+        kept = np.flatnonzero(keep).tolist()
+        return BoxTable(
+            self.stamps_ns[kept],
+            self.frame_id,
+            tuple(self.track_ids[row] for row in kept),
+            tuple(self.class_names[row] for row in kept),
+            self.scores[kept],
+            self.boxes[kept],
+            tuple(self.status[row] for row in kept),
+            self.num_points[kept],
         )
 
     def write(self, path: str | Path) -> None:

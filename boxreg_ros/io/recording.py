@@ -15,9 +15,11 @@ import shlex
 from typing import Any, cast, NamedTuple, Protocol, runtime_checkable, Self
 
 from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
-from boxreg_ros.io.foxglove_mcap import encoded
-from boxreg_ros.io.message_files import is_message, one_line, readable, Reader
+from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.resync import Timeline
+from boxreg_ros.io.storage.files import is_ros1, part_of
+from boxreg_ros.io.storage.reader import is_message, Reader
+from boxreg_ros.io.storage.record import Damage, one_line, Record
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, poses, WITHOUT_IDS
@@ -49,14 +51,6 @@ VISION_DEFINITIONS = {
         'std_msgs/Header header\nvision_msgs/Detection3D[] detections'
     ),
 }
-
-
-class Record(NamedTuple):
-    """One message as it was recorded, still encoded."""
-
-    connection: Connection
-    received_ns: int
-    data: bytes
 
 
 class Item(NamedTuple):
@@ -122,6 +116,10 @@ class ItemSource(Protocol):
     def apart(self) -> dict[str, float]:
         """Return the topics that were recorded apart from the clouds, and by how much [s]."""
 
+    @property
+    def damages(self) -> list[Damage]:
+        """Return the parts of the files that could not be read so far."""
+
     def sensor_frame(self) -> str:
         """Return the frame of the first cloud."""
 
@@ -170,7 +168,7 @@ class Recording:
     part_ns : tuple of int or None
         Begin and end of the part that was asked for, in receive time [ns]; None if it was not.
     files : list of Path
-        Files and folders that are read.
+        Files that are read.
 
     Raises
     ------
@@ -203,9 +201,13 @@ class Recording:
 
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
-        with readable(str(self)):
-            self.files = _files(self._paths)
-            self._reader = _opened(self.files)
+        parts = [part_of(path) for path in self._paths]
+        self.files = [file for part in parts for file in part.files]
+        if len({is_ros1(file) for file in self.files}) > 1:
+            raise RecordingError(
+                'recordings of ROS 1 and ROS 2 cannot be merged; relabel them one by one'
+            )
+        self._reader = Reader(parts)
         try:
             self._find()
         except BaseException:
@@ -331,6 +333,16 @@ class Recording:
         return {topic: late for topic, late in self._timeline.apart.items() if topic in used}
 
     @property
+    def damages(self) -> list[Damage]:
+        """Return the parts of the files that could not be read so far."""
+        return self._reader.damages
+
+    @property
+    def is2(self) -> bool:
+        """Return whether its messages are of ROS 2."""
+        return self._reader.is2
+
+    @property
     def typestore(self) -> Typestore:
         """Return the message definitions of the recording."""
         return self._reader.typestore
@@ -441,7 +453,8 @@ class Recording:
             self._adapter = adapter_for(self._topics[self.boxes_topic], self._convention)
 
         known = self._reader.typestore.fielddefs
-        if not known.keys() >= set(self._topics.values()):
+        used = {kind for kind in self._topics.values() if '/msg/' in kind}
+        if not known.keys() >= used:
             stock = stock_types().fielddefs
             self._reader.typestore.register({k: v for k, v in stock.items() if k not in known})
 
@@ -539,8 +552,7 @@ class Recording:
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[Record]:
-        for message in self._timeline.messages(connections, start_ns, end_ns):
-            yield Record(*message)
+        return self._timeline.messages(connections, start_ns, end_ns)
 
     def _records(self, tree: TransformTree, topics: set[str]) -> Iterator[Record]:
         """Yield the messages on `topics`, still encoded, while `tree` follows."""
@@ -631,40 +643,6 @@ def _fixed_frame(tree: TransformTree, frame: str, wanted: str | None) -> str | N
     if wanted is None:
         return tree.fixed_frame(frame)
     return wanted.lstrip('/') if tree.connects(wanted, frame) else None
-
-
-def _files(paths: Sequence[Path]) -> list[Path]:
-    """Return the files and folders to open; of a folder without metadata, the files in it."""
-    files = []
-    for path in paths:
-        if not path.exists():
-            raise RecordingError(f'no such recording: {str(path)!r}')
-        if path.is_dir() and not (path / 'metadata.yaml').exists():
-            inner = sorted(f for f in path.iterdir() if f.suffix in ('.mcap', '.db3', '.bag'))
-            if not inner:
-                raise RecordingError(
-                    f'{str(path)!r} is no recording: expected metadata.yaml, .mcap, .db3 or .bag '
-                    f'files in it'
-                )
-            files += inner
-        else:
-            files.append(path)
-    if len({path.suffix == '.bag' for path in files}) > 1:
-        raise RecordingError(
-            'recordings of ROS 1 and ROS 2 cannot be merged; relabel them one by one'
-        )
-    return files
-
-
-def _opened(files: Sequence[Path]) -> Reader:
-    """Return a reader of all files; an error names the one that cannot be read."""
-    try:
-        return Reader(files, stock_types)
-    except Exception:
-        for path in files:
-            with readable(str(path)):
-                Reader([path], stock_types).close()
-        raise
 
 
 def stock_types() -> Typestore:

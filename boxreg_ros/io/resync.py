@@ -15,7 +15,8 @@ from functools import cached_property
 from heapq import merge
 from itertools import islice
 
-from boxreg_ros.io.message_files import EncodedMessage, Reader
+from boxreg_ros.io.storage.reader import Reader
+from boxreg_ros.io.storage.record import Record
 from rosbags.interfaces import Connection
 
 APART_NS = 10**9
@@ -68,13 +69,13 @@ class Timeline:
 
     def messages(
         self, connections: Collection[Connection], start_ns: int | None, end_ns: int | None
-    ) -> Iterator[EncodedMessage]:
-        """Yield connection, receive time [ns] and bytes, in the order of these times."""
+    ) -> Iterator[Record]:
+        """Yield the messages in the order of their receive times."""
         apart = [c for c in connections if self._is_apart(c)]
         together = [c for c in connections if c not in apart]
         streams = [self._reader.messages(together, start_ns, end_ns)]
         streams += [self._by_stamp(c, start_ns, end_ns) for c in apart]
-        return merge(*streams, key=lambda item: item[1])
+        return merge(*streams, key=lambda record: record.received_ns)
 
     def received_ns(self, connection: Connection, received_ns: int, data: bytes) -> int:
         """Return the receive time that a message on one of the topics `apart` gets [ns]."""
@@ -85,14 +86,14 @@ class Timeline:
 
     def _by_stamp(
         self, connection: Connection, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[EncodedMessage]:
+    ) -> Iterator[Record]:
         last_ns = self._begin_ns
-        for _, _, data in self._reader.messages([connection], None, None):
-            due_ns = self._due_ns(self._stamp_of(connection, data))
+        for record in self._reader.messages([connection], None, None):
+            due_ns = self._due_ns(self._stamp_of(connection, record.data))
             if due_ns is not None:  # else it stays behind the message before it
                 last_ns = due_ns
             if (start_ns is None or start_ns <= last_ns) and (end_ns is None or last_ns < end_ns):
-                yield connection, last_ns, data
+                yield record._replace(received_ns=last_ns)
 
     def _is_apart(self, connection: Connection) -> bool:
         """Return whether the first or the last message was received far from its clouds."""
@@ -131,10 +132,10 @@ class Timeline:
         return ends
 
     def _stamped(self, connection: Connection, start_ns: int | None) -> Iterator[tuple[int, int]]:
-        for _, received_ns, data in self._reader.messages([connection], start_ns, None):
-            stamp_ns = self._stamp_of(connection, data)
+        for record in self._reader.messages([connection], start_ns, None):
+            stamp_ns = self._stamp_of(connection, record.data)
             if stamp_ns is not None:
-                yield received_ns, stamp_ns
+                yield record.received_ns, stamp_ns
 
     @cached_property
     def _delay_ns(self) -> int | None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterator
+from contextlib import closing
 from copy import copy
 from dataclasses import asdict, replace
 from functools import partial
@@ -23,16 +24,17 @@ from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.markers import MarkerBoard
-from boxreg_ros.io.recording import stock_types
 from boxreg_ros.io.session import covariances_to_write
+from boxreg_ros.io.storage.files import opened
+from boxreg_ros.io.storage.mcap import McapFile
+from boxreg_ros.io.storage.record import Definition
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
-from boxreg_ros.structures import BoxArray, INTERPOLATED, RefinedBoxes
-from mcap.reader import make_reader
+from boxreg_ros.structures import ADDED, BoxArray, RefinedBoxes
+from mcap.records import Attachment
 from mcap.writer import Writer as McapWriter
 from msg_adapters.poses import turned_covariances
 import numpy as np
-from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -106,7 +108,7 @@ class Writer:
         self.dropped: Counter[str] = Counter()
         self._recording = copy(options.recording).__enter__()
         self._topic = self._recording.boxes_topic
-        files = [file for path in self._recording.files for file in _storage_files(path)]
+        files = self._recording.files
         sources = [self._read(file) for file in files]
         self._messages = merge(*sources, key=lambda raw: raw.log_time)
         self._next = next(self._messages, None)
@@ -116,19 +118,18 @@ class Writer:
         self._refined_topic = self._topic + BOXES_SUFFIX
         while self._refined_topic in self._recording.topics:
             self._refined_topic += BOXES_SUFFIX
-        is_ros1 = files[0].suffix == '.bag'
+        is_ros1 = not self._recording.is2
         self._markers = _MarkerEncoder(self._recording.typestore, is_ros1)
         self._writer = McapWriter(str(folder / 'overlay.mcap'))
         self._writer.start('ros1' if is_ros1 else 'ros2')
         origin = asdict(provenance) | {'recordings': ', '.join(provenance.recordings)}
         self._writer.add_metadata('boxreg_ros', origin)
-        for file in files:
-            if file.suffix == '.mcap':
-                _copy_extras(file, self._writer)
+        for path in files:
+            _copy_extras(path, self._writer)
 
     def write(self, frame: LabelFrame) -> None:
         """Add the boxes of a message, and copy messages up to the next missing boxes."""
-        if _without_interpolated(frame.refined).status:
+        if _without_added(frame.refined).status:
             stamp_ns = frame.refined.boxes.stamp_ns
             self._waiting.setdefault(stamp_ns, deque()).append(frame)
         self._copy(is_end=False)
@@ -145,8 +146,7 @@ class Writer:
         """Yield the messages of a file; topics recorded apart get the time of their clouds."""
         start_ns, end_ns = self._recording.part_ns
         apart = self._recording.apart
-        read = _read_mcap if file.suffix == '.mcap' else _read_bag
-        for raw in read(file, start_ns, end_ns, apart):
+        for raw in self._read_file(file, start_ns, end_ns, apart):
             if raw.topic not in apart:
                 yield raw
                 continue
@@ -154,6 +154,38 @@ class Writer:
             if (start_ns or 0) <= time_ns and (end_ns is None or time_ns < end_ns):
                 is_same = time_ns == raw.log_time
                 yield raw if is_same else raw._replace(log_time=time_ns, publish_time=time_ns)
+
+    def _read_file(
+        self, path: Path, start_ns: int | None, end_ns: int | None, whole: Collection[str]
+    ) -> Iterator[RawMessage]:
+        """
+        Yield the messages of a file from `start_ns` to `end_ns`.
+
+        Topics in `whole` and those of static transforms are read from the whole file.
+
+        """
+        with closing(opened(path)) as file:
+            channels = {c.id: self._channel(c) for c in file.connections}
+            uncut = [
+                c for c in file.connections if c.topic.endswith(STATIC_SUFFIX) or c.topic in whole
+            ]
+            for wanted, begin, end in _intervals(file.connections, uncut, start_ns, end_ns):
+                for record in file.messages(wanted, begin, end):
+                    yield RawMessage(
+                        record.connection.topic,
+                        *channels[record.connection.id],
+                        record.received_ns,
+                        record.published_ns,
+                        record.sequence,
+                        record.data,
+                    )
+
+    def _channel(self, connection: Connection) -> Definition:
+        """Return schema, encoding and metadata of the channel of a connection."""
+        owner: Any = connection.owner
+        if isinstance(owner, McapFile):
+            return owner.definition_of(connection)
+        return _definition(connection, self._recording.typestore)
 
     def _copy(self, is_end: bool) -> None:
         """Copy messages up to the first whose boxes are not refined yet."""
@@ -182,7 +214,7 @@ class Writer:
         frame = waiting.popleft()
         if not waiting:
             del self._waiting[given.stamp_ns]
-        refined = _without_interpolated(frame.refined)
+        refined = _without_added(frame.refined)
         T = frame.T_fixed_given
         if refined.boxes.frame_id != given.frame_id and T is not None:
             refined = replace(
@@ -258,9 +290,9 @@ def _new_message(store: Typestore, kind: str, **fields: Any) -> Any:
     return store.types[kind](**fields)
 
 
-def _without_interpolated(refined: RefinedBoxes) -> RefinedBoxes:
-    """Return the boxes without interpolated ones, for which the message has no entry."""
-    rows = [i for i, status in enumerate(refined.status) if status != INTERPOLATED]
+def _without_added(refined: RefinedBoxes) -> RefinedBoxes:
+    """Return the boxes without added ones, for which the message has no entry."""
+    rows = [i for i, status in enumerate(refined.status) if status not in ADDED]
     if len(rows) == len(refined.status):
         return refined
     boxes = refined.boxes
@@ -281,61 +313,6 @@ def _without_interpolated(refined: RefinedBoxes) -> RefinedBoxes:
     )
 
 
-def _storage_files(path: Path) -> list[Path]:
-    """Return the MCAP files of a rosbag2 folder of MCAP files, else the path itself."""
-    if path.is_dir():
-        metadata = yaml.safe_load((path / 'metadata.yaml').read_text(encoding='utf-8'))
-        names = metadata['rosbag2_bagfile_information']['relative_file_paths']
-        if all(name.endswith('.mcap') for name in names):
-            return [path / name for name in names]
-    return [path]
-
-
-def _read_mcap(
-    path: Path, start_ns: int | None, end_ns: int | None, whole: Collection[str]
-) -> Iterator[RawMessage]:
-    """
-    Yield the messages of an MCAP file from `start_ns` to `end_ns`.
-
-    Topics in `whole` and those of static transforms are read from the whole file.
-
-    """
-    with path.open('rb') as file:
-        reader = make_reader(file)
-        summary = reader.get_summary()
-        topics = {c.topic for c in summary.channels.values()} if summary else set()
-        uncut = [topic for topic in topics if topic.endswith(STATIC_SUFFIX) or topic in whole]
-        for wanted, begin, end in _intervals(None, uncut, start_ns, end_ns):
-            for schema, channel, message in reader.iter_messages(
-                wanted, starting_at=begin, ending_before=end
-            ):
-                yield RawMessage(
-                    channel.topic,
-                    (schema.name, schema.encoding, schema.data) if schema else None,
-                    channel.message_encoding,
-                    tuple(channel.metadata.items()),
-                    message.log_time,
-                    message.publish_time,
-                    message.sequence,
-                    message.data,
-                )
-
-
-def _read_bag(
-    path: Path, start_ns: int | None, end_ns: int | None, whole: Collection[str]
-) -> Iterator[RawMessage]:
-    """Yield the same of other storages, which have one time per message and no sequence."""
-    with AnyReader([path], default_typestore=stock_types()) as reader:
-        uncut = [
-            c for c in reader.connections if c.topic.endswith(STATIC_SUFFIX) or c.topic in whole
-        ]
-        channels = {(c.id, id(c.owner)): _channel(c, reader) for c in reader.connections}
-        for interval in _intervals(reader.connections, uncut, start_ns, end_ns):
-            for connection, time_ns, data in reader.messages(*interval):
-                channel = channels[connection.id, id(connection.owner)]
-                yield RawMessage(*channel, time_ns, time_ns, 0, bytes(data))
-
-
 def _intervals(
     every: _T, uncut: _T, start_ns: int | None, end_ns: int | None
 ) -> list[tuple[_T, int | None, int | None]]:
@@ -353,20 +330,18 @@ def _intervals(
     return intervals
 
 
-def _channel(
-    connection: Connection, reader: AnyReader
-) -> tuple[str, tuple[str, str, bytes], str, tuple[tuple[str, str], ...]]:
-    """Return topic, schema, encoding and metadata of the channel of a connection."""
-    definition = connection.msgdef
+def _definition(connection: Connection, store: Typestore) -> Definition:
+    """Return schema, encoding and metadata of a channel for a connection of another format."""
     kind = connection.msgtype
-    text = definition.data
+    text = connection.msgdef.data
     if isinstance(connection.ext, ConnectionExtRosbag2):
         encoding = connection.ext.serialization_format
-        language = 'ros2idl' if definition.format is MessageDefinitionFormat.IDL else 'ros2msg'
-        if definition.format is MessageDefinitionFormat.NONE:
+        is_idl = connection.msgdef.format is MessageDefinitionFormat.IDL
+        language = 'ros2idl' if is_idl else 'ros2msg'
+        if connection.msgdef.format is MessageDefinitionFormat.NONE:
             text = ''
-            if kind in reader.typestore.fielddefs:
-                text = reader.typestore.generate_msgdef(kind, ros_version=2)[0]
+            if kind in store.fielddefs:
+                text = store.generate_msgdef(kind, ros_version=2)[0]
         qos = yaml.safe_dump(dump_qos_v9(connection.ext.offered_qos_profiles), sort_keys=False)
         metadata = {'offered_qos_profiles': qos, 'topic_type_hash': connection.digest or ''}
     else:
@@ -378,16 +353,18 @@ def _channel(
             'latching': str(int(bool(connection.ext.latching))),
             'md5sum': connection.digest or '',
         }
-    return connection.topic, (kind, language, text.encode()), encoding, tuple(metadata.items())
+    return Definition((kind, language, text.encode()), encoding, tuple(metadata.items()))
 
 
 def _copy_extras(path: Path, writer: McapWriter) -> None:
     """Copy attachments and metadata of an MCAP file."""
-    with path.open('rb') as file:
-        reader = make_reader(file)
-        for item in reader.iter_attachments():
-            writer.add_attachment(
-                item.create_time, item.log_time, item.name, item.media_type, item.data
-            )
-        for note in reader.iter_metadata():
-            writer.add_metadata(note.name, note.metadata)
+    with closing(opened(path)) as file:
+        if not isinstance(file, McapFile):
+            return
+        for item in file.extras():
+            if isinstance(item, Attachment):
+                writer.add_attachment(
+                    item.create_time, item.log_time, item.name, item.media_type, item.data
+                )
+            else:
+                writer.add_metadata(item.name, item.metadata)

@@ -29,9 +29,9 @@ from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.labels.sidecar import read_sidecar, SidecarWriter
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
+    ADDED,
     Floats,
     HEIGHT,
-    INTERPOLATED,
     LENGTH,
     ROLL,
     X,
@@ -131,7 +131,7 @@ class Writer:
             else:
                 tracklet = self._open.pop(key, tracklet)
             continued[key] = tracklet
-            is_interpolated = frame.refined.status[row] == INTERPOLATED
+            is_interpolated = frame.refined.status[row] in ADDED
             tracklet.boxes.append(box)
             tracklet.states.append(INTERPOLATED_STATE if is_interpolated else LABELLED_STATE)
         for tracklet in self._open.values():

@@ -160,7 +160,7 @@ def _errors_of_kind(
     labelled = [_bare([row[::2] for row in track]) for track in tracks]
     problem, base = stack_windows(given, config)
     true, true_base = stack_windows(labelled, config)
-    problem = problem._replace(mask=problem.valid[..., None])  # as if all boxes had points
+    problem = problem._replace(counts=problem.valid.long())  # as if all boxes had points
     shift = torch.nn.functional.pad(torch.from_numpy(true_base - base), (0, 3))
     pose = true.pose + shift[:, None]
     # The input may have the opposite heading, for a whole track: yaw is compared modulo 180°.

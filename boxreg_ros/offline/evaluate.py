@@ -1,10 +1,10 @@
-"""`boxreg evaluate`: compare boxes with true boxes, matched by stamp and track id."""
+"""`boxreg evaluate`: compare boxes with true boxes, matched by stamp and overlap."""
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 import json
 import math
@@ -20,9 +20,16 @@ from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_cova
 from boxreg_ros.offline.arguments import add_topic_arguments, convention_from
 from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
+from boxreg_ros.offline.overlap import best_pairs, overlaps
 from boxreg_ros.offline.result_folder import earlier_summary
+from boxreg_ros.offline.track_scores import (
+    has_trackeval,
+    LEAST_IOU,
+    track_scores,
+    TrackScores,
+)
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, is_valid_box, YAW
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, is_valid_box, REJECTED, YAW
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,12 +41,14 @@ MAX_STEP = 1.0
 """Jitter is not computed across longer gaps [s]."""
 
 Mask = NDArray[np.bool_]
+Pairing = Callable[[BoxTable, BoxTable], Ints]
+"""Returns the row of the prediction of each true box (n,), -1 where there is none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Matches:
     """
-    All true boxes in scope, each with the prediction of its stamp and track id if there is one.
+    All true boxes in scope, each with its prediction if there is one.
 
     Attributes
     ----------
@@ -65,7 +74,7 @@ class Matches:
     true_jitter : array, shape (n,)
         The same of the true centre, as a reference for `jitter`.
     unmatched : int
-        Predictions without a true box of the same stamp and track id.
+        Predictions without a true box.
     invalid : int
         True boxes that are out of scope because of NaN or an extent that is not positive.
 
@@ -132,11 +141,46 @@ class Scores:
     true_jitter: float
 
 
+def by_id(predicted: BoxTable, truth: BoxTable) -> Ints:
+    """
+    Return the row of the prediction with the stamp and track id of each true box, or -1.
+
+    For boxes that follow from the true ones, such as the results of several methods for one
+    input: a box that is far off counts with its error. Of two predictions the first one counts.
+
+    """
+    row_of: dict[tuple[int, str], int] = {}
+    for row, key in enumerate(_keys(predicted)):
+        row_of.setdefault(key, row)
+    rows = np.array([row_of.get(key, -1) for key in _keys(truth)], np.int64)
+    is_finite = np.append(np.isfinite(predicted.boxes).all(axis=1), False)
+    return np.where(is_finite[rows], rows, -1)
+
+
+def by_overlap(predicted: BoxTable, truth: BoxTable) -> Ints:
+    """
+    Return the row of the prediction that overlaps each true box, or -1.
+
+    At each stamp the one-to-one pairs with the greatest sum of 3D IoU are chosen; ids play no
+    role.
+
+    """
+    rows = np.full(len(truth.boxes), -1, np.int64)
+    for stamp in overlaps(predicted, truth):
+        true, found = best_pairs(stamp.iou)
+        rows[stamp.true[true]] = stamp.predicted[found]
+    return rows
+
+
 def match(
-    predicted: BoxTable, truth: BoxTable, min_points: int = 0, classes: Sequence[str] = ()
+    predicted: BoxTable,
+    truth: BoxTable,
+    min_points: int = 0,
+    classes: Sequence[str] = (),
+    pair: Pairing = by_id,
 ) -> Matches:
     """
-    Compare predictions with the true boxes of the same stamp and track id.
+    Compare predictions with true boxes of the same stamp.
 
     Parameters
     ----------
@@ -147,6 +191,8 @@ def match(
     classes : sequence of str
         True boxes whose class name contains none of these words are out of scope; case is
         ignored. Empty: all classes are in scope.
+    pair : callable
+        Which prediction belongs to a true box: `by_id` or `by_overlap`.
 
     Raises
     ------
@@ -159,17 +205,13 @@ def match(
             f'predicted boxes: expected the frame of the true boxes, {truth.frame_id!r}, got '
             f'{predicted.frame_id!r}; relabel with --fixed-frame {truth.frame_id}'
         )
-    true_keys = _keys(truth)
-    _check_unique(true_keys)
-    row_of: dict[tuple[int, str], int] = {}  # row of the prediction
-    for row, key in enumerate(_keys(predicted)):
-        row_of.setdefault(key, row)  # of two predictions with the same key the first counts
+    _check_unique(_keys(truth))
+    paired_rows = pair(predicted, truth)
     is_valid = is_valid_box(truth.boxes)
     is_in_class = np.array([has_word(name, classes) for name in truth.class_names], bool)
     scope = np.flatnonzero(is_valid & is_in_class & (truth.num_points >= min_points))
-    predicted_rows = np.array([row_of.get(key, -1) for key in true_keys], np.int64)[scope]
-    is_finite = np.isfinite(predicted.boxes).all(axis=1)
-    is_matched = (predicted_rows >= 0) & np.append(is_finite, False)[predicted_rows]
+    predicted_rows = paired_rows[scope]
+    is_matched = predicted_rows >= 0
     true_rows = scope[is_matched]
     boxes = predicted.boxes[predicted_rows[is_matched]]
     true_boxes = truth.boxes[true_rows]
@@ -194,7 +236,7 @@ def match(
         jitter=_spread(jitter, is_matched, np.nan),
         turn_jitter=_spread(turn_jitter, is_matched, np.nan),
         true_jitter=_spread(true_jitter, is_matched, np.nan),
-        unmatched=len(row_of.keys() - set(true_keys)),
+        unmatched=len(predicted.boxes) - int((paired_rows >= 0).sum()),
         invalid=int((~is_valid).sum()),
     )
 
@@ -283,7 +325,7 @@ def run(args: argparse.Namespace) -> int:
     truth = BoxTable.read(args.truth)
     predicted = _predicted(args, truth.frame_id)
     classes = [word for part in args.classes for word in part.split(',') if word]
-    matches = match(predicted, truth, args.min_points, classes)
+    matches = match(predicted, truth, args.min_points, classes, by_overlap)
     if matches.invalid:
         _warn(
             f'{matches.invalid} of {len(truth.boxes)} true boxes are left out: NaN, or an extent '
@@ -296,16 +338,20 @@ def run(args: argparse.Namespace) -> int:
             f'--min-points or choose other --classes; the table has {names}'
         )
     if len(predicted.boxes) and not matches.is_matched.any():
-        _warn(_why_none_matches(predicted, truth, matches))
+        _warn(_why_none_matches(predicted, truth))
     overall = summarise(matches)
+    tracks = track_scores(predicted, truth, matches.rows)
+    if not has_trackeval():
+        _warn('HOTA and IDF1 need the package trackeval: pip install trackeval')
     certainty = consistency(matches, truth, _covariances(args.predicted))
     if args.json:
-        report = _report(overall, groups(matches))
+        report = _report(overall, groups(matches)) | {'tracks': asdict(tracks)}
         if certainty:
             report['consistency'] = {name: group._asdict() for name, group in certainty.items()}
         print(json.dumps(finite(report)))
     else:
         _print_tables(overall, groups(matches))
+        print(_track_lines(tracks))
         if certainty:
             print(f'\ncovariances of the {_estimate(args.predicted)} estimate')
             print(consistency_table(certainty))
@@ -326,6 +372,19 @@ def _estimate(source: Path) -> str:
     return str((earlier_summary(folder) or {}).get('estimate', 'written'))
 
 
+def _track_lines(scores: TrackScores) -> str:
+    """Return the scores of tracks as text."""
+    lines = [
+        f'tracks, at a 3D IoU of {LEAST_IOU}: recall {scores.recall:.3f} ({scores.misses} '
+        f'misses), precision {scores.precision:.3f} ({scores.ghosts} ghosts), '
+        f'{scores.ids_per_object:.2f} ids per object, IDF1 {scores.idf1:.3f}; HOTA '
+        f'{scores.hota:.3f} (detection {scores.det_a:.3f}, association {scores.ass_a:.3f})'
+    ]
+    if scores.added:
+        lines.append(f'{scores.added} added boxes with a mean 3D IoU of {scores.added_iou:.3f}')
+    return '\n'.join(lines)
+
+
 def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
     """Read the boxes to compare: a table, or the input boxes of a recording."""
     source: Path = args.predicted
@@ -339,7 +398,8 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
                 f'--points, --boxes, --odometry, --fixed-frame, {convention}: expected with a '
                 f'recording only, got the table {str(source)!r}; leave them out'
             )
-        return _table_in_frame(BoxTable.read_frames(source), frame_id)
+        found = _table_in_frame(BoxTable.read_frames(source), frame_id)
+        return found.rows(np.array([status != REJECTED for status in found.status], bool))
     from boxreg_ros.io.recording import input_boxes  # slow to import: it reads bags
 
     arrays, left_out = input_boxes(source, args.fixed_frame, convention=convention, **topics)
@@ -380,28 +440,23 @@ def _print_tables(overall: Scores, grouped: dict[str, dict[str, Scores]]) -> Non
     print(table(rows))
     print(
         f'{overall.boxes} true boxes, {overall.missing} missing, {overall.unmatched} predictions '
-        f'without a true box; recalls of 3D IoU, ATE in m, ASE is 1 - IoU, AOE in rad, jitter in '
-        f'm/s^2'
+        f'without a true box, matched by overlap; recalls of 3D IoU, ATE in m, ASE is 1 - IoU, '
+        f'AOE in rad, jitter in m/s^2'
     )
 
 
-def _why_none_matches(predicted: BoxTable, truth: BoxTable, matches: Matches) -> str:
+def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
     """Return why no predicted box has a true one."""
-    true_keys = _keys(truth)
-    keys = set(_keys(predicted))
-    invalid = sum(true_keys[row] in keys for row in matches.rows)
-    if invalid:
+    if not is_valid_box(predicted.boxes).any():
         return (
-            f'all {invalid} predicted boxes with the stamp and the track id of a true one are '
-            f'invalid: expected finite numbers and a quaternion other than 0 0 0 0'
+            f'all {len(predicted.boxes)} predicted boxes are invalid: expected finite numbers and '
+            f'a quaternion other than 0 0 0 0'
         )
     stamps = np.intersect1d(predicted.stamps_ns, truth.stamps_ns)
-    tracks = set(predicted.track_ids) & set(truth.track_ids)
     return (
-        f'no predicted box has the stamp and the track id of a true one: {len(stamps)} stamps and '
-        f'{len(tracks)} track ids are in both; stamps of predicted boxes: '
-        f'{time_range(predicted.stamps_ns)}, of true boxes: {time_range(truth.stamps_ns)}; '
-        f'compare boxes of one recording with the ids of one tracker'
+        f'no predicted box overlaps a true one: {len(stamps)} stamps are in both; stamps of '
+        f'predicted boxes: {time_range(predicted.stamps_ns)}, of true boxes: '
+        f'{time_range(truth.stamps_ns)}; compare boxes of one recording in one frame'
     )
 
 

@@ -15,17 +15,20 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.review.decisions import Corrections, read_decisions
 from boxreg_ros.structures import (
+    ADDED,
     BoxArray,
     Floats,
-    INTERPOLATED,
     KEPT,
     REFINED,
     RefinedBoxes,
+    REJECTED,
     Sweep,
     YAW,
 )
-from boxreg_ros.tracks.bridge import Bridge
 import numpy as np
+
+WITH_REJECTED = ('csv', 'mcap')
+"""Formats that hold every box of the input; the messages of an overlay are those of the input."""
 
 
 @dataclass(eq=False, slots=True)
@@ -63,7 +66,7 @@ class Sink:
     Attributes
     ----------
     boxes_in, boxes_out : int
-        Boxes of the input, and boxes written, interpolated ones included.
+        Boxes of the input, and boxes written, added ones included.
     status, reasons : Counter
         Of the boxes written.
     heading_flips : int
@@ -102,7 +105,6 @@ class Sink:
         self.corrections = Corrections(
             read_decisions(request.decisions) if request.decisions is not None else ()
         )
-        self._bridge: Bridge[_Slot] = Bridge(request.bridge, self._fixed_frame, request.config)
         # These import torch, after the fork of the reader.
         from boxreg_ros.review.changes import Changes
         from boxreg_ros.review.track_points import PointCollector
@@ -152,8 +154,7 @@ class Sink:
             if first.result is None:
                 return
             del self._by_stamp[0]
-            for refined, slot in self._bridge.add(first.result, first):
-                self._put(refined, slot)
+            self._put(first.result, first)
 
     def __enter__(self) -> Sink:
         """Return the sink."""
@@ -165,8 +166,6 @@ class Sink:
             return
         if self.points is not None:
             self.points.flush()
-        for refined, slot in self._bridge.flush():
-            self._put(refined, slot)
         with self._clock('write'):
             for writer in self._writers.values():
                 writer.close()
@@ -180,7 +179,7 @@ class Sink:
 
     def missing(self) -> int:
         """Return the number of input boxes that have not been written."""
-        return self.boxes_in - (self.boxes_out - self.status[INTERPOLATED])
+        return self.boxes_in - (self.boxes_out - sum(self.status[word] for word in ADDED))
 
     def _note_time(self, content: Sweep | BoxArray | None) -> None:
         """Widen the time range of clouds or boxes by a message; empty box arrays count."""
@@ -220,8 +219,9 @@ class Sink:
         self.changes.add(slot.boxes, refined)
         with self._clock('write'):
             frame = self._frame(refined, slot)
-            for writer in self._writers.values():
-                writer.write(frame)
+            accepted = replace(frame, refined=_accepted(refined))
+            for name, writer in self._writers.items():
+                writer.write(frame if name in WITH_REJECTED else accepted)
 
     def _frame(self, refined: RefinedBoxes, slot: _Slot) -> LabelFrame:
         """Return all that label writers need about one array, its cloud included."""
@@ -246,9 +246,31 @@ def _kept(boxes: BoxArray) -> RefinedBoxes:
     return RefinedBoxes(boxes, (KEPT,) * n, reasons, np.zeros(n, np.int64), unknown)
 
 
+def _accepted(refined: RefinedBoxes) -> RefinedBoxes:
+    """Return a result without the rejected boxes."""
+    if REJECTED not in refined.status:
+        return refined
+    rows = [row for row, status in enumerate(refined.status) if status != REJECTED]
+    boxes = refined.boxes
+    return RefinedBoxes(
+        replace(
+            boxes,
+            track_ids=tuple(boxes.track_ids[row] for row in rows),
+            class_names=tuple(boxes.class_names[row] for row in rows),
+            scores=boxes.scores[rows],
+            boxes=boxes.boxes[rows],
+        ),
+        tuple(refined.status[row] for row in rows),
+        tuple(refined.reasons[row] for row in rows),
+        refined.num_points[rows],
+        refined.covariances[rows],
+        refined.is_final,
+    )
+
+
 def _heading_flips(boxes: BoxArray, refined: RefinedBoxes) -> int:
     """Return how many refined headings differ from the input by more than 90 degrees."""
-    n = len(boxes.track_ids)  # interpolated boxes stand behind those of the input
+    n = len(boxes.track_ids)  # added boxes stand behind those of the input
     turn = refined.boxes.boxes[:n, YAW] - boxes.boxes[:, YAW]
     is_refined = np.array([status == REFINED for status in refined.status[:n]], bool)
     return int((is_refined & (np.cos(turn) < 0)).sum())

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.io.recording import Item, ItemSource
 from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
@@ -81,13 +82,16 @@ class Findings(NamedTuple):
     Attributes
     ----------
     counts : Counter
-        Sweeps, box arrays, time jumps, and sweeps without a transform.
+        Sweeps, box arrays, time jumps, sweeps without a transform, and sweeps and box arrays
+        without a stamp.
     first_missing_transform : str
         Error of the first item without a transform; empty if there is none.
     unreadable, first_unreadable : int and str
         Number of unreadable messages, and the first error of each topic.
     apart : dict
         Topics that were recorded apart from the clouds, and by how much [s].
+    damages : list of Damage
+        Parts of the files that could not be read.
     outside : int
         Boxes of label files outside of the part that is read.
     warning, facts : str and dict
@@ -102,6 +106,7 @@ class Findings(NamedTuple):
     unreadable: int
     first_unreadable: str
     apart: dict[str, float]
+    damages: list[Damage]
     outside: int
     warning: str
     facts: dict[str, object]
@@ -186,6 +191,7 @@ class RecordingReader:
             recording.unreadable.total(),
             '; '.join(map(str, recording.first_errors.values())),
             recording.apart,
+            recording.damages,
             recording.outside,
             self._session.finding,
             self._session.facts,
@@ -194,7 +200,10 @@ class RecordingReader:
 
     def _count(self, given: Sweep | BoxArray, admitted: Admitted) -> None:
         is_sweep = isinstance(given, Sweep)
-        self._counts['sweeps' if is_sweep else 'box_arrays'] += 1
+        kind = 'sweeps' if is_sweep else 'box_arrays'
+        self._counts[kind] += 1
+        if given.stamp_ns <= 0 and not is_placeholder(given):
+            self._counts[f'{kind}_without_stamp'] += 1
         if admitted.detail:
             self._counts['sweep_without_transform'] += is_sweep
             self._first_missing_transform = self._first_missing_transform or admitted.detail

@@ -1,8 +1,8 @@
 """
 Refine the boxes of a recording and write them as label files.
 
-Every box of the recording is written exactly once: refined, or unchanged with the reason. With
-`Request.bridge`, interpolated boxes are added.
+Every box of the recording is written exactly once: refined, or unchanged with the reason. With a
+step of `Config.complete`, the recording is read twice and its tracks are completed.
 
 """
 
@@ -24,22 +24,26 @@ from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
+from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress
-from boxreg_ros.offline.reader import Findings, ReadAhead, reader
+from boxreg_ros.offline.reader import Findings, ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.review.decisions import DECISIONS
-from boxreg_ros.structures import INTERPOLATED, KEPT, REFINED
+from boxreg_ros.structures import EXTENDED, INTERPOLATED, KEPT, REFINED, RefinedBoxes, REJECTED
 import numpy as np
 import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar
+    from boxreg_ros.offline.completion import Completion
     from boxreg_ros.review.changes import TrackChanges
     from boxreg_ros.review.track_points import PointCollector
+    from boxreg_ros.tracks.complete import Plan
 
 MAX_NAMED = 5
 """Most tracks that a warning names; chosen."""
@@ -62,7 +66,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     out : Path
         Result folder. It appears complete or not at all; an earlier result is replaced.
     progress : Progress, optional
-        Shows the duration of the recording that has been read and its whole duration [s].
+        Shows the duration of the recording that has been read and its whole duration [s]. Both
+        count once for each time that the recording is read: with completed tracks once more.
 
     Returns
     -------
@@ -80,6 +85,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     clock = Stopwatch()
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
+    shown = _Passes(progress, 1 + bool(request.config.complete.steps))
+    plan, completion = _survey(request, clock, shown)
     with ExitStack() as workers:
         process = workers.enter_context(reader(request))
         # The recording is opened while this process imports torch, which takes a second.
@@ -90,18 +97,20 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             registration_worker(request.config, clock, progress.announce)
         )
         recording = ReadAhead(process)
-        clock.begun('start')
+        if plan is None:
+            clock.begun('start')
         registrar = BoxRegistrar(request.config, submit)
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
-                _register(recording, registrar, sink, clock, progress)
+                _register(recording, registrar, completion, sink, clock, shown)
             summary = _summary(request, recording, registrar.counts, sink)
+            summary['complete'] = _completed(plan)
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary |= {'fingerprint': fingerprint, 'seconds': clock.seconds()}
             tracks = sink.changes.tracks()
             with clock('write'):
-                summary['rules'] = _write_tables(folder, tracks, request.config)
+                summary['rules'] = _write_tables(folder, tracks, request.config, plan)
             if sink.points is not None:
                 _report(folder, out, request, summary, tracks, sink.points, clock)
             if request.decisions is not None:
@@ -112,34 +121,104 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     return summary
 
 
+class _Passes:
+    """Progress over several passes through a recording."""
+
+    def __init__(self, progress: Progress, passes: int) -> None:
+        self.progress = progress
+        self._passes = passes
+        self._done = 0
+
+    def each(self, recording: ReadAhead) -> Iterator[ReadItem]:
+        """Yield the items of one pass, and show the time that has been read [s]."""
+        seconds = recording.source.seconds
+        for item in recording:
+            self.progress.show(self._done * seconds + item.seconds, self._passes * seconds)
+            yield item
+        self._done += 1
+
+
+def _survey(
+    request: Request, clock: Stopwatch, progress: _Passes
+) -> tuple[Plan | None, Completion | None]:
+    """Register the recording a first time and plan its whole tracks; None without steps."""
+    if not request.config.complete.steps:
+        return None, None
+    with ExitStack() as workers:
+        process = workers.enter_context(reader(request))
+        from boxreg_ros.offline.completion import Completion, survey
+        from boxreg_ros.offline.registration_worker import registration_worker
+
+        submit = workers.enter_context(
+            registration_worker(request.config, clock, progress.progress.announce)
+        )
+        recording = ReadAhead(process)
+        clock.begun('start')
+        items = ((item.moved, item.restarts) for item in progress.each(recording))
+        plan = survey(items, recording.source.fixed_frame, request.config, submit)
+        return plan, Completion(plan, request.config)
+
+
 def _register(
     recording: ReadAhead,
     registrar: BoxRegistrar,
+    completion: Completion | None,
     sink: Sink,
     clock: Stopwatch,
-    progress: Progress,
+    progress: _Passes,
 ) -> None:
-    """Read the recording, register its boxes and write them."""
-    for item in recording:
-        progress.show(item.seconds, recording.source.seconds)
+    """Read the recording, register its boxes, with those of `completion`, and write them."""
+    for item in progress.each(recording):
         with_ticket = sink.expect(item)
+        moved = with_ticket.moved
         with clock('registrar'):
-            ready = register(registrar, with_ticket.moved, with_ticket.restarts)
-        sink.take(ready)
+            if completion is not None:
+                moved = completion.to_register(moved, item.restarts)
+            ready = register(registrar, moved, item.restarts)
+        _take(ready, completion, sink)
     with clock('registrar'):
         ready = registrar.flush()
-    sink.take(ready)
+    _take(ready, completion, sink)
+    if completion is not None:
+        sink.take(completion.finished())
+
+
+def _take(ready: list[RefinedBoxes], completion: Completion | None, sink: Sink) -> None:
+    """Hand results on; those of completed tracks wait for the end of the recording."""
+    if completion is None:
+        sink.take(ready)
+    else:
+        completion.add(ready)
+
+
+def _completed(plan: Plan | None) -> dict[str, int]:
+    """Return what each step did to how many tracks and boxes; empty without steps."""
+    if plan is None:
+        return {}
+    tracks = plan.tracks
+    return {
+        'tracks': len(tracks),
+        'joined': sum(track.fragments - 1 for track in tracks),
+        'ambiguous': sum(bool(track.ambiguous) for track in tracks),
+        'rejected': sum(track.rejected for track in tracks),
+        'filled': sum(track.filled for track in tracks),
+        'extended': sum(track.extended for track in tracks),
+        'reclassified': sum(track.reclassified for track in tracks),
+    }
 
 
 def _write_tables(
-    folder: Path, tracks: Sequence[TrackChanges], config: Config
+    folder: Path, tracks: Sequence[TrackChanges], config: Config, plan: Plan | None
 ) -> dict[str, dict[str, int]]:
     """Write the tables of tracks; return violations of rules ``before`` and ``after`` the run."""
     from boxreg_ros.review.rules import counts
     from boxreg_ros.review.rules.protocol import LabelTrack
     from boxreg_ros.review.tables import assessed, write_tables
 
-    write_tables(folder, assessed(tracks))
+    if plan is None:
+        write_tables(folder, assessed(tracks))
+    else:
+        write_tables(folder, assessed(tracks), STEP_COLUMNS, step_cells(plan.tracks))
     before = []
     after = []
     for track in tracks:
@@ -225,6 +304,8 @@ def _summary(
         'time_ranges': {name: list(ends) for name, ends in sink.time_ranges.items()},
         'unknown_classes': dict(sink.unknown_classes.most_common()),
         'dropped': _dropped(registered, findings),
+        'without_stamp': _without_stamp(findings),
+        'damage': [damage._asdict() for damage in findings.damages],
         'first_missing_transform': findings.first_missing_transform,
         'first_unreadable': findings.first_unreadable,
         'warning': findings.warning or ('' if sink.boxes_in else NO_BOXES),
@@ -254,6 +335,12 @@ def _dropped(registered: Counter[str], findings: Findings) -> dict[str, int]:
     return {name: count for name, count in sorted(counts.items()) if count}
 
 
+def _without_stamp(findings: Findings) -> dict[str, int]:
+    """Return the number of clouds and box arrays whose header has no stamp."""
+    counts = {name: findings.counts[f'{name}_without_stamp'] for name in ('sweeps', 'box_arrays')}
+    return {name: count for name, count in counts.items() if count}
+
+
 def _versions() -> dict[str, str]:
     """Return the versions of everything that can change the results."""
     versions = {'boxreg_ros': __version__, 'python': platform.python_version()}
@@ -274,8 +361,9 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
         parts[-1] += f' ({_counts(summary["reasons"])})'
     if summary['heading_flips']:
         parts.append(f'{summary["heading_flips"]:,} heading flips corrected')
-    if INTERPOLATED in status:
-        parts.append(f'{status[INTERPOLATED]:,} interpolated')
+    for word in (REJECTED, INTERPOLATED, EXTENDED):
+        if word in status:
+            parts.append(f'{status[word]:,} {word}')
     line = (
         f'{out}: {", ".join(parts)} from {summary["sweeps"]:,} sweeps in '
         f'{summary["seconds"]["total"]:.1f} s, fixed frame {summary["fixed_frame"]}'
@@ -290,6 +378,14 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
 
 def notes(summary: dict[str, Any]) -> Iterator[str]:
     """Yield warnings about the input and the results, one line each."""
+    if summary['damage']:
+        yield _damage_line(summary['damage'])
+    if summary['without_stamp']:
+        counts = ' and '.join(f'{n:,} {kind}' for kind, n in summary['without_stamp'].items())
+        yield (
+            f'{counts} have the stamp 0 in their header and cannot be used: receive times do not '
+            f'replace stamps; let the publishers set them'
+        ).replace('box_arrays', 'box arrays')
     if summary['warning']:
         yield summary['warning']
     if summary['first_missing_transform']:
@@ -322,6 +418,23 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
         )
     if part_refined(summary) < FEW_REFINED:
         yield _why_few_were_refined(summary)
+
+
+def is_complete(summary: dict[str, Any]) -> bool:
+    """Return whether all messages of the recording were read, with usable stamps."""
+    return not (
+        summary['damage'] or summary['without_stamp'] or 'unreadable' in summary['dropped']
+    )
+
+
+def _damage_line(damages: list[dict[str, Any]]) -> str:
+    """Return all damages of a recording in one line."""
+    count = len(damages)
+    parts = f'{count:,} parts' if count > 1 else 'a part'
+    return (
+        f'{parts} of the recording cannot be read; the rest was used; first: '
+        f'{Damage(**damages[0])}; {SUMMARY} lists {"all" if count > 1 else "it"} under "damage"'
+    )
 
 
 def has_failed(summary: dict[str, Any]) -> bool:

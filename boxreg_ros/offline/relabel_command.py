@@ -7,6 +7,7 @@ from pathlib import Path
 import sys
 from typing import Any, Self, TYPE_CHECKING
 
+from boxreg_ros.config import COMPLETE_STEPS
 from boxreg_ros.offline.arguments import (
     add_label_arguments,
     add_recording_arguments,
@@ -58,9 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='end of the part to refine, from the beginning of the recording [s]',
     )  # fmt: skip
     parser.add_argument(
-        '--bridge', type=float, default=0.0, metavar='S',
-        help='interpolate missing boxes in gaps of a track up to this long [s] (default: none)',
+        '--complete', action='store_true',
+        help='complete the tracks: join fragments, reject ghosts, add missing boxes (sets '
+        ' complete.stitch, static, prune, fill and extend)',
     )  # fmt: skip
+    parser.add_argument('--bridge', nargs='?', action=_Removed, help=argparse.SUPPRESS)
     parser.add_argument(
         '--report', action='store_true',
         help='also write report.html: every track before and after, to look at in a browser',
@@ -78,12 +81,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='do nothing if OUT holds the result of the same request, files and settings',
     )  # fmt: skip
     parser.add_argument(
+        '--strict', action='store_true',
+        help='exit with status 1 if a part of the recording could not be read, or has no stamps',
+    )  # fmt: skip
+    parser.add_argument(
         '--fail-under', type=_part, default=0.0, metavar='PART',
         help='exit with 1, the results kept, if a smaller part of the boxes is refined, as in 0.9',
     )  # fmt: skip
     parser.add_argument(
         '--workers', type=int, metavar='N', help='CPU cores of the solver (sets solver.threads)'
     )
+
+
+class _Removed(argparse.Action):
+    """An option of earlier versions: its error names what replaces it."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        _namespace: argparse.Namespace,
+        _values: object,
+        option_string: str | None = None,
+    ) -> None:
+        """Refuse the option."""
+        parser.error(
+            f'{option_string}: was removed; use --complete, or for missing boxes alone '
+            f'--set complete.fill=true --set complete.fill_gap=SECONDS'
+        )
 
 
 def _part(text: str) -> float:
@@ -123,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
     earlier = earlier_summary(args.out)
     if args.resume and earlier and _is_complete(earlier, request, args.out):
         print(f'{args.out}: up to date, made from the same files with the same settings')
-        return _status(earlier, args.fail_under)
+        return _status(earlier, args.fail_under, args.strict)
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
     with ProgressBar() as bar:
@@ -131,12 +155,12 @@ def run(args: argparse.Namespace) -> int:
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))
-    return _status(summary, args.fail_under)
+    return _status(summary, args.fail_under, args.strict)
 
 
-def _status(summary: dict[str, Any], fail_under: float) -> int:
+def _status(summary: dict[str, Any], fail_under: float, is_strict: bool) -> int:
     """Return the exit status of a run; say on stderr if it misses ``--fail-under``."""
-    from boxreg_ros.offline.relabel import has_failed, part_refined
+    from boxreg_ros.offline.relabel import has_failed, is_complete, part_refined
 
     part = part_refined(summary)
     if part < fail_under:
@@ -146,7 +170,7 @@ def _status(summary: dict[str, Any], fail_under: float) -> int:
             file=sys.stderr,
         )
         return FAILED
-    return FAILED if has_failed(summary) else DONE
+    return FAILED if has_failed(summary) or (is_strict and not is_complete(summary)) else DONE
 
 
 def _request(args: argparse.Namespace) -> Request:
@@ -155,6 +179,8 @@ def _request(args: argparse.Namespace) -> Request:
     from boxreg_ros.offline.request import Request
 
     config = config_from(args)
+    if args.complete:
+        config = config.updated({f'complete.{step}': True for step in COMPLETE_STEPS})
     if args.workers is not None:
         config = config.updated({'solver.threads': args.workers})
     return Request(
@@ -171,7 +197,6 @@ def _request(args: argparse.Namespace) -> Request:
         labels=args.labels,
         label_frame=args.label_frame,
         convention=convention_from(args, args.associate),
-        bridge=args.bridge,
         report=args.report,
         truth=args.truth,
         decisions=args.decisions,

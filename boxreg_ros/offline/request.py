@@ -45,8 +45,6 @@ class Request:
         Sensor frame of the written label files; None for the frame of the clouds.
     convention : Convention
         Meaning of pose and size of the input boxes.
-    bridge : float
-        Longest gap of a track that is filled with interpolated boxes [s]; 0 fills none.
     report : bool
         Also write ``report.html``.
     decisions : Path or None
@@ -74,7 +72,6 @@ class Request:
     labels: tuple[str, Path] | None = None
     label_frame: str | None = None
     convention: Convention = STANDARD
-    bridge: float = 0.0
     report: bool = False
     truth: Path | None = None
     decisions: Path | None = None
@@ -84,12 +81,6 @@ class Request:
         self._check_recordings()
         self._check_boxes()
         self._check_part()
-        if not 0 <= self.bridge <= self.config.max_gap:
-            raise ConfigError(
-                f'bridge: expected 0 to max_gap ({self.config.max_gap:g} s), got {self.bridge:g}; '
-                f'after a longer gap an id names another track: choose a smaller --bridge or a '
-                f'larger max_gap'
-            )
         check_options(self.formats, self.options)
         if self.report:
             from boxreg_ros.review.report import check_packages  # imports torch

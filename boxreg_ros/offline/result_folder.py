@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+import errno
 import json
 import os
 from pathlib import Path
 import shutil
-from typing import Any
+from typing import Any, TextIO
 from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
 
+DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+"""Disk full, file larger than the limit of the process, quota used up."""
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
 
@@ -74,7 +77,7 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
     ConfigError
         If one of `inputs` is in `out`.
     RecordingError
-        If `out` exists and is not the unchanged result of an earlier run.
+        If `out` exists and is not the unchanged result of an earlier run, or its disk is full.
 
     """
     spare(out, inputs)
@@ -90,11 +93,30 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
         if out.exists():
             os.replace(out, earlier)
         os.replace(partial, out)
+    except OSError as error:
+        if error.filename is None and error.errno in DISK_ERRORS:  # of a write, which has no name
+            raise RecordingError(
+                f'output {str(out)!r}: expected room for all files, got: {error.strerror}; '
+                f'nothing was written: free some space, or choose another disk with -o'
+            ) from None
+        raise
     finally:
         if earlier.exists() and not out.exists():
             os.replace(earlier, out)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(earlier, ignore_errors=True)
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[TextIO]:
+    """Yield a file that replaces `path` on success and is deleted on failure."""
+    partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
+    try:
+        with partial.open('w', encoding='utf-8', newline='') as file:
+            yield file
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _check_replaceable(out: Path) -> None:

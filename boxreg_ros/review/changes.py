@@ -30,11 +30,13 @@ class TrackChanges:
     ----------
     track_id, class_name : str
         As in the input; the most frequent class of the track.
+    input_ids : tuple of n str
+        Track ids in the input; empty for boxes that the input does not have.
     stamps_ns : array, shape (n,)
         Header stamps [ns].
     given, boxes : array, shape (n, 9)
         Input and result in the fixed frame; NaN where a box is invalid or in another frame, and
-        in `given` for interpolated boxes.
+        in `given` for added boxes.
     change : array, shape (n, 4)
         Result minus input along the axes of the box [m] and in yaw [rad], without 180 degree
         flips.
@@ -58,6 +60,7 @@ class TrackChanges:
 
     track_id: str
     class_name: str
+    input_ids: tuple[str, ...]
     stamps_ns: Ints
     given: Floats
     boxes: Floats
@@ -105,7 +108,8 @@ class Changes:
 
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
-        self._names: list[tuple[str, str, str, str]] = []  # id, class, status, reason
+        # Id, class, status, reason, id in the input.
+        self._names: list[tuple[str, str, str, str, str]] = []
         # Rows of given (9), boxes (9), deviations (4), extent deviations (3), face distances (6),
         # part of the points outside (1).
         self._numbers: list[Floats] = []
@@ -120,7 +124,7 @@ class Changes:
         given : BoxArray
             The input.
         refined : RefinedBoxes
-            The result; interpolated boxes stand behind those of the input.
+            The result; added boxes stand behind those of the input.
 
         """
         boxes = refined.boxes
@@ -147,9 +151,9 @@ class Changes:
             )
         )
         self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
-        self._names += zip(
-            boxes.track_ids, boxes.class_names, refined.status, refined.reasons, strict=True
-        )
+        input_ids = (*given.track_ids, *('' for _ in range(n - len(given.track_ids))))
+        names = boxes.track_ids, boxes.class_names, refined.status, refined.reasons, input_ids
+        self._names += zip(*names, strict=True)
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
@@ -163,13 +167,15 @@ class Changes:
         change = -np.column_stack([errors.translation, yaw_change])
         found = []
         for track_id, rows in self._rows_by_track(counts[:, 0]).items():
-            _, classes, status, reasons = zip(*(self._names[row] for row in rows), strict=True)
+            parts = zip(*(self._names[row] for row in rows), strict=True)
+            _, classes, status, reasons, input_ids = parts
             is_refined = np.isin(status, (REFINED, HUMAN))
             unknown = np.where(is_refined, 0.0, np.nan)[:, None]
             found.append(
                 TrackChanges(
                     track_id=track_id,
                     class_name=Counter(classes).most_common(1)[0][0],
+                    input_ids=input_ids,
                     stamps_ns=counts[rows, 0],
                     given=given[rows],
                     boxes=boxes[rows],

@@ -14,7 +14,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.changes import median, TrackChanges
 from boxreg_ros.review.quality import ious, quality
 from boxreg_ros.review.track_points import PointCollector, to_millimetres
-from boxreg_ros.structures import BOX_EXTENT, Floats, INTERPOLATED, X, Y, Z
+from boxreg_ros.structures import ADDED, BOX_EXTENT, Floats, X, Y, Z
 import numpy as np
 import orjson
 
@@ -59,7 +59,7 @@ class TrackTruth(NamedTuple):
 
 
 def true_boxes(tracks: Sequence[TrackChanges], truth: BoxTable | None) -> list[TrackTruth]:
-    """Return the true boxes of each track by stamp and track id."""
+    """Return the true boxes of each track by stamp and track id of the input."""
     if not tracks:
         return []
     row_of: dict[tuple[int, str], int] = {}
@@ -70,9 +70,9 @@ def true_boxes(tracks: Sequence[TrackChanges], truth: BoxTable | None) -> list[T
         known = truth.boxes
     known = np.append(known, np.full((1, 9), np.nan), axis=0)  # the last one is unknown
     rows = [
-        row_of.get((stamp, track.track_id), -1)
+        row_of.get((stamp, name), -1)
         for track in tracks
-        for stamp in track.stamps_ns.tolist()
+        for stamp, name in zip(track.stamps_ns.tolist(), track.input_ids, strict=True)
     ]
     boxes = known[rows]
     nothing = np.zeros((0, 9))
@@ -115,7 +115,7 @@ class TrackPart:
         """Return the row of the list; `risk` is the row of ``review.csv``, empty without."""
         track = self._track
         status = Counter(track.status.tolist())
-        is_input = track.status != INTERPOLATED
+        is_input = ~np.isin(track.status, ADDED)
         boxes = int(is_input.sum())
         extents = [_median_extents(track.given), _median_extents(track.boxes)]
         known = np.flatnonzero(np.isfinite(track.boxes[:, X]))
@@ -124,7 +124,7 @@ class TrackPart:
             'id': track.track_id,
             'class': track.class_name,
             'boxes': boxes,
-            'interpolated': status[INTERPOLATED],
+            'interpolated': sum(status[word] for word in ADDED),
             'begin': (int(track.stamps_ns[0]) - begin_ns) * 1e-9,
             'seconds': float(track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
             'points': median(track.num_points[is_input]),

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.review.changes import median, TrackChanges
 from boxreg_ros.review.risk import assess, reasons_of, Risk
-from boxreg_ros.structures import BOX_EXTENT, INTERPOLATED, KEPT, REFINED
+from boxreg_ros.structures import ADDED, BOX_EXTENT, INTERPOLATED, KEPT, REFINED
 import numpy as np
 
 TRACKS = 'tracks.csv'
@@ -34,7 +34,7 @@ def _extent(axis: int) -> Callable[[TrackRow], float]:
 TRACK_COLUMNS: Mapping[str, Callable[[TrackRow], Any]] = {
     'track_id': lambda row: row.track.track_id,
     'class_name': lambda row: row.track.class_name,
-    'boxes': lambda row: int((row.track.status != INTERPOLATED).sum()),
+    'boxes': lambda row: int((~np.isin(row.track.status, ADDED)).sum()),
     'refined': _count(REFINED),
     'kept': _count(KEPT),
     'risk_m': lambda row: row.risk.track,
@@ -58,7 +58,12 @@ def assessed(tracks: Sequence[TrackChanges]) -> list[TrackRow]:
     return sorted(rows, key=lambda row: (-row.risk.track, row.track.track_id))
 
 
-def write_tables(folder: Path, rows: Sequence[TrackRow]) -> None:
+def write_tables(
+    folder: Path,
+    rows: Sequence[TrackRow],
+    more_columns: Sequence[str] = (),
+    more_cells: Mapping[str, Sequence[Any]] | None = None,
+) -> None:
     """
     Write ``tracks.csv`` and ``review.csv`` into a folder of results.
 
@@ -68,12 +73,22 @@ def write_tables(folder: Path, rows: Sequence[TrackRow]) -> None:
         The folder.
     rows : sequence of TrackRow
         As `assessed` returns them.
+    more_columns : sequence of str
+        Further columns of ``tracks.csv``.
+    more_cells : mapping, optional
+        Their cells by track id; empty for other tracks.
 
     """
+    found = more_cells or {}
+    absent = [''] * len(more_columns)
     _write(
         folder / TRACKS,
-        list(TRACK_COLUMNS),
-        [[cell(row) for cell in TRACK_COLUMNS.values()] for row in rows],
+        [*TRACK_COLUMNS, *more_columns],
+        [
+            [cell(row) for cell in TRACK_COLUMNS.values()]
+            + list(found.get(row.track.track_id, absent))
+            for row in rows
+        ],
     )
     _write(folder / REVIEW, REVIEW_COLUMNS, [_review_row(i, row) for i, row in enumerate(rows, 1)])
 

@@ -81,7 +81,7 @@ class PointCollector:
         R = matrix_from_rpy(np.where(is_known[:, None], both[..., ROLL:], 0.0))
         points = []
         for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
-            found = self._gathered.get((stamp_ns, track.track_id))
+            found = self._gathered.get((stamp_ns, track.input_ids[row]))
             if found is None or not is_known[row]:
                 points.append(np.zeros((0, 3)))
                 continue

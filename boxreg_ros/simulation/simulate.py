@@ -10,15 +10,21 @@ they are when each ray leaves; the times of the points hold that moment.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.simulation.breaks import break_tracks
 from boxreg_ros.simulation.raycast import ROAD
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.scenarios import SCENARIOS
-from boxreg_ros.simulation.scene import FIXED_FRAME, Scene
+from boxreg_ros.simulation.scene import FIXED_FRAME, Scene, SENSOR_FRAME
 from boxreg_ros.structures import Ints
 import numpy as np
+
+BREAK_STREAM = 1
+"""Random stream of the breaks, so that they do not depend on the number of draws before."""
 
 
 def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None) -> Scene:
@@ -49,6 +55,28 @@ def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None)
     return SCENARIOS[scenario](np.random.default_rng(seed), sweeps)
 
 
+def broken(scene: Scene, seed: int, ghosts: float = 0.0) -> Scene:
+    """
+    Return a scene whose detections are broken on purpose; its truth stays.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    seed : int
+        Of the breaks.
+    ghosts : float
+        Mean number of boxes per sweep that belong to no object.
+
+    """
+    rng = np.random.default_rng([seed, BREAK_STREAM])
+    origins = scene.T_fixed_sensor[:, :3, 3]
+    arrays = break_tracks(scene.fixed_detections(), rng, ghosts, origins)
+    pairs = zip(arrays, scene.T_fixed_sensor, strict=True)
+    detections = tuple(boxes_to_frame(boxes, inverse(T), SENSOR_FRAME) for boxes, T in pairs)
+    return replace(scene, detections=detections)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `boxreg simulate`."""
     parser.add_argument(
@@ -68,6 +96,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--sweeps', type=int, metavar='N', help='number of sweeps (default: that of the scenario)'
     )
+    parser.add_argument(
+        '--break', action='store_true', dest='breaks',
+        help='break the tracks: 8 %% of the boxes missing, gaps of 3 to 8 sweeps, new ids after '
+        'half of them; the truth stays',
+    )  # fmt: skip
+    parser.add_argument(
+        '--ghosts', type=float, default=0.0, metavar='N',
+        help='with --break: mean number of boxes per sweep that belong to no object (default: 0)',
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -88,7 +125,11 @@ def run(args: argparse.Namespace) -> int:
             f'--truth {str(truth)!r}: expected a file beside the recording, got the recording '
             f'itself; choose another'
         )
+    if args.ghosts and not args.breaks:
+        raise ConfigError(f'--ghosts {args.ghosts:g}: expected with --break only; add --break')
     scene = simulate(args.scenario, args.seed, args.sweeps)
+    if args.breaks:
+        scene = broken(scene, args.seed, args.ghosts)
     write_recording(
         args.output,
         scene.sweeps,

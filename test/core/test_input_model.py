@@ -18,7 +18,7 @@ from boxreg_ros.core.input_model import (
 )
 import numpy as np
 import pytest
-from scenes import problem_of, shared_of
+from scenes import problem_of, returns_of, shared_of
 import torch
 
 D = torch.float64
@@ -122,7 +122,8 @@ def test_short_tracks_and_padding_are_left_out():
 
 
 def with_points(problem):
-    return problem._replace(mask=problem.valid[..., None])
+    points = torch.zeros(*problem.valid.shape, 1, 3)
+    return problem._replace(**returns_of(points, problem.valid[..., None]))
 
 
 def test_input_residuals_by_hand():

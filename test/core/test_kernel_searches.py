@@ -1,16 +1,26 @@
 """The compiled searches against their torch twins, fallbacks, and independence of windows."""
 
+from dataclasses import fields
 import subprocess
 import sys
 
 from boxreg_ros.config import Config
-from boxreg_ros.core import batch, kernels, prior, rigid_shape
+from boxreg_ros.core import batch, kernels, prior, registration, rigid_shape
 from boxreg_ros.core.arrowhead import BandedFactor
 from boxreg_ros.core.batch import EXTENT, SHARED, State
-from boxreg_ros.core.face_support import FAR, outermost_points, outermost_points_compiled, Search
-from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.face_support import (
+    FaceOffsets,
+    FAR,
+    observe_faces_compiled,
+    observe_faces_torch,
+)
+from boxreg_ros.core.input_model import expect, InputModel
+from boxreg_ros.core.observation import own_points, own_points_numpy
 from boxreg_ros.core.registration import register
-from boxreg_ros.core.terms import Objective
+from boxreg_ros.core.solver import MOTION_TERMS
+from boxreg_ros.core.terms import Objective, term_arrays
+from boxreg_ros.core.weights import robustify_motion, weigh, weigh_compiled
+from boxreg_ros.structures import Sweep
 import numpy as np
 from paths import ROOT
 import pytest
@@ -19,6 +29,7 @@ from scenes import (
     problem_of,
     random_problem,
     random_variables,
+    returns_of,
     terms_of,
     track_of,
     window_of,
@@ -81,30 +92,147 @@ def searched(case):
     return problem, State(pose, shared)
 
 
-@pytest.mark.parametrize('strips', [1, 3])
-@pytest.mark.parametrize('share', [0.02, 0.3])
+OFFSETS = FaceOffsets(
+    torch.zeros(6, dtype=D),
+    torch.tensor([0.3, 0.3, 0.2, 0.2, 0.0, 0.0], dtype=D),
+    torch.tensor([0.1, 0.1, 0.05, 0.05, 0.0, 0.0], dtype=D),
+)
+
+
+def assert_same_faces(problem, state, config):
+    """Check the face observations by the kernel; return which faces have a weight."""
+    found = observe_faces_compiled(problem, state, OFFSETS, config)
+    known = observe_faces_torch(problem, state, OFFSETS, config)
+    is_seen = (known.weight > 0) & problem.valid[..., None]
+    for name in ('moments', 'distance', 'inset'):
+        pair = (getattr(side, name)[is_seen] for side in (found, known))
+        assert_equal(*pair)
+    assert_equal(found.weight[problem.valid], known.weight[problem.valid].nan_to_num())
+    is_valid = problem.valid[..., None].expand_as(is_seen)
+    for found_share, known_share in zip(found.inset_shares, known.inset_shares, strict=True):
+        assert_equal(found_share[is_valid], known_share[is_valid])
+    assert_equal(found.num_points[problem.valid], known.num_points[problem.valid])
+    return is_seen
+
+
+@pytest.mark.parametrize('strips', [False, True])
+@pytest.mark.parametrize('share', [0.02, 0.9])
 @pytest.mark.parametrize('case', CASES)
-def test_outermost_points_equal_those_of_torch(case, share, strips):
+def test_face_observations_equal_those_of_torch(case, share, strips):
     problem, state = searched(case)
-    rng = np.random.default_rng(5)
-    inset, weight = (torch.from_numpy(rng.random((*problem.valid.shape, 6))) for _ in range(2))
-    search = Search(problem.points, 0.2 * inset, weight, share, strips)
-    found = outermost_points_compiled(problem, state, search)
-    known = outermost_points(problem, state, search)
-    is_seen = (known[2] > 0)[..., None, None]
-    assert_equal(torch.where(is_seen, found[0], 0.0), torch.where(is_seen, known[0], 0.0))
-    assert_equal(found[1] * is_seen[..., 0, 0], known[1] * is_seen[..., 0, 0])
-    np.testing.assert_array_equal(found[2], known[2])
-    np.testing.assert_array_equal(found[3], known[3])
+    config = Config().updated({'faces.outermost': share, 'ingredients.strips': strips})
+    is_seen = assert_same_faces(problem, state, config)
     if case == 'usual':
         assert is_seen.sum() > 30
+
+
+@pytest.mark.parametrize('far', [10.0, 60.0])
+def test_observed_faces_from_a_known_sensor_equal_those_of_torch(far):
+    problem, state = searched('a road')
+    rng = np.random.default_rng(6)
+    origins = far * torch.from_numpy(rng.normal(size=(*problem.valid.shape, 3)))
+    origins[0, 0] = torch.nan
+    valid = problem.valid.clone()
+    valid[1, 3:] = False
+    points, mask, _ = problem.padded()
+    mask = mask & valid[..., None]
+    delays = 0.05 * torch.from_numpy(rng.normal(size=mask.shape))
+    problem = problem._replace(origins=origins, valid=valid, **returns_of(points, mask, delays))
+    assert_same_faces(problem, state, Config())
+    assert_same_faces(problem, state, Config().updated({'ingredients.range_inset': False}))
+
+
+def weighed(problem, state, config):
+    """Return the terms of a problem by torch, and by the kernel, with robust motion."""
+    observations = observe_faces_torch(problem, state, OFFSETS, config)
+    expected = expect(problem, OFFSETS)
+    known = [
+        robustify_motion(term, state) if term.function in MOTION_TERMS else term
+        for term in weigh(problem, state, observations, expected, config)
+    ]
+    return known, weigh_compiled(problem, state, observations, expected, config, True)
+
+
+def drives(kind, N=12):
+    """Return a problem of three cars, one with two boxes less, and boxes near the input."""
+    rng = np.random.default_rng(4)
+    boxes = np.array([drive(N, speed=speed, turn=0.1) for speed in (3, 5, 9)])
+    if kind in ('still', 'drives off'):
+        boxes[:2] = boxes[:2, :1]
+    if kind == 'drives off':
+        boxes[0, -5:, 0] += 0.2 * np.arange(1, 6)
+    if kind == 'one outlier':
+        boxes[0, 5, :2] += 8.0
+        boxes[0, 5, 8] += 1.6
+    boxes += 0.02 * rng.normal(size=boxes.shape)
+    valid = np.ones((3, N), bool)
+    valid[1, N - 2 :] = False
+    points = surfaces(7, 3, N)
+    mask = np.broadcast_to(valid[..., None], points.shape[:3])
+    problem = problem_of(
+        boxes, points=points, mask=mask, valid=valid, ground=np.full((3, N), -0.8),
+        class_numbers={
+            field.name: getattr(Config().vehicle, field.name)
+            for field in fields(Config().vehicle)[1:]
+        },
+    )  # fmt: skip
+    pose = problem.pose + 0.05 * torch.from_numpy(rng.normal(size=(3, N, 6)))
+    shared = expect(problem, OFFSETS).shared
+    return problem, State(pose, shared + 0.02 * torch.from_numpy(rng.normal(size=shared.shape)))
+
+
+@pytest.mark.parametrize('kind', ['usual', 'still', 'drives off', 'one outlier', 'two boxes'])
+@pytest.mark.parametrize('robust', [True, False])
+def test_weights_equal_those_of_torch(kind, robust):
+    problem, state = drives(kind, {'two boxes': 4, 'drives off': 24}.get(kind, 12))
+    config = Config().updated({'ingredients.robust_weights': robust})
+    known, found = weighed(problem, state, config)
+    known = term_arrays(known, state.pack(), problem.length)
+    for name in found._fields:
+        if not name.startswith('shape'):
+            assert_equal(getattr(found, name), getattr(known, name))
+    is_held = found.W_zero_motion[:2, :, 0, 0] > 0
+    if kind == 'still':
+        assert is_held[0].all()
+    if kind == 'drives off':
+        assert is_held[0, 0]
+        assert not is_held[0, -5:].any()
+
+
+@pytest.mark.parametrize('road', [True, False])
+@pytest.mark.parametrize('ownership', [True, False])
+def test_points_of_boxes_equal_those_of_numpy(road, ownership):
+    # Boxes that overlap, lie apart, and share cells of the raster; a road under some of them.
+    rng = np.random.default_rng(8)
+    boxes = np.zeros((12, 9))
+    boxes[:, :2] = rng.uniform(-12, 12, (12, 2)) + 256 * rng.integers(-1, 2, (12, 2))
+    boxes[:, 3:6] = [4.5, 1.9, 1.6]
+    boxes[:, 6:] = rng.normal(size=(12, 3)) * [0.05, 0.05, 2.0]
+    points = rng.uniform(-6, 6, (20_000, 3)) + boxes[rng.integers(0, 12, 20_000), :3]
+    points[::2, 2] = -0.8 + 0.02 * rng.normal(size=10_000)
+    sweep = Sweep(0, 'odom', points.astype(np.float32))
+    config = Config().updated({'ingredients.road': road, 'ingredients.point_ownership': ownership})
+    found, known = own_points(sweep, boxes, config), own_points_numpy(sweep, boxes, config)
+    order = np.lexsort((found.row, found.owner)), np.lexsort((known.row, known.owner))
+    for a, b in zip(found[:3], known[:3], strict=True):
+        assert_equal(a[order[0]], b[order[1]])
+    assert_equal(found.road, known.road)
+    np.testing.assert_array_equal(found.num_inside, known.num_inside)
+    assert np.isfinite(known.road).any() == road
+
+
+def test_held_points_are_counted_as_by_torch():
+    problem, state = searched('usual')
+    extent = state.shared[:, None, EXTENT].expand(*problem.valid.shape, 3)
+    found = registration._held(problem, state.pose, extent)
+    np.testing.assert_array_equal(found, registration._held_torch(problem, state.pose, extent))
 
 
 @pytest.mark.parametrize('case', CASES)
 def test_rigid_shape_equals_that_of_torch(case):
     problem, state = searched(case)
-    found = rigid_shape.agreement_compiled(problem.points, problem, state)
-    known = rigid_shape.agreement_torch(problem.points, problem, state)
+    found = rigid_shape.agreement_compiled(problem, state)
+    known = rigid_shape.agreement_torch(problem, state)
     for a, b in zip(found, known, strict=True):
         assert_equal(a, b, 1e-8)
     if case == 'usual':

@@ -8,8 +8,9 @@ sums in a different order.
 
 from boxreg_ros.core.arrowhead import Chain
 from boxreg_ros.core.batch import SHARED, State
+from boxreg_ros.core.kernels.arrays import TermArrays
 from boxreg_ros.core.prior import marginalise, marginalised_terms
-from boxreg_ros.core.terms import Objective, TermArrays, value_and_gradient
+from boxreg_ros.core.terms import Objective, value_and_gradient
 import numpy as np
 import pytest
 from scenes import random_problem, random_variables, terms_of
@@ -32,7 +33,7 @@ def both_sides(terms, x, free):
     """Return (value, gradient, steps, blocks of the inverse) by the kernels and by torch."""
     N = (x.shape[1] - SHARED) // 6
     objective = Objective(terms, x, N, free)
-    assert isinstance(objective.arrays, TermArrays)
+    assert isinstance(objective.terms, TermArrays)
     rows = torch.arange(len(x))
     value, gradient = objective(x.clone(), rows)  # a copy: not the result kept for the start
     steps = objective.newton(gradient, rows)

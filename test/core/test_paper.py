@@ -6,7 +6,7 @@ from boxreg_ros.core.paper import EPSILON
 from boxreg_ros.structures import POSE
 import numpy as np
 import pytest
-from scenes import boxes_at, problem_of, random_problem
+from scenes import boxes_at, problem_of, random_problem, returns_of
 import torch
 
 D = torch.float64
@@ -206,7 +206,7 @@ def test_gradients_are_finite_at_kinks(term, moving):
 def test_padding_alone_has_value_and_gradient_zero(term):
     problem = random_problem()
     nothing = problem._replace(
-        mask=torch.zeros_like(problem.mask), valid=torch.zeros_like(problem.valid)
+        counts=torch.zeros_like(problem.counts), valid=torch.zeros_like(problem.valid)
     )
     pose = poses_of(problem.boxes)
     value = term(with_poses(problem.boxes, pose), nothing)
@@ -219,10 +219,10 @@ def test_padding_alone_has_value_and_gradient_zero(term):
 def test_padding_order_and_batch_do_not_matter(term):
     problem = random_problem()
     known = term(problem.boxes, problem)
-    # Other order of points, and padding filled with other numbers.
+    # Other order of points.
     order = torch.from_numpy(np.random.default_rng(1).permutation(problem.points.shape[2]))
-    points = torch.where(problem.mask[..., None], problem.points, -1e4)[:, :, order]
-    other = problem._replace(points=points, mask=problem.mask[:, :, order])
+    points, mask = problem.points[:, :, order], problem.mask[:, :, order]
+    other = problem._replace(**returns_of(points, mask))
     boxes = torch.where(problem.valid[..., None], problem.boxes, 77.0)
     np.testing.assert_allclose(term(problem.boxes, other), known, rtol=1e-12)
     if term is not PAPER['total']:  # whose points are relative to the boxes

@@ -3,11 +3,10 @@
 from boxreg_ros import Config, refine
 from boxreg_ros.core.batch import State
 from boxreg_ros.core.rigid_shape import agreement
-from boxreg_ros.core.window import PADDING_POSITION
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
 import pytest
-from scenes import problem_of, shared_of
+from scenes import problem_of, returns_of, shared_of
 import torch
 
 BOX = [0.0, 0, 0, 4.0, 2.0, 2.0, 0, 0, 0]
@@ -60,7 +59,9 @@ def test_a_common_step_is_not_observable():
 
 def test_too_few_points_give_no_information():
     seen = problem(np.zeros((3, 6)))
-    seen.points[..., 2:, :] = PADDING_POSITION
+    mask = seen.mask
+    mask[..., 2:] = False
+    seen = seen._replace(**returns_of(seen.points, mask))
     information, wanted = agreement(seen, State(seen.pose, shared_of(EXTENT=BOX[3:6])))
     np.testing.assert_array_equal(information, 0)
     np.testing.assert_array_equal(wanted, 0)
@@ -69,7 +70,8 @@ def test_too_few_points_give_no_information():
 def test_a_plane_gives_no_information_along_it():
     # Only the front is visible: steps to the left or up, and a roll about x, do not change it.
     seen = problem(np.zeros((5, 6)))
-    seen.points[seen.points[..., 0] < 1.99] = PADDING_POSITION
+    mask = seen.mask & (seen.points[..., 0] >= 1.99)
+    seen = seen._replace(**returns_of(seen.points, mask))
     information, _ = agreement(seen, State(seen.pose, shared_of(EXTENT=BOX[3:6])))
     pinned = information[0].diagonal(dim1=-2, dim2=-1)
     assert (pinned[:, [0, 4, 5]] > 100).all()

@@ -143,7 +143,7 @@ def test_faces_by_moments_equal_the_sum_over_points():
     rng = np.random.default_rng(3)
     inset = torch.from_numpy(rng.random((3, 6, 6)))
     homogeneous = torch.cat([problem.points, torch.ones_like(problem.points[..., :1])], -1)
-    moment = torch.einsum('bnmi,bnmj->bnij', homogeneous, homogeneous) / 20
+    moment = torch.einsum('bnmi,bnmj->bnij', homogeneous, homogeneous) / problem.returns.width
     term = Term(terms.faces, moment[:, :, None].expand(-1, -1, 6, -1, -1), (problem.pose, inset))
     r = term.linearise(state).residual
     found = torch.einsum('bnfr,bnfrs,bnfs->bnf', r, term.weight, r)

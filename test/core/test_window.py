@@ -1,7 +1,7 @@
 """Windows of observations, and batches of windows as padded tensors."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import PRIOR_SIZE
+from boxreg_ros.core.batch import PRIOR_SIZE, Problem
 from boxreg_ros.core.window import (
     group_windows,
     MarginalisationPrior,
@@ -173,8 +173,9 @@ def test_whole_turns_between_prior_and_start_are_removed(turns):
     (window,) = windows([5])
     known, _ = stack_windows([with_prior(window)], CONFIG)
     found, _ = stack_windows([with_prior(window, turns)], CONFIG)
-    for a, b in zip(found, known, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-9)
+    for name in Problem._fields:
+        if name != 'returns':
+            np.testing.assert_allclose(getattr(found, name), getattr(known, name), atol=1e-9)
 
 
 def test_a_prior_of_the_opposite_heading_is_dropped():

@@ -323,15 +323,6 @@ def test_files_that_are_no_recordings_are_refused(tmp_path):
     assert 'folder' in error_of(tmp_path / 'folder')
 
 
-def test_a_truncated_recording_is_refused(tmp_path):
-    path = Drive().write(tmp_path / 'drive')
-    path.write_bytes(path.read_bytes()[:-500])
-    assert 'expected a whole MCAP' in error_of(path)
-    # The error names the truncated one of several recordings.
-    whole = [Drive().write(tmp_path / name) for name in ('before', 'behind')]
-    assert error_of([whole[0], path, whole[1]]).startswith(f'{path}: ')
-
-
 def test_a_recording_without_messages_is_refused(tmp_path):
     path = tmp_path / 'drive'
     write_recording(path, [], 'sqlite3')

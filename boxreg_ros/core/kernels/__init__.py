@@ -7,11 +7,17 @@ is what the tests compare with. `compiled` decides which of them runs.
 
 """
 
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
+from itertools import pairwise
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from warnings import warn
 
+import numpy as np
 from torch import Tensor
 
 
@@ -19,24 +25,86 @@ class Kernels(NamedTuple):
     """The modules with compiled functions."""
 
     arrowhead: ModuleType
+    crop: ModuleType
     face_support: ModuleType
     normal_equations: ModuleType
     rigid_shape: ModuleType
+    weights: ModuleType
+
+
+MIN_WINDOWS_PER_THREAD = 8
+"""Fewest windows that a thread gets. Chosen: they take longer than handing them over, 0.1 ms."""
+
+
+class _Threads(NamedTuple):
+    pool: ThreadPoolExecutor
+    workers: int
+
+
+_threads: ContextVar[_Threads | None] = ContextVar('threads', default=None)
+
+
+@contextmanager
+def shared_by(pool: ThreadPoolExecutor, workers: int) -> Iterator[None]:
+    """Let `run` share the windows of each kernel between the caller and `workers` - 1 threads."""
+    token = _threads.set(_Threads(pool, workers))
+    try:
+        yield
+    finally:
+        _threads.reset(token)
+
+
+def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
+    """
+    Run a kernel for a number of `windows`, shared between threads within `shared_by`.
+
+    No window depends on another: the results do not depend on the number of threads.
+
+    Parameters
+    ----------
+    kernel : callable
+        A kernel whose first arguments are the first window, and that after the last.
+    windows : int
+        Number of windows.
+    *arguments
+        The other arguments.
+
+    """
+    threads = _threads.get()
+    parts = 1 if threads is None else min(threads.workers, windows // MIN_WINDOWS_PER_THREAD)
+    if threads is None or parts < 2:
+        kernel(0, windows, *arguments)
+        return
+    ends = [windows * part // parts for part in range(parts + 1)]
+    others = [
+        threads.pool.submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])
+    ]
+    kernel(0, ends[1], *arguments)
+    for other in others:
+        other.result()
+
+
+def contiguous(tensor: Tensor) -> Any:
+    """Return the values of a tensor as a contiguous array, for a kernel."""
+    return np.ascontiguousarray(tensor.numpy())
 
 
 def compiled(like: Tensor) -> Kernels | None:
     """Return the kernels for tensors as `like`; None on a GPU, and where numba does not work."""
-    return _load() if like.is_cpu else None
+    return load() if like.is_cpu else None
 
 
 @cache
-def _load() -> Kernels | None:
+def load() -> Kernels | None:
+    """Return the kernels; None where numba does not work, with one warning."""
     try:
         from boxreg_ros.core.kernels import (
             arrowhead,
+            crop,
             face_support,
             normal_equations,
             rigid_shape,
+            weights,
         )
     except Exception as error:  # whatever an incomplete or unsupported installation raises
         reason = ' '.join(f'{type(error).__name__}: {error}'.split())
@@ -47,4 +115,4 @@ def _load() -> Kernels | None:
             stacklevel=2,
         )
         return None
-    return Kernels(arrowhead, face_support, normal_equations, rigid_shape)
+    return Kernels(arrowhead, crop, face_support, normal_equations, rigid_shape, weights)

@@ -15,6 +15,8 @@ import numpy as np
 
 POSE = 6
 BAND = 3 * POSE
+NEXT = 2 * POSE
+"""Variables of the two poses that a pose is coupled to after it."""
 RIDGE = 1e-9
 """Added to the diagonal: an unobserved variable does not break the factorisation."""
 
@@ -51,8 +53,8 @@ def factorise(band, border, corner):
         for k in range(1, last):
             factor = band[i, k]
             if factor != 0.0:
-                for j in range(k, last):
-                    band[i + k, j - k] -= factor * band[i, j]
+                for j in range(last - k):
+                    band[i + k, j] -= factor * band[i, k + j]
                 for s in range(S):
                     border[i + k, s] -= factor * border[i, s]
         for s in range(S):
@@ -120,66 +122,109 @@ def invert_corner(corner, inverse):
 
 
 @kernel
+def fill_coupling(band, border, pose, coupling):
+    """Write W = inv(U_pp) U_pr (6, 12 + S): r are the two poses after `pose`, and the border."""
+    n, S = border.shape
+    for a in range(POSE - 1, -1, -1):
+        row = POSE * pose + a
+        for c in range(NEXT):
+            k = POSE + c - a
+            coupling[a, c] = band[row, k] if k < min(BAND, n - row) else 0.0
+        for s in range(S):
+            coupling[a, NEXT + s] = border[row, s]
+        for b in range(a + 1, POSE):
+            factor = band[row, b - a]
+            for c in range(NEXT + S):
+                coupling[a, c] -= factor * coupling[b, c]
+        for c in range(NEXT + S):
+            coupling[a, c] /= band[row, 0]
+
+
+@kernel
+def fill_own_inverse(band, pose, inverse):
+    """Write inv(U_pp) (6, 6) of one pose, upper triangular."""
+    for column in range(POSE):
+        for a in range(POSE - 1, -1, -1):
+            total = 1.0 if a == column else 0.0
+            for b in range(a + 1, POSE):
+                total -= band[POSE * pose + a, b - a] * inverse[b, column]
+            inverse[a, column] = total / band[POSE * pose + a, 0]
+
+
+@kernel
+def shift_known(known, own, across):
+    """
+    Move the known part of the inverse (12 + S, 12 + S) to the pose before.
+
+    `own` (6, 6) is the block of this pose, `across` (6, 12 + S) the negative of those beside it.
+
+    """
+    size = len(known)
+    for a in range(POSE):
+        for c in range(size):
+            if c < POSE:
+                known[POSE + a, POSE + c] = known[a, c]
+            elif c >= NEXT:
+                known[POSE + a, c] = known[a, c]
+                known[c, POSE + a] = known[a, c]
+    for a in range(POSE):
+        for c in range(size):
+            if c < POSE:
+                known[a, c] = own[a, c]
+                known[a, POSE + c] = -across[a, c]
+                known[POSE + c, a] = -across[a, c]
+            elif c >= NEXT:
+                known[a, c] = -across[a, c]
+                known[c, a] = -across[a, c]
+
+
+@kernel
 def invert_poses(band, border, corner, blocks, corner_inverse):
     """
     Write the diagonal blocks (N, 6, 6) of the poses in the inverse, and that of the border.
 
-    The entries of the inverse Z within the pattern of U follow from the last variable backward
-    (Takahashi): Z[i, j] = (delta_ij / u_ii - sum over k > i of u_ik Z[k, j]) / u_ii.
+    The blocks of the inverse Z within the pattern of U follow from the last pose backward
+    (Takahashi). With r the two poses after p and the border, and W = inv(U_pp) U_pr:
+    Z_pr = -W Z_rr, and Z_pp = inv(U_pp) inv(U_pp)' - Z_pr W'.
 
     """
     n, S = border.shape
     invert_corner(corner, corner_inverse)
-    Z_band = np.zeros((n, BAND))
-    Z_border = np.zeros((n, S))
-    # Row i of Z, columns i + 1 to i + 17, as far as it is known when row i is worked out.
-    known = np.zeros((BAND, BAND))
-    for i in range(n - 1, -1, -1):
-        last = min(BAND, n - i)
-        scale = -1.0 / band[i, 0]
-        for k in range(1, last):
-            for s in range(S):
-                Z_border[i, s] += band[i, k] * Z_border[i + k, s]
+    size = NEXT + S
+    known = np.zeros((size, size))  # Z_rr
+    for s in range(S):
         for t in range(S):
-            for s in range(S):
-                Z_border[i, s] += border[i, t] * corner_inverse[t, s]
-        for s in range(S):
-            Z_border[i, s] *= scale
-        for j in range(1, last):
-            for k in range(j, last):
-                known[j, k] = Z_band[i + j, k - j]
-                known[k, j] = known[j, k]
-        total = 0.0
-        for j in range(1, last):
-            entry = 0.0
-            for k in range(1, last):
-                entry += band[i, k] * known[j, k]
-            for t in range(S):
-                entry += border[i, t] * Z_border[i + j, t]
-            Z_band[i, j] = entry * scale
-            total += band[i, j] * Z_band[i, j]
-        for t in range(S):
-            total += border[i, t] * Z_border[i, t]
-        Z_band[i, 0] = (1.0 / band[i, 0] - total) / band[i, 0]
-    for pose in range(n // POSE):
+            known[NEXT + s, NEXT + t] = corner_inverse[s, t]
+    coupling = np.empty((POSE, size))
+    across = np.empty((POSE, size))
+    root = np.zeros((POSE, POSE))
+    for pose in range(n // POSE - 1, -1, -1):
+        own = blocks[pose]
+        fill_coupling(band, border, pose, coupling)
+        fill_own_inverse(band, pose, root)
+        np.dot(coupling, known, across)  # -Z_pr: the largest product, by BLAS
         for a in range(POSE):
             for b in range(a, POSE):
-                value = Z_band[POSE * pose + a, b - a]
-                blocks[pose, a, b] = value
-                blocks[pose, b, a] = value
+                total = 0.0
+                for c in range(b, POSE):
+                    total += root[a, c] * root[b, c]
+                for c in range(size):
+                    total += across[a, c] * coupling[b, c]
+                own[a, b] = total
+                own[b, a] = total
+        shift_known(known, own, across)
 
 
 @kernel
-def solve_rows(rows, band, border, corner, b, x):
-    """Write the solutions x (r, n + S) for right sides `b` of the windows `rows` (r,)."""
-    for i in range(len(rows)):
+def solve_rows(begin, end, rows, band, border, corner, b, x):
+    """Write the solutions x (r, n + S) for right sides `b` of the windows `rows[begin:end]`."""
+    for i in range(begin, end):
         x[i] = b[i]
         solve(band[rows[i]], border[rows[i]], corner[rows[i]], x[i])
 
 
 @kernel
-def invert_rows(rows, band, border, corner, blocks, corner_inverse):
-    """Write, for the windows `rows`, the blocks of the inverse (r, N, 6, 6) and (r, S, S)."""
-    for i in range(len(rows)):
-        row = rows[i]
-        invert_poses(band[row], border[row], corner[row], blocks[i], corner_inverse[i])
+def invert_windows(begin, end, band, border, corner, blocks, corner_inverse):
+    """Write the blocks of the inverse, (B, N, 6, 6) and (B, S, S), of windows `begin` to `end`."""
+    for b in range(begin, end):
+        invert_poses(band[b], border[b], corner[b], blocks[b], corner_inverse[b])

@@ -1,20 +1,28 @@
 """
 The outermost points on each face of each box, as their second moments, in plain loops.
 
-The torch twin is `boxreg_ros.core.face_support.outermost_points`.
+The torch twin is `boxreg_ros.core.face_support.observe_faces_torch`; the formulas are (M10) to
+(M12).
 
 """
 
-from math import ceil
+from math import ceil, isfinite, isnan, sqrt
 
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.rotation import fill_rotation
 import numpy as np
 
+EXTENT, GAP = 0, 9
+"""First of the shared variables of each kind."""
 FACES = 5
 """Front, back, left, right, top: the bottom is observed by the road."""
+BOTTOM = 5
 NOWHERE = 1e9
 """Depth of points that are not on a face [m]."""
+ALWAYS_VISIBLE = 9.0
+"""Tangent of the roof; that of the bottom is its negative."""
+FAR_SENSOR = 1e6
+"""Distance of an unknown sensor, over that of the centre of the points."""
 
 
 @kernel
@@ -30,19 +38,7 @@ def add_candidate(depth, index, best_depth, best_index, count):
 
 
 @kernel
-def to_box_axes(points, shift, R, local):
-    """Write points (M, 3) in box axes (3, M); the box is `shift` (3,) from their origin [m]."""
-    for i in range(len(points)):
-        x = points[i, 0] - shift[0]
-        y = points[i, 1] - shift[1]
-        z = points[i, 2] - shift[2]
-        local[0, i] = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
-        local[1, i] = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
-        local[2, i] = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
-
-
-@kernel
-def fill_depths(local, half, level, limits, strips, excess, strip, depth):
+def fill_depths(local, half, level, numbers, excess, strip, depth):
     """
     Write how far inside of the expected surface of each face each point is, (5, M) [m].
 
@@ -50,7 +46,10 @@ def fill_depths(local, half, level, limits, strips, excess, strip, depth):
     (2, M) too; returns how many points are in and near the box.
 
     """
-    outside_margin, edge_margin, _, deepest, _ = limits
+    outside_margin, edge_margin, deepest = (
+        numbers.outside_margin, numbers.edge_margin, numbers.deepest
+    )  # fmt: skip
+    strips = numbers.strips
     M = local.shape[1]
     for k in range(3):
         for i in range(M):
@@ -82,9 +81,7 @@ def fill_depths(local, half, level, limits, strips, excess, strip, depth):
 
 
 @kernel
-def outermost_points(
-    points, depth, strip, strip_axis, wanted, limits, best_depth, best_index, moments, out
-):
+def outermost_points(points, depth, strip, wanted, numbers, best_depth, best_index, moments, out):
     """
     Find the outermost points of the five faces of one box.
 
@@ -92,18 +89,17 @@ def outermost_points(
     face.
 
     """
-    _, _, max_depth, deepest, _ = limits
     number = np.zeros(FACES, np.int64)
     for face in range(FACES):
-        own_strip = strip[strip_axis[face]]
+        own_strip = strip[numbers.strip_axis[face]]
         best_depth[:, :wanted] = NOWHERE
         for i in range(len(points)):
             d = depth[face, i]
             if d < best_depth[own_strip[i], wanted - 1]:
                 add_candidate(d, i, best_depth[own_strip[i]], best_index[own_strip[i]], wanted)
-        limit = deepest
+        limit = numbers.deepest
         for s in range(len(best_depth)):
-            limit = min(limit, best_depth[s, 0] + max_depth)
+            limit = min(limit, best_depth[s, 0] + numbers.max_depth)
         total = 0.0
         moment = moments[face]
         for a in range(4):
@@ -131,40 +127,132 @@ def outermost_points(
 
 
 @kernel
-def observe_faces(
-    poses, given, extents, gaps, inset, base_weight, ground, points, counts, share, strip_axis,
-    strips, limits, moments, distance, weight, near,
-):  # fmt: skip
+def returns_of(windows, values, b, n):
+    """Return the values of the points of one observation."""
+    first = windows.first[b, n]
+    return values[first : first + windows.counts[b, n] * windows.stride : windows.stride]
+
+
+@kernel
+def centre_of(points, centre):
+    """Write the mean of points (M, 3); zero without points."""
+    centre[:] = 0.0
+    for i in range(len(points)):
+        for k in range(3):
+            centre[k] += points[i, k]
+    for k in range(3):
+        centre[k] /= max(len(points), 1)
+
+
+@kernel
+def fill_visibility(box, origin, points, numbers, R, tangent):
+    """Write how openly the sensor sees each face of one input box, (6,)."""
+    toward = np.empty(3)
+    if isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2]):
+        for k in range(3):
+            toward[k] = origin[k]
+    else:
+        centre_of(points, toward)
+        for k in range(3):
+            toward[k] *= FAR_SENSOR
+    fill_rotation(box[6], box[7], box[8], R)
+    for face in range(4):
+        axis = face // 2
+        sign = 1.0 - 2.0 * (face % 2)
+        outward = -box[3 + axis] / 2
+        along = 0.0
+        for k in range(3):
+            outward += sign * toward[k] * R[k, axis]
+            along += toward[k] * R[k, 1 - axis]
+        along = abs(along) - box[4 - axis] / 2
+        tangent[face] = outward / max(along, numbers.min_along)
+    tangent[4] = ALWAYS_VISIBLE
+    tangent[5] = -ALWAYS_VISIBLE
+
+
+@kernel
+def fill_insets(origin, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight):
+    """Write the shares (2, 6) of the two insets, their sum (6,), and the weights of faces (6,)."""
+    reach = sqrt(origin[0] ** 2 + origin[1] ** 2)
+    beyond = 0.0 if isnan(reach) else (reach - numbers.near_range) / numbers.range_span
+    beyond = min(max(beyond, 0.0), numbers.max_range_share)
+    for face in range(6):
+        u = tangent[face] + numbers.edge_lead[face]
+        occluded = 0.5 - 0.5 * u / sqrt(u**2 + numbers.softness)
+        shares[0, face] = occluded
+        shares[1, face] = (1.0 - occluded) * beyond
+        by_range = shares[1, face] * range_inset[face]
+        inset[face] = occluded * occlusion_inset[face] + by_range
+        seen = 1.0 if tangent[face] > 0.0 else numbers.occluded_weight
+        weight[face] = seen / (1.0 + (by_range / numbers.range_half_weight) ** 2)
+
+
+@kernel
+def fill_velocity(poses, times, n, length, velocity):
+    """Write the velocity (3,) of pose n: the mean over the steps before and after it."""
+    before = max(n - 1, 0)
+    after = min(n + 1, length - 1)
+    duration = max(times[after] - times[before], 1e-9)
+    for k in range(3):
+        velocity[k] = (poses[after, k] - poses[before, k]) / duration
+
+
+@kernel
+def to_box_axes(points, delays, velocity, shift, R, moved, local):
     """
-    Write the face observations of all windows.
+    Write points at the stamp of their box (M12), (M, 3), and in its axes, (3, M) [m].
+
+    The box is `shift` (3,) from the origin of the points.
+
+    """
+    for i in range(len(points)):
+        for k in range(3):
+            moved[i, k] = points[i, k] - velocity[k] * delays[i]
+        x = moved[i, 0] - shift[0]
+        y = moved[i, 1] - shift[1]
+        z = moved[i, 2] - shift[2]
+        local[0, i] = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
+        local[1, i] = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+        local[2, i] = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+
+
+@kernel
+def add_road(shift, ground, half_height, gap, moment, distance):
+    """Write the observation of the bottom: a point of the road under the centre of the box."""
+    road = ground if isfinite(ground) else 0.0
+    point = (shift[0], shift[1], road, 1.0)
+    for a in range(4):
+        for b in range(4):
+            moment[a, b] = point[a] * point[b]
+    distance[BOTTOM] = shift[2] - road - half_height + gap
+
+
+@kernel
+def observe_faces(
+    begin, end, windows, poses, shared, occlusion_inset, range_inset, numbers, faces
+):
+    """
+    Write the face observations of the windows `begin` to `end`.
 
     Parameters
     ----------
-    poses, given : array, shape (B, N, 6)
-        Poses of this round and of the input.
-    extents, gaps : array, shapes (B, 3) and (B, 6)
-        Extents and labelling margins [m].
-    inset, base_weight : array, shape (B, N, 6)
-        How much further inside points are expected [m], and the weight of a face with points.
-    ground : array, shape (B, N)
-        Height of the road minus that of the input centre [m]; NaN if unknown.
-    points, counts : array, shapes (B, N, M, 3) and (B, N)
-        Points minus the input centre [m]; the first `counts` are not padding.
-    share : float
-        Part of the points of a box that is taken from each strip of a face.
-    strip_axis, strips : tuple of int and int
-        Axis along which the strips of each face lie, and their number.
-    limits : tuple of float
-        `OUTSIDE_MARGIN`, `EDGE_MARGIN`, `MAX_DEPTH`, largest depth, `MIN_POINTS`.
-    moments, distance, weight, near : array
-        Written: (B, N, 6, 4, 4), (B, N, 6) [m], (B, N, 6), and the points in and near each box
-        (B, N).
+    windows : WindowArrays
+        Input of the windows.
+    poses, shared : array, shapes (B, N, 6) and (B, 22)
+        Boxes of this round.
+    occlusion_inset, range_inset : array, shape (6,)
+        As in `boxreg_ros.core.face_support.FaceOffsets` [m].
+    numbers : FaceNumbers
+        Constants and settings.
+    faces : FaceArrays
+        Written; zero for padding.
 
     """
-    B, N, M = points.shape[:3]
-    size = ceil(max(limits[4], share * M)) + 1
-    best_depth = np.empty((strips, size))
-    best_index = np.empty((strips, size), np.int64)
+    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
+    size = ceil(max(numbers.min_points, numbers.share * M)) + 1
+    best_depth = np.empty((numbers.strips, size))
+    best_index = np.empty((numbers.strips, size), np.int64)
+    moved = np.empty((M, 3))
     local = np.empty((3, M))
     excess = np.empty((3, M))
     strip = np.empty((2, M), np.int64)
@@ -173,42 +261,92 @@ def observe_faces(
     half = np.empty(3)
     shift = np.empty(3)
     level = np.empty(6)
+    tangent = np.empty(6)
+    velocity = np.zeros(3)
     mean_depth = np.empty(FACES)
-    for b in range(B):
+    for b in range(begin, end):
+        length = windows.lengths[b]
         for k in range(3):
-            half[k] = extents[b, k] / 2
-        for n in range(N):
-            pose = poses[b, n]
-            fill_rotation(pose[3], pose[4], pose[5], R)
+            half[k] = shared[b, EXTENT + k] / 2
+        for n in range(poses.shape[1]):
+            moments, distance, weight = (
+                faces.moments[b, n],
+                faces.distance[b, n],
+                faces.weight[b, n],
+            )
+            inset, shares = faces.inset[b, n], faces.inset_shares[:, b, n]
+            if n >= length:
+                moments[:] = 0.0
+                distance[:] = 0.0
+                weight[:] = 0.0
+                inset[:] = 0.0
+                shares[:] = 0.0
+                faces.num_points[b, n] = 0.0
+                continue
+            m = windows.counts[b, n]
+            points = returns_of(windows, windows.points, b, n)
+            box, pose, origin = windows.boxes[b, n], poses[b, n], windows.origins[b, n]
+            fill_visibility(box, origin, points, numbers, R, tangent)
+            fill_insets(
+                origin, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight
+            )
             for k in range(3):
-                shift[k] = pose[k] - given[b, n, k]
+                shift[k] = pose[k] - box[k]
             for face in range(6):
-                level[face] = gaps[b, face] + inset[b, n, face]
-            m = counts[b, n]
-            to_box_axes(points[b, n, :m], shift, R, local[:, :m])
-            near[b, n] = fill_depths(
-                local[:, :m], half, level, limits, strips, excess[:, :m], strip[:, :m],
-                depth[:, :m],
+                level[face] = shared[b, GAP + face] + inset[face]
+            if numbers.is_moving:
+                fill_velocity(poses[b], windows.times[b], n, length, velocity)
+            fill_rotation(pose[3], pose[4], pose[5], R)
+            to_box_axes(
+                points, returns_of(windows, windows.delays, b, n), velocity, shift, R, moved[:m],
+                local[:, :m],
             )  # fmt: skip
-            wanted = ceil(max(limits[4], share * near[b, n]))
+            near = fill_depths(
+                local[:, :m], half, level, numbers, excess[:, :m], strip[:, :m], depth[:, :m]
+            )
+            wanted = ceil(max(numbers.min_points, numbers.share * near))
             number = outermost_points(
-                points[b, n, :m], depth, strip, strip_axis, wanted, limits, best_depth,
-                best_index, moments[b, n], mean_depth,
+                moved[:m], depth, strip, wanted, numbers, best_depth, best_index, moments,
+                mean_depth,
             )  # fmt: skip
             for face in range(FACES):
-                is_seen = number[face] >= limits[4]
-                distance[b, n, face] = -mean_depth[face]
-                weight[b, n, face] = base_weight[b, n, face] if is_seen else 0.0
-            add_road(shift, ground[b, n], half[2], gaps[b, 5], moments[b, n, 5], distance[b, n])
-            weight[b, n, 5] = base_weight[b, n, 5]
+                distance[face] = -mean_depth[face]
+                if number[face] < numbers.min_points:
+                    weight[face] = 0.0
+            add_road(
+                shift,
+                windows.ground[b, n],
+                half[2],
+                shared[b, GAP + BOTTOM],
+                moments[BOTTOM],
+                distance,
+            )
+            weight[BOTTOM] = 1.0 if isfinite(windows.ground[b, n]) else 0.0
+            faces.num_points[b, n] = near
 
 
 @kernel
-def add_road(shift, ground, half_height, gap, moment, distance):
-    """Write the observation of the bottom: a point of the road under the centre of the box."""
-    road = ground if np.isfinite(ground) else 0.0
-    point = (shift[0], shift[1], road, 1.0)
-    for a in range(4):
-        for b in range(4):
-            moment[a, b] = point[a] * point[b]
-    distance[5] = shift[2] - road - half_height + gap
+def count_held(begin, end, windows, poses, extents, margin, held):
+    """
+    Write how many points are in each box, or less than `margin` outside of it, (B, N).
+
+    Boxes at `poses` (B, N, 6) of `extents` (B, N, 3); windows `begin` to `end`.
+
+    """
+    R = np.empty((3, 3))
+    for b in range(begin, end):
+        for n in range(windows.lengths[b]):
+            pose, extent, box = poses[b, n], extents[b, n], windows.boxes[b, n]
+            fill_rotation(pose[3], pose[4], pose[5], R)
+            points = returns_of(windows, windows.points, b, n)
+            count = 0
+            for i in range(len(points)):
+                x = points[i, 0] - (pose[0] - box[0])
+                y = points[i, 1] - (pose[1] - box[1])
+                z = points[i, 2] - (pose[2] - box[2])
+                outside = -margin
+                for k in range(3):
+                    along = R[0, k] * x + R[1, k] * y + R[2, k] * z
+                    outside = max(outside, abs(along) - extent[k] / 2)
+                count += outside < margin
+            held[b, n] = count

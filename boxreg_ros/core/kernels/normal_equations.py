@@ -10,7 +10,7 @@ from math import sqrt
 
 from boxreg_ros.core.kernels.arrowhead import BAND, factorise, fix_variables, RIDGE
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.rotation import fill_rotation_derivatives
+from boxreg_ros.core.kernels.rotation import fill_rotation, fill_rotation_derivatives
 import numpy as np
 
 EXTENT, BIAS, GAP, PIVOT, ANCHOR, SHARED = 0, 3, 9, 15, 16, 22
@@ -176,6 +176,22 @@ def add_acceleration(n, poses, times, W, gradient, band, curved):
 
 
 @kernel
+def slip_of(before, after, dt, pivot, r):
+    """Write the velocity of the pivot to the left and upward between two poses, (2,) [m/s]."""
+    R0, R1, Rm = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    fill_rotation(before[3], before[4], before[5], R0)
+    fill_rotation(after[3], after[4], after[5], R1)
+    fill_rotation(
+        (before[3] + after[3]) / 2, (before[4] + after[4]) / 2, (before[5] + after[5]) / 2, Rm
+    )
+    for side in range(2):
+        r[side] = 0.0
+        for j in range(3):
+            step = after[j] - before[j] - pivot * (R1[j, 0] - R0[j, 0])
+            r[side] += Rm[j, 1 + side] / dt * step
+
+
+@kernel
 def add_slip(n, poses, times, pivot, W, scratch, gradient, band, border, corner, curved):
     """Add the velocity of the pivot to the left and upward from pose n to n + 1; W (2, 2)."""
     R0, dR0, R1, dR1, Rm, dRm, J = scratch
@@ -311,16 +327,19 @@ def rotation_scratch():
 
 
 @kernel
-def add_window(poses, shared, last, data, gradient, band, border, corner, curved):
+def add_window(b, poses, shared, last, terms, gradient, band, border, corner, curved):
     """
-    Add all residuals of one window that begin at its first `last` observations.
+    Add all residuals of window `b` that begin at its first `last` observations.
 
-    `data` are the arrays of this window in `TermArrays`. The prior on the shared variables is not
-    among them: it belongs to no observation.
+    `terms` are the `TermArrays` of the batch. The prior on the shared variables is not among
+    them: it belongs to no observation.
 
     """
-    (given, inset, W_faces, input_pose, axes, W_input, shape_start, shape_axes, wanted, W_shape,
-     times, W_acceleration, W_slip, W_zero_motion, mean, information) = data  # fmt: skip
+    times, given, inset = terms.times[b], terms.given[b], terms.inset[b]
+    W_faces, W_input, W_shape = terms.W_faces[b], terms.W_input[b], terms.W_shape[b]
+    W_acceleration, W_slip, W_still = (
+        terms.W_acceleration[b], terms.W_slip[b], terms.W_zero_motion[b]
+    )  # fmt: skip
     faces_scratch, slip_scratch = rotation_scratch()
     nothing = np.zeros(6)
     value = 0.0
@@ -330,37 +349,40 @@ def add_window(poses, shared, last, data, gradient, band, border, corner, curved
             border, corner, curved,
         )  # fmt: skip
     for n in range(min(last, len(W_input))):
-        value += add_step(
-            n, poses[n], shared, input_pose[n], axes[n], nothing, W_input[n], BIAS, gradient,
-            band, border, corner, curved,
-        )  # fmt: skip
+        if W_input[n, 0, 0] != 0.0:
+            value += add_step(
+                n, poses[n], shared, terms.input_pose[b, n], terms.axes[b, n], nothing,
+                W_input[n], BIAS, gradient, band, border, corner, curved,
+            )  # fmt: skip
     for n in range(min(last, len(W_shape))):
         value += add_step(
-            n, poses[n], shared, shape_start[n], shape_axes[n], wanted[n], W_shape[n],
-            ANCHOR, gradient, band, border, corner, curved,
+            n, poses[n], shared, terms.shape_start[b, n], terms.shape_axes[b, n],
+            terms.wanted[b, n], W_shape[n], ANCHOR, gradient, band, border, corner, curved,
         )  # fmt: skip
     for n in range(min(last, len(W_acceleration))):
-        value += add_acceleration(n, poses, times, W_acceleration[n], gradient, band, curved)
+        if W_acceleration[n, 0, 0] != 0.0:
+            value += add_acceleration(n, poses, times, W_acceleration[n], gradient, band, curved)
     for n in range(min(last, len(W_slip))):
         if W_slip[n, 0, 0] != 0.0:
             value += add_slip(
                 n, poses, times, shared[PIVOT], W_slip[n], slip_scratch, gradient, band, border,
                 corner, curved,
             )  # fmt: skip
-    for n in range(min(last, len(W_zero_motion))):
-        if W_zero_motion[n, 0, 0] != 0.0:
-            value += add_zero_motion(n, poses, W_zero_motion[n], gradient, band, curved)
-    if len(information):
+    for n in range(min(last, len(W_still))):
+        if W_still[n, 0, 0] != 0.0:
+            value += add_zero_motion(n, poses, W_still[n], gradient, band, curved)
+    W_prior = terms.W_prior[b]
+    if W_prior[0, 0] != 0.0:
         value += add_marginal_prior(
-            poses, shared, mean, information, gradient, band, border, corner, curved
+            poses, shared, terms.prior_mean[b], W_prior, gradient, band, border, corner, curved
         )
     return value
 
 
 @kernel
-def accumulate(x, rows, last, terms, expected, W_shared, value, gradient, band, border, corner):
+def accumulate(begin, end, x, rows, last, terms, value, gradient, band, border, corner):
     """
-    Write the sums of the residuals of some windows.
+    Write the sums of the residuals of the windows `rows[begin:end]`.
 
     Parameters
     ----------
@@ -369,10 +391,8 @@ def accumulate(x, rows, last, terms, expected, W_shared, value, gradient, band, 
     last : int
         Only residuals that begin at the first `last` observations; less than N leaves out the
         prior on the shared variables too, which belongs to no observation.
-    terms : tuple of array
-        As in `boxreg_ros.core.terms.TermArrays`.
-    expected, W_shared : array, shapes (B, 22) and (B, 22, 22)
-        Mean and weight of the shared variables.
+    terms : TermArrays
+        Data and weights.
     value, gradient : array, shapes (b,) and (b, D)
         Written.
     band, border, corner : array, shapes (b, 6 N, 18), (b, 6 N, S) and (b, S, S)
@@ -384,7 +404,7 @@ def accumulate(x, rows, last, terms, expected, W_shared, value, gradient, band, 
     no_band = np.empty((0, BAND))
     no_border = np.empty((6 * N, 0))
     no_corner = np.empty((0, 0))
-    for i in range(len(rows)):
+    for i in range(begin, end):
         b = rows[i]
         poses = x[i, : 6 * N].reshape(N, 6)
         shared = x[i, 6 * N :]
@@ -396,24 +416,25 @@ def accumulate(x, rows, last, terms, expected, W_shared, value, gradient, band, 
             corner[i] = 0.0
             own_band, own_border, own_corner = band[i], border[i], corner[i]
         value[i] = add_window(
-            poses, shared, last, window_rows(terms, b), gradient[i], own_band, own_border,
-            own_corner, curved,
-        )  # fmt: skip
+            b, poses, shared, last, terms, gradient[i], own_band, own_border, own_corner, curved
+        )
         if last >= N:
             value[i] += add_shared_prior(
-                shared, expected[b], W_shared[b], gradient[i], 6 * N, own_corner, curved
-            )
+                shared, terms.expected[b], terms.W_shared[b], gradient[i], 6 * N, own_corner,
+                curved,
+            )  # fmt: skip
 
 
 @kernel
-def factorise_windows(free, band, border, corner):
+def factorise_windows(begin, end, free, band, border, corner):
     """
     Replace Gauss-Newton matrices by their Cholesky factors in the `free` variables (B, D).
 
+    Those of the windows `begin` to `end`.
     Factors of a matrix that is not positive definite are NaN.
 
     """
-    for b in range(len(band)):
+    for b in range(begin, end):
         fix_variables(band[b], border[b], corner[b], free[b])
         if not factorise(band[b], border[b], corner[b]):
             band[b] = np.nan
@@ -422,21 +443,9 @@ def factorise_windows(free, band, border, corner):
 
 
 @kernel
-def window_rows(terms, b):
-    """Return the arrays of one window."""
-    (given, inset, W_faces, input_pose, axes, W_input, shape_start, shape_axes, wanted, W_shape,
-     times, W_acceleration, W_slip, W_zero_motion, mean, information) = terms  # fmt: skip
-    return (
-        given[b], inset[b], W_faces[b], input_pose[b], axes[b], W_input[b], shape_start[b],
-        shape_axes[b], wanted[b], W_shape[b], times[b], W_acceleration[b], W_slip[b],
-        W_zero_motion[b], mean[b], information[b],
-    )  # fmt: skip
-
-
-@kernel
-def marginalise(x, gradient, band, border, corner, mean, step, information):
+def marginalise(begin, end, x, gradient, band, border, corner, mean, step, information):
     """
-    Write the quadratic form that stands for the oldest observation of each window.
+    Write the quadratic form that stands for the oldest observation of the windows.
 
     In the next two poses and the shared variables: where they are (B, 34), the step from there to
     the minimum (B, 34), and the curvature (B, 34, 34). The sums of the residuals of the oldest
@@ -446,7 +455,7 @@ def marginalise(x, gradient, band, border, corner, mean, step, information):
     N = (x.shape[1] - SHARED) // 6
     head = min(3, N)
     size = 12 + SHARED
-    for b in range(len(x)):
+    for b in range(begin, end):
         poses = x[b, : 6 * N].reshape(N, 6)
         shared = x[b, 6 * N :]
         # Dense, in the order: oldest pose, two next poses, shared variables.

@@ -6,7 +6,7 @@ The torch twin is `boxreg_ros.core.rigid_shape.agreement_torch`, which has the f
 """
 
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.face_support import to_box_axes
+from boxreg_ros.core.kernels.face_support import fill_velocity, returns_of, to_box_axes
 from boxreg_ros.core.kernels.rotation import fill_rotation
 import numpy as np
 
@@ -44,19 +44,21 @@ def fill_planes(sums, roughness, flatness, min_points, planes, thickness):
 
 @kernel
 def agreement(
-    poses, given, extents, points, counts, roughness, cells, limits, information, wanted
+    begin, end, windows, poses, extents, is_moving, roughness, cells, limits, information, wanted
 ):
     """
-    Write information (B, N, 6, 6) and wanted steps (B, N, 6) of all windows.
+    Write information (B, N, 6, 6) and wanted steps (B, N, 6) of windows `begin` to `end`.
 
     Parameters
     ----------
-    poses, given : array, shape (B, N, 6)
-        Poses of this round and of the input.
+    windows : WindowArrays
+        Input of the windows.
+    poses : array, shape (B, N, 6)
+        Poses of this round.
     extents : array, shape (B, 3)
         Extents [m].
-    points, counts : array, shapes (B, N, M, 3) and (B, N)
-        Points minus the input centre [m]; the first `counts` are not padding.
+    is_moving : bool
+        Whether points are to be moved to the stamp of their box.
     roughness : array, shape (B,)
         How far the surface of each window's object is from rigid [m].
     cells : tuple of int
@@ -68,7 +70,10 @@ def agreement(
 
     """
     margin, flatness, min_points, independent, ridge = limits
-    B, N, M = points.shape[:3]
+    N = poses.shape[1]
+    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
+    moved = np.empty((M, 3))
+    velocity = np.zeros(3)
     cell_count = cells[0] * cells[1] * cells[2]
     local = np.empty((N, 3, M))
     R = np.empty((3, 3))
@@ -77,16 +82,22 @@ def agreement(
     planes = np.empty((cell_count, 4))
     thickness = np.empty(cell_count)
     lever = np.empty(6)
-    for b in range(B):
+    for b in range(begin, end):
         for k in range(3):
             half[k] = extents[b, k] / 2
         sums = np.zeros((cell_count, 4, 4))
         for n in range(N):
-            m = counts[b, n]
+            m = windows.counts[b, n]
             fill_rotation(poses[b, n, 3], poses[b, n, 4], poses[b, n, 5], R)
             for k in range(3):
-                shift[k] = poses[b, n, k] - given[b, n, k]
-            to_box_axes(points[b, n, :m], shift, R, local[n, :, :m])
+                shift[k] = poses[b, n, k] - windows.boxes[b, n, k]
+            if is_moving:
+                fill_velocity(poses[b], windows.times[b], n, windows.lengths[b], velocity)
+            to_box_axes(
+                returns_of(windows, windows.points, b, n),
+                returns_of(windows, windows.delays, b, n), velocity, shift, R, moved[:m],
+                local[n, :, :m],
+            )  # fmt: skip
             for i in range(m):
                 x, y, z = local[n, 0, i], local[n, 1, i], local[n, 2, i]
                 if not is_near(x, y, z, half, margin):
@@ -98,7 +109,7 @@ def agreement(
                         moment[a, c] += p[a] * p[c]
         fill_planes(sums, roughness[b], flatness, min_points, planes, thickness)
         for n in range(N):
-            m = counts[b, n]
+            m = windows.counts[b, n]
             total = information[b, n]
             total[:] = 0.0
             pull = np.zeros(6)

@@ -1,5 +1,5 @@
 """
-MCAP files of Foxglove: its schemas as protobuf and as JSON, beside channels of ROS.
+Messages of Foxglove's schemas, as protobuf and as JSON.
 
 Clouds and transforms are converted to the corresponding ROS messages. A SceneUpdate stays as it
 is, because adapters read by attribute.
@@ -9,25 +9,16 @@ is, because adapters read by attribute.
 from __future__ import annotations
 
 from base64 import b64decode
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 import json
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.records import Schema
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag2,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
-from rosbags.typesys import get_types_from_msg
 
-ROS_ENCODINGS = ('ros2msg', 'ros2idl', 'omgidl', '')
+FOXGLOVE_ENCODINGS = ('protobuf', 'json')
+"""Encodings of messages with a schema of Foxglove."""
 ROS_TYPES = {
     'foxglove.SceneUpdate': 'foxglove_msgs/msg/SceneUpdate',
     'foxglove.PointCloud': 'sensor_msgs/msg/PointCloud2',
@@ -71,85 +62,31 @@ A field whose name ends with ``?`` may be null.
 """
 
 
-class FoxgloveFile:
+def ros_type(schema_name: str) -> str:
+    """Return the ROS type that messages of a schema are read as; else the name of the schema."""
+    return ROS_TYPES.get(schema_name, schema_name)
+
+
+def decoder_of(origin: str, topic: str, schema: Schema) -> Callable[[bytes], Any]:
     """
-    An MCAP file with channels of Foxglove's schemas, as rosbags' readers offer theirs.
+    Return the function that decodes the messages of a channel.
 
     Parameters
     ----------
-    path : Path
-        MCAP file with a summary.
-
-    Attributes
-    ----------
-    connections : list of Connection
-        One for each channel.
-    decoders : dict
-        Message type to the function that decodes its bytes; not for messages in CDR.
-    start_time, end_time : int
-        Receive times of the first message and behind the last [ns].
+    origin, topic : str
+        Names of the recording and of the topic, for errors.
+    schema : Schema
+        Schema of the channel.
 
     """
-
-    def __init__(self, path: Path) -> None:
-        self.decoders: dict[str, Callable[[bytes], Any]] = {}
-        self._file = path.open('rb')
-        self._reader = make_reader(self._file)
-        summary = self._reader.get_summary()
-        assert summary is not None and summary.statistics is not None
-        self._schemas = summary.schemas
-        self.start_time = summary.statistics.message_start_time
-        self.end_time = summary.statistics.message_end_time + 1
-        self.connections: list[Connection] = []
-        for channel in summary.channels.values():
-            schema = self._schemas.get(channel.schema_id)
-            name = schema.name if schema else channel.message_encoding
-            msgtype = name
-            if schema and channel.message_encoding in ('protobuf', 'json'):
-                msgtype = ROS_TYPES.get(name, name)
-                self.decoders[msgtype] = _Decoder(path, channel.topic, schema)
-            self.connections.append(
-                Connection(
-                    channel.id,
-                    channel.topic,
-                    msgtype,
-                    MessageDefinition(MessageDefinitionFormat.NONE, ''),
-                    '',
-                    summary.statistics.channel_message_counts.get(channel.id, 0),
-                    ConnectionExtRosbag2(channel.message_encoding, []),
-                    self,
-                )
-            )
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def ros_types(self) -> Any:
-        """Return the definitions of the ROS messages in the file."""
-        types: dict[str, Any] = {}
-        for schema in self._schemas.values():
-            if schema.encoding == 'ros2msg':
-                types.update(get_types_from_msg(schema.data.decode(), schema.name))
-        return types
-
-    def messages(
-        self, connections: Sequence[Connection], start: int | None, stop: int | None
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield connection, receive time [ns] and bytes of the messages on `connections`."""
-        by_id = {connection.id: connection for connection in connections}
-        topics = {connection.topic for connection in connections}
-        part = self._reader.iter_messages(topics, starting_at=start, ending_before=stop)
-        for _, channel, message in part:
-            if channel.id in by_id:
-                yield by_id[channel.id], message.log_time, message.data
+    return _Decoder(origin, topic, schema)
 
 
 class _Decoder:
     """Decodes the messages of one channel; each may be JSON or protobuf."""
 
-    def __init__(self, path: Path, topic: str, schema: Schema) -> None:
-        self._origin = f'{path}: messages on {topic!r}'
+    def __init__(self, origin: str, topic: str, schema: Schema) -> None:
+        self._origin = f'{origin}: messages on {topic!r}'
         self._schema = schema
         self._decode: Callable[[bytes], Any] | None = None
 
@@ -298,16 +235,3 @@ CONVERTERS = {
     'foxglove.FrameTransform': _transforms,
     'foxglove.FrameTransforms': _transforms,
 }
-
-
-def is_foxglove(path: Path) -> bool:
-    """Return whether a file is MCAP and has schemas that are not of ROS."""
-    if path.suffix != '.mcap' or not path.is_file():
-        return False
-    try:
-        with path.open('rb') as file:
-            summary = make_reader(file).get_summary()
-    except (McapError, OSError):
-        return False  # reading it as a ROS recording reports the error
-    schemas = summary.schemas.values() if summary else ()
-    return any(schema.encoding not in ROS_ENCODINGS for schema in schemas)

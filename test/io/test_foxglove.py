@@ -8,7 +8,7 @@ import sys
 from boxreg_ros.cli import main
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.foxglove_mcap import encoded
+from boxreg_ros.io.foxglove import encoded
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from foxglove_recordings import PointCloud, SceneUpdate, write_foxglove_mcap

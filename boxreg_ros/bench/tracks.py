@@ -1,0 +1,145 @@
+"""
+`boxreg bench tracks`: broken tracks before and after each step of ``relabel --complete``.
+
+The tracks of each recording are broken by the same rules as in ``boxreg simulate --break``. All
+rows of a table have the same sweeps and the same broken boxes; each row has one step more.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+import math
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
+from boxreg_ros.config import COMPLETE_STEPS, Config
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.session import register
+from boxreg_ros.offline.completion import completed
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.track_scores import track_scores, TrackScores
+from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
+from boxreg_ros.structures import BoxArray, RefinedBoxes, REJECTED, Sweep
+import numpy as np
+
+TITLES = ('recall', 'prec.', 'ids/obj', 'HOTA', 'IDF1', 'added', '3D added', 'ghosts', 'lost')
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """
+    Scores after one step.
+
+    Attributes
+    ----------
+    scores : TrackScores
+        Of the boxes that are not rejected.
+    ghosts, lost : float
+        Rejected part of the ghosts, and of the other boxes of the input; NaN without any.
+
+    """
+
+    scores: TrackScores
+    ghosts: float
+    lost: float
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `boxreg bench tracks`."""
+    parser.add_argument(
+        'data', nargs='+', type=Path, metavar='FOLDER',
+        help='folder with one recording and truth.csv in the columns of boxes.csv',
+    )  # fmt: skip
+    parser.add_argument(
+        '--ghosts', type=float, default=0.0, metavar='N',
+        help='mean number of boxes per sweep that belong to no object (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--seed', type=int, default=0, metavar='N', help='of the breaks (default: %(default)s)'
+    )
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the scores after each step, one table per recording."""
+    report: dict[str, Any] = {}
+    with progress_bar(len(args.data) * (2 + len(COMPLETE_STEPS)), args) as bar:
+        for folder in args.data:
+            drive = broken(Drive.read(folder), args.seed, args.ghosts)
+            if not args.json:
+                bar.clear()
+                print(f'{folder}: {len(drive.truth.boxes)} true boxes')
+                print(line('', TITLES))
+            rows = {}
+            for name, row in after_each_step(drive):
+                rows[name] = asdict(row.scores) | {'ghosts_rejected': row.ghosts, 'lost': row.lost}
+                bar.update()
+                if not args.json:
+                    print(line(name, _cells(row)))
+            report[str(folder)] = rows
+    if args.json:
+        print_json(report)
+    return 0
+
+
+def broken(drive: Drive, seed: int, ghosts: float) -> Drive:
+    """Return a drive with broken tracks."""
+    stamps = np.array([array.stamp_ns for array in drive.boxes])
+    origins = np.array([sweep.origin for sweep in drive.sweeps_at(stamps)])
+    arrays = break_tracks(drive.boxes, np.random.default_rng(seed), ghosts, origins)
+    return replace(drive, boxes=tuple(arrays))
+
+
+def after_each_step(drive: Drive) -> Iterator[tuple[str, Row]]:
+    """Yield the scores of the input, of registration alone, and with one more step each."""
+    items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
+    items.sort(key=lambda item: item.stamp_ns)
+    scores = track_scores(BoxTable.from_arrays(drive.boxes), drive.truth)
+    yield 'input', Row(scores, math.nan, math.nan)
+    config = Config()
+    registrar = BoxRegistrar(config)
+    refined: list[RefinedBoxes] = []
+    for item in items:
+        refined += register(registrar, item, restarts=False)
+    yield 'refined', _row([*refined, *registrar.flush()], drive)
+    for step in COMPLETE_STEPS:
+        config = config.updated({f'complete.{step}': True})
+        results, _ = completed(items, drive.truth.frame_id, config)
+        yield f'+ {step}', _row(results, drive)
+
+
+def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
+    """Return the scores of results, and which part of the input is rejected."""
+    is_rejected: dict[bool, list[bool]] = {True: [], False: []}  # of ghosts, and of other boxes
+    for given, result in zip(drive.boxes, results, strict=True):
+        for track_id, status in zip(given.track_ids, result.status, strict=False):
+            is_rejected[track_id.startswith(GHOST_PREFIX)].append(status == REJECTED)
+    parts = [float(np.mean(rows)) if rows else math.nan for rows in is_rejected.values()]
+    return Row(track_scores(table_of(results), drive.truth), *parts)
+
+
+def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
+    """Return the boxes of results that are not rejected, with their status."""
+    table = BoxTable.from_arrays([result.boxes for result in results])
+    table = replace(table, status=tuple(word for r in results for word in r.status))
+    return table.rows(np.array([status != REJECTED for status in table.status], bool))
+
+
+def _cells(row: Row) -> tuple[float | str, ...]:
+    scores = row.scores
+    return (
+        scores.recall,
+        scores.precision,
+        scores.ids_per_object,
+        scores.hota,
+        scores.idf1,
+        str(scores.added),
+        scores.added_iou,
+        row.ghosts,
+        row.lost,
+    )

@@ -1,0 +1,214 @@
+"""
+Files that consist of chunks: MCAP and ROS 1 bags.
+
+A chunk is read when the stream reaches its first message, and dropped after its last one. Chunks
+may overlap in time, or lie in any order. What is held of them is limited by `BUFFER_BYTES`.
+
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from heapq import heapify, heappop, heappush
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from boxreg_ros.io.storage.record import Damage, note, one_line, Record, shown, span_ns
+from rosbags.interfaces import Connection
+
+BUFFER_BYTES = 256 * 2**20
+"""
+Messages of chunks that are held at a time [bytes].
+
+Two seconds of a recording of 100 MB/s. Recordings whose chunks all cover the whole time exceed
+it; their chunks are then dropped and read again.
+
+"""
+MAX_CHUNK_BYTES = 2**30
+"""Chunks that claim to be larger are damaged [bytes]; writers make chunks of 1 to 16 MB."""
+
+
+class Chunk(NamedTuple):
+    """
+    A part of a file with messages.
+
+    Attributes
+    ----------
+    first_byte, end_byte : int
+        Byte range in the file.
+    start_ns, last_ns : int
+        Receive times of its first and last message [ns].
+    counts : dict of int
+        Number of messages by the id of their connection.
+    is_compressible : bool
+        False for messages outside of chunks, which are grouped to chunks here.
+
+    """
+
+    first_byte: int
+    end_byte: int
+    start_ns: int
+    last_ns: int
+    counts: Mapping[int, int]
+    is_compressible: bool = True
+
+
+class StoredMessage(NamedTuple):
+    """Connection id, receive time [ns] and bytes of a message, and what MCAP has beside them."""
+
+    connection_id: int
+    received_ns: int
+    data: bytes
+    published_ns: int
+    sequence: int
+
+
+class ChunkedFile(ABC):
+    """
+    An open file of chunks; see `StorageFile`.
+
+    Parameters
+    ----------
+    path : Path
+        File to read.
+    origin : Path, optional
+        File that it was unpacked from, for errors.
+
+    """
+
+    def __init__(self, path: Path, origin: Path | None = None) -> None:
+        self.name = shown(path, origin)
+        self._file = path.open('rb')
+        self.size = os.fstat(self._file.fileno()).st_size
+        self.connections: list[Connection] = []
+        self.damages: list[Damage] = []
+        self._chunks: list[Chunk] = []
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+        spans = [(chunk.start_ns, chunk.last_ns + 1) for chunk in self._chunks if chunk.counts]
+        self.start_time, self.end_time = span_ns(spans)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def messages(
+        self, connections: Collection[Connection], start: int | None, stop: int | None
+    ) -> Iterator[Record]:
+        """Yield the messages on `connections`, ordered by receive time; see `StorageFile`."""
+        wanted = {connection.id: connection for connection in connections}
+
+        def load(chunk: Chunk) -> list[Record]:
+            return [
+                Record(
+                    wanted[message.connection_id], message.received_ns, message.data,
+                    message.published_ns, message.sequence,
+                )
+                for message in self._messages_of(chunk)
+                if message.connection_id in wanted and _is_within(message.received_ns, start, stop)
+            ]  # fmt: skip
+
+        chunks = [
+            chunk
+            for chunk in self._chunks
+            if not wanted.keys().isdisjoint(chunk.counts)
+            and (start is None or start <= chunk.last_ns)
+            and (stop is None or chunk.start_ns < stop)
+        ]
+        return _merged(chunks, load, BUFFER_BYTES)
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Set `connections` and `_chunks`, from the index of the file or by a scan."""
+
+    @abstractmethod
+    def _unpack(self, chunk: Chunk) -> list[StoredMessage]:
+        """Return the messages of a chunk; any error means that it is damaged."""
+
+    def _messages_of(self, chunk: Chunk) -> list[StoredMessage]:
+        """Return the messages of a chunk; none, and a damage is noted, if it is damaged."""
+        try:
+            return self._unpack(chunk)
+        except Exception as error:  # of the format's library or of a decompressor
+            reason = f'damaged chunk ({one_line(error)})'
+            self._note(reason, chunk.first_byte, chunk.end_byte, chunk.start_ns, chunk.last_ns)
+            return []
+
+    def _note(
+        self,
+        reason: str,
+        first_byte: int,
+        end_byte: int,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> None:
+        note(self.damages, Damage(self.name, reason, first_byte, end_byte, start_ns, end_ns))
+
+    def _bytes(self, first_byte: int, end_byte: int) -> bytes:
+        """Return a part of the file; fewer bytes at its end."""
+        return os.pread(self._file.fileno(), end_byte - first_byte, first_byte)
+
+    def _count_messages(self) -> Counter[int]:
+        """Return the number of messages in all chunks by connection id."""
+        counts: Counter[int] = Counter()
+        for chunk in self._chunks:
+            counts.update(chunk.counts)
+        return counts
+
+    def _locate_damages(self) -> None:
+        """Give damages found by a scan the times of the chunks before and behind them."""
+        for i, damage in enumerate(self.damages):
+            if damage.start_ns is not None or damage.first_byte is None:
+                continue
+            first, end = damage.first_byte, damage.end_byte or damage.first_byte
+            before = [c.last_ns for c in self._chunks if c.end_byte <= first]
+            behind = [c.start_ns for c in self._chunks if c.first_byte >= end]
+            # Behind the last chunk the end is unknown: the recording was interrupted there.
+            start_ns = max(before, default=None)
+            end_ns = min(behind, default=start_ns)
+            self.damages[i] = damage._replace(start_ns=start_ns, end_ns=end_ns)
+
+
+def _merged(
+    chunks: Sequence[Chunk],
+    load: Callable[[Chunk], list[Record]],
+    buffer_bytes: int,
+) -> Iterator[Record]:
+    """
+    Yield the messages of chunks in the order of their receive times.
+
+    If more than `buffer_bytes` would be held, the chunk that is needed last is dropped and read
+    again when its next message is due.
+
+    """
+    waiting = [(chunk.start_ns, i) for i, chunk in enumerate(chunks)]
+    heapify(waiting)
+    positions = [0] * len(chunks)
+    held: dict[int, list[Record]] = {}
+    sizes: dict[int, int] = {}
+    while waiting:
+        _, i = heappop(waiting)
+        if i in held:
+            yield held[i][positions[i]]
+            positions[i] += 1
+        else:
+            held[i] = sorted(load(chunks[i]), key=lambda record: record.received_ns)
+            sizes[i] = sum(len(record.data) for record in held[i])
+            while len(held) > 1 and sum(sizes.values()) > buffer_bytes:
+                others = {k: held[k][positions[k]].received_ns for k in held if k != i}
+                last = max(others, key=others.__getitem__)
+                del held[last], sizes[last]
+        if positions[i] < len(held[i]):
+            heappush(waiting, (held[i][positions[i]].received_ns, i))
+        else:
+            del held[i], sizes[i]
+
+
+def _is_within(time_ns: int, start: int | None, stop: int | None) -> bool:
+    return (start is None or start <= time_ns) and (stop is None or time_ns < stop)

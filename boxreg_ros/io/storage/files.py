@@ -1,0 +1,225 @@
+"""Which files a recording consists of, and how each is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing, ExitStack
+from heapq import heapify, heappop, heapreplace
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.storage.mcap import McapFile
+from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, StorageFile
+from boxreg_ros.io.storage.rosbag1 import Rosbag1File
+from boxreg_ros.io.storage.sqlite import SqliteFile
+from mcap.records import Schema
+from rosbags.interfaces import Connection
+import yaml
+import zstandard
+
+OPENERS: dict[str, Callable[[Path, Path | None], StorageFile]] = {
+    '.mcap': McapFile,
+    '.db3': SqliteFile,
+    '.bag': Rosbag1File,
+    '.active': Rosbag1File,  # of a recorder that has not ended
+}
+COMPRESSED = ('.zstd', '.zst')
+METADATA = 'metadata.yaml'
+BLOCK_BYTES = 2**12
+"""Bytes that are decompressed at a time; damage in one costs all of it."""
+
+
+class Part(NamedTuple):
+    """The files of one path of a recording, and those of them that do not exist."""
+
+    path: Path
+    files: tuple[Path, ...]
+    missing: tuple[Path, ...] = ()
+
+
+def part_of(path: Path) -> Part:
+    """
+    Return the files of a recording: of a folder those in its metadata, or all without metadata.
+
+    Raises
+    ------
+    RecordingError
+        If it does not exist, or is a folder without files of recordings.
+
+    """
+    if not path.exists():
+        raise RecordingError(f'no such recording: {str(path)!r}')
+    if not path.is_dir():
+        return Part(path, (path,))
+    listed = _listed(path)
+    there = sorted(file for file in path.iterdir() if file.is_file() and _kind(file) in OPENERS)
+    files = [file for file in listed if file.is_file()] or there
+    if not files:
+        raise RecordingError(
+            f'{str(path)!r} is no recording: expected {METADATA}, .mcap, .db3 or .bag files in it'
+        )
+    return Part(path, tuple(files), tuple(file for file in listed if not file.is_file()))
+
+
+def is_ros1(path: Path) -> bool:
+    """Return whether a file is a ROS 1 bag."""
+    return OPENERS.get(_kind(path)) is Rosbag1File
+
+
+def opened(path: Path) -> StorageFile:
+    """
+    Open a file of a recording; a compressed one is unpacked to a temporary file first.
+
+    Raises
+    ------
+    RecordingError
+        If it is none, or nothing in it can be read.
+
+    """
+    opener = OPENERS.get(_kind(path))
+    if opener is None:
+        raise RecordingError(
+            f'{str(path)!r}: expected an .mcap, .db3 or .bag file, or a rosbag2 folder'
+        )
+    try:
+        path.open('rb').close()
+    except PermissionError as error:
+        raise RecordingError(
+            f'{path}: expected a file that may be read, got {error.strerror}; change its '
+            f'permissions (chmod u+r) or the user'
+        ) from None
+    if path.suffix not in COMPRESSED:
+        return opener(path, None)
+    with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
+        plain = Path(folder, path.stem)
+        damage = _unpack(path, plain)
+        file = opener(plain, path)
+    if damage is not None:
+        file.damages.insert(0, damage)
+    return file
+
+
+class Files:
+    """
+    Several open files of one path as one; see `StorageFile`.
+
+    Parameters
+    ----------
+    part : Part
+        Its files. One that cannot be opened is noted as a damage, unless none can be.
+
+    """
+
+    def __init__(self, part: Part) -> None:
+        self._files: list[StorageFile] = []
+        self._damages = [
+            Damage(str(file), f'file is missing; {METADATA} lists it') for file in part.missing
+        ]
+        first_error: RecordingError | None = None
+        with ExitStack() as stack:
+            for path in part.files:
+                try:
+                    self._files.append(stack.enter_context(closing(opened(path))))
+                except RecordingError as error:
+                    first_error = first_error or error
+                    size = path.stat().st_size
+                    self._damages.append(Damage(str(path), str(error), 0, size))
+            if first_error is not None and not self._files:
+                raise first_error
+            self._opened = stack.pop_all()
+        self.start_time, self.end_time = span_ns([(f.start_time, f.end_time) for f in self._files])
+        self._own: dict[tuple[str, str, str], list[Connection]] = {}
+        for file in self._files:
+            for connection in file.connections:
+                key = connection.topic, connection.msgtype, connection.ext.__class__.__name__
+                self._own.setdefault(key, []).append(connection)
+        self.connections = [
+            next((c for c in own if c.msgdef.data), own[0])._replace(
+                id=number, owner=self, msgcount=sum(c.msgcount for c in own)
+            )
+            for number, own in enumerate(self._own.values())
+        ]
+
+    @property
+    def damages(self) -> list[Damage]:
+        """Return the damages of all files."""
+        return [*self._damages, *(damage for file in self._files for damage in file.damages)]
+
+    def schema_of(self, connection: Connection) -> Schema | None:
+        """Return the schema of a channel of MCAP files; None without."""
+        for own in list(self._own.values())[connection.id]:
+            if isinstance(own.owner, McapFile):
+                return own.owner.schema_of(own)
+        return None
+
+    def close(self) -> None:
+        """Close all files."""
+        self._opened.close()
+
+    def messages(
+        self, connections: Collection[Connection], start: int | None, stop: int | None
+    ) -> Iterator[Record]:
+        """Yield the messages of all files, each opened when the stream reaches it."""
+        shared = {
+            (id(own.owner), own.id): connection
+            for connection, group in zip(self.connections, self._own.values(), strict=True)
+            if connection in connections
+            for own in group
+        }
+        streams = []
+        for file in self._files:
+            wanted = [c for c in file.connections if (id(c.owner), c.id) in shared]
+            if wanted:
+                streams.append((file.start_time, file.messages(wanted, start, stop)))
+        for record in merged(streams):
+            connection = record.connection
+            yield record._replace(connection=shared[id(connection.owner), connection.id])
+
+
+def merged(streams: Sequence[tuple[int, Iterator[Record]]]) -> Iterator[Record]:
+    """Merge streams by receive time; a stream is begun when its start time [ns] is reached."""
+    ahead: list[tuple[int, int, Record | None]] = [
+        (start_ns, i, None) for i, (start_ns, _) in enumerate(streams)
+    ]
+    heapify(ahead)
+    while ahead:
+        _, i, record = ahead[0]
+        if record is not None:
+            yield record
+        following = next(streams[i][1], None)
+        if following is None:
+            heappop(ahead)
+        else:
+            heapreplace(ahead, (following.received_ns, i, following))
+
+
+def _kind(path: Path) -> str:
+    """Return the suffix of a file without that of its compression."""
+    return Path(path.stem).suffix if path.suffix in COMPRESSED else path.suffix
+
+
+def _listed(folder: Path) -> list[Path]:
+    """Return the files in the metadata of a rosbag2 folder; none without valid metadata."""
+    try:
+        metadata = yaml.safe_load((folder / METADATA).read_text(encoding='utf-8'))
+        names = metadata['rosbag2_bagfile_information']['relative_file_paths']
+        # The name alone: a recording must not refer to files elsewhere.
+        return [folder / PurePath(name).name for name in names]
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        return []
+
+
+def _unpack(path: Path, plain: Path) -> Damage | None:
+    """Decompress a file as far as it is readable; return the damage, if any."""
+    unpacker = zstandard.ZstdDecompressor().decompressobj(read_across_frames=True)
+    with path.open('rb') as source, plain.open('wb') as target:
+        while block := source.read(BLOCK_BYTES):
+            try:
+                target.write(unpacker.decompress(block))
+            except zstandard.ZstdError as error:
+                reason = f'damaged compression ({one_line(error)})'
+                first_byte = source.tell() - len(block)
+                return Damage(str(path), reason, first_byte, path.stat().st_size)
+    return None

@@ -1,0 +1,358 @@
+"""
+MCAP files: read by their index, or scanned record by record where the index is missing or damaged.
+
+The records are parsed by the mcap library. Its readers stop at the first error; here a damaged
+chunk is left out and noted, and after a damaged record the next plausible chunk is searched for.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+import struct
+from typing import NamedTuple, TypeVar
+import zlib
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.storage.chunks import Chunk, ChunkedFile, MAX_CHUNK_BYTES, StoredMessage
+from boxreg_ros.io.storage.record import Definition, one_line
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.stream_reader import breakup_chunk, StreamReader
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
+from rosbags.typesys.msg import normalize_msgtype
+import zstandard
+
+MCAP_MAGIC = b'\x89MCAP0\r\n'
+HEAD_BYTES = 9
+"""Operation code (1 byte) and length (8 bytes) in front of each record."""
+FOOTER_BYTES = HEAD_BYTES + 20
+CHUNK_HEAD = struct.Struct('<QQQII')
+"""First and last receive time, size, checksum, and length of the name of the compression."""
+COMPRESSIONS = ('', 'lz4', 'zstd')
+GROUP_BYTES = 2**22
+"""Messages outside of chunks are grouped to chunks of this size [bytes], as writers do."""
+SEARCH_BYTES = 2**20
+SCHEMA_FORMATS = {
+    'ros2msg': MessageDefinitionFormat.MSG,
+    'ros1msg': MessageDefinitionFormat.MSG,
+    'ros2idl': MessageDefinitionFormat.IDL,
+    'omgidl': MessageDefinitionFormat.IDL,
+}
+
+_T = TypeVar('_T')
+
+
+class _Place(NamedTuple):
+    """A record in the file, without its content."""
+
+    opcode: int
+    first_byte: int
+    end_byte: int
+
+
+class McapFile(ChunkedFile):
+    """
+    An open MCAP file; see `ChunkedFile`.
+
+    Attributes
+    ----------
+    is_indexed : bool
+        False if the whole file had to be scanned.
+
+    Raises
+    ------
+    RecordingError
+        If there is no message in it, and it is not a whole MCAP file.
+
+    """
+
+    def __init__(self, path: Path, origin: Path | None = None) -> None:
+        self._schemas: dict[int, records.Schema] = {}
+        self.is_indexed = True
+        self._channels: dict[int, records.Channel] = {}
+        self._extras: list[_Place] = []
+        super().__init__(path, origin)
+
+    def schema_of(self, connection: Connection) -> records.Schema | None:
+        """Return the schema of a connection's channel; None without."""
+        return self._schemas.get(self._channels[connection.id].schema_id)
+
+    def definition_of(self, connection: Connection) -> Definition:
+        """Return schema, encoding and metadata of a connection's channel."""
+        channel = self._channels[connection.id]
+        schema = self.schema_of(connection)
+        return Definition(
+            (schema.name, schema.encoding, schema.data) if schema else None,
+            channel.message_encoding,
+            tuple(channel.metadata.items()),
+        )
+
+    def extras(self) -> Iterator[records.Attachment | records.Metadata]:
+        """Yield the attachments and the metadata; damaged ones are noted and left out."""
+        for place in self._extras:
+            try:
+                kind = (
+                    records.Attachment if place.opcode == Opcode.ATTACHMENT else records.Metadata
+                )
+                yield self._parsed(kind.read, place)
+            except Exception as error:  # of the library, for any malformed content
+                reason = f'damaged attachment or metadata ({one_line(error)})'
+                self._note(reason, place.first_byte, place.end_byte)
+
+    def _open(self) -> None:
+        counts = self._read_index()
+        if counts is None:
+            self.is_indexed = False
+            counts = self._scan()
+        for number, channel in sorted(self._channels.items()):
+            self.connections.append(self._connection(channel, counts.get(number, 0)))
+
+    def _connection(self, channel: records.Channel, count: int) -> Connection:
+        schema = self._schemas.get(channel.schema_id)
+        kind = schema.name if schema else channel.message_encoding
+        definition = MessageDefinition(MessageDefinitionFormat.NONE, '')
+        if schema and schema.encoding in SCHEMA_FORMATS:
+            kind = normalize_msgtype(kind)
+            text = schema.data.decode(errors='replace')
+            definition = MessageDefinition(SCHEMA_FORMATS[schema.encoding], text)
+        return Connection(
+            channel.id, channel.topic, kind, definition, '', count,
+            ConnectionExtRosbag2(channel.message_encoding, []), self,
+        )  # fmt: skip
+
+    # Index ------------------------------------------------------------------------------------
+
+    def _read_index(self) -> dict[int, int] | None:
+        """
+        Read the summary at the end of the file.
+
+        Returns
+        -------
+        counts : dict of int, or None
+            Number of messages by channel; None where the summary is missing, damaged, or does
+            not list all chunks and channels.
+
+        """
+        try:
+            found = self._summary_records()
+            statistics = next(r for r in found if isinstance(r, records.Statistics))
+        except Exception:  # of the library, for any malformed content; the scan reports it
+            return None
+        indexes = [r for r in found if isinstance(r, records.ChunkIndex)]
+        for record in found:
+            self._add_definition(record)
+        is_complete = (
+            len(self._channels) == statistics.channel_count
+            and len(indexes) == statistics.chunk_count
+            and (indexes or not statistics.message_count)
+            and all(_is_index_of(index, self.size) for index in indexes)
+        )
+        if not is_complete:
+            return None
+        filled = [i for i in indexes if i.message_index_offsets or i.message_end_time]
+        self._chunks = [self._indexed_chunk(index, statistics) for index in filled]
+        self._extras = [
+            _Place(
+                Opcode.ATTACHMENT if isinstance(r, records.AttachmentIndex) else Opcode.METADATA,
+                r.offset,
+                r.offset + r.length,
+            )
+            for r in found
+            if isinstance(r, records.AttachmentIndex | records.MetadataIndex)
+        ]
+        return statistics.channel_message_counts
+
+    def _summary_records(self) -> list[records.McapRecord]:
+        footer_byte = self.size - FOOTER_BYTES - len(MCAP_MAGIC)
+        end = self._bytes(footer_byte, self.size)
+        if self._bytes(0, len(MCAP_MAGIC)) != MCAP_MAGIC or end[FOOTER_BYTES:] != MCAP_MAGIC:
+            raise RecordingError('expected the magic bytes of MCAP at begin and end')
+        footer = records.Footer.read(ReadDataStream(BytesIO(end[HEAD_BYTES:])))
+        summary = self._bytes(footer.summary_start, footer_byte)
+        # The checksum covers the summary and the footer without the checksum itself.
+        checksum = zlib.crc32(summary + end[: FOOTER_BYTES - 4])
+        if footer.summary_crc not in (0, checksum):
+            raise RecordingError('expected a summary of its checksum')
+        return list(StreamReader(BytesIO(summary + end), skip_magic=True).records)
+
+    def _indexed_chunk(self, index: records.ChunkIndex, statistics: records.Statistics) -> Chunk:
+        """Return a chunk; without an index of its messages it may have any channel."""
+        channels = index.message_index_offsets or statistics.channel_message_counts
+        return Chunk(
+            index.chunk_start_offset,
+            index.chunk_start_offset + index.chunk_length,
+            index.message_start_time,
+            index.message_end_time,
+            dict.fromkeys(channels, 1),
+        )
+
+    # Scan -------------------------------------------------------------------------------------
+
+    def _scan(self) -> Counter[int]:
+        """Find all chunks without the index; return the number of messages by channel."""
+        self._channels.clear()
+        self._schemas.clear()
+        has_end = False
+        group: list[_Place] = []
+        for place in self._places():
+            if place.opcode == Opcode.MESSAGE:
+                group.append(place)
+                if place.end_byte - group[0].first_byte < GROUP_BYTES:
+                    continue
+            self._add_chunk(group)
+            group = []
+            if place.opcode == Opcode.CHUNK:
+                self._add_chunk([place])
+            elif place.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                kind = records.Schema if place.opcode == Opcode.SCHEMA else records.Channel
+                self._add_definition(self._parsed_or_noted(kind.read, place))
+            elif place.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
+                self._extras.append(place)
+            has_end = has_end or place.opcode == Opcode.DATA_END
+        self._add_chunk(group)
+        if not has_end:
+            if not self._chunks:
+                raise RecordingError(
+                    f'{self.name}: no message can be read; expected an MCAP file, got '
+                    f'{self.size} bytes without a whole chunk'
+                )
+            self._note('the recording was interrupted: no end of data', self.size, self.size)
+        self._locate_damages()
+        return self._count_messages()
+
+    def _places(self) -> Iterator[_Place]:
+        """Yield the records up to the end of the data; skip and note what is no record."""
+        first_byte = len(MCAP_MAGIC)
+        while first_byte < self.size:
+            place = self._place_at(first_byte)
+            if place is None:
+                following = self._next_chunk(first_byte + 1)
+                self._note('no record', first_byte, following)
+                first_byte = following
+                continue
+            yield place
+            if place.opcode == Opcode.DATA_END:
+                return
+            first_byte = place.end_byte
+
+    def _place_at(self, first_byte: int) -> _Place | None:
+        """Return the record at a position; None where there can be none."""
+        head = self._bytes(first_byte, first_byte + HEAD_BYTES)
+        if len(head) < HEAD_BYTES:
+            return None
+        opcode, length = struct.unpack('<BQ', head)
+        end_byte = first_byte + HEAD_BYTES + length
+        # Codes from 128 are for the extensions of others.
+        is_known = Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= 128
+        return _Place(opcode, first_byte, end_byte) if is_known and end_byte <= self.size else None
+
+    def _next_chunk(self, position: int) -> int:
+        """Return where the next whole chunk begins; the end of the file without."""
+        while position < self.size:
+            block = self._bytes(position, position + SEARCH_BYTES)
+            found = block.find(Opcode.CHUNK)
+            while found >= 0:
+                place = self._place_at(position + found)
+                if place is not None and self._chunk_times(place) is not None:
+                    return position + found
+                found = block.find(Opcode.CHUNK, found + 1)
+            position += len(block)
+        return self.size
+
+    def _chunk_times(self, place: _Place) -> tuple[int, int] | None:
+        """Return first and last receive time of a chunk [ns]; None if it is no chunk."""
+        first_byte = place.first_byte + HEAD_BYTES
+        head = self._bytes(first_byte, first_byte + CHUNK_HEAD.size + 16)
+        if len(head) < CHUNK_HEAD.size + 8:
+            return None
+        start_ns, last_ns, size, _, length = CHUNK_HEAD.unpack_from(head)
+        name_end = CHUNK_HEAD.size + length
+        if length > 4 or head[CHUNK_HEAD.size : name_end].decode('latin1') not in COMPRESSIONS:
+            return None
+        (stored,) = struct.unpack_from('<Q', head, name_end)
+        is_whole = first_byte + name_end + 8 + stored == place.end_byte
+        if not is_whole or start_ns > last_ns or size > MAX_CHUNK_BYTES:
+            return None
+        return start_ns, last_ns
+
+    def _add_chunk(self, places: list[_Place]) -> None:
+        """Add a chunk, or messages outside of chunks as one, and the definitions in it."""
+        if not places:
+            return
+        is_chunk = places[0].opcode == Opcode.CHUNK
+        start_ns, last_ns = (is_chunk and self._chunk_times(places[0])) or (0, 0)
+        chunk = Chunk(places[0].first_byte, places[-1].end_byte, start_ns, last_ns, {}, is_chunk)
+        messages = self._messages_of(chunk)
+        if messages:
+            times = [message.received_ns for message in messages]
+            counts = Counter(message.connection_id for message in messages)
+            self._chunks.append(
+                chunk._replace(start_ns=min(times), last_ns=max(times), counts=counts)
+            )
+
+    def _parsed_or_noted(self, read: Callable[[ReadDataStream], _T], place: _Place) -> _T | None:
+        try:
+            return self._parsed(read, place)
+        except Exception as error:  # of the library, for any malformed content
+            reason = f'damaged record ({one_line(error)})'
+            self._note(reason, place.first_byte, place.end_byte)
+            return None
+
+    # Content ----------------------------------------------------------------------------------
+
+    def _parsed(self, read: Callable[[ReadDataStream], _T], place: _Place) -> _T:
+        """Return the record at a place."""
+        content = self._bytes(place.first_byte + HEAD_BYTES, place.end_byte)
+        return read(ReadDataStream(BytesIO(content)))
+
+    def _add_definition(self, record: object) -> None:
+        if isinstance(record, records.Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, records.Channel):
+            self._channels.setdefault(record.id, record)
+
+    def _unpack(self, chunk: Chunk) -> list[StoredMessage]:
+        found = []
+        for record in breakup_chunk(self._chunk_record(chunk), validate_crc=True):
+            if isinstance(record, records.Message):
+                found.append(
+                    StoredMessage(
+                        record.channel_id, record.log_time, record.data,
+                        record.publish_time, record.sequence,
+                    )
+                )  # fmt: skip
+            elif not self.is_indexed:
+                self._add_definition(record)
+        return found
+
+    def _chunk_record(self, chunk: Chunk) -> records.Chunk:
+        """Return a chunk as it is stored; RecordingError if its sizes are wrong."""
+        data = self._bytes(chunk.first_byte, chunk.end_byte)
+        size = chunk.end_byte - chunk.first_byte
+        if not chunk.is_compressible:
+            return records.Chunk('', data, chunk.last_ns, chunk.start_ns, 0, size)
+        if data[:1] != bytes([Opcode.CHUNK]):
+            raise RecordingError('no chunk at the place that the index names')
+        record: records.Chunk = records.Chunk.read(ReadDataStream(BytesIO(data[HEAD_BYTES:])))
+        if record.compression == 'zstd':
+            size = zstandard.frame_content_size(record.data)
+            if size not in (-1, record.uncompressed_size):
+                raise RecordingError(f'{size} bytes in a chunk of {record.uncompressed_size}')
+        if record.uncompressed_size > MAX_CHUNK_BYTES:
+            raise RecordingError(f'size of {record.uncompressed_size} bytes')
+        return record
+
+
+def _is_index_of(index: records.ChunkIndex, size: int) -> bool:
+    """Return whether a chunk index names a place inside of a file of `size` [bytes]."""
+    return HEAD_BYTES <= index.chunk_length <= size - index.chunk_start_offset

@@ -1,0 +1,129 @@
+"""Messages as they were recorded, and the parts of a file that cannot be read."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from rosbags.interfaces import Connection
+
+NO_MESSAGES_NS = (2**63 - 1, 0)
+"""Begin and end of a file without messages, as in rosbags [ns]."""
+
+
+class Record(NamedTuple):
+    """
+    One message as it was recorded, still encoded.
+
+    Attributes
+    ----------
+    connection : Connection
+        Topic and type; its `owner` is the file.
+    received_ns : int
+        When it was received [ns].
+    data : bytes
+        Encoded message.
+    published_ns, sequence : int
+        Of MCAP files; equal to `received_ns`, and 0, for other files.
+
+    """
+
+    connection: Connection
+    received_ns: int
+    data: bytes
+    published_ns: int = 0
+    sequence: int = 0
+
+
+class Damage(NamedTuple):
+    """
+    Part of a file that cannot be read.
+
+    Attributes
+    ----------
+    file : str
+        File of the recording.
+    reason : str
+        What is wrong with it.
+    first_byte, end_byte : int or None
+        Byte range in the file; None where the format has none (rows of a database).
+    start_ns, end_ns : int or None
+        Receive times that are affected [ns]; None where unknown.
+
+    """
+
+    file: str
+    reason: str
+    first_byte: int | None = None
+    end_byte: int | None = None
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def __str__(self) -> str:
+        """Return the damage in one line."""
+        parts = [self.reason]
+        if self.first_byte is not None and self.end_byte is not None:
+            parts.append(f'bytes {self.first_byte} to {self.end_byte}')
+        if self.start_ns is not None and self.end_ns is not None:
+            parts.append(f'received {self.start_ns * 1e-9:.3f} to {self.end_ns * 1e-9:.3f} s')
+        return f'{self.file}: {", ".join(parts)}'
+
+
+class StorageFile(Protocol):
+    """
+    One open file of a recording, or several that belong together.
+
+    Attributes
+    ----------
+    connections : list of Connection
+        Topics with types and numbers of messages.
+    start_time, end_time : int
+        Receive times of the first message and behind the last [ns].
+    damages : list of Damage
+        Known so far: some are found while messages are read.
+
+    """
+
+    connections: list[Connection]
+    start_time: int
+    end_time: int
+    damages: list[Damage]
+
+    def messages(
+        self, connections: Collection[Connection], start: int | None, stop: int | None
+    ) -> Iterator[Record]:
+        """Yield the messages on `connections`, ordered by receive time from start to stop [ns]."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+class Definition(NamedTuple):
+    """Channel of an MCAP file as it was written: schema, encoding and metadata."""
+
+    schema: tuple[str, str, bytes] | None
+    encoding: str
+    metadata: tuple[tuple[str, str], ...]
+
+
+def note(damages: list[Damage], damage: Damage) -> None:
+    """Add a damage once: a part of a file may be read several times."""
+    if damage not in damages:
+        damages.append(damage)
+
+
+def span_ns(spans: Collection[tuple[int, int]]) -> tuple[int, int]:
+    """Return the earliest begin and the latest end of `spans` [ns]."""
+    begins, ends = zip(NO_MESSAGES_NS, *spans, strict=True)
+    return min(begins), max(ends)
+
+
+def shown(path: Path, origin: Path | None) -> str:
+    """Return the file that a user knows: `path`, or what it was unpacked from."""
+    return str(origin or path)
+
+
+def one_line(error: Exception) -> str:
+    """Return the text of an error in one line."""
+    return ' '.join(str(error).split()).rstrip('.') or type(error).__name__

@@ -1,0 +1,197 @@
+"""ROS 1 bags: read by their index, or scanned where the index is missing or damaged."""
+
+from __future__ import annotations
+
+from bz2 import BZ2Decompressor
+from collections import Counter
+from collections.abc import Iterator
+from io import BytesIO
+import struct
+
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.storage.chunks import Chunk, ChunkedFile, MAX_CHUNK_BYTES, StoredMessage
+from boxreg_ros.io.storage.record import one_line
+from lz4.frame import LZ4FrameDecompressor
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1.reader import Header, normalize, RecordType
+from rosbags.typesys.msg import normalize_msgtype
+
+BAG_MAGIC = b'#ROSBAG V2.0\n'
+CHUNK_MARK = b'op=\x05'
+"""The field of a record's header that marks a chunk."""
+MAX_HEAD_BYTES = 128
+"""The header of a chunk has three short fields; a mark is this far behind its begin at most."""
+SEARCH_BYTES = 2**20
+
+
+class Rosbag1File(ChunkedFile):
+    """
+    An open ROS 1 bag; see `ChunkedFile`.
+
+    Raises
+    ------
+    RecordingError
+        If it has no whole chunk.
+
+    """
+
+    def _open(self) -> None:
+        if self._bytes(0, len(BAG_MAGIC)) != BAG_MAGIC:
+            raise RecordingError(f'{self.name}: expected a ROS 1 bag of version 2.0')
+        if not self._read_index():
+            self._scan()
+
+    def _read_index(self) -> bool:
+        """Read the index; return False if it is missing or damaged."""
+        reader = Reader(self._file.name)
+        try:
+            reader.open()
+        except Exception:  # of the library, for any malformed content; the scan reports it
+            return False
+        ends = sorted([info.pos for info in reader.chunk_infos] + [self.size])
+        for info in reader.chunk_infos:
+            following = ends[ends.index(info.pos) + 1]
+            self._chunks.append(
+                Chunk(
+                    info.pos, following, info.start_time, info.end_time - 1, info.connection_counts
+                )
+            )
+        self.connections = [c._replace(owner=self) for c in reader.connections]
+        reader.close()
+        return True
+
+    def _scan(self) -> None:
+        """Find all chunks and connections without the index."""
+        self._found: dict[int, Connection] = {}
+        first_byte = len(BAG_MAGIC)
+        while first_byte < self.size:
+            place = self._record_at(first_byte)
+            if place is None:
+                following = self._next_chunk(first_byte + 1)
+                self._note('no record', first_byte, following)
+                first_byte = following
+                continue
+            header, end_byte = place
+            if header.get_uint8('op') == RecordType.CHUNK:
+                self._add_chunk(first_byte, end_byte)
+            first_byte = end_byte
+        if not self._chunks:
+            raise RecordingError(
+                f'{self.name}: no message can be read; expected a ROS 1 bag, got {self.size} '
+                f'bytes without a whole chunk'
+            )
+        self._locate_damages()
+        counts = self._count_messages()
+        self.connections = [
+            connection._replace(msgcount=counts[number])
+            for number, connection in sorted(self._found.items())
+        ]
+
+    def _add_chunk(self, first_byte: int, end_byte: int) -> None:
+        messages = self._messages_of(Chunk(first_byte, end_byte, 0, 0, {}))
+        if messages:
+            times = [message.received_ns for message in messages]
+            counts = Counter(message.connection_id for message in messages)
+            self._chunks.append(Chunk(first_byte, end_byte, min(times), max(times), counts))
+
+    def _record_at(self, first_byte: int) -> tuple[Header, int] | None:
+        """Return header and end of the record at a position; None where there can be none."""
+        try:
+            (length,) = struct.unpack('<I', self._bytes(first_byte, first_byte + 4))
+            data_byte = first_byte + 4 + length
+            if data_byte > self.size:
+                return None
+            header = Header.read(BytesIO(self._bytes(first_byte, data_byte)))
+            header.get_uint8('op')
+            (size,) = struct.unpack('<I', self._bytes(data_byte, data_byte + 4))
+        except Exception:  # of the library, for any malformed content
+            return None
+        end_byte = data_byte + 4 + size
+        return (header, end_byte) if end_byte <= self.size else None
+
+    def _next_chunk(self, position: int) -> int:
+        """Return where the next whole chunk begins; the end of the file without."""
+        while position < self.size:
+            block = self._bytes(position, position + SEARCH_BYTES)
+            found = block.find(CHUNK_MARK)
+            while found >= 0:
+                mark = position + found
+                for first_byte in range(max(position, mark - MAX_HEAD_BYTES), mark):
+                    place = self._record_at(first_byte)
+                    if place is not None and place[0].get_uint8('op') == RecordType.CHUNK:
+                        return first_byte
+                found = block.find(CHUNK_MARK, found + 1)
+            # A mark may lie across the blocks, and its header before it.
+            position += max(len(block) - MAX_HEAD_BYTES, 1)
+        return self.size
+
+    def _unpack(self, chunk: Chunk) -> list[StoredMessage]:
+        stream = BytesIO(self._bytes(chunk.first_byte, chunk.end_byte))
+        head = Header.read(stream, RecordType.CHUNK)
+        stored = _sized(stream)
+        size = head.get_uint32('size')
+        if size > MAX_CHUNK_BYTES:
+            raise RecordingError(f'size of {size} bytes')
+        content = _decompressed(stored, head.get_string('compression'), size)
+        if len(content) != size:
+            raise RecordingError(f'expected {size} bytes, got {len(content)}')
+        return list(self._stored_messages(BytesIO(content), size))
+
+    def _stored_messages(self, stream: BytesIO, size: int) -> Iterator[StoredMessage]:
+        while stream.tell() < size:
+            header = Header.read(stream)
+            data = _sized(stream)
+            operation = header.get_uint8('op')
+            if operation == RecordType.MSGDATA:
+                time_ns = header.get_time('time')
+                yield StoredMessage(header.get_uint32('conn'), time_ns, data, time_ns, 0)
+            elif operation == RecordType.CONNECTION and not self.connections:
+                connection = self._connection(header, Header.read(_with_length(data)))
+                self._found.setdefault(connection.id, connection)
+
+    def _connection(self, header: Header, about: Header) -> Connection:
+        latching = about.get_string('latching') if 'latching' in about else ''
+        return Connection(
+            header.get_uint32('conn'),
+            normalize(header.get_string('topic')),
+            normalize_msgtype(about.get_string('type')),
+            MessageDefinition(MessageDefinitionFormat.MSG, about.get_string('message_definition')),
+            about.get_string('md5sum'),
+            0,
+            ConnectionExtRosbag1(
+                about.get_string('callerid') if 'callerid' in about else None,
+                int(latching) if latching else None,
+            ),
+            self,
+        )
+
+
+def _sized(stream: BytesIO) -> bytes:
+    """Return bytes that follow their number."""
+    (size,) = struct.unpack('<I', stream.read(4))
+    data = stream.read(size)
+    if len(data) != size:
+        raise RecordingError(f'expected {size} bytes, got {len(data)}')
+    return data
+
+
+def _with_length(data: bytes) -> BytesIO:
+    """Return the header that the data of a connection record consists of, as one to read."""
+    return BytesIO(struct.pack('<I', len(data)) + data)
+
+
+def _decompressed(data: bytes, compression: str, size: int) -> bytes:
+    """Return the content of a chunk, at most `size` bytes."""
+    if compression == 'none':
+        return data
+    if compression == 'bz2':
+        return BZ2Decompressor().decompress(data, size)
+    if compression == 'lz4':
+        return bytes(LZ4FrameDecompressor().decompress(data, size))
+    raise RecordingError(f'compression {one_line(ValueError(compression))!r} is not known')

@@ -1,0 +1,226 @@
+"""The two passes over a recording that complete its tracks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.matching import Pair, StampMatcher
+from boxreg_ros.core.observation import crop
+from boxreg_ros.core.registrar import BoxRegistrar, Submit
+from boxreg_ros.io.session import register
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import (
+    BoxArray,
+    Floats,
+    Ints,
+    is_valid_box,
+    RefinedBoxes,
+    ROLL,
+    Sweep,
+)
+from boxreg_ros.tracks.complete import complete, Plan
+from boxreg_ros.tracks.track_steps import TrackSteps
+import numpy as np
+
+ROAD_CLEARANCE = 0.3
+"""Points are above the road if they are so high above the bottom of a box [m]; chosen: the height
+of a box errs by 0.1 m, and the road within it by as much."""
+SIDE_MARGIN = 0.2
+"""Points up to so far outside of the sides of a box count [m]; chosen: the error of the input."""
+
+Moved = Sweep | BoxArray | None
+"""An item in the fixed frame; None where no transform is known."""
+
+
+class PointCounter:
+    """
+    Count the points above the road in the boxes of each array.
+
+    Attributes
+    ----------
+    counts : dict
+        Counts (n,) of the arrays by ticket; of arrays without a sweep there are none.
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self.counts: dict[object, Ints] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Discard sweeps and boxes that wait for each other."""
+        self._matcher = StampMatcher(self._config, Counter())
+
+    def add(self, item: Moved) -> None:
+        """Add a sweep or boxes."""
+        if isinstance(item, BoxArray):
+            self._count(self._matcher.add_boxes(item))
+        elif item is not None:
+            self._count(self._matcher.add_sweep(item))
+
+    def finish(self) -> None:
+        """Count the boxes that still wait."""
+        self._count(self._matcher.flush())
+
+    def of(self, array: BoxArray) -> Ints:
+        """Return the counts of an array; zeros where it has no sweep."""
+        return self.counts.get(array.ticket, np.zeros(len(array.track_ids), np.int64))
+
+    def _count(self, pairs: Iterable[Pair]) -> None:
+        for boxes, sweep in pairs:
+            if sweep is not None:
+                self.counts[boxes.ticket] = points_above_road(sweep, boxes.boxes)
+
+
+def points_above_road(sweep: Sweep, boxes: Floats) -> Ints:
+    """Return the number of points (n,) in boxes (n, 9), without the lowest part; 0 if invalid."""
+    counts = np.zeros(len(boxes), np.int64)
+    valid = np.flatnonzero(is_valid_box(boxes))
+    if not len(valid):
+        return counts
+    near = crop(sweep.points, boxes[valid], SIDE_MARGIN)
+    up = matrix_from_rpy(boxes[valid, ROLL:])[:, :, 2]
+    half_height = boxes[valid, 5] / 2
+    height = (near.offset * up.T.take(near.owner, 1)).sum(0) + half_height.take(near.owner)
+    is_inside = (near.outside.max(0) <= SIDE_MARGIN) & (height > ROAD_CLEARANCE)
+    counts[valid] = np.bincount(near.owner[is_inside], minlength=len(valid))
+    return counts
+
+
+def survey(
+    items: Iterable[tuple[Moved, bool]],
+    fixed_frame: str,
+    config: Config,
+    submit: Submit | None = None,
+) -> Plan:
+    """
+    Register a recording and plan its completed tracks: the first pass.
+
+    Parameters
+    ----------
+    items : iterable of (item, restarts)
+        Sweeps and boxes in the fixed frame, and whether time went back before them.
+    fixed_frame : str
+        Frame of the tracks.
+    config : Config
+        Settings.
+    submit : callable, optional
+        As of `BoxRegistrar`.
+
+    Returns
+    -------
+    plan : Plan
+        Its arrays are in the order of the box arrays among the items. Parts of a recording
+        between two time jumps are completed on their own.
+
+    """
+    registrar = BoxRegistrar(config, submit)
+    counter = PointCounter(config)
+    parts: list[list[BoxArray]] = [[]]
+    results: dict[object, RefinedBoxes] = {}
+    is_early = config.estimate == 'early'
+
+    def keep(ready: Iterable[RefinedBoxes]) -> None:
+        for result in ready:
+            if result.is_final or is_early:
+                results.setdefault(result.boxes.ticket, result)
+
+    for item, restarts in items:
+        if restarts:
+            counter.finish()
+            counter.restart()
+            parts.append([])
+        moved = item
+        if isinstance(moved, BoxArray):
+            moved = replace(moved, ticket=sum(map(len, parts)))
+            parts[-1].append(moved)
+        counter.add(moved)
+        keep(register(registrar, moved, restarts))
+    keep(registrar.flush())
+    counter.finish()
+    whole = Plan([], [])
+    for given in parts:
+        found = [results[array.ticket] for array in given]
+        points = [counter.of(array) for array in given]
+        whole.append(complete(given, found, points, fixed_frame, config))
+    return whole
+
+
+class Completion:
+    """
+    Register completed tracks: the second pass.
+
+    Parameters
+    ----------
+    plan : Plan
+        From the first pass over the same items.
+    config : Config
+        Settings.
+
+    """
+
+    def __init__(self, plan: Plan, config: Config) -> None:
+        self._plan = plan
+        self._is_early = config.estimate == 'early'
+        self._counter = PointCounter(config)
+        self._given: list[BoxArray] = []
+        self._to_register: list[BoxArray] = []
+        self._index_of: dict[object, int] = {}
+        self._results: dict[int, RefinedBoxes] = {}
+
+    def to_register(self, item: Moved, restarts: bool) -> Moved:
+        """Return an item as it is to be registered: boxes with those that the plan adds."""
+        if restarts:
+            self._counter.finish()
+            self._counter.restart()
+        if isinstance(item, BoxArray):
+            index = len(self._given)
+            self._given.append(item)
+            self._index_of[item.ticket] = index
+            item = self._plan.arrays[index].to_register(item)
+            self._to_register.append(item)
+        self._counter.add(item)
+        return item
+
+    def add(self, ready: Iterable[RefinedBoxes]) -> None:
+        """Hold results of the registrar."""
+        for result in ready:
+            if result.is_final or self._is_early:
+                self._results.setdefault(self._index_of[result.boxes.ticket], result)
+
+    def finished(self) -> list[RefinedBoxes]:
+        """Return the results of all arrays, in their order."""
+        self._counter.finish()
+        points = [self._counter.of(array) for array in self._to_register]
+        registered = [self._results[index] for index in range(len(self._given))]
+        return self._plan.finished(self._given, registered, points)
+
+
+def completed(
+    items: Sequence[Sweep | BoxArray], fixed_frame: str, config: Config
+) -> tuple[list[RefinedBoxes], list[TrackSteps]]:
+    """
+    Return the completed tracks of a drive in memory, and what was done per track.
+
+    Parameters
+    ----------
+    items : sequence of Sweep and BoxArray
+        In the order of stamps, in the fixed frame.
+    fixed_frame : str
+        That frame.
+    config : Config
+        Settings; see `Config.complete`.
+
+    """
+    plan = survey(((item, False) for item in items), fixed_frame, config)
+    completion = Completion(plan, config)
+    registrar = BoxRegistrar(config)
+    for ticket, item in enumerate(items):
+        moved = replace(item, ticket=ticket) if isinstance(item, BoxArray) else item
+        completion.add(register(registrar, completion.to_register(moved, False), False))
+    completion.add(registrar.flush())
+    return completion.finished(), plan.tracks

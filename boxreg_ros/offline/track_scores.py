@@ -1,0 +1,163 @@
+"""Scores of whole tracks: misses, ghosts, ids per object, HOTA and IDF1, by overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+import math
+from typing import Any
+
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.overlap import best_pairs, Overlaps, overlaps
+from boxreg_ros.structures import ADDED, Ints
+import numpy as np
+
+LEAST_IOU = 0.5
+"""3D IoU of a box that is found; literature: threshold of IDF1 and of most recalls."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackScores:
+    """
+    Scores of boxes as tracks. Boxes are matched by overlap at each stamp, not by their ids.
+
+    Attributes
+    ----------
+    recall, precision : float
+        Part of the true boxes, and of the predicted boxes, that are found with `LEAST_IOU`.
+    misses, ghosts : int
+        True boxes that are not found, and predicted boxes that find none.
+    ids_per_object : float
+        Mean number of predicted ids that find a true object, over the objects found.
+    added, added_iou : int and float
+        Boxes that the input did not have, and their mean 3D IoU; 0 for a ghost.
+    hota, det_a, ass_a, idf1 : float
+        HOTA, its parts for detection and association, and IDF1; NaN without trackeval.
+
+    """
+
+    recall: float
+    precision: float
+    misses: int
+    ghosts: int
+    ids_per_object: float
+    added: int
+    added_iou: float
+    hota: float
+    det_a: float
+    ass_a: float
+    idf1: float
+
+
+def has_trackeval() -> bool:
+    """Return whether the package for HOTA and IDF1 is installed."""
+    return find_spec('trackeval') is not None
+
+
+def track_scores(predicted: BoxTable, truth: BoxTable, scope: Ints | None = None) -> TrackScores:
+    """
+    Return the scores of tracks.
+
+    Parameters
+    ----------
+    predicted, truth : BoxTable
+        Boxes in one frame; invalid ones are ignored.
+    scope : array, shape (n,), optional
+        Rows of the true boxes that count. A predicted box that finds one of the others is
+        ignored. Default: all.
+
+    """
+    is_in_scope = np.ones(len(truth.boxes), bool)
+    if scope is not None:
+        is_in_scope[:] = False
+        is_in_scope[scope] = True
+    stamps = [_scoped(stamp, is_in_scope) for stamp in overlaps(predicted, truth)]
+    num_true = sum(len(stamp.true) for stamp in stamps)
+    num_predicted = sum(len(stamp.predicted) for stamp in stamps)
+    found = 0
+    ids: dict[str, set[str]] = {}  # predicted ids that find each object
+    added: list[float] = []
+    for stamp in stamps:
+        rows, columns = best_pairs(stamp.iou, LEAST_IOU)
+        found += len(rows)
+        pairs = zip(stamp.true[rows], stamp.predicted[columns], strict=True)
+        for true, box in pairs:
+            ids.setdefault(truth.track_ids[true], set()).add(predicted.track_ids[box])
+        added += _iou_of_added(stamp, predicted)
+    return TrackScores(
+        recall=_part(found, num_true),
+        precision=_part(found, num_predicted),
+        misses=num_true - found,
+        ghosts=num_predicted - found,
+        ids_per_object=_part(sum(map(len, ids.values())), len(ids)),
+        added=len(added),
+        added_iou=_part(sum(added), len(added)),
+        **_trackeval_scores(stamps, predicted, truth),
+    )
+
+
+def _scoped(stamp: Overlaps, is_in_scope: Any) -> Overlaps:
+    """Return a stamp without the true boxes out of scope and the boxes that find them."""
+    rows, columns = best_pairs(stamp.iou, LEAST_IOU)
+    is_other = ~is_in_scope[stamp.true]
+    is_ignored = np.zeros(len(stamp.predicted), bool)
+    is_ignored[columns[is_other[rows]]] = True
+    return Overlaps(
+        stamp.predicted[~is_ignored], stamp.true[~is_other], stamp.iou[~is_other][:, ~is_ignored]
+    )
+
+
+def _iou_of_added(stamp: Overlaps, predicted: BoxTable) -> list[float]:
+    """Return the IoU of each box of a stamp that the input did not have."""
+    rows, columns = best_pairs(stamp.iou)
+    iou = np.zeros(len(stamp.predicted))
+    iou[columns] = stamp.iou[rows, columns]
+    return [
+        float(value)
+        for row, value in zip(stamp.predicted, iou, strict=True)
+        if predicted.status[row] in ADDED
+    ]
+
+
+def _trackeval_scores(
+    stamps: Sequence[Overlaps], predicted: BoxTable, truth: BoxTable
+) -> dict[str, float]:
+    """Return HOTA, its parts, and IDF1, by the package trackeval; NaN where it is missing."""
+    if not has_trackeval():
+        return dict.fromkeys(('hota', 'det_a', 'ass_a', 'idf1'), math.nan)
+    from trackeval.metrics import HOTA, Identity
+
+    true_codes, num_true_ids = _codes(truth, [stamp.true for stamp in stamps])
+    codes, num_ids = _codes(predicted, [stamp.predicted for stamp in stamps])
+    data = {
+        'gt_ids': true_codes,
+        'tracker_ids': codes,
+        'similarity_scores': [stamp.iou for stamp in stamps],
+        'num_gt_dets': sum(map(len, true_codes)),
+        'num_tracker_dets': sum(map(len, codes)),
+        'num_gt_ids': num_true_ids,
+        'num_tracker_ids': num_ids,
+    }
+    hota = HOTA().eval_sequence(data)
+    identity = Identity({'THRESHOLD': LEAST_IOU, 'PRINT_CONFIG': False}).eval_sequence(data)
+    return {
+        'hota': float(np.mean(hota['HOTA'])),
+        'det_a': float(np.mean(hota['DetA'])),
+        'ass_a': float(np.mean(hota['AssA'])),
+        'idf1': float(identity['IDF1']),
+    }
+
+
+def _codes(table: BoxTable, rows: Sequence[Ints]) -> tuple[list[Ints], int]:
+    """Return the track ids of the rows of each stamp as numbers from 0, and their number."""
+    code_of: dict[str, int] = {}
+    codes = []
+    for stamp_rows in rows:
+        names = [table.track_ids[row] for row in stamp_rows]
+        codes.append(np.array([code_of.setdefault(n, len(code_of)) for n in names], np.int64))
+    return codes, len(code_of)
+
+
+def _part(part: float, whole: int) -> float:
+    return part / whole if whole else math.nan

@@ -1,0 +1,375 @@
+"""
+From tracks to whole tracks: stitch, join parked ones, prune, fill and extend.
+
+All steps work on tables of boxes, so a recording is read twice and its points are never held: the
+first pass registers the input, `complete` makes a plan from the results, and the second pass
+registers the completed tracks. Only then does the last step, the end of each extension, follow
+from the points.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from boxreg_ros.config import Config
+from boxreg_ros.structures import (
+    BoxArray,
+    EXTENDED,
+    Floats,
+    INTERPOLATED,
+    Ints,
+    KEPT,
+    RefinedBoxes,
+    REJECTED,
+)
+from boxreg_ros.tracks.added import AddedBoxes
+from boxreg_ros.tracks.extend import extend, num_free, num_supported, points_at_end
+from boxreg_ros.tracks.fill import fill
+from boxreg_ros.tracks.prune import duplicates, ghosts
+from boxreg_ros.tracks.static import join_static
+from boxreg_ros.tracks.stitch import stitch
+from boxreg_ros.tracks.track_steps import TrackSteps
+from boxreg_ros.tracks.tracklet import Tracklet, tracklets_of
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class _AddedBox:
+    """A box to add to an array; `extension` is the index of its extension in the plan, or -1."""
+
+    track_id: str
+    class_name: str
+    status: str
+    box: Floats
+    covariance: Floats
+    score: float
+    extension: int = -1
+
+
+@dataclass(slots=True)
+class PlannedArray:
+    """
+    The boxes of one array after completion.
+
+    Attributes
+    ----------
+    track_ids, class_names : list of n str
+        Of the input boxes.
+    rejected : dict
+        Reason by row.
+    added : list
+        Boxes to add.
+
+    """
+
+    track_ids: list[str]
+    class_names: list[str]
+    rejected: dict[int, str] = field(default_factory=dict)
+    added: list[_AddedBox] = field(default_factory=list)
+
+    def to_register(self, given: BoxArray) -> BoxArray:
+        """Return the boxes of an array without rejected ones, and with the added ones."""
+        rows = [row for row in range(len(given.track_ids)) if row not in self.rejected]
+        pinned = None
+        if given.pinned is not None:
+            pinned = np.append(given.pinned[rows], np.zeros(len(self.added), bool))
+        return replace(
+            given,
+            track_ids=(*(self.track_ids[i] for i in rows), *(a.track_id for a in self.added)),
+            class_names=(
+                *(self.class_names[i] for i in rows),
+                *(a.class_name for a in self.added),
+            ),
+            scores=np.append(given.scores[rows], [a.score for a in self.added]),
+            boxes=np.concatenate(
+                [given.boxes[rows], np.array([a.box for a in self.added]).reshape(-1, 9)]
+            ),
+            pinned=pinned,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Extension:
+    """Candidates of one end of a track: stamps from the track outwards, and points at the end."""
+
+    track_id: str
+    stamps_ns: Ints
+    at_end: Ints
+
+
+@dataclass(slots=True)
+class Plan:
+    """
+    The completed tracks of a recording.
+
+    Attributes
+    ----------
+    arrays : list of PlannedArray
+        One per box array of the input.
+    tracks : list of TrackSteps
+        What was done per track; `extended` is known after `finished`.
+
+    """
+
+    arrays: list[PlannedArray]
+    tracks: list[TrackSteps]
+    extensions: list[_Extension] = field(default_factory=list)
+
+    def finished(
+        self,
+        given: Sequence[BoxArray],
+        registered: Sequence[RefinedBoxes],
+        num_points: Sequence[Ints],
+    ) -> list[RefinedBoxes]:
+        """
+        Return the results with rejected boxes, and without extensions that no points support.
+
+        Parameters
+        ----------
+        given : sequence of BoxArray
+            The input.
+        registered : sequence of RefinedBoxes
+            Results of `PlannedArray.to_register`, in the same order.
+        num_points : sequence of arrays
+            Points above the road in each box that was registered.
+
+        """
+        supported = self._supported(given, num_points)
+        steps = {track.track_id: track for track in self.tracks}
+        finished = []
+        for index, array in enumerate(self.arrays):
+            keep = [
+                added.extension < 0 or given[index].stamp_ns in supported[added.extension]
+                for added in array.added
+            ]
+            for added, is_kept in zip(array.added, keep, strict=True):
+                steps[added.track_id].extended += is_kept and added.status == EXTENDED
+                steps[added.track_id].filled += added.status == INTERPOLATED
+            finished.append(
+                _finished(array, given[index], registered[index], num_points[index], keep)
+            )
+        return finished
+
+    def append(self, other: Plan) -> None:
+        """Append the plan of a later part of the recording."""
+        offset = len(self.extensions)
+        for array in other.arrays:
+            array.added = [
+                replace(added, extension=added.extension + offset)
+                if added.extension >= 0
+                else added
+                for added in array.added
+            ]
+        self.arrays += other.arrays
+        self.tracks += other.tracks
+        self.extensions += other.extensions
+
+    def _supported(self, given: Sequence[BoxArray], num_points: Sequence[Ints]) -> list[set[int]]:
+        """Return the stamps of the boxes of each extension that points support."""
+        points: list[dict[int, int]] = [{} for _ in self.extensions]  # by stamp
+        for array, boxes, counts in zip(self.arrays, given, num_points, strict=True):
+            of_added = counts[len(counts) - len(array.added) :].tolist()
+            for added, count in zip(array.added, of_added, strict=True):
+                if added.extension >= 0:
+                    points[added.extension][boxes.stamp_ns] = count
+        found = []
+        for extension, count_at in zip(self.extensions, points, strict=True):
+            outwards = [count_at[stamp_ns] for stamp_ns in extension.stamps_ns.tolist()]
+            count = num_supported(np.array(outwards), extension.at_end)
+            found.append(set(extension.stamps_ns[:count].tolist()))
+        return found
+
+
+def complete(
+    given: Sequence[BoxArray],
+    results: Sequence[RefinedBoxes],
+    num_points: Sequence[Ints],
+    fixed_frame: str,
+    config: Config,
+) -> Plan:
+    """
+    Plan the completed tracks of a recording.
+
+    Parameters
+    ----------
+    given : sequence of BoxArray
+        The input boxes.
+    results : sequence of RefinedBoxes
+        Their registration, in the same order.
+    num_points : sequence of arrays, shape (n,)
+        Points above the road in each input box.
+    fixed_frame : str
+        Arrays in another frame stay as they are.
+    config : Config
+        The steps that are on, and their settings.
+
+    Returns
+    -------
+    plan : Plan
+        What to register in the second pass.
+
+    """
+    steps = config.complete
+    tracks = tracklets_of(results, num_points, fixed_frame, config)
+    plan = Plan([PlannedArray([*a.track_ids], [*a.class_names]) for a in given], [])
+    if steps.prune:  # first: a duplicate could be stitched to its object
+        tracks = _rejected(tracks, duplicates(tracks, config), 'duplicate', plan)
+    ambiguous: list[tuple[str, str]] = []
+    if steps.stitch:
+        tracks, ambiguous = stitch(tracks, config)
+    if steps.static:
+        tracks = join_static(tracks, config)
+    if steps.prune:  # last: a fragment of an object may look like a ghost
+        tracks = _rejected(tracks, ghosts(tracks), 'ghost', plan)
+    for track in tracks:
+        _place(track, '', plan)
+    array_of = _array_of_stamp(given, fixed_frame)
+    stamps_ns = np.array(sorted(array_of), np.int64)
+    if steps.fill:
+        for track in tracks:
+            for gap in fill(track, stamps_ns, config):
+                _add(gap, track, plan, array_of)
+    if steps.extend:
+        _extend(tracks, stamps_ns, plan, array_of, config)
+    _note_ambiguous(plan, ambiguous)
+    return plan
+
+
+def _rejected(tracks: list[Tracklet], names: set[str], reason: str, plan: Plan) -> list[Tracklet]:
+    """Reject the boxes of some tracks in the plan; return the other tracks."""
+    for track in tracks:
+        if track.track_id in names:
+            _place(track, reason, plan)
+    return [track for track in tracks if track.track_id not in names]
+
+
+def _place(track: Tracklet, reason: str, plan: Plan) -> None:
+    """Write id and class of a track to its input boxes; reject them where there is a reason."""
+    steps = TrackSteps(track.track_id, track.class_name, track.fragments)
+    for index, row in track.places:
+        array = plan.arrays[index]
+        steps.reclassified += array.class_names[row] != track.class_name
+        array.track_ids[row] = track.track_id
+        array.class_names[row] = track.class_name
+        if reason:
+            array.rejected[row] = reason
+            steps.rejected += 1
+    plan.tracks.append(steps)
+
+
+def _array_of_stamp(given: Sequence[BoxArray], fixed_frame: str) -> dict[int, int]:
+    """Return the index of the array that boxes of each stamp are added to: none that is late."""
+    array_of: dict[int, int] = {}
+    newest_ns = -1
+    for index, array in enumerate(given):
+        if array.frame_id == fixed_frame and array.stamp_ns > newest_ns:
+            array_of[array.stamp_ns] = index
+            newest_ns = array.stamp_ns
+    return array_of
+
+
+def _add(
+    boxes: AddedBoxes, track: Tracklet, plan: Plan, array_of: dict[int, int], extension: int = -1
+) -> None:
+    """Add boxes of a track to the arrays of their stamps."""
+    for i, stamp_ns in enumerate(boxes.stamps_ns.tolist()):
+        plan.arrays[array_of[stamp_ns]].added.append(
+            _AddedBox(
+                track.track_id,
+                track.class_name,
+                boxes.status,
+                boxes.boxes[i],
+                boxes.covariances[i],
+                float(boxes.scores[i]),
+                extension,
+            )
+        )
+
+
+def _extend(
+    tracks: Sequence[Tracklet],
+    stamps_ns: Ints,
+    plan: Plan,
+    array_of: dict[int, int],
+    config: Config,
+) -> None:
+    """Add the candidates of all extensions, as far as no other track owns their place."""
+    owned: dict[int, list[Floats]] = {}
+    for track in tracks:
+        for stamp_ns, box in zip(track.stamps_ns.tolist(), track.boxes, strict=True):
+            owned.setdefault(stamp_ns, []).append(box)
+    for stamp_ns, index in array_of.items():
+        owned.setdefault(stamp_ns, []).extend(added.box for added in plan.arrays[index].added)
+    for track in tracks:
+        for candidates in extend(track, stamps_ns, config):
+            free = candidates.first(num_free(candidates, owned))
+            if not len(free.boxes):
+                continue
+            is_last = int(free.stamps_ns[0]) > track.last_ns
+            extension = _Extension(track.track_id, free.stamps_ns, points_at_end(track, is_last))
+            plan.extensions.append(extension)
+            _add(free, track, plan, array_of, len(plan.extensions) - 1)
+
+
+def _note_ambiguous(plan: Plan, ambiguous: Sequence[tuple[str, str]]) -> None:
+    """List pairs that were left alone at both of their tracks."""
+    others: dict[str, list[str]] = {}
+    for first, second in ambiguous:
+        others.setdefault(first, []).append(second)
+        others.setdefault(second, []).append(first)
+    for track in plan.tracks:
+        track.ambiguous = tuple(others.get(track.track_id, ()))
+
+
+def _finished(
+    array: PlannedArray,
+    given: BoxArray,
+    registered: RefinedBoxes,
+    num_points: Ints,
+    keep: Sequence[bool],
+) -> RefinedBoxes:
+    """Return the result of one array: the input boxes in their order, then the added ones."""
+    n = len(given.track_ids)
+    taken = [row for row in range(n) if row not in array.rejected]
+    kept = [i for i, is_kept in enumerate(keep) if is_kept]
+    rows = [len(taken) + i for i in kept]  # of the added boxes, in what was registered
+    boxes = given.boxes.copy()
+    boxes[taken] = registered.boxes.boxes[: len(taken)]
+    covariances = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()
+    covariances[taken] = registered.covariances[: len(taken)]
+    counts = np.zeros(n, np.int64)
+    counts[taken] = registered.num_points[: len(taken)]
+    status = [REJECTED] * n
+    reasons = [array.rejected.get(row, '') for row in range(n)]
+    for i, row in enumerate(taken):
+        status[row] = registered.status[i]
+        reasons[row] = registered.reasons[i]
+    added_covariances = [
+        _covariance_of_added(array.added[i], registered, row, int(num_points[row]))
+        for i, row in zip(kept, rows, strict=True)
+    ]
+    return RefinedBoxes(
+        replace(
+            given,
+            track_ids=(*array.track_ids, *(array.added[i].track_id for i in kept)),
+            class_names=(*array.class_names, *(array.added[i].class_name for i in kept)),
+            scores=np.append(given.scores, [array.added[i].score for i in kept]),
+            boxes=np.concatenate([boxes, registered.boxes.boxes[rows]]),
+        ),
+        (*status, *(array.added[i].status for i in kept)),
+        (*reasons, *('',) * len(kept)),
+        np.append(counts, registered.num_points[rows]),
+        np.concatenate([covariances, np.array(added_covariances).reshape(-1, 6, 6)]),
+        registered.is_final,
+    )
+
+
+def _covariance_of_added(
+    added: _AddedBox, registered: RefinedBoxes, row: int, num_points: int
+) -> Floats:
+    """Return that of the registration, or of the motion model where no points were registered."""
+    if num_points and registered.status[row] != KEPT:
+        return np.asarray(registered.covariances[row])
+    return added.covariance

@@ -1,0 +1,124 @@
+"""
+Extend: a track goes on before its first and after its last box while points support it.
+
+Tracks that may be ghosts are not extended. Candidates are put on the motion model and registered
+with the track. `num_supported` then counts from the track outwards: the first box without support
+ends the extension.
+
+"""
+
+from __future__ import annotations
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.structures import EXTENDED, Floats, Ints
+from boxreg_ros.tracks.added import AddedBoxes
+from boxreg_ros.tracks.fill import accelerations
+from boxreg_ros.tracks.motion import end_motion, is_parked
+from boxreg_ros.tracks.prune import CONFIRMED_BOXES
+from boxreg_ros.tracks.tracklet import Tracklet
+import numpy as np
+
+SUPPORT_POINTS = 3
+"""Least points above the road in a supported box; chosen: one or two may be of clutter."""
+SUPPORT_PART = 0.3
+"""
+Least part of the points that the end of the track has, in a supported box.
+
+Chosen: within the longest extension the range, and so the number, changes less.
+
+"""
+SUPPORT_BOXES = 5
+"""Boxes at the end of a track that give the number of points to expect; chosen."""
+OWNED = 0.1
+"""3D IoU with a box of another track that ends an extension; chosen: objects do not overlap."""
+
+
+def extend(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:
+    """
+    Return the candidates before the first box of a track and after its last.
+
+    Parameters
+    ----------
+    tracklet : Tracklet
+        The track.
+    array_stamps_ns : array, shape (a,)
+        Stamps at which the input has boxes of any object, ascending [ns].
+    config : Config
+        `complete.extend_time` of moving and `complete.extend_parked` of parked objects.
+
+    """
+    if len(tracklet.stamps_ns) < CONFIRMED_BOXES:
+        return []
+    settings = config.complete
+    parked = is_parked(tracklet.boxes)
+    reach_ns = (settings.extend_parked if parked else settings.extend_time) * 1e9
+    before_ns = tracklet.first_ns - array_stamps_ns
+    after_ns = array_stamps_ns - tracklet.last_ns
+    earlier = array_stamps_ns[(before_ns > 0) & (before_ns <= reach_ns)]
+    later = array_stamps_ns[(after_ns > 0) & (after_ns <= reach_ns)]
+    return [
+        _candidates(tracklet, is_last, stamps_ns, config)
+        for is_last, stamps_ns in ((False, earlier[::-1]), (True, later))
+        if len(stamps_ns)
+    ]
+
+
+def num_supported(num_points: Ints, at_end: Ints) -> int:
+    """
+    Return how many boxes of an extension are supported, from the track outwards.
+
+    Parameters
+    ----------
+    num_points : array, shape (n,)
+        Points above the road in each box, from the track outwards.
+    at_end : array, shape (m,)
+        The same of the boxes at that end of the track.
+
+    """
+    least = max(SUPPORT_POINTS, SUPPORT_PART * float(np.median(at_end)))
+    is_supported = num_points >= least
+    return len(num_points) if is_supported.all() else int(np.argmin(is_supported))
+
+
+def _candidates(tracklet: Tracklet, is_last: bool, stamps_ns: Ints, config: Config) -> AddedBoxes:
+    """Return the boxes at some stamps beyond one end of a track."""
+    motion = end_motion(tracklet, is_last, config)
+    row = -1 if is_last else 0
+    seconds = (stamps_ns - motion.stamp_ns) * 1e-9
+    deviations = accelerations(motion.model) * (seconds**2 / 2)[:, None]
+    boxes = np.array([motion.predict(int(stamp_ns)) for stamp_ns in stamps_ns])
+    return AddedBoxes(
+        EXTENDED,
+        stamps_ns,
+        boxes,
+        tracklet.covariances[row] + deviations[:, :, None] ** 2 * np.eye(6),
+        np.full(len(stamps_ns), tracklet.scores[row]),
+    )
+
+
+def points_at_end(tracklet: Tracklet, is_last: bool) -> Ints:
+    """Return the points in the boxes at one end of a track."""
+    points = tracklet.num_points
+    return points[-SUPPORT_BOXES:] if is_last else points[:SUPPORT_BOXES]
+
+
+def num_free(candidates: AddedBoxes, owned: dict[int, list[Floats]]) -> int:
+    """
+    Return how many boxes of an extension stand where no other track does, from the track out.
+
+    Parameters
+    ----------
+    candidates : AddedBoxes
+        The extension.
+    owned : dict
+        Boxes (9,) of the other tracks, by stamp.
+
+    """
+    for count, (stamp_ns, box) in enumerate(
+        zip(candidates.stamps_ns.tolist(), candidates.boxes, strict=True)
+    ):
+        others = owned.get(stamp_ns, [])
+        if others and iou_3d(np.tile(box, (len(others), 1)), np.array(others)).max() > OWNED:
+            return count
+    return len(candidates.boxes)

@@ -1,0 +1,69 @@
+"""
+Static: parked tracks that are one object with pauses become one.
+
+A parked object stands at its place however long it is hidden. Two parked tracks at the same place
+are one object, unless another object stood there in between.
+
+"""
+
+from __future__ import annotations
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.metrics import iou_3d, iou_bev
+from boxreg_ros.structures import Floats
+from boxreg_ros.tracks.links import join_links
+from boxreg_ros.tracks.motion import is_parked
+from boxreg_ros.tracks.tracklet import Tracklet
+import numpy as np
+
+SAME_PLACE = 0.5
+"""Least IoU of the median boxes; chosen: another car in the same space rarely reaches it."""
+
+
+def join_static(tracklets: list[Tracklet], config: Config) -> list[Tracklet]:
+    """
+    Join parked tracklets at one place.
+
+    Parameters
+    ----------
+    tracklets : list of Tracklet
+        In the order of their start.
+    config : Config
+        The kinds of objects.
+
+    """
+    parked = [i for i, tracklet in enumerate(tracklets) if is_parked(tracklet.boxes)]
+    places = {i: np.median(tracklets[i].boxes, axis=0) for i in parked}
+    pairs: list[tuple[int, int]] = []
+    used: set[int] = set()  # have a successor
+    for j in parked:
+        earlier = [
+            i
+            for i in parked
+            if tracklets[i].last_ns < tracklets[j].first_ns
+            and i not in used
+            and tracklets[i].model(config) is tracklets[j].model(config)
+            and _is_same_place(places[i], places[j])
+        ]
+        if not earlier:
+            continue
+        i = max(earlier, key=lambda index: tracklets[index].last_ns)
+        if not _is_occupied(places[j], tracklets[i].last_ns, tracklets[j].first_ns, tracklets):
+            pairs.append((i, j))
+            used.add(i)
+    return join_links(tracklets, pairs)
+
+
+def _is_same_place(first: Floats, second: Floats) -> bool:
+    # A wrong height is no other place, but a pedestrian is no car.
+    return bool(iou_bev(first[None], second[None])[0] >= SAME_PLACE)
+
+
+def _is_occupied(place: Floats, after_ns: int, before_ns: int, tracklets: list[Tracklet]) -> bool:
+    """Return whether a box of any object overlaps a place between two stamps."""
+    for tracklet in tracklets:
+        is_between = (tracklet.stamps_ns > after_ns) & (tracklet.stamps_ns < before_ns)
+        boxes = tracklet.boxes[is_between]
+        if len(boxes) and (iou_3d(boxes, np.tile(place, (len(boxes), 1))) > 0.2).any():
+            return True
+    return False

@@ -1,0 +1,99 @@
+"""
+Stitch: fragments of one object become one track.
+
+A fragment continues another one if motion and extents of both agree. Boxes are compared after
+registration, so position and extents are those of the points. Where two continuations are nearly
+as good, none is made.
+
+"""
+
+from __future__ import annotations
+
+from boxreg_ros.config import Config
+from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.structures import HEIGHT, LENGTH, X, Y, YAW, Z
+from boxreg_ros.tracks.links import best_links, join_links
+from boxreg_ros.tracks.motion import end_motion, EndMotion
+from boxreg_ros.tracks.tracklet import Tracklet
+import numpy as np
+
+STITCH_GATE = 24.3
+"""Greatest squared distance; derived: 99.9 % of chi-square with 7 degrees of freedom."""
+EXTENT_DEVIATION = 0.07
+"""Standard deviation of the logarithm of an extent; literature: PointRCNN errs by 7 % of it."""
+HEADING_DEVIATION = 0.15
+"""Least standard deviation of the heading of a fragment [rad]; chosen: a few boxes."""
+MIN_KNOWN_MOTION = 3
+"""The longer of two fragments has at least so many boxes, so that its motion is known; chosen."""
+HEIGHT_DEVIATION = 0.2
+"""Standard deviation of the height of a centre [m]; chosen: two times that of one box."""
+
+
+def stitch(
+    tracklets: list[Tracklet], config: Config
+) -> tuple[list[Tracklet], list[tuple[str, str]]]:
+    """
+    Join tracklets that continue each other.
+
+    Parameters
+    ----------
+    tracklets : list of Tracklet
+        In the order of their start.
+    config : Config
+        `complete.stitch_gap`, and the motion of each class.
+
+    Returns
+    -------
+    tracklets : list of Tracklet
+        Joined ones included.
+    ambiguous : list of (str, str)
+        Ids of pairs that were left alone.
+
+    """
+    n = len(tracklets)
+    counts = [len(tracklet.stamps_ns) for tracklet in tracklets]
+    firsts = [end_motion(tracklet, False, config) for tracklet in tracklets]
+    lasts = [end_motion(tracklet, True, config) for tracklet in tracklets]
+    kinds = [tracklet.model(config) for tracklet in tracklets]
+    costs = np.full((n, n), np.inf)
+    for i in range(n):
+        for j in range(n):
+            gap = (firsts[j].stamp_ns - lasts[i].stamp_ns) * 1e-9
+            is_known = max(counts[i], counts[j]) >= MIN_KNOWN_MOTION
+            if is_known and 0 < gap <= config.complete.stitch_gap and kinds[i] is kinds[j]:
+                costs[i, j] = _cost(lasts[i], firsts[j])
+    links = best_links(costs)
+    ambiguous = [(tracklets[i].track_id, tracklets[j].track_id) for i, j in links.ambiguous]
+    return join_links(tracklets, links.pairs), ambiguous
+
+
+def _cost(before: EndMotion, after: EndMotion) -> float:
+    """
+    Return -2 ln of the likelihood that a fragment continues another; inf beyond `STITCH_GATE`.
+
+    The sum of the squared deviations of position, height, extents and heading, plus the log
+    determinant of the covariance of the position.
+
+    """
+    forward = _position_cost(before, after)
+    backward = _position_cost(after, before)
+    distance, log_det = max(forward, backward)
+    seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
+    up = HEIGHT_DEVIATION + before.model.vertical * seconds**2 / 2
+    distance += (after.box[Z] - before.box[Z]) ** 2 / up**2
+    extents = slice(LENGTH, HEIGHT + 1)
+    ratios = np.log(after.box[extents] / before.box[extents])
+    distance += np.square(ratios).sum() / (2 * EXTENT_DEVIATION**2)
+    predicted_yaw = before.predict(after.stamp_ns)[YAW]
+    turn = wrap_angle(2 * (after.box[YAW] - predicted_yaw)) / 2  # without half turns
+    heading = max(HEADING_DEVIATION, before.model.heading)
+    distance += float(turn) ** 2 / (2 * heading**2)
+    return float(distance + log_det) if distance < STITCH_GATE else np.inf
+
+
+def _position_cost(known: EndMotion, other: EndMotion) -> tuple[float, float]:
+    """Return squared distance and log determinant of the prediction of another box."""
+    offset = (other.box - known.predict(other.stamp_ns))[X : Y + 1]
+    covariance = known.covariance(other.stamp_ns)
+    distance = float(offset @ np.linalg.solve(covariance, offset))
+    return distance, float(np.linalg.slogdet(covariance)[1])

@@ -1,0 +1,95 @@
+"""`boxreg batch`: each drive once, failures isolated, a second run does only what is left."""
+
+import csv
+import json
+
+from boxreg_ros.cli import main
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.offline.batch import jobs_of
+from boxreg_ros.offline.result_folder import whole_folder
+import pytest
+from ros_messages import Drive
+
+QUICK = ['--set=min_observations=3', '--set=window=5', '--set=lag=2']
+
+
+def index_of(out):
+    with (out / 'index.csv').open(newline='') as file:
+        return {row['drive']: row for row in csv.DictReader(file)}
+
+
+def test_failures_are_isolated_and_a_second_run_does_what_is_left(tmp_path, capsys):
+    paths = [Drive(sweeps=6).write(tmp_path / name) for name in ('one', 'two')]
+    junk = tmp_path / 'junk.mcap'
+    junk.write_text('no recording')
+    out = tmp_path / 'out'
+    command = ['batch', *map(str, paths), str(junk), '-o', str(out), '--workers=2', *QUICK]
+    assert main(command) == 1
+    streams = capsys.readouterr()
+    assert f'{out}: 2 of 3 drives done, 0 of them earlier' in streams.out
+    (line,) = streams.err.splitlines()
+    assert line.startswith('boxreg: junk: ')
+    assert 'no message can be read' in line
+    rows = index_of(out)
+    assert [rows[name]['status'] for name in ('one', 'two', 'junk')] == ['done', 'done', 'failed']
+    merged = json.loads((out / 'summary.json').read_text())
+    assert merged['boxes_in'] == 2 * 12
+    assert list(merged['failed']) == ['junk']
+
+    # What is done stays done when its file is touched, and not when its content changes.
+    before = {name: (out / name / 'boxes.csv').stat().st_mtime_ns for name in ('one', 'two')}
+    paths[0].touch()
+    Drive(sweeps=7).write(tmp_path / 'other').replace(paths[1])
+    (out / 'one' / 'review.csv').write_text('rank,track_id,risk_m\n1,7,0.25\n1,8,0.75\n')
+    assert main([*command[:-3], '--workers=1', *QUICK]) == 1
+    rows = index_of(out)
+    # `--workers` is no setting: it changes no result.
+    assert rows['one']['status'] == 'up to date'
+    assert rows['two']['status'] == 'done'
+    assert (out / 'one' / 'boxes.csv').stat().st_mtime_ns == before['one']
+    assert rows['two']['boxes_in'] == '14'
+    page = (out / 'report.html').read_text()
+    assert page.index('0.75') < page.index('0.25')
+
+
+def test_a_drive_that_takes_too_long_is_ended_and_leaves_nothing(tmp_path, capsys):
+    path = Drive(sweeps=6).write(tmp_path / 'one')
+    out = tmp_path / 'out'
+    assert main(['batch', str(path), '-o', str(out), '--timeout=0.01', *QUICK]) == 1
+    assert 'not done after 0.01 s' in capsys.readouterr().err
+    assert {item.name for item in out.iterdir()} == {
+        'jobs', 'index.csv', 'summary.json', 'report.html',
+    }  # fmt: skip
+
+
+def test_manifests_patterns_and_their_errors(tmp_path):
+    for name in ('a.mcap', 'b.mcap', 'c.mcap'):
+        (tmp_path / name).touch()
+    (tmp_path / 'x').mkdir()
+    (tmp_path / 'x' / 'a.mcap').touch()
+    manifest = tmp_path / 'drives.txt'
+    manifest.write_text('# two files of one drive\na.mcap b.mcap\n\nx/a.mcap  # another\n')
+    jobs = jobs_of([manifest, tmp_path / '[c]*.mcap'])
+    assert [job.name for job in jobs] == ['a', 'x_a', 'c']
+    assert jobs[0].recordings == (tmp_path / 'a.mcap', tmp_path / 'b.mcap')
+    manifest.write_text('a.mcap\nmissing.mcap\n../' + tmp_path.name + '/a.mcap\n')
+    with pytest.raises(ConfigError) as caught:
+        jobs_of([manifest])
+    assert 'missing.mcap: expected a recording' in str(caught.value)
+    assert 'got it twice' in str(caught.value)
+
+
+def test_shards_cover_all_drives_once(tmp_path, capsys):
+    assert main(['batch', 'x.mcap', '-o', str(tmp_path), '--shard=1/2']) == 2
+    with pytest.raises(SystemExit):
+        main(['batch', 'x.mcap', '-o', str(tmp_path), '--shard=3/2'])
+    assert 'expected I/N' in capsys.readouterr().err
+
+
+def test_a_full_disk_is_named_and_nothing_is_written(tmp_path):
+    out = tmp_path / 'out'
+    with pytest.raises(RecordingError, match=r"output '.*/out'.*No space left"):  # noqa: SIM117
+        with whole_folder(out) as folder:
+            (folder / 'boxes.csv').symlink_to('/dev/full')
+            (folder / 'boxes.csv').write_text('x')
+    assert list(tmp_path.iterdir()) == []
