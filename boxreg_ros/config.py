@@ -24,6 +24,7 @@ _T = TypeVar('_T')
 RENAMED = {
     'faces.depth_ends': 'faces.inset_ends',
     'faces.depth_sides': 'faces.inset_sides',
+    'faces.spread': 'vehicle.gap_spread',
 }
 """Settings of earlier versions by their old names: the error names the new one."""
 REMOVED = {'solver.history': 'no result depends on it'}
@@ -39,6 +40,9 @@ NODE_OPTIONS = (
 
 COMPLETE_STEPS = ('stitch', 'static', 'prune', 'fill', 'extend')
 """Switches of `CompleteConfig`, in the order of execution."""
+KINDS = ('vehicle', 'cyclist', 'pedestrian')
+"""Kinds of objects, each a group of settings of `Config`."""
+
 DEFAULT_LAG = 9
 """The whole default window. It may exceed a shorter window, which then limits it."""
 
@@ -80,7 +84,13 @@ def setting(default: Any, *facts: Any, **more: Any) -> Any:
 class SamplingConfig:
     """Selection of the points of an observation."""
 
-    deskew: bool = setting(False, 'motion-compensate points to the stamp by their own times')
+    deskew: bool = setting(True, 'motion-compensate points by their own times, where known')
+    box_time: str = setting(
+        'auto',
+        'time that the input boxes are of: the stamp, when the sweep saw the object (sight), or '
+        'as estimated from fast objects',
+        choices=('auto', 'stamp', 'sight'),
+    )
     margin: float = setting(
         0.6, 'points up to this distance outside a box are used', 'm', 0.05, 5.0
     )
@@ -114,9 +124,6 @@ class FaceConfig:
     )
     inset_sides: float = setting(
         0.18, 'expected inset of the surface behind an occluded left or right face', 'm', 0.0, 2.0
-    )
-    spread: float = setting(
-        0.05, 'standard deviation of the labelling margin between objects', 'm', 1e-4, 1.0
     )
     learn: bool = setting(
         True, 'estimate the labelling margins from the input boxes while they come in'
@@ -162,7 +169,7 @@ class ClassConfig:
     Motion, input errors and labelling margins of the objects of one kind.
 
     A labelling margin (``gap_*``) is the distance from the outermost surface points out to the
-    face of the label. With ``faces.learn`` the input boxes correct them, all kinds together.
+    face of the label. With ``faces.learn`` the input boxes correct them, each kind its own.
 
     """
 
@@ -226,6 +233,9 @@ class ClassConfig:
     )
     gap_bottom: float = setting(
         0.0, 'labelling margin: bottom face below the road', 'm', -2.0, 2.0
+    )
+    gap_spread: float = setting(
+        0.05, 'standard deviation of the labelling margins between objects', 'm', 1e-4, 1.0
     )
 
 
@@ -352,12 +362,13 @@ class Config:
     )
     cyclist: ClassConfig = ClassConfig(
         names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
-        acceleration=2.0,
-        cornering=2.0, turning=1.5, slip=0.4, pivot=0.2, shape=0.06, heading=0.15, extent=0.1,
+        acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4, pivot=0.2, shape=0.15,
+        heading=0.15, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
     pedestrian: ClassConfig = ClassConfig(
-        names=('pedestrian', 'person', 'walker', 'people', 'child'), acceleration=2.0,
-        cornering=2.0, turning=4.0, slip=1.5, pivot=0.0, shape=0.15, heading=0.5, extent=0.1,
+        names=('pedestrian', 'person', 'walker', 'people', 'child'),
+        acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5, pivot=0.0, shape=0.2,
+        heading=0.5, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -375,13 +386,18 @@ class Config:
         for item in settings():
             yield item, attrgetter(item.name)(self)
 
+    def kind(self, class_name: str) -> str:
+        """Return the one of `KINDS` that `class_name` is of; vehicle for unknown classes."""
+        words = words_of(class_name)
+        for kind in ('cyclist', 'pedestrian'):
+            if not words.isdisjoint(name.lower() for name in getattr(self, kind).names):
+                return kind
+        return 'vehicle'
+
     def class_config(self, class_name: str) -> ClassConfig:
         """Return the group of settings for `class_name`; `vehicle` for unknown classes."""
-        words = words_of(class_name)
-        for group in (self.cyclist, self.pedestrian):
-            if not words.isdisjoint(name.lower() for name in group.names):
-                return group
-        return self.vehicle
+        group: ClassConfig = getattr(self, self.kind(class_name))
+        return group
 
     def knows_class(self, class_name: str) -> bool:
         """Return whether `class_name` has a word of some group; others are vehicles by default."""

@@ -44,6 +44,9 @@ Accuracy is measured against true boxes of vehicles with at least 100 points:
 - **flips**: part of the boxes whose heading is off by more than a right angle.
 - **jitter**: mean second difference of the centre over time [m/s^2].
 
+- **by class**: BEV and 3D IoU of all true boxes of a class with points, for classes with at least
+  20 of them.
+
 Rows of every table: *input* is the noisy input. *smoothing* is a robust constant-velocity
 smoother that does not use the points: *early* at the newest box, *final* with the lag of the live
 node, *only* on the whole track. *paper* is the objective of the paper (Eq. 4 to 8). *ours* is the
@@ -129,6 +132,8 @@ def _accuracy(results: Any) -> Iterable[str]:
         yield f'{measured["input"]["boxes"]} true boxes.'
         yield _table(['', *header.split()], rows)
         yield from _groups(measured, '3D IoU')
+        if 'by_class' in measured['input']:
+            yield _classes(measured)
         for name, reason in skipped.items():
             yield f'{name}: {reason}.'
 
@@ -141,6 +146,19 @@ def _groups(measured: Any, iou: str) -> Iterable[str]:
             [name, *(_number(row.get(label)) for label in labels)] for name, row in grouped.items()
         ]
         yield _table([f'{iou} {title}', *labels], rows)
+
+
+def _classes(measured: Any) -> str:
+    """Return the table of BEV and 3D IoU of each class, of all its boxes with points."""
+    names = measured['input']['by_class']
+    header = [f'{name} ({row["boxes"]})' for name, row in names.items()]
+    rows = []
+    for method, scores in measured.items():
+        pairs = [
+            (scores['by_class'][name][key] for key in ('iou_bev', 'iou_3d')) for name in names
+        ]
+        rows.append([method, *(' / '.join(map(_number, pair)) for pair in pairs)])
+    return _table(['BEV / 3D IoU by class (boxes)', *header], rows)
 
 
 def _paper(results: Any) -> Iterable[str]:

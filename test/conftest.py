@@ -31,6 +31,7 @@ def pytest_xdist_setupnodes():
     """Compile the kernels once, before the workers start nodes that wait for them."""
     # Imported here: messages are imported after their checks are switched on.
     from boxreg_ros.config import Config
-    from boxreg_ros.live.driver import warm_up
+    from boxreg_ros.io.warm_up import warm_up
 
-    warm_up(Config())
+    for estimate in ('final', 'track'):
+        warm_up(Config(estimate=estimate))

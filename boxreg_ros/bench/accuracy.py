@@ -24,13 +24,16 @@ from boxreg_ros.bench.common import (
     progress_bar,
 )
 from boxreg_ros.bench.methods import add_method_argument, run_methods
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import Matches, RECALLS, summarise
+from boxreg_ros.offline.evaluate import groups, match, Matches, RECALLS, Scores, summarise
 from boxreg_ros.structures import Floats
 import numpy as np
 
 RANGE_GROUPS = (0, 20, 40, 80, math.inf)  # [m]
 POINT_GROUPS = (0, 30, 100, 300, 1000, math.inf)
+MIN_CLASS_BOXES = 20
+"""Classes with fewer true boxes have no row of their own."""
 GROUPINGS = {'by_range': 'by range [m]', 'by_points': 'by points'}
 
 Groups = dict[str, dict[str, float]]
@@ -55,11 +58,19 @@ def run(args: argparse.Namespace) -> int:
                 name: boxes if isinstance(boxes, str) else in_scope(boxes, drive.truth, args)
                 for name, boxes in methods.items()
             }
+            classes = {
+                name: scores_by_class(boxes, drive.truth)
+                for name, boxes in methods.items()
+                if not isinstance(boxes, str)
+            }
             if not args.json:
                 bar.clear()
                 print_tables(folder, drive, found)
+                print_classes(classes)
             report[str(folder)] = {
-                name: matches if isinstance(matches, str) else _scores(drive, matches)
+                name: matches
+                if isinstance(matches, str)
+                else _scores(drive, matches) | {'by_class': _plain(classes[name])}
                 for name, matches in found.items()
             }
     if args.json:
@@ -67,9 +78,32 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def scores_by_class(boxes: BoxTable, truth: BoxTable) -> dict[str, Scores]:
+    """Return the scores of every class of true boxes with points, and enough of them."""
+    by_class = groups(match(boxes, truth, min_points=1))['by_class']
+    return {name: scores for name, scores in by_class.items() if scores.boxes >= MIN_CLASS_BOXES}
+
+
 def _scores(drive: Drive, matches: Matches) -> dict[str, Any]:
-    groups = iou_by_group(iou_and_group_values(drive, matches, '3d'))
-    return asdict(summarise(matches)) | groups
+    by_group = iou_by_group(iou_and_group_values(drive, matches, '3d'))
+    return asdict(summarise(matches)) | by_group
+
+
+def _plain(classes: Mapping[str, Scores]) -> dict[str, dict[str, float]]:
+    return {
+        name: {'boxes': s.boxes, 'iou_bev': s.iou_bev, 'iou_3d': s.iou_3d}
+        for name, s in classes.items()
+    }
+
+
+def print_classes(found: Mapping[str, Mapping[str, Scores]]) -> None:
+    """Print one table of BEV and 3D IoU for each class, of all its true boxes with points."""
+    for class_name, scores in found['input'].items():
+        print(line(f'{class_name}: {scores.boxes} true boxes with points', ''))
+        print(line('', ('BEV', '3D')))
+        for name, classes in found.items():
+            print(line(name, (classes[class_name].iou_bev, classes[class_name].iou_3d)))
+    print()
 
 
 def print_tables(folder: Path, drive: Drive, found: Mapping[str, Matches | str]) -> None:
@@ -86,11 +120,11 @@ def print_tables(folder: Path, drive: Drive, found: Mapping[str, Matches | str])
         s = summarise(matches)
         numbers = (s.iou_bev, s.iou_3d, *s.recall_3d, s.ate, s.ase, s.aoe, s.flips, s.jitter)
         print(line(name, numbers))
-    groups = {
+    by_group = {
         name: iou_by_group(iou_and_group_values(drive, matches, '3d'))
         for name, matches in measured.items()
     }
-    print_groups(groups, '3D')
+    print_groups(by_group, '3D')
     print()
 
 
@@ -112,23 +146,23 @@ def iou_and_group_values(drive: Drive, matches: Matches, mode: str) -> Floats:
 def iou_by_group(rows: Floats) -> Groups:
     """Return mean IoU by range and by number of points, of the `iou_and_group_values` (n, 3)."""
     iou, *columns = rows[np.isfinite(rows).all(axis=1)].T
-    groups: Groups = {}
+    by_group: Groups = {}
     for grouping, values, edges in zip(
         GROUPINGS, columns, (RANGE_GROUPS, POINT_GROUPS), strict=True
     ):
-        groups[grouping] = {}
+        by_group[grouping] = {}
         for low, high in pairwise(edges):
             label = f'{low:g}-{high:g}' if math.isfinite(high) else f'{low:g}+'
             mask = (values >= low) & (values < high)
             if mask.any():
-                groups[grouping][label] = float(iou[mask].mean())
-    return groups
+                by_group[grouping][label] = float(iou[mask].mean())
+    return by_group
 
 
 def print_groups(found: Mapping[str, Groups], iou: str) -> None:
     """Print the `iou_by_group` of each method; `iou` names the kind of IoU."""
     for grouping, title in GROUPINGS.items():
-        labels = list(dict.fromkeys(key for groups in found.values() for key in groups[grouping]))
+        labels = list(dict.fromkeys(key for one in found.values() for key in one[grouping]))
         print(line(f'{iou} {title}', labels))
-        for name, groups in found.items():
-            print(line(name, [groups[grouping].get(label, math.nan) for label in labels]))
+        for name, one in found.items():
+            print(line(name, [one[grouping].get(label, math.nan) for label in labels]))

@@ -39,7 +39,7 @@ from boxreg_ros.bench.common import (
     print_json,
     progress_bar,
 )
-from boxreg_ros.config import Config, Setting
+from boxreg_ros.config import Config, KINDS, Setting
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.evaluate import match, summarise
@@ -51,7 +51,6 @@ FACTORS = (0.5, 2.0)
 CORE = 'boxreg_ros.core'
 PACKAGE = 'boxreg_ros'
 CONSTANT_NAME = re.compile(r'_?[A-Z][A-Z0-9_]*')
-KINDS = ('vehicle', 'cyclist', 'pedestrian')
 OTHER_OBJECTIVE = 'paper'  # group of settings that the default objective does not read
 
 SourcePlace = tuple[str, int, int]
@@ -535,8 +534,7 @@ def kinds_of(arrays: Sequence[BoxArray], config: Config) -> list[str]:
     counts: Counter[str] = Counter()
     for array in arrays:
         for class_name in array.class_names:
-            own = config.class_config(class_name)
-            counts.update(kind for kind in KINDS if getattr(config, kind) is own)
+            counts[config.kind(class_name)] += 1
     return [kind for kind, _ in counts.most_common()]
 
 

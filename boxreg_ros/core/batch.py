@@ -115,6 +115,8 @@ class Problem(NamedTuple):
         The numbers of each window's `ClassConfig`, in the order of `CLASS_NUMBERS`.
     pinned : Tensor, shape (B, N)
         True for boxes that a person has corrected.
+    kind : Tensor, shape (B,)
+        Index of the kind of each window's object among `KINDS`.
 
     """
 
@@ -132,6 +134,7 @@ class Problem(NamedTuple):
     marginalised_extents: Tensor
     class_numbers: Tensor
     pinned: Tensor
+    kind: Tensor
 
     @property
     def pose(self) -> Tensor:
@@ -275,7 +278,7 @@ class Solution(NamedTuple):
     marginalised_extents : Tensor or None, shape (B, 4)
         `Problem.marginalised_extents` of the next window.
     extent_evidence : Tensor, shape (B, 3, 3)
-        Evidence of the points alone about the extents, see `InputNoise`.
+        Evidence of the points alone about the extents, see `Population`.
 
     """
 

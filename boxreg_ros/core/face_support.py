@@ -8,7 +8,7 @@ the formulas (M10) to (M12).
 
 from typing import NamedTuple
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, GAP, Problem, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
@@ -63,13 +63,15 @@ class FaceOffsets(NamedTuple):
     """
     Offsets of the outermost points from the face of a label, as estimated from the input.
 
+    One row for each of `KINDS`; without that axis, the same for all kinds.
+
     Attributes
     ----------
-    gap_correction : Tensor, shape (6,)
+    gap_correction : Tensor, shape (K, 6) or (6,)
         Labelling margin of each face less the one its class lets expect [m].
-    occlusion_inset : Tensor, shape (6,)
+    occlusion_inset : Tensor, shape (K, 6) or (6,)
         How much further inside the points of an occluded face are [m]; 0 for roof and road.
-    range_inset : Tensor, shape (6,)
+    range_inset : Tensor, shape (K, 6) or (6,)
         How much further inside they are on an object 70 m away [m].
 
     """
@@ -77,6 +79,11 @@ class FaceOffsets(NamedTuple):
     gap_correction: Tensor
     occlusion_inset: Tensor
     range_inset: Tensor
+
+    def of(self, problem: Problem) -> 'FaceOffsets':
+        """Return the offsets of each window of `problem`, shapes (B, 6)."""
+        rows = (part.to(problem.boxes).expand(len(KINDS), 6) for part in self)
+        return FaceOffsets(*(part[problem.kind] for part in rows))
 
 
 class FaceObservations(NamedTuple):
@@ -227,10 +234,10 @@ def observe_faces_compiled(
         min_along=MIN_ALONG,
         is_moving=problem.returns.is_moving,
     )
+    _, occlusion_inset, range_inset = map(contiguous, offsets.of(problem))
     run(
         kernels.face_support.observe_faces, B, problem.arrays(), contiguous(state.pose),
-        contiguous(state.shared), contiguous(offsets.occlusion_inset),
-        contiguous(offsets.range_inset), numbers, faces,
+        contiguous(state.shared), occlusion_inset, range_inset, numbers, faces,
     )  # fmt: skip
     return FaceObservations(*(torch.from_numpy(part) for part in faces))
 
@@ -242,8 +249,9 @@ def observe_faces_torch(
     points = motion_compensated(problem, state)
     tangent = visibility(problem)
     shares = inset_shares(problem, tangent, config)
-    range_inset = shares[1] * offsets.range_inset.to(shares)
-    inset = (shares[0] * offsets.occlusion_inset.to(shares) + range_inset).to(state.pose)
+    _, occlusion_inset, range_inset = (part.to(shares)[:, None] for part in offsets.of(problem))
+    range_inset = shares[1] * range_inset
+    inset = (shares[0] * occlusion_inset + range_inset).to(state.pose)
     occluded_weight = OCCLUDED_FACE_WEIGHT if config.ingredients.occluded_faces else 0.0
     weight = torch.where(tangent > 0, 1.0, occluded_weight).to(state.pose)
     weight = weight / (1 + (range_inset / RANGE_INSET_HALF_WEIGHT) ** 2)

@@ -8,12 +8,12 @@ docs/method.md, section Input model, has the formulas (M14) to (M18).
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from boxreg_ros.config import FaceConfig
+from boxreg_ros.config import FaceConfig, KINDS
 from boxreg_ros.core.arrowhead import BandedFactor, Factor
 from boxreg_ros.core.batch import EXTENT, POSE_ERRORS, Problem, State
 from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
-from boxreg_ros.core.geometry import rotation_from_rpy
-from boxreg_ros.structures import Floats
+from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
+from boxreg_ros.structures import Floats, ROLL
 import numpy as np
 import torch
 from torch import Tensor
@@ -29,8 +29,14 @@ FACE_GAPS = ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_b
 """Settings of `ClassConfig` that are the expected margins of the six faces."""
 FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
 """Faces with one labelling margin: ends, sides, top, bottom."""
-GAP_DEVIATIONS = (0.05, 0.05, 0.05, 0.15)
-"""Prior deviation of the margin of each group from the one its class lets expect [m]."""
+GAP_DEVIATIONS = {
+    'vehicle': (0.05, 0.05, 0.05, 0.15),
+    'cyclist': (0.15, 0.15, 0.15, 0.15),
+    'pedestrian': (0.15, 0.15, 0.15, 0.15),
+}
+"""Prior deviation of the margin of each group from the one its class lets expect, by kind [m]."""
+LARGE_EXTENT = (5.0, 2.0, 2.0)
+"""The margins of larger objects differ in proportion to their extent [m]; a large car."""
 MIN_TRACK_OBSERVATIONS = 3
 """Fewest face observations of a track, and tracks, that a margin is estimated from."""
 MIN_GAP_DEVIATION = 0.02
@@ -54,11 +60,16 @@ MAX_TRACKS = 200
 MAX_FITS_PER_TRACK = 100
 """Fits of each track that the model keeps, the last ones."""
 
-MIN_OBSERVATIONS_FOR_NOISE = 14
-"""Fewest observations of a track that noise is estimated from. With as many in total the
-estimate has weight 1/2."""
+MIN_OBSERVATIONS_FOR_NOISE = 5
+"""Fewest observations of a track that noise is estimated from."""
+OBSERVATIONS_FOR_HALF_WEIGHT = 14
+"""With as many observations in total the estimated noise has weight 1/2."""
 MAX_CORRELATION = 0.9
 """Largest correlation of the errors of consecutive observations."""
+CORRELATION_ITERATIONS = 5
+"""Evaluations of the correlation and of what the means of tracks remove, by each other."""
+MIN_LEFT = 0.3
+"""Least part of the variance that the means of tracks are taken to leave."""
 MIN_POWER = 1e-12
 """Errors with a smaller variance do not change along a track [m^2, rad^2]."""
 TYPICAL_CORRELATION = 0.385
@@ -104,37 +115,36 @@ class InputNoise(NamedTuple):
     """
     Estimated errors of the input poses and extents.
 
+    One row for each of `KINDS`; without that axis, the same for all kinds. Lengths are in units
+    of the deviation that the settings of the kind let expect.
+
     Attributes
     ----------
-    deviation : Tensor, shape (9,)
-        Robust standard deviation about the mean of a track, along the box axes (lon lat z roll
-        pitch yaw [m, rad], extents as part of each).
-    correlation : Tensor, shape (9,)
+    deviation : Tensor, shape (K, 9) or (9,)
+        Robust standard deviation about the mean of a track, along the box axes: lon lat z roll
+        pitch yaw, and the extents.
+    correlation : Tensor, shape (K, 9) or (9,)
         Correlation from one observation to the next, 0 to 0.9.
-    offset : Tensor, shape (9,)
+    offset : Tensor, shape (K, 9) or (9,)
         Robust standard deviation of the means of the tracks about zero.
-    weight : float
+    weight : Tensor, shape (K, 1) or (1,)
         Weight of the estimate against the settings: 0 without observations, 1/2 after
-        `MIN_OBSERVATIONS_FOR_NOISE` observations, near 1 after many.
-    extent_evidence : Tensor, shape (n, 3, 3)
-        Evidence of the points of n tracks about their extents. Rows of length, width and height:
-        logarithms of the input's; corrections to these, over the square of their expected error;
-        the weights of these, 0 without enough evidence.
+        `OBSERVATIONS_FOR_HALF_WEIGHT`, near 1 after many.
 
     """
 
     deviation: Tensor = torch.zeros(9, dtype=torch.float64)
     correlation: Tensor = torch.zeros(9, dtype=torch.float64)
     offset: Tensor = torch.zeros(9, dtype=torch.float64)
-    weight: float = 0.0
-    extent_evidence: Tensor = torch.zeros(1, 3, 3, dtype=torch.float64)
+    weight: Tensor = torch.zeros(1, dtype=torch.float64)
 
     @classmethod
     def estimate(cls, residuals: Tensor) -> 'InputNoise':
         """
-        Estimate the noise of tracks (B, N, 9) from `input_residuals` (M14); NaN is left out.
+        Estimate the noise of tracks (B, N, 9) of one kind (M14), NaN is left out.
 
-        Tracks with fewer than `MIN_OBSERVATIONS_FOR_NOISE` observations are left out too.
+        Of `input_residuals`, over their expected deviations. Tracks with fewer than
+        `MIN_OBSERVATIONS_FOR_NOISE` observations are left out too.
 
         """
         valid = residuals.isfinite().all(2)
@@ -157,16 +167,100 @@ class InputNoise(NamedTuple):
         # A constant error, such as that of an extent that a tracker holds, is fully correlated;
         # with one or two tracks it cannot be distinguished from the labelling margin.
         constant = 1 - 2 / tracks
-        ratio = torch.where(power > MIN_POWER, (first * second).sum(0) / power, constant)
-        correlation = ratio.clamp(0.0, MAX_CORRELATION)
-        # The mean of a track removes part of the variance of correlated errors.
-        removed = (1 + correlation) / (1 - correlation) * tracks / total
-        deviation = deviation / (1 - removed).clamp(min=0.3).sqrt()
-        weight = total / (total + MIN_OBSERVATIONS_FOR_NOISE)
+        ratio = (first * second).sum(0) / power.clamp(min=MIN_POWER)
+        # The mean of a track removes part of the variance of its errors, the more the slower they
+        # change, and part of the products of neighbours.
+        removed = torch.zeros_like(ratio)
+        for _ in range(CORRELATION_ITERATIONS):
+            whole = ratio + (1 - ratio) * removed
+            correlation = whole.where(power > MIN_POWER, constant).clamp(0.0, MAX_CORRELATION)
+            variance, removed = _removed_by_means(correlation, total / tracks)
+        deviation = deviation / (1 - variance).clamp(min=MIN_LEFT).sqrt()
+        weight = deviation.new_tensor([total / (total + OBSERVATIONS_FOR_HALF_WEIGHT)])
         return cls(deviation, correlation, offset, weight)
+
+    @classmethod
+    def estimate_by_kind(cls, residuals: Tensor, kind: Tensor) -> 'InputNoise':
+        """
+        Estimate the noise of each of `KINDS` from tracks (B, N, 9) of a `kind` (B,).
+
+        The noise of all other kinds together is the prior of each: a kind of which few boxes were
+        seen is expected to err as the others do, in proportion to the settings of its kind.
+
+        """
+        by_kind = []
+        for k in range(len(KINDS)):
+            is_own = kind == k
+            own = cls.estimate(residuals[is_own])
+            by_kind.append(own._with_prior(cls.estimate(residuals[~is_own])))
+        return cls(*(torch.stack(parts) for parts in zip(*by_kind, strict=True)))
+
+    def _with_prior(self, others: 'InputNoise') -> 'InputNoise':
+        """Return this estimate of one kind, and as far as it has no weight that of `others`."""
+        weight = self.weight + (1 - self.weight) * others.weight
+        share = self.weight / weight.clamp(min=1e-9)
+        return InputNoise(
+            torch.lerp(others.deviation, self.deviation, share),
+            torch.lerp(others.correlation, self.correlation, share),
+            torch.lerp(others.offset, self.offset, share),
+            weight,
+        )
+
+    def of(self, problem: Problem) -> 'InputNoise':
+        """Return the noise of each window of `problem`, shapes (B, 9) and (B, 1)."""
+        rows = (part.to(problem.boxes).expand(len(KINDS), -1) for part in self)
+        return InputNoise(*(part[problem.kind] for part in rows))
+
+
+class Population(NamedTuple):
+    """
+    Evidence of the points of n tracks about their extents.
+
+    Attributes
+    ----------
+    evidence : Tensor, shape (n, 3, 3)
+        Rows of length, width and height: logarithms of the input's; corrections to these, over
+        the square of their expected error; the weights of these, 0 without enough evidence.
+    kind : Tensor, shape (n,)
+        Indices among `KINDS`.
+
+    """
+
+    evidence: Tensor = torch.zeros(0, 3, 3, dtype=torch.float64)
+    kind: Tensor = torch.zeros(0, dtype=torch.int64)
+
+    def joined(self, evidence: Tensor, kind: Tensor) -> 'Population':
+        """Return this population with more tracks."""
+        evidence = torch.cat([self.evidence, evidence.to(self.evidence)])
+        return Population(evidence, torch.cat([self.kind, kind.to(self.kind)]))
+
+    def factors(self, problem: Problem, given: Tensor, error: Tensor) -> Tensor:
+        """Return the `population_factor` of each window, by tracks of its kind, (B, 3)."""
+        factors = torch.ones_like(given)
+        for kind in self.kind.unique():
+            rows = problem.kind == kind
+            own = self.evidence[self.kind == kind]
+            factors[rows] = population_factor(own, given[rows], error[rows])
+        return factors
+
+
+def _removed_by_means(correlation: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
+    """
+    Return what is lost when the mean of `n` autoregressive errors is subtracted from each.
+
+    Of their variance, and of the mean product of neighbours; both over the variance of an error.
+
+    """
+    c = correlation
+    with_mean = (1 - c**n) / (n * (1 - c))  # covariance of the first or last error with the mean
+    of_mean = (1 + c) / (1 - c) / n - 2 * c * with_mean / (n * (1 - c))
+    # Neighbours leave out one end each.
+    inner = (n * of_mean - with_mean) / (n - 1)
+    return of_mean, 2 * inner - of_mean
 
 
 UNKNOWN_NOISE = InputNoise()
+UNKNOWN_POPULATION = Population()
 
 
 def input_residuals(problem: Problem, state: State) -> Tensor:
@@ -188,6 +282,47 @@ def input_residuals(problem: Problem, state: State) -> Tensor:
     return torch.where(is_new[..., None], residuals, torch.nan)
 
 
+def normalised_residuals(problem: Problem, state: State) -> Tensor:
+    """Return `input_residuals` over the deviations that the class lets expect, (B, N, 9)."""
+    expected = problem.of_class(*POSE_ERRORS, *['extent'] * 3)
+    return input_residuals(problem, state) / expected[:, None]
+
+
+def smoothed_angles(problem: Problem) -> Tensor:
+    """
+    Return roll, pitch and yaw of the start of the search, smoothed over time, (B, N, 3) [rad].
+
+    By the motion model alone: the noise, estimated from second differences, against the angular
+    accelerations of the class. The outermost points of a box with a wrong yaw are its corners,
+    further outside than its faces: margins are learnt at these angles.
+
+    """
+    angles = problem.start[..., ROLL:]
+    B, N = problem.valid.shape
+    if N < MIN_TRACK_OBSERVATIONS:
+        return angles
+    step = problem.times.diff(dim=1)
+    mean_step = (step[:, 1:] + step[:, :-1]) / 2
+    # Rows of the second derivative by time, (B, N - 2, N), without padding.
+    before = 1 / (step[:, :-1] * mean_step)
+    after = 1 / (step[:, 1:] * mean_step)
+    rows = torch.stack([before, -before - after, after], 2) * problem.valid[:, 2:, None]
+    derivative = angles.new_zeros((B, N - 2, N))
+    for k in range(3):
+        derivative.diagonal(k, 1, 2).copy_(rows[..., k])
+    acceleration = derivative @ angles  # (B, N - 2, 3)
+    noise_gain = derivative.square().sum(2, keepdim=True).sqrt().clamp(min=MIN_POWER)
+    white = torch.where(problem.valid[:, 2:, None], acceleration.abs() / noise_gain, torch.nan)
+    noise = MAD_TO_DEVIATION * white.nanmedian(1).values.nan_to_num()  # (B, 3)
+    stiffness = (noise / problem.of_class('tilting', 'tilting', 'turning')) ** 2
+    roughness = (derivative.mT @ derivative)[:, None] * stiffness[..., None, None]
+    system = torch.eye(N).to(angles) + roughness  # (B, 3, N, N)
+    smoothed, _ = torch.linalg.solve_ex(system, angles.mT[..., None])
+    smoothed = smoothed[..., 0].mT
+    # Noise of many radians makes the system singular to working precision.
+    return torch.where(smoothed.isfinite(), smoothed, angles)
+
+
 class Expectation(NamedTuple):
     """
     Means and deviations of a batch before its points are used.
@@ -197,7 +332,7 @@ class Expectation(NamedTuple):
     shared : Tensor, shape (B, 22)
         Mean of the shared variables, see `State`.
     deviation : Tensor, shape (B, 22)
-        Their deviations; of labelling margins, multiples of `faces.spread`.
+        Their deviations.
     pose_deviation : Tensor, shape (B, 6)
         Deviation of the input poses along the axes of their boxes, without their bias [m, rad].
     widened_deviation : Tensor, shape (B, 6)
@@ -215,10 +350,13 @@ class Expectation(NamedTuple):
 
 
 def expect(
-    problem: Problem, offsets: FaceOffsets, noise: InputNoise = UNKNOWN_NOISE
+    problem: Problem,
+    offsets: FaceOffsets,
+    noise: InputNoise = UNKNOWN_NOISE,
+    population: Population = UNKNOWN_POPULATION,
 ) -> Expectation:
     """
-    Return the expectation of a batch, given labelling margins and noise of the input (M15).
+    Return the expectation of a batch, given margins, noise and population of the input (M15).
 
     Notes
     -----
@@ -228,31 +366,32 @@ def expect(
     further, and its bias and extents are held, unless it has been filtered: filtered input has as
     little scatter, but its errors are correlated along a whole track. Then the means of tracks are
     far off their fits, and bias and extents stay free. Labelling margins of low-noise input differ
-    between objects by twice as much: human labels follow each object.
+    between objects by twice as much: human labels follow each object. So do those of objects
+    larger than cars, in proportion: of trams, and of machines with booms.
 
     """
     valid = problem.valid
     usual = problem.of_class(*POSE_ERRORS)
     usual_extent = problem.of_class('extent')
+    noise = noise.of(problem)
 
     # Deviations: the expected ones, and by the weight of the noise the estimated ones.
-    ratio = noise.deviation[:6].to(usual) / usual
+    ratio = noise.deviation[:, :6]
     low_noise = (ratio / LOW_NOISE_RATIO).square().clamp(max=1.0)
     ratio = (ratio * low_noise).clamp(*RATIO_BOUNDS)
     ratio = (1 + noise.weight * (ratio**2 - 1)).sqrt()
     deviation = usual * ratio
-    correlation = noise.correlation.to(usual) - TYPICAL_CORRELATION
+    correlation = noise.correlation - TYPICAL_CORRELATION
     correlation = TYPICAL_CORRELATION + noise.weight * correlation
-    widening = ((1 + correlation[:6]) / (1 - correlation[:6])).sqrt()
+    widening = ((1 + correlation) / (1 - correlation))[:, :6].sqrt()
 
     # Bias: by the correlation over a fixed time, and by how large constant errors can be.
     duration = (problem.times * valid).amax(1)
     interval = (duration / (valid.sum(1) - 1).clamp(1))[:, None]
     slow = correlation ** (CORRELATION_INTERVAL / interval) - WHITE_CORRELATION
     slow = (slow / CORRELATION_SPAN).clamp(0.1, 1.0)
-    offsets_usual = torch.cat([usual[:, :2], usual_extent], 1)
-    filtered = noise.offset[[0, 1, 6]].to(usual) / offsets_usual
-    filtered = (filtered.mean(1, keepdim=True) / FILTERED_OFFSET).square()
+    filtered = noise.offset[:, [0, 1, 6]].mean(1, keepdim=True)
+    filtered = (filtered / FILTERED_OFFSET).square()
     filtered = noise.weight * filtered.clamp(max=MAX_FILTERED_BIAS)
     constant = torch.cat([ratio[:, :3].maximum(filtered), ratio[:, 3:]], 1).clamp(0.1, 2.0)
     bias = usual * usual.new_tensor([1, 1, 1, 1, 1, YAW_BIAS]) * slow[:, :6] * constant
@@ -260,21 +399,22 @@ def expect(
     # Extents: the mean of the input, corrected by the population.
     mean = _mean_input_extents(problem)
     part = usual_extent * slow[:, 6:] * (2 * constant[:, :3]).clamp(max=1)
-    extent = mean * population_factor(noise.extent_evidence, mean, part)
+    extent = mean * population.factors(problem, mean, part)
 
     one = torch.ones_like(usual)
     length = mean[:, :1]
-    gaps = problem.of_class(*FACE_GAPS) + offsets.gap_correction.to(usual)
-    loose = (2 - 2 * constant[:, :1]).clamp(1)
+    gaps = problem.of_class(*FACE_GAPS) + offsets.of(problem).gap_correction
+    size = (mean / mean.new_tensor(LARGE_EXTENT)).clamp(min=1)[:, FACE_AXIS]
+    spread = problem.of_class('gap_spread') * size * (2 - 2 * constant[:, :1]).clamp(1)
     # A pinned box has the true extents, and no bias: its pose is that of the object.
     has_pin = problem.pinned.any(1)[:, None]
     extent = torch.where(has_pin, mean, extent)
     extent_deviation = torch.where(has_pin, PINNED_EXTENT, extent * part)
     unmodelled = torch.where(has_pin, bias, 0.0)
-    loose = torch.where(has_pin, PINNED_MARGINS, loose)
+    spread = torch.where(has_pin, PINNED_MARGINS, 1.0) * spread
     bias = torch.where(has_pin, PINNED_EXTENT, bias)
     shared = [extent, 0 * one, gaps, length * problem.of_class('pivot'), 0 * one]
-    deviations = [extent_deviation, bias, one * loose, length * PIVOT_DEVIATION, one]
+    deviations = [extent_deviation, bias, spread, length * PIVOT_DEVIATION, one]
     return Expectation(
         torch.cat(shared, 1), torch.cat(deviations, 1), deviation, deviation * widening, unmodelled
     )
@@ -303,7 +443,7 @@ def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
     Parameters
     ----------
     evidence : Tensor, shape (n, 3, 3)
-        Evidence of the points of n tracks about their extents, see `InputNoise`.
+        Evidence of the points of n tracks about their extents, see `Population`.
     given : Tensor, shape (B, 3)
         Mean extents of the input [m].
     error : Tensor, shape (B, 3)
@@ -341,7 +481,7 @@ def evidence_of_extents(
     """
     Return the evidence of the points alone about the extents (M17), shape (B, 2, 3).
 
-    Corrections of the logarithms, and their weights, as in `InputNoise`.
+    Corrections of the logarithms, and their weights, as in `Population`.
 
     Parameters
     ----------
@@ -368,6 +508,9 @@ class InputModel:
     """
     Labelling margins, noise and population of extents, estimated from the input of a stream.
 
+    Each of `KINDS` has its own: labels of pedestrians do not follow the rule for cars. Noise is
+    pooled for kinds that were seen in few boxes.
+
     A labelling margin is the gap between a face of the label and its outermost points. Each track
     gives one value per face: the mean over its observations of the gap, less the one expected of
     its class. The mean of the middle half of all tracks is weighed against a correction of zero
@@ -385,15 +528,16 @@ class InputModel:
     def __init__(self, config: FaceConfig) -> None:
         self._estimates_margins = config.learn
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
-        # Of each track: sums over its face observations, see `add_face_observations`; its last
-        # input residuals; its extent evidence.
-        self._faces = dict[str, Floats]()
-        self._residuals = dict[str, Floats]()
-        self._evidence = dict[str, Floats]()
+        # Of each track of each kind: sums over its face observations, see
+        # `add_face_observations`; its last input residuals; its extent evidence.
+        self._faces = [dict[str, Floats]() for _ in KINDS]
+        self._residuals = [dict[str, Floats]() for _ in KINDS]
+        self._evidence = [dict[str, Floats]() for _ in KINDS]
 
     def add_face_observations(
         self,
         track_ids: Sequence[str],
+        kind: Tensor,
         observations: FaceObservations,
         new: Tensor,
         offsets: FaceOffsets,
@@ -405,6 +549,8 @@ class InputModel:
         ----------
         track_ids : sequence of B str
             The tracks.
+        kind : Tensor, shape (B,)
+            Indices of their kinds among `KINDS`.
         observations : FaceObservations
             Of their windows.
         new : Tensor, shape (B, N)
@@ -414,7 +560,8 @@ class InputModel:
 
         """
         distance = observations.distance
-        gap_correction, occlusion_inset, range_inset = (part.to(distance) for part in offsets)
+        per_track = (part.to(distance).expand(len(KINDS), 6)[kind] for part in offsets)
+        gap_correction, occlusion_inset, range_inset = (part[:, None] for part in per_track)
         occluded, distant = observations.inset_shares
         occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
         is_visible = occluded < MAX_VISIBLE_SHARE
@@ -435,27 +582,51 @@ class InputModel:
         shares = torch.stack([torch.ones_like(distance), occluded, distant])
         # (B, 3 quantities, 3 sums: value, count, share; 6 faces)
         sums = torch.stack([values * counts, counts, shares * counts], 1).sum(3).movedim(2, 0)
-        for track_id, row in zip(track_ids, sums.cpu().numpy(), strict=True):
-            _of_track(self._faces, track_id, np.zeros((3, 3, 6)))[:] += row
+        rows = zip(track_ids, kind.tolist(), sums.cpu().numpy(), strict=True)
+        for track_id, k, row in rows:
+            _of_track(self._faces[k], track_id, np.zeros((3, 3, 6)))[:] += row
 
-    def add_fits(self, track_ids: Sequence[str], residuals: Floats, evidence: Floats) -> None:
-        """Add one fit of each track: its `input_residuals` (B, 9), extent evidence (B, 3, 3)."""
-        for track_id, row, extents in zip(track_ids, residuals, evidence, strict=True):
-            known = _of_track(self._residuals, track_id, np.full((MAX_FITS_PER_TRACK, 9), np.nan))
+    def add_fits(
+        self, track_ids: Sequence[str], kind: Tensor, residuals: Floats, evidence: Floats
+    ) -> None:
+        """
+        Add one fit of each track.
+
+        Parameters
+        ----------
+        track_ids : sequence of B str
+            The tracks.
+        kind : Tensor, shape (B,)
+            Indices of their kinds among `KINDS`.
+        residuals : array, shape (B, 9)
+            `input_residuals`, over their expected deviations.
+        evidence : array, shape (B, 3, 3)
+            Evidence of the extents, see `Population`.
+
+        """
+        rows = zip(track_ids, kind.tolist(), residuals, evidence, strict=True)
+        for track_id, k, row, extents in rows:
+            unknown = np.full((MAX_FITS_PER_TRACK, 9), np.nan)
+            known = _of_track(self._residuals[k], track_id, unknown)
             known[:-1] = known[1:].copy()
             known[-1] = row
-            _of_track(self._evidence, track_id, extents)[:] = extents
+            _of_track(self._evidence[k], track_id, extents)[:] = extents
 
     def offsets(self) -> FaceOffsets:
-        """Return the labelling margins and insets to expect."""
-        known = np.array(list(self._faces.values())).reshape(-1, 3, 3, 6)
+        """Return the labelling margins and insets to expect of each kind."""
+        rows = [self._offsets(k) for k in range(len(KINDS))]
+        return FaceOffsets(*(torch.stack(parts) for parts in zip(*rows, strict=True)))
+
+    def _offsets(self, kind: int) -> FaceOffsets:
+        known = np.array(list(self._faces[kind].values())).reshape(-1, 3, 3, 6)
         none = (0.0,) * len(FACE_GROUPS)
-        gaps = self._pooled(known[:, 0], none)
-        occlusion_insets = self._pooled(
-            self._estimates_margins * known[:, 1], self._occlusion_insets
+        deviations = GAP_DEVIATIONS[KINDS[kind]]
+        gaps = _pooled(known[:, 0], none, deviations)
+        occlusion_insets = _pooled(
+            self._estimates_margins * known[:, 1], self._occlusion_insets, deviations
         )
         known[:, 2, 0] -= gaps.numpy() * known[:, 2, 1]
-        range_insets = self._pooled(known[:, 2], none)
+        range_insets = _pooled(known[:, 2], none, deviations)
         return FaceOffsets(self._estimates_margins * gaps, occlusion_insets, range_insets)
 
     def gaps_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
@@ -468,29 +639,41 @@ class InputModel:
 
     def noise(self) -> InputNoise:
         """Return the noise of all fits that were added."""
-        known = np.array(list(self._residuals.values())).reshape(-1, MAX_FITS_PER_TRACK, 9)
-        evidence = np.array([*self._evidence.values()] or [np.zeros((3, 3))])
-        noise = InputNoise.estimate(torch.from_numpy(known))
-        return noise._replace(extent_evidence=torch.from_numpy(evidence))
+        rows, kind = _flat(self._residuals)
+        known = np.array(rows).reshape(-1, MAX_FITS_PER_TRACK, 9)
+        return InputNoise.estimate_by_kind(torch.from_numpy(known), kind)
+
+    def population(self) -> Population:
+        """Return the evidence of extents of the last fits that were added."""
+        rows, kind = _flat(self._evidence)
+        return Population(torch.from_numpy(np.array(rows).reshape(-1, 3, 3)), kind)
 
     def _means_of_tracks(self, quantity: int, faces: Sequence[int]) -> list[Floats]:
         means = []
-        for sums in self._faces.values():
+        for sums in _flat(self._faces)[0]:
             total, count, share = sums[quantity][:, faces]
             is_known = count >= MIN_TRACK_OBSERVATIONS
             if is_known.any():
                 means.append(total[is_known] / share[is_known])
         return means
 
-    def _pooled(self, known: Floats, expected: Sequence[float]) -> Tensor:
-        """Weigh the tracks' sums (n, 3, 6) of a quantity against its prior (M18), (6,)."""
-        values = torch.zeros(6, dtype=torch.float64)
-        for faces, prior, deviation in zip(FACE_GROUPS, expected, GAP_DEVIATIONS, strict=True):
-            total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
-            is_known = count >= MIN_TRACK_OBSERVATIONS
-            means = np.sort(total[is_known] / share[is_known])
-            values[faces] = _posterior_mean(means, prior, deviation)
-        return values
+
+def _pooled(known: Floats, expected: Sequence[float], deviations: Sequence[float]) -> Tensor:
+    """Weigh the tracks' sums (n, 3, 6) of a quantity against its prior (M18), (6,)."""
+    values = torch.zeros(6, dtype=torch.float64)
+    for faces, prior, deviation in zip(FACE_GROUPS, expected, deviations, strict=True):
+        total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
+        is_known = count >= MIN_TRACK_OBSERVATIONS
+        means = np.sort(total[is_known] / share[is_known])
+        values[faces] = _posterior_mean(means, prior, deviation)
+    return values
+
+
+def _flat(known: Sequence[dict[str, Floats]]) -> tuple[list[Floats], Tensor]:
+    """Return the arrays of the tracks of all kinds, and their kinds (n,)."""
+    counts = torch.tensor([len(tracks) for tracks in known])
+    rows = [row for tracks in known for row in tracks.values()]
+    return rows, torch.arange(len(known)).repeat_interleave(counts)
 
 
 def _posterior_mean(means: Floats, prior: float, deviation: float) -> float:

@@ -70,6 +70,8 @@ class Observation(NamedTuple):
         Height of the road beside the box minus z of the centre [m]; NaN where not found.
     num_points : int
         Sweep points inside the input box.
+    sight : float
+        Median of `delays` [s]: when the sweep saw the object.
     is_pinned : bool
         Whether a person has corrected the box.
 
@@ -82,7 +84,17 @@ class Observation(NamedTuple):
     origin: Floats
     ground: float
     num_points: int
+    sight: float = 0.0
     is_pinned: bool = False
+
+    def relative_to(self, box: Floats, shift: Floats) -> 'Observation':
+        """Return this as the observation of another `box` (9,), whose centre is `-shift` away."""
+        return self._replace(
+            box=box,
+            points=self.points + shift.astype(np.float32),
+            origin=self.origin + shift,
+            ground=self.ground + float(shift[2]),
+        )
 
 
 def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[Observation]:
@@ -119,11 +131,13 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
 
     points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
     delays = np.zeros(len(rows), np.float32)
+    sights = np.zeros(n)
+    parts = _slices(owner, n)
     if config.sampling.deskew and sweep.times is not None:
         delays = sweep.times[rows].astype(np.float32)
+        sights = np.array([np.median(delays[part]) if delays[part].size else 0 for part in parts])
     up = matrix_from_rpy(boxes[:, ROLL:])[:, 2, 2]
     ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
-    parts = _slices(owner, n)
     columns = zip(
         boxes,
         [points[part] for part in parts],
@@ -131,6 +145,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
         sweep.origin - centers,
         ground.tolist(),
         own.num_inside.tolist(),
+        sights.tolist(),
         strict=True,
     )
     return [Observation(stamp_ns, *values) for values in columns]

@@ -9,6 +9,7 @@ from math import dist, inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import Observation, observe
@@ -83,6 +84,8 @@ class BoxRegistrar:
         after `reset`.
     counts : Counter
         Sweeps and boxes added, boxes by status, and everything dropped or kept, by reason.
+    box_time : BoxTimeEvidence
+        Evidence of the time that the input boxes are of.
 
     Raises
     ------
@@ -124,6 +127,7 @@ class BoxRegistrar:
         config = self.config
         self._matcher = StampMatcher(config, self.counts)
         self._input_model = InputModel(config.faces)
+        self.box_time = BoxTimeEvidence()
         self._pending = deque[_PendingArray]()
         self._newest_ns = -inf
         self._tracks: dict[str, _Track] = {}
@@ -207,22 +211,30 @@ class BoxRegistrar:
         given = boxes.boxes[rows]
         at_sweep = given.copy()
         offset = (sweep.stamp_ns - boxes.stamp_ns) * 1e-9  # [s]
-        if offset:
-            # The points are relative to the box: motion-compensated to the stamp of the box.
-            velocities = [
+        velocities = np.array(
+            [
                 track.input_velocity(box, boxes.stamp_ns)
                 for track, box in zip(tracks, given, strict=True)
             ]
-            at_sweep[:, X : Z + 1] += offset * np.array(velocities)
-        observations = observe(sweep, at_sweep, boxes.stamp_ns, self.config)
-        for row, track, box, observation in zip(rows, tracks, given, observations, strict=True):
-            is_pinned = boxes.pinned is not None and bool(boxes.pinned[row])
-            array.num_points[row] = observation.num_points
+        )
+        # The points are relative to the box: motion-compensated to the stamp of the box.
+        at_sweep[:, X : Z + 1] += offset * velocities
+        motion = np.zeros_like(velocities)
+        if self.config.sampling.deskew:
+            motion = motion_to_sight(sweep, at_sweep, velocities)
+        found = observe(sweep, swept(at_sweep, motion), boxes.stamp_ns, self.config)
+        observations = [
+            seen.relative_to(box, shift)
+            for seen, box, shift in zip(found, given, motion / 2, strict=True)
+        ]
+        for row, track, moved, seen in zip(rows, tracks, motion, observations, strict=True):
+            self.box_time.add(seen.box, seen.points, moved)
+            array.num_points[row] = seen.num_points
             array.reasons[row] = 'short_track'  # until there is an estimate
             array.num_unsettled += 1
-            track.entries.append(
-                _Entry(observation._replace(box=box, is_pinned=is_pinned), array, row)
-            )
+            is_pinned = boxes.pinned is not None and bool(boxes.pinned[row])
+            observation = seen._replace(is_pinned=is_pinned)
+            track.entries.append(_Entry(observation, array, row))
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
@@ -261,7 +273,8 @@ class BoxRegistrar:
         self._submitted += [_SubmittedTrack(track, track.entries, False) for track in tracks]
         windows = [track.window() for track in ended + tracks]
         submit = self._submit or _submit_locally
-        self._get_estimates = submit(windows, self.config, self._input_model)
+        config = self.box_time.resolved(self.config)
+        self._get_estimates = submit(windows, config, self._input_model)
         for track in tracks:
             track.entries = track.entries[-self._num_overlapping :]
         self._ended_tracks = []

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
-from boxreg_ros.core.face_support import observe_faces, to_box_frame
-from boxreg_ros.core.input_model import expect, input_residuals, InputModel
+from boxreg_ros.core.face_support import motion_compensated, observe_faces, to_box_frame
+from boxreg_ros.core.input_model import expect, InputModel, normalised_residuals, smoothed_angles
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.solver import COARSE_POINTS, solve
@@ -116,8 +116,7 @@ def _update_offsets(model: InputModel, windows: Sequence[Window], config: Config
     """
     Update the labelling margins with new observations, their faces as in the input boxes.
 
-    Sliding windows at the yaw they start from, which has been fitted: the outermost points of a
-    box with a wrong yaw are its corners, further outside than its faces.
+    At smoothed angles, see `smoothed_angles`.
 
     """
     new_parts = [window.margin_part() for window in windows if window.num_new > 0]
@@ -126,11 +125,11 @@ def _update_offsets(model: InputModel, windows: Sequence[Window], config: Config
     problem, _ = stack_windows(new_parts, config)
     problem = problem.thinned(COARSE_POINTS)
     offsets = model.offsets()
-    pose = torch.cat([problem.boxes[..., :3], problem.start[..., 6:]], -1)
+    pose = torch.cat([problem.boxes[..., :3], smoothed_angles(problem)], -1)
     state = State(pose, expect(problem, offsets).shared)
     observations = observe_faces(problem, state, offsets, config)
     track_ids = [window.track_id for window in new_parts]
-    model.add_face_observations(track_ids, observations, problem.valid, offsets)
+    model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)
 
 
 @torch.inference_mode()
@@ -143,10 +142,11 @@ def _update_noise(
 ) -> None:
     """Update the noise with the best fit of each window, `lag` from its end, and its extents."""
     best = [max(0, len(window.observations) - 1 - config.lag) for window in windows]
-    residuals = input_residuals(problem, solution.state)[range(len(windows)), best]
+    residuals = normalised_residuals(problem, solution.state)
+    residuals = residuals[range(len(windows)), best]
     track_ids = [window.track_id for window in windows]
     evidence = solution.extent_evidence
-    model.add_fits(track_ids, residuals.cpu().numpy(), evidence.cpu().numpy())
+    model.add_fits(track_ids, problem.kind, residuals.cpu().numpy(), evidence.cpu().numpy())
 
 
 @torch.inference_mode()
@@ -229,7 +229,7 @@ def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
         held = np.zeros(problem.counts.shape, np.int64)
         run(
             kernels.face_support.count_held, len(held), problem.arrays(), contiguous(pose),
-            contiguous(extent), HELD_MARGIN, held,
+            contiguous(extent), HELD_MARGIN, problem.returns.is_moving, held,
         )  # fmt: skip
         return torch.from_numpy(held)
     return _held_torch(problem, pose, extent)
@@ -237,7 +237,8 @@ def _held(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
 
 def _held_torch(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
     """Return the same as `_held`, by torch."""
-    local = to_box_frame(problem.points, problem, pose).abs_()
+    points = motion_compensated(problem, State(pose, problem.prior_mean))
+    local = to_box_frame(points, problem, pose).abs_()
     outside = local.sub_(extent[..., None].to(local) / 2).amax(-2)
     return (outside < HELD_MARGIN).sum(-1)
 

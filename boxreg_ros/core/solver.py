@@ -34,9 +34,11 @@ from boxreg_ros.core.input_model import (
     evidence_of_extents,
     expect,
     Expectation,
-    input_residuals,
     InputModel,
     InputNoise,
+    normalised_residuals,
+    UNKNOWN_NOISE,
+    UNKNOWN_POPULATION,
 )
 from boxreg_ros.core.kernels import compiled, shared_by
 from boxreg_ros.core.kernels.arrays import TermArrays
@@ -198,10 +200,11 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     """
     plan = Plan.choose(config, is_warm)
     offsets = model.offsets()
-    known = _known_noise(model, config)
-    noise = known
-    if plan.estimates_noise:
-        noise = InputNoise(extent_evidence=known.extent_evidence)
+    learns_noise = config.ingredients.noise_estimation
+    learns_extents = config.ingredients.population_extents
+    noise = model.noise() if learns_noise and not plan.estimates_noise else UNKNOWN_NOISE
+    known = model.population() if learns_extents else UNKNOWN_POPULATION
+    population = known
     solution = _start(problem, config, offsets, plan)
     free = free_variables(problem, config)
     every = torch.arange(len(free), device=free.device)
@@ -212,7 +215,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
         shared_by(pool, workers),
     ):
         while len(rows):
-            expected = expect(problem, offsets, noise)
+            expected = expect(problem, offsets, noise, population)
             log_extent = solution.extent_evidence[:, 0]
             batch = Round(problem.thinned(points), solution.state, expected, free, log_extent)
             work = partial(run_round, batch, offsets, plan, turn, config)
@@ -223,8 +226,11 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
             unfinished = [_store(result, solution) for result in list(results)]
             rows = torch.cat(unfinished)
             turn += 1
-            if plan.estimates_noise:
-                noise = _estimated_noise(noise, known, problem, solution, turn, config)
+            if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
+                residuals = normalised_residuals(problem, solution.state)
+                noise = InputNoise.estimate_by_kind(residuals, problem.kind)
+            if plan.estimates_noise and learns_extents:
+                population = known.joined(solution.extent_evidence, problem.kind)
             if not len(rows) and 2 * points <= problem.returns.width:
                 rows, points = every, inf  # settled on few points: once more with all
     return solution
@@ -344,30 +350,3 @@ def _split(rows: Tensor, length: int, workers: int) -> tuple[Tensor, ...]:
         return (rows,)
     parts = workers * int(1 + len(rows) / size / workers)
     return rows.tensor_split(min(len(rows), parts))
-
-
-def _known_noise(model: InputModel, config: Config) -> InputNoise:
-    """Return the noise of the input that the model has estimated so far."""
-    noise = model.noise()
-    if not config.ingredients.noise_estimation:
-        noise = InputNoise(extent_evidence=noise.extent_evidence)
-    if not config.ingredients.population_extents:
-        noise = noise._replace(extent_evidence=InputNoise().extent_evidence)
-    return noise
-
-
-def _estimated_noise(
-    noise: InputNoise,
-    known: InputNoise,
-    problem: Problem,
-    solution: Solution,
-    turn: int,
-    config: Config,
-) -> InputNoise:
-    """Return the noise after `turn` rounds, with the extent evidence of the batch itself."""
-    if turn <= NOISE_ROUNDS and config.ingredients.noise_estimation:
-        noise = InputNoise.estimate(input_residuals(problem, solution.state))
-    evidence = [known.extent_evidence]
-    if config.ingredients.population_extents:
-        evidence.append(solution.extent_evidence.cpu())
-    return noise._replace(extent_evidence=torch.cat(evidence))

@@ -10,14 +10,14 @@ from math import inf
 from boxreg_ros.config import Config
 from boxreg_ros.core import terms
 from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Problem, SHARED, State
-from boxreg_ros.core.face_support import FaceObservations
+from boxreg_ros.core.face_support import BOTTOM, FaceObservations
 from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
 from boxreg_ros.core.input_model import Expectation
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.kernels.arrays import (
+    ClassDeviations,
     ExpectedArrays,
     FaceArrays,
-    MotionDeviations,
     TermArrays,
     WeightNumbers,
 )
@@ -95,7 +95,7 @@ def weigh(
     axes = rotation_from_rpy(state.pose[..., 3:])
     given = problem.pose
     off_track = neighbour_deviation(problem, axes)
-    face_weight = _face_weights(observations, off_track, valid, config)
+    face_weight = _face_weights(problem, observations, off_track, valid, config)
     at_input = terms.input_pose(state, given, axes)
     input_weight = _input_weights(at_input.residual[:, :, 0], off_track, valid, expected, config)
     input_weight = _with_pins(input_weight, problem, expected)
@@ -182,12 +182,11 @@ def weigh_compiled(
         driving_span=DRIVING_SPAN,
         driving_reach=DRIVING_REACH,
         face_outlier=settings.outlier,
-        spread=settings.spread,
-        face_deviations=_face_deviations(config),
         is_robust=is_smooth and ingredients.robust_motion,
     )
     drift = problem.of_class('drift')
-    motion = MotionDeviations(
+    of_class = ClassDeviations(
+        faces=contiguous(_face_deviations(problem, config)),
         acceleration=contiguous(problem.of_class(*ACCELERATIONS)),
         slip=contiguous(problem.of_class('slip', 'climb')),
         zero_motion=contiguous(drift * drift.new_tensor(DRIFT_RATIOS)),
@@ -197,7 +196,7 @@ def weigh_compiled(
     run(
         kernels.weights.weigh_windows, B, problem.arrays(), contiguous(state.pose),
         contiguous(state.shared), FaceArrays(*map(contiguous, observations)),
-        ExpectedArrays(**columns), motion, numbers, terms,
+        ExpectedArrays(**columns), of_class, numbers, terms,
     )  # fmt: skip
     if problem.pinned.any():
         weight = torch.from_numpy(terms.W_input).diagonal(dim1=2, dim2=3)
@@ -278,7 +277,11 @@ def parked_steps(problem: Problem, yaw_deviation: Tensor) -> Tensor:
 
 
 def _face_weights(
-    observations: FaceObservations, off_track: Tensor, valid: Tensor, config: Config
+    problem: Problem,
+    observations: FaceObservations,
+    off_track: Tensor,
+    valid: Tensor,
+    config: Config,
 ) -> Tensor:
     """
     Return the weights of the faces (M20), shape (B, N, 6) [1/m^2].
@@ -288,10 +291,10 @@ def _face_weights(
 
     """
     settings = config.faces
-    deviation = valid.new_tensor(_face_deviations(config))
+    deviation = _face_deviations(problem, config)
     robust = 1 / (1 + (observations.distance / settings.outlier) ** 2) ** 2
     same_object = valid / (1 + off_track[..., :2].square().sum(2) ** 2) ** 2
-    return observations.weight * robust * same_object[..., None] / deviation**2
+    return observations.weight * robust * same_object[..., None] / deviation[:, None] ** 2
 
 
 def _input_weights(
@@ -345,9 +348,9 @@ def _shared_weights(
     above, must not lift the roof.
 
     """
-    spread = config.faces.spread
     outlier = GAP_OUTLIER if config.ingredients.robust_weights else inf
     deviation = expected.deviation
+    spread = deviation[:, GAP]
     # Points and the face of the input are apart by margin, bias and half the error of the extent.
     face_variance = deviation[:, BIAS][:, :3] ** 2 + (deviation[:, EXTENT] / 2) ** 2
     variance = spread**2 + face_variance[:, FACE_AXIS]
@@ -355,7 +358,7 @@ def _shared_weights(
     mean_distance = (observations.distance * face_weight).sum(1) / total.clamp(min=1e-9)
     gap_off = (state.shared - expected.shared)[:, GAP] ** 2 / spread**2
     squared = gap_off.maximum(mean_distance**2 / variance)
-    gap = deviation[:, GAP] * spread * (1 + squared / outlier**2).sqrt()
+    gap = spread * (1 + squared / outlier**2).sqrt()
     return torch.cat([deviation[:, : GAP.start], gap, deviation[:, GAP.stop :]], 1) ** -2
 
 
@@ -379,10 +382,20 @@ def _zero_motion_weights(problem: Problem, expected: Expectation) -> Tensor:
     return deviation[:, None] ** -2 * parked_steps(problem, yaw_deviation)[..., None]
 
 
-def _face_deviations(config: Config) -> tuple[float, ...]:
-    """Return the deviation of one observation of each face, (6,) [m]."""
+def _face_deviations(problem: Problem, config: Config) -> Tensor:
+    """
+    Return the deviation of one observation of each face, shape (B, 6) [m].
+
+    The outermost points of what is not rigid, legs and arms, are off its faces by `shape` at
+    least; the road is not.
+
+    """
     faces = config.faces
-    return faces.ends, faces.ends, faces.sides, faces.sides, faces.top, faces.bottom
+    of_rigid = [faces.ends] * 2 + [faces.sides] * 2 + [faces.top, faces.bottom]
+    shape = problem.of_class('shape')
+    deviation = shape.maximum(shape.new_tensor(of_rigid))
+    deviation[:, BOTTOM] = faces.bottom
+    return deviation
 
 
 def _diagonal(weight: Tensor) -> Tensor:

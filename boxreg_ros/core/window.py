@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.batch import numbers_of, PRIOR_SIZE, Problem, Returns, SHARED
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
@@ -212,6 +212,7 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
         prior_information=on_device(information),
         marginalised_extents=on_device(extents),
         class_numbers=on_device(_class_numbers(windows, config)),
+        kind=on_device(np.array([KINDS.index(config.kind(w.class_name)) for w in windows])),
         pinned=on_device(pinned),
     )
     return problem, base
@@ -261,9 +262,11 @@ def _places_of_returns(windows: Sequence[Window], valid: NDArray[np.bool_]) -> t
 
 
 def _returns(windows: Sequence[Window], config: Config) -> Returns:
-    """Return the returns of all observations, one after the other."""
+    """Return the returns of all observations, one after the other, delayed from their boxes."""
     every = [observation for window in windows for observation in window.observations]
-    delays = np.concatenate([observation.delays for observation in every])
+    is_sight = config.sampling.box_time == 'sight'
+    of_boxes = [o.delays - is_sight * np.float32(o.sight) for o in every]
+    delays = np.concatenate(of_boxes)
     return Returns(
         _tensor(np.concatenate([observation.points for observation in every]), config.device),
         _tensor(delays, config.device),

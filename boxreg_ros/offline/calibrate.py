@@ -15,7 +15,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from boxreg_ros.config import Config, Setting, settings
+from boxreg_ros.config import Config, KINDS, Setting, settings
 from boxreg_ros.core.batch import EXTENT, State
 from boxreg_ros.core.face_support import FaceOffsets, observe_faces
 from boxreg_ros.core.input_model import (
@@ -44,7 +44,6 @@ import yaml
 GAPS = ('gap_ends', 'gap_sides', 'gap_top', 'gap_bottom')
 INSETS = ('inset_ends', 'inset_sides')
 ERRORS = ('position', 'lateral', 'height', 'tilt', 'heading', 'extent')
-KINDS = ('vehicle', 'cyclist', 'pedestrian')
 PASSES = 4
 """Passes of the estimation: the outermost points depend a little on the margins. Chosen."""
 MIN_TRACKS = 3
@@ -99,7 +98,7 @@ def labelling_margins(drive: Drive, config: Config) -> dict[str, Measured]:
     """
     kinds: dict[str, list[Window]] = {}
     for window in _true_windows(drive, config):
-        kinds.setdefault(_kind(window.class_name, config), []).append(window)
+        kinds.setdefault(config.kind(window.class_name), []).append(window)
     found: dict[str, Measured] = {}
     for _ in range(PASSES):
         means = _means_of_tracks(kinds, config)
@@ -138,7 +137,7 @@ def input_errors(drive: Drive, config: Config) -> dict[str, Measured]:
     for i in np.argsort(truth.stamps_ns, kind='stable'):
         stamp_ns, name = int(truth.stamps_ns[i]), truth.track_ids[i]
         if (stamp_ns, name) in given and is_valid_box(truth.boxes[i]):
-            kind = _kind(truth.class_names[i], config)
+            kind = config.kind(truth.class_names[i])
             pair = stamp_ns, given[stamp_ns, name], truth.boxes[i]
             pairs.setdefault(kind, {}).setdefault(name, []).append(pair)
     return {
@@ -348,7 +347,7 @@ def _model_of(windows: Sequence[Window], config: Config) -> InputModel:
         state = State(problem.pose, expect(problem, offsets).shared)
         observations = observe_faces(problem, state, offsets, config)
         track_ids = [window.track_id for window in part]
-        model.add_face_observations(track_ids, observations, problem.valid, offsets)
+        model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)
     return model
 
 
@@ -360,12 +359,6 @@ def _bare(rows: Iterable[Sequence[Any]]) -> Window:
         for stamp_ns, box in rows
     ]
     return Window('', '', observations, len(observations), np.zeros((0, 9)))
-
-
-def _kind(class_name: str, config: Config) -> str:
-    """Return the name of the settings for objects of a class."""
-    found = config.class_config(class_name)
-    return next(kind for kind in KINDS if getattr(config, kind) is found)
 
 
 def _deviation(offsets: Floats) -> float:

@@ -103,7 +103,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
                 _register(recording, registrar, completion, sink, clock, shown)
-            summary = _summary(request, recording, registrar.counts, sink)
+            summary = _summary(request, recording, registrar, sink)
             summary['complete'] = _completed(plan)
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
@@ -112,6 +112,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             with clock('write'):
                 summary['rules'] = _write_tables(folder, tracks, request.config, plan)
             if sink.points is not None:
+                sink.points.settle(registrar.box_time.resolved(request.config))
                 _report(folder, out, request, summary, tracks, sink.points, clock)
             if request.decisions is not None:
                 copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
@@ -276,7 +277,7 @@ def _truth(
 
 
 def _summary(
-    request: Request, recording: ReadAhead, registered: Counter[str], sink: Sink
+    request: Request, recording: ReadAhead, registrar: BoxRegistrar, sink: Sink
 ) -> dict[str, Any]:
     """Return the content of summary.json, without the fingerprint and the times."""
     if sink.missing():
@@ -301,9 +302,10 @@ def _summary(
         'time_jumps': findings.counts['time_jump'],
         'recorded_apart': {t: round(late, 3) for t, late in findings.apart.items()},
         'heading_flips': sink.heading_flips,
+        'box_time': registrar.box_time.summary(request.config),
         'time_ranges': {name: list(ends) for name, ends in sink.time_ranges.items()},
         'unknown_classes': dict(sink.unknown_classes.most_common()),
-        'dropped': _dropped(registered, findings),
+        'dropped': _dropped(registrar.counts, findings),
         'without_stamp': _without_stamp(findings),
         'damage': [damage._asdict() for damage in findings.damages],
         'first_missing_transform': findings.first_missing_transform,

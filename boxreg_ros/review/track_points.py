@@ -25,11 +25,18 @@ MILLIMETRES = 1000.0
 
 
 class _Gathered(NamedTuple):
-    """Points (M, 3) around a centre (3,) [mm from it], and when they were measured [s]."""
+    """
+    Points (M, 3) around a centre (3,) [mm from it], and their times.
+
+    The stamp of the sweep relative to that of the box, and the times of the points relative to the
+    stamp of the sweep, None where unknown [s].
+
+    """
 
     center: Floats
     offsets: NDArray[np.int16]
-    delays: NDArray[np.float32]
+    sweep_delay: float
+    times: NDArray[np.float32] | None
 
 
 class PointCollector:
@@ -47,9 +54,14 @@ class PointCollector:
 
     def __init__(self, config: Config) -> None:
         self._matcher = StampMatcher(config, Counter())
-        self._deskew = config.sampling.deskew
+        self.settle(config)
         self._gathered: dict[tuple[int, str], _Gathered] = {}
         self._origins: dict[int, Floats] = {}
+
+    def settle(self, config: Config) -> None:
+        """Take over settings that a run has resolved: whether boxes hold at their stamp."""
+        sampling = config.sampling
+        self._is_at_stamp = sampling.deskew and sampling.box_time == 'stamp'
 
     def add(self, item: Sweep | BoxArray) -> None:
         """Add a sweep or a box array in the fixed frame."""
@@ -85,7 +97,10 @@ class PointCollector:
             if found is None or not is_known[row]:
                 points.append(np.zeros((0, 3)))
                 continue
-            motion = _motion_to_stamp(track, row, found.delays)
+            delays = np.array([found.sweep_delay])
+            if self._is_at_stamp and found.times is not None:
+                delays = delays + found.times
+            motion = _motion_to_stamp(track, row, delays)
             near = found.offsets / MILLIMETRES + found.center + motion
             local = (near - both[:, row, None, : Z + 1]) @ R[:, row]
             limit = both[:, row, None, Z + 1 : ROLL] / 2 + SHOWN_MARGIN
@@ -112,16 +127,18 @@ class PointCollector:
             is_near = near.outside.max(0) < GATHERED_MARGIN
             owners = near.owner[is_near]
             offsets = to_millimetres(near.offset[:, is_near].T)
-            delays = np.full(len(owners), (sweep.stamp_ns - boxes.stamp_ns) * 1e-9, np.float32)
-            if self._deskew and sweep.times is not None:
-                delays += sweep.times[near.row[is_near]]
+            delay = (sweep.stamp_ns - boxes.stamp_ns) * 1e-9
+            times = None
+            if sweep.times is not None:
+                times = sweep.times[near.row[is_near]].astype(np.float32)
             ends = np.searchsorted(owners, np.arange(len(rows) + 1))
             for row, begin, end in zip(rows.tolist(), ends[:-1], ends[1:], strict=True):
                 step = max(1, -(-(end - begin) // GATHERED_POINTS))
                 part = slice(begin, end, step)
                 key = boxes.stamp_ns, boxes.track_ids[row]
                 center = boxes.boxes[row, : Z + 1].copy()
-                found = _Gathered(center, offsets[part].copy(), delays[part].copy())
+                own_times = None if times is None else times[part].copy()
+                found = _Gathered(center, offsets[part].copy(), delay, own_times)
                 self._gathered.setdefault(key, found)  # of two boxes of one id the first counts
 
 

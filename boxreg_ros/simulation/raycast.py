@@ -18,7 +18,7 @@ from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
-SWEEP_PERIOD = 0.1  # of a revolution [s]; the stamp is its middle
+SWEEP_PERIOD = 0.1  # of a revolution [s]
 ROAD = -1  # owner of returns from the road
 
 View = list[tuple[float, float]]
@@ -79,6 +79,10 @@ BODIES: dict[str, list[tuple[View, View, View]]] = {
         ([(0.29, 0.12), (0.49, 0.12), (0.5, 0.2), (0.5, 0.42), (0.47, 0.78), (0.42, 0.84),
           (0.29, 0.84)], SQUARE, _front([(0.48, 0.0), (0.48, 1.0)])),
         _wheel(0.36, 0.062, 0.15), _wheel(-0.3, 0.062, 0.15),
+    ],
+    'trailer': [
+        ([(-0.5, 0.28), (0.5, 0.28), (0.5, 1.0), (-0.5, 1.0)], SQUARE, RECTANGLE),
+        _wheel(-0.3, 0.06, 0.14), _wheel(-0.15, 0.06, 0.14),
     ],
     'pedestrian': [
         ([(-0.3, 0.0), (0.3, 0.0), (0.2, 0.52), (-0.2, 0.52)],
@@ -175,13 +179,19 @@ class Actor:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A spinning LiDAR: beam elevations [rad], columns per revolution, reach and noise [m]."""
+    """
+    A spinning LiDAR: beam elevations [rad], columns per revolution, reach and noise [m].
+
+    A revolution begins and ends behind; its stamp is after the part `stamp_at` of it.
+
+    """
 
     elevations: Floats
     columns: int
     reach: float = 70.0
     noise: float = 0.02
     dropout: float = 0.03
+    stamp_at: float = 0.5
 
 
 def revolution(
@@ -204,7 +214,7 @@ def revolution(
     sensor : Sensor
         Its beams, reach and noise.
     stamp : float
-        The middle of the revolution [s].
+        The stamp of the revolution, see `Sensor` [s].
     rng : Generator
         Source of noise and drop-outs.
 
@@ -222,7 +232,7 @@ def revolution(
     beams = len(sensor.elevations)
     phase = (np.arange(columns) + 0.5) / columns - 0.5
     azimuth = 2 * np.pi * phase
-    times = SWEEP_PERIOD * phase
+    times = SWEEP_PERIOD * (phase + 0.5 - sensor.stamp_at)
     poses = ego.at(stamp + times)
     flat = np.cos(sensor.elevations)
     rise = np.sin(sensor.elevations)
@@ -240,11 +250,12 @@ def revolution(
         ranges = np.where(rays[..., 2] < 0, -origins[:, None, 2] / rays[..., 2], np.inf)
     owner = np.full((columns, beams), ROAD)
     for index, actor in enumerate(actors):
-        # Only rays that can meet the sphere around the body, 1 m wider for its motion.
-        center = actor.motion.at(np.array([stamp]))[0, :3]
+        # Only rays that can meet the sphere around the body, wider for its motion.
+        first, center, last = actor.motion.at(stamp + times[[0, columns // 2, -1]])[:, :3]
         offset = center - poses[columns // 2, :3]
         distance = np.hypot(*offset[:2])
-        radius = np.linalg.norm(actor.extent) / 2 + 1
+        moved = (np.linalg.norm(last - first) + np.linalg.norm(poses[-1] - poses[0])) / 2
+        radius = np.linalg.norm(actor.extent) / 2 + np.maximum(1.0, moved)
         if distance - radius > sensor.reach:
             continue
         half = np.arcsin(radius / distance) if distance > radius else np.pi

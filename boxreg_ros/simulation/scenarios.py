@@ -1,4 +1,4 @@
-"""The scenarios of `boxreg simulate`: a street, and the paper's experiment."""
+"""The scenarios of `boxreg simulate`: a street, a highway, and the paper's experiment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 EXTENTS = {
     'car': (4.4, 1.8, 1.5), 'suv': (4.7, 1.92, 1.72), 'van': (5.4, 2.0, 2.3),
-    'truck': (7.8, 2.45, 3.1), 'pedestrian': (0.6, 0.65, 1.75), 'cyclist': (1.75, 0.6, 1.75),
+    'truck': (7.8, 2.45, 3.1), 'trailer': (8.0, 2.5, 3.4),
+    'pedestrian': (0.6, 0.65, 1.75), 'cyclist': (1.75, 0.6, 1.75),
 }  # fmt: skip
 """Length, width and height of each shape [m]."""
 ROAD_MARGIN = 1.6  # road points further than this from every box are left out [m]
@@ -35,6 +36,10 @@ INTEGRATION_STEP = 0.01  # of a motion [s]
 STREET_SWEEPS = 50
 SENSOR_HEIGHT = 1.8  # in the street [m]
 PITCH_AMPLITUDE = 0.006  # of the vehicle that carries the sensor [rad]
+
+HIGHWAY_SWEEPS = 40
+HIGHWAY_SPEED = 30.0  # of the vehicle that carries the sensor [m/s]
+TRAILER_DISTANCE = 9.1  # of the centre of a trailer behind that of its truck [m]
 
 PAPER_STEPS = 100  # T of Eq. 10
 PAPER_SPEED = 5.0  # [m/s]
@@ -107,10 +112,56 @@ def street(rng: np.random.Generator, sweeps: int | None) -> Scene:
     return _scan(actors, ego, sensor, count, rng)
 
 
+HIGHWAY = (
+    ('car', 'car', 22, 0.0, 1.0), ('car', 'suv', 48, 0.0, 0.97), ('car', 'car', -18, 0.0, 1.02),
+    ('car', 'suv', -25, 3.6, 1.25), ('car', 'car', 12, 3.6, 1.33), ('van', 'van', 35, 3.6, 1.1),
+    ('truck', 'truck', 30, -3.6, 0.83), ('trailer', 'trailer', 30, -3.6, 0.83),
+    ('truck', 'truck', -6, -3.6, 0.85), ('trailer', 'trailer', -6, -3.6, 0.85),
+    ('car', 'car', 55, 11.0, -1.1), ('car', 'suv', 80, 14.6, -1.2),
+    ('truck', 'truck', 95, 11.0, -0.85), ('trailer', 'trailer', 95, 11.0, -0.85),
+)  # fmt: skip
+"""Class, shape, x and y [m] and speed over that of the sensor; a trailer follows its truck."""
+
+
+def highway(
+    rng: np.random.Generator,
+    sweeps: int | None,
+    at_sight: bool = False,
+    speed: float = HIGHWAY_SPEED,
+) -> Scene:
+    """
+    Return a highway: every vehicle moves by metres while the sensor turns.
+
+    Parameters
+    ----------
+    rng : Generator
+        Source of all random numbers.
+    sweeps : int or None
+        Number of sweeps.
+    at_sight : bool
+        Whether a box is where the vehicle was when the sensor saw it, and not where it was at
+        the stamp.
+    speed : float
+        Of the vehicle that carries the sensor [m/s]; the others drive 0.83 to 1.33 times as fast.
+
+    """
+    count = sweeps or HIGHWAY_SWEEPS
+    actors = []
+    for i, (class_name, shape, x, y, ratio) in enumerate(HIGHWAY):
+        behind = TRAILER_DISTANCE * np.sign(ratio) if class_name == 'trailer' else 0.0
+        place = (x - behind, y, np.pi * (ratio < 0))
+        plan = Plan(class_name, shape, place, constant(abs(ratio) * speed), zero)
+        actors.append(_actor(str(i + 1), plan, count, rng))
+    ego = drive(count * SWEEP_PERIOD, (0, 0, 0), constant(speed), zero)
+    ego.poses[:, 2] = SENSOR_HEIGHT
+    sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
+    return _scan(actors, ego, replace(sensor, stamp_at=1.0), count, rng, at_sight)
+
+
 def _actor(track_id: str, plan: Plan, count: int, rng: np.random.Generator) -> Actor:
     """Return a road user with a random size, on its path for `count` sweeps."""
     extent = np.array(EXTENTS[plan.shape]) * rng.uniform(0.95, 1.05, 3)
-    is_vehicle = plan.class_name in ('car', 'van', 'truck')
+    is_vehicle = plan.class_name in ('car', 'van', 'truck', 'trailer')
     axle = 0.25 * extent[0] if is_vehicle else 0.0
     motion = drive(count * SWEEP_PERIOD, plan.place, plan.speed, plan.yaw_rate, axle)
     motion.poses[:, 2] = extent[2] / 2
@@ -145,9 +196,14 @@ def drive(duration: float, start: Place, speed: Rate, yaw_rate: Rate, axle: floa
 
 
 def _scan(
-    actors: Sequence[Actor], ego: Motion, sensor: Sensor, count: int, rng: np.random.Generator
+    actors: Sequence[Actor],
+    ego: Motion,
+    sensor: Sensor,
+    count: int,
+    rng: np.random.Generator,
+    at_sight: bool = False,
 ) -> Scene:
-    """Return the scene of `count` revolutions of a sensor on `ego`."""
+    """Return the scene of `count` revolutions of a sensor on `ego`; `at_sight` as of `highway`."""
     parts = [body(actor.shape, actor.extent) for actor in actors]
     stamps = np.arange(count) * SWEEP_PERIOD
     T_fixed_sensor = to_matrix(ego.at(stamps))
@@ -162,6 +218,10 @@ def _scan(
             kept |= is_near(points, box, ROAD_MARGIN)
         sweeps.append(make_sweep(stamp, points[kept], times[kept], T_fixed_sensor[i]))
         owners.append(owner[kept])
+        if at_sight:
+            for row in np.unique(owner[owner != ROAD]):
+                seen = actors[row].motion.at(stamp + times[owner == row].mean(keepdims=True))
+                true_boxes[row, i] = boxes_of(actors[row], seen)[0]
     return make_scene(
         actors, true_boxes, sweeps, owners, T_fixed_sensor, detector_noise, MISS_PROBABILITY, rng
     )
@@ -234,6 +294,8 @@ def _occluded(points: Floats, extent: Floats, rng: np.random.Generator) -> NDArr
 
 SCENARIOS: dict[str, Callable[[np.random.Generator, int | None], Scene]] = {
     'street': street,
+    'highway': lambda rng, sweeps: highway(rng, sweeps),
+    'highway-sight': lambda rng, sweeps: highway(rng, sweeps, at_sight=True),
     'paper': lambda rng, sweeps: paper(rng, sweeps, is_flat=False),
     'paper-bev': lambda rng, sweeps: paper(rng, sweeps, is_flat=True),
 }

@@ -1,9 +1,9 @@
 """The input model, from input whose labelling margins and noise are known."""
 
-from boxreg_ros.config import Config, FaceConfig
+from boxreg_ros.config import Config, FaceConfig, KINDS
 from boxreg_ros.core.arrowhead import Factor
 from boxreg_ros.core.batch import State
-from boxreg_ros.core.face_support import FaceObservations, observe_faces
+from boxreg_ros.core.face_support import FaceObservations, FaceOffsets, observe_faces
 from boxreg_ros.core.input_model import (
     evidence_of_extents,
     Expectation,
@@ -14,7 +14,10 @@ from boxreg_ros.core.input_model import (
     MAX_FITS_PER_TRACK,
     MAX_TRACKS,
     MIN_OBSERVATIONS_FOR_NOISE,
+    OBSERVATIONS_FOR_HALF_WEIGHT,
+    Population,
     population_factor,
+    smoothed_angles,
 )
 import numpy as np
 import pytest
@@ -118,7 +121,31 @@ def test_short_tracks_and_padding_are_left_out():
     found = InputNoise.estimate(values)
     np.testing.assert_allclose(found.deviation, known.deviation)
     np.testing.assert_allclose(found.correlation, known.correlation)
-    assert found.weight == known.weight == 60 / (60 + MIN_OBSERVATIONS_FOR_NOISE)
+    assert found.weight == known.weight == 60 / (60 + OBSERVATIONS_FOR_HALF_WEIGHT)
+
+
+def test_noise_of_a_kind_is_that_of_the_others_until_it_has_its_own():
+    # Vehicles err as expected, pedestrians twice as much; of cyclists there is nothing, or a few
+    # boxes that err three times as much: their own weight is 60 / 74.
+    kind = torch.tensor([0] * 30 + [2] * 30)
+    values = autoregressive(60, 40, np.ones(9), 0.0)
+    values[30:] *= 2
+    noise = InputNoise.estimate_by_kind(values, kind)
+    np.testing.assert_allclose(noise.deviation[[0, 2]], [[1.0] * 9, [2.0] * 9], rtol=0.1)
+    pooled = InputNoise.estimate(values)
+    np.testing.assert_array_equal(noise.deviation[1], pooled.deviation)
+    np.testing.assert_array_equal(noise.weight[1], pooled.weight)
+    few = 3 * autoregressive(2, 40, np.ones(9), 0.0, seed=3)
+    few[:, 30:] = torch.nan
+    values = torch.cat([values, few])
+    found = InputNoise.estimate_by_kind(values, torch.cat([kind, torch.tensor([1, 1])]))
+    own = InputNoise.estimate(few)
+    assert own.weight == 60 / (60 + OBSERVATIONS_FOR_HALF_WEIGHT)
+    total = own.weight + (1 - own.weight) * pooled.weight
+    share = own.weight / total
+    known = share * own.deviation + (1 - share) * pooled.deviation
+    np.testing.assert_allclose(found.deviation[1], known)
+    np.testing.assert_allclose(found.weight[1], total)
 
 
 def with_points(problem):
@@ -159,9 +186,15 @@ def test_repeated_boxes_have_no_residual():
         assert found.isfinite().all(2).tolist() == [[True] * 5 + [False]]
 
 
+def noise_of(model):
+    """Return the noise of vehicles that `model` has estimated."""
+    return InputNoise(*(part[0] for part in model.noise()))
+
+
 def add_residuals(model, names, row):
     """Add one residual of each track to `model`, without evidence of extents."""
-    model.add_fits(names, row.numpy(), np.zeros((len(names), 3, 3)))
+    kind = torch.zeros(len(names), dtype=torch.int64)
+    model.add_fits(names, kind, row.numpy(), np.zeros((len(names), 3, 3)))
 
 
 def test_noise_of_a_stream():
@@ -169,16 +202,16 @@ def test_noise_of_a_stream():
     values = autoregressive(4, 40, np.ones(9), 0.5, seed=2)
     lengths = [40, 30, MIN_OBSERVATIONS_FOR_NOISE, MIN_OBSERVATIONS_FOR_NOISE - 1]
     model = InputModel(FACES)
-    assert model.noise().weight == 0
+    assert noise_of(model).weight == 0
     for i in range(40):
         alive = [b for b in range(4) if i < lengths[b]]
         add_residuals(model, [str(b) for b in alive], values[alive, i])
         if i == MIN_OBSERVATIONS_FOR_NOISE - 2:
-            assert model.noise().weight == 0
+            assert noise_of(model).weight == 0
     is_there = torch.arange(40) < torch.tensor(lengths)[:, None]
     known = InputNoise.estimate(torch.where(is_there[..., None], values, torch.nan))
-    np.testing.assert_allclose(model.noise().deviation, known.deviation)
-    np.testing.assert_allclose(model.noise().correlation, known.correlation)
+    np.testing.assert_allclose(noise_of(model).deviation, known.deviation)
+    np.testing.assert_allclose(noise_of(model).correlation, known.correlation)
 
 
 def test_the_last_fits_of_a_track_are_kept():
@@ -189,8 +222,8 @@ def test_the_last_fits_of_a_track_are_kept():
     for row in values.unbind(1):
         add_residuals(model, ['a', 'b', 'c'], row)
     known = InputNoise.estimate(values[:, MAX_FITS_PER_TRACK:])
-    np.testing.assert_allclose(model.noise().deviation, known.deviation)
-    np.testing.assert_allclose(model.noise().correlation, known.correlation)
+    np.testing.assert_allclose(noise_of(model).deviation, known.deviation)
+    np.testing.assert_allclose(noise_of(model).correlation, known.correlation)
 
 
 def test_non_finite_residuals_are_left_out():
@@ -201,8 +234,8 @@ def test_non_finite_residuals_are_left_out():
     for row in values.unbind(1):
         add_residuals(model, ['a', 'b'], row)
     known = InputNoise.estimate(values)
-    np.testing.assert_allclose(model.noise().deviation, known.deviation)
-    np.testing.assert_allclose(model.noise().correlation, known.correlation)
+    np.testing.assert_allclose(noise_of(model).deviation, known.deviation)
+    np.testing.assert_allclose(noise_of(model).correlation, known.correlation)
 
 
 def test_residuals_of_the_tracks_seen_last_are_kept():
@@ -217,7 +250,7 @@ def test_residuals_of_the_tracks_seen_last_are_kept():
         for row in values.unbind(1):
             add_residuals(model, kind, row)
     known = InputNoise.estimate(new)
-    np.testing.assert_allclose(model.noise().deviation, known.deviation)
+    np.testing.assert_allclose(noise_of(model).deviation, known.deviation)
 
 
 # --- extents ------------------------------------------------------------------------------------
@@ -323,17 +356,39 @@ def test_extents_are_expected_as_given_without_evidence(evidence):
 
 def test_the_last_fit_of_a_track_is_its_extent_evidence():
     model = InputModel(FACES)
-    assert not model.noise().extent_evidence.any()
+    assert not len(model.population().evidence)
     nothing = np.full((2, 9), np.nan)
     for value in (1.0, 2.0):
-        model.add_fits(['a', 'b'], nothing, np.full((2, 3, 3), value))
-    np.testing.assert_array_equal(model.noise().extent_evidence, np.full((2, 3, 3), 2.0))
+        model.add_fits(['a', 'b'], torch.tensor([0, 1]), nothing, np.full((2, 3, 3), value))
+    np.testing.assert_array_equal(model.population().evidence, np.full((2, 3, 3), 2.0))
+    assert model.population().kind.tolist() == [0, 1]
     for i in range(MAX_TRACKS):
-        model.add_fits([str(i)], nothing[:1], np.zeros((1, 3, 3)))
-    np.testing.assert_array_equal(model.noise().extent_evidence, np.zeros((MAX_TRACKS, 3, 3)))
+        model.add_fits([str(i)], torch.tensor([1]), nothing[:1], np.zeros((1, 3, 3)))
+    is_own = model.population().kind == 1
+    evidence = model.population().evidence[is_own]
+    np.testing.assert_array_equal(evidence, np.zeros((MAX_TRACKS, 3, 3)))
+
+
+def test_population_of_one_kind_corrects_no_other():
+    true = sizes(100)
+    given = true.median(0).values + 0.5 * (true - true.median(0).values)
+    population = Population(evidence_of(true, given), torch.zeros(100, dtype=torch.int64))
+    problem = problem_of(np.zeros((2, 1, 9)), kind=[0, 1])
+    error = torch.full((2, 3), 0.05, dtype=D)
+    factors = population.factors(problem, given[[0, 0]].exp(), error)
+    np.testing.assert_array_equal(
+        factors[:1], population_factor(population.evidence, given[:1].exp(), error[:1])
+    )
+    np.testing.assert_array_equal(factors[1], 1)
+    assert (factors[0] - 1).abs().max() > 1e-3
 
 
 # --- labelling margins --------------------------------------------------------------------------
+
+
+def offsets_of(model, kind='vehicle'):
+    """Return the offsets that `model` lets expect of one kind of objects, (6,) each."""
+    return FaceOffsets(*(part[KINDS.index(kind)] for part in model.offsets()))
 
 
 def show_faces(
@@ -342,20 +397,20 @@ def show_faces(
     shifts,
     n=5,
     count=100,
-    seen=1.0,
-    fresh=True,
+    seen=True,
     hidden=0.0,
     distant=0.0,
     further=0.0,
+    of_kind='vehicle',
 ):
     """
     Show `model` tracks whose gaps are `shifts` (b, 6) larger than expected of their class.
 
     Points are further inside by the insets of `model` for shares `hidden` and `distant`, and by
-    `further` [m].
+    `further` [m]. Faces are turned away unless `seen`, and known before if that is None.
 
     """
-    offsets = model.offsets()
+    offsets = offsets_of(model, of_kind)
     b = len(names)
     shifts = torch.as_tensor(np.broadcast_to(shifts, (b, 6)).copy(), dtype=D)
     # Distance of the points from where they are expected: from the face less its margin.
@@ -364,14 +419,25 @@ def show_faces(
     shares = torch.stack([hidden * whole, distant * whole])
     inset = hidden * offsets.occlusion_inset + distant * offsets.range_inset + 0 * whole
     observations = FaceObservations(
-        torch.zeros(b, n, 6, 4, 4, dtype=D), out, seen * whole, inset, shares,
+        torch.zeros(b, n, 6, 4, 4, dtype=D), out, bool(seen) * whole, inset, shares,
         count * whole[..., 0],
     )  # fmt: skip
-    model.add_face_observations(names, observations, torch.full((b, n), fresh), offsets)
+    kind = torch.full((b,), KINDS.index(of_kind))
+    model.add_face_observations(
+        names, kind, observations, torch.full((b, n), seen is not None), offsets
+    )
+
+
+def test_margins_of_one_kind_teach_no_other():
+    model = InputModel(FACES)
+    show_faces(model, [str(i) for i in range(20)], 0.05)
+    show_faces(model, [str(i) for i in range(20)], -0.1, of_kind='pedestrian')
+    for kind, known in (('vehicle', 0.05), ('cyclist', 0.0), ('pedestrian', -0.1)):
+        np.testing.assert_allclose(offsets_of(model, kind).gap_correction, known, atol=0.01)
 
 
 def test_insets_are_expected_from_the_settings():
-    offsets = InputModel(FACES).offsets()
+    offsets = offsets_of(InputModel(FACES))
     np.testing.assert_array_equal(offsets.gap_correction, 0)  # relative to the class
     np.testing.assert_allclose(
         offsets.occlusion_inset[:4], [FACES.inset_ends] * 2 + [FACES.inset_sides] * 2
@@ -389,7 +455,7 @@ def test_labelling_margins_are_learnt():
     for start in range(0, 200, 20):
         part = slice(start, start + 20)
         show_faces(model, [str(i) for i in range(200)[part]], shifts[part])
-    np.testing.assert_allclose(model.offsets().gap_correction, 0.02, atol=0.01)
+    np.testing.assert_allclose(offsets_of(model).gap_correction, 0.02, atol=0.01)
 
 
 def test_the_mean_of_a_track_does_not_depend_on_order():
@@ -403,7 +469,7 @@ def test_the_mean_of_a_track_does_not_depend_on_order():
         for name, row in zip(names, shifts, strict=True):
             show_faces(in_parts, [name], row[None])
     np.testing.assert_allclose(
-        in_parts.offsets().gap_correction, at_once.offsets().gap_correction, atol=1e-12
+        offsets_of(in_parts).gap_correction, offsets_of(at_once).gap_correction, atol=1e-12
     )
 
 
@@ -412,18 +478,18 @@ def test_few_or_discordant_tracks_change_little():
     # tracks at -0.4, 0.0 and 0.4 m around the expected gap plus 0.2 have e of 0.77 m at least.
     model = InputModel(FACES)
     show_faces(model, ['a', 'b', 'c'], np.array([[-0.2], [0.2], [0.4]]))
-    change = model.offsets().gap_correction.numpy()
+    change = offsets_of(model).gap_correction.numpy()
     assert (np.abs(change) < 0.2 * 0.75).all()
     assert (np.abs(change[:4]) < 0.2 * 0.25).all()
-    assert max(GAP_DEVIATIONS) < 0.2
+    assert max(GAP_DEVIATIONS['vehicle']) < 0.2
 
 
 @pytest.mark.parametrize(
     'unfit',
     [
-        {'seen': 0.0},
+        {'seen': False},
         {'count': 29},
-        {'fresh': False},
+        {'seen': None},
         {'shifts': 0.6},
         {'n': 2},
     ],
@@ -433,7 +499,7 @@ def test_unfit_observations_are_not_learnt_from(unfit):
     model = InputModel(FACES)
     given = {'shifts': 0.04, **unfit}
     show_faces(model, [str(i) for i in range(50)], **given)
-    np.testing.assert_array_equal(model.offsets().gap_correction, 0)
+    np.testing.assert_array_equal(offsets_of(model).gap_correction, 0)
 
 
 def test_occlusion_insets_are_learnt_from_occluded_faces_only():
@@ -441,7 +507,7 @@ def test_occlusion_insets_are_learnt_from_occluded_faces_only():
     # for the margin of visible faces.
     model = InputModel(FACES)
     show_faces(model, [str(i) for i in range(50)], 0.0, hidden=1.0, further=-0.05)
-    found = model.offsets()
+    found = offsets_of(model)
     # Points 0.05 m further out than expected: the inset is nearly that much smaller.
     assert FACES.inset_ends - 0.05 <= found.occlusion_inset[0] < FACES.inset_ends - 0.045
     assert FACES.inset_sides - 0.05 <= found.occlusion_inset[2] < FACES.inset_sides - 0.045
@@ -461,18 +527,18 @@ def test_range_insets_are_learnt_from_distant_faces():
     # Distant faces alone are no evidence of the margin.
     model = InputModel(FACES)
     far_and_near(model, 0.04, 0.12)
-    offsets = model.offsets()
+    offsets = offsets_of(model)
     np.testing.assert_allclose(offsets.gap_correction, 0.04, atol=1e-3)
     np.testing.assert_allclose(offsets.range_inset[:4], 0.12, atol=5e-3)
     alone = InputModel(FACES)
     show_faces(alone, [str(i) for i in range(50)], 0.04, distant=0.51)
-    np.testing.assert_array_equal(alone.offsets().gap_correction, 0)
+    np.testing.assert_array_equal(offsets_of(alone).gap_correction, 0)
 
 
 def test_without_distant_objects_there_is_no_range_inset():
     model = InputModel(FACES)
     show_faces(model, [str(i) for i in range(50)], 0.04)
-    np.testing.assert_array_equal(model.offsets().range_inset, 0)
+    np.testing.assert_array_equal(offsets_of(model).range_inset, 0)
 
 
 def test_learning_of_margins_can_be_switched_off():
@@ -481,7 +547,7 @@ def test_learning_of_margins_can_be_switched_off():
     model = InputModel(FaceConfig(learn=False))
     far_and_near(model, 0.04, 0.12)
     show_faces(model, [f'hidden {i}' for i in range(50)], 0.0, hidden=1.0, further=-0.05)
-    offsets = model.offsets()
+    offsets = offsets_of(model)
     np.testing.assert_array_equal(offsets.gap_correction, 0)
     np.testing.assert_allclose(
         offsets.occlusion_inset[:4], [FACES.inset_ends] * 2 + [FACES.inset_sides] * 2
@@ -497,8 +563,8 @@ def test_only_the_tracks_seen_last_are_kept():
     new = [f'new {i}' for i in range(MAX_TRACKS)]
     for learner in (model, known):
         show_faces(learner, new, -0.02)
-    np.testing.assert_allclose(model.offsets().gap_correction, known.offsets().gap_correction)
-    assert model.offsets().gap_correction[0] == pytest.approx(-0.02, abs=1e-3)
+    np.testing.assert_allclose(offsets_of(model).gap_correction, offsets_of(known).gap_correction)
+    assert offsets_of(model).gap_correction[0] == pytest.approx(-0.02, abs=1e-3)
 
 
 def test_labelling_margins_are_learnt_from_face_observations():
@@ -516,13 +582,35 @@ def test_labelling_margins_are_learnt_from_face_observations():
     boxes[..., 3:6] = 2 * half
     problem = problem_of(boxes, points=points, origins=np.repeat(origins[:, None], N, 1))
     model = InputModel(FaceConfig(inset_ends=0.0, inset_sides=0.0))
-    offsets = model.offsets()
+    offsets = offsets_of(model)
     car = Config().vehicle
     expected = [car.gap_ends] * 2 + [car.gap_sides] * 2 + [car.gap_top, car.gap_bottom]
     state = State(problem.pose, shared_of(B=B, GAP=expected))
     observations = observe_faces(problem, state, offsets, Config())
-    model.add_face_observations([str(b) for b in range(B)], observations, problem.valid, offsets)
+    names = [str(b) for b in range(B)]
+    model.add_face_observations(names, problem.kind, observations, problem.valid, offsets)
     # The weight of the tracks is near 1: their error, 1.25 * 0.02 m / sqrt(12), against 0.05 m.
-    found = np.array(expected) + model.offsets().gap_correction.numpy()
+    found = np.array(expected) + offsets_of(model).gap_correction.numpy()
     np.testing.assert_allclose(found[:5], 0.11, atol=0.003)
-    assert model.offsets().gap_correction[5] == 0
+    assert offsets_of(model).gap_correction[5] == 0
+
+
+# --- angles to learn at -------------------------------------------------------------------------
+
+
+def test_angles_are_smoothed_as_far_as_they_are_noisy():
+    # A car turns at 0.5 rad/s. An exact heading stays as it is; of noise of 0.2 rad remains what
+    # a straight line through ten values has: about 0.06 in its middle. Padding does not count.
+    rng = np.random.default_rng(0)
+    boxes = np.zeros((200, 12, 9))
+    boxes[..., 8] = 0.05 * np.arange(12)
+    exact = boxes[..., 8].copy()
+    boxes[100:, :, 8] += 0.2 * rng.normal(size=(100, 12))
+    boxes[:, 10:, 8] = boxes[:, 9:10, 8]
+    valid = np.arange(12) < np.full((200, 1), 10)
+    numbers = {'turning': 0.8, 'tilting': 0.2}
+    problem = problem_of(boxes, valid=valid, class_numbers=numbers)
+    off = smoothed_angles(problem)[..., 2].numpy() - exact
+    np.testing.assert_allclose(off[:100, :10], 0, atol=1e-9)
+    assert 0.04 < off[100:, 4:6].std() < 0.1
+    assert off[100:, :10].std() < 0.14

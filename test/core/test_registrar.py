@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from boxreg_ros import Config, refine
+from boxreg_ros.config import Ingredients
 from boxreg_ros.core import input_model as calibration
 from boxreg_ros.core import registration
 from boxreg_ros.core.geometry import face_distances
@@ -179,8 +180,8 @@ def test_sweeps_may_be_added_long_before_their_boxes(stream, estimate):
 
 @each_estimate
 def test_deskew_compensates_points_measured_before_the_stamp(estimate):
-    # A car at 10 m/s whose points are all 20 ms old: 0.2 m behind. `deskew` moves them to the
-    # position of the car at the stamp.
+    # A car at 10 m/s whose points are all 20 ms old: 0.2 m behind its boxes, which are of the
+    # stamp. `deskew` moves the points there.
     truth = drive(14, speed=10.0, turn=0.0, start=(-8.0, 6.0, 0.0))
     errors = []
     for seed in range(3):
@@ -189,7 +190,10 @@ def test_deskew_compensates_points_measured_before_the_stamp(estimate):
             for s, b in stream_of([track_of(truth, np.random.default_rng(seed))])
         ]
         for deskew in (False, True):
-            results, _ = run(late, config_with(estimate, **{'sampling.deskew': deskew}))
+            changed = config_with(
+                estimate, **{'sampling.deskew': deskew, 'sampling.box_time': 'stamp'}
+            )
+            results, _ = run(late, changed)
             boxes = np.array([r.boxes.boxes[0] for r in finals(results)])
             errors.append(np.abs((boxes - truth)[2:, 0]).mean())
     assert np.mean(errors[1::2]) < 0.5 * np.mean(errors[::2])
@@ -409,6 +413,7 @@ def test_a_gap_longer_than_max_gap_starts_a_new_track(estimate, no_extent_law):
     # The same id after a gap of 0.9 s or 1.1 s. After the longer one the following boxes are
     # refined as those of a new track; the input model keeps what it has learnt.
     config = config_with(estimate, max_gap=1.0, **{'faces.learn': False})
+    config = replace(config, ingredients=Ingredients(noise_estimation=False))
     track = track_of(drive(28), np.random.default_rng(0))
     whole = stream_of([track])
     for gap, is_new in ((8, False), (9, False), (10, True)):
@@ -425,9 +430,10 @@ def test_a_gap_longer_than_max_gap_starts_a_new_track(estimate, no_extent_law):
 
 @pytest.mark.parametrize('estimate', ['early', 'final'])
 def test_a_new_track_of_a_known_id_has_no_prior(estimate, no_extent_law):
-    # Eight boxes, a gap, then eight with the same id, in windows of six; too few to measure the
-    # noise of the input. The boxes after the gap equal those of the second part alone.
+    # Eight boxes, a gap, then eight with the same id, in windows of six, without
+    # the noise of the input. The boxes after the gap equal those of the second part alone.
     config = config_with(estimate, max_gap=1.0, **{'faces.learn': False})
+    config = replace(config, ingredients=Ingredients(noise_estimation=False))
     whole = stream_of([track_of(drive(30), np.random.default_rng(0), 'a')])
     registrar = BoxRegistrar(config)
     fed(registrar, whole[:8])

@@ -312,8 +312,8 @@ def test_expected_bias_by_hand(weight, fast, slow):
     state = State(problem.pose, expect(problem, NO_OFFSETS).shared)
     observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
     error = problem.of_class(*POSE_ERRORS)
-    deviation = torch.cat([2 * error[0], torch.ones(3, dtype=D)])
-    noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), weight=weight)
+    deviation = torch.full((9,), 2.0, dtype=D)
+    noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), weight=torch.tensor([weight]))
     (information,) = (
         term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
         for term in weigh(problem, state, observations, expect(problem, NO_OFFSETS, noise), ALONE)
@@ -341,9 +341,13 @@ def test_expected_bias_of_low_noise_input_by_hand(offset, lasting):
     state = State(problem.pose, expect(problem, NO_OFFSETS).shared)
     observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
     error, extent = problem.of_class(*POSE_ERRORS), kinds['extent'][:, None]
-    usual = torch.cat([error, extent.expand(-1, 3)], 1)[0]
     parts = torch.tensor([1.5, 0.5, 9, 9, 9, 9, 1, 9, 9], dtype=D)  # 1 on average, of three
-    noise = InputNoise(0.01 * usual, torch.full((9,), 0.9, dtype=D), parts * offset * usual, 1.0)
+    noise = InputNoise(
+        torch.full((9,), 0.01, dtype=D),
+        torch.full((9,), 0.9, dtype=D),
+        parts * offset,
+        torch.ones(1, dtype=D),
+    )
     (weight,) = (
         term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
         for term in weigh(problem, state, observations, expect(problem, NO_OFFSETS, noise), ALONE)
@@ -355,7 +359,7 @@ def test_expected_bias_of_low_noise_input_by_hand(offset, lasting):
     extents = found[:, batch.EXTENT] / state.shared[:, batch.EXTENT] / extent
     np.testing.assert_allclose(extents, np.full((1, 3), min(1.0, 2 * lasting)), rtol=1e-9)
     # Margins of low-noise input differ by up to twice as much.
-    loose = found[:, batch.GAP] / ALONE.faces.spread
+    loose = found[:, batch.GAP] / ALONE.vehicle.gap_spread
     np.testing.assert_allclose(loose, np.full((1, 6), max(1.0, 2 - 2 * lasting)), rtol=1e-9)
 
 
@@ -375,7 +379,7 @@ def test_robust_prior_of_labelling_margins_by_hand():
     face_weight[0, 2, 4] = 0.0
     observations = observations._replace(distance=distance, weight=face_weight)
     state = State(problem.pose, expected.shared.clone())
-    state.shared[0, left] += 2 * ALONE.faces.spread
+    state.shared[0, left] += 2 * ALONE.vehicle.gap_spread
     (weight,) = (
         term.weight[0, 0, 0].diagonal()
         for term in weigh(problem, state, observations, expected, ALONE)
@@ -383,9 +387,9 @@ def test_robust_prior_of_labelling_margins_by_hand():
     )
     part, height = (0.385 - 0.15) / 0.3, drive(1)[0, 5]
     z, half = part * ALONE.vehicle.height, part * ALONE.vehicle.extent * height / 2
-    known = np.full(22, ALONE.faces.spread)
+    known = np.full(22, ALONE.vehicle.gap_spread)
     known[left] *= 2**0.5
-    known[top] *= (1 + 0.3**2 / (ALONE.faces.spread**2 + z**2 + half**2) / 4) ** 0.5
+    known[top] *= (1 + 0.3**2 / (ALONE.vehicle.gap_spread**2 + z**2 + half**2) / 4) ** 0.5
     np.testing.assert_allclose(weight[batch.GAP] ** -0.5, known[batch.GAP], rtol=1e-9)
 
 

@@ -379,7 +379,7 @@ def test_points_are_motion_compensated_by_their_times():
             item = replace(item, points=item.points + 15.0 * times[:, None] * heading, times=times)
         late.append(item)
     tracks = changes_of(truth, truth)
-    deskewing = Config().updated({'sampling.deskew': True})
+    deskewing = Config().updated({'sampling.box_time': 'stamp'})
     blurred, _ = cells_of(tracks, late)
     sharp, _ = cells_of(tracks, late, deskewing)
     exact, _ = cells_of(tracks, items)

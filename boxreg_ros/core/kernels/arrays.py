@@ -65,12 +65,14 @@ class ExpectedArrays(NamedTuple):
     widened_deviation: Any
 
 
-class MotionDeviations(NamedTuple):
+class ClassDeviations(NamedTuple):
     """
-    Deviations of the motion of the class of each window.
+    Deviations of the class of each window.
 
     Attributes
     ----------
+    faces : array, shape (B, 6)
+        Of one observation of each face [m].
     acceleration : array, shape (B, 6)
         Of the accelerations along the axes of the body.
     slip : array, shape (B, 2)
@@ -82,6 +84,7 @@ class MotionDeviations(NamedTuple):
 
     """
 
+    faces: Any
     acceleration: Any
     slip: Any
     zero_motion: Any
@@ -170,8 +173,6 @@ class WeightNumbers(NamedTuple):
     driving_span: int
     driving_reach: int
     face_outlier: float
-    spread: float
-    face_deviations: tuple[float, ...]
     is_robust: bool
 
 

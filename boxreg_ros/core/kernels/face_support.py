@@ -240,7 +240,7 @@ def observe_faces(
         Input of the windows.
     poses, shared : array, shapes (B, N, 6) and (B, 22)
         Boxes of this round.
-    occlusion_inset, range_inset : array, shape (6,)
+    occlusion_inset, range_inset : array, shape (B, 6)
         As in `boxreg_ros.core.face_support.FaceOffsets` [m].
     numbers : FaceNumbers
         Constants and settings.
@@ -288,7 +288,7 @@ def observe_faces(
             box, pose, origin = windows.boxes[b, n], poses[b, n], windows.origins[b, n]
             fill_visibility(box, origin, points, numbers, R, tangent)
             fill_insets(
-                origin, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight
+                origin, tangent, occlusion_inset[b], range_inset[b], numbers, shares, inset, weight
             )
             for k in range(3):
                 shift[k] = pose[k] - box[k]
@@ -326,24 +326,32 @@ def observe_faces(
 
 
 @kernel
-def count_held(begin, end, windows, poses, extents, margin, held):
+def count_held(begin, end, windows, poses, extents, margin, is_moving, held):
     """
     Write how many points are in each box, or less than `margin` outside of it, (B, N).
 
-    Boxes at `poses` (B, N, 6) of `extents` (B, N, 3); windows `begin` to `end`.
+    Boxes at `poses` (B, N, 6) of `extents` (B, N, 3); windows `begin` to `end`. With `is_moving`
+    points are at the stamp of their box (M12).
 
     """
     R = np.empty((3, 3))
+    velocity = np.zeros(3)
+    shift = np.empty(3)
     for b in range(begin, end):
         for n in range(windows.lengths[b]):
             pose, extent, box = poses[b, n], extents[b, n], windows.boxes[b, n]
             fill_rotation(pose[3], pose[4], pose[5], R)
+            if is_moving:
+                fill_velocity(poses[b], windows.times[b], n, windows.lengths[b], velocity)
+            for k in range(3):
+                shift[k] = pose[k] - box[k]
             points = returns_of(windows, windows.points, b, n)
+            delays = returns_of(windows, windows.delays, b, n)
             count = 0
             for i in range(len(points)):
-                x = points[i, 0] - (pose[0] - box[0])
-                y = points[i, 1] - (pose[1] - box[1])
-                z = points[i, 2] - (pose[2] - box[2])
+                x = points[i, 0] - velocity[0] * delays[i] - shift[0]
+                y = points[i, 1] - velocity[1] * delays[i] - shift[1]
+                z = points[i, 2] - velocity[2] * delays[i] - shift[2]
                 outside = -margin
                 for k in range(3):
                     along = R[0, k] * x + R[1, k] * y + R[2, k] * z

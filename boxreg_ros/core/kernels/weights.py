@@ -117,15 +117,15 @@ def fill_input_weights(
 
 
 @kernel
-def fill_face_weights(distance, weight, off_track, length, numbers, face_weight):
+def fill_face_weights(distance, weight, off_track, length, deviation, numbers, face_weight):
     """Write the weights of the faces (M20), (N, 6) [1/m^2]."""
     for n in range(length):
         off = off_track[n, 0] ** 2 + off_track[n, 1] ** 2
         same_object = 1 / (1 + off**2) ** 2
         for face in range(6):
             robust = 1 / (1 + (distance[n, face] / numbers.face_outlier) ** 2) ** 2
-            variance = numbers.face_deviations[face] ** 2
-            face_weight[n, face] = weight[n, face] * robust * same_object / variance
+            precision = robust * same_object / deviation[face] ** 2
+            face_weight[n, face] = weight[n, face] * precision
 
 
 @kernel
@@ -151,11 +151,11 @@ def fill_shared_weights(shared, expected, deviation, distance, face_weight, leng
             pull += distance[n, face] * face_weight[n, face]
         # Points and the face of the input are apart by margin, bias and half the extent's error.
         half_extent = deviation[EXTENT + axis] / 2
-        variance = numbers.spread**2 + deviation[BIAS + axis] ** 2 + half_extent**2
+        spread = deviation[GAP + face]
+        variance = spread**2 + deviation[BIAS + axis] ** 2 + half_extent**2
         of_points = (pull / max(total, 1e-9)) ** 2 / variance
-        of_gap = (shared[GAP + face] - expected[GAP + face]) ** 2 / numbers.spread**2
+        of_gap = (shared[GAP + face] - expected[GAP + face]) ** 2 / spread**2
         off = max(of_points, of_gap)
-        spread = deviation[GAP + face] * numbers.spread
         W[GAP + face, GAP + face] = 1 / (spread**2 * (1 + off / numbers.gap_outlier**2))
 
 
@@ -216,7 +216,7 @@ def robustify_motion(poses, times, pivot, length, numbers, W_acceleration, W_sli
 
 
 @kernel
-def weigh_windows(begin, end, windows, poses, shared, faces, expected, motion, numbers, terms):
+def weigh_windows(begin, end, windows, poses, shared, faces, expected, of_class, numbers, terms):
     """
     Write data and weights of the terms of the windows `begin` to `end`.
 
@@ -230,7 +230,7 @@ def weigh_windows(begin, end, windows, poses, shared, faces, expected, motion, n
         Face observations.
     expected : ExpectedArrays
         Means and deviations of input and shared variables.
-    motion : MotionDeviations
+    of_class : ClassDeviations
         Of the class of each window.
     numbers : WeightNumbers
         Constants and settings.
@@ -250,7 +250,9 @@ def weigh_windows(begin, end, windows, poses, shared, faces, expected, motion, n
             fill_rotation(poses[b, n, 3], poses[b, n, 4], poses[b, n, 5], axes[n])
         fill_neighbour_deviation(boxes, times, length, axes, numbers, off_track)
         distance = faces.distance[b]
-        fill_face_weights(distance, faces.weight[b], off_track, length, numbers, face_weight)
+        fill_face_weights(
+            distance, faces.weight[b], off_track, length, of_class.faces[b], numbers, face_weight
+        )
         for n in range(length):
             scale_moments(faces.moments[b, n], face_weight[n], terms.W_faces[b, n])
         deviation = expected.pose_deviation[b]
@@ -262,15 +264,15 @@ def weigh_windows(begin, end, windows, poses, shared, faces, expected, motion, n
             shared[b], expected.shared[b], expected.deviation[b], distance, face_weight, length,
             numbers, terms.W_shared[b],
         )  # fmt: skip
-        fill_acceleration_weights(axes, motion.acceleration[b], length, terms.W_acceleration[b])
-        yaw_deviation = max(deviation[5], motion.heading[b])
+        fill_acceleration_weights(axes, of_class.acceleration[b], length, terms.W_acceleration[b])
+        yaw_deviation = max(deviation[5], of_class.heading[b])
         fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked)
         for n in range(length - 1):
             for k in range(2):
-                terms.W_slip[b, n, k, k] = 1 / motion.slip[b, k] ** 2
+                terms.W_slip[b, n, k, k] = 1 / of_class.slip[b, k] ** 2
             if parked[n]:
                 for k in range(6):
-                    terms.W_zero_motion[b, n, k, k] = 1 / motion.zero_motion[b, k] ** 2
+                    terms.W_zero_motion[b, n, k, k] = 1 / of_class.zero_motion[b, k] ** 2
         if numbers.is_robust:
             robustify_motion(
                 poses[b], times, shared[b, PIVOT], length, numbers, terms.W_acceleration[b],

@@ -1,0 +1,117 @@
+"""
+The time that input boxes are of: the stamp, or when the sweep saw the object.
+
+While a sweep takes place, a vehicle at 30 m/s moves by 3 m. Boxes of one convention are at its
+points, those of the other are ahead of or behind them. docs/method.md (M12).
+
+"""
+
+from collections import Counter
+from dataclasses import replace
+from typing import Any
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.observation import crop
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import Floats, LENGTH, ROLL, Sweep, X, Z
+import numpy as np
+from numpy.typing import NDArray
+
+# All of these are chosen.
+SIGHT_MARGIN = 1.0
+"""Points up to this far outside a box give the time at which the sweep saw it [m]."""
+MIN_MOTION = 0.3
+"""Least motion between stamp and sight that is evidence [m]: twice the error of an input box."""
+MIN_VOTE_POINTS = 10
+"""Fewest points of a box that is evidence."""
+MAX_FACE_DISTANCE = 0.5
+"""Points count as no further from the nearest face of a box than this [m]."""
+MIN_DIFFERENCE = 0.02
+"""Least difference of the mean distance of the points from a face that is evidence [m]."""
+MIN_VOTES = 10
+"""Fewest boxes that decide; without them boxes are taken to be at the time of sight."""
+MIN_MAJORITY = 0.6
+"""Least part of these boxes that decides."""
+
+
+def motion_to_sight(sweep: Sweep, boxes: Floats, velocities: Floats) -> Floats:
+    """
+    Return how far each object moves from the stamp until the sweep sees it, (n, 3) [m].
+
+    Of `boxes` (n, 9) with `velocities` (n, 3) [m/s]. Zero without times of the points, and
+    without points near a box.
+
+    """
+    motion = np.zeros((len(boxes), 3))
+    if sweep.times is None or not len(sweep.times):
+        return motion
+    most = np.abs(sweep.times).max() * np.linalg.norm(velocities, axis=1)
+    moving = np.flatnonzero(most > MIN_MOTION)
+    if not len(moving):
+        return motion
+    near = crop(sweep.points, boxes[moving], SIGHT_MARGIN)
+    is_near = near.outside.max(0) < SIGHT_MARGIN
+    rows, owner = near.row[is_near], near.owner[is_near]
+    for i, box in enumerate(moving):
+        times = sweep.times[rows[owner == i]]
+        if len(times):
+            motion[box] = velocities[box] * np.median(times)
+    return motion
+
+
+def swept(boxes: Floats, motion: Floats) -> Floats:
+    """Return boxes (n, 9) that hold each object both at the stamp and after its `motion`."""
+    whole = boxes.copy()
+    whole[:, X : Z + 1] += motion / 2
+    whole[:, LENGTH] += np.linalg.norm(motion, axis=1)
+    return whole
+
+
+class BoxTimeEvidence:
+    """Votes of fast objects for the time that the input boxes are of."""
+
+    def __init__(self) -> None:
+        self.votes = Counter[str]()
+
+    def add(self, box: Floats, points: NDArray[np.floating], motion: Floats) -> None:
+        """
+        Compare a box (9,) with its points, as measured and moved back to the stamp.
+
+        The points (M, 3) are relative to the centre of the box [m]; they are on the surface of the
+        object: near the faces of a box of their own time.
+
+        """
+        if np.linalg.norm(motion) < MIN_MOTION or len(points) < MIN_VOTE_POINTS:
+            return
+        at_sight = _distance_from_faces(box, points)
+        at_stamp = _distance_from_faces(box, points - motion)
+        if abs(at_sight - at_stamp) > MIN_DIFFERENCE:
+            self.votes['sight' if at_sight < at_stamp else 'stamp'] += 1
+
+    def decided(self) -> str:
+        """Return ``stamp`` or ``sight``; ``unknown`` without enough evidence."""
+        total = self.votes.total()
+        if total < MIN_VOTES:
+            return 'unknown'
+        name, count = self.votes.most_common(1)[0]
+        return name if count >= MIN_MAJORITY * total else 'unknown'
+
+    def summary(self, config: Config) -> dict[str, Any]:
+        """Return the setting, what the votes decide, and the number of votes for each time."""
+        setting = config.sampling.box_time
+        votes = {name: self.votes[name] for name in ('stamp', 'sight')}
+        return {'setting': setting, 'estimated': self.decided(), 'votes': votes}
+
+    def resolved(self, config: Config) -> Config:
+        """Return `config` with `sampling.box_time` as the votes decide, if it is ``auto``."""
+        if config.sampling.box_time != 'auto':
+            return config
+        box_time = 'stamp' if self.decided() == 'stamp' else 'sight'
+        return replace(config, sampling=replace(config.sampling, box_time=box_time))
+
+
+def _distance_from_faces(box: Floats, points: NDArray[np.floating]) -> float:
+    """Return the mean distance of points (M, 3) from the nearest face of a box [m]."""
+    local = np.abs(points @ matrix_from_rpy(box[ROLL:]))
+    outside = (local - box[LENGTH:ROLL] / 2).max(1)
+    return float(np.abs(outside).clip(max=MAX_FACE_DISTANCE).mean())

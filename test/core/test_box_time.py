@@ -1,0 +1,82 @@
+"""The time that input boxes are of, from fast objects whose convention is known."""
+
+from dataclasses import replace
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.box_time import (
+    BoxTimeEvidence,
+    MIN_VOTE_POINTS,
+    MIN_VOTES,
+    motion_to_sight,
+    swept,
+)
+from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.simulation.scenarios import highway
+from boxreg_ros.structures import Sweep
+import numpy as np
+import pytest
+
+BOX = np.array([20.0, 0, 0, 4, 2, 1.5, 0, 0, 0])
+
+
+def surface(n=MIN_VOTE_POINTS):
+    """Return points on the rear face of `BOX`, relative to its centre."""
+    return np.stack([np.full(n, -2.0), np.linspace(-0.9, 0.9, n), np.zeros(n)], 1)
+
+
+def test_motion_to_sight_is_that_of_the_points_of_the_box():
+    # A box at 30 m/s whose points are 40 ms old, one at rest, and one without points.
+    boxes = np.array([BOX, BOX, BOX])
+    boxes[1, 1] = 50.0
+    boxes[2, 1] = 100.0
+    points = np.concatenate([surface() + boxes[0, :3], surface() + boxes[1, :3]])
+    times = np.full(len(points), -0.04)
+    velocities = np.array([[30.0, 0, 0], [0, 0, 0], [30.0, 0, 0]])
+    sweep = Sweep(0, 'odom', points, times)
+    motion = motion_to_sight(sweep, boxes, velocities)
+    np.testing.assert_allclose(motion, [[-1.2, 0, 0], [0, 0, 0], [0, 0, 0]])
+    assert not motion_to_sight(replace(sweep, times=None), boxes, velocities).any()
+    whole = swept(boxes, motion)
+    np.testing.assert_allclose(whole[0, [0, 3]], [20 - 0.6, 4 + 1.2])
+    np.testing.assert_array_equal(whole[1:], boxes[1:])
+
+
+@pytest.mark.parametrize('known', ['stamp', 'sight'])
+def test_points_on_the_faces_decide(known):
+    evidence = BoxTimeEvidence()
+    assert evidence.decided() == 'unknown'
+    assert evidence.resolved(Config()).sampling.box_time == 'sight'
+    motion = np.array([-1.2, 0, 0])
+    points = surface() + motion * (known == 'stamp')
+    for _ in range(MIN_VOTES):
+        evidence.add(BOX, points, 0.1 * motion)  # slow
+        evidence.add(BOX, points[1:], motion)  # few points
+    assert not evidence.votes
+    for _ in range(MIN_VOTES):
+        evidence.add(BOX, points, motion)
+    assert evidence.votes == {known: MIN_VOTES}
+    assert evidence.resolved(Config()).sampling.box_time == known
+    other = 'sight' if known == 'stamp' else 'stamp'
+    config = Config().updated({'sampling.box_time': other})
+    assert evidence.resolved(config) == config
+    for _ in range(MIN_VOTES):  # as many for the other: undecided
+        evidence.add(BOX, surface() + motion * (other == 'stamp'), motion)
+    assert evidence.decided() == 'unknown'
+
+
+@pytest.mark.parametrize('at_sight', [False, True], ids=['stamp', 'sight'])
+def test_fast_vehicles_are_as_accurate_as_slow_ones(at_sight):
+    # The same scene at 5 and at 30 m/s, with boxes of either time.
+    mean = []
+    for speed in (5.0, 30.0):
+        scene = highway(np.random.default_rng(0), 25, at_sight, speed)
+        drive = Drive.from_scene(scene)
+        boxes = drive.registered(Config(estimate='track'))['track']
+        names = zip(boxes.stamps_ns, boxes.track_ids, strict=True)
+        row_of = dict(zip(names, boxes.boxes, strict=True))
+        keys = list(zip(drive.truth.stamps_ns, drive.truth.track_ids, strict=True))
+        rows = [i for i, key in enumerate(keys) if key in row_of]
+        found = np.array([row_of[keys[i]] for i in rows])
+        mean.append(iou_3d(found, drive.truth.boxes[rows]).mean())
+    assert mean[1] > mean[0] - 0.01
