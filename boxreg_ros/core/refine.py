@@ -90,10 +90,10 @@ class Track:
             self._set('sensor_origins', checked('sensor_origins', self.sensor_origins, (n, 3)))
         if self.scores is not None:
             self._set('scores', checked('scores', self.scores, (n,)))
-        self._set('pinned', self._checked_pins(n))
+        if self.pinned is not None:
+            self._set('pinned', self._checked_pins(np.asarray(self.pinned), n))
 
-    def _checked_pins(self, n: int) -> NDArray[np.bool_]:
-        pinned = np.zeros(n, bool) if self.pinned is None else np.asarray(self.pinned)
+    def _checked_pins(self, pinned: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:
         if pinned.dtype != bool or pinned.shape != (n,):
             raise ShapeError(
                 f'pinned of track {self.track_id!r}: expected booleans of shape ({n},), got '
