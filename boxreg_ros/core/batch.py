@@ -152,7 +152,7 @@ class Problem(NamedTuple):
 
     @property
     def points(self) -> Tensor:
-        """Returns minus the centre of their input box, padded, shape (B, N, M, 3) [m]."""
+        """Return the returns minus the centre of their input box, padded, (B, N, M, 3) [m]."""
         return self.padded()[0]
 
     @property

@@ -186,7 +186,7 @@ def test_each_kind_has_its_own_errors():
 
 
 def test_short_tracks_give_no_errors():
-    found = input_errors(noisy_drive(DEVIATION, n=13), Config())
+    found = input_errors(noisy_drive(DEVIATION, n=4), Config())
     assert found['vehicle.position'].tracks == 0
     assert calibrated(Config(), found) == {}
 

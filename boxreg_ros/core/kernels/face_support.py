@@ -236,6 +236,8 @@ def observe_faces(
 
     Parameters
     ----------
+    begin, end : int
+        First window, and the one after the last.
     windows : WindowArrays
         Input of the windows.
     poses, shared : array, shapes (B, N, 6) and (B, 22)
