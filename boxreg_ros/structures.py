@@ -29,6 +29,8 @@ REFINED, KEPT = 'refined', 'kept'
 INTERPOLATED, EXTENDED, REJECTED = 'interpolated', 'extended', 'rejected'
 ADDED = (INTERPOLATED, EXTENDED)
 """Status of boxes that the input does not have."""
+HUMAN = 'human'
+"""Status of a box that a person has corrected and pinned."""
 
 
 def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
@@ -129,6 +131,9 @@ class BoxArray:
         As defined in the docstring of the module; invalid boxes are allowed and returned as kept.
     ticket : object
         Any object of the caller; returned unchanged with the refined boxes, in their ``boxes``.
+    pinned : array, shape (n,), or None
+        True for boxes that a person has corrected: they are held, and the rest of their track
+        follows them. None for none.
 
     """
 
@@ -139,6 +144,7 @@ class BoxArray:
     scores: Floats
     boxes: Floats
     ticket: object = field(default=None, compare=False, repr=False)
+    pinned: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         """Check that all columns have one length."""
@@ -147,6 +153,8 @@ class BoxArray:
         checked('scores', self.scores, (n,))
         if len(self.class_names) != n:
             raise ShapeError(f'class_names: expected {n}, got {len(self.class_names)}')
+        if self.pinned is not None and self.pinned.shape != (n,):
+            raise ShapeError(f'pinned: expected shape ({n},), got {self.pinned.shape}')
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +168,8 @@ class RefinedBoxes:
         Refined boxes, otherwise as in the input: stamp, frame, ids, scores and ticket.
     status : tuple of n str
         ``refined``, ``kept`` (the input box is returned unchanged), ``rejected`` (likewise, and
-        no object), ``interpolated`` or ``extended`` (the input has no such box).
+        no object), ``interpolated`` or ``extended`` (the input has no such box), or ``human`` (a
+        pinned box).
     reasons : tuple of n str
         Why a box was kept or rejected; empty for the others.
     num_points : array, shape (n,)

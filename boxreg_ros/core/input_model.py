@@ -102,6 +102,11 @@ CROSS_SLOPE_INFORMATION = 4.0
 """Prior information of slopes over the other two extents: half the deviation of the own one."""
 MIN_EXTENT_GAIN = 0.2
 """Smallest part of the information about an extent that points must provide to be evidence."""
+PINNED_EXTENT = 0.01
+"""Deviation of the extents of a pinned box and of its bias [m, rad]: practically held."""
+PINNED_MARGINS = 4.0
+"""Factor on the deviation of labelling margins beside a pinned box, whose faces are evidence of
+them. Chosen; 4 and 10 give the same."""
 REPEATED_BOX_TOLERANCE = 1e-3
 """A box that differs from the one before by less repeats it [m, rad]."""
 
@@ -332,6 +337,8 @@ class Expectation(NamedTuple):
         Deviation of the input poses along the axes of their boxes, without their bias [m, rad].
     widened_deviation : Tensor, shape (B, 6)
         The same, widened for the correlation of the errors of neighbours [m, rad].
+    unmodelled_bias : Tensor, shape (B, 6)
+        Deviation of the bias of windows with a pinned box, where no bias is estimated; else 0.
 
     """
 
@@ -339,6 +346,7 @@ class Expectation(NamedTuple):
     deviation: Tensor
     pose_deviation: Tensor
     widened_deviation: Tensor
+    unmodelled_bias: Tensor
 
 
 def expect(
@@ -398,19 +406,34 @@ def expect(
     gaps = problem.of_class(*FACE_GAPS) + offsets.of(problem).gap_correction
     size = (mean / mean.new_tensor(LARGE_EXTENT)).clamp(min=1)[:, FACE_AXIS]
     spread = problem.of_class('gap_spread') * size * (2 - 2 * constant[:, :1]).clamp(1)
+    # A pinned box has the true extents, and no bias: its pose is that of the object.
+    has_pin = problem.pinned.any(1)[:, None]
+    extent = torch.where(has_pin, mean, extent)
+    extent_deviation = torch.where(has_pin, PINNED_EXTENT, extent * part)
+    unmodelled = torch.where(has_pin, bias, 0.0)
+    spread = torch.where(has_pin, PINNED_MARGINS, 1.0) * spread
+    bias = torch.where(has_pin, PINNED_EXTENT, bias)
     shared = [extent, 0 * one, gaps, length * problem.of_class('pivot'), 0 * one]
-    deviations = [extent * part, bias, spread, length * PIVOT_DEVIATION, one]
+    deviations = [extent_deviation, bias, spread, length * PIVOT_DEVIATION, one]
     return Expectation(
-        torch.cat(shared, 1), torch.cat(deviations, 1), deviation, deviation * widening
+        torch.cat(shared, 1), torch.cat(deviations, 1), deviation, deviation * widening, unmodelled
     )
 
 
 def _mean_input_extents(problem: Problem) -> Tensor:
-    """Return the mean extents of the input, marginalised observations included, (B, 3) [m]."""
+    """
+    Return the mean extents of the input, marginalised observations included, (B, 3) [m].
+
+    Of windows with pinned boxes the mean extents of these.
+
+    """
+    pinned = problem.pinned[..., None]
+    of_pins = (problem.boxes[..., 3:6] * pinned).sum(1) / pinned.sum(1).clamp(1)
     valid = problem.valid
     total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1)
     total = total + problem.marginalised_extents[:, :3]
-    return total / (valid.sum(1)[:, None] + problem.marginalised_extents[:, 3:])
+    mean = total / (valid.sum(1)[:, None] + problem.marginalised_extents[:, 3:])
+    return torch.where(pinned.any(1), of_pins, mean)
 
 
 def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:

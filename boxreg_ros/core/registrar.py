@@ -227,11 +227,13 @@ class BoxRegistrar:
             seen.relative_to(box, shift)
             for seen, box, shift in zip(found, given, motion / 2, strict=True)
         ]
-        for row, track, moved, observation in zip(rows, tracks, motion, observations, strict=True):
-            self.box_time.add(observation.box, observation.points, moved)
-            array.num_points[row] = observation.num_points
+        for row, track, moved, seen in zip(rows, tracks, motion, observations, strict=True):
+            self.box_time.add(seen.box, seen.points, moved)
+            array.num_points[row] = seen.num_points
             array.reasons[row] = 'short_track'  # until there is an estimate
             array.num_unsettled += 1
+            is_pinned = boxes.pinned is not None and bool(boxes.pinned[row])
+            observation = seen._replace(is_pinned=is_pinned)
             track.entries.append(_Entry(observation, array, row))
             successor = track.split_at_id_switch()
             if successor is not None:

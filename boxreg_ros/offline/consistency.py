@@ -72,7 +72,7 @@ def consistency(
     rows = np.array([i for i, _ in known])
     squared = _normalised(matches, truth, rows, [covariance for _, covariance in known])
     classes = np.array([matches.class_names[i] for i in rows], object)
-    ranges = np.array([covariance.range for _, covariance in known])
+    ranges = np.array([covariance.distance for _, covariance in known])
     found = {'all': _over(squared, np.ones(len(rows), bool))}
     for name in sorted(set(classes)):
         found[str(name)] = _over(squared, np.equal(classes, name))

@@ -455,12 +455,13 @@ def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
     stamps = np.intersect1d(predicted.stamps_ns, truth.stamps_ns)
     return (
         f'no predicted box overlaps a true one: {len(stamps)} stamps are in both; stamps of '
-        f'predicted boxes: {_time_range(predicted.stamps_ns)}, of true boxes: '
-        f'{_time_range(truth.stamps_ns)}; compare boxes of one recording in one frame'
+        f'predicted boxes: {time_range(predicted.stamps_ns)}, of true boxes: '
+        f'{time_range(truth.stamps_ns)}; compare boxes of one recording in one frame'
     )
 
 
-def _time_range(stamps_ns: Ints) -> str:
+def time_range(stamps_ns: Ints) -> str:
+    """Return the first and the last of stamps [ns] as text [s]."""
     return f'{stamps_ns.min() * 1e-9:.3f} to {stamps_ns.max() * 1e-9:.3f} s'
 
 

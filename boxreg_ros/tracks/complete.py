@@ -72,6 +72,9 @@ class PlannedArray:
     def to_register(self, given: BoxArray) -> BoxArray:
         """Return the boxes of an array without rejected ones, and with the added ones."""
         rows = [row for row in range(len(given.track_ids)) if row not in self.rejected]
+        pinned = None
+        if given.pinned is not None:
+            pinned = np.append(given.pinned[rows], np.zeros(len(self.added), bool))
         return replace(
             given,
             track_ids=(*(self.track_ids[i] for i in rows), *(a.track_id for a in self.added)),
@@ -83,6 +86,7 @@ class PlannedArray:
             boxes=np.concatenate(
                 [given.boxes[rows], np.array([a.box for a in self.added]).reshape(-1, 9)]
             ),
+            pinned=pinned,
         )
 
 

@@ -268,9 +268,7 @@ def fitted(given, measured, own, part=0.05):
     error, precision = part * given, torch.ones(1, 22, dtype=D)
     precision[:, :3] = error**-2 + own**-2
     spread = torch.cat([error, torch.ones(1, 19, dtype=D)], 1)
-    expected = Expectation(
-        shared_of(given[0].tolist()), spread, torch.ones(1, 6), torch.ones(1, 6)
-    )
+    expected = Expectation(shared_of(given[0].tolist()), spread, *torch.ones(3, 1, 6))
     known = own**-2 / precision[:, :3]
     shared = shared_of((given * (measured / given) ** known)[0].tolist())
     factor = Factor([], torch.diag_embed(precision.sqrt()))

@@ -68,7 +68,7 @@ def test_evaluate_prints_coverage_and_nees(tmp_path, capsys):
     writer.close()
     known = read_covariances(tmp_path / 'covariances.csv')[0, '3']
     np.testing.assert_allclose(known.pose, 0.01 * np.eye(6))
-    assert known.range == pytest.approx(0.5)
+    assert known.distance == pytest.approx(0.5)
     paths = [str(tmp_path / name) for name in ('boxes.csv', 'truth.csv')]
     assert main(['evaluate', *paths, '--json']) == 0
     found = json.loads(capsys.readouterr().out)['consistency']
