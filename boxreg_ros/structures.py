@@ -11,7 +11,8 @@ header.
 
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 from boxreg_ros.errors import ShapeError
 import numpy as np
@@ -156,6 +157,17 @@ class BoxArray:
         if self.pinned is not None and self.pinned.shape != (n,):
             raise ShapeError(f'pinned: expected shape ({n},), got {self.pinned.shape}')
 
+    def take(self, rows: Sequence[int]) -> 'BoxArray':
+        """Return the boxes `rows` only."""
+        return replace(
+            self,
+            track_ids=tuple(self.track_ids[row] for row in rows),
+            class_names=tuple(self.class_names[row] for row in rows),
+            scores=self.scores[rows],
+            boxes=self.boxes[rows],
+            pinned=None if self.pinned is None else self.pinned[rows],
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class RefinedBoxes:
@@ -207,3 +219,17 @@ class RefinedBoxes:
             object.__setattr__(self, 'face_distances', np.zeros((n, 6)))
         if len(self.outside) != n:
             object.__setattr__(self, 'outside', np.zeros(n))
+
+    def take(self, rows: Sequence[int]) -> 'RefinedBoxes':
+        """Return the boxes `rows` only."""
+        return RefinedBoxes(
+            self.boxes.take(rows),
+            tuple(self.status[row] for row in rows),
+            tuple(self.reasons[row] for row in rows),
+            self.num_points[rows],
+            self.covariances[rows],
+            self.is_final,
+            self.extent_covariances[rows],
+            self.face_distances[rows],
+            self.outside[rows],
+        )

@@ -251,21 +251,7 @@ def _accepted(refined: RefinedBoxes) -> RefinedBoxes:
     if REJECTED not in refined.status:
         return refined
     rows = [row for row, status in enumerate(refined.status) if status != REJECTED]
-    boxes = refined.boxes
-    return RefinedBoxes(
-        replace(
-            boxes,
-            track_ids=tuple(boxes.track_ids[row] for row in rows),
-            class_names=tuple(boxes.class_names[row] for row in rows),
-            scores=boxes.scores[rows],
-            boxes=boxes.boxes[rows],
-        ),
-        tuple(refined.status[row] for row in rows),
-        tuple(refined.reasons[row] for row in rows),
-        refined.num_points[rows],
-        refined.covariances[rows],
-        refined.is_final,
-    )
+    return refined.take(rows)
 
 
 def _heading_flips(boxes: BoxArray, refined: RefinedBoxes) -> int:

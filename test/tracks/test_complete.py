@@ -62,6 +62,26 @@ def test_ghosts_of_the_street_are_rejected_and_objects_are_kept(street):
     assert objects['rejected'] * 300 <= objects.total()
 
 
+def test_boxes_of_complete_tracks_keep_their_evidence(street):
+    # Identity matrices, 1 m^2, stand for unknown covariances.
+    _, results, _ = street
+    refined = [
+        (result, row)
+        for result in results
+        for row, status in enumerate(result.status)
+        if status == 'refined'
+    ]
+    lengths = np.array([result.extent_covariances[row][0, 0] for result, row in refined])
+    assert (lengths < 0.5).mean() > 0.99
+    assert all(
+        np.array_equal(result.extent_covariances[row], np.eye(3))
+        for result in results
+        for row, status in enumerate(result.status)
+        if status == 'rejected'
+    )
+    assert any(result.face_distances[row].any() for result, row in refined)
+
+
 def test_all_boxes_of_the_street_are_returned(street):
     found, results, tracks = street
     assert len(results) == len(found.boxes)
