@@ -291,7 +291,7 @@ def _parsed(row: dict[str, str]) -> Decision:
 
 
 def _box_of(numbers: NDArray[np.float64]) -> Floats:
-    """Return a box (9,) of the `PINNED_BOX_COLUMNS` (10,), NaN angles without a valid quaternion."""
+    """Return a box (9,) of `PINNED_BOX_COLUMNS` (10,), NaN angles without a valid quaternion."""
     quaternion = numbers[3:7]
     norm = np.linalg.norm(quaternion)
     angles = np.full(3, np.nan)
