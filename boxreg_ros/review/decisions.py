@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 DECISIONS = 'decisions.csv'
-KINDS = ('accept', 'reject', 'unsure', 'pin', 'none')
-POSE_COLUMNS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height')
-COLUMNS = ('track_id', 'stamp_ns', 'decision', 'comment', 'frame_id', *POSE_COLUMNS)
+DECISION_KINDS = ('accept', 'reject', 'unsure', 'pin', 'none')
+PINNED_BOX_COLUMNS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height')
+DECISION_COLUMNS = ('track_id', 'stamp_ns', 'decision', 'comment', 'frame_id', *PINNED_BOX_COLUMNS)
 REJECTED = 'rejected'
 """Reason of boxes that are kept because a person rejected the refined ones."""
 MAX_COMMENT = 2000
@@ -79,9 +79,9 @@ class Decision:
 
     def __post_init__(self) -> None:
         """Check the decision."""
-        if self.kind not in KINDS:
+        if self.kind not in DECISION_KINDS:
             raise RecordingError(
-                f'decision: expected one of {", ".join(KINDS)}, got {self.kind!r}'
+                f'decision: expected one of {", ".join(DECISION_KINDS)}, got {self.kind!r}'
             )
         if self.kind != 'pin':
             return
@@ -99,7 +99,7 @@ class Decision:
 
     def row(self) -> list[str]:
         """Return the columns of the file."""
-        numbers = [''] * len(POSE_COLUMNS)
+        numbers = [''] * len(PINNED_BOX_COLUMNS)
         if self.box is not None:
             quaternion = quaternion_from_rpy(self.box[None, ROLL:])[0]
             values = [*self.box[: Z + 1], *quaternion, *self.box[BOX_EXTENT]]
@@ -135,7 +135,7 @@ def read_decisions(path: Path) -> list[Decision]:
         raise RecordingError(f'{path}: cannot be read: {error}') from None
     whole = text[: text.rfind('\n') + 1]
     reader = csv.DictReader(io.StringIO(whole, newline=''))
-    missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+    missing = [name for name in DECISION_COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
         raise RecordingError(
             f'{path}: expected decisions of boxreg review, columns missing: {", ".join(missing)}'
@@ -175,7 +175,7 @@ class DecisionLog:
         text = io.StringIO(newline='')
         writer = csv.writer(text, lineterminator='\n')
         if is_new:
-            writer.writerow(COLUMNS)
+            writer.writerow(DECISION_COLUMNS)
         writer.writerow(decision.row())
         with open(self._path, 'r+b' if not is_new else 'wb') as file:
             file.seek(0 if is_new else self._end_of_last_row())
@@ -281,8 +281,8 @@ class Corrections:
 def _parsed(row: dict[str, str]) -> Decision:
     """Return the decision of a row; raises ValueError for text that is no number."""
     box = None
-    if any(row[name] for name in POSE_COLUMNS):
-        numbers = np.array([float(row[name] or 'nan') for name in POSE_COLUMNS])
+    if any(row[name] for name in PINNED_BOX_COLUMNS):
+        numbers = np.array([float(row[name] or 'nan') for name in PINNED_BOX_COLUMNS])
         box = _box_of(numbers)
     stamp_ns = int(row['stamp_ns']) if row['stamp_ns'] else None
     return Decision(
@@ -291,7 +291,7 @@ def _parsed(row: dict[str, str]) -> Decision:
 
 
 def _box_of(numbers: NDArray[np.float64]) -> Floats:
-    """Return a box (9,) of the `POSE_COLUMNS` (10,), NaN angles without a valid quaternion."""
+    """Return a box (9,) of `PINNED_BOX_COLUMNS` (10,), NaN angles without a valid quaternion."""
     quaternion = numbers[3:7]
     norm = np.linalg.norm(quaternion)
     angles = np.full(3, np.nan)

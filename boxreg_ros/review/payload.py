@@ -20,7 +20,7 @@ import orjson
 
 MAX_POINTS = 2_000_000
 """Points in a report; chosen: about 10 MB of the file."""
-MIN_BOX_POINTS = 40
+MIN_SHOWN_POINTS = 40
 """Points of a box that are shown in spite of `MAX_POINTS`, if there are; chosen."""
 PATH_POINTS = 40
 """Points of the line of a track on the map; chosen."""
@@ -42,7 +42,7 @@ def as_json(value: Any) -> bytes:
 
 def points_per_box(boxes: int) -> int:
     """Return how many points of a box are shown in a report of `boxes` boxes."""
-    return max(MIN_BOX_POINTS, MAX_POINTS // max(1, boxes))
+    return max(MIN_SHOWN_POINTS, MAX_POINTS // max(1, boxes))
 
 
 class TrackTruth(NamedTuple):

@@ -93,9 +93,9 @@ def braking(n=40, speed=14.0, brake=8.0, start=1.5):
 @pytest.mark.parametrize('estimate, most', [('final', 1.05), ('track', 0.5)])
 def test_hard_braking_is_followed(estimate, most):
     # The motion model expects 1.5 m/s^2: over a window of 0.9 s it is wrong by
-    # 6.5 * 0.9^2 / 2 = 2.6 m. The points must outweigh it. Live, accurate input gains nothing
-    # here: over twelve seeds the loss of IoU is 1.02 times that of the input, of whole
-    # tracks 0.28.
+    # 6.5 * 0.9^2 / 2 = 2.6 m. The points must outweigh it. Live, accurate input is not improved
+    # here: over twelve seeds 1 - IoU is 1.02 times that of the input, 0.28 times for whole
+    # tracks.
     missing = []
     for seed in range(3):
         track, truth = a_track(seed, truth=braking(), position=0.05, heading=0.01)
@@ -163,7 +163,7 @@ def test_whole_turns_of_input_angles_do_not_matter(estimate):
 
 @each_estimate
 def test_three_points_per_box_do_no_harm(estimate):
-    # They are hardly any evidence: boxes are smoothed at most, and not worse than the input.
+    # They provide little evidence: boxes are smoothed, and not worse than the input.
     track, truth = a_track()
     poor = replace(track, points=[points[::60][:3] for points in track.points])
     refined = only(poor, Config(estimate=estimate))

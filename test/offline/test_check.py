@@ -37,7 +37,7 @@ def test_check_prints_violations_and_fails_with_strict_only(tmp_path, capsys):
     assert report['rules']['jump']['violations'] == []
 
 
-def test_check_reads_recordings_and_refuses_what_it_cannot_read(tmp_path, capsys):
+def test_check_reads_recordings_and_refuses_unreadable_files(tmp_path, capsys):
     assert main(['check', str(BAGS / 'street.mcap')]) == 0
     assert 'spin' in capsys.readouterr().out
     assert main(['check', str(tmp_path / 'labels')]) == 2

@@ -1,4 +1,4 @@
-"""Rules on labels with one known fault each."""
+"""Rules on labels, each with labels of one known fault."""
 
 from boxreg_ros.config import Config
 from boxreg_ros.review.rules import counts, RULES, violations
