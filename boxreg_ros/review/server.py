@@ -19,7 +19,7 @@ MAX_BODY = 65536
 """Longest request [bytes]: a decision takes less than 3 kB."""
 SUMMARY = 'summary.json'
 MARK = b'<html lang="en"', b'<html lang="en" data-review'
-"""Tells the page that decisions can be made."""
+"""The page offers decisions where its root element has this attribute."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
