@@ -51,8 +51,8 @@ setup(
         'formats': ['pyarrow'],
         # MCAP files whose boxes are protobuf.
         'foxglove': ['mcap-protobuf-support'],
-        # The pictures and the page of `boxreg relabel --report`.
-        'report': ['jinja2', 'matplotlib'],
+        # The page of `boxreg relabel --report` and `boxreg review`.
+        'report': ['jinja2', 'plotly>=6'],
         # HOTA and IDF1 of `boxreg evaluate`.
         'tracking': ['trackeval>=1.3,<2'],
         # Where ROS 2 Jazzy itself is not installed.
@@ -79,6 +79,8 @@ setup(
             'mkdocs-material',
             'mypy',
             'openlabel-checker',
+            'playwright',
+            'plotly',
             'pyarrow',
             'pytest',
             'pytest-cov',

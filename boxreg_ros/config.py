@@ -271,7 +271,7 @@ class Ingredients:
     Parts of the method that `boxreg bench ablation` switches off, one at a time.
 
     For measurement only: no settings, so neither parameters of the node nor part of a written
-    configuration. Each says what is done where it is True.
+    configuration. Each docstring states the effect of True.
 
     """
 
@@ -298,7 +298,7 @@ class Ingredients:
     robust_motion: bool = True
     """Motion residuals are down-weighted beyond three deviations."""
     robust_weights: bool = True
-    """Input poses and labelling margins far from what is expected are down-weighted."""
+    """Input poses and labelling margins far from the expected ones are down-weighted."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,6 +76,9 @@ REASONS = {
         'nothing, if a recording is played in a loop; otherwise let one clock set all stamps of '
         'a topic',
     ),
+    'rejected': Reason(
+        'box', 'a person rejected the refined box or its track in `boxreg review`', ''
+    ),
     'no_sweep': Reason(
         'box',
         'no cloud within `tolerance` or `reach` of its stamp',

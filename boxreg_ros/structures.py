@@ -11,7 +11,8 @@ header.
 
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 from boxreg_ros.errors import ShapeError
 import numpy as np
@@ -29,6 +30,8 @@ REFINED, KEPT = 'refined', 'kept'
 INTERPOLATED, EXTENDED, REJECTED = 'interpolated', 'extended', 'rejected'
 ADDED = (INTERPOLATED, EXTENDED)
 """Status of boxes that the input does not have."""
+HUMAN = 'human'
+"""Status of a box that a person has corrected and pinned."""
 
 
 def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
@@ -129,6 +132,9 @@ class BoxArray:
         As defined in the docstring of the module; invalid boxes are allowed and returned as kept.
     ticket : object
         Any object of the caller; returned unchanged with the refined boxes, in their ``boxes``.
+    pinned : array, shape (n,), or None
+        True for boxes that a person has corrected: they are held, and the rest of their track
+        follows them. None for none.
 
     """
 
@@ -139,6 +145,7 @@ class BoxArray:
     scores: Floats
     boxes: Floats
     ticket: object = field(default=None, compare=False, repr=False)
+    pinned: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         """Check that all columns have one length."""
@@ -147,6 +154,19 @@ class BoxArray:
         checked('scores', self.scores, (n,))
         if len(self.class_names) != n:
             raise ShapeError(f'class_names: expected {n}, got {len(self.class_names)}')
+        if self.pinned is not None and self.pinned.shape != (n,):
+            raise ShapeError(f'pinned: expected shape ({n},), got {self.pinned.shape}')
+
+    def take(self, rows: Sequence[int]) -> 'BoxArray':
+        """Return the boxes `rows` only."""
+        return replace(
+            self,
+            track_ids=tuple(self.track_ids[row] for row in rows),
+            class_names=tuple(self.class_names[row] for row in rows),
+            scores=self.scores[rows],
+            boxes=self.boxes[rows],
+            pinned=None if self.pinned is None else self.pinned[rows],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +180,8 @@ class RefinedBoxes:
         Refined boxes, otherwise as in the input: stamp, frame, ids, scores and ticket.
     status : tuple of n str
         ``refined``, ``kept`` (the input box is returned unchanged), ``rejected`` (likewise, and
-        no object), ``interpolated`` or ``extended`` (the input has no such box).
+        no object), ``interpolated`` or ``extended`` (the input has no such box), or ``human`` (a
+        pinned box).
     reasons : tuple of n str
         Why a box was kept or rejected; empty for the others.
     num_points : array, shape (n,)
@@ -198,3 +219,17 @@ class RefinedBoxes:
             object.__setattr__(self, 'face_distances', np.zeros((n, 6)))
         if len(self.outside) != n:
             object.__setattr__(self, 'outside', np.zeros(n))
+
+    def take(self, rows: Sequence[int]) -> 'RefinedBoxes':
+        """Return the boxes `rows` only."""
+        return RefinedBoxes(
+            self.boxes.take(rows),
+            tuple(self.status[row] for row in rows),
+            tuple(self.reasons[row] for row in rows),
+            self.num_points[rows],
+            self.covariances[rows],
+            self.is_final,
+            self.extent_covariances[rows],
+            self.face_distances[rows],
+            self.outside[rows],
+        )

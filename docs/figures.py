@@ -8,40 +8,55 @@ and needs Chromium; where there is none, that picture alone stays as it is.
 
 from __future__ import annotations
 
-from base64 import b64decode
 from collections.abc import Sequence
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 import shutil
 import subprocess
 import sys
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, TrackChanges
-from boxreg_ros.review.pictures import points_picture, STYLE
-from boxreg_ros.review.report import MIN_BOXES, REPORT
-from boxreg_ros.review.track_points import gather_points, points_before_and_after
-from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
+from boxreg_ros.review.report import REPORT
+from boxreg_ros.review.track_points import PointCollector, SHOWN_MARGIN
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, RefinedBoxes, ROLL, Sweep, X, Y, Z
 import matplotlib
 import numpy as np
+from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[1]
 STREET = ROOT / 'bags' / 'street.mcap'
+STYLE: Any = {'font.size': 8, 'axes.spines.top': False, 'axes.spines.right': False}
+INPUT_COLOUR = '#d55e00'
+REFINED_COLOUR = '#0072b2'
+MIN_BOXES = 10
+"""Least boxes of the car that is shown."""
+POINT_STEP = 3
+"""Every n-th point is drawn."""
 RESULT = 'street'
 """Result folder of `STREET`, inside of the folder of the runs."""
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
 BROWSER_OPTIONS = (
-    '--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
+    '--headless', '--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader',
+    '--virtual-time-budget=20000', '--disable-quic', '--no-first-run',
     '--disable-background-networking', '--disable-component-update', '--disable-sync',
     '--hide-scrollbars',
 )  # fmt: skip
-"""Root needs ``--no-sandbox``; the page is our own. Most others keep it off the network."""
-PAGE_SIZE = (1200, 1400)
-"""Width and height of the screenshot [CSS pixels]: down to the end of the first table."""
+"""
+Root needs ``--no-sandbox``; the page is our own. SwiftShader draws WebGL without a GPU; the budget
+lets the page finish its drawing. Most others keep it off the network.
+
+"""
+PAGE_SIZE = (1366, 900)
+"""Width and height of the screenshot [CSS pixels]: a small laptop."""
 SCALE = 1.2
 """Pixels of the screenshot per CSS pixel, so that small text is sharp on dense screens."""
 TIMEOUT = 120
@@ -60,7 +75,7 @@ def draw_car(runs: Path, target: Path) -> None:
 
 
 def draw_report(runs: Path, target: Path) -> None:
-    """Take a screenshot of the top of the report, if there is a browser."""
+    """Take a screenshot of the first track of the report, if there is a browser."""
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         print(
@@ -74,7 +89,7 @@ def draw_report(runs: Path, target: Path) -> None:
     command = [
         browser, *BROWSER_OPTIONS, f'--user-data-dir={runs / "profile"}',
         f'--window-size={width},{height}', f'--force-device-scale-factor={SCALE}',
-        f'--screenshot={screenshot}', (runs / RESULT / REPORT).as_uri(),
+        f'--screenshot={screenshot}', (runs / RESULT / REPORT).as_uri() + '#tracks',
     ]  # fmt: skip
     subprocess.run(command, check=True, capture_output=True, timeout=TIMEOUT)
     shutil.copyfile(screenshot, target)
@@ -114,10 +129,73 @@ def car_picture(recording: Path, result: Path) -> bytes:
     track = most_shifted_vehicle(changes_of(drive.boxes, refined))
     items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
     items.sort(key=lambda item: item.stamp_ns)
-    points, _ = gather_points([track], items, Config())
-    before, after, is_object = points_before_and_after(track, points[track.track_id])
+    collector = PointCollector(Config())
+    for item in items:
+        collector.add(item)
+    collector.flush()
     with matplotlib.rc_context(STYLE):
-        return b64decode(points_picture(track, before, after, is_object))
+        return points_picture(track, collector.points_of(track))
+
+
+def points_picture(track: TrackChanges, points: Sequence[Floats]) -> bytes:
+    """
+    Draw the points of all sweeps in the input boxes and in the refined boxes of a track.
+
+    Parameters
+    ----------
+    track : TrackChanges
+        The track.
+    points : sequence of n arrays, shape (M_i, 3)
+        Points near each box in the fixed frame [m].
+
+    Returns
+    -------
+    picture : bytes
+        A PNG file.
+
+    """
+    from matplotlib.figure import Figure
+
+    before = in_boxes(track.given, points, track.is_flipped)
+    after = in_boxes(track.boxes, points, np.zeros_like(track.is_flipped))
+    extents = [np.nanmedian(boxes[:, BOX_EXTENT], axis=0) for boxes in (track.given, track.boxes)]
+    is_object = after[:, Z] > GROUND_CLEARANCE - extents[1][2] / 2
+    reach_x, *reaches = np.maximum(*extents) / 2 + SHOWN_MARGIN
+    figure = Figure((8, 4.5))
+    grid = figure.add_gridspec(
+        2, 2, left=0.07, right=0.99, top=0.93, bottom=0.09, hspace=0.1, wspace=0.04,
+        height_ratios=reaches,
+    )  # fmt: skip
+    panels: Any = grid.subplots(sharex=True, sharey='row')  # (view, before or after)
+    columns = ((before, extents[0], INPUT_COLOUR), (after, extents[1], REFINED_COLOUR))
+    for k, (local, extent, colour) in enumerate(columns):
+        for panel, axis, reach in zip(panels[:, k], (Y, Z), reaches, strict=True):
+            shown = local[is_object] if axis == Y else local
+            opacity = float(np.clip(800 / (1 + len(shown)), 0.2, 0.8))
+            panel.scatter(
+                shown[:, X], shown[:, axis], s=4 * opacity**0.5, c='k', alpha=opacity, lw=0
+            )
+            corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [1.2, 0]])
+            panel.plot(*(corners * [extent[X], extent[axis]] / 2).T, color=colour, lw=1.2)
+            panel.set(xlim=(-reach_x, reach_x), ylim=(-reach, reach), aspect='equal')
+    panels[0, 0].set_title('points in the input boxes', fontweight='bold')
+    panels[0, 1].set_title('points in the refined boxes', fontweight='bold')
+    panels[0, 0].set_ylabel('top view [m]')
+    panels[1, 0].set_ylabel('side view [m]')
+    buffer = BytesIO()
+    figure.savefig(buffer, format='png', dpi=150)
+    return buffer.getvalue()
+
+
+def in_boxes(boxes: Floats, points: Sequence[Floats], is_flipped: NDArray[np.bool_]) -> Floats:
+    """Return the points of all sweeps in the frames of their boxes, those flipped turned first."""
+    local = [np.zeros((0, 3))]
+    for row, fixed in enumerate(points):
+        if len(fixed):
+            sign = np.array([-1, -1, 1]) if is_flipped[row] else 1
+            R = matrix_from_rpy(boxes[row, ROLL:])
+            local.append((fixed[::POINT_STEP] - boxes[row, : Z + 1]) @ R * sign)
+    return np.concatenate(local)
 
 
 def changes_of(given: Sequence[BoxArray], refined: BoxTable) -> list[TrackChanges]:
@@ -157,7 +235,8 @@ def main() -> None:
     """Draw all pictures; this takes some minutes."""
     with TemporaryDirectory() as folder:
         runs = Path(folder)
-        boxreg('relabel', STREET, '-o', RESULT, '--report', folder=runs)
+        truth = STREET.with_name('street_truth.csv')
+        boxreg('relabel', STREET, '-o', RESULT, '--report', '--truth', truth, folder=runs)
         for name, draw in PICTURES.items():
             draw(runs, ROOT / name)
 

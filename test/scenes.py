@@ -133,6 +133,7 @@ def problem_of(boxes, **changes):
         'prior_information': torch.zeros(B, PRIOR_SIZE, PRIOR_SIZE, dtype=torch.float64),
         'marginalised_extents': torch.zeros(B, 4, dtype=torch.float64),
         'class_numbers': torch.full((B, len(CLASS_NUMBERS)), torch.nan, dtype=torch.float64),
+        'pinned': torch.zeros(B, N, dtype=torch.bool),
         'kind': torch.zeros(B, dtype=torch.int64),
     }
     for name, values in changes.pop('class_numbers', {}).items():

@@ -51,32 +51,32 @@ def _every_kind(**values: float) -> dict[str, float]:
 
 
 def _off(*names: str) -> dict[str, bool]:
-    """Return what switches `Ingredients` off."""
+    """Return the settings that switch `Ingredients` off."""
     return {f'ingredients.{name}': False for name in names}
 
 
 INGREDIENTS = {
-    WHOLE: Ingredient('all is on', {}),
+    WHOLE: Ingredient('every ingredient is on', {}),
     'points': Ingredient(
         'faces and rigid shape have no weight: motion and input alone',
         {f'faces.{name}': 10.0 for name in ('ends', 'sides', 'top', 'bottom')}
         | _every_kind(shape=1.0),
     ),
-    'rigid shape': Ingredient('the points of a track need not agree', _every_kind(shape=1.0)),
+    'rigid shape': Ingredient(
+        'points of a track are not tied to one rigid shape', _every_kind(shape=1.0)
+    ),
     'learnt margins': Ingredient(
         'labelling margins are those of the settings', {'faces.learn': False}
     ),
     'strips': Ingredient(
-        'the outermost points of a face may all be at one end of it', _off('strips')
+        'outermost points are taken from a whole face, not from each of its strips', _off('strips')
     ),
     'occluded faces': Ingredient('occluded faces have no weight', _off('occluded_faces')),
     'occlusion inset': Ingredient(
-        'points are expected no further inside occluded faces',
+        'points of occluded faces have no inset',
         {'faces.inset_ends': 0.0, 'faces.inset_sides': 0.0},
     ),
-    'range inset': Ingredient(
-        'points are expected no further inside distant faces', _off('range_inset')
-    ),
+    'range inset': Ingredient('points of distant faces have no inset', _off('range_inset')),
     'noise estimation': Ingredient(
         'the input has the errors of the settings', _off('noise_estimation')
     ),
@@ -88,7 +88,9 @@ INGREDIENTS = {
         'extents are expected as in the input', _off('population_extents')
     ),
     'one extent': Ingredient('each box keeps the extent of its input', {'extent': 'fixed'}),
-    'point ownership': Ingredient('points of a neighbour count too', _off('point_ownership')),
+    'point ownership': Ingredient(
+        'boxes also use the points of their neighbours', _off('point_ownership')
+    ),
     'road': Ingredient('the bottom face is never observed', _off('road')),
     'smoothness': Ingredient(
         'accelerations have no weight',
@@ -180,7 +182,7 @@ def table(rows: Mapping[str, Sequence[float]]) -> list[str]:
     """Return lines of scores, each followed by its loss against that of `WHOLE`."""
     lines = [line('without', [cell for name in SCORES for cell in (name, '')])]
     for name, row in rows.items():
-        worse = np.subtract(rows[WHOLE], row) * [1, 1, 1, -1]  # of flips, more are worse
+        worse = np.subtract(rows[WHOLE], row) * [1, 1, 1, -1]  # more flips are worse
         costs = ['' if name == WHOLE else f'({cost:+.3f})' for cost in worse.round(3) + 0.0]
         pairs = zip(row, costs, strict=True)
         lines.append(line(name, [cell for pair in pairs for cell in pair]))

@@ -28,7 +28,7 @@ REWEIGHTINGS = 5  # iterations of the robust fit
 # Rectangle fit and ICP: which points are used.
 SCAN_MARGIN = 0.4  # points this far outside the box are used [m]
 ROAD_CLEARANCE = 0.3  # points lower than this above the bottom are not [m]
-MIN_SCAN_POINTS = 20  # with fewer the box is left as it is
+MIN_SCAN_POINTS = 20  # with fewer the box is returned unchanged
 MIN_GAP = 0.03  # gaps below this count as this in the closeness criterion [m]
 FACE_SPACING = 0.1  # of the points on the faces that ICP aligns to [m]
 ICP_DISTANCE = 0.5  # largest distance of two matched points [m]
@@ -50,7 +50,7 @@ def smoothed(track: Track) -> Floats:
 
 
 def smoothed_live(track: Track, lag: int) -> tuple[Floats, Floats]:
-    """Return each box as `smoothed` gives it when it is the newest, and `lag` boxes later."""
+    """Return the early and the final estimate of each box by `smoothed`."""
     newest = track.boxes.copy()
     lagged = track.boxes.copy()
     for count in range(1, len(newest) + 1):

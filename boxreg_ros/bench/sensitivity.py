@@ -94,7 +94,7 @@ class Outcome:
 @dataclass(frozen=True, slots=True)
 class Loss:
     """
-    What the mean IoU of all data sets loses by one variation; negative where it gains.
+    Loss of the mean IoU of all data sets by one variation; negative for a gain.
 
     Attributes
     ----------

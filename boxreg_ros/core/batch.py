@@ -113,6 +113,8 @@ class Problem(NamedTuple):
         Sum of the input extents of marginalised observations, and the number of these.
     class_numbers : Tensor, shape (B, C)
         The numbers of each window's `ClassConfig`, in the order of `CLASS_NUMBERS`.
+    pinned : Tensor, shape (B, N)
+        True for boxes that a person has corrected.
     kind : Tensor, shape (B,)
         Index of the kind of each window's object among `KINDS`.
 
@@ -131,6 +133,7 @@ class Problem(NamedTuple):
     prior_information: Tensor
     marginalised_extents: Tensor
     class_numbers: Tensor
+    pinned: Tensor
     kind: Tensor
 
     @property
@@ -149,7 +152,7 @@ class Problem(NamedTuple):
 
     @property
     def points(self) -> Tensor:
-        """Returns minus the centre of their input box, padded, shape (B, N, M, 3) [m]."""
+        """Return the returns minus the centre of their input box, padded, (B, N, M, 3) [m]."""
         return self.padded()[0]
 
     @property

@@ -68,7 +68,7 @@ class FaceOffsets(NamedTuple):
     Attributes
     ----------
     gap_correction : Tensor, shape (K, 6) or (6,)
-        Labelling margin of each face less the one its class lets expect [m].
+        Labelling margin of each face less the one of the settings of its kind [m].
     occlusion_inset : Tensor, shape (K, 6) or (6,)
         How much further inside the points of an occluded face are [m]; 0 for roof and road.
     range_inset : Tensor, shape (K, 6) or (6,)
@@ -117,7 +117,7 @@ class FaceObservations(NamedTuple):
 
 def visibility(problem: Problem) -> Tensor:
     """
-    Return how openly the sensor sees each face, shape (B, N, 6).
+    Return the visibility of each face from the sensor, shape (B, N, 6).
 
     The tangent of the angle between the plane of the face and the line of sight, in the
     horizontal for the four upright faces: positive where the sensor is on the outer side,

@@ -34,7 +34,7 @@ GAP_DEVIATIONS = {
     'cyclist': (0.15, 0.15, 0.15, 0.15),
     'pedestrian': (0.15, 0.15, 0.15, 0.15),
 }
-"""Prior deviation of the margin of each group from the one its class lets expect, by kind [m]."""
+"""Prior deviation of each margin from the one of the settings of its kind [m]."""
 LARGE_EXTENT = (5.0, 2.0, 2.0)
 """The margins of larger objects differ in proportion to their extent [m]; a large car."""
 MIN_TRACK_OBSERVATIONS = 3
@@ -67,7 +67,7 @@ OBSERVATIONS_FOR_HALF_WEIGHT = 14
 MAX_CORRELATION = 0.9
 """Largest correlation of the errors of consecutive observations."""
 CORRELATION_ITERATIONS = 5
-"""Evaluations of the correlation and of what the means of tracks remove, by each other."""
+"""Alternating evaluations of the correlation and of the variance that track means remove."""
 MIN_LEFT = 0.3
 """Least part of the variance that the means of tracks are taken to leave."""
 MIN_POWER = 1e-12
@@ -101,7 +101,12 @@ whose extents err by 5 %, 0.6 / 0.05^2."""
 CROSS_SLOPE_INFORMATION = 4.0
 """Prior information of slopes over the other two extents: half the deviation of the own one."""
 MIN_EXTENT_GAIN = 0.2
-"""Fewest part of the information about an extent that must be of points to count as evidence."""
+"""Smallest part of the information about an extent that points must provide to be evidence."""
+PINNED_EXTENT = 0.01
+"""Deviation of the extents of a pinned box and of its bias [m, rad]: practically held."""
+PINNED_MARGINS = 4.0
+"""Factor on the deviation of labelling margins beside a pinned box, whose faces are evidence of
+them. Chosen; 4 and 10 give the same."""
 REPEATED_BOX_TOLERANCE = 1e-3
 """A box that differs from the one before by less repeats it [m, rad]."""
 
@@ -111,7 +116,7 @@ class InputNoise(NamedTuple):
     Estimated errors of the input poses and extents.
 
     One row for each of `KINDS`; without that axis, the same for all kinds. Lengths are in units
-    of the deviation that the settings of the kind let expect.
+    of the expected deviation, from the settings of the kind.
 
     Attributes
     ----------
@@ -281,7 +286,7 @@ def input_residuals(problem: Problem, state: State) -> Tensor:
 
 
 def normalised_residuals(problem: Problem, state: State) -> Tensor:
-    """Return `input_residuals` over the deviations that the class lets expect, (B, N, 9)."""
+    """Return `input_residuals` over the expected deviations of the class, (B, N, 9)."""
     expected = problem.of_class(*POSE_ERRORS, *['extent'] * 3)
     return input_residuals(problem, state) / expected[:, None]
 
@@ -292,7 +297,7 @@ def smoothed_angles(problem: Problem) -> Tensor:
 
     By the motion model alone: the noise, estimated from second differences, against the angular
     accelerations of the class. The outermost points of a box with a wrong yaw are its corners,
-    further outside than its faces: margins are learnt at these angles.
+    further outside than its faces: margins are estimated at these angles.
 
     """
     angles = problem.start[..., ROLL:]
@@ -335,6 +340,8 @@ class Expectation(NamedTuple):
         Deviation of the input poses along the axes of their boxes, without their bias [m, rad].
     widened_deviation : Tensor, shape (B, 6)
         The same, widened for the correlation of the errors of neighbours [m, rad].
+    unmodelled_bias : Tensor, shape (B, 6)
+        Deviation of the bias of windows with a pinned box, where no bias is estimated; else 0.
 
     """
 
@@ -342,6 +349,7 @@ class Expectation(NamedTuple):
     deviation: Tensor
     pose_deviation: Tensor
     widened_deviation: Tensor
+    unmodelled_bias: Tensor
 
 
 def expect(
@@ -399,10 +407,18 @@ def expect(
     one = torch.ones_like(usual)
     size = (mean / mean.new_tensor(LARGE_EXTENT)).clamp(min=1)[:, FACE_AXIS]
     spread = problem.of_class('gap_spread') * size * (2 - 2 * constant[:, :1]).clamp(1)
+    # A pinned box has the true extents, and no bias: its pose is that of the object.
+    has_pin = problem.pinned.any(1)[:, None]
+    extent_deviation = torch.where(has_pin, PINNED_EXTENT, extent * part)
+    unmodelled = torch.where(has_pin, bias, 0.0)
+    spread = torch.where(has_pin, PINNED_MARGINS, 1.0) * spread
+    bias = torch.where(has_pin, PINNED_EXTENT, bias)
     shared = expected_shared(problem, offsets, mean)
-    shared[:, EXTENT] = extent
-    deviations = [extent * part, bias, spread, mean[:, :1] * PIVOT_DEVIATION, one]
-    return Expectation(shared, torch.cat(deviations, 1), deviation, deviation * widening)
+    shared[:, EXTENT] = torch.where(has_pin, mean, extent)
+    deviations = [extent_deviation, bias, spread, mean[:, :1] * PIVOT_DEVIATION, one]
+    return Expectation(
+        shared, torch.cat(deviations, 1), deviation, deviation * widening, unmodelled
+    )
 
 
 def expected_shared(problem: Problem, offsets: FaceOffsets, extent: Tensor) -> Tensor:
@@ -420,11 +436,19 @@ def expected_shared(problem: Problem, offsets: FaceOffsets, extent: Tensor) -> T
 
 
 def mean_input_extents(problem: Problem) -> Tensor:
-    """Return the mean extents of the input, marginalised observations included, (B, 3) [m]."""
+    """
+    Return the mean extents of the input, marginalised observations included, (B, 3) [m].
+
+    Of windows with pinned boxes the mean extents of these.
+
+    """
+    pinned = problem.pinned[..., None]
+    of_pins = (problem.boxes[..., 3:6] * pinned).sum(1) / pinned.sum(1).clamp(1)
     valid = problem.valid
     total = (problem.boxes[..., 3:6] * valid[..., None]).sum(1)
     total = total + problem.marginalised_extents[:, :3]
-    return total / (valid.sum(1)[:, None] + problem.marginalised_extents[:, 3:])
+    mean = total / (valid.sum(1)[:, None] + problem.marginalised_extents[:, 3:])
+    return torch.where(pinned.any(1), of_pins, mean)
 
 
 def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
@@ -501,8 +525,8 @@ class InputModel:
     """
     Labelling margins, noise and population of extents, estimated from the input of a stream.
 
-    Each of `KINDS` has its own: labels of pedestrians do not follow the rule for cars. Noise is
-    pooled for kinds that were seen in few boxes.
+    Each of `KINDS` has its own: labels of pedestrians have other margins than those of cars. Noise
+    is pooled for kinds that were seen in few boxes.
 
     A labelling margin is the gap between a face of the label and its outermost points. Each track
     gives one value per face: the mean over its observations of the gap, less the one expected of

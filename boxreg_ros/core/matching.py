@@ -23,8 +23,8 @@ class StampMatcher:
 
     A box array takes the nearest sweep within `tolerance` at once. A sweep within `reach` is taken
     as soon as a younger sweep than the boxes is known: no later one can be nearer, whichever kind
-    arrives first. A sweep may serve several box arrays. A box array whose sweep was dropped is
-    returned without one. At most `queue` sweeps and `queue` box arrays are held.
+    arrives first. A sweep may be paired with several box arrays. A box array whose sweep was
+    dropped is returned without one. At most `queue` sweeps and `queue` box arrays are held.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class StampMatcher:
         self._counts = counts
         self._sweeps: list[Sweep] = []  # ascending by stamp
         self._boxes: list[BoxArray] = []  # ascending by stamp
-        self._used_ns: set[int] = set()  # stamps of held sweeps that served a box array
+        self._used_ns: set[int] = set()  # stamps of held sweeps that were paired
         self._newest_ns = -inf  # of all sweeps added
         self._oldest_ns = -inf  # sweeps before this one are late
 
@@ -93,7 +93,7 @@ class StampMatcher:
             self._discard_before(stamp_ns - self._reach_ns)
 
     def _discard_before(self, oldest_ns: float) -> None:
-        """Discard older sweeps; count those that served no box array."""
+        """Discard older sweeps; count those that were paired with no box array."""
         self._oldest_ns = max(self._oldest_ns, oldest_ns)
         while self._sweeps and self._sweeps[0].stamp_ns < oldest_ns:
             stamp_ns = self._sweeps.pop(0).stamp_ns

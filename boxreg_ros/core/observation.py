@@ -72,6 +72,8 @@ class Observation(NamedTuple):
         Sweep points inside the input box.
     sight : float
         Median of `delays` [s]: when the sweep saw the object.
+    is_pinned : bool
+        Whether a person has corrected the box.
 
     """
 
@@ -83,6 +85,7 @@ class Observation(NamedTuple):
     ground: float
     num_points: int
     sight: float = 0.0
+    is_pinned: bool = False
 
     def relative_to(self, box: Floats, shift: Floats) -> 'Observation':
         """Return this as the observation of another `box` (9,), whose centre is `-shift` away."""

@@ -12,8 +12,10 @@ from boxreg_ros.structures import (
     BoxArray,
     checked,
     Floats,
+    HUMAN,
     INTERPOLATED,
     Ints,
+    is_valid_box,
     RefinedBoxes,
     ROLL,
     Sweep,
@@ -43,6 +45,9 @@ class Track:
         mass of the points.
     scores : array, shape (N,), or None
         Detector confidence.
+    pinned : array, shape (N,), or None
+        True for boxes that are right as given: they are returned unchanged, and the rest of the
+        track follows them. None for none.
 
     Raises
     ------
@@ -58,6 +63,7 @@ class Track:
     points: Sequence[NDArray[np.floating]]
     sensor_origins: Floats | None = None
     scores: Floats | None = None
+    pinned: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and order; convert lists to arrays."""
@@ -84,6 +90,23 @@ class Track:
             self._set('sensor_origins', checked('sensor_origins', self.sensor_origins, (n, 3)))
         if self.scores is not None:
             self._set('scores', checked('scores', self.scores, (n,)))
+        if self.pinned is not None:
+            self._set('pinned', self._checked_pins(np.asarray(self.pinned), n))
+
+    def _checked_pins(self, pinned: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:
+        if pinned.dtype != bool or pinned.shape != (n,):
+            raise ShapeError(
+                f'pinned of track {self.track_id!r}: expected booleans of shape ({n},), got '
+                f'{pinned.dtype} of shape {pinned.shape}'
+            )
+        rows = np.flatnonzero(pinned & ~is_valid_box(self.boxes))
+        if len(rows):
+            raise ShapeError(
+                f'pinned boxes of track {self.track_id!r}: expected finite numbers and positive '
+                f'extents, got {self.boxes[rows[0]].tolist()} in row {rows[0]}; correct it or '
+                f'remove its pin'
+            )
+        return pinned
 
     def _checked_stamps(self) -> Ints:
         given = np.asarray(self.stamps_ns)
@@ -118,7 +141,8 @@ class RefinedTrack:
     boxes : array, shape (N, 9)
         Refined boxes in the fixed frame [m, rad].
     status : tuple of N str
-        ``refined``, ``kept`` (the input box, unchanged) or ``interpolated`` (invalid input box).
+        ``refined``, ``kept`` (the input box, unchanged), ``interpolated`` (invalid input box) or
+        ``human`` (a pinned box, unchanged).
     reasons : tuple of N str
         Why a box was kept or interpolated; empty for refined boxes.
     covariances : array, shape (N, 6, 6)
@@ -218,7 +242,13 @@ def _box_array(stamp_ns: int, tracks: Sequence[Track], places: Sequence[_Place])
         tuple(tracks[place.track].class_name for place in places),
         np.ones(len(places)),
         np.array([tracks[index].boxes[row] for index, row in places]),
+        pinned=np.array([_pins(tracks[index])[row] for index, row in places]),
     )
+
+
+def _pins(track: Track) -> NDArray[np.bool_]:
+    """Return which boxes of a track are pinned, (N,)."""
+    return np.zeros(len(track.boxes), bool) if track.pinned is None else track.pinned
 
 
 def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> RefinedTrack:
@@ -241,6 +271,9 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
         )
         for row in np.flatnonzero(~is_valid):
             status[row] = INTERPOLATED
+    for row in np.flatnonzero(_pins(track)):
+        boxes[row] = track.boxes[row]
+        status[row], reasons[row] = HUMAN, ''
     columns = tuple(status), tuple(reasons), covariances, extents
     return RefinedTrack(track.track_id, boxes, *columns)
 

@@ -63,7 +63,7 @@ class BoxRegistrar:
     thread-safe.
 
     Each box array added is returned exactly once with ``is_final=True``, with all its boxes in
-    the order of the input. Stamps of returned arrays ascend, except for arrays that came late.
+    the order of the input. Stamps of returned arrays ascend, except for late arrays.
     With `estimate` 'early' or 'final' an array is returned once more before that, with
     ``is_final=False``, as soon as its sweep is known.
 
@@ -227,11 +227,13 @@ class BoxRegistrar:
             seen.relative_to(box, shift)
             for seen, box, shift in zip(found, given, motion / 2, strict=True)
         ]
-        for row, track, moved, observation in zip(rows, tracks, motion, observations, strict=True):
-            self.box_time.add(observation.box, observation.points, moved)
-            array.num_points[row] = observation.num_points
+        for row, track, moved, seen in zip(rows, tracks, motion, observations, strict=True):
+            self.box_time.add(seen.box, seen.points, moved)
+            array.num_points[row] = seen.num_points
             array.reasons[row] = 'short_track'  # until there is an estimate
             array.num_unsettled += 1
+            is_pinned = boxes.pinned is not None and bool(boxes.pinned[row])
+            observation = seen._replace(is_pinned=is_pinned)
             track.entries.append(_Entry(observation, array, row))
             successor = track.split_at_id_switch()
             if successor is not None:

@@ -1,7 +1,7 @@
 """
 One rigid shape per track: all its points in the frame of its box, as small planes.
 
-docs/method.md (M4) has the residual that comes of it.
+The residual is (M4) of docs/method.md.
 
 """
 

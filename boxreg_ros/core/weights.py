@@ -36,6 +36,8 @@ MOTION_OUTLIER = 3.0
 """Deviation at which a motion residual has weight 1/4, in standard deviations."""
 GAP_OUTLIER = 2.0
 """Deviation at which the prior of a labelling margin has weight 1/2, in standard deviations."""
+PIN_DEVIATIONS = (0.02, 0.02, 0.02, 0.005, 0.005, 0.005)
+"""Deviations of a pinned pose x y z [m] and roll pitch yaw [rad]; a person sees that much."""
 NEIGHBOUR_FACTOR = 3.0
 """Deviation from neighbours over error of the input. Derived roughly: white noise of deviation s
 makes an extrapolation from two neighbours err by sqrt(1 + 4 + 1) s = 2.4 s."""
@@ -96,6 +98,7 @@ def weigh(
     face_weight = _face_weights(problem, observations, off_track, valid, config)
     at_input = terms.input_pose(state, given, axes)
     input_weight = _input_weights(at_input.residual[:, :, 0], off_track, valid, expected, config)
+    input_weight = _with_pins(input_weight, problem, expected)
     shared_weight = _shared_weights(state, observations, face_weight, expected, config)
     to_body = at_input.by_pose[:, :, 0]  # (B, N, 6, 6)
     slip_weight = problem.of_class('slip', 'climb')[:, None] ** -2 * valid[:, 1:, None]
@@ -189,11 +192,15 @@ def weigh_compiled(
         zero_motion=contiguous(drift * drift.new_tensor(DRIFT_RATIOS)),
         heading=contiguous(problem.of_class('heading')[:, 0]),
     )
+    columns = {name: contiguous(getattr(expected, name)) for name in ExpectedArrays._fields}
     run(
         kernels.weights.weigh_windows, B, problem.arrays(), contiguous(state.pose),
         contiguous(state.shared), FaceArrays(*map(contiguous, observations)),
-        ExpectedArrays(*map(contiguous, expected)), of_class, numbers, terms,
+        ExpectedArrays(**columns), of_class, numbers, terms,
     )  # fmt: skip
+    if problem.pinned.any():
+        weight = torch.from_numpy(terms.W_input).diagonal(dim1=2, dim2=3)
+        weight.copy_(_with_pins(weight, problem, expected))
     return terms
 
 
@@ -303,6 +310,27 @@ def _input_weights(
     off = (residual.abs() + off_track) / expected.pose_deviation[:, None]
     inverse_variance = valid[..., None] / expected.widened_deviation[:, None] ** 2
     return inverse_variance / (1 + (off / outlier) ** 2)
+
+
+def _with_pins(weight: Tensor, problem: Problem, expected: Expectation) -> Tensor:
+    """
+    Return the weights of the input poses (B, N, 6) of windows with pinned boxes (M21a).
+
+    A pinned pose has the deviation `PIN_DEVIATIONS`. The bias of the others is not estimated
+    there but part of their noise. n independent errors of variance s^2 + n b^2 provide as much
+    information about a constant offset as n errors of variance s^2 with a common bias of
+    deviation b, and s^2 as much about changes: the factor of b^2 is the geometric mean of n and 1.
+
+    """
+    has_pin = problem.pinned.any(1)
+    if not has_pin.any():
+        return weight
+    count = problem.valid.sum(1)[:, None]
+    variance = expected.widened_deviation**2
+    factor = variance / (variance + count.sqrt() * expected.unmodelled_bias**2)
+    weight = torch.where(has_pin[:, None, None], weight * factor[:, None], weight)
+    pin_weight = weight.new_tensor(PIN_DEVIATIONS) ** -2
+    return torch.where(problem.pinned[..., None], pin_weight, weight)
 
 
 def _shared_weights(

@@ -185,8 +185,10 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     base, state, step, information, extents = (
         np.array(part) for part in zip(*priors, strict=True)
     )
+    pinned = np.zeros(valid.shape, bool)
+    pinned[valid] = [o.is_pinned for window in windows for o in window.observations]
     if config.ingredients.heading_sign:
-        boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, state[:, 5])
+        boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, pinned, state[:, 5])
     else:
         boxes[..., YAW] = np.unwrap(boxes[..., YAW])
     start = _starting_boxes(windows, boxes)
@@ -211,6 +213,7 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
         marginalised_extents=on_device(extents),
         class_numbers=on_device(_class_numbers(windows, config)),
         kind=on_device(np.array([KINDS.index(config.kind(w.class_name)) for w in windows])),
+        pinned=on_device(pinned),
     )
     return problem, base
 
@@ -273,10 +276,21 @@ def _returns(windows: Sequence[Window], config: Config) -> Returns:
 
 
 def _resolved_angles(
-    boxes: Floats, times: Floats, valid: NDArray[np.bool_], known_yaw: Floats
+    boxes: Floats,
+    times: Floats,
+    valid: NDArray[np.bool_],
+    pinned: NDArray[np.bool_],
+    known_yaw: Floats,
 ) -> Floats:
-    """Return roll, pitch and yaw (B, N, 3) of `boxes` (B, N, 9) with 180° flips corrected."""
+    """
+    Return roll, pitch and yaw (B, N, 3) of `boxes` (B, N, 9) with 180° flips corrected.
+
+    A pinned box decides on the heading of its window.
+
+    """
     yaw = resolve_headings(boxes, times, valid, known_yaw)
+    is_contrary = np.any(pinned & (np.cos(yaw - boxes[..., YAW]) < 0), axis=1, keepdims=True)
+    yaw = np.where(is_contrary, yaw + np.pi, yaw)
     # A half turn about the z axis of the box changes the signs of roll and pitch.
     is_same = np.sign(np.cos(yaw - boxes[..., YAW]))
     tilt = boxes[..., ROLL:YAW] * is_same[..., None]

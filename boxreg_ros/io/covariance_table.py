@@ -33,7 +33,7 @@ class BoxCovariance(NamedTuple):
 
     Attributes
     ----------
-    range : float
+    distance : float
         Horizontal distance of the box from the sensor [m]; NaN if unknown.
     pose : array, shape (6, 6)
         Of x y z roll pitch yaw, in the frame of the box's row in ``boxes.csv`` [m, rad].
@@ -42,7 +42,7 @@ class BoxCovariance(NamedTuple):
 
     """
 
-    range: float
+    distance: float
     pose: Floats
     extent: Floats
 

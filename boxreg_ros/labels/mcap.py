@@ -295,22 +295,7 @@ def _without_added(refined: RefinedBoxes) -> RefinedBoxes:
     rows = [i for i, status in enumerate(refined.status) if status not in ADDED]
     if len(rows) == len(refined.status):
         return refined
-    boxes = refined.boxes
-    return RefinedBoxes(
-        BoxArray(
-            boxes.stamp_ns,
-            boxes.frame_id,
-            tuple(boxes.track_ids[i] for i in rows),
-            tuple(boxes.class_names[i] for i in rows),
-            boxes.scores[rows],
-            boxes.boxes[rows],
-        ),
-        tuple(refined.status[i] for i in rows),
-        tuple(refined.reasons[i] for i in rows),
-        refined.num_points[rows],
-        refined.covariances[rows],
-        refined.is_final,
-    )
+    return refined.take(rows)
 
 
 def _intervals(

@@ -16,7 +16,7 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 LOG_PERIOD = 10.0
 """The same reason is logged at most once in this time [s]."""
 WAITING = 'waiting'
-"""Name of the log entry that says what the node waits for."""
+"""Name of the log entry with the inputs that the node waits for."""
 REASONS_WITHOUT_CLOUDS = ('no_transform', 'no_sweep')
 """Reasons that boxes get when no cloud arrives at all."""
 RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')

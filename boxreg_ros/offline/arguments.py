@@ -11,11 +11,13 @@ from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
 import yaml
 
 
-def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the recordings, their topics and the settings."""
+def add_recording_arguments(
+    parser: argparse.ArgumentParser, several: str = 'several are merged by time'
+) -> None:
+    """Add the recordings, their topics and the settings; the help states the use of `several`."""
     parser.add_argument(
         'recordings', nargs='+', type=Path, metavar='RECORDING',
-        help='MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; several are merged by time',
+        help=f'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; {several}',
     )  # fmt: skip
     add_topic_arguments(parser)
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')

@@ -47,7 +47,9 @@ END_SECONDS = 10.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg batch`."""
-    add_recording_arguments(parser)
+    add_recording_arguments(
+        parser, 'each is one drive; also a pattern in quotes, or a .txt or .lst file of drives'
+    )
     parser.add_argument(
         '-o', '--out', type=Path, required=True, help='folder with one result folder per drive'
     )
@@ -61,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument('--report', action='store_true', help='write report.html for each drive')
     parser.add_argument(
-        '--strict', action='store_true', help='drives that cannot be read completely have failed'
+        '--strict', action='store_true', help='a drive that cannot be read completely has failed'
     )
     parser.add_argument(
         '--shard', type=_shard, default=(1, 1), metavar='I/N',

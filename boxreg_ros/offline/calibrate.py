@@ -262,7 +262,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='true boxes of some tracks, in the columns of boxes.csv',
     )  # fmt: skip
     parser.add_argument(
-        '-o', '--output', type=Path, metavar='RULE.yaml', help='file to write the settings to'
+        '-o', '--output', type=Path, metavar='MARGINS.yaml', help='file to write the settings to'
     )
     parser.add_argument(
         '--no-boxes',

@@ -46,6 +46,7 @@ class Consistency(NamedTuple):
 
 def consistency(
     matches: Matches,
+    predicted: BoxTable,
     truth: BoxTable,
     covariances: Mapping[tuple[int, str], BoxCovariance],
 ) -> dict[str, Consistency]:
@@ -56,23 +57,24 @@ def consistency(
     ----------
     matches : Matches
         True boxes with the errors of their predictions.
-    truth : BoxTable
-        The table of the true boxes.
+    predicted, truth : BoxTable
+        The tables of the predictions and of the true boxes.
     covariances : mapping
         Of the predictions, by stamp and track id.
 
     """
     known = []
-    for i, row in enumerate(matches.rows):
-        covariance = covariances.get((int(truth.stamps_ns[row]), truth.track_ids[row]))
-        if covariance is not None and matches.is_matched[i] and not matches.is_flipped[i]:
+    for i in np.flatnonzero(matches.is_matched & ~matches.is_flipped).tolist():
+        row = matches.predicted_rows[i]
+        covariance = covariances.get((int(predicted.stamps_ns[row]), predicted.track_ids[row]))
+        if covariance is not None:
             known.append((i, covariance))
     if not known:
         return {}
     rows = np.array([i for i, _ in known])
     squared = _normalised(matches, truth, rows, [covariance for _, covariance in known])
     classes = np.array([matches.class_names[i] for i in rows], object)
-    ranges = np.array([covariance.range for _, covariance in known])
+    ranges = np.array([covariance.distance for _, covariance in known])
     found = {'all': _over(squared, np.ones(len(rows), bool))}
     for name in sorted(set(classes)):
         found[str(name)] = _over(squared, np.equal(classes, name))

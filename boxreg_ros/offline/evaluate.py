@@ -54,6 +54,8 @@ class Matches:
     ----------
     rows : array, shape (n,)
         Rows of the true boxes in their table.
+    predicted_rows : array, shape (n,)
+        Rows of their predictions in the table of these; -1 without one.
     class_names : tuple of n str
         Of the true boxes.
     num_points : array, shape (n,)
@@ -81,6 +83,7 @@ class Matches:
     """
 
     rows: Ints
+    predicted_rows: Ints
     class_names: tuple[str, ...]
     num_points: Ints
     is_matched: Mask
@@ -223,6 +226,7 @@ def match(
     true_jitter = _second_difference(stamps, tracks, true_boxes[:, :3])
     return Matches(
         rows=scope,
+        predicted_rows=predicted_rows,
         class_names=tuple(truth.class_names[i] for i in scope),
         num_points=truth.num_points[scope],
         is_matched=is_matched,
@@ -343,7 +347,7 @@ def run(args: argparse.Namespace) -> int:
     tracks = track_scores(predicted, truth, matches.rows)
     if not has_trackeval():
         _warn('HOTA and IDF1 need the package trackeval: pip install trackeval')
-    certainty = consistency(matches, truth, _covariances(args.predicted))
+    certainty = consistency(matches, predicted, truth, _covariances(args.predicted))
     if args.json:
         report = _report(overall, groups(matches)) | {'tracks': asdict(tracks)}
         if certainty:
@@ -455,12 +459,13 @@ def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
     stamps = np.intersect1d(predicted.stamps_ns, truth.stamps_ns)
     return (
         f'no predicted box overlaps a true one: {len(stamps)} stamps are in both; stamps of '
-        f'predicted boxes: {_time_range(predicted.stamps_ns)}, of true boxes: '
-        f'{_time_range(truth.stamps_ns)}; compare boxes of one recording in one frame'
+        f'predicted boxes: {time_range(predicted.stamps_ns)}, of true boxes: '
+        f'{time_range(truth.stamps_ns)}; compare boxes of one recording in one frame'
     )
 
 
-def _time_range(stamps_ns: Ints) -> str:
+def time_range(stamps_ns: Ints) -> str:
+    """Return the first and the last of stamps [ns] as text [s]."""
     return f'{stamps_ns.min() * 1e-9:.3f} to {stamps_ns.max() * 1e-9:.3f} s'
 
 

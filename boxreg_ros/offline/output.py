@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline.cloud_spool import Spool
 from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.review.decisions import Corrections, read_decisions
 from boxreg_ros.structures import (
     ADDED,
     BoxArray,
@@ -26,9 +26,6 @@ from boxreg_ros.structures import (
     YAW,
 )
 import numpy as np
-
-if TYPE_CHECKING:
-    pass
 
 WITH_REJECTED = ('csv', 'mcap')
 """Formats that hold every box of the input; the messages of an overlay are those of the input."""
@@ -82,6 +79,10 @@ class Sink:
         Boxes by class name, of the names that no group of settings has.
     changes : Changes
         Boxes before and after, for the report and the tables of tracks.
+    corrections : Corrections
+        Rejected tracks and pinned boxes.
+    points : PointCollector or None
+        Points around the input boxes, for the report.
 
     """
 
@@ -101,11 +102,15 @@ class Sink:
         self._writers = {
             name: writer_for(name, folder, provenance, options) for name in request.all_formats
         }
-        from boxreg_ros.review.changes import (
-            Changes,  # imports torch, after the fork of the reader
+        self.corrections = Corrections(
+            read_decisions(request.decisions) if request.decisions is not None else ()
         )
+        # These import torch, after the fork of the reader.
+        from boxreg_ros.review.changes import Changes
+        from boxreg_ros.review.track_points import PointCollector
 
         self.changes = Changes(self._fixed_frame)
+        self.points = PointCollector(request.config) if request.report else None
         self._by_stamp: list[_Slot] = []  # not yet written
         self._by_ticket: dict[object, _Slot] = {}  # without a result
         self._last_ticket = 0
@@ -126,6 +131,9 @@ class Sink:
             The same for the registrar; boxes carry a ticket.
 
         """
+        if self.points is not None and item.moved is not None:
+            with self._clock('report'):
+                self.points.add(item.moved)
         self._note_time(item.given or item.moved)
         if isinstance(item.given, BoxArray):
             return self._reserve(item, item.given)
@@ -140,7 +148,7 @@ class Sink:
             if refined.is_final or self._writes_early:
                 slot = self._by_ticket.pop(refined.boxes.ticket, None)
                 if slot is not None:  # otherwise its early result has been taken
-                    slot.result = refined
+                    slot.result = self.corrections.apply(slot.boxes, refined)
         while self._by_stamp:
             first = self._by_stamp[0]
             if first.result is None:
@@ -156,6 +164,8 @@ class Sink:
         """Complete the files; after a failure the caller deletes them."""
         if failure is not None:
             return
+        if self.points is not None:
+            self.points.flush()
         with self._clock('write'):
             for writer in self._writers.values():
                 writer.close()
@@ -191,7 +201,7 @@ class Sink:
             slot = _Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
             self._last_ticket += 1
             self._by_ticket[self._last_ticket] = slot
-            moved = replace(item.moved, ticket=self._last_ticket)
+            moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
             item = item._replace(moved=moved)
         elif count:
             slot = _Slot(given, item.T_fixed_sensor, item.T_fixed_given, _kept(given))
@@ -241,21 +251,7 @@ def _accepted(refined: RefinedBoxes) -> RefinedBoxes:
     if REJECTED not in refined.status:
         return refined
     rows = [row for row, status in enumerate(refined.status) if status != REJECTED]
-    boxes = refined.boxes
-    return RefinedBoxes(
-        replace(
-            boxes,
-            track_ids=tuple(boxes.track_ids[row] for row in rows),
-            class_names=tuple(boxes.class_names[row] for row in rows),
-            scores=boxes.scores[rows],
-            boxes=boxes.boxes[rows],
-        ),
-        tuple(refined.status[row] for row in rows),
-        tuple(refined.reasons[row] for row in rows),
-        refined.num_points[rows],
-        refined.covariances[rows],
-        refined.is_final,
-    )
+    return refined.take(rows)
 
 
 def _heading_flips(boxes: BoxArray, refined: RefinedBoxes) -> int:

@@ -17,10 +17,12 @@ from importlib.metadata import version
 import json
 from pathlib import Path
 import platform
+from shutil import copyfile
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.output import Sink
@@ -31,24 +33,20 @@ from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
-from boxreg_ros.structures import (
-    BoxArray,
-    EXTENDED,
-    INTERPOLATED,
-    KEPT,
-    REFINED,
-    RefinedBoxes,
-    REJECTED,
-    Sweep,
-)
+from boxreg_ros.review.decisions import DECISIONS
+from boxreg_ros.structures import EXTENDED, INTERPOLATED, KEPT, REFINED, RefinedBoxes, REJECTED
+import numpy as np
 import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar
     from boxreg_ros.offline.completion import Completion
     from boxreg_ros.review.changes import TrackChanges
+    from boxreg_ros.review.track_points import PointCollector
     from boxreg_ros.tracks.complete import Plan
 
+MAX_NAMED = 5
+"""Most tracks that a warning names; chosen."""
 UNUSED_PREFIXES = ('sweep_', 'boxes_')
 """Counters of the registrar with these prefixes count unused messages and not kept boxes."""
 NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
@@ -69,8 +67,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         Result folder. It appears complete or not at all; an earlier result is replaced.
     progress : Progress, optional
         Shows the duration of the recording that has been read and its whole duration [s]. Both
-        count once for each time that the recording is read: with completed tracks and with a
-        report once more each.
+        count once for each time that the recording is read: with completed tracks once more.
 
     Returns
     -------
@@ -88,7 +85,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     clock = Stopwatch()
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
-    shown = _Passes(progress, 1 + bool(request.config.complete.steps) + request.report)
+    shown = _Passes(progress, 1 + bool(request.config.complete.steps))
     plan, completion = _survey(request, clock, shown)
     with ExitStack() as workers:
         process = workers.enter_context(reader(request))
@@ -114,9 +111,11 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
             tracks = sink.changes.tracks()
             with clock('write'):
                 summary['rules'] = _write_tables(folder, tracks, request.config, plan)
-            if request.report:
-                config = registrar.box_time.resolved(request.config)
-                _report(folder, out, request, config, summary, tracks, clock, shown)
+            if sink.points is not None:
+                sink.points.settle(registrar.box_time.resolved(request.config))
+                _report(folder, out, request, summary, tracks, sink.points, clock)
+            if request.decisions is not None:
+                copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
             (folder / CONFIG).write_text(settings, encoding='utf-8')
             (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
@@ -234,28 +233,47 @@ def _report(
     folder: Path,
     out: Path,
     request: Request,
-    config: Config,
     summary: dict[str, Any],
     tracks: Sequence[TrackChanges],
+    points: PointCollector,
     clock: Stopwatch,
-    progress: _Passes,
 ) -> None:
     """Write the report and add its time to the summary."""
-    from boxreg_ros.review.report import REPORT, write_report
+    from boxreg_ros.review.report import write_report
 
     with clock('report'):
+        truth = _truth(request, tracks, summary)
         line = closing_line(summary, out)
-        items = _items(request, progress)
-        write_report(folder / REPORT, line, summary, config, tracks, items)
+        write_report(folder, line, summary, request.config, tracks, points, truth)
     summary['seconds'] = clock.seconds()
 
 
-def _items(request: Request, progress: _Passes) -> Iterator[Sweep | BoxArray]:
-    """Read the recording once more; yield its clouds and boxes in the fixed frame."""
-    with reader(request) as process:
-        for item in progress.each(ReadAhead(process)):
-            if item.moved is not None:
-                yield item.moved
+def _truth(
+    request: Request, tracks: Sequence[TrackChanges], summary: dict[str, Any]
+) -> BoxTable | None:
+    """Return the true boxes for the report; None, with a warning, where they do not fit."""
+    if request.truth is None:
+        return None
+    from boxreg_ros.offline.evaluate import time_range
+
+    truth = BoxTable.read(request.truth)
+    stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
+    names = {track.track_id for track in tracks}
+    problem = ''
+    if truth.frame_id != summary['fixed_frame']:
+        problem = f'frame {summary["fixed_frame"]!r}, got {truth.frame_id!r}'
+    elif len(stamps) and not np.isin(stamps, truth.stamps_ns).any():
+        problem = f'boxes of {time_range(stamps)}, got {time_range(truth.stamps_ns)}'
+    elif names.isdisjoint(truth.track_ids):
+        problem = f'tracks {sorted(names)[:MAX_NAMED]}, got {truth.track_ids[:MAX_NAMED]}'
+    if not problem:
+        return truth
+    line = (
+        f'truth {str(request.truth)!r}: expected {problem}; the report is written without it: '
+        f'give the true boxes of this drive to --truth'
+    )
+    summary['warning'] = '; '.join(filter(None, (summary['warning'], line)))
+    return None
 
 
 def _summary(
@@ -295,6 +313,7 @@ def _summary(
         'warning': findings.warning or ('' if sink.boxes_in else NO_BOXES),
         **findings.facts,
         'left_out_of_labels': sink.left_out(),
+        'unused_decisions': sink.corrections.unused(),
         'frames_without_cloud': sink.without_cloud,
         'versions': _versions(),
     }
@@ -381,6 +400,13 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
     for name, found in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
         yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
+    if summary['unused_decisions']:
+        names = ', '.join(summary['unused_decisions'][:MAX_NAMED])
+        yield (
+            f'decisions: expected tracks and boxes of this recording, got '
+            f'{len(summary["unused_decisions"]):,} others, which are not used: {names}; give the '
+            f'decisions of this recording to --decisions'
+        )
     if summary['frames_without_cloud']:
         yield (
             f'{summary["frames_without_cloud"]:,} of {summary["box_arrays"]:,} box arrays have no '

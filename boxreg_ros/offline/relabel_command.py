@@ -66,7 +66,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--bridge', nargs='?', action=_Removed, help=argparse.SUPPRESS)
     parser.add_argument(
         '--report', action='store_true',
-        help='also write report.html: what was changed, and which tracks to check',
+        help='also write report.html: every track before and after, to look at in a browser',
+    )  # fmt: skip
+    parser.add_argument(
+        '--decisions', type=Path, metavar='FILE',
+        help='decisions.csv of boxreg review: keep rejected tracks as input, hold pinned boxes',
+    )  # fmt: skip
+    parser.add_argument(
+        '--truth', type=Path, metavar='FILE',
+        help='true boxes that the report shows, as CSV with the columns of boxes.csv',
     )  # fmt: skip
     parser.add_argument(
         '--resume', action='store_true',
@@ -190,6 +198,8 @@ def _request(args: argparse.Namespace) -> Request:
         label_frame=args.label_frame,
         convention=convention_from(args, args.associate),
         report=args.report,
+        truth=args.truth,
+        decisions=args.decisions,
     )
 
 

@@ -46,7 +46,11 @@ class Request:
     convention : Convention
         Meaning of pose and size of the input boxes.
     report : bool
-        Also write ``report.html``; the recording is then read once more.
+        Also write ``report.html``.
+    decisions : Path or None
+        Decisions of `boxreg review`: rejected tracks and pinned boxes.
+    truth : Path or None
+        True boxes that the report shows, in the columns of ``boxes.csv``.
 
     Raises
     ------
@@ -69,6 +73,8 @@ class Request:
     label_frame: str | None = None
     convention: Convention = STANDARD
     report: bool = False
+    truth: Path | None = None
+    decisions: Path | None = None
 
     def __post_init__(self) -> None:
         """Check the options."""
@@ -147,6 +153,7 @@ class Request:
             paths.append(self.options.camera)
         if self.labels is not None:
             paths.append(self.labels[1])
+        paths += filter(None, (self.truth, self.decisions))
         return tuple(paths)
 
     def fingerprint(self) -> str:

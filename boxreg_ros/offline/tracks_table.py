@@ -1,4 +1,4 @@
-"""Columns of `tracks.csv` that say what the completing steps did."""
+"""Columns of `tracks.csv` about the completing steps."""
 
 from __future__ import annotations
 

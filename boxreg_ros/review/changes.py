@@ -7,7 +7,16 @@ from dataclasses import dataclass
 
 from boxreg_ros.core.metrics import pose_errors
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, REFINED, RefinedBoxes, YAW
+from boxreg_ros.structures import (
+    BoxArray,
+    Floats,
+    HUMAN,
+    Ints,
+    is_valid_box,
+    REFINED,
+    RefinedBoxes,
+    YAW,
+)
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -21,6 +30,8 @@ class TrackChanges:
     ----------
     track_id, class_name : str
         As in the input; the most frequent class of the track.
+    input_ids : tuple of n str
+        Track ids in the input; empty for boxes that the input does not have.
     stamps_ns : array, shape (n,)
         Header stamps [ns].
     given, boxes : array, shape (n, 9)
@@ -40,8 +51,8 @@ class TrackChanges:
         True where the heading was flipped by 180 degrees.
     status : array of str, shape (n,)
         As in `RefinedBoxes`.
-    reasons : Counter
-        Why boxes were kept.
+    reasons : array of str, shape (n,)
+        Why a box was kept; empty for the others.
     num_points : array, shape (n,)
         Points inside the input boxes.
 
@@ -49,6 +60,7 @@ class TrackChanges:
 
     track_id: str
     class_name: str
+    input_ids: tuple[str, ...]
     stamps_ns: Ints
     given: Floats
     boxes: Floats
@@ -59,13 +71,13 @@ class TrackChanges:
     outside: Floats
     is_flipped: NDArray[np.bool_]
     status: NDArray[np.str_]
-    reasons: Counter[str]
+    reasons: NDArray[np.str_]
     num_points: Ints
 
     @property
     def is_refined(self) -> NDArray[np.bool_]:
-        """Return which boxes are refined, shape (n,)."""
-        return np.asarray(self.status == REFINED)
+        """Return which boxes are refined or pinned, shape (n,)."""
+        return np.isin(self.status, (REFINED, HUMAN))
 
     @property
     def shift(self) -> float:
@@ -96,7 +108,8 @@ class Changes:
 
     def __init__(self, fixed_frame: str) -> None:
         self._fixed_frame = fixed_frame
-        self._names: list[tuple[str, str, str, str]] = []  # id, class, status, reason
+        # Id, class, status, reason, id in the input.
+        self._names: list[tuple[str, str, str, str, str]] = []
         # Rows of given (9), boxes (9), deviations (4), extent deviations (3), face distances (6),
         # part of the points outside (1).
         self._numbers: list[Floats] = []
@@ -138,9 +151,9 @@ class Changes:
             )
         )
         self._counts.append(np.column_stack([np.full(n, boxes.stamp_ns), refined.num_points]))
-        self._names += zip(
-            boxes.track_ids, boxes.class_names, refined.status, refined.reasons, strict=True
-        )
+        input_ids = (*given.track_ids, *('' for _ in range(n - len(given.track_ids))))
+        names = boxes.track_ids, boxes.class_names, refined.status, refined.reasons, input_ids
+        self._names += zip(*names, strict=True)
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
@@ -154,13 +167,15 @@ class Changes:
         change = -np.column_stack([errors.translation, yaw_change])
         found = []
         for track_id, rows in self._rows_by_track(counts[:, 0]).items():
-            _, classes, status, reasons = zip(*(self._names[row] for row in rows), strict=True)
-            is_refined = np.array(status) == REFINED
+            parts = zip(*(self._names[row] for row in rows), strict=True)
+            _, classes, status, reasons, input_ids = parts
+            is_refined = np.isin(status, (REFINED, HUMAN))
             unknown = np.where(is_refined, 0.0, np.nan)[:, None]
             found.append(
                 TrackChanges(
                     track_id=track_id,
                     class_name=Counter(classes).most_common(1)[0][0],
+                    input_ids=input_ids,
                     stamps_ns=counts[rows, 0],
                     given=given[rows],
                     boxes=boxes[rows],
@@ -171,7 +186,7 @@ class Changes:
                     outside=outside[rows, 0],
                     is_flipped=errors.is_flipped[rows] & is_refined,
                     status=np.array(status),
-                    reasons=Counter(filter(None, reasons)),
+                    reasons=np.array(reasons),
                     num_points=counts[rows, 1],
                 )
             )

@@ -1,51 +1,42 @@
 """
-`boxreg relabel --report`: one HTML page that shows the changes and which tracks to check.
+`boxreg relabel --report`: one HTML page to look at every track before and after.
 
-The page needs no other file and no network: its pictures are embedded.
+The page needs no other file and no network. Its 3D view and charts are drawn by Plotly, whose
+script is taken from the installed package and embedded. The boxes and points of each track are
+compressed and decompressed when the track is opened. `boxreg review` serves the same page.
 
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+import csv
+from dataclasses import asdict
 from importlib import import_module
-from math import isfinite
 import os
 from pathlib import Path
 import re
-from string import ascii_uppercase
 from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.reasons import Reason, REASONS
-from boxreg_ros.review.changes import mean, median, TrackChanges
-from boxreg_ros.review.pictures import STYLE, top_view, track_picture
-from boxreg_ros.review.track_points import BoxPoints, gather_points, points_before_and_after
-from boxreg_ros.structures import (
-    ADDED,
-    BOX_EXTENT,
-    BoxArray,
-    Floats,
-    KEPT,
-    REFINED,
-    Sweep,
-    X,
-)
+from boxreg_ros.review.changes import mean, TrackChanges
+from boxreg_ros.review.payload import as_json, compressed, points_per_box, TrackPart, true_boxes
+from boxreg_ros.review.quality import CELL, Quality
+from boxreg_ros.review.track_points import PointCollector
+from boxreg_ros.structures import REFINED
 import numpy as np
 
 REPORT = 'report.html'
-PACKAGES = ('jinja2', 'matplotlib')
-TEMPLATE = Path(__file__).parents[1] / 'share' / 'report.html.j2'
-MAX_SHOWN = 12
-"""Tracks with a picture."""
-MIN_BOXES = 10
-"""Boxes in the fixed frame that a track with a picture has at least."""
-MAX_ROWS = 300
-"""Tracks in the table of all tracks."""
-CELL = 0.1
-"""Edge of the cubes that measure how sharp the points of all sweeps are in their boxes [m]."""
+REVIEW = 'review.csv'
+PACKAGES = ('jinja2', 'plotly')
+SHARE = Path(__file__).parents[1] / 'share'
+TEMPLATE = 'report.html.j2'
+ASSETS = ('report.css', 'report.js')
+MAX_MAP_SENSOR = 2000
+"""Positions of the sensor on the map; chosen."""
 
 
 def check_packages() -> None:
@@ -68,20 +59,21 @@ def check_packages() -> None:
 
 
 def write_report(
-    path: Path,
+    folder: Path,
     line: str,
     summary: Mapping[str, Any],
     config: Config,
     tracks: Sequence[TrackChanges],
-    items: Iterable[Sweep | BoxArray],
+    points: PointCollector,
+    truth: BoxTable | None = None,
 ) -> None:
     """
     Write the report of a run as one HTML file.
 
     Parameters
     ----------
-    path : Path
-        The file.
+    folder : Path
+        Result folder. The risks and the order of its ``review.csv`` are shown, if it has one.
     line : str
         The closing line of the run.
     summary : mapping
@@ -89,140 +81,90 @@ def write_report(
     config : Config
         Settings of the run.
     tracks : sequence of TrackChanges
-        All tracks, in the order of the table.
-    items : iterable of Sweep and BoxArray
-        The recording once more, in the fixed frame. One item is held at a time.
+        All tracks, in the order of the list.
+    points : PointCollector
+        The points of the recording.
+    truth : BoxTable, optional
+        True boxes in the fixed frame, by the same stamps and track ids.
 
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    import matplotlib
 
-    selected = select_tracks(tracks)
-    letters = dict(zip(selected, ascii_uppercase, strict=False))
-    shown = [track for track_id in selected for track in tracks if track.track_id == track_id]
-    points, origins = gather_points(shown, items, config)
     begin_ns = min((int(track.stamps_ns[0]) for track in tracks), default=0)
-    in_fixed_frame = [track for track in tracks if np.isfinite(track.boxes[:, X]).any()]
-    sections = []
-    with matplotlib.rc_context(STYLE):
-        overview = top_view(in_fixed_frame, letters, origins) if in_fixed_frame else ''
-        for track in shown:
-            section = _numbers(track)
-            section['letter'] = letters[track.track_id]
-            section['why'] = selected[track.track_id]
-            section |= _picture(track, points[track.track_id], begin_ns)
-            sections.append(section)
+    max_points = points_per_box(sum(len(track.stamps_ns) for track in tracks))
+    review = list(_rows_of(folder / REVIEW))
+    risks = {row['track_id']: row for row in review}
+    rows = []
+    parts = []
+    qualities = []
+    for track, true in zip(tracks, true_boxes(tracks, truth), strict=True):
+        part = TrackPart(track, points, true)
+        rows.append(part.row(begin_ns, risks.get(track.track_id, {})))
+        parts.append(compressed(as_json(part.part(begin_ns, max_points))))
+        qualities.append((part.before, part.after))
+    stride = 1 + len(points.origins) // MAX_MAP_SENSOR
+    data = {
+        'begin_ns': str(begin_ns),
+        'frame': summary['fixed_frame'],
+        'cell': CELL,
+        'has_truth': truth is not None,
+        'has_risk': bool(risks),
+        'tracks': rows,
+        'review': review,
+        'sensor': np.round(points.origins[::stride, :2], 2),
+        'total': [_total([pair[k] for pair in qualities]) for k in range(2)],
+    }
     environment = Environment(
-        loader=FileSystemLoader(TEMPLATE.parent), autoescape=True, undefined=StrictUndefined,
+        loader=FileSystemLoader(SHARE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {'number': _number, 'code': _code}
+    environment.filters['code'] = _code
+    css, script = (_as_markup((SHARE / name).read_text(encoding='utf-8')) for name in ASSETS)
     changes = np.concatenate([np.zeros((0, 4)), *(t.change[t.is_refined] for t in tracks)])
-    page = environment.get_template(TEMPLATE.name).render(
+    page = environment.get_template(TEMPLATE).render(
         line=line,
         summary=summary,
         names=[Path(os.path.abspath(name)).name for name in summary['recordings']],
         warnings=_warnings(summary),
         shift=mean(np.linalg.norm(changes[:, :3], axis=1)),
-        turn=np.degrees(mean(np.abs(changes[:, 3]))),
+        turn=float(np.degrees(mean(np.abs(changes[:, 3])))),
         reasons=_explained(summary['reasons']),
         dropped=_explained(summary['dropped']),
         settings=[(item, value) for item, value in config.items() if value != item.default],
-        overview=overview,
-        sections=sections,
-        letters=letters,
-        rows=[_numbers(track) for track in tracks[:MAX_ROWS]],
         count=len(tracks),
-        min_boxes=MIN_BOXES,
-        cell=CELL,
+        css=css,
+        script=script,
+        data=compressed(as_json(data)),
+        parts=parts,
+        plotly=compressed(_plotly_script()),
     )
     # File names need not be valid UTF-8.
-    path.write_text(page, encoding='utf-8', errors='backslashreplace')
+    (folder / REPORT).write_text(page, encoding='utf-8', errors='backslashreplace')
 
 
-def select_tracks(tracks: Sequence[TrackChanges]) -> dict[str, str]:
-    """
-    Select the tracks to show with a picture.
-
-    By turns the next track of four orders is taken: largest shift, largest standard deviation,
-    most boxes kept although they have points, and, for comparison, most points.
-
-    Returns
-    -------
-    selected : dict
-        Why each track is shown, by track id, in the order of the page.
-
-    """
-    candidates = []
-    for track in tracks:
-        if track.track_id and np.isfinite(track.boxes[:, X]).sum() >= MIN_BOXES:
-            candidates.append(track)
-    orders: list[list[tuple[float, str, str]]] = [[], [], [], []]  # (value, why, track id)
-    for track in candidates:
-        shift = track.shift
-        deviation = track.deviation
-        points = median(track.num_points)
-        kept = int(((track.status == KEPT) & (track.num_points > 0)).sum())
-        texts = (
-            f'largest shift: mean {shift:.2f} m',
-            f'largest uncertainty: {deviation:.2f} m (1 sigma)',
-            f'boxes kept although they have points: {kept} of {len(track.status)}',
-            f'most points: {points:,.0f} per box',
-        )
-        values = (shift, deviation, kept, points)
-        for order, value, text in zip(orders, values, texts, strict=True):
-            if value > 0:  # NaN is not
-                order.append((value, text, track.track_id))
-    for order in orders:
-        order.sort(key=lambda item: -item[0])
-    selected: dict[str, str] = {}
-    for rank in range(len(candidates)):
-        for order in orders:
-            if rank < len(order) and len(selected) < MAX_SHOWN:
-                _, why, track_id = order[rank]
-                selected.setdefault(track_id, why)
-    return selected
+def _total(qualities: Sequence[Quality]) -> dict[str, Any]:
+    """Return the figures of all tracks: sums of counts, means of the others."""
+    rows = [asdict(one) for one in qualities]
+    total: dict[str, Any] = {}
+    for name in ('flips', 'cells'):
+        total[name] = sum(row[name] for row in rows)
+    for name in ('jitter', 'yaw_jitter', 'size_spread', 'iou'):
+        total[name] = mean([row[name] for row in rows])
+    return total
 
 
-def _picture(track: TrackChanges, points: Sequence[BoxPoints], begin_ns: int) -> dict[str, Any]:
-    """Return the picture of a track, and the cells that its points fill before and after."""
-    before, after, is_object = points_before_and_after(track, points)
-    return {
-        'picture': track_picture(track, before, after, is_object, begin_ns),
-        'sweeps': len(points),
-        'cells': [_filled_cells(before[is_object]), _filled_cells(after[is_object])],
-    }
+def _rows_of(path: Path) -> Iterator[dict[str, str]]:
+    """Yield the rows of a CSV file; none if it does not exist."""
+    if path.exists():
+        with open(path, newline='', encoding='utf-8') as file:
+            yield from csv.DictReader(file)
 
 
-def _filled_cells(points: Floats) -> int:
-    """Return the number of cubes of edge `CELL` that hold points (M, 3)."""
-    return len(np.unique(np.floor(points / CELL), axis=0))
+def _plotly_script() -> bytes:
+    """Return the script of Plotly from its package."""
+    import plotly
 
-
-def _numbers(track: TrackChanges) -> dict[str, Any]:
-    """Return the numbers of a track on the page."""
-    counts = Counter(track.status.tolist())
-    is_input = ~np.isin(track.status, ADDED)
-    boxes = int(is_input.sum())
-    return {
-        'track_id': track.track_id,
-        'class_name': track.class_name,
-        'boxes': boxes,
-        'interpolated': len(track.status) - boxes,
-        'seconds': (track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
-        'points': median(track.num_points[is_input]),
-        'refined': counts[REFINED] / boxes if boxes else np.nan,
-        'kept': ', '.join(f'{name} {count:,}' for name, count in track.reasons.most_common()),
-        'shift': track.shift,
-        'turn': track.turn,
-        'deviation': track.deviation,
-        'extents': [_median_extents(track.given), _median_extents(track.boxes)],
-        'flips': int(track.is_flipped.sum()),
-    }
-
-
-def _median_extents(boxes: Floats) -> list[float]:
-    return [median(values) for values in boxes[:, BOX_EXTENT].T]
+    return (Path(plotly.__file__).parent / 'package_data' / 'plotly.min.js').read_bytes()
 
 
 def _warnings(summary: Mapping[str, Any]) -> list[str]:
@@ -246,13 +188,15 @@ def _explained(counts: Mapping[str, int]) -> list[tuple[str, int, Reason]]:
     return sorted(found, key=lambda item: -item[1])
 
 
-def _number(value: float, digits: int = 2) -> str:
-    """Return a number with separators; a dash for NaN."""
-    return f'{value:,.{digits}f}' if isfinite(value) else '\N{EN DASH}'
-
-
 def _code(text: str) -> Any:
     """Return text as HTML; words between backticks become code."""
     from markupsafe import escape, Markup
 
     return Markup(re.sub(r'`([^`]+)`', r'<code>\1</code>', str(escape(text))))
+
+
+def _as_markup(text: str) -> Any:
+    """Return a file of ours as it is: style and script must not be escaped."""
+    from markupsafe import Markup
+
+    return Markup(text)

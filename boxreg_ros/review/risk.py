@@ -8,6 +8,7 @@ as much 3D IoU as the errors to expect. So boxes of all sizes and errors of all 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -103,7 +104,8 @@ def reasons_of(track: TrackChanges, risk: Risk, row: int | None = None) -> str:
     points = float(np.median(track.num_points)) if row is None else float(track.num_points[row])
     if points < FEW_POINTS:
         words.append(f'few points ({points:.0f} per box)')
-    words += [f'{count} kept: {name}' for name, count in track.reasons.most_common(2)]
+    kept = Counter(filter(None, track.reasons.tolist()))
+    words += [f'{count} kept: {name}' for name, count in kept.most_common(2)]
     return '; '.join(words)
 
 

@@ -1,4 +1,4 @@
-"""``tracks.csv``, one row per track, and ``review.csv``, what a person should look at first."""
+"""``tracks.csv``, one row per track, and ``review.csv``, tracks in the order of their risk."""
 
 from __future__ import annotations
 

@@ -1,173 +1,157 @@
-"""Points of a recording near the boxes of some tracks, for the pictures of the report."""
+"""Points of a recording near the boxes of its tracks, for the report."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import Pair, StampMatcher
-from boxreg_ros.core.observation import crop, GROUND_CLEARANCE
+from boxreg_ros.core.observation import crop
 from boxreg_ros.review.changes import TrackChanges
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import BoxArray, Floats, HEIGHT, ROLL, Sweep, X, Z
+from boxreg_ros.structures import BoxArray, Floats, is_valid_box, ROLL, Sweep, X, Z
 import numpy as np
 from numpy.typing import NDArray
 
 SHOWN_MARGIN = 0.6
-"""Points up to this far outside a box are shown [m]."""
-MAX_SWEEPS = 60
-"""Sweeps of one track that are shown, spread over its duration."""
-MAX_POINTS = 150
-"""Points of one box that are shown."""
+"""Points up to this far outside a box are shown [m]; chosen."""
+GATHERED_MARGIN = 1.6
+"""Points up to this far outside an input box are gathered [m]: a refined box may be 1 m off it."""
+GATHERED_POINTS = 400
+"""Most points gathered of one box; derived: 100,000 boxes take 240 MB."""
+MILLIMETRES = 1000.0
+"""Points are stored as 16-bit integers in this unit [1/m]: up to 32 m from the centre."""
 
 
-class BoxPoints(NamedTuple):
-    """Points (M, 3) of a sweep near the box in one row of a track, in the fixed frame [m]."""
-
-    row: int
-    points: Floats
-
-
-def gather_points(
-    tracks: Sequence[TrackChanges], items: Iterable[Sweep | BoxArray], config: Config
-) -> tuple[dict[str, list[BoxPoints]], Floats]:
+class _Gathered(NamedTuple):
     """
-    Select some points of each track from a recording.
+    Points (M, 3) around a centre (3,) [mm from it], and their times.
+
+    The stamp of the sweep relative to that of the box, and the times of the points relative to the
+    stamp of the sweep, None where unknown [s].
+
+    """
+
+    center: Floats
+    offsets: NDArray[np.int16]
+    sweep_delay: float
+    times: NDArray[np.float32] | None
+
+
+class PointCollector:
+    """
+    Gather the points around the input boxes while a recording is read.
+
+    The recording is read once: points are gathered before the boxes are refined.
 
     Parameters
     ----------
-    tracks : sequence of TrackChanges
-        The tracks to show.
-    items : iterable of Sweep and BoxArray
-        The recording in the fixed frame. One item is held at a time, and few points are kept.
     config : Config
         Settings of the run.
 
-    Returns
-    -------
-    points : dict
-        The selected points of each track, by track id.
-    origins : array, shape (n, 3)
-        Positions of the sensor in the fixed frame [m].
-
     """
-    wanted: dict[tuple[int, str], tuple[TrackChanges, int]] = {}
-    for track in tracks:
-        for row in reversed(_selected_rows(track)):  # of two boxes of one stamp use the first
-            wanted[int(track.stamps_ns[row]), track.track_id] = track, row
-    points: dict[str, list[BoxPoints]] = {track.track_id: [] for track in tracks}
-    origins: list[Floats] = []
-    for boxes, sweep in _pairs(items, config, origins):
-        if sweep is None:
-            continue
-        for track_id in boxes.track_ids:
-            found = wanted.pop((boxes.stamp_ns, track_id), None)
-            if found is not None:
-                track, row = found
-                near = _points_near(track, row, sweep, config)
-                points[track_id].append(BoxPoints(row, near))
-    return points, np.reshape(origins, (-1, 3))
 
+    def __init__(self, config: Config) -> None:
+        self._matcher = StampMatcher(config, Counter())
+        self.settle(config)
+        self._gathered: dict[tuple[int, str], _Gathered] = {}
+        self._origins: dict[int, Floats] = {}
 
-def in_box_frame(
-    points: Sequence[BoxPoints], boxes: Floats, is_flipped: NDArray[np.bool_]
-) -> Floats:
-    """
-    Return the points of all sweeps in the frame of the box of their sweep.
+    def settle(self, config: Config) -> None:
+        """Take over settings that a run has resolved: whether boxes hold at their stamp."""
+        sampling = config.sampling
+        self._is_at_stamp = sampling.deskew and sampling.box_time == 'stamp'
 
-    Parameters
-    ----------
-    points : sequence of BoxPoints
-        Points in the fixed frame.
-    boxes : array, shape (n, 9)
-        The boxes of the track in the fixed frame.
-    is_flipped : array, shape (n,)
-        Boxes whose heading is to be flipped first.
-
-    Returns
-    -------
-    local : array, shape (M, 3)
-        Points [m]; x forward, y left, z up from the centre of the box.
-
-    """
-    local = [np.zeros((0, 3))]
-    for row, fixed in points:
-        R = matrix_from_rpy(boxes[row, ROLL:])
-        sign = np.array([-1, -1, 1]) if is_flipped[row] else 1
-        local.append((fixed - boxes[row, : Z + 1]) @ R * sign)
-    return np.concatenate(local)
-
-
-def points_before_and_after(
-    track: TrackChanges, points: Sequence[BoxPoints]
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """
-    Return the points of all sweeps in the frames of the input boxes and of the refined boxes.
-
-    Parameters
-    ----------
-    track : TrackChanges
-        The track.
-    points : sequence of BoxPoints
-        Its points in the fixed frame.
-
-    Returns
-    -------
-    before, after : array, shape (M, 3)
-        Points [m]; x forward, y left, z up from the centre of the box. Input boxes whose heading
-        was flipped are flipped here too.
-    is_object : array, shape (M,)
-        False for points near the lower face of the refined box, which may be road.
-
-    """
-    before = in_box_frame(points, track.given, track.is_flipped)
-    after = in_box_frame(points, track.boxes, np.zeros_like(track.is_flipped))
-    half_height = np.nanmedian(track.boxes[:, HEIGHT]) / 2
-    is_object = after[:, Z] > GROUND_CLEARANCE - half_height
-    return before, after, is_object
-
-
-def _pairs(
-    items: Iterable[Sweep | BoxArray], config: Config, origins: list[Floats]
-) -> Iterator[Pair]:
-    """Yield boxes and sweeps paired by stamp; append the sensor positions to `origins`."""
-    matcher = StampMatcher(config, Counter())
-    for item in items:
+    def add(self, item: Sweep | BoxArray) -> None:
+        """Add a sweep or a box array in the fixed frame."""
         if isinstance(item, Sweep):
-            origins.append(item.origin)
-            yield from matcher.add_sweep(item)
+            self._origins[item.stamp_ns] = item.origin
+            pairs = self._matcher.add_sweep(item)
         else:
-            yield from matcher.add_boxes(item)
-    yield from matcher.flush()
+            pairs = self._matcher.add_boxes(item)
+        self._gather(pairs)
+
+    def flush(self) -> None:
+        """Gather the points of the last boxes; call this after the last item."""
+        self._gather(self._matcher.flush())
+
+    @property
+    def origins(self) -> Floats:
+        """Return the positions of the sensor in the fixed frame by stamp, shape (n, 3) [m]."""
+        return np.array([self._origins[stamp] for stamp in sorted(self._origins)]).reshape(-1, 3)
+
+    def points_of(self, track: TrackChanges) -> list[Floats]:
+        """
+        Return the points near each box of a track before or after, n arrays (M_i, 3) [m].
+
+        In the fixed frame, motion-compensated to the stamp of the box.
+
+        """
+        is_known = np.asarray(np.isfinite(np.hstack([track.given, track.boxes])).all(axis=1))
+        both = np.stack([track.given, track.boxes])
+        R = matrix_from_rpy(np.where(is_known[:, None], both[..., ROLL:], 0.0))
+        points = []
+        for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
+            found = self._gathered.get((stamp_ns, track.input_ids[row]))
+            if found is None or not is_known[row]:
+                points.append(np.zeros((0, 3)))
+                continue
+            delays = np.array([found.sweep_delay])
+            if self._is_at_stamp and found.times is not None:
+                delays = delays + found.times
+            motion = _motion_to_stamp(track, row, delays)
+            near = found.offsets / MILLIMETRES + found.center + motion
+            local = (near - both[:, row, None, : Z + 1]) @ R[:, row]
+            limit = both[:, row, None, Z + 1 : ROLL] / 2 + SHOWN_MARGIN
+            is_shown = (np.abs(local) < limit).all(axis=2).any(axis=0)
+            points.append(near[is_shown])
+        return points
+
+    def sensor_at(self, stamps_ns: NDArray[np.int64]) -> Floats:
+        """Return the position of the sensor (n, 3) nearest in time to each stamp, or NaN [m]."""
+        if not self._origins:
+            return np.full((len(stamps_ns), 3), np.nan)
+        known = np.array(sorted(self._origins))
+        after = np.searchsorted(known, stamps_ns).clip(0, len(known) - 1)
+        before = (after - 1).clip(0)
+        is_before = stamps_ns - known[before] < known[after] - stamps_ns
+        return self.origins[np.where(is_before, before, after)]
+
+    def _gather(self, pairs: list[Pair]) -> None:
+        for boxes, sweep in pairs:
+            rows = np.flatnonzero(is_valid_box(boxes.boxes))
+            if sweep is None or not len(rows):
+                continue
+            near = crop(sweep.points, boxes.boxes[rows], GATHERED_MARGIN)
+            is_near = near.outside.max(0) < GATHERED_MARGIN
+            owners = near.owner[is_near]
+            offsets = to_millimetres(near.offset[:, is_near].T)
+            delay = (sweep.stamp_ns - boxes.stamp_ns) * 1e-9
+            times = None
+            if sweep.times is not None:
+                times = sweep.times[near.row[is_near]].astype(np.float32)
+            ends = np.searchsorted(owners, np.arange(len(rows) + 1))
+            for row, begin, end in zip(rows.tolist(), ends[:-1], ends[1:], strict=True):
+                step = max(1, -(-(end - begin) // GATHERED_POINTS))
+                part = slice(begin, end, step)
+                key = boxes.stamp_ns, boxes.track_ids[row]
+                center = boxes.boxes[row, : Z + 1].copy()
+                own_times = None if times is None else times[part].copy()
+                found = _Gathered(center, offsets[part].copy(), delay, own_times)
+                self._gathered.setdefault(key, found)  # of two boxes of one id the first counts
 
 
-def _selected_rows(track: TrackChanges) -> list[int]:
-    """Return rows of boxes with points in or near them, spread over the track."""
-    has_points = track.is_refined | (track.num_points > 0)
-    rows = np.flatnonzero(np.isfinite(track.change).all(axis=1) & has_points)
-    picks = np.linspace(0, len(rows) - 1, min(MAX_SWEEPS, len(rows))).astype(int)
-    return [int(row) for row in rows[picks]]
+def to_millimetres(offsets: Floats) -> NDArray[np.int16]:
+    """Return `offsets` [m] as 16-bit integers [mm]; those beyond 32 m are clipped."""
+    limit = np.iinfo(np.int16).max
+    return np.rint(offsets * MILLIMETRES).clip(-limit, limit).astype(np.int16)
 
 
-def _points_near(track: TrackChanges, row: int, sweep: Sweep, config: Config) -> Floats:
-    """Return points (M, 3) near a box before or after, motion-compensated to its stamp."""
-    delay = np.array([(sweep.stamp_ns - track.stamps_ns[row]) * 1e-9])
-    both = np.array([track.given[row], track.boxes[row]])
-    both[:, : Z + 1] -= _motion_to_stamp(track, row, delay)
-    index, _, _, outside = crop(sweep.points, both, SHOWN_MARGIN)
-    index = np.unique(index[outside.max(0) < SHOWN_MARGIN])
-    step = max(1, -(-len(index) // MAX_POINTS))
-    index = index[::step]
-    is_at_stamp = config.sampling.deskew and config.sampling.box_time == 'stamp'
-    if is_at_stamp and sweep.times is not None:
-        delay = delay + sweep.times[index]
-    return np.asarray(sweep.points[index] + _motion_to_stamp(track, row, delay))
-
-
-def _motion_to_stamp(track: TrackChanges, row: int, delays: Floats) -> Floats:
-    """Return how far the box moves (n, 3) from `delays` [s] after its stamp back to it [m]."""
+def _motion_to_stamp(track: TrackChanges, row: int, delays: NDArray[np.floating]) -> Floats:
+    """Return how far the box moves from `delays` (n,) after its stamp back to it, (n or 1, 3)."""
+    if not delays.any():
+        return np.zeros((1, 3))
     is_known = np.isfinite(track.boxes[:, X])
     times = (track.stamps_ns[is_known] - track.stamps_ns[row]) * 1e-9
     centers = track.boxes[is_known, : Z + 1]

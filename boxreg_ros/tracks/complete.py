@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.structures import (
@@ -33,6 +34,7 @@ from boxreg_ros.tracks.stitch import stitch
 from boxreg_ros.tracks.track_steps import TrackSteps
 from boxreg_ros.tracks.tracklet import Tracklet, tracklets_of
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +74,9 @@ class PlannedArray:
     def to_register(self, given: BoxArray) -> BoxArray:
         """Return the boxes of an array without rejected ones, and with the added ones."""
         rows = [row for row in range(len(given.track_ids)) if row not in self.rejected]
+        pinned = None
+        if given.pinned is not None:
+            pinned = np.append(given.pinned[rows], np.zeros(len(self.added), bool))
         return replace(
             given,
             track_ids=(*(self.track_ids[i] for i in rows), *(a.track_id for a in self.added)),
@@ -83,6 +88,7 @@ class PlannedArray:
             boxes=np.concatenate(
                 [given.boxes[rows], np.array([a.box for a in self.added]).reshape(-1, 9)]
             ),
+            pinned=pinned,
         )
 
 
@@ -331,34 +337,39 @@ def _finished(
     taken = [row for row in range(n) if row not in array.rejected]
     kept = [i for i, is_kept in enumerate(keep) if is_kept]
     rows = [len(taken) + i for i in kept]  # of the added boxes, in what was registered
-    boxes = given.boxes.copy()
-    boxes[taken] = registered.boxes.boxes[: len(taken)]
-    covariances = np.broadcast_to(np.eye(6), (n, 6, 6)).copy()
-    covariances[taken] = registered.covariances[: len(taken)]
-    counts = np.zeros(n, np.int64)
-    counts[taken] = registered.num_points[: len(taken)]
+
+    def completed(values: NDArray[Any], of_rejected: NDArray[Any]) -> NDArray[Any]:
+        column = np.broadcast_to(of_rejected, (n, *values.shape[1:])).astype(values.dtype)
+        column[taken] = values[: len(taken)]
+        return np.concatenate([column, values[rows]])
+
+    covariances = completed(registered.covariances, np.eye(6))
+    for i, row in enumerate(rows):
+        covariances[n + i] = _covariance_of_added(
+            array.added[kept[i]], registered, row, int(num_points[row])
+        )
     status = [REJECTED] * n
     reasons = [array.rejected.get(row, '') for row in range(n)]
     for i, row in enumerate(taken):
         status[row] = registered.status[i]
         reasons[row] = registered.reasons[i]
-    added_covariances = [
-        _covariance_of_added(array.added[i], registered, row, int(num_points[row]))
-        for i, row in zip(kept, rows, strict=True)
-    ]
     return RefinedBoxes(
         replace(
             given,
             track_ids=(*array.track_ids, *(array.added[i].track_id for i in kept)),
             class_names=(*array.class_names, *(array.added[i].class_name for i in kept)),
             scores=np.append(given.scores, [array.added[i].score for i in kept]),
-            boxes=np.concatenate([boxes, registered.boxes.boxes[rows]]),
+            boxes=completed(registered.boxes.boxes, given.boxes),
+            pinned=None,
         ),
         (*status, *(array.added[i].status for i in kept)),
         (*reasons, *('',) * len(kept)),
-        np.append(counts, registered.num_points[rows]),
-        np.concatenate([covariances, np.array(added_covariances).reshape(-1, 6, 6)]),
+        completed(registered.num_points, np.zeros(n)),
+        covariances,
         registered.is_final,
+        completed(registered.extent_covariances, np.eye(3)),
+        completed(registered.face_distances, np.zeros(6)),
+        completed(registered.outside, np.zeros(n)),
     )
 
 

@@ -76,7 +76,7 @@ class EndMotion:
 
     def covariance(self, stamp_ns: int) -> Floats:
         """
-        Return the covariance (2, 2) of x and y of the prediction [m^2].
+        Return the covariance of x and y of the prediction, shape (2, 2) [m^2].
 
         With an acceleration a, the object is a t^2 / 2 off the prediction: a is the usual one
         along the heading, and the speed times `TURN_RATE` across it, but no more than usual.

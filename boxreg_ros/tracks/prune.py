@@ -38,7 +38,7 @@ def ghosts(tracklets: list[Tracklet]) -> set[str]:
     last_ns = max((tracklet.last_ns for tracklet in tracklets), default=0)
     found = set()
     for tracklet in tracklets:
-        # What comes into sight at the end of a recording has had no time for more boxes.
+        # An object that appears at the end of a recording has no time for more boxes.
         is_cut = tracklet.first_ns == first_ns or tracklet.last_ns == last_ns
         is_flash = len(tracklet.stamps_ns) < MIN_HITS and not is_cut
         if is_flash or _is_ghost(tracklet):

@@ -44,7 +44,7 @@ def test_switching_off_an_ingredient_changes_boxes(drive, whole, name):
 
 
 def test_ingredients_are_switched_by_their_run_alone(drive, whole):
-    # Nothing of the core is replaced: a run with all of them after one without is as before.
+    # The core is unchanged: a run with all of them after a run without one is as before.
     without(INGREDIENTS['point ownership'], drive)
     again = without(INGREDIENTS[WHOLE], drive)
     np.testing.assert_array_equal(again.boxes, whole.boxes)
@@ -54,7 +54,7 @@ def test_every_switch_is_used():
     names = {name for item in INGREDIENTS.values() for name in item.settings}
     switches = {f'ingredients.{item.name}' for item in fields(Ingredients)}
     assert {name for name in names if name.startswith('ingredients.')} == switches
-    assert not switches & {item.name for item in settings()}  # they are no settings
+    assert not switches & {item.name for item in settings()}  # they are not settings
 
 
 def test_losses_are_printed(tmp_path, scene, capsys):

@@ -171,5 +171,5 @@ def test_json_names_version_and_command(folder, capsys, monkeypatch):
 def test_every_measurement_prints_json(name):
     parser = argparse.ArgumentParser()
     bench.add_arguments(parser)
-    data = ['folder'] if name in ('real', 'ablation', 'sensitivity') else []
+    data = ['folder'] if name in ('real', 'ablation', 'sensitivity', 'tracks', 'review') else []
     assert parser.parse_args([name, *data, '--json']).json

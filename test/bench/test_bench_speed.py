@@ -1,4 +1,4 @@
-"""`boxreg bench speed` on small cases: its results are there and consistent."""
+"""`boxreg bench speed` on small cases: its results are complete and consistent."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""docs/results.md: made from the stored measurements, and from nothing else."""
+"""docs/results.md: made from the stored measurements alone."""
 
 import json
 import runpy

@@ -1,4 +1,4 @@
-"""Covariances: the curvature, and the model error that more observations do not lower."""
+"""Covariances: the inverse curvature, and the model error."""
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import covariance

@@ -29,8 +29,8 @@ def seen_from(origin, points=((0.0, 0, 0),), yaw=0.0, **changes):
 
 def test_visibility_by_hand():
     # From 12 m ahead and 5 m to the left of a 4 x 2 m box: 10 m before the plane of the front,
-    # 4 m to the side of its edge; 4 m before the left plane, 10 m ahead of its edge. From the
-    # back plane 14 m on the wrong side, the right one 6 m.
+    # 4 m to the side of its edge; 4 m before the left plane, 10 m ahead of its edge. It is 14 m
+    # on the inner side of the back plane, and 6 m of the right one.
     known = [[[10 / 4, -14 / 4, 4 / 10, -6 / 10, 9, -9]]]
     np.testing.assert_allclose(visibility(seen_from([12.0, 5.0, 1.0])), known)
 
@@ -124,7 +124,7 @@ def test_outermost_points_of_each_strip_by_hand():
 
 @pytest.mark.parametrize(('behind', 'used'), [(0.15, 9), (0.25, 6)])
 def test_a_strip_far_behind_the_others_is_left_out(behind, used):
-    # The left strip of the front stands 0.15 or 0.25 m behind the other two; 0.2 m is the limit.
+    # The left strip of the front is 0.15 or 0.25 m behind the other two; 0.2 m is the limit.
     # Of 60 points each strip takes the minimum, three.
     y = np.repeat([-0.7, 0.0, 0.7], 20)
     points = np.c_[np.where(y > 0.5, 1.9 - behind, 1.9), y, np.tile(np.linspace(-0.8, 0.8, 20), 3)]

@@ -124,7 +124,7 @@ def test_short_tracks_and_padding_are_left_out():
 
 
 def test_noise_of_a_kind_is_that_of_the_others_until_it_has_its_own():
-    # Vehicles err as expected, pedestrians twice as much; of cyclists there is nothing, or a few
+    # Vehicles err as expected, pedestrians twice as much; of cyclists there are none, or a few
     # boxes that err three times as much: their own weight is 60 / 74.
     kind = torch.tensor([0] * 30 + [2] * 30)
     values = autoregressive(60, 40, np.ones(9), 0.0)
@@ -267,9 +267,7 @@ def fitted(given, measured, own, part=0.05):
     error, precision = part * given, torch.ones(1, 22, dtype=D)
     precision[:, :3] = error**-2 + own**-2
     spread = torch.cat([error, torch.ones(1, 19, dtype=D)], 1)
-    expected = Expectation(
-        shared_of(given[0].tolist()), spread, torch.ones(1, 6), torch.ones(1, 6)
-    )
+    expected = Expectation(shared_of(given[0].tolist()), spread, *torch.ones(3, 1, 6))
     known = own**-2 / precision[:, :3]
     shared = shared_of((given * (measured / given) ** known)[0].tolist())
     covariance = torch.diag_embed(1 / precision)
@@ -278,8 +276,8 @@ def fitted(given, measured, own, part=0.05):
 
 
 def test_evidence_of_extents_by_hand():
-    # Lengths are expected to 0.2 m and measured to 0.1 m: of what is known of them the points
-    # have 1 / (1 + 0.1^2 / 0.2^2) = 0.8. Corrections count by the squared error, 0.05^2.
+    # Lengths are expected to 0.2 m and measured to 0.1 m: points provide 1 / (1 + 0.1^2 / 0.2^2)
+    # = 0.8 of the information about them. Corrections count by the squared error, 0.05^2.
     correction, weight = fitted([4.0, 1.8, 1.5], [4.2, 1.8, 1.5], [0.1, 0.045, 0.0375])
     known = np.log([4.2 / 4.0, 1.0, 1.0]) / 0.05**2
     np.testing.assert_allclose(correction, known, atol=1e-4)  # shared_of has single precision
@@ -288,7 +286,7 @@ def test_evidence_of_extents_by_hand():
 
 @pytest.mark.parametrize('own', [0.5, np.nan, 1e9], ids=['vague', 'failed', 'not measured'])
 def test_uncertain_extents_are_no_evidence(own):
-    # Of lengths measured to 0.5 m the points have 1 / (1 + 0.5^2 / 0.2^2) = 0.14.
+    # For lengths measured to 0.5 m this part is only 1 / (1 + 0.5^2 / 0.2^2) = 0.14.
     evidence = fitted([4.0, 1.8, 1.5], [4.2, 1.9, 1.6], [own, 0.01, 0.01])
     np.testing.assert_array_equal(evidence[:, 0], 0)
     assert (evidence[1, 1:] > 0).all()
@@ -308,9 +306,9 @@ def evidence_of(true, given, error=0.05, weight=0.8):
 
 @pytest.mark.parametrize('part', [0.5, 1.0, 1.5], ids=['shrunk', 'as they are', 'spread'])
 def test_shrunk_extents_are_corrected(part):
-    # The input has a `part` of what cars differ by in length, and all else as it is. What is
-    # expected of the slopes, 0.6 and half of that, is weaker than 400 cars; and an object that is
-    # 0.12 longer than most in logarithms has (0.12 / 0.5)^2 = 0.06 less of the correction.
+    # The differences between the lengths of the input are a `part` of the true ones. The prior
+    # on the slopes, 0.6 and half of that, is weaker than 400 cars. An object that is 0.12 longer
+    # than most in logarithms has (0.12 / 0.5)^2 = 0.06 less of the correction.
     true = sizes(401)
     given = true.clone()
     middle = true.median(0).values
@@ -322,8 +320,8 @@ def test_shrunk_extents_are_corrected(part):
 
 
 def test_extents_of_low_noise_input_are_kept():
-    # What is true of an input that errs by 5 % is corrected by a hundredth of it where one errs
-    # by 0.5 %: by squares.
+    # The correction is in proportion to the squared error of the input: with errors of 0.5 % it
+    # is a hundredth of that with 5 %.
     true = sizes(100)
     given = 2 * true.median(0).values - true
     evidence = evidence_of(true, given)
@@ -335,8 +333,8 @@ def test_extents_of_low_noise_input_are_kept():
 
 
 def test_cars_do_not_correct_trucks():
-    # Of what is four times as long, twice as wide and twice as high, 1 / (1 + 11.6) is said of
-    # what a regression would.
+    # An object four times as long, twice as wide and twice as high gets 1 / (1 + 11.6) of the
+    # correction of the regression.
     true = sizes(100)
     given = true.median(0).values + 0.5 * (true - true.median(0).values)
     truck = given.median(0).values + torch.tensor([[4.0, 2.0, 2.0]], dtype=D).log()
@@ -347,7 +345,7 @@ def test_cars_do_not_correct_trucks():
 
 
 @pytest.mark.parametrize('evidence', [torch.zeros(1, 3, 3), torch.zeros(5, 3, 3)])
-def test_extents_are_expected_as_given_without_evidence(evidence):
+def test_without_evidence_expected_extents_are_those_of_the_input(evidence):
     given = sizes(3).exp()
     np.testing.assert_array_equal(
         population_factor(evidence, given, torch.full_like(given, 0.05)), 1
@@ -369,7 +367,7 @@ def test_the_last_fit_of_a_track_is_its_extent_evidence():
     np.testing.assert_array_equal(evidence, np.zeros((MAX_TRACKS, 3, 3)))
 
 
-def test_population_of_one_kind_corrects_no_other():
+def test_population_of_one_kind_does_not_correct_others():
     true = sizes(100)
     given = true.median(0).values + 0.5 * (true - true.median(0).values)
     population = Population(evidence_of(true, given), torch.zeros(100, dtype=torch.int64))
@@ -387,7 +385,7 @@ def test_population_of_one_kind_corrects_no_other():
 
 
 def offsets_of(model, kind='vehicle'):
-    """Return the offsets that `model` lets expect of one kind of objects, (6,) each."""
+    """Return the offsets of one kind of objects by `model`, (6,) each."""
     return FaceOffsets(*(part[KINDS.index(kind)] for part in model.offsets()))
 
 
@@ -428,7 +426,7 @@ def show_faces(
     )
 
 
-def test_margins_of_one_kind_teach_no_other():
+def test_margins_of_one_kind_do_not_change_those_of_others():
     model = InputModel(FACES)
     show_faces(model, [str(i) for i in range(20)], 0.05)
     show_faces(model, [str(i) for i in range(20)], -0.1, of_kind='pedestrian')
@@ -445,7 +443,7 @@ def test_insets_are_expected_from_the_settings():
     np.testing.assert_allclose(offsets.occlusion_inset[4:], 0)
 
 
-def test_labelling_margins_are_learnt():
+def test_labelling_margins_are_estimated():
     # 200 tracks with margins of 0.02 m more than expected and a deviation of 0.05 m: the error of
     # a median of 400 values (two ends, two sides) is some 3 mm, far less than the prior deviation
     # of 0.05 m.
@@ -495,14 +493,14 @@ def test_few_or_discordant_tracks_change_little():
     ],
     ids=['hidden', 'few points', 'known before', 'half a metre off', 'two observations'],
 )
-def test_unfit_observations_are_not_learnt_from(unfit):
+def test_unfit_observations_are_no_evidence(unfit):
     model = InputModel(FACES)
     given = {'shifts': 0.04, **unfit}
     show_faces(model, [str(i) for i in range(50)], **given)
     np.testing.assert_array_equal(offsets_of(model).gap_correction, 0)
 
 
-def test_occlusion_insets_are_learnt_from_occluded_faces_only():
+def test_occlusion_insets_are_estimated_from_occluded_faces_only():
     # All faces are occluded. A distance of 0 confirms the occlusion inset, and is no evidence
     # for the margin of visible faces.
     model = InputModel(FACES)
@@ -521,7 +519,7 @@ def far_and_near(model, gap, distant):
     show_faces(model, names, gap, count=10, distant=0.51, further=0.51 * distant)
 
 
-def test_range_insets_are_learnt_from_distant_faces():
+def test_range_insets_are_estimated_from_distant_faces():
     # Few points are enough there. Near faces have a margin of 0.04 m, distant ones 0.06 m more at
     # 0.51 of the way from 20 to 70 m: 0.12 m at 70 m, nearly, by the weight of the evidence.
     # Distant faces alone are no evidence of the margin.
@@ -541,8 +539,8 @@ def test_without_distant_objects_there_is_no_range_inset():
     np.testing.assert_array_equal(offsets_of(model).range_inset, 0)
 
 
-def test_learning_of_margins_can_be_switched_off():
-    # Margins and occlusion insets are fixed then. The range inset is learnt all the same:
+def test_estimation_of_margins_can_be_switched_off():
+    # Margins and occlusion insets are fixed then. The range inset is estimated all the same:
     # a common error of near and far boxes, such as a size error, cancels in it.
     model = InputModel(FaceConfig(learn=False))
     far_and_near(model, 0.04, 0.12)
@@ -561,15 +559,15 @@ def test_only_the_tracks_seen_last_are_kept():
     show_faces(model, [f'old {i}' for i in range(MAX_TRACKS)], 0.1)
     known = InputModel(FACES)
     new = [f'new {i}' for i in range(MAX_TRACKS)]
-    for learner in (model, known):
-        show_faces(learner, new, -0.02)
+    for shown in (model, known):
+        show_faces(shown, new, -0.02)
     np.testing.assert_allclose(offsets_of(model).gap_correction, offsets_of(known).gap_correction)
     assert offsets_of(model).gap_correction[0] == pytest.approx(-0.02, abs=1e-3)
 
 
-def test_labelling_margins_are_learnt_from_face_observations():
+def test_labelling_margins_are_estimated_from_face_observations():
     # Through `support` itself: boxes 0.11 m larger on every side than what their points show,
-    # of which their class lets expect 0.05 m, 0.03 m at the sides.
+    # where the settings of their class expect 0.05 m, 0.03 m at the sides.
     rng = np.random.default_rng(5)
     B, N, half = 12, 6, np.array([2.0, 1.0, 1.0])
     n = 300
@@ -595,12 +593,12 @@ def test_labelling_margins_are_learnt_from_face_observations():
     assert offsets_of(model).gap_correction[5] == 0
 
 
-# --- angles to learn at -------------------------------------------------------------------------
+# --- angles of the margins ----------------------------------------------------------------------
 
 
 def test_angles_are_smoothed_as_far_as_they_are_noisy():
-    # A car turns at 0.5 rad/s. An exact heading stays as it is; of noise of 0.2 rad remains what
-    # a straight line through ten values has: about 0.06 in its middle. Padding does not count.
+    # A car turns at 0.5 rad/s. An exact heading stays as it is; noise of 0.2 rad is reduced to
+    # that of a straight line through ten values: about 0.06 in its middle. Padding does not count.
     rng = np.random.default_rng(0)
     boxes = np.zeros((200, 12, 9))
     boxes[..., 8] = 0.05 * np.arange(12)

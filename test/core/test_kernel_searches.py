@@ -332,7 +332,7 @@ def refined(prepare=''):
 @pytest.mark.parametrize(
     ('prepare', 'remedy'), [(WITHOUT_NUMBA, 'pip install'), (WITHOUT_CACHE, 'NUMBA_CACHE_DIR')]
 )
-def test_without_numba_or_its_cache_results_are_the_same_and_one_warning_says_so(prepare, remedy):
+def test_without_numba_or_its_cache_results_are_the_same_with_one_warning(prepare, remedy):
     texts, known = refined()
     assert texts == []
     texts, found = refined(prepare)

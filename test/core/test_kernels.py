@@ -21,7 +21,7 @@ TOLERANCE = 1e-9
 
 
 def assert_close(found, known, tolerance=TOLERANCE):
-    """Compare with the largest entry of `known`; what is not finite must be so in both."""
+    """Compare with the largest entry of `known`; non-finite values must be so in both."""
     found, known = torch.as_tensor(found), torch.as_tensor(known)
     assert found.shape == known.shape
     finite = known[known.isfinite()].abs()
@@ -79,7 +79,7 @@ def test_normal_equations_equal_those_of_torch(seed, mask):
 
 @pytest.mark.parametrize('kept', range(8))
 def test_each_term_alone_equals_that_of_torch(kept):
-    # The other terms have no weight: they are not evaluated, and have to add nothing.
+    # The other terms have no weight: they are not evaluated and must add nothing.
     problem = random_problem()
     x = random_variables(problem)
     every = regular_terms(problem)

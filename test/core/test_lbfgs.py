@@ -42,7 +42,7 @@ def starts(B, n, seed=1):
 def test_minima_of_quadratics():
     A, known = quadratics(5, 8)
     found = minimize(quadratic(A, known), starts(5, 8), 200, 8, 1e-16)
-    # The tolerance bounds what is left to gain, x' A x / 2 with A of 1 at least.
+    # The tolerance bounds the remaining decrease, x' A x / 2 with A of 1 at least.
     np.testing.assert_allclose(found.x, known, atol=1e-6)
     np.testing.assert_allclose(found.value, 3, atol=1e-12)
     assert (found.status == Status.CONVERGED).all()

@@ -88,7 +88,7 @@ def test_a_sweep_is_paired_with_all_boxes_near_it():
 
 
 @pytest.mark.parametrize('late', range(3))
-def test_boxes_between_sweeps_are_paired_when_a_younger_sweep_is_known(late):
+def test_boxes_between_sweeps_are_paired_when_a_younger_sweep_arrives(late):
     # 150 is 45 from 105, 55 from 205: within reach of both, the tolerance of neither.
     items = ['s105', 's205']
     items.insert(late, 'b150')
@@ -144,7 +144,7 @@ def test_boxes_are_returned_in_the_order_of_stamps():
     assert feed.add('s100', 's200', 's300') == [(100, 100), (200, 200), (300, 300)]
 
 
-def test_boxes_are_held_until_a_younger_sweep_is_known():
+def test_boxes_are_held_until_a_younger_sweep_arrives():
     feed = Feed()
     assert feed.add('b100', 'b200') == []
     assert feed.add('s120') == [(100, 120)]

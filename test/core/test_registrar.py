@@ -404,14 +404,14 @@ def test_short_tracks_are_kept_and_boxes_without_points_refined(stream, estimate
 
 @pytest.fixture
 def no_extent_law(monkeypatch):
-    """Turn off the extent law, which is learnt from all tracks."""
+    """Turn off the population prior on extents, which is estimated from all tracks."""
     monkeypatch.setattr(calibration, 'SLOPE_DEVIATION', 1e-9)
 
 
 @each_estimate
 def test_a_gap_longer_than_max_gap_starts_a_new_track(estimate, no_extent_law):
     # The same id after a gap of 0.9 s or 1.1 s. After the longer one the following boxes are
-    # refined as those of a new track; the input model keeps what it has learnt.
+    # refined as those of a new track; the input model keeps its estimates.
     config = config_with(estimate, max_gap=1.0, **{'faces.learn': False})
     config = replace(config, ingredients=Ingredients(noise_estimation=False))
     track = track_of(drive(28), np.random.default_rng(0))
@@ -559,7 +559,7 @@ def test_an_id_switch_starts_a_new_track(estimate):
     def overlap(of_b, of_a):
         parts = [cut(a, early), cut(b, early)]
         parts += [replace(cut(b, late), track_id=of_b), replace(cut(a, late), track_id=of_a)]
-        # The number of ids affects learning.
+        # The number of ids affects the input model.
         config = config_with(estimate, **{'faces.learn': False})
         results, counts = run(stream_of(parts), config)
         order = [('a', 'b'), (of_b, of_a)], [(0, 1), (1, 0)]

@@ -52,8 +52,8 @@ def given(window):
 
 
 def test_refined_boxes_are_closer_to_the_truth():
-    # Input errors of 0.15 m and 0.05 rad give an IoU of some 0.8; half of what is missing to 1
-    # must be gained, on average, and something every time.
+    # Input errors of 0.15 m and 0.05 rad give an IoU of some 0.8; 1 - IoU must fall in
+    # each window, and by half on average.
     missing = []
     for seed in range(6):
         truth = drive(10)
@@ -90,7 +90,7 @@ WHOLE = ALONE.updated({'estimate': 'track'})
 
 def test_constant_errors_of_extents_are_corrected():
     # Eight cars of one length pass the sensor, which sees their fronts first and their backs
-    # later: that length is there to be measured. The input is 6 % too long for one half of them
+    # later, so that the length is observable. The input is 6 % too long for one half of them
     # and too short for the other, always the same.
     truth = drive(40, turn=0, start=(-10.0, 6.0, 0.0))
     many = []
@@ -105,7 +105,7 @@ def test_constant_errors_of_extents_are_corrected():
 
 def test_repeated_parked_boxes_are_not_taken_for_exact():
     # Nine parked cars, the box of each always the same, 0.2 m off along or across; and three
-    # that move, whose boxes wander by 0.15 m: by these the input is judged, and the others too.
+    # that move, whose boxes wander by 0.15 m: the noise of all is estimated from these.
     rng, many, truths, n = np.random.default_rng(0), [], [], 60
     for k in range(12):
         is_parked = k % 4 > 0
@@ -176,7 +176,7 @@ def test_an_ill_conditioned_window_does_not_affect_others():
     assert np.isfinite(found[2].covariances).all()
 
 
-def test_observations_are_learnt_from_once():
+def test_observations_update_the_margins_once():
     config = ALONE.updated({'faces.learn': True})
     model = InputModel(config.faces)
     many = [window(drive(12), seed, config, str(seed)) for seed in range(4)]
@@ -207,7 +207,7 @@ def test_no_windows_to_solve(many):
 
 def test_expectation_of_shared_variables_by_hand():
     # Lengths of 4.0, 4.4 and 4.5 m are in the window, two of 4.3 m have left: 21.5 / 5 = 4.3 m;
-    # what is padded, 9 m, does not count. The pivot is a quarter of that behind the centre.
+    # padding, 9 m, does not count. The pivot is a quarter of that behind the centre.
     boxes = np.zeros((2, 4, 9))
     boxes[:, :, 3] = [4.0, 4.4, 4.5, 9.0]
     boxes[..., 4:6] = [2.0, 1.5]
@@ -243,7 +243,7 @@ def test_an_object_that_turns_on_the_spot_is_not_parked():
     # 0.01 rad/s over 5.9 s are 0.059 rad, less than three errors of 0.04 rad of a heading.
     assert parked(drive(60, 0.0, 0.01)).all()
     assert not parked(drive(60, 0.0, 0.03)).any()
-    assert parked(drive(60, 0.0, 0.03), heading=0.06).all()  # 0.177 rad: no more than it errs
+    assert parked(drive(60, 0.0, 0.03), heading=0.06).all()  # 0.177 rad: less than three errors
 
 
 def test_a_parked_vehicle_that_drives_off_is_not_held_there():
@@ -253,7 +253,7 @@ def test_a_parked_vehicle_that_drives_off_is_not_held_there():
     rests = parked(boxes)[0].numpy()
     # Middles of five boxes and the next five are 0.5 s apart: about step 72 by 0.7^2 - 0.2^2 =
     # 0.45 m, which is slower than 1 m/s, about step 73 by 0.8^2 - 0.3^2 = 0.55 m. So it drives
-    # from step 73 on, and does not rest from four before that.
+    # from step 73 on, and the zero-motion prior ends four steps before that.
     np.testing.assert_array_equal(rests, np.arange(79) < 69)
     np.testing.assert_array_equal(parked(boxes[::-1])[0], rests[::-1])
 
@@ -419,7 +419,7 @@ def test_the_number_of_threads_does_not_change_results(monkeypatch, estimate, pa
 
 
 def patch_observe_faces(monkeypatch, function):
-    """Replace `observe_faces` where labelling margins are learnt and where rounds are taken."""
+    """Replace `observe_faces` where labelling margins are estimated and where rounds are taken."""
     for module in (registration, solver):
         monkeypatch.setattr(module, 'observe_faces', function)
 
@@ -442,7 +442,7 @@ def test_all_points_are_used_in_the_last_round_only(monkeypatch, estimate):
     patch_observe_faces(monkeypatch, noted)
     (found,) = register([one], config, InputModel(config.faces))
     assert most > 900 and few < 350
-    assert seen.pop(0) == few  # margins are learnt from few, too
+    assert seen.pop(0) == few  # margins are estimated from few, too
     assert seen == sorted(seen) and set(seen) == {few, most}
     assert seen.count(few) >= 2 and seen.count(most) <= 2
     for module in (registration, solver):
@@ -475,7 +475,7 @@ def test_an_error_in_a_thread_is_raised(monkeypatch, part):
 def test_shrunk_extents_are_corrected_by_the_population():
     # Lengths of 16 cars, which differ half as much in the input: a slope of -0.5 in logarithms.
     # Most drive by, every fourth one is seen from behind only. The population has more evidence of
-    # each than each alone: of what was left of the slope a quarter and more is made good.
+    # each than each alone: the remaining slope shrinks by a quarter or more.
     config = ALONE.updated({'estimate': 'track'})
     rng, many, lengths = (
         np.random.default_rng(0),
@@ -503,7 +503,7 @@ def test_shrunk_extents_are_corrected_by_the_population():
 
 @pytest.fixture
 def extents_used(monkeypatch):
-    """Collect the extents (3,) that faces of the first window are judged by, round by round."""
+    """Collect the extents (3,) at which faces of the first window are observed, round by round."""
     seen = []
 
     def noted(problem, state, *rest):
@@ -524,7 +524,7 @@ def test_a_warm_window_uses_the_extents_of_the_tick_before(extents_used, changes
     start = given(whole)[:-1]
     start[:, 3:6] = found
     register([whole._replace(num_new=1, start=start)], config, InputModel(config.faces))
-    assert len(extents_used) == 2  # to learn from it, and the one round of a tick
+    assert len(extents_used) == 2  # for the margins, and the one round of a tick
     known = np.where(np.isin(np.arange(3), held), given(whole)[:, 3:6].mean(0), found)
     np.testing.assert_allclose(extents_used[1], known)
 

@@ -97,7 +97,7 @@ def test_value_gradient_and_curvature(names):
 
 
 def test_the_objective_is_the_sum_of_its_terms():
-    # Where it was made, away from there, and for some windows alone.
+    # At its linearisation point, away from it, and for some windows alone.
     problem = random_problem()
     terms, x = list(terms_of(problem).values()), random_variables(problem)
     free = (torch.rand(x.shape, generator=torch.Generator().manual_seed(5)) < 0.9).to(x)
@@ -192,7 +192,7 @@ def test_input_pose_by_hand():
 
 def test_rigid_shape_by_hand():
     # Boxes head along +y: a step of 0.3 m along y and 0.2 m along x is 0.3 m ahead and 0.2 m to
-    # the right, and yaw is a turn about z. The shape stands 0.1 m ahead in its box.
+    # the right, and yaw is a turn about z. The shape is 0.1 m ahead in its box.
     problem = problem_at([[0, 0, 0, 0, 0, np.pi / 2]], [0.0])
     wanted = tensor([[[0.05, 0, 0, 0, 0, 0.01]]])
     state = State(

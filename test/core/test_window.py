@@ -200,10 +200,10 @@ def test_a_solved_window_starts_from_its_estimates():
     known = np.zeros((4, 9))
     known[:3, 0] = 0.2
     np.testing.assert_allclose(problem.start[0] - problem.boxes[0], known, atol=1e-12)
-    # The newest of the window before is learnt from now, at its estimate.
-    learning = window.margin_part()
-    assert learning.observations == window.observations[2:3]
-    np.testing.assert_array_equal(learning.start, solved[2:])
+    # The newest of the window before updates the margins now, at its estimate.
+    part = window.margin_part()
+    assert part.observations == window.observations[2:3]
+    np.testing.assert_array_equal(part.start, solved[2:])
     first = window._replace(num_new=4, start=solved[:0]).margin_part()
     assert first.observations == window.observations[:3]
     np.testing.assert_array_equal(

@@ -1,4 +1,4 @@
-"""Damaged, odd and unindexed recordings: what is whole is read, the rest is listed."""
+"""Damaged, odd and unindexed recordings: whole parts are read, the others are listed."""
 
 from contextlib import closing
 import json

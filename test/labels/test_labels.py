@@ -1,4 +1,4 @@
-"""``boxes.csv`` and OpenLABEL: values, order and what is left out."""
+"""``boxes.csv`` and OpenLABEL: values, order and omitted boxes."""
 
 import csv
 from importlib import import_module

@@ -95,7 +95,7 @@ def test_internal_errors_are_logged_with_their_traceback_in_the_debug_log():
     assert debug_entry[0] == 'debug' and 'test_diagnostics.py' in debug_entry[1]
 
 
-def test_node_says_what_it_waits_for_until_its_first_refined_box(monkeypatch):
+def test_node_logs_its_missing_inputs_until_its_first_refined_box(monkeypatch):
     now = [0.0]
     monkeypatch.setattr('boxreg_ros.live.diagnostics.time.monotonic', lambda: now[0])
     log = Log()

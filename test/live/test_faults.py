@@ -136,7 +136,7 @@ def test_time_jump_with_sim_time_and_silence_after_it(graph, tmp_path):
         message.clock.sec = sec
         clock.publish(message)
         play(graph, records, early)
-    # The last boxes are published after a silence, and every message exactly once.
+    # The last boxes are published after 3 s without boxes, and every message exactly once.
     graph.wait(lambda: len(final) == 16, 'final boxes after a silence')
     graph.wait(lambda: values_of(diagnostics).get('final_published') == '16', 'counters')
     values = values_of(diagnostics)

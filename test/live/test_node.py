@@ -404,9 +404,9 @@ def test_calibrated_settings_are_read_as_parameters(graph, tmp_path):
     gap = Measured(value=0.25, spread=0.01, tracks=9)
     measured = {f'cyclist.{name}': gap for name in GAPS} | {'cyclist.position': gap}
     values = calibrated(Config().updated(changes), measured)
-    rule = tmp_path / 'rule.yaml'
-    write_settings(rule, values, 'a test')
-    node = graph.start('--params-file', str(rule))
+    margins = tmp_path / 'margins.yaml'
+    write_settings(margins, values, 'a test')
+    node = graph.start('--params-file', str(margins))
     client = graph.node.create_client(GetParameters, '/boxreg_node/get_parameters')
     graph.wait(client.service_is_ready, 'its parameters')
     names = [item.name for item in settings()]

@@ -1,4 +1,4 @@
-"""`boxreg batch`: each drive once, failures isolated, a second run does only what is left."""
+"""`boxreg batch`: each drive once, failures isolated, a second run skips done drives."""
 
 import csv
 import json
@@ -18,7 +18,7 @@ def index_of(out):
         return {row['drive']: row for row in csv.DictReader(file)}
 
 
-def test_failures_are_isolated_and_a_second_run_does_what_is_left(tmp_path, capsys):
+def test_failures_are_isolated_and_a_second_run_skips_done_drives(tmp_path, capsys):
     paths = [Drive(sweeps=6).write(tmp_path / name) for name in ('one', 'two')]
     junk = tmp_path / 'junk.mcap'
     junk.write_text('no recording')
@@ -36,7 +36,7 @@ def test_failures_are_isolated_and_a_second_run_does_what_is_left(tmp_path, caps
     assert merged['boxes_in'] == 2 * 12
     assert list(merged['failed']) == ['junk']
 
-    # What is done stays done when its file is touched, and not when its content changes.
+    # A drive stays done when its file is touched, but not when its content changes.
     before = {name: (out / name / 'boxes.csv').stat().st_mtime_ns for name in ('one', 'two')}
     paths[0].touch()
     Drive(sweeps=7).write(tmp_path / 'other').replace(paths[1])

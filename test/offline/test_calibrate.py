@@ -23,15 +23,15 @@ from ros_messages import Drive as Recorded
 from scipy.spatial.transform import Rotation
 import yaml
 
-RULE = {'gap_ends': 0.12, 'gap_sides': 0.07, 'gap_top': 0.09, 'gap_bottom': 0.05}
+MARGINS = {'gap_ends': 0.12, 'gap_sides': 0.07, 'gap_top': 0.09, 'gap_bottom': 0.05}
 """Labelling margins around the boxes of the bodies [m]."""
 
 
-def drawn(truth, rule=RULE):
+def drawn(truth, margins=MARGINS):
     """Return true boxes with labelling margins."""
     boxes = truth.boxes.copy()
-    up, down = rule['gap_top'], rule['gap_bottom']
-    boxes[:, 3:6] += 2 * rule['gap_ends'], 2 * rule['gap_sides'], up + down
+    up, down = margins['gap_top'], margins['gap_bottom']
+    boxes[:, 3:6] += 2 * margins['gap_ends'], 2 * margins['gap_sides'], up + down
     axes = Rotation.from_euler('ZYX', boxes[:, [8, 7, 6]]).as_matrix()
     boxes[:, :3] += axes[:, :, 2] * (up - down) / 2
     return replace(truth, boxes=boxes)
@@ -48,13 +48,14 @@ def plain(scene):
 
 
 def test_labelling_margins_of_a_simulated_recording_are_found(scene, plain):
-    # The bodies are on the road, which is the bottom of their boxes. Elsewhere they reach these
-    # here and there, and of the noise of 0.02 m the outermost twentieth is 2 deviations out.
+    # The bodies are on the road, which is the bottom of their boxes. Elsewhere they touch these
+    # faces at a few points, and of the noise of 0.02 m the outermost twentieth is 2 deviations
+    # out.
     assert plain['vehicle.gap_bottom'].value == pytest.approx(0.0, abs=0.01)
     assert all(-0.05 < plain[f'vehicle.{name}'].value < 0.15 for name in GAPS)
     drive = Drive.from_scene(scene)
     found = labelling_margins(replace(drive, truth=drawn(drive.truth)), Config())
-    for gap_name, gap in RULE.items():
+    for gap_name, gap in MARGINS.items():
         name = f'vehicle.{gap_name}'
         assert found[name].value - plain[name].value == pytest.approx(gap, abs=0.012), name
         assert (
@@ -67,7 +68,7 @@ def test_labelling_margins_of_a_simulated_recording_are_found(scene, plain):
 
 
 def test_each_kind_has_its_own_margins(scene):
-    # Every other track is labelled motorcycle, with the margins of `RULE`.
+    # Every other track is labelled motorcycle, with the margins of `MARGINS`.
     drive = Drive.from_scene(scene)
     rides = np.array([int(name) % 2 == 1 for name in drive.truth.track_ids])
     names = tuple('motorcycle' if ride else 'car' for ride in rides)
@@ -78,7 +79,7 @@ def test_each_kind_has_its_own_margins(scene):
         for truth in (plain, replace(plain, boxes=boxes))
     )
     assert not any(name.startswith('pedestrian') for name in found)
-    for name, gap in RULE.items():
+    for name, gap in MARGINS.items():
         change = {k: found[f'{k}.{name}'].value - before[f'{k}.{name}'].value
                   for k in ('vehicle', 'cyclist')}  # fmt: skip
         assert change['cyclist'] == pytest.approx(gap, abs=0.012), name
@@ -186,23 +187,23 @@ def test_each_kind_has_its_own_errors():
 
 
 def test_short_tracks_give_no_errors():
-    found = input_errors(noisy_drive(DEVIATION, n=13), Config())
+    found = input_errors(noisy_drive(DEVIATION, n=4), Config())
     assert found['vehicle.position'].tracks == 0
     assert calibrated(Config(), found) == {}
 
 
 def test_written_settings():
-    rule = {f'vehicle.{name}': Measured(gap, 0.01, 3) for name, gap in RULE.items()}
+    margins = {f'vehicle.{name}': Measured(gap, 0.01, 3) for name, gap in MARGINS.items()}
     # Two tracks of a kind are too few for margins; those of other kinds are fixed all the same.
-    rule |= {f'cyclist.{name}': Measured(0.4, 0.01, 2) for name in RULE}
-    found = calibrated(Config(lag=4), rule)
-    known = {f'vehicle.{name}': gap for name, gap in RULE.items()}
+    margins |= {f'cyclist.{name}': Measured(0.4, 0.01, 2) for name in MARGINS}
+    found = calibrated(Config(lag=4), margins)
+    known = {f'vehicle.{name}': gap for name, gap in MARGINS.items()}
     assert found == known | {'lag': 4, 'faces.learn': False}
-    # One gap alone of a kind that is not known does, be the others of another kind or of its own.
-    rule['cyclist.gap_top'] = Measured(0.4, 0.01, 3)
-    assert calibrated(Config(), rule) == known | {'cyclist.gap_top': 0.4}
-    rule['cyclist.gap_top'] = rule['vehicle.gap_top'] = Measured(0.4, 0.01, 2)
-    assert calibrated(Config(), rule) == {k: v for k, v in known.items() if k[-4:] != '_top'}
+    # One unknown gap of a kind keeps the estimation on, for gaps of this or of another kind.
+    margins['cyclist.gap_top'] = Measured(0.4, 0.01, 3)
+    assert calibrated(Config(), margins) == known | {'cyclist.gap_top': 0.4}
+    margins['cyclist.gap_top'] = margins['vehicle.gap_top'] = Measured(0.4, 0.01, 2)
+    assert calibrated(Config(), margins) == {k: v for k, v in known.items() if k[-4:] != '_top'}
     # Values beyond what a setting may have; tilt that neither labels nor input have.
     edges = {
         'faces.inset_ends': Measured(-0.1, 0.01, 9), 'vehicle.tilt': Measured(0.0, 0.0, 9),
@@ -224,24 +225,24 @@ def street(tmp_path_factory, scene):
 
 
 def test_relabel_reads_the_written_settings(street, scene, tmp_path, capsys):
-    rule, out = tmp_path / 'rule.yaml', tmp_path / 'out'
+    margins, out = tmp_path / 'margins.yaml', tmp_path / 'out'
     truth = street.with_name('truth.csv')
-    arguments = ['calibrate', street, '--truth', truth, '-o', rule, '--set', 'solver.rounds=2']
+    arguments = ['calibrate', street, '--truth', truth, '-o', margins, '--set', 'solver.rounds=2']
     assert cli.main([str(a) for a in arguments]) == 0
     text = capsys.readouterr().out
     assert 'vehicle.gap_bottom' in text
     assert 'vehicle.position' in text
     assert 'the labelling margins are fixed' in text
     assert f'{len(set(scene.truth.track_ids))} labelled tracks' in text
-    config = Config.from_yaml(rule)
-    assert config.vehicle.gap_bottom == pytest.approx(RULE['gap_bottom'], abs=0.01)
+    config = Config.from_yaml(margins)
+    assert config.vehicle.gap_bottom == pytest.approx(MARGINS['gap_bottom'], abs=0.01)
     assert config.pedestrian.gap_bottom == Config().pedestrian.gap_bottom  # only two walk
     assert not config.faces.learn
     assert config.solver.rounds == 2
     # The form of ROS, which the node's --params-file needs: numbers are floats, but for counts.
-    group = yaml.safe_load(rule.read_text())['/**']['ros__parameters']
+    group = yaml.safe_load(margins.read_text())['/**']['ros__parameters']
     assert all(isinstance(v, float) for k, v in group['vehicle'].items())
-    assert cli.main(['relabel', str(street), '-o', str(out), '--config', str(rule)]) == 0
+    assert cli.main(['relabel', str(street), '-o', str(out), '--config', str(margins)]) == 0
     assert Config.from_yaml(out / 'config.yaml') == config
 
 
@@ -294,13 +295,13 @@ def test_truth_of_another_time_is_refused(street, scene, tmp_path, capsys):
     arguments = ['calibrate', str(street), '--truth', str(tmp_path / 'truth.csv')]
     assert cli.main(arguments) == 1
     assert 'are stamps and frame those of the recording?' in capsys.readouterr().err
-    assert cli.main([*arguments, '-o', str(tmp_path / 'nowhere' / 'rule.yaml')]) == 2
+    assert cli.main([*arguments, '-o', str(tmp_path / 'nowhere' / 'margins.yaml')]) == 2
     assert 'in a folder that is there' in capsys.readouterr().err, 'before any work'
     assert cli.main([*arguments, '-o', str(tmp_path)]) == 2
     assert 'expected a file' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('given', ['{bag}', '{link}', '{truth}', '{folder}/rule.yaml'])
+@pytest.mark.parametrize('given', ['{bag}', '{link}', '{truth}', '{folder}/margins.yaml'])
 def test_the_output_never_overwrites_an_input(tmp_path, capsys, given):
     folder = Recorded(sweeps=2).write(tmp_path / 'drive', 'sqlite3')
     bag, truth, link = next(folder.glob('*.db3')), tmp_path / 'truth.csv', tmp_path / 'link'
@@ -309,9 +310,9 @@ def test_the_output_never_overwrites_an_input(tmp_path, capsys, given):
     before = {path: path.read_bytes() for path in (bag, truth)}
     out = given.format(bag=bag, link=link, truth=truth, folder=folder)
     for recording in (folder, bag):
-        if recording == folder or given != '{folder}/rule.yaml':
+        if recording == folder or given != '{folder}/margins.yaml':
             words = ['calibrate', str(recording), '--truth', str(truth), '-o', out]
             assert cli.main(words) == 2
             assert 'expected a file that is no input' in capsys.readouterr().err
     assert {path: path.read_bytes() for path in (bag, truth)} == before
-    assert not (folder / 'rule.yaml').exists()
+    assert not (folder / 'margins.yaml').exists()

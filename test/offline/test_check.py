@@ -37,7 +37,7 @@ def test_check_prints_violations_and_fails_with_strict_only(tmp_path, capsys):
     assert report['rules']['jump']['violations'] == []
 
 
-def test_check_reads_recordings_and_refuses_what_it_cannot_read(tmp_path, capsys):
+def test_check_reads_recordings_and_refuses_unreadable_files(tmp_path, capsys):
     assert main(['check', str(BAGS / 'street.mcap')]) == 0
     assert 'spin' in capsys.readouterr().out
     assert main(['check', str(tmp_path / 'labels')]) == 2
@@ -68,7 +68,7 @@ def test_evaluate_prints_coverage_and_nees(tmp_path, capsys):
     writer.close()
     known = read_covariances(tmp_path / 'covariances.csv')[0, '3']
     np.testing.assert_allclose(known.pose, 0.01 * np.eye(6))
-    assert known.range == pytest.approx(0.5)
+    assert known.distance == pytest.approx(0.5)
     paths = [str(tmp_path / name) for name in ('boxes.csv', 'truth.csv')]
     assert main(['evaluate', *paths, '--json']) == 0
     found = json.loads(capsys.readouterr().out)['consistency']

@@ -1,4 +1,4 @@
-"""`boxreg inspect`: what is in a recording, and the relabel command to run."""
+"""`boxreg inspect`: contents of a recording, and the relabel command to run."""
 
 import json
 import shlex

@@ -594,11 +594,11 @@ def test_output_that_contains_an_input_is_refused(tmp_path, capsys, given):
     run(bag, out)
     shutil.copy(bag, out / 'drive.mcap')
     link.symlink_to(out / 'drive.mcap')
-    rule = out / 'rule.yaml'
-    rule.write_text('')
+    margins = out / 'margins.yaml'
+    margins.write_text('')
     before = sorted(out.rglob('*'))
     words = ['relabel', given.format(out=out, link=link, bag=bag), '-o', str(out)]
-    words += ['--config', str(rule)] if given == '{bag}' else []
+    words += ['--config', str(margins)] if given == '{bag}' else []
     assert main(words) == 2
     assert 'choose another with -o' in capsys.readouterr().err
     labels = 'csv', out / 'boxes.csv'

@@ -1,4 +1,4 @@
-"""Rules on labels with one known fault each."""
+"""Rules on labels, each with labels of one known fault."""
 
 from boxreg_ros.config import Config
 from boxreg_ros.review.rules import counts, RULES, violations
@@ -75,7 +75,7 @@ def test_each_rule_finds_its_fault_at_its_stamp(name):
     if row is not None:
         assert found[name][0].stamp_ns == STAMPS[row]
     assert RULES[name].severity in (ERROR, WARNING)
-    assert RULES[name].id == name
+    assert RULES[name].rule_id == name
 
 
 def test_an_id_that_occurs_twice_at_a_stamp_is_a_duplicate():

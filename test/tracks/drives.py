@@ -47,6 +47,8 @@ def drive(truth, given, seed=0):
         Objects that return points, per step.
     given : list of n lists
         Detections per step, as of `detections`; None for a step without a message.
+    seed : int
+        Of the points.
 
     """
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Faulty ids, classes and rates: all boxes come back, and no box is added without a mark."""
+"""Faulty ids, classes and rates: all boxes are returned, added ones are marked."""
 
 from collections import Counter
 
@@ -84,7 +84,7 @@ def test_class_that_changes_along_a_track_becomes_the_majority():
     assert tracks['7'].reclassified == 3
 
 
-def test_boxes_that_cannot_be_completed_come_back():
+def test_boxes_that_cannot_be_completed_are_returned():
     boxes = path((5, 6), (4, 0), 12)
     given = [[('7', box), ('', box + 1)] for box in boxes]
     given[4].append(('8', np.full(9, np.nan)))

@@ -51,7 +51,7 @@ def test_broken_street_becomes_whole(street):
     assert after.added_iou > 0.82
 
 
-def test_ghosts_of_the_street_are_rejected_and_no_object(street):
+def test_ghosts_of_the_street_are_rejected_and_objects_are_kept(street):
     found, results, _ = street
     ghosts = Counter()
     objects = Counter()
@@ -62,7 +62,27 @@ def test_ghosts_of_the_street_are_rejected_and_no_object(street):
     assert objects['rejected'] * 300 <= objects.total()
 
 
-def test_all_boxes_of_the_street_come_back(street):
+def test_boxes_of_complete_tracks_keep_their_evidence(street):
+    # Identity matrices, 1 m^2, stand for unknown covariances.
+    _, results, _ = street
+    refined = [
+        (result, row)
+        for result in results
+        for row, status in enumerate(result.status)
+        if status == 'refined'
+    ]
+    lengths = np.array([result.extent_covariances[row][0, 0] for result, row in refined])
+    assert (lengths < 0.5).mean() > 0.99
+    assert all(
+        np.array_equal(result.extent_covariances[row], np.eye(3))
+        for result in results
+        for row, status in enumerate(result.status)
+        if status == 'rejected'
+    )
+    assert any(result.face_distances[row].any() for result, row in refined)
+
+
+def test_all_boxes_of_the_street_are_returned(street):
     found, results, tracks = street
     assert len(results) == len(found.boxes)
     for given, result in zip(found.boxes, results, strict=True):
@@ -83,7 +103,7 @@ def test_all_boxes_of_the_street_come_back(street):
 
 
 def test_filled_boxes_are_registered_to_their_points():
-    # The car brakes in the gap; the motion model does not know it, the points do.
+    # The car brakes in the gap, against the motion model; the boxes follow its points.
     boxes = path((5, 6), (8, 0), 30)
     seconds = np.arange(30) * 0.1
     speed = 8 - 4 * np.clip(seconds - 0.9, 0, 1.0)
@@ -170,7 +190,7 @@ def test_recording_without_steps_is_as_before(tmp_path):
     assert summary['boxes_in'] == summary['boxes_out'] == 16
 
 
-def test_time_jump_separates_what_is_completed(tmp_path):
+def test_tracks_are_not_completed_across_a_time_jump(tmp_path):
     first = Recorded(sweeps=12)
     again = Recorded(sweeps=12)
     for k in (4, 5):

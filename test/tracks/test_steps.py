@@ -69,12 +69,12 @@ def test_hermite_curve_follows_a_parabola_exactly():
     assert np.abs(linear - boxes[2:10, 0]).max() > 0.1
 
 
-def test_best_links_leaves_what_is_ambiguous():
+def test_best_links_leaves_ambiguous_fragments_apart():
     clear = np.array([[INF, 1.0, 20.0], [INF, INF, INF], [INF, INF, INF]])
     assert best_links(clear).pairs == [(0, 1)]
     close = np.array([[INF, 1.0, 3.0], [INF, INF, INF], [INF, INF, INF]])
     assert best_links(close) == ([], [(0, 1)])
-    # 0, 1, 2 are a chain: that 2 could follow 0 as well is no doubt.
+    # 0, 1, 2 are a chain: 2 could follow 0 as well, which is not ambiguous.
     chain = np.array([[INF, 1.0, 3.0], [INF, INF, 1.0], [INF, INF, INF]])
     assert best_links(chain) == ([(0, 1), (1, 2)], [])
     assert best_links(np.full((2, 2), INF)) == ([], [])

@@ -41,7 +41,7 @@ def tick(config: Config, tracks: int, points: int, ticks: int = 40) -> dict[str,
         marks.append(perf_counter())
         [boxes_to_frame(r.boxes, inverse(T), 'lidar') for r in ready]
         marks.append(perf_counter())
-        observe(sweep, array.boxes, stamp, config)  # once more by itself, to know its share
+        observe(sweep, array.boxes, stamp, config)  # once more alone, to measure its share
         marks.append(perf_counter())
         decode, transform, both, encode, alone = np.diff(marks) * 1e3
         times.append((decode, transform, alone, both - alone, encode))
@@ -62,7 +62,7 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
     """
     Return the time to crop all boxes of a sweep [ms]: ours, and box by box.
 
-    The crop only, for all of them; the rest of `observe` is in a stage of the tick.
+    All of them only crop; the stages of a tick have the rest of `observe`.
 
     """
     ((_, _, cloud, boxes),) = traffic(tracks, points, 1)

@@ -146,7 +146,7 @@ def centre_of(points, centre):
 
 @kernel
 def fill_visibility(box, origin, points, numbers, R, tangent):
-    """Write how openly the sensor sees each face of one input box, (6,)."""
+    """Write the visibility of each face of one input box from the sensor, (6,)."""
     toward = np.empty(3)
     if isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2]):
         for k in range(3):
@@ -236,6 +236,8 @@ def observe_faces(
 
     Parameters
     ----------
+    begin, end : int
+        First window, and the one after the last.
     windows : WindowArrays
         Input of the windows.
     poses, shared : array, shapes (B, N, 6) and (B, 22)

@@ -386,6 +386,8 @@ def accumulate(begin, end, x, rows, last, terms, value, gradient, band, border, 
 
     Parameters
     ----------
+    begin, end : int
+        First window, and the one after the last.
     x, rows : array, shapes (b, D) and (b,)
         Variables, and which windows of `terms` they are of.
     last : int

@@ -51,6 +51,8 @@ def agreement(
 
     Parameters
     ----------
+    begin, end : int
+        First window, and the one after the last.
     windows : WindowArrays
         Input of the windows.
     poses : array, shape (B, N, 6)

@@ -222,6 +222,8 @@ def weigh_windows(begin, end, windows, poses, shared, faces, expected, of_class,
 
     Parameters
     ----------
+    begin, end : int
+        First window, and the one after the last.
     windows : WindowArrays
         Input of the windows.
     poses, shared : array, shapes (B, N, 6) and (B, 22)

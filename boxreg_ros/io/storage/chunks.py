@@ -2,7 +2,7 @@
 Files that consist of chunks: MCAP and ROS 1 bags.
 
 A chunk is read when the stream reaches its first message, and dropped after its last one. Chunks
-may overlap in time, or lie in any order. What is held of them is limited by `BUFFER_BYTES`.
+may overlap in time, or lie in any order. At most `BUFFER_BYTES` of them are buffered.
 
 """
 

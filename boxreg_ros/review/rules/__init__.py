@@ -20,7 +20,7 @@ from boxreg_ros.review.rules import (
 from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation
 
 RULES: dict[str, Rule] = {
-    module.RULE.id: module.RULE
+    module.RULE.rule_id: module.RULE
     for module in (
         size_outside_class,
         size_changes,

@@ -120,7 +120,7 @@ class Rule(NamedTuple):
 
     Attributes
     ----------
-    id, severity : str
+    rule_id, severity : str
         Name, and `ERROR` or `WARNING`.
     meaning, remedy : str
         What is wrong, and what to do.
@@ -129,7 +129,7 @@ class Rule(NamedTuple):
 
     """
 
-    id: str
+    rule_id: str
     severity: str
     meaning: str
     remedy: str

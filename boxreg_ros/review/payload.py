@@ -1,0 +1,193 @@
+"""What ``report.html`` holds of each track: one row for the list, and one compressed part."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from math import isfinite
+from typing import Any, NamedTuple
+import zlib
+
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.review.changes import median, TrackChanges
+from boxreg_ros.review.quality import ious, quality
+from boxreg_ros.review.track_points import PointCollector, to_millimetres
+from boxreg_ros.structures import ADDED, BOX_EXTENT, Floats, X, Y, Z
+import numpy as np
+import orjson
+
+MAX_POINTS = 2_000_000
+"""Points in a report; chosen: about 10 MB of the file."""
+MIN_SHOWN_POINTS = 40
+"""Points of a box that are shown in spite of `MAX_POINTS`, if there are; chosen."""
+PATH_POINTS = 40
+"""Points of the line of a track on the map; chosen."""
+DECIMALS = 4
+"""Decimals of metres and radians: a tenth of a millimetre."""
+COMPRESSION = 3
+"""Level of zlib; measured: level 6 saves 9 % of the file and takes twice as long."""
+
+
+def compressed(data: bytes) -> str:
+    """Return `data` as zlib in base64, which browsers decompress as ``deflate``."""
+    return b64encode(zlib.compress(data, COMPRESSION)).decode('ascii')
+
+
+def as_json(value: Any) -> bytes:
+    """Return JSON with null for NaN; numpy arrays are lists."""
+    return orjson.dumps(value, np.ndarray.tolist, orjson.OPT_SERIALIZE_NUMPY)
+
+
+def points_per_box(boxes: int) -> int:
+    """Return how many points of a box are shown in a report of `boxes` boxes."""
+    return max(MIN_SHOWN_POINTS, MAX_POINTS // max(1, boxes))
+
+
+class TrackTruth(NamedTuple):
+    """
+    The true boxes of a track (n, 9), and the 3D IoU (n,) of the input and the refined boxes.
+
+    NaN where there is no true box.
+
+    """
+
+    boxes: Floats
+    iou_before: Floats
+    iou_after: Floats
+
+
+def true_boxes(tracks: Sequence[TrackChanges], truth: BoxTable | None) -> list[TrackTruth]:
+    """Return the true boxes of each track by stamp and track id of the input."""
+    if not tracks:
+        return []
+    row_of: dict[tuple[int, str], int] = {}
+    known = np.zeros((0, 9))
+    if truth is not None:
+        keys = zip(truth.stamps_ns.tolist(), truth.track_ids, strict=True)
+        row_of = {key: row for row, key in enumerate(keys)}
+        known = truth.boxes
+    known = np.append(known, np.full((1, 9), np.nan), axis=0)  # the last one is unknown
+    rows = [
+        row_of.get((stamp, name), -1)
+        for track in tracks
+        for stamp, name in zip(track.stamps_ns.tolist(), track.input_ids, strict=True)
+    ]
+    boxes = known[rows]
+    nothing = np.zeros((0, 9))
+    before = ious(np.concatenate([nothing, *(track.given for track in tracks)]), boxes)
+    after = ious(np.concatenate([nothing, *(track.boxes for track in tracks)]), boxes)
+    ends = np.cumsum([len(track.stamps_ns) for track in tracks])[:-1]
+    parts = (np.split(values, ends) for values in (boxes, before, after))
+    return [TrackTruth(*found) for found in zip(*parts, strict=True)]
+
+
+class TrackPart:
+    """
+    The points and figures of one track, as the report shows them.
+
+    Parameters
+    ----------
+    track : TrackChanges
+        The track.
+    collector : PointCollector
+        The points of the recording.
+    truth : TrackTruth
+        True boxes of the track.
+
+    Attributes
+    ----------
+    before, after : Quality
+        Figures of the input boxes and of the refined boxes.
+
+    """
+
+    def __init__(self, track: TrackChanges, collector: PointCollector, truth: TrackTruth) -> None:
+        self._track = track
+        self._truth = truth
+        self._sensor = collector.sensor_at(track.stamps_ns)
+        self._points = collector.points_of(track)
+        self.before = quality(track, track.given, self._points, truth.iou_before)
+        self.after = quality(track, track.boxes, self._points, truth.iou_after)
+
+    def row(self, begin_ns: int, risk: Mapping[str, str]) -> dict[str, Any]:
+        """Return the row of the list; `risk` is the row of ``review.csv``, empty without."""
+        track = self._track
+        status = Counter(track.status.tolist())
+        is_input = ~np.isin(track.status, ADDED)
+        boxes = int(is_input.sum())
+        extents = [_median_extents(track.given), _median_extents(track.boxes)]
+        known = np.flatnonzero(np.isfinite(track.boxes[:, X]))
+        picks = known[np.linspace(0, len(known) - 1, min(PATH_POINTS, len(known))).astype(int)]
+        return {
+            'id': track.track_id,
+            'class': track.class_name,
+            'boxes': boxes,
+            'interpolated': sum(status[word] for word in ADDED),
+            'begin': (int(track.stamps_ns[0]) - begin_ns) * 1e-9,
+            'seconds': float(track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
+            'points': median(track.num_points[is_input]),
+            'refined': float(track.is_refined.sum() / boxes) if boxes else None,
+            'status': dict(status),
+            'reasons': dict(Counter(filter(None, track.reasons.tolist())).most_common()),
+            'shift': track.shift,
+            'turn': track.turn,
+            'deviation': track.deviation,
+            'flips': int(track.is_flipped.sum()),
+            'extents': extents,
+            'resized': float(np.abs(np.subtract(extents[0], extents[1])).max()),
+            'before': asdict(self.before),
+            'after': asdict(self.after),
+            'path': np.round(track.boxes[picks][:, [X, Y]], 2),
+            'rows': picks,
+            'risk': _number(risk.get('risk_m', '')),
+            'why': risk.get('reasons', ''),
+        }
+
+    def part(self, begin_ns: int, max_points: int) -> dict[str, Any]:
+        """Return all boxes of the track, with at most `max_points` points each."""
+        track = self._track
+        center = np.where(np.isfinite(track.boxes), track.boxes, track.given)[:, : Z + 1]
+        origin = np.nan_to_num(np.append(center[np.isfinite(center[:, X])], [[0, 0, 0]], 0)[0])
+        shown = []
+        for middle, points in zip(center, self._points, strict=True):
+            step = max(1, -(-len(points) // max_points))
+            shown.append(to_millimetres(points[::step] - middle))
+        every = np.concatenate([np.zeros((0, 3), np.int16), *shown])
+        return {
+            'origin': origin,
+            'stamps': [str(stamp) for stamp in track.stamps_ns.tolist()],
+            'times': np.round((track.stamps_ns - begin_ns) * 1e-9, DECIMALS),
+            'given': _moved(track.given, origin),
+            'boxes': _moved(track.boxes, origin),
+            'truth': _moved(self._truth.boxes, origin),
+            'iou': np.round([self._truth.iou_before, self._truth.iou_after], 3),
+            'sensor': np.round(self._sensor - origin, 2),
+            'status': track.status.tolist(),
+            'reasons': track.reasons.tolist(),
+            'flipped': track.is_flipped.tolist(),
+            'change': np.round(track.change, DECIMALS),
+            'deviations': np.round(track.deviations, DECIMALS),
+            'num_points': track.num_points,
+            'counts': [len(points) for points in shown],
+            'points': b64encode(every.astype('<i2').tobytes()).decode('ascii'),
+        }
+
+
+def _moved(boxes: Floats, origin: Floats) -> Floats:
+    moved = boxes.copy()
+    moved[:, : Z + 1] -= origin
+    return np.round(moved, DECIMALS)
+
+
+def _median_extents(boxes: Floats) -> list[float]:
+    return [median(values) for values in boxes[:, BOX_EXTENT].T]
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if isfinite(value) else None

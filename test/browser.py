@@ -1,0 +1,30 @@
+"""A headless Chromium for tests of pages."""
+
+from contextlib import contextmanager
+import shutil
+
+import pytest
+
+EXECUTABLE = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+NEEDS_BROWSER = pytest.mark.skipif(
+    EXECUTABLE is None, reason='no Chromium on PATH: apt install chromium'
+)
+OPTIONS = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader']
+"""Root needs ``--no-sandbox``; the others draw WebGL without a GPU."""
+
+
+@contextmanager
+def opened_page(url, expected='', **context):
+    """Yield a page of a browser, ready; it fails for errors on its console but one `expected`."""
+    playwright = pytest.importorskip('playwright.sync_api')
+    errors = []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=EXECUTABLE, args=OPTIONS)
+        page = browser.new_page(**{'viewport': {'width': 1366, 'height': 800}, **context})
+        page.on('console', lambda line: errors.append(line.text) if line.type == 'error' else None)
+        page.on('pageerror', lambda error: errors.append(str(error)))
+        page.goto(url)
+        page.wait_for_selector('html[data-ready]', timeout=60_000)
+        yield page
+        browser.close()
+    assert [line for line in errors if not expected or expected not in line] == []

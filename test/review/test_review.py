@@ -1,0 +1,346 @@
+"""`boxreg review`: the page in a real browser, decisions.csv, and what a run makes of it."""
+
+import csv
+from http.client import HTTPConnection
+from threading import Thread
+
+from boxreg_ros.cli import main
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.review.decisions import (
+    Corrections,
+    Decision,
+    DecisionLog,
+    DECISIONS,
+    read_decisions,
+)
+from boxreg_ros.review.server import review_server
+from boxreg_ros.structures import BoxArray, RefinedBoxes
+from browser import NEEDS_BROWSER, opened_page
+import numpy as np
+import pytest
+from ros_messages import Drive
+
+pytest.importorskip('plotly')
+SCRIPT = '<script>alert(1)</script>'
+BOX = np.array([10.0, -2.0, 0.5, 4.2, 1.8, 1.5, 0.01, -0.02, 0.3])
+QUICK = ['--set', 'solver.rounds=2', '--set', 'sampling.points=64']
+
+
+def boxreg(*words):
+    return main([str(word) for word in words])
+
+
+def served(out):
+    """Return a server for a result folder, running in a thread, and its address."""
+    server = review_server(out, 0)
+    Thread(target=server.serve_forever, daemon=True).start()
+    return server, f'http://127.0.0.1:{server.server_port}/'
+
+
+@pytest.fixture(scope='module')
+def result(tmp_path_factory):
+    """Return a recording with a class named like a tag, and the result of relabelling it."""
+    folder = tmp_path_factory.mktemp('review')
+    drive = Drive(sweeps=14)
+    for topic, _, message in drive.items:
+        for detection in message.detections[1:] if topic == '/boxes' else ():
+            for hypothesis in detection.results:
+                hypothesis.hypothesis.class_id = SCRIPT
+    recording = drive.write(folder / 'drive')
+    assert boxreg('relabel', recording, '-o', folder / 'out', '--report', *QUICK) == 0
+    return recording, folder / 'out'
+
+
+# The file ----------------------------------------------------------------------------------------
+
+
+def test_decisions_are_read_as_written(tmp_path):
+    made = [
+        Decision('a,"b"', None, 'reject', 'two\nlines, "quoted"'),
+        Decision('7', 1_700_000_000_123_456_789, 'pin', '', 'odom', BOX),
+    ]
+    log = DecisionLog(tmp_path / DECISIONS)
+    for decision in made:
+        log.append(decision)
+    first, second = read_decisions(tmp_path / DECISIONS)
+    assert (first.track_id, first.kind, first.comment) == (
+        'a,"b"',
+        'reject',
+        'two lines, "quoted"',
+    )
+    assert second.stamp_ns == made[1].stamp_ns
+    np.testing.assert_allclose(second.box, BOX, atol=1e-8)
+
+
+def test_a_crash_loses_no_earlier_row(tmp_path):
+    path = tmp_path / DECISIONS
+    log = DecisionLog(path)
+    log.append(Decision('1', None, 'accept'))
+    with open(path, 'ab') as file:
+        file.write(b'2,,rej')  # the machine stopped while a row was written
+    assert [one.track_id for one in read_decisions(path)] == ['1']
+    DecisionLog(path).append(Decision('3', None, 'unsure'))
+    assert [one.track_id for one in read_decisions(path)] == ['1', '3']
+
+
+@pytest.mark.parametrize(
+    ('row', 'word'),
+    [
+        ('7,12,pin,,odom,nan,0,0,0,0,0,1,4,2,1.5', 'finite numbers'),
+        ('7,12,pin,,odom,1,0,0,0,0,0,1,4,-2,1.5', 'positive extents'),
+        ('7,12,pin,,odom,,,,,,,,,,', 'got none'),
+        ('7,,pin,,odom,1,0,0,0,0,0,1,4,2,1.5', 'stamp'),
+        ('7,noon,accept,,,,,,,,,,,,', 'noon'),
+        ('7,,maybe,,,,,,,,,,,,', 'maybe'),
+    ],
+)
+def test_bad_rows_are_refused_by_line(tmp_path, row, word):
+    path = tmp_path / DECISIONS
+    DecisionLog(path).append(Decision('1', None, 'accept'))
+    with open(path, 'a', encoding='utf-8') as file:
+        file.write(row + '\n')
+    with pytest.raises(RecordingError, match=r'line 3: .*') as caught:
+        read_decisions(path)
+    assert word in str(caught.value)
+
+
+def test_last_decision_holds_and_box_goes_before_track():
+    given = BoxArray(5, 'odom', ('1', '2', '3'), ('car',) * 3, np.ones(3), np.tile(BOX, (3, 1)))
+    moved = given.boxes + 0.1
+    result = BoxArray(5, 'odom', given.track_ids, given.class_names, np.ones(3), moved)
+    covariances = np.tile(0.01 * np.eye(6), (3, 1, 1))
+    refined = RefinedBoxes(result, ('refined',) * 3, ('',) * 3, np.ones(3, int), covariances)
+    pin = BOX + 0.5
+    corrections = Corrections([
+        Decision('1', None, 'reject'),
+        Decision('1', 5, 'pin', '', 'odom', pin),
+        Decision('2', None, 'reject'),
+        Decision('3', None, 'reject'),
+        Decision('3', None, 'none'),
+        Decision('4', None, 'reject'),
+        Decision('2', 6, 'reject'),
+    ])  # fmt: skip
+    pinned = corrections.pinned(given)
+    assert pinned.pinned.tolist() == [True, False, False]
+    np.testing.assert_array_equal(pinned.boxes[0], pin)
+    found = corrections.apply(given, refined)
+    assert found.status == ('human', 'kept', 'refined')
+    assert found.reasons == ('', 'rejected', '')
+    np.testing.assert_array_equal(found.boxes.boxes, [pin, BOX, moved[2]])
+    assert corrections.unused() == ["'2' at 6", "'4'"]
+
+
+def test_pin_in_another_frame_is_refused():
+    given = BoxArray(5, 'odom', ('1',), ('car',), np.ones(1), BOX[None])
+    with pytest.raises(RecordingError, match="expected frame 'odom', got 'map'"):
+        Corrections([Decision('1', 5, 'pin', '', 'map', BOX)]).pinned(given)
+
+
+# The run -----------------------------------------------------------------------------------------
+
+
+def test_rejected_tracks_stay_and_pinned_boxes_are_held(result, tmp_path, capsys):
+    recording, out = result
+    table = BoxTable.read(out / 'boxes.csv')
+    rows = [i for i, name in enumerate(table.track_ids) if name == '1']
+    row = rows[7]
+    pin = table.boxes[row] + np.array([0.2, 0.1, 0, 0.3, 0, 0, 0, 0, 0])
+    log = DecisionLog(tmp_path / DECISIONS)
+    log.append(Decision('2', None, 'reject'))
+    log.append(Decision('1', int(table.stamps_ns[row]), 'pin', '', table.frame_id, pin))
+    log.append(Decision('nobody', None, 'reject'))
+    again = tmp_path / 'again'
+    decisions = ['--decisions', tmp_path / DECISIONS]
+    formats = ['--formats', 'openlabel,nuscenes,parquet']
+    assert boxreg('relabel', recording, '-o', again, *formats, *decisions, *QUICK) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if 'decisions' in line]
+    for word in ("'nobody'", 'expected', 'got', '--decisions'):
+        assert word in line
+    corrected = BoxTable.read(again / 'boxes.csv')
+    is_second = np.array(corrected.track_ids) == '2'
+    assert {corrected.status[i] for i in np.flatnonzero(is_second)} == {'kept'}
+    assert corrected.status[row] == 'human'
+    np.testing.assert_allclose(corrected.boxes[row], pin, atol=1e-6)
+    # The rest of the track has the extents of the pinned box.
+    lengths = corrected.boxes[rows, 3]
+    np.testing.assert_allclose(lengths, pin[3], atol=0.05)
+    assert abs(table.boxes[rows[0], 3] - pin[3]) > 0.25
+    for name in ('openlabel', 'nuscenes'):
+        texts = [file.read_text('utf-8') for file in (again / name).rglob('*.json')]
+        assert any('"human"' in text for text in texts), name
+    assert (again / DECISIONS).read_bytes() == (tmp_path / DECISIONS).read_bytes()
+
+
+def test_unreadable_decisions_stop_the_run_before_it_replaces_a_result(result, tmp_path, capsys):
+    recording, _ = result
+    path = tmp_path / DECISIONS
+    path.write_text('a,b\n1,2\n')
+    assert boxreg('relabel', recording, '-o', tmp_path / 'out', '--decisions', path) == 1
+    assert 'columns missing' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+# The server --------------------------------------------------------------------------------------
+
+
+def test_unfinished_result_is_refused(tmp_path, capsys):
+    assert boxreg('review', tmp_path) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    for word in ('expected', 'got', 'report.html', '--report'):
+        assert word in line
+
+
+def test_busy_port_is_refused(result):
+    server, _ = served(result[1])
+    with pytest.raises(ConfigError, match=r'expected a free one, got .* --port'):
+        review_server(result[1], server.server_port)
+    server.shutdown()
+
+
+@pytest.mark.parametrize(
+    ('headers', 'body', 'status'),
+    [
+        ({'Host': 'example.org'}, '{}', 403),
+        ({'Origin': 'http://example.org'}, '{}', 403),
+        ({'Content-Type': 'text/plain'}, '{}', 415),
+        ({}, '{"track_id": "1"}', 400),
+        ({}, '[1]', 400),
+        ({}, '{"track_id": "1", "stamp_ns": "5", "decision": "pin", "box": [NaN]}', 400),
+    ],
+)
+def test_foreign_and_broken_requests_write_nothing(result, headers, body, status):
+    server, _ = served(result[1])
+    connection = HTTPConnection('127.0.0.1', server.server_port)
+    sent = {'Content-Type': 'application/json', **headers}
+    connection.request('POST', '/decisions', body, sent)
+    assert connection.getresponse().status == status
+    server.shutdown()
+    assert not (result[1] / DECISIONS).exists()
+
+
+# The page ----------------------------------------------------------------------------------------
+
+
+@NEEDS_BROWSER
+def test_list_sorts_and_filters_and_shows_tags_as_text(result):
+    with opened_page((result[1] / 'report.html').as_uri() + '#tracks') as page:
+        tracks = page.locator('#rows tbody tr')
+        assert tracks.count() == 2
+        page.click('[data-sort=id]')
+        assert [tracks.nth(i).locator('td').nth(1).inner_text() for i in range(2)] == ['1', '2']
+        page.click('[data-sort=id]')
+        assert tracks.first.locator('td').nth(1).inner_text() == '2'
+        assert tracks.first.locator('td').nth(2).inner_text() == SCRIPT
+        page.select_option('#f-class', '=' + SCRIPT)
+        assert tracks.count() == 1
+        page.fill('#f-text', 'nothing')
+        assert tracks.count() == 0
+        assert page.inner_text('#f-count') == '0 of 2 tracks'
+
+
+@NEEDS_BROWSER
+def test_slider_keys_and_links_step_through_a_track(result):
+    url = (result[1] / 'report.html').as_uri()
+    table = BoxTable.read(result[1] / 'boxes.csv')
+    stamp = [s for s, name in zip(table.stamps_ns, table.track_ids, strict=True) if name == '2'][5]
+    with opened_page(f'{url}#track=2&stamp={stamp}') as page:
+        row = lambda: page.evaluate('view.row')  # noqa: E731
+        assert row() == 5
+        page.keyboard.press('ArrowRight')
+        assert row() == 6
+        page.keyboard.press('End')
+        assert row() == 13
+        page.fill('#time', '3')
+        assert row() == 3
+        before = page.evaluate("document.getElementById('top').toDataURL()")
+        page.keyboard.press('Shift+ArrowRight')
+        assert row() == 13
+        assert page.evaluate("document.getElementById('top').toDataURL()") != before
+        page.wait_for_function("location.hash.includes('stamp=') && view.space && view.charts")
+        page.keyboard.press('ArrowDown')
+        page.keyboard.press('ArrowUp')
+        page.wait_for_function('view.part !== null')
+        for mode in ('after', 'before', 'sweep'):
+            page.keyboard.press('m')
+            assert page.input_value('#mode') == mode
+        assert page.locator('#space canvas').count() > 0
+        assert page.locator('#charts svg.main-svg').count() > 0
+
+
+@NEEDS_BROWSER
+@pytest.mark.parametrize('scheme', ['light', 'dark'])
+def test_narrow_page_does_not_overflow(result, scheme):
+    narrow = {'viewport': {'width': 390, 'height': 844}, 'color_scheme': scheme}
+    with opened_page((result[1] / 'report.html').as_uri(), **narrow) as page:
+        page.wait_for_selector('#map .main-svg')
+        for tab in ('tracks', 'run', 'overview'):
+            page.click(f'#tab-{tab}')
+            overflow = 'document.documentElement.scrollWidth - innerWidth'
+            assert page.evaluate(overflow) <= 0
+        back = page.evaluate('getComputedStyle(document.body).backgroundColor')
+        assert (back == 'rgb(255, 255, 255)') == (scheme == 'light')
+
+
+@NEEDS_BROWSER
+def test_pin_and_re_solve_round_trip(result, tmp_path):
+    recording, out = result
+    server, url = served(out)
+    try:
+        with opened_page(url + '#track=1') as page:
+            page.keyboard.press('a')
+            page.wait_for_selector('[data-do=accept][aria-pressed=true]')
+            page.keyboard.press('r')
+            page.wait_for_selector('[data-do=reject][aria-pressed=true]')
+            page.keyboard.press('z')
+            page.wait_for_selector('[data-do=accept][aria-pressed=true]')
+            page.fill('#comment', SCRIPT)
+            page.keyboard.press('Enter')
+            page.wait_for_function("decisionOf('1').comment !== ''")
+            page.evaluate('step(6)')
+            page.keyboard.press('e')
+            before = page.evaluate('view.edit.slice()')
+            for _ in range(10):
+                page.keyboard.press('l')  # 0.2 m longer
+            bounds = page.locator('#side').bounding_box()
+            middle = bounds['x'] + bounds['width'] / 2, bounds['y'] + bounds['height'] / 2
+            page.mouse.move(*middle)
+            page.mouse.down()
+            page.mouse.move(middle[0], middle[1] - 10, steps=4)  # up
+            page.mouse.up()
+            page.keyboard.press('Enter')
+            page.wait_for_selector('[data-do=unpin]')
+    finally:
+        server.shutdown()
+    with open(out / DECISIONS, newline='', encoding='utf-8') as file:
+        rows = list(csv.DictReader(file))
+    assert [row['decision'] for row in rows] == ['accept', 'reject', 'accept', 'accept', 'pin']
+    assert rows[3]['comment'] == SCRIPT
+    (pin,) = [one for one in read_decisions(out / DECISIONS) if one.kind == 'pin']
+    assert pin.box[3] == pytest.approx(before[3] + 0.2)
+    table = BoxTable.read(out / 'boxes.csv')
+    row = [i for i, name in enumerate(table.track_ids) if name == '1'][6]
+    assert pin.stamp_ns == table.stamps_ns[row]
+    assert 0.02 < pin.box[2] - table.boxes[row, 2] < 0.5
+    decisions = tmp_path / DECISIONS
+    (out / DECISIONS).rename(decisions)
+    again = tmp_path / 'again'
+    options = ['-o', again, '--report', '--decisions', decisions, *QUICK]
+    assert boxreg('relabel', recording, *options) == 0
+    corrected = BoxTable.read(again / 'boxes.csv')
+    np.testing.assert_allclose(corrected.boxes[row], pin.box, atol=1e-3)
+    with opened_page((again / 'report.html').as_uri() + f'#track=1&stamp={pin.stamp_ns}') as page:
+        assert 'human' in page.inner_text('#clock')
+
+
+@NEEDS_BROWSER
+def test_lost_server_is_said_and_nothing_counts_as_saved(result):
+    server, url = served(result[1])
+    with opened_page(url + '#track=1', expected='500') as page:
+        page.route('**/decisions', lambda route: route.fulfill(status=500, body='disk full'))
+        page.evaluate("decide('accept')")
+        page.wait_for_selector('#failure:not([hidden])')
+        assert 'disk full' in page.inner_text('#failure')
+        assert page.evaluate('decisions.size') == 0
+        page.unroute('**/decisions')
+    server.shutdown()
