@@ -224,7 +224,7 @@ class McapFile(ChunkedFile):
             if not self._chunks:
                 raise RecordingError(
                     f'{self.name}: no message can be read; expected an MCAP file, got '
-                    f'{self.size} bytes without a whole chunk'
+                    f'{self.size} bytes without a whole chunk; copy or record it again'
                 )
             self._note('the recording was interrupted: no end of data', self.size, self.size)
         self._locate_damages()

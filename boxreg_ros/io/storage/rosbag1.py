@@ -84,7 +84,7 @@ class Rosbag1File(ChunkedFile):
         if not self._chunks:
             raise RecordingError(
                 f'{self.name}: no message can be read; expected a ROS 1 bag, got {self.size} '
-                f'bytes without a whole chunk'
+                f'bytes without a whole chunk; copy or record it again'
             )
         self._locate_damages()
         counts = self._count_messages()
