@@ -353,7 +353,7 @@ def _model_of(windows: Sequence[Window], config: Config) -> InputModel:
 
 def _bare(rows: Iterable[Sequence[Any]]) -> Window:
     """Return a window of (stamp, box) without points."""
-    nowhere, no_points = np.full(3, np.nan), np.zeros((0, 3), np.float32)
+    nowhere, no_points = np.full((1, 3), np.nan), np.zeros((0, 3), np.float32)
     observations = [
         Observation(stamp_ns, box, no_points, no_points[:, 0], nowhere, np.nan, 0)
         for stamp_ns, box in rows
