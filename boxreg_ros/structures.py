@@ -101,6 +101,8 @@ class Sweep:
         Positions of several sensors [m]; None if all points are of the one at `origin`.
     sensors : array, shape (M,), or None
         Row of `origins` of the sensor that measured each point; None without `origins`.
+    rows : array, shape (M,), or None
+        Row of each point in its message; None where no point was left out.
 
     """
 
@@ -113,6 +115,7 @@ class Sweep:
     topic: str = ''
     origins: Floats | None = None
     sensors: NDArray[np.uint8] | None = None
+    rows: Ints | None = None
 
     def __post_init__(self) -> None:
         """Check the shapes."""

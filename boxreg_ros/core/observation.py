@@ -1,6 +1,5 @@
 """Observations of boxes in a sweep: crop, ownership, height of the road, sampling."""
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -154,9 +153,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     return [Observation(stamp_ns, *values) for values in columns]
 
 
-def _origins(
-    sweep: Sweep, rows: Ints, parts: list[slice], centers: Floats
-) -> Sequence[Floats]:
+def _origins(sweep: Sweep, rows: Ints, parts: list[slice], centers: Floats) -> list[Floats]:
     """
     Return the sensors that see each of n objects, minus its centre, n arrays (K, 3) [m].
 
@@ -165,7 +162,7 @@ def _origins(
 
     """
     if sweep.origins is None or sweep.sensors is None:
-        return (sweep.origin - centers)[:, None]
+        return list((sweep.origin - centers)[:, None])
     origins = []
     for part, center in zip(parts, centers, strict=True):
         counts = np.bincount(sweep.sensors[rows[part]], minlength=len(sweep.origins))
