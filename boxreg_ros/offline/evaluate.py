@@ -13,7 +13,7 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
-from boxreg_ros.offline.arguments import add_topic_arguments, convention_from
+from boxreg_ros.offline.arguments import add_topic_arguments, convention_from, lidars_from
 from boxreg_ros.offline.box_scores import (
     by_overlap,
     groups,
@@ -131,10 +131,10 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
     source: Path = args.predicted
     if (source / 'boxes.csv').is_file():
         source = source / 'boxes.csv'
-    topics = {name: getattr(args, name) for name in ('points', 'boxes', 'odometry')}
+    topics = {'boxes': args.boxes, 'odometry': args.odometry}
     convention = convention_from(args)
     if source.suffix == '.csv':
-        if any(topics.values()) or args.fixed_frame or not convention.is_standard:
+        if any(topics.values()) or args.points or args.fixed_frame or not convention.is_standard:
             raise ConfigError(
                 f'--points, --boxes, --odometry, --fixed-frame, {convention}: expected with a '
                 f'recording only, got the table {str(source)!r}; leave them out'
@@ -143,7 +143,9 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
         return found.rows(np.array([status != REJECTED for status in found.status], bool))
     from boxreg_ros.io.recording import input_boxes  # slow to import: it reads bags
 
-    arrays, left_out = input_boxes(source, args.fixed_frame, convention=convention, **topics)
+    arrays, left_out = input_boxes(
+        source, args.fixed_frame, convention=convention, lidars=lidars_from(args), **topics
+    )
     if left_out:
         _warn(left_out)
     return BoxTable.from_arrays(arrays)
