@@ -10,6 +10,12 @@ from boxreg_ros.config import Config
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
 import yaml
 
+RECORDINGS = (
+    'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag, or a scene of a data set as in '
+    'nuscenes:/data#scene-0061'
+)
+"""What a recording can be, for the help of options."""
+
 
 def add_recording_arguments(
     parser: argparse.ArgumentParser, several: str = 'several are merged by time'
@@ -17,7 +23,7 @@ def add_recording_arguments(
     """Add the recordings, their topics and the settings; the help states the use of `several`."""
     parser.add_argument(
         'recordings', nargs='+', type=Path, metavar='RECORDING',
-        help=f'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; {several}',
+        help=f'{RECORDINGS}; {several}',
     )  # fmt: skip
     add_topic_arguments(parser)
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')
