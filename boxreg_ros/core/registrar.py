@@ -272,7 +272,7 @@ class BoxRegistrar:
         self._submitted = [_SubmittedTrack(track, track.entries, True) for track in ended]
         self._submitted += [_SubmittedTrack(track, track.entries, False) for track in tracks]
         windows = [track.window() for track in ended + tracks]
-        submit = self._submit or _submit_locally
+        submit = self._submit or submit_locally
         config = self.box_time.resolved(self.config)
         self._get_estimates = submit(windows, config, self._input_model)
         for track in tracks:
@@ -470,7 +470,8 @@ class _SubmittedTrack(NamedTuple):
     is_ended: bool
 
 
-def _submit_locally(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
+def submit_locally(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
+    """Return a function that runs `register` in this process."""
     return partial(register, windows, config, model)
 
 
