@@ -37,12 +37,12 @@ def both_sides(terms, x, free):
     rows = torch.arange(len(x))
     value, gradient = objective(x.clone(), rows)  # a copy: not the result kept for the start
     steps = objective.newton(gradient, rows)
-    kernel = value, gradient, steps, objective.factor.inverse_of_links(N)
+    kernel = value, gradient, steps, *objective.factor.inverse_of_links(N)
     chain = Chain.zeros(x, N)
     value, gradient = value_and_gradient(terms, x, N, chain)
     gradient = gradient * free
     factor = chain.factorised(free)
-    twin = value, gradient, factor.solve(gradient), factor.inverse_of_links(N)
+    twin = value, gradient, factor.solve(gradient), *factor.inverse_of_links(N)
     return kernel, twin
 
 
