@@ -325,9 +325,9 @@ def test_expected_bias_by_hand(weight, fast, slow):
 
 
 def test_errors_of_the_input_by_hand():
-    # Errors twice the usual size: of the mean of six extents, correlated by 0.2, sqrt(1.2 / 0.8 / 6)
-    # = 1/2 of it; and the constant one, over the robust deviation, by as much as 0.2 is above 0.15
-    # of 0.3: 1/6. Biases likewise. Low-noise input is not lowered here.
+    # The mean of six extents, correlated by 0.2, errs by sqrt(1.2 / 0.8 / 6) = 1/2 of the measured
+    # error. Constant errors count by how far the correlation is above 0.15, of 0.3: 1/6. Biases
+    # likewise. The error of low-noise input is not lowered here.
     kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
     problem = problem_of(drive(6)[None], class_numbers=kinds)
     for size in (2.0, 0.2):
