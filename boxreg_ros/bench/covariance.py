@@ -1,5 +1,5 @@
 """
-`boxreg bench covariance`: are the covariances as large as the errors?
+`boxreg bench covariance`: the sizes of covariances against those of the errors.
 
 Of early, final and track estimates, for every class, along the axes of the true boxes.
 
