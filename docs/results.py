@@ -317,7 +317,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     'covariance': (
         'Covariances',
         'Part of the errors within two standard deviations (0.95 is consistent) / mean squared\n'
-        'error over variance (1 is consistent), along the axes of the true boxes, without heading\n'
+        'error over variance (1 is consistent), along the axes of the true boxes; no heading\n'
         'flips. All boxes of a track share its constant errors: classes of one or two tracks say\n'
         'little. "Without input errors" are the inverse curvature and the model error alone.',
         _covariance,
