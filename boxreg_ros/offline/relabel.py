@@ -31,6 +31,7 @@ from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
+from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
@@ -257,7 +258,7 @@ def _truth(
         return None
     from boxreg_ros.offline.evaluate import time_range
 
-    truth = BoxTable.read(request.truth)
+    truth = true_boxes(request.truth)
     stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
     names = {track.track_id for track in tracks}
     problem = ''

@@ -75,7 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--truth', type=Path, metavar='FILE',
-        help='true boxes that the report shows, as CSV with the columns of boxes.csv',
+        help='true boxes that the report shows: CSV with the columns of boxes.csv, or a scene of '
+        'a data set',
     )  # fmt: skip
     parser.add_argument(
         '--resume', action='store_true',
