@@ -19,6 +19,7 @@ from boxreg_ros.io.session import (
     Session,
 )
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
+from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -130,6 +131,8 @@ class LiveRegistrar:
         Called with reason, text and count for everything that is not refined here.
     convention : Convention
         Convention of the boxes, and whether ids are to be assigned.
+    budget : TickBudget, optional
+        Limits the windows that are solved for a box array. Default: all are solved.
 
     Attributes
     ----------
@@ -148,6 +151,7 @@ class LiveRegistrar:
         transform_timeout: float,
         trouble: Callable[[str, str, int], None],
         convention: Convention = STANDARD,
+        budget: TickBudget | None = None,
     ) -> None:
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
@@ -155,6 +159,8 @@ class LiveRegistrar:
         self._trouble = trouble
         self._session = Session(convention, config, fixed_frame)
         self._registrar = BoxRegistrar(config)
+        if budget is not None:
+            self._registrar = BoxRegistrar(config, budget.submit, budget.windows)
         self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
         self._made: list[Outgoing] = []  # survives an error while further messages are made
