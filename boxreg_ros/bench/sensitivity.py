@@ -41,8 +41,8 @@ from boxreg_ros.bench.common import (
 )
 from boxreg_ros.config import Config, KINDS, Setting
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import match, summarise
 from boxreg_ros.structures import BoxArray
 import numpy as np
 import torch
