@@ -22,7 +22,7 @@ from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, median, TrackChanges
-from boxreg_ros.review.risk import assess
+from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
 import numpy as np
@@ -81,8 +81,9 @@ def measure(drive: Drive) -> dict[str, Any]:
     count = max(1, math.ceil(BAD_PART * len(tracks)))
     is_bad = np.zeros(len(tracks), bool)
     is_bad[np.argsort(overlap[known], kind='stable')[:count]] = True
+    usual = Usual.of(tracks)
     orders = {
-        'risk': [-assess(track).track for track in tracks],
+        'risk': [-assess(track, usual).track for track in tracks],
         'fewest points': [median(track.num_points) for track in tracks],
         'largest deviation': [-np.nan_to_num(track.deviation, nan=np.inf) for track in tracks],
     }
