@@ -21,11 +21,25 @@ RECORDINGS = (
 
 
 def add_recording_arguments(
-    parser: argparse.ArgumentParser, several: str = 'several are merged by time'
+    parser: argparse.ArgumentParser,
+    several: str = 'several are merged by time',
+    count: str = '+',
 ) -> None:
-    """Add the recordings, their topics and the settings; the help states the use of `several`."""
+    """
+    Add the recordings, their topics and the settings.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Gets the arguments.
+    several : str
+        Use of several recordings, for the help.
+    count : str
+        How many recordings are expected: ``+`` or ``*``.
+
+    """
     parser.add_argument(
-        'recordings', nargs='+', type=Path, metavar='RECORDING',
+        'recordings', nargs=count, type=Path, metavar='RECORDING',
         help=f'{RECORDINGS}; {several}',
     )  # fmt: skip
     add_topic_arguments(parser)
