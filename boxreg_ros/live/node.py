@@ -22,7 +22,8 @@ from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from
 from boxreg_ros.live.topics import Topics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
-from msg_adapters import adapter_for, canonical, POINTS_TYPE
+from msg_adapters import adapter_for, canonical
+from msg_adapters.clouds import header_of
 from msg_adapters.concatenation import INFO_TYPE
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
@@ -30,7 +31,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 NAME = 'boxreg_node'
@@ -126,7 +126,7 @@ class BoxregNode(Node):
             self._live, self._inbox, self._health, self.get_logger(), self._budget,
             options.backlog, markers,
         )  # fmt: skip
-        self._subscribe_to_points(options.lidars)
+        self._subscribe_to_points(options.points_type, options.lidars)
         self._subscribe_to_motion()
         for name, callback in (
             ('~/reset', self._on_reset),
@@ -161,7 +161,7 @@ class BoxregNode(Node):
 
     # ------------------------------------------------------------ topics
 
-    def _subscribe_to_points(self, lidars: Lidars) -> None:
+    def _subscribe_to_points(self, points_type: str, lidars: Lidars) -> None:
         """Subscribe to the clouds of all LiDARs, and to the info on concatenated ones."""
         # While the process is suspended, messages wait in DDS, which drops without a count. Its
         # queue must be longer than the inbox, which counts.
@@ -173,7 +173,7 @@ class BoxregNode(Node):
         for topic in lidars.topics or ('points',):
             lidar = topic if len(lidars.topics) > 1 else ''
             callback = partial(self._on_points, lidar)
-            self._topics.subscribe(POINTS_TYPE, topic, callback, qos(), is_required=True)
+            self._topics.subscribe(points_type, topic, callback, qos(), is_required=True)
         if lidars.info:
             self._topics.subscribe(INFO_TYPE, lidars.info, self._on_info, qos(), is_required=True)
 
@@ -230,8 +230,8 @@ class BoxregNode(Node):
     def _on_info(self, msg: Any) -> None:
         self._inbox.put_event('points_info', msg)
 
-    def _on_points(self, lidar: str, msg: PointCloud2) -> None:
-        self.worker.cloud_frame = msg.header.frame_id
+    def _on_points(self, lidar: str, msg: Any) -> None:
+        self.worker.cloud_frame = header_of(msg).frame_id
         self.worker.cloud_received = time.monotonic()
         self._receive('points', msg, lidar)
 
