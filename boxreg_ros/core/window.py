@@ -197,6 +197,7 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     minimum, is_usable = _prior_minimum(start, state, step)
     information *= PRIOR_DECAY * is_usable[:, None, None]
     first, counts = _places_of_returns(windows, valid)
+    class_numbers, kind = _of_classes(windows, config)
     on_device = partial(_tensor, device=config.device)
     problem = Problem(
         boxes=on_device(boxes),
@@ -211,8 +212,8 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
         prior_mean=on_device(np.nan_to_num(minimum)),
         prior_information=on_device(information),
         marginalised_extents=on_device(extents),
-        class_numbers=on_device(_class_numbers(windows, config)),
-        kind=on_device(np.array([KINDS.index(config.kind(w.class_name)) for w in windows])),
+        class_numbers=on_device(class_numbers),
+        kind=on_device(kind),
         pinned=on_device(pinned),
     )
     return problem, base
@@ -264,14 +265,16 @@ def _places_of_returns(windows: Sequence[Window], valid: NDArray[np.bool_]) -> t
 def _returns(windows: Sequence[Window], config: Config) -> Returns:
     """Return the returns of all observations, one after the other, delayed from their boxes."""
     every = [observation for window in windows for observation in window.observations]
-    is_sight = config.sampling.box_time == 'sight'
-    of_boxes = [o.delays - is_sight * np.float32(o.sight) for o in every]
-    delays = np.concatenate(of_boxes)
+    counts = [len(observation.points) for observation in every]
+    delays = np.concatenate([observation.delays for observation in every])
+    if config.sampling.box_time == 'sight':
+        sights = np.array([observation.sight for observation in every], dtype=np.float32)
+        delays -= np.repeat(sights, counts)
     return Returns(
         _tensor(np.concatenate([observation.points for observation in every]), config.device),
         _tensor(delays, config.device),
         is_moving=bool(delays.any()),
-        width=max(1, *(len(observation.points) for observation in every)),
+        width=max(1, *counts),
     )
 
 
@@ -324,11 +327,12 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
     return minimum, np.asarray((half_turns % 2 == 0).all(1))
 
 
-def _class_numbers(windows: Sequence[Window], config: Config) -> Floats:
-    """Return the numbers of each window's `ClassConfig`, in the order of its fields, (B, D)."""
-    names = {window.class_name for window in windows}
-    rows = {name: numbers_of(config.class_config(name)) for name in names}
-    return np.array([rows[window.class_name] for window in windows], dtype=np.float64)
+def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Floats, Ints]:
+    """Return numbers of the `ClassConfig` (B, C) and kind (B,) of each window, see `Problem`."""
+    kinds = {name: config.kind(name) for name in {window.class_name for window in windows}}
+    kind = np.array([KINDS.index(kinds[window.class_name]) for window in windows])
+    numbers = np.array([numbers_of(getattr(config, name)) for name in KINDS], dtype=np.float64)
+    return numbers[kind], kind
 
 
 def resolve_headings(
