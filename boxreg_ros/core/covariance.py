@@ -1,6 +1,6 @@
 """Covariances of the estimate, and the residuals of its faces: once per window, at its end."""
 
-from boxreg_ros.core.arrowhead import BandedFactor, Factor, product
+from boxreg_ros.core.arrowhead import InverseBlocks, product
 from boxreg_ros.core.batch import EXTENT, GAP, Posterior, Problem, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
 import torch
@@ -26,8 +26,7 @@ def posterior(
     moments: Tensor,
     inset: Tensor,
     weight: Tensor,
-    factor: Factor | BandedFactor,
-    covariance: Tensor,
+    inverse: InverseBlocks,
 ) -> Posterior:
     """
     Return the covariances of settled windows (M26, M28), and the residuals of their faces.
@@ -40,16 +39,14 @@ def posterior(
         Their estimate.
     moments, inset, weight : Tensor, shapes (B, N, 6, 4, 4), (B, N, 6) and (B, N, 6)
         Of the `FaceObservations` of the last round.
-    factor : Factor or BandedFactor
+    inverse : InverseBlocks
         Of the Gauss-Newton curvature of the last round.
-    covariance : Tensor, shape (B, 22, 22)
-        Of the shared variables: their block of the inverse of that curvature.
 
     """
     R = rotation_from_rpy(state.pose[..., 3:])
-    poses = factor.inverse_of_links(problem.length)
+    poses = inverse.links.clone()
     _add_pose_model_covariance(poses, R)
-    extents = covariance[:, EXTENT, EXTENT]
+    extents = inverse.corner[:, EXTENT, EXTENT]
     extents = extents + torch.diag(extents.new_tensor(EXTENT_MODEL_DEVIATION) ** 2)
     distances = _face_distances(problem, state, R, moments[..., 3, :3], inset)
     return Posterior(poses, extents, torch.where(weight > 0, distances, 0.0))
