@@ -184,7 +184,9 @@ def run_round(
     fit = take(part, offsets, plan, turn, config)
     done = fit.is_done.nonzero()[:, 0]
     faces = fit.observations.moments, fit.observations.inset, fit.observations.weight
-    settled = select((part.problem, fit.state, *faces, fit.inverse), done)
+    settled = select(
+        (part.problem, fit.state, *faces, part.expected, part.free, fit.inverse), done
+    )
     evidence = evidence_of_extents(part.log_extent, part.expected, fit.state, fit.inverse.corner)
     return RoundResult(rows, fit.state, fit.is_done, evidence, posterior(*settled), fit.prior)
 

@@ -12,11 +12,13 @@ from typing import Any
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
+from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
 from boxreg_ros.live.inbox import Inbox, Message
 from boxreg_ros.reasons import REASONS
-from msg_adapters import Adapter, pointcloud
+from boxreg_ros.structures import BoxArray, Sweep
+from msg_adapters import Adapter
 from msg_adapters.poses import stamp_ns
 from rclpy.duration import Duration
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -52,6 +54,8 @@ class Worker:
         Counters and log.
     logger : RcutilsLogger
         Logger of the node.
+    budget : TickBudget
+        That of `live`.
     backlog : float
         How long a cloud may wait for the solver [s].
     markers : Publisher
@@ -78,6 +82,7 @@ class Worker:
         inbox: Inbox,
         health: Health,
         logger: RcutilsLogger,
+        budget: TickBudget,
         backlog: float,
         markers: Publisher,
     ) -> None:
@@ -90,6 +95,7 @@ class Worker:
         self._inbox = inbox
         self._health = health
         self._logger = logger
+        self._budget = budget
         self._backlog = backlog
         self._idle_at = 0.0
         self._waited = 0.0
@@ -108,7 +114,7 @@ class Worker:
 
     def facts(self) -> dict[str, object]:
         """Return what /diagnostics reports about the boxes beside the counters."""
-        return self._live.facts
+        return {**self._live.facts, 'deadline [ms]': f'{1e3 * self._budget.seconds:.0f}'}
 
     def stop(self) -> None:
         """Make `run` return after the message at hand."""
@@ -151,7 +157,8 @@ class Worker:
             self._publish([Outgoing(message.content, False)])
             self._inbox.put_passing(message)  # the final copy, in the order of all
         else:
-            self._inbox.put_event('lost', stamp_ns(message.content.header))
+            lost = stamp_ns(message.content.header), message.lidar
+            self._inbox.put_event('lost', lost)
 
     def _next(self) -> ReceivedMessage | None:
         """Return the next message decoded, or None if there is none to process now."""
@@ -191,9 +198,13 @@ class Worker:
 
     def _decoded(self, message: Message) -> ReceivedMessage | None:
         """Return a message decoded; boxes that cannot be decoded pass through."""
-        reader: Any = pointcloud if message.topic == 'points' else self._live.adapter
+        content: Sweep | BoxArray
         try:
-            content = reader.from_msg(message.content)
+            if message.topic == 'points':
+                content = self._live.placement.sweep_of(message.content, message.lidar)
+            else:
+                assert self._live.adapter is not None  # set before boxes are subscribed to
+                content = self._live.adapter.from_msg(message.content)
         except UnsupportedMessage as error:
             self._health.report('unreadable', f'{message.topic}: {error}')
         except Exception as error:
@@ -230,24 +241,37 @@ class Worker:
         for kind, content in self._inbox.take_events():
             if kind == 'odom':
                 self._live.tree.add_odometry(content)
+            elif kind == 'points_info':
+                self._take_info(content)
             elif kind == 'lost':
-                self._publish(self._guarded(partial(self._live.lose, content)))
+                self._publish(self._guarded(partial(self._live.lose, *content)))
             elif kind == 'reset':
                 self._publish(self._guarded(self._live.reset))
             elif kind == 'settings':
                 self._live.config, options = content
                 self._live.output_frame = options.output_frame.lstrip('/')
                 self._live.transform_timeout = options.transform_timeout
+                self._budget.deadline = options.deadline
             else:
                 self._live.tree.add_transforms(content, is_static=kind == '/tf_static')
         self.newest_transform_ns = self._live.tree.newest_ns()
 
+    def _take_info(self, message: Any) -> None:
+        try:
+            self._live.placement.add_info(message)
+        except UnsupportedMessage as error:
+            self._health.report('unreadable', f'points_info: {error}')
+
     def _process(self, item: ReceivedMessage) -> None:
+        if isinstance(item.content, BoxArray):
+            self._budget.add_arrival(item.received)
+        self._budget.begin(max(item.received, self._idle_at))
         ready = self._guarded(partial(self._live.process, item), item)
         if self.fixed_frame != self._live.fixed_frame:
             self.fixed_frame = self._live.fixed_frame
             self._logger.info(f'fixed frame is {self.fixed_frame!r}')
         self._publish(ready)
+        self._budget.end()
         if is_placeholder(item.content) and self._board.is_showing:
             self._markers.publish(self._board.clear())
 

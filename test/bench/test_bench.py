@@ -11,8 +11,8 @@ from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import evaluate, match
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
@@ -165,6 +165,19 @@ def test_json_names_version_and_command(folder, capsys, monkeypatch):
     assert document['version'] == __version__
     assert document['command'] == ' '.join(['boxreg', *words])
     assert set(document) == {'version', 'command', 'results'}
+
+
+def test_covariances_are_measured_for_each_estimate(folder, capsys):
+    assert run('covariance', folder, '--json') == 0
+    report = json.loads(capsys.readouterr().out)['results'][str(folder)]
+    assert set(report) == {'early', 'final', 'track'}
+    for groups in report.values():
+        group = groups['all']
+        assert group['boxes'] > 10
+        assert all(0.6 < value <= 1 for value in group['coverage'].values())
+        assert all(0 < value < 6 for value in group['nees'].values())
+    assert run('covariance', folder) == 0
+    assert 'early' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize('name', bench.MEASUREMENTS)
