@@ -508,12 +508,15 @@ class _Track:
         if len(recent) < ID_SWITCH_OBSERVATIONS - 1:
             return None
         first, latest = recent[0], recent[-3]
-        velocity = (latest.box - first.box) / (latest.stamp_ns - first.stamp_ns)  # [m/ns]
+        first_x, first_y = first.box[:Z].tolist()
+        x, y = latest.box[:Z].tolist()
+        duration_ns = latest.stamp_ns - first.stamp_ns
         for observation in recent[-2:]:
             elapsed_ns = observation.stamp_ns - latest.stamp_ns
-            predicted = latest.box + elapsed_ns * velocity
+            part = elapsed_ns / duration_ns
+            predicted = x + part * (x - first_x), y + part * (y - first_y)
             gate = latest.box[LENGTH] / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
-            if dist(observation.box[:2], predicted[:2]) < gate:
+            if dist(observation.box[:Z], predicted) < gate:
                 return None
         moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
         del self.entries[-2:]
