@@ -476,8 +476,8 @@ class _Track:
 
     def urgency(self) -> tuple[int, float, float]:
         """Return the key that sorts tracks by the gain of solving them, highest gain first."""
-        origins = self.entries[-1].observation.origins
-        distance = float(np.linalg.norm(origins, axis=1).min())  # may be NaN
+        sensors = self.entries[-1].observation.origins
+        distance = float(np.linalg.norm(sensors, axis=1).min())  # NaN if unknown
         return -self.num_carried, -self.variance, distance if distance >= 0 else inf
 
     def carry(self, length: int) -> None:

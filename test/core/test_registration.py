@@ -3,7 +3,7 @@
 from dataclasses import fields, replace
 
 from boxreg_ros.config import Config
-from boxreg_ros.core import batch, paper, registration, solver, terms
+from boxreg_ros.core import batch, paper, registration, rounds, solver, terms
 from boxreg_ros.core.batch import POSE_ERRORS, State
 from boxreg_ros.core.face_support import FaceOffsets, observe_faces
 from boxreg_ros.core.geometry import rotation_from_rpy
@@ -12,6 +12,7 @@ from boxreg_ros.core.lbfgs import minimize, Minimum, select
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.registration import register
+from boxreg_ros.core.rounds import run_round
 from boxreg_ros.core.terms import Objective, Term
 from boxreg_ros.core.weights import parked_steps, weigh
 from boxreg_ros.core.window import stack_windows
