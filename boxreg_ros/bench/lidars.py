@@ -18,7 +18,7 @@ from boxreg_ros.bench.common import add_json_argument, line, print_json, progres
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.lidars import Lidars
-from boxreg_ros.io.recording import input_boxes
+from boxreg_ros.io.recording import input_boxes, Recording
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
@@ -80,7 +80,7 @@ def measured(seed: int, sweeps: int | None, done: Any) -> dict[str, tuple[float,
             write_truck(path, scene, layout)
             topics = tuple(f'/points/{name}' for name in CORNERS) if layout == 'corners' else ()
             if not found:
-                arrays, _ = input_boxes(path, lidars=Lidars(topics))
+                arrays, _ = input_boxes(Recording([path], Lidars(topics)))
                 found['input'] = _ious(BoxTable.from_arrays(arrays, 'input'), scene.truth)
             request = Request((path,), lidars=Lidars(topics), formats=('csv',), config=Config())
             relabel(request, out)
