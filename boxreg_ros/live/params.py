@@ -12,6 +12,7 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars
 from msg_adapters import CLOUD_TYPES, POINTS_TYPE
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
+from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -29,6 +30,11 @@ NODE_SETTINGS = (
     Setting(
         'points_type', POINTS_TYPE, 'message type of the clouds, as package/msg/Type',
         choices=CLOUD_TYPES,
+    ),
+    Setting(
+        'time_unit', AUTO,
+        'unit of the times of the points; auto: that of the layout, else by magnitude',
+        choices=TIME_UNIT_CHOICES,
     ),
     Setting(
         'sensor_frames', (),
@@ -98,6 +104,7 @@ class NodeOptions(NamedTuple):
     boxes_type: str
     points: tuple[str, ...]
     points_type: str
+    time_unit: str
     sensor_frames: tuple[str, ...]
     points_info: str
     pose_reference: str
@@ -119,7 +126,7 @@ class NodeOptions(NamedTuple):
     @property
     def lidars(self) -> Lidars:
         """Return the topics of the clouds and the frames of the LiDARs."""
-        return Lidars(self.points, self.sensor_frames, self.points_info)
+        return Lidars(self.points, self.sensor_frames, self.points_info, self.time_unit)
 
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:

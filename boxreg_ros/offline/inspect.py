@@ -273,6 +273,7 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
         'sensor_frame': recording.sensor_frame(),
         'transforms': [_transform(link) for link in session.tree.links()],
         'connected_frames': session.tree.groups(),
+        'point_layouts': recording.placement.layouts,
         'sample': _summary(sample),
         'warnings': list(_warnings(sample, session.finding, recording)),
     }
@@ -450,6 +451,8 @@ def _sample_lines(facts: dict[str, Any]) -> Iterator[str]:
         f'  clouds {facts["points_topic"]}: {sample["points_per_sweep"]:,} points, {shown}, '
         f'{_seconds(sample["sweep_period_s"])} apart, {len(sample["gaps"]["sweeps"])} gaps'
     )
+    for topic, layout in facts['point_layouts'].items():
+        yield f'  layout {topic}: {layout}'
     yield (
         f'  boxes {facts["boxes_topic"]}: {_seconds(sample["boxes_period_s"])} apart, '
         f'{len(sample["gaps"]["box_arrays"])} gaps, at most '

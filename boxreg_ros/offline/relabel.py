@@ -337,6 +337,7 @@ def _summary(
         'without_stamp': _without_stamp(findings),
         'damage': [damage._asdict() for damage in findings.damages],
         'lidars': {topic: dict(counts) for topic, counts in findings.lidars.items()},
+        'point_layouts': findings.point_layouts,
         'first_missing_transform': findings.first_missing_transform,
         'first_unplaced': findings.first_unplaced,
         'first_unreadable': findings.first_unreadable,
