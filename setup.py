@@ -47,6 +47,8 @@ setup(
     extras_require={
         # A baseline of `boxreg bench`, and its figures.
         'bench': ['matplotlib', 'small-gicp'],
+        # Data sets as recordings: tables of nuScenes, pickles of PandaSet, tables of Arrow.
+        'datasets': ['ijson>=3.2', 'pandas>=2', 'pyarrow'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
         'formats': ['pyarrow'],
         # MCAP files whose boxes are protobuf.
@@ -72,6 +74,7 @@ setup(
             'flake8-import-order',
             'flake8-quotes',
             'foxglove-schemas-protobuf',
+            'ijson>=3.2',
             'jinja2',
             'matplotlib',
             'mcap-protobuf-support',
@@ -79,6 +82,7 @@ setup(
             'mkdocs-material',
             'mypy',
             'openlabel-checker',
+            'pandas>=2',
             'playwright',
             'plotly',
             'pyarrow',

