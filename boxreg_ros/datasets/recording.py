@@ -10,6 +10,7 @@ from typing import Self
 from boxreg_ros.datasets.protocol import Scene, SweepFile
 from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_inputs
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.lidars import Lidars, SensorPlacement
 from boxreg_ros.io.recording import Item, LOOKAHEAD_NS, not_measured, Stage
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
@@ -43,7 +44,9 @@ class SceneRecording:
     ----------
     has_boxes : bool
         Whether boxes are required.
-    points_topic, boxes_topic, odometry_topic, start_ns, end_ns, unreadable, first_errors, outside
+    points_topic, placement, boxes_topic, odometry_topic, start_ns, end_ns
+        See `ItemSource`.
+    unreadable, first_errors, outside
         See `ItemSource`.
 
     Raises
@@ -79,6 +82,7 @@ class SceneRecording:
         self._address = resolved(self._address)
         self._scene: Scene = open_scene(self._address, self._points)
         self.points_topic = self._scene.points_topic
+        self.placement = SensorPlacement(Lidars((self.points_topic,)))
         first_ns, last_ns = self._scene.sweep_stamps_ns[[0, -1]].tolist()
         self.start_ns = first_ns + round((self._start or 0.0) * 1e9)
         self.end_ns = last_ns + 1

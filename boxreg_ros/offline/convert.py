@@ -14,6 +14,7 @@ from typing import Any
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.transforms import boxes_to_frame, TransformTree
 from boxreg_ros.labels import (
     check_options,
@@ -174,9 +175,8 @@ def _read_with_recording(
     tree = TransformTree()
     labels = (request.source_format, request.source)
     spool = Spool(folder, Config()) if request.options.with_points else None
-    source = source_of(
-        request.recordings, request.points, odometry=request.odometry, labels=labels
-    )
+    lidars = Lidars((request.points,) if request.points else ())
+    source = source_of(request.recordings, lidars, odometry=request.odometry, labels=labels)
     with source as recording:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)

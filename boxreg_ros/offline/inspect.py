@@ -21,7 +21,13 @@ from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.offline.arguments import add_topic_arguments, convention_from, RECORDINGS
+from boxreg_ros.offline.arguments import (
+    add_topic_arguments,
+    convention_from,
+    lidar_options,
+    lidars_from,
+    RECORDINGS,
+)
 
 if TYPE_CHECKING:
     from boxreg_ros.io.recording import Item, ItemSource
@@ -79,7 +85,7 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
 
     convention = convention_from(args)
     source = source_of(
-        args.recordings, args.points, args.boxes, args.odometry, convention=convention
+        args.recordings, lidars_from(args), args.boxes, args.odometry, convention=convention
     )
     if scene_address(args.recordings) is None:
         facts = _contents(args.recordings)
@@ -206,7 +212,7 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
     """Return what the first seconds of a recording show."""
     from boxreg_ros.io.session import Session
 
-    session = Session(convention, Config())
+    session = Session(convention, Config(), placement=recording.placement)
     session.fixed_frame = recording.choose_fixed_frame(session.tree)
     sample = _Sample()
     begin_ns = recording.start_ns
@@ -318,7 +324,8 @@ def _command(args: argparse.Namespace, facts: dict[str, Any]) -> str:
     scene = scene_address([first])
     out = f'out/{first.stem if scene is None else scene.scene or scene.root.name}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
-    for name in ('points', 'boxes', 'odometry'):
+    words += lidar_options(args)
+    for name in ('boxes', 'odometry'):
         if getattr(args, name):
             words += [f'--{name}', getattr(args, name)]
     convention = convention_from(args)

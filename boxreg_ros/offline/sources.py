@@ -9,6 +9,7 @@ from pathlib import Path
 from boxreg_ros.datasets import Address, address_of, SceneRecording
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
 from boxreg_ros.offline.labelled_recording import LabelledRecording
@@ -19,7 +20,7 @@ import numpy as np
 
 def source_of(
     paths: Sequence[Path],
-    points: str | None = None,
+    lidars: Lidars = SINGLE_LIDAR,
     boxes: str | None = None,
     odometry: str | None = None,
     start: float | None = None,
@@ -34,7 +35,7 @@ def source_of(
     ----------
     paths : sequence of Path
         Recordings of one drive, or one address of a scene.
-    points, boxes, odometry, start, end, convention
+    lidars, boxes, odometry, start, end, convention
         As those of `Recording`.
     labels : tuple of str and Path, optional
         Format and path of label files to read the boxes from.
@@ -47,13 +48,13 @@ def source_of(
     """
     address = scene_address(paths)
     if address is not None:
-        _check_scene(address, boxes, odometry, convention)
-        return SceneRecording(address, points, start, end, labels)
+        _check_scene(address, lidars, boxes, odometry, convention)
+        return SceneRecording(address, next(iter(lidars.topics), None), start, end, labels)
     if labels is not None:
         return LabelledRecording(
-            labels, paths, points=points, odometry=odometry, start=start, end=end
+            labels, paths, lidars=lidars, odometry=odometry, start=start, end=end
         )
-    return Recording(paths, points, boxes, odometry, start, end, convention)
+    return Recording(paths, lidars, boxes, odometry, start, end, convention)
 
 
 def scene_address(paths: Sequence[Path]) -> Address | None:
@@ -78,9 +79,19 @@ def scene_address(paths: Sequence[Path]) -> Address | None:
 
 
 def _check_scene(
-    address: Address, boxes: str | None, odometry: str | None, convention: Convention
+    address: Address,
+    lidars: Lidars,
+    boxes: str | None,
+    odometry: str | None,
+    convention: Convention,
 ) -> None:
     """Refuse options of topics."""
+    if len(lidars.topics) > 1 or lidars.frames or lidars.info:
+        raise ConfigError(
+            f'points: expected at most the name of one LiDAR of {address}, got '
+            f'{", ".join((*lidars.topics, *lidars.frames, lidars.info))}; leave the others out: a '
+            f'data set states the positions of its LiDARs'
+        )
     for name, topic in (('boxes', boxes), ('odometry', odometry)):
         if topic is not None:
             raise ConfigError(
