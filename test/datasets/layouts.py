@@ -154,8 +154,15 @@ def nuscenes(root, version='v1.0-mini', scene='scene-0061', with_annotations=Tru
         }],
         'visibility': [{'token': '4', 'level': 'v80-100', 'description': ''}],
         'attribute': [],
-        'map': [],
+        'map': [
+            {
+                'token': 'map', 'log_tokens': ['log'], 'category': 'semantic_prior',
+                'filename': 'maps/map.png',
+            }
+        ],
     }  # fmt: skip
+    (root / 'maps').mkdir(parents=True)
+    (root / 'maps' / 'map.png').touch()
     for name, rows in content.items():
         write_json(tables / f'{name}.json', rows)
     return root
