@@ -254,6 +254,23 @@ def _review(results: Any) -> Iterable[str]:
             yield _table([head, '1 %', '5 %', '10 %', '20 %'], rows)
 
 
+def _covariance(results: Any) -> Iterable[str]:
+    """Yield coverage and NEES of each variable, by estimate and class, one table per recording."""
+    for recording, estimates in results.items():
+        rows = [
+            [f'{estimate}, {name}', str(group['boxes']), *_consistent(group)]
+            for estimate, groups in estimates.items()
+            for name, group in groups.items()
+        ]
+        variables = next(iter(next(iter(estimates.values())).values()))['nees']
+        yield _table([recording, 'boxes', *variables], rows)
+
+
+def _consistent(group: Any) -> Iterable[str]:
+    pairs = zip(group['coverage'].values(), group['nees'].values(), strict=True)
+    return (f'{coverage:.2f} / {nees:.1f}' for coverage, nees in pairs)
+
+
 def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
     for name, value in results.items():
         if isinstance(value, dict):
@@ -296,6 +313,14 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'One setting or constant halved or doubled. A positive loss means that the default is '
         'better.',
         _sensitivity,
+    ),
+    'covariance': (
+        'Covariances',
+        'Part of the errors within two standard deviations (0.95 is consistent) / mean squared\n'
+        'error over variance (1 is consistent), along the axes of the true boxes; no heading\n'
+        'flips. All boxes of a track share its constant errors: classes of one or two tracks say\n'
+        'little. "Without input errors" are the inverse curvature and the model error alone.',
+        _covariance,
     ),
     'review': (
         'Review list',

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Self
 
 from boxreg_ros.datasets.protocol import Scene, SweepFile
-from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_inputs
+from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_files
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
-from boxreg_ros.io.lidars import Lidars, SensorPlacement
+from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.recording import Item, LOOKAHEAD_NS, not_measured, Stage
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
@@ -74,6 +74,7 @@ class SceneRecording:
         self.boxes_topic = '' if labels else ANNOTATIONS
         self.unreadable: Counter[str] = Counter()
         self.first_errors: dict[str, UnsupportedMessage] = {}
+        self.placement = SensorPlacement()
         self.outside = 0
         self._readable = 0
 
@@ -82,7 +83,6 @@ class SceneRecording:
         self._address = resolved(self._address)
         self._scene: Scene = open_scene(self._address, self._points)
         self.points_topic = self._scene.points_topic
-        self.placement = SensorPlacement(Lidars((self.points_topic,)))
         first_ns, last_ns = self._scene.sweep_stamps_ns[[0, -1]].tolist()
         self.start_ns = first_ns + round((self._start or 0.0) * 1e9)
         self.end_ns = last_ns + 1
@@ -127,10 +127,7 @@ class SceneRecording:
     @property
     def files(self) -> list[Path]:
         """Return the files that the scene is read from."""
-        found: list[Path] = []
-        for path in scene_inputs(self._address):
-            found += sorted(path.rglob('*')) if path.is_dir() else [path]
-        return [path for path in found if path.is_file()]
+        return scene_files(self._address)
 
     def sensor_frame(self) -> str:
         """Return the frame of the clouds."""

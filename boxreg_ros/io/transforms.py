@@ -11,7 +11,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.rotations import (
@@ -75,6 +75,15 @@ class TimeJumpDetector:
         self._newest_ns = max(self._newest_ns, stamp_ns)
         self._was_back = is_back
         return False
+
+
+class Link(NamedTuple):
+    """A pair of parent and child frame; `stamps_ns` ascend, and are one for a static pair."""
+
+    parent: str
+    child: str
+    is_static: bool
+    stamps_ns: tuple[int, ...]
 
 
 class TransformTree:
@@ -195,6 +204,23 @@ class TransformTree:
         """Return all pairs of parent and child."""
         pairs = dict.fromkeys(f'{edge.parent} -> {edge.child}' for edge in self._edges())
         return ', '.join(pairs) or 'none'
+
+    def links(self) -> list[Link]:
+        """Return all pairs of parent and child with the stamps that are known."""
+        return [
+            Link(edge.parent, edge.child, edge.is_static, tuple(edge.stamps))
+            for edge in self._edges()
+        ]
+
+    def groups(self) -> list[list[str]]:
+        """Return the names of frames that transforms connect with each other, sorted."""
+        group_of: dict[str, list[str]] = {name: [name] for name in self.frames()}
+        for edge in self._edges():
+            ours, others = group_of[edge.parent], group_of[edge.child]
+            if ours is not others:
+                ours += others
+                group_of |= dict.fromkeys(others, ours)
+        return sorted({id(group): sorted(group) for group in group_of.values()}.values())
 
     def frames(self) -> list[str]:
         """Return the names of all frames, sorted."""

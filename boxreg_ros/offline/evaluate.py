@@ -148,8 +148,8 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
     from boxreg_ros.io.recording import input_boxes  # slow to import: it reads bags
     from boxreg_ros.offline.sources import source_of
 
-    source_options = {'convention': convention, 'lidars': lidars_from(args), **topics}
-    arrays, others = input_boxes(source_of([source], **source_options), args.fixed_frame)
+    recording = source_of([source], lidars_from(args), convention=convention, **topics)
+    arrays, others = input_boxes(recording, args.fixed_frame)
     if others:
         _warn(others)
     return BoxTable.from_arrays(arrays)

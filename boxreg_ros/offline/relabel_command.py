@@ -80,7 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--resume', action='store_true',
-        help='do nothing if OUT holds the result of the same request, files and settings',
+        help='go on with an interrupted run of the same request, files and settings; do nothing '
+        'if OUT holds its result',
     )  # fmt: skip
     parser.add_argument(
         '--strict', action='store_true',
@@ -153,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
     with ProgressBar() as bar:
-        summary = relabel(request, args.out, bar)
+        summary = relabel(request, args.out, bar, args.resume)
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))

@@ -49,7 +49,8 @@ def source_of(
     address = scene_address(paths)
     if address is not None:
         _check_scene(address, lidars, boxes, odometry, convention)
-        return SceneRecording(address, next(iter(lidars.topics), None), start, end, labels)
+        sensor = lidars.topics[0] if lidars.topics else None
+        return SceneRecording(address, sensor, start, end, labels)
     if labels is not None:
         return LabelledRecording(
             labels, paths, lidars=lidars, odometry=odometry, start=start, end=end
@@ -88,9 +89,8 @@ def _check_scene(
     """Refuse options of topics."""
     if len(lidars.topics) > 1 or lidars.frames or lidars.info:
         raise ConfigError(
-            f'points: expected at most the name of one LiDAR of {address}, got '
-            f'{", ".join((*lidars.topics, *lidars.frames, lidars.info))}; leave the others out: a '
-            f'data set states the positions of its LiDARs'
+            f'points, sensor_frames, points_info: expected at most one sensor for a scene of a '
+            f'data set, got {lidars} with {address}; leave out all but one --points'
         )
     for name, topic in (('boxes', boxes), ('odometry', odometry)):
         if topic is not None:

@@ -167,6 +167,19 @@ def test_json_names_version_and_command(folder, capsys, monkeypatch):
     assert set(document) == {'version', 'command', 'results'}
 
 
+def test_covariances_are_measured_for_each_estimate(folder, capsys):
+    assert run('covariance', folder, '--json') == 0
+    report = json.loads(capsys.readouterr().out)['results'][str(folder)]
+    assert set(report) == {'early', 'final', 'track'}
+    for groups in report.values():
+        group = groups['all']
+        assert group['boxes'] > 10
+        assert all(0.6 < value <= 1 for value in group['coverage'].values())
+        assert all(0 < value < 6 for value in group['nees'].values())
+    assert run('covariance', folder) == 0
+    assert 'early' in capsys.readouterr().out
+
+
 @pytest.mark.parametrize('name', bench.MEASUREMENTS)
 def test_every_measurement_prints_json(name):
     parser = argparse.ArgumentParser()

@@ -381,3 +381,25 @@ def test_results_of_other_scenes_are_refused(tmp_path):
     source = source_of('argoverse2', tmp_path / 'av2', labels=('argoverse2', detections))
     with pytest.raises(RecordingError, match='expected boxes of log unknown-log'):
         read(source)
+
+
+def test_batch_relabels_every_scene_and_counts_those_that_fail(tmp_path, capsys):
+    for name in ('0004', '0005'):
+        layouts.kitti_tracking(tmp_path / name, name)
+    shutil.copytree(tmp_path / '0005', tmp_path / '0004', dirs_exist_ok=True)
+    (tmp_path / '0004' / 'training' / 'oxts' / '0005.txt').unlink()
+    out = tmp_path / 'out'
+    address = f'kitti-tracking:{tmp_path / "0004"}'
+    assert main(['batch', address, '-o', str(out), '--workers=1', '--formats=csv']) == 1
+    streams = capsys.readouterr()
+    assert '1 of 2 drives done' in streams.out
+    assert 'boxreg: 0005: ' in streams.err
+    assert 'data_tracking_oxts.zip' in streams.err
+    assert len(rows_of(out / '0004')) == FRAMES
+
+
+def test_formats_lists_the_data_sets(capsys):
+    assert main(['formats']) == 0
+    printed = capsys.readouterr().out
+    assert 'nuscenes:FOLDER#scene-0061: nuScenes' in printed
+    assert '--labels argoverse2:PATH' in printed
