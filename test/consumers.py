@@ -165,6 +165,29 @@ def waymo(boxes, poses):
     return box, pose.world_from_vehicle.transform
 
 
+def waymo_schemas():
+    """Return the columns of the components that clouds need, with their types."""
+    import types
+
+    skip_package_init('waymo_open_dataset.v2')
+    # TensorFlow is not installed; these modules use its name in annotations only.
+    tensorflow = types.ModuleType('tensorflow')
+    tensorflow.Tensor = object
+    sys.modules['tensorflow'] = tensorflow
+    from waymo_open_dataset.v2.perception.context import LiDARCalibrationComponent
+    from waymo_open_dataset.v2.perception.lidar import LiDARComponent, LiDARPoseComponent
+    from waymo_open_dataset.v2.perception.pose import VehiclePoseComponent
+
+    components = {
+        'lidar': LiDARComponent, 'lidar_pose': LiDARPoseComponent,
+        'lidar_calibration': LiDARCalibrationComponent, 'vehicle_pose': VehiclePoseComponent,
+    }  # fmt: skip
+    return {
+        folder: {field.name: str(field.type) for field in component.schema()}
+        for folder, component in components.items()
+    }
+
+
 def pykitti(folder):
     """Return calibration and sweep of a sequence."""
     from pykitti import utils

@@ -5,6 +5,7 @@ from boxreg_ros.io.transforms import matrix
 from consumers import consumer
 import layouts
 import numpy as np
+from pyarrow import parquet
 import test_datasets
 
 
@@ -44,3 +45,12 @@ def test_pykitti_has_the_same_poses_of_the_gps_unit(tmp_path):
         found = consumer('pykitti_oxts', *files)
         poses = oxts_poses(np.concatenate([oxts_rows(path) for path in files]), np.eye(4))
         np.testing.assert_allclose([matrix(pose) for pose in poses], found, atol=1e-6)
+
+
+def test_the_tables_of_waymo_have_the_columns_of_its_components(tmp_path):
+    split = layouts.waymo(tmp_path) / 'training'
+    for folder, columns in consumer('waymo_schemas').items():
+        schema = parquet.read_schema(split / folder / f'{layouts.SEGMENT}.parquet')
+        # Parquet names the items of a list itself.
+        found = {field.name: str(field.type).replace('element', 'item') for field in schema}
+        assert found == columns
