@@ -35,11 +35,12 @@ DATASET = Dataset(
     folder='DATE/DATE_drive_0001_sync/velodyne_points/, DATE/calib_imu_to_velo.txt',
     scene='2011_09_26_drive_0001',
     labels='tracklets',
+    remedy='unpack its archives into one folder',
+    lidar='velodyne_points',
 )
-LIDAR = 'velodyne_points'
 SUFFIX = '_sync'
-DIGITS = 10
-CALIBRATION_FILE = 'calib_imu_to_velo.txt'
+RAW_DIGITS = 10
+IMU_CALIBRATION_FILE = 'calib_imu_to_velo.txt'
 
 
 def scene_names(root: Path) -> list[str]:
@@ -50,29 +51,29 @@ def scene_names(root: Path) -> list[str]:
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files and folders of a drive."""
     drive = _drives(root)[name]
-    paths = (drive / FILE, drive / 'oxts', drive.parent / CALIBRATION_FILE)
-    return (drive / LIDAR, *(path for path in paths if path.exists()))
+    paths = (drive / FILE, drive / 'oxts', drive.parent / IMU_CALIBRATION_FILE)
+    return (drive / DATASET.lidar, *(path for path in paths if path.exists()))
 
 
 def open_scene(root: Path, name: str, points: str | None) -> Scene:
     """Return a drive; see `protocol.DatasetModule`."""
-    require_lidar(points, [LIDAR], LIDAR)
+    require_lidar(points, [DATASET.lidar], DATASET.lidar)
     drive = _drives(root)[name]
     exported = exported_poses(drive, 1)
     if exported is None:
-        stamps_ns = _stamps(drive / LIDAR / STAMPS_FILE, f'{name}{SUFFIX}.zip')
+        stamps_ns = _stamps(drive / DATASET.lidar / STAMPS_FILE, f'{name}{SUFFIX}.zip')
         pose_stamps_ns, poses = _oxts(drive, name)
     else:
         pose_stamps_ns, poses = exported
         stamps_ns = _stamps(drive / STAMPS_FILE, 'the export')
     names = {str(number): stamp_ns for number, stamp_ns in enumerate(stamps_ns)}
-    frames = SceneFrames(name, names, *frame_names(drive, 'map', LIDAR))
+    frames = SceneFrames(name, names, *frame_names(drive, 'map', DATASET.lidar))
     labels = drive / FILE
     return Scene(
         frames,
-        LIDAR,
+        DATASET.lidar,
         np.array(stamps_ns, np.int64),
-        partial(sweep_files, drive / LIDAR / 'data', DIGITS, stamps_ns),
+        partial(sweep_files, drive / DATASET.lidar / 'data', RAW_DIGITS, stamps_ns),
         pose_stamps_ns,
         poses,
         partial(frames_of, 'tracklets', labels, frames) if labels.is_file() else None,
@@ -91,7 +92,7 @@ def _oxts(drive: Path, name: str) -> tuple[Ints, Floats]:
             f'{folder}: expected {len(stamps_ns)} poses, one per stamp, got {len(rows)}; unpack '
             f'{archive} again'
         )
-    calibration = drive.parent / CALIBRATION_FILE
+    calibration = drive.parent / IMU_CALIBRATION_FILE
     values = calibration_lines(calibration, f'{drive.parent.name}_calib.zip')
     R, t = values.get('R', []), values.get('T', [])
     if (len(R), len(t)) != (9, 3):
@@ -116,5 +117,5 @@ def _stamps(path: Path, archive: str) -> list[int]:
 def _drives(root: Path) -> dict[str, Path]:
     """Return the folders of all drives by name: of all days, of one day, or one export."""
     found = [*root.glob(f'*{SUFFIX}'), *root.glob(f'*/*{SUFFIX}')]
-    found += [root.absolute()] if (root / LIDAR).is_dir() else []
+    found += [root.absolute()] if (root / DATASET.lidar).is_dir() else []
     return {path.name.removesuffix(SUFFIX): path for path in found}

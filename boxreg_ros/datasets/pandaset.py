@@ -34,21 +34,21 @@ DATASET = Dataset(
     folder='001/lidar/poses.json, 001/annotations/cuboids/',
     scene='001',
     labels='',
+    remedy='unpack the archive of this part again',
+    lidar='pandar64',
     packages=('pandas',),
 )
-LIDAR = 'pandar64'
-MECHANICAL, FORWARD = 0, 1
+MECHANICAL_LIDAR, FORWARD_LIDAR = 0, 1
 """Values of the columns ``d`` of points and ``cuboids.sensor_id`` of boxes; the latter may be -1:
 boxes for both LiDARs."""
-POSITION = [f'position.{axis}' for axis in 'xyz']
-EXTENT = [f'dimensions.{axis}' for axis in 'yxz']
+CUBOID_CENTRE = [f'position.{axis}' for axis in 'xyz']
+CUBOID_EXTENT = [f'dimensions.{axis}' for axis in 'yxz']
 """Length, width and height: y of a cuboid is its forward axis."""
 DAMAGE = (
     *(OSError, EOFError, zlib.error, pickle.UnpicklingError),
     *(AttributeError, ImportError, ValueError),
 )
 """Errors of a pickle that is cut short, or of other versions of pandas."""
-REMEDY = 'unpack the archive of this part again'
 
 
 def scene_names(root: Path) -> list[str]:
@@ -64,9 +64,9 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
 
 def open_scene(root: Path, name: str, points: str | None) -> Scene:
     """Return a sequence; see `protocol.DatasetModule`."""
-    require_lidar(points, [LIDAR], LIDAR)
+    require_lidar(points, [DATASET.lidar], DATASET.lidar)
     folder = root / name / 'lidar'
-    path = require(folder / 'timestamps.json', 'the stamps', REMEDY)
+    path = require(folder / 'timestamps.json', 'the stamps', DATASET.remedy)
     try:
         stamps_ns = np.rint(np.array(from_json(path), np.float64) * 1e9).astype(np.int64)
         poses = np.array([_pose(item) for item in from_json(folder / 'poses.json')])
@@ -77,14 +77,14 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
     if len(poses) != len(stamps_ns) or not len(stamps_ns):
         raise RecordingError(
             f'{folder}: expected a pose per stamp, got {len(poses)} poses and {len(stamps_ns)} '
-            f'stamps; {REMEDY}'
+            f'stamps; {DATASET.remedy}'
         )
     names = {str(number): stamp_ns for number, stamp_ns in enumerate(stamps_ns.tolist())}
-    frames = SceneFrames(name, names, 'world', LIDAR)
+    frames = SceneFrames(name, names, 'world', DATASET.lidar)
     cuboids = root / name / 'annotations' / 'cuboids'
     return Scene(
         frames,
-        LIDAR,
+        DATASET.lidar,
         stamps_ns,
         partial(_sweep_files, folder, stamps_ns.tolist(), poses),
         stamps_ns,
@@ -110,7 +110,7 @@ def _cloud(path: Path, stamp_ns: int, T_world_lidar: Floats) -> Cloud:
     """Return the points of the mechanical LiDAR in its frame."""
     try:
         table = _table(path)
-        table = table[table['d'] == MECHANICAL]
+        table = table[table['d'] == MECHANICAL_LIDAR]
         world = table[['x', 'y', 'z']].to_numpy(np.float64)
         intensities = table['i'].to_numpy(np.float64)
         times = table['t'].to_numpy(np.float64) - stamp_ns * 1e-9
@@ -129,14 +129,14 @@ def _boxes(folder: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
         path = folder / f'{int(number):02d}.pkl.gz'
         try:
             table = _table(path)
-            table = table[table['cuboids.sensor_id'] != FORWARD]
+            table = table[table['cuboids.sensor_id'] != FORWARD_LIDAR]
             boxes = np.zeros((len(table), 9))
-            boxes[:, :6] = table[POSITION + EXTENT].to_numpy(np.float64)
+            boxes[:, :6] = table[CUBOID_CENTRE + CUBOID_EXTENT].to_numpy(np.float64)
             # A yaw of 0 points along y.
             boxes[:, YAW] = wrap_angle(table['yaw'].to_numpy(np.float64) + np.pi / 2)
         except (FileNotFoundError, KeyError) as error:
             raise RecordingError(
-                f'{path}: expected cuboids of PandaSet: {type(error).__name__} {error}; {REMEDY}'
+                f'{path}: expected cuboids of PandaSet: {type(error).__name__} {error}; {DATASET.remedy}'
             ) from None
         refined = refined_boxes(
             stamp_ns, scene.fixed_frame, table['uuid'].tolist(), table['label'].tolist(), boxes

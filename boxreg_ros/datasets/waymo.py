@@ -34,10 +34,11 @@ DATASET = Dataset(
     '(of training/, unless the folder is named)',
     scene='SEGMENT',
     labels='waymo',
+    remedy='download it again',
+    lidar='TOP',
     packages=('pyarrow',),
 )
-LIDAR = 'TOP'
-TOP = 1
+TOP_LASER = 1
 """Value of the column `LASER` for the LiDAR on the roof."""
 LASER = 'key.laser_name'
 RETURNS = [f'[LiDARComponent].range_image_return{i}' for i in (1, 2)]
@@ -65,7 +66,7 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
 
 def open_scene(root: Path, name: str, points: str | None) -> Scene:
     """Return a segment; see `protocol.DatasetModule`."""
-    require_lidar(points, [LIDAR], LIDAR)
+    require_lidar(points, [DATASET.lidar], DATASET.lidar)
     clouds = _component(root, 'lidar', name)
     pixel_poses = _component(root, 'lidar_pose', name)
     calibration = _Calibration.read(_component(root, 'lidar_calibration', name))
@@ -76,11 +77,11 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
     stamps_ns = [
         row[MICROSECONDS] * 1000
         for row in _streamed(clouds, [MICROSECONDS, LASER])
-        if row[LASER] == TOP
+        if row[LASER] == TOP_LASER
     ]
     if stamps_ns != sorted(stamps_ns) or not stamps_ns:
         raise RecordingError(
-            f'{clouds}: expected sweeps of the LiDAR {LIDAR} in order of time, got '
+            f'{clouds}: expected sweeps of the LiDAR {DATASET.lidar} in order of time, got '
             f'{len(stamps_ns)}; download it again'
         )
     missing = set(stamps_ns) - T_world_vehicle.keys()
@@ -98,7 +99,7 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
     pose_stamps_ns = sorted(T_world_vehicle)
     return Scene(
         frames,
-        LIDAR,
+        DATASET.lidar,
         np.array(stamps_ns, np.int64),
         partial(_sweeps, clouds, pixel_poses, calibration, T_world_vehicle),
         np.array(pose_stamps_ns, np.int64),
@@ -120,7 +121,7 @@ class _Calibration(NamedTuple):
     def read(cls, path: Path) -> _Calibration:
         """Read the calibration of a segment."""
         for row in read_rows(path):
-            if row[LASER] == TOP:
+            if row[LASER] == TOP_LASER:
                 values = row[f'{CALIBRATION}beam_inclination.values']
                 return cls(
                     np.reshape(row[f'{CALIBRATION}extrinsic.transform'], (4, 4)),
@@ -128,7 +129,9 @@ class _Calibration(NamedTuple):
                     row[f'{CALIBRATION}beam_inclination.min'],
                     row[f'{CALIBRATION}beam_inclination.max'],
                 )
-        raise RecordingError(f'{path}: expected the LiDAR {LIDAR}, got others; download it again')
+        raise RecordingError(
+            f'{path}: expected the LiDAR {DATASET.lidar}, got others; download it again'
+        )
 
     def rows(self, height: int) -> Floats:
         """Return the inclination of each row of a range image, the highest first."""
@@ -150,12 +153,12 @@ def _sweeps(
     columns = [f'{image}.{part}' for image in RETURNS for part in ('values', 'shape')]
     pose_columns = [f'{PIXEL_POSE}.values', f'{PIXEL_POSE}.shape']
     poses = _streamed(pixel_poses, [MICROSECONDS, LASER, *pose_columns])
-    pose: dict[str, Any] = {MICROSECONDS: -1, LASER: TOP}
+    pose: dict[str, Any] = {MICROSECONDS: -1, LASER: TOP_LASER}
     for row in _streamed(clouds, [MICROSECONDS, LASER, *columns]):
-        if row[LASER] != TOP:
+        if row[LASER] != TOP_LASER:
             continue
-        while pose[MICROSECONDS] < row[MICROSECONDS] or pose[LASER] != TOP:
-            pose = next(poses, {MICROSECONDS: 1 << 62, LASER: TOP})
+        while pose[MICROSECONDS] < row[MICROSECONDS] or pose[LASER] != TOP_LASER:
+            pose = next(poses, {MICROSECONDS: 1 << 62, LASER: TOP_LASER})
         stamp_ns = row[MICROSECONDS] * 1000
         read = partial(_cloud, row, pose, calibration, T_world_vehicle[stamp_ns], pixel_poses)
         yield SweepFile(stamp_ns, read)

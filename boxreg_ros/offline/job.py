@@ -8,6 +8,7 @@ from glob import glob
 import hashlib
 import os
 from pathlib import Path
+import re
 import shlex
 from typing import Any
 
@@ -16,6 +17,8 @@ from boxreg_ros.datasets import address_of, all_scenes, resolved, scene_files
 from boxreg_ros.errors import BoxregError
 
 MANIFESTS = ('.txt', '.lst')
+COMMENT = re.compile(r'(^|\s)#.*')
+"""A comment of a manifest; within a word, ``#`` begins the name of a scene."""
 JOB_FAILED = 'failed'
 JOB_DONE = 'done'
 UP_TO_DATE = 'up to date'
@@ -139,9 +142,14 @@ def jobs_of(arguments: Sequence[Path]) -> list[Job]:
 
 def _manifest(path: Path) -> Iterator[tuple[Path, ...]]:
     for line in path.read_text(encoding='utf-8').splitlines():
-        words = shlex.split(line, comments=True)
+        words = shlex.split(COMMENT.sub('', line))
         if words:
-            yield tuple(path.parent / word for word in words)
+            yield tuple(_listed(path.parent, word) for word in words)
+
+
+def _listed(folder: Path, word: str) -> Path:
+    """Return a path of a manifest in `folder`; the address of a scene is returned unchanged."""
+    return Path(word) if address_of(Path(word)) is not None else folder / word
 
 
 def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
