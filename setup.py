@@ -45,6 +45,8 @@ setup(
         'zstandard>=0.21',
     ],
     extras_require={
+        # Point clouds that are compressed by Draco.
+        'compressed': ['DracoPy>=2,<3'],
         # A baseline of `boxreg bench`, and its figures.
         'bench': ['matplotlib', 'small-gicp'],
         # Data sets as recordings: tables of nuScenes, pickles of PandaSet, tables of Arrow.
@@ -65,6 +67,7 @@ setup(
             'check-jsonschema',
             'codespell',
             'colcon-common-extensions',
+            'DracoPy>=2,<3',
             'flake8-blind-except',
             'flake8-builtins',
             'flake8-class-newline',
