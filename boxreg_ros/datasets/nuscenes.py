@@ -29,7 +29,7 @@ DATASET = Dataset(
     folder='v1.0-*/scene.json, samples/, sweeps/',
     scene='scene-0061',
     labels='nuscenes',
-    remedy='unpack the metadata archive of this split into the same folder',
+    remedy='unpack its metadata and LiDAR archives into one folder',
     packages=('ijson',),
 )
 CLOUD_SUFFIX = '.pcd.bin'

@@ -136,7 +136,8 @@ def _boxes(folder: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
             boxes[:, YAW] = wrap_angle(table['yaw'].to_numpy(np.float64) + np.pi / 2)
         except (FileNotFoundError, KeyError) as error:
             raise RecordingError(
-                f'{path}: expected cuboids of PandaSet: {type(error).__name__} {error}; {DATASET.remedy}'
+                f'{path}: expected cuboids of PandaSet: {type(error).__name__} {error}; '
+                f'{DATASET.remedy}'
             ) from None
         refined = refined_boxes(
             stamp_ns, scene.fixed_frame, table['uuid'].tolist(), table['label'].tolist(), boxes

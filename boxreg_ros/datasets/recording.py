@@ -68,6 +68,7 @@ class SceneRecording:
         labels: tuple[str, Path] | None = None,
     ) -> None:
         self._address = address
+        self._dataset = module_of(address.dataset).DATASET
         self._points = points
         self._start, self._end = start, end
         self._labels = labels
@@ -191,8 +192,8 @@ class SceneRecording:
         for topic, first in self.first_errors.items():
             if not self._readable:
                 raise UnsupportedMessage(
-                    f'none of {self.unreadable[topic]} sweeps of {topic!r} can be read; first: '
-                    f'{first}'
+                    f'{self}: none of {self.unreadable[topic]} sweeps of {topic!r} can be read; '
+                    f'first: {first}; {self._dataset.remedy}'
                 )
 
     def _frames(self) -> Iterator[LabelFrame]:
@@ -202,10 +203,9 @@ class SceneRecording:
             return frames_of(*self._labels, scene.frames)
         if scene.boxes is not None:
             return scene.boxes()
-        dataset = module_of(self._address.dataset).DATASET
         remedy = 'give label files with --labels'
-        if dataset.labels:
-            remedy = f'give detections or tracks with --labels {dataset.labels}:PATH'
+        if self._dataset.labels:
+            remedy = f'give detections or tracks with --labels {self._dataset.labels}:PATH'
         raise RecordingError(
             f'{self}: no boxes: expected {scene.without_boxes}, got none (a test split has none); '
             f'{remedy}'

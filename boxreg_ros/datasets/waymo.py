@@ -82,13 +82,13 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
     if stamps_ns != sorted(stamps_ns) or not stamps_ns:
         raise RecordingError(
             f'{clouds}: expected sweeps of the LiDAR {DATASET.lidar} in order of time, got '
-            f'{len(stamps_ns)}; download it again'
+            f'{len(stamps_ns)}; {DATASET.remedy}'
         )
     missing = set(stamps_ns) - T_world_vehicle.keys()
     if missing:
         raise RecordingError(
             f'{_file(root, "vehicle_pose", name)}: expected a pose at each of {len(stamps_ns)} '
-            f'sweeps, got none at {min(missing)} ns; download it again'
+            f'sweeps, got none at {min(missing)} ns; {DATASET.remedy}'
         )
     frames = SceneFrames(
         name,
@@ -130,7 +130,7 @@ class _Calibration(NamedTuple):
                     row[f'{CALIBRATION}beam_inclination.max'],
                 )
         raise RecordingError(
-            f'{path}: expected the LiDAR {DATASET.lidar}, got others; download it again'
+            f'{path}: expected the LiDAR {DATASET.lidar}, got others; {DATASET.remedy}'
         )
 
     def rows(self, height: int) -> Floats:
@@ -175,7 +175,7 @@ def _cloud(
     if pose[MICROSECONDS] != row[MICROSECONDS]:
         raise UnsupportedMessage(
             f'{pixel_poses}: expected the poses of the sweep at {row[MICROSECONDS]} us, got none; '
-            f'download it again'
+            f'{DATASET.remedy}'
         )
     T_world_pixel = _image(pose, PIXEL_POSE)
     points = []
@@ -252,7 +252,7 @@ def _streamed(path: Path, columns: list[str]) -> Iterator[dict[str, Any]]:
                 yield {name: _value(batch.column(name)) for name in columns}
     except (OSError, KeyError, pyarrow.ArrowException) as error:
         text = ' '.join(str(error).split())
-        raise RecordingError(f'{path}: cannot be read: {text}; download it again') from None
+        raise RecordingError(f'{path}: cannot be read: {text}; {DATASET.remedy}') from None
 
 
 def _value(column: Any) -> Any:

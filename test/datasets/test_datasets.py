@@ -10,6 +10,7 @@ from boxreg_ros.datasets import address_of, SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.recording import ItemSource
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
+from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.structures import Sweep
 import layouts
 from layouts import FRAMES
@@ -320,7 +321,9 @@ def test_a_missing_or_damaged_sweep_is_counted_and_the_others_go_on(tmp_path, na
 
 def test_a_scene_without_any_sweep_is_an_error(tmp_path):
     source = broken('nuscenes', tmp_path, 's*s')
-    with pytest.raises(UnsupportedMessage, match="none of 12 sweeps of 'LIDAR_TOP' can be read"):
+    with pytest.raises(
+        UnsupportedMessage, match=r"none of 12 sweeps of 'LIDAR_TOP' .*; unpack its"
+    ):
         read(source)
 
 
@@ -403,3 +406,15 @@ def test_formats_lists_the_data_sets(capsys):
     printed = capsys.readouterr().out
     assert 'nuscenes:FOLDER#scene-0061: nuScenes' in printed
     assert '--labels argoverse2:PATH' in printed
+
+
+def test_a_manifest_names_scenes(tmp_path):
+    layouts.nuscenes(tmp_path / 'data')
+    manifest = tmp_path / 'drives.txt'
+    manifest.write_text(f'nuscenes:{tmp_path / "data"}#scene-0061  # a comment\n')
+    (job,) = jobs_of([manifest])
+    assert (job.name, job.status) == ('scene-0061', 'waiting')
+    assert [job.name for job in jobs_of([Path(f'nuscenes:{tmp_path / "data"}')])] == [
+        'scene-0061',
+        'scene-0103',
+    ]

@@ -3,10 +3,12 @@
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import input_boxes, Recording
+import layouts
 import numpy as np
 import pytest
 from relabel_results import rows_of
 from ros_messages import Drive
+import test_datasets
 
 NUMBERS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height')
 CAMERA = """\
@@ -59,3 +61,17 @@ def test_an_export_gives_the_result_of_its_recording(
     assert 'refined' in statuses.values()
     for key, numbers in boxes.items():
         np.testing.assert_allclose(found[key], numbers, atol=1e-6)
+
+
+def test_exports_of_argoverse2_keep_the_times_of_points(tmp_path):
+    layouts.argoverse2(tmp_path / 'data')
+    address = f'argoverse2:{tmp_path / "data"}'
+    out = tmp_path / 'out'
+    arguments = ['relabel', address, '-o', str(out), '--formats=argoverse2', '--with-points']
+    assert main(arguments) == 0
+    expected, _ = test_datasets.read(test_datasets.source_of('argoverse2', tmp_path / 'data'))
+    found, _ = test_datasets.read(test_datasets.source_of('argoverse2', out / 'argoverse2'))
+    assert len(found) == len(expected)
+    for sweep, original in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(sweep.points, original.points)
+        np.testing.assert_allclose(sweep.times, original.times, atol=1e-9)
