@@ -27,9 +27,10 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.arguments import add_recording_arguments, config_from
 from boxreg_ros.offline.batch_report import write_batch_report
-from boxreg_ros.offline.result_folder import earlier_summary, SUMMARY, written_whole
+from boxreg_ros.offline.result_folder import earlier_summary, SUMMARY
 
 DONE = 0
 FAILED = 1

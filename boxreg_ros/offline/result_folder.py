@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-import errno
 import json
 import os
 from pathlib import Path
 import shutil
-from typing import Any, TextIO
+from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.whole_files import DISK_ERRORS
 
-DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-"""Disk full, file larger than the limit of the process, quota used up."""
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
 
@@ -105,18 +103,6 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
             os.replace(earlier, out)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(earlier, ignore_errors=True)
-
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[TextIO]:
-    """Yield a file that replaces `path` on success and is deleted on failure."""
-    partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
-    try:
-        with partial.open('w', encoding='utf-8', newline='') as file:
-            yield file
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _check_replaceable(out: Path) -> None:
