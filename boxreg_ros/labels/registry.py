@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import cast
 
@@ -16,6 +17,7 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     ReadableModule,
 )
+from boxreg_ros.labels.segments import segments_of
 
 FORMATS = {
     'csv': 'boxreg_ros.labels.csv',
@@ -115,7 +117,7 @@ def is_written(name: str, out: Path) -> bool:
 
 def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
     """
-    Yield the frames of a label file or folder.
+    Yield the frames of a label file or folder, or of all segments of a recording of labels.
 
     Boxes whose file states no status or covariance have the status ``input`` and the unit
     matrix.
@@ -134,7 +136,11 @@ def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
         raise ConfigError(f'format {name!r} can only be written; readable: {able}')
     if not path.exists():
         raise RecordingError(f'labels {str(path)!r}: no such file or folder')
-    return cast(ReadableModule, module).read(path)
+    read = cast(ReadableModule, module).read
+    segments = segments_of(path)
+    if not segments:
+        return read(path)
+    return chain.from_iterable(read(_folder_of(name, segment)) for segment in segments)
 
 
 def _imported(name: str) -> FormatModule:

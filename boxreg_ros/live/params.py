@@ -51,12 +51,29 @@ NODE_SETTINGS = (
     Setting(
         'config_file', 'boxreg_node.yaml', 'file that ~/save_config writes all parameters to'
     ),
+    Setting(
+        'record_to', '',
+        'folder to write the final boxes to as label files while driving; empty: none are written',
+    ),
+    Setting(
+        'record_formats', ('csv', 'openlabel'),
+        'label formats to record, see `boxreg formats`; csv is always written',
+    ),
+    Setting('record_points', False, 'record the clouds that the formats need, too'),
+    Setting(
+        'record_segment', '60 s',
+        'length of a segment of label files: a number with the unit s, min, h, MB or GB',
+    ),
+    Setting(
+        'record_camera', '', 'calibration file, for recorded formats in the frame of a camera'
+    ),
 )  # fmt: skip
 """Options of the node beside `Config`; `config.NODE_OPTIONS` holds their names."""
 
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
     *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'config_file'),
+    'record_',
 )
 """Prefixes of the parameters that may change while the node runs."""
 READ_ONLY = 'read-only: windows, threads or subscriptions are built from it at start-up'
@@ -77,6 +94,11 @@ class NodeOptions(NamedTuple):
     transform_timeout: float
     backlog: float
     config_file: str
+    record_to: str
+    record_formats: tuple[str, ...]
+    record_points: bool
+    record_segment: str
+    record_camera: str
 
     @property
     def convention(self) -> Convention:
@@ -263,6 +285,8 @@ def _values_of(parameters: Iterable[Parameter]) -> dict[str, Any]:
 def _checked(item: Setting, value: Any) -> Any:
     """Return the value of an option of the node in its type, or raise ConfigError."""
     kind: Any = type(item.default)
+    if kind is tuple and isinstance(value, list | tuple):
+        return _checked_names(item, value)
     if kind is float and type(value) is int:
         value = float(value)
     if type(value) is not kind:
@@ -270,3 +294,11 @@ def _checked(item: Setting, value: Any) -> Any:
     if item.low is not None and item.high is not None and not item.low <= value <= item.high:
         raise ConfigError(f'{item.name}: expected {_bounds_of(item)}, got {value!r}')
     return value
+
+
+def _checked_names(item: Setting, value: Iterable[Any]) -> tuple[str, ...]:
+    """Return a list of names as a tuple, or raise ConfigError."""
+    names = tuple(value)
+    if not all(isinstance(name, str) for name in names):
+        raise ConfigError(f'{item.name}: expected a list of names, got {list(names)!r}')
+    return names
