@@ -28,8 +28,9 @@ ORANGE = (1.0, 0.6, 0.1, 0.45)
 BLUE = (0.2, 0.5, 1.0, 0.6)
 WHITE = (1.0, 1.0, 1.0, 1.0)
 RED = (0.9, 0.1, 0.1, 1.0)
-NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
+BOX_NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
 RECORDING = 'recording'
+NAMESPACES = (*BOX_NAMESPACES, RECORDING)
 DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
 TEXT_HEIGHT = 3.0
 """Height of the state of the recording above the sensor [m]; chosen."""
@@ -103,7 +104,7 @@ class MarkerBoard:
         markers += [
             m.Marker(header=header, ns=ns, id=number, action=DELETE)
             for number in gone
-            for ns in NAMESPACES
+            for ns in BOX_NAMESPACES
         ]
         return m.MarkerArray(markers=markers)
 

@@ -113,7 +113,7 @@ class RecorderProcess:
                 self._changed.notify()
         if is_full:
             self._health.report(
-                f'label_{kind}_dropped', 'the recorder, or its disk, is slower than the data'
+                f'{kind}_unrecorded', 'the recorder, or its disk, is slower than the data'
             )
 
     def finish(self) -> None:

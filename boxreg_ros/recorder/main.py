@@ -81,7 +81,7 @@ class Recorder:
         self._thread = ThreadPoolExecutor(1)
         self._recovery: Future[int] | None = self._thread.submit(recover_all, cut_off)
         self._completions: deque[tuple[Segment, Future[None]]] = deque()
-        self._counts: Counter[str] = Counter()  # by field of `Status`
+        self._written: Counter[str] = Counter()  # by field of `Status`
         self._growth = Growth()
 
     def take(self, item: Any) -> None:
@@ -130,22 +130,22 @@ class Recorder:
                 f'let nothing delete it meanwhile'
             )
         open_bytes = 0 if segment is None else self._growth.measure(segment.files)
-        written = self._counts['bytes'] + open_bytes
+        size = self._written['bytes'] + open_bytes
         if segment is not None and self._limits_bytes and open_bytes >= self._limit:
             self._end_segment()
         left_out = 0 if segment is None else segment.files.left_out
         return replace(
             self._counted(),
             segment='' if segment is None else segment.name,
-            bytes=written,
-            rate=self._growth.rate(written),
+            bytes=size,
+            rate=self._growth.rate(size),
             free=shutil.disk_usage(self._folder).free,
-            left_out=self._counts['left_out'] + left_out,
+            left_out=self._written['left_out'] + left_out,
         )
 
     def _counted(self) -> Status:
         """Return a status with the counters only."""
-        counts: dict[str, Any] = dict(self._counts)
+        counts: dict[str, Any] = dict(self._written)
         return Status(**counts)
 
     def _add_cloud(self, cloud: Cloud) -> None:
@@ -161,16 +161,16 @@ class Recorder:
         )  # fmt: skip
         if self._spool is not None:
             frame = self._spool.with_cloud(frame)
-            self._counts['without_cloud'] += frame.sweep is None
+            self._written['without_cloud'] += frame.sweep is None
         if self._segment is not None and self._is_beyond(self._segment, frame):
             self._end_segment()
         if self._segment is None:
             self._segment = Segment(self._folder, self._number, self._settings)
             self._number += 1
         self._segment.write(frame)
-        self._counts['frames'] += 1
-        self._counts['boxes'] += len(frame.refined.status)
-        self._counts['clouds'] += frame.sweep is not None
+        self._written['frames'] += 1
+        self._written['boxes'] += len(frame.refined.status)
+        self._written['clouds'] += frame.sweep is not None
 
     def _is_beyond(self, segment: Segment, frame: LabelFrame) -> bool:
         """Return whether a frame is too late for a segment, or time went back before it."""
@@ -189,15 +189,15 @@ class Recorder:
     def _collect(self) -> None:
         """Count completed segments; raise the error of one that could not be completed."""
         if self._recovery is not None and self._recovery.done():
-            self._counts['recovered'] = self._recovery.result()
+            self._written['recovered'] = self._recovery.result()
             self._recovery = None
         while self._completions and self._completions[0][1].done():
             segment, completion = self._completions[0]
             completion.result()
             self._completions.popleft()
-            self._counts['segments'] += 1
-            self._counts['bytes'] += segment.files.size
-            self._counts['left_out'] += segment.files.left_out
+            self._written['segments'] += 1
+            self._written['bytes'] += segment.files.size
+            self._written['left_out'] += segment.files.left_out
 
 
 class Growth:

@@ -4,10 +4,21 @@ import csv
 
 from boxreg_ros.cli import main
 from boxreg_ros.labels import FORMATS
+from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import orjson
-from ros_graph import DIAGNOSTICS, graph_in, play, publishers_for, records_of, RELIABLE
-from ros_messages import DETECTIONS, Drive
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from ros_graph import (
+    DIAGNOSTICS,
+    ended_cleanly,
+    graph_in,
+    play,
+    publishers_for,
+    records_of,
+    RELIABLE,
+)
+from ros_messages import DETECTIONS, Drive, MARKERS
 from std_srvs.srv import Trigger
 
 SETTINGS = {'window': 5, 'lag': 3}
@@ -41,16 +52,26 @@ class Robot:
 
     def call(self, name):
         """Call a service of the node and return its response."""
-        client = self.graph.node.create_client(Trigger, f'/boxreg_node/{name}')
+        return self._request(Trigger, name, Trigger.Request())
+
+    def set(self, name, value):
+        """Set a parameter of the node."""
+        parameters = [Parameter(name, value=value).to_parameter_msg()]
+        request = SetParameters.Request(parameters=parameters)
+        (result,) = self._request(SetParameters, 'set_parameters', request).results
+        assert result.successful, result.reason
+
+    def _request(self, kind, name, request):
+        client = self.graph.node.create_client(kind, f'/boxreg_node/{name}')
         self.graph.wait(client.service_is_ready, f'the service {name}')
-        future = client.call_async(Trigger.Request())
+        future = client.call_async(request)
         self.graph.wait(future.done, f'the response of {name}')
         return future.result()
 
     def state(self):
         """Return the newest state of the recording in /diagnostics, as level, text and values."""
-        status = self.diagnostics[-1].status[2]
-        assert status.name == '/boxreg_node: recording'
+        every = [status for message in self.diagnostics for status in message.status]
+        status = [one for one in every if one.name == '/boxreg_node: recording'][-1]
         return status.level, status.message, {v.key: v.value for v in status.values}
 
     def stop(self):
@@ -145,3 +166,76 @@ def test_labels_in_every_format_equal_those_of_relabel(tmp_path):
     assert {path.parts[0] for path in live} >= {*LIVE_FORMATS} - {'csv'}
     for name, file in live.items():
         assert_equal_files(file, offline[name])
+
+
+def test_services_start_split_and_stop_a_recording(tmp_path):
+    """Labels are read back by `relabel`; what goes wrong is one line, and boxes go on."""
+    path = Drive(sweeps=20).write(tmp_path / 'drive')
+    folder = tmp_path / 'labels'
+    with graph_in(tmp_path) as graph:
+        robot = Robot(graph, path)
+        markers = graph.collect(MARKERS, '/refined_markers')
+        for name, error in (
+            ('start_recording', 'record_to: expected a folder, got none'),
+            ('stop_recording', 'expected a recording, got none'),
+            ('split', 'expected a recording, got none'),
+        ):
+            answer = robot.call(name)
+            assert not answer.success
+            assert error in answer.message
+        (tmp_path / 'file').write_text('')
+        robot.set('record_to', str(tmp_path / 'file'))
+        answer = robot.call('start_recording')
+        assert not answer.success
+        assert 'file' in answer.message
+        graph.wait(lambda: robot.state()[0] == DiagnosticStatus.ERROR, 'an ERROR')
+        robot.set('record_to', str(folder))
+        answer = robot.call('start_recording')
+        assert answer.success, answer.message
+        assert 'call ~/stop_recording first' in robot.call('start_recording').message
+        per_sweep = 3  # transform, cloud, boxes
+        robot.play(robot.records[: 1 + 10 * per_sweep])
+        graph.wait(lambda: robot.state()[2].get('frames') == '7', 'final boxes')  # lag 3
+        level, text, values = robot.state()
+        assert level == DiagnosticStatus.OK
+        assert text.startswith('recording segment_000001, ')
+        assert (values['folder'], values['boxes'], values['boxes waiting']) == (
+            str(folder), '14', '0',
+        )  # fmt: skip
+        assert float(values['disk free [GB]']) > 0
+        assert robot.call('split').success
+        graph.wait(lambda: 'segment_000001' in str(markers), 'the marker of the recording')
+        robot.play(robot.records[1 + 10 * per_sweep : 1 + 15 * per_sweep])
+        answer = robot.call('stop_recording')  # waits until the last boxes are final
+        assert answer.success
+        assert answer.message == f'{folder}: 30 boxes in 2 segments'
+        assert [row['frames'] for row in index_of(folder)] == ['7', '8']
+        robot.play(robot.records[1 + 15 * per_sweep :])  # not recorded
+        graph.wait(lambda: robot.state()[1] == 'off', 'the end of the recording')
+        robot.stop()
+    assert len(robot.early) == 20
+    out = tmp_path / 'out'
+    assert main(['relabel', str(path), '--labels', f'openlabel:{folder}', '-o', str(out)]) == 0
+    with (out / 'boxes.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 30
+    assert {row['track_id'] for row in rows} == {'1', '2'}
+
+
+def test_two_nodes_and_a_killed_node(tmp_path):
+    """The second node does not record; the recorder of a killed node completes the segment."""
+    path = Drive(sweeps=12).write(tmp_path / 'drive')
+    folder = tmp_path / 'labels'
+    with graph_in(tmp_path) as graph:
+        robot = Robot(graph, path, record_to=folder)
+        graph.wait(lambda: (folder / '.lock').exists(), 'the recorder')
+        second = graph.start('-p', f'record_to:={folder}', '-r', '__node:=second')
+        graph.wait(lambda: 'nobody records into, got one in use' in second.output(), 'an error')
+        assert second.output().count('ERROR') == 1
+        robot.play()
+        graph.wait(lambda: robot.state()[2].get('frames') == '9', 'final boxes')
+        robot.node.kill()
+        graph.wait((folder / 'index.csv').exists, 'a whole segment')
+        assert ended_cleanly(second)
+    (row,) = index_of(folder)
+    assert (row['frames'], row['recovered']) == ('9', '0')  # those before the lag
