@@ -343,7 +343,7 @@ def interpolated(first: Floats, second: Floats, share: float) -> Floats:
 
 def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     """
-    Return the sweep, points and origin, in another frame.
+    Return the sweep, points and positions of the sensors, in another frame.
 
     float32 points stay float32 while the sensor is within `FLOAT32_RANGE` of the origin of the
     frame; farther away (a map in UTM) they become float64.
@@ -357,7 +357,10 @@ def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     moved = np.empty((3, len(sweep.points)), kind)
     for i, (a, b, c) in enumerate(R.astype(kind)):  # not R @: BLAS starts threads of its own
         moved[i] = a * x + b * y + c * z + t[i].astype(kind)
-    return replace(sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t)
+    origins = None if sweep.origins is None else sweep.origins @ R.T + t
+    return replace(
+        sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t, origins=origins
+    )
 
 
 def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -> Sweep | BoxArray:

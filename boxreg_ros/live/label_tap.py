@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.label_feed import FinalBoxes
@@ -13,6 +14,15 @@ from boxreg_ros.io.stamp_order import kept, Slot, StampOrder
 from boxreg_ros.io.transforms import boxes_to_frame
 from boxreg_ros.live.recorder_process import RawCloud, RecorderProcess
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
+import numpy as np
+
+
+class Part(NamedTuple):
+    """A cloud of one LiDAR: its message, and its sweep in its own frame with the pose of that."""
+
+    message: Any
+    sweep: Sweep
+    T_fixed_sweep: Floats
 
 
 class LabelTap:
@@ -35,6 +45,7 @@ class LabelTap:
         self._order = StampOrder()
         self._cloud_stamps: deque[int] = deque()
         self._is_finishing = False
+        self._label_frame = ''
 
     def start(self, recorder: RecorderProcess) -> None:
         """Record from now on."""
@@ -44,15 +55,23 @@ class LabelTap:
         self._cloud_stamps = deque(maxlen=recorder.settings.config.queue)
         self._is_finishing = False
 
-    def add_cloud(self, message: Any, sweep: Sweep, T_fixed_sweep: Floats) -> None:
-        """Hand on a cloud, if clouds are recorded."""
-        if self._recorder is None or not self._recorder.settings.with_points:
+    def add_cloud(self, whole: Sweep, parts: Sequence[Part]) -> None:
+        """Hand on a cloud in the fixed frame that was merged from parts, if it is recorded."""
+        if not parts:  # lost
             return
+        self._label_frame = self._label_frame or parts[0].sweep.frame_id  # as in `relabel`
+        recorder = self._recorder
+        if recorder is None or not recorder.settings.with_points:
+            return
+        sweep, T_fixed_sweep = whole, np.eye(4)
+        if len(parts) == 1:  # not moved, files get the numbers of the message
+            _, sweep, T_fixed_sweep = parts[0]
         self._cloud_stamps.append(sweep.stamp_ns)
         needed_from_ns = min(self._cloud_stamps)
         if self._order.first_ns is not None:
             needed_from_ns = min(needed_from_ns, self._order.first_ns)
-        self._recorder.put(RawCloud(message, sweep, T_fixed_sweep, needed_from_ns))
+        messages = [part.message for part in parts]
+        recorder.put(RawCloud(sweep, T_fixed_sweep, needed_from_ns, messages))
 
     def expect(self, ticket: object, boxes: BoxArray, T_fixed_given: Floats) -> None:
         """Add boxes in the fixed frame, on their way to the registrar with a ticket."""
@@ -93,13 +112,13 @@ class LabelTap:
         """Hand on the boxes that are final; end the recording after the last."""
         if self._recorder is None:
             return
-        session = self._session
+        sensor_frame = self._label_frame or self._session.sensor_frame
         for slot, refined in self._order.ready():
             final = FinalBoxes(
                 replace(refined, boxes=replace(refined.boxes, ticket=None)),  # it has the message
-                session.fixed_frame,
-                session.sensor_frame,
-                self._pose_of(session.sensor_frame, slot.stamp_ns),
+                self._session.fixed_frame,
+                sensor_frame,
+                self._pose_of(sensor_frame, slot.stamp_ns),
                 slot.T_fixed_boxes,
             )
             self._recorder.put(final)

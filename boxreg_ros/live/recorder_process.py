@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import json
 import pickle
 import subprocess
@@ -11,6 +11,7 @@ import sys
 from threading import Condition, Event, Thread
 from typing import Any, IO, NamedTuple
 
+from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.label_feed import (
     Cloud,
     FinalBoxes,
@@ -21,8 +22,9 @@ from boxreg_ros.io.label_feed import (
     Tick,
 )
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.structures import Sweep
+from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import pointcloud
+import numpy as np
 
 CAPACITY = {'clouds': 50, 'boxes': 1000}
 """
@@ -37,12 +39,22 @@ TICK_PERIOD = 1.0
 
 
 class RawCloud(NamedTuple):
-    """A cloud before its intensities are decoded; `message` is as received."""
+    """
+    A cloud whose intensities are decoded by the thread that sends it, not by the worker.
 
-    message: Any
+    Attributes
+    ----------
+    sweep, T_fixed_sweep, needed_from_ns
+        As of `Cloud`.
+    messages : sequence of message
+        The messages of the clouds that it was merged from, in the order of its points.
+
+    """
+
     sweep: Sweep
-    T_fixed_sweep: Any
+    T_fixed_sweep: Floats
     needed_from_ns: int
+    messages: Sequence[Any]
 
 
 class RecorderProcess:
@@ -192,5 +204,15 @@ def _decoded(item: Any) -> Any:
     """Return an item as the recorder takes it: a cloud with its intensities."""
     if not isinstance(item, RawCloud):
         return item
-    intensities = pointcloud.intensities(item.message)
-    return Cloud(item.sweep, item.T_fixed_sweep, intensities, item.needed_from_ns)
+    sweep = Sweep(item.sweep.stamp_ns, item.sweep.frame_id, item.sweep.points)  # all it needs
+    return Cloud(sweep, item.T_fixed_sweep, _intensities(item.messages), item.needed_from_ns)
+
+
+def _intensities(messages: Sequence[Any]) -> Floats | None:
+    """Return the intensities of all clouds; None if one has none."""
+    try:
+        found = [pointcloud.intensities(message) for message in messages]
+    except UnsupportedMessage:
+        return None
+    known = [values for values in found if values is not None]
+    return np.concatenate(known) if len(known) == len(messages) else None

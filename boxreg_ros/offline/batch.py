@@ -28,7 +28,7 @@ from typing import Any
 from boxreg_ros import __version__
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.whole_files import written_whole
-from boxreg_ros.offline.arguments import add_recording_arguments, config_from
+from boxreg_ros.offline.arguments import add_recording_arguments, config_from, lidar_options
 from boxreg_ros.offline.batch_report import write_batch_report
 from boxreg_ros.offline.result_folder import earlier_summary, SUMMARY
 
@@ -221,8 +221,8 @@ def _names(drives: Sequence[tuple[Path, ...]]) -> list[str]:
 
 def _options(args: argparse.Namespace) -> list[str]:
     """Return the options of `boxreg relabel` for every drive."""
-    options = ['--formats', args.formats]
-    for name in ('points', 'boxes', 'odometry', 'pose_reference', 'size_order', 'forward_axis'):
+    options = ['--formats', args.formats, *lidar_options(args)]
+    for name in ('boxes', 'odometry', 'pose_reference', 'size_order', 'forward_axis'):
         value = getattr(args, name)
         if value is not None:
             options.append(f'--{name.replace("_", "-")}={value}')

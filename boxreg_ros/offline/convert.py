@@ -14,6 +14,7 @@ from typing import Any
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.transforms import boxes_to_frame, TransformTree
 from boxreg_ros.labels import (
     check_options,
@@ -173,7 +174,8 @@ def _read_with_recording(
     tree = TransformTree()
     labels = (request.source_format, request.source)
     spool = Spool(folder, Config()) if request.options.with_points else None
-    topics = {'points': request.points, 'odometry': request.odometry}
+    lidars = Lidars((request.points,) if request.points else ())
+    topics = {'lidars': lidars, 'odometry': request.odometry}
     with LabelledRecording(labels, request.recordings, **topics) as recording:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)

@@ -21,7 +21,12 @@ from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.offline.arguments import add_topic_arguments, convention_from
+from boxreg_ros.offline.arguments import (
+    add_topic_arguments,
+    convention_from,
+    lidar_options,
+    lidars_from,
+)
 
 if TYPE_CHECKING:
     from boxreg_ros.io.recording import Item, Recording
@@ -75,9 +80,9 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
 
     facts = _contents(args.recordings)
     convention = convention_from(args)
-    options = {'points': args.points, 'boxes': args.boxes, 'odometry': args.odometry}
+    options = {'boxes': args.boxes, 'odometry': args.odometry, 'convention': convention}
     try:
-        with Recording(args.recordings, **options, convention=convention) as recording:
+        with Recording(args.recordings, lidars_from(args), **options) as recording:
             facts |= _sampled(recording, convention)
             facts['damage'] = [damage._asdict() for damage in recording.damages]
     except BoxregError as error:
@@ -156,7 +161,7 @@ def _sampled(recording: Recording, convention: Any) -> dict[str, Any]:
     """Return what the first seconds of a recording show."""
     from boxreg_ros.io.session import Session
 
-    session = Session(convention, Config())
+    session = Session(convention, Config(), placement=recording.placement)
     session.fixed_frame = recording.choose_fixed_frame(session.tree)
     sample = _Sample()
     begin_ns = recording.start_ns
@@ -264,7 +269,8 @@ def _command(args: argparse.Namespace, facts: dict[str, Any]) -> str:
     """Return the relabel command with the same recordings and topics."""
     out = f'out/{args.recordings[0].stem}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
-    for name in ('points', 'boxes', 'odometry'):
+    words += lidar_options(args)
+    for name in ('boxes', 'odometry'):
         if getattr(args, name):
             words += [f'--{name}', getattr(args, name)]
     convention = convention_from(args)

@@ -23,6 +23,7 @@ from typing import Any, TYPE_CHECKING
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import LATE, MERGED, MISSING
 from boxreg_ros.io.session import register
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.output import Sink
@@ -308,7 +309,9 @@ def _summary(
         'dropped': _dropped(registrar.counts, findings),
         'without_stamp': _without_stamp(findings),
         'damage': [damage._asdict() for damage in findings.damages],
+        'lidars': {topic: dict(counts) for topic, counts in findings.lidars.items()},
         'first_missing_transform': findings.first_missing_transform,
+        'first_unplaced': findings.first_unplaced,
         'first_unreadable': findings.first_unreadable,
         'warning': findings.warning or ('' if sink.boxes_in else NO_BOXES),
         **findings.facts,
@@ -332,7 +335,11 @@ def _dropped(registered: Counter[str], findings: Findings) -> dict[str, int]:
     counts = {
         name: count for name, count in registered.items() if name.startswith(UNUSED_PREFIXES)
     }
-    counts['sweep_without_transform'] = findings.counts['sweep_without_transform']
+    for name in ('sweep_without_transform', 'sensor_without_transform', 'cloud_without_info'):
+        counts[name] = findings.counts[name]
+    for lidar in findings.lidars.values():
+        for name in (LATE, MISSING):
+            counts[name] = counts.get(name, 0) + lidar[name]
     counts['unreadable'] = findings.unreadable
     return {name: count for name, count in sorted(counts.items()) if count}
 
@@ -396,6 +403,21 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
         yield (
             f'{boxes:,} boxes and {sweeps:,} clouds have no transform; first: '
             f'{summary["first_missing_transform"]}'
+        )
+    for topic, counts in summary['lidars'].items():
+        if counts.get(LATE) or counts.get(MISSING):
+            yield (
+                f'LiDAR {topic}: {counts.get(MERGED, 0):,} clouds merged, {counts.get(LATE, 0):,} '
+                f'late, {counts.get(MISSING, 0):,} missing; the others were used'
+            )
+    if summary['first_unplaced']:
+        clouds = sum(
+            summary['dropped'].get(name, 0)
+            for name in ('sensor_without_transform', 'cloud_without_info')
+        )
+        yield (
+            f'the LiDARs of {clouds:,} clouds are not all known, the origin of their frame is '
+            f'used; first: {summary["first_unplaced"]}'
         )
     for name, found in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())

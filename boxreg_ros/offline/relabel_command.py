@@ -13,6 +13,7 @@ from boxreg_ros.offline.arguments import (
     add_recording_arguments,
     config_from,
     convention_from,
+    lidars_from,
 )
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare
@@ -185,7 +186,7 @@ def _request(args: argparse.Namespace) -> Request:
         config = config.updated({'solver.threads': args.workers})
     return Request(
         recordings=tuple(args.recordings),
-        points=args.points,
+        lidars=lidars_from(args),
         boxes=args.boxes,
         odometry=args.odometry,
         fixed_frame=args.fixed_frame,

@@ -12,6 +12,7 @@ from typing import Any
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import check_options, module_of, Options
 from boxreg_ros.offline.labelled_recording import LabelledRecording
@@ -27,7 +28,9 @@ class Request:
     ----------
     recordings : tuple of Path
         Files or folders of one drive, merged by time.
-    points, boxes, odometry : str or None
+    lidars : Lidars
+        Topics of the clouds, and their LiDARs.
+    boxes, odometry : str or None
         Topics; None where the only topic of the type is used.
     fixed_frame : str or None
         Frame to refine in; None for the topmost frame that the frame of the clouds moves in.
@@ -60,7 +63,7 @@ class Request:
     """
 
     recordings: tuple[Path, ...]
-    points: str | None = None
+    lidars: Lidars = SINGLE_LIDAR
     boxes: str | None = None
     odometry: str | None = None
     fixed_frame: str | None = None
@@ -132,7 +135,7 @@ class Request:
     def recording(self) -> Recording:
         """Return the recording, not yet open."""
         options: dict[str, Any] = {
-            'points': self.points,
+            'lidars': self.lidars,
             'odometry': self.odometry,
             'start': self.start,
             'end': self.end,

@@ -11,6 +11,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import input_boxes
 from boxreg_ros.labels import Options
 from boxreg_ros.labels.cloud_spool import Spool
@@ -333,7 +334,7 @@ def test_start_counts_from_the_first_cloud(tmp_path):
         write_recording(tmp_path / 'rest', [*static, *other]),
         write_recording(tmp_path / 'main', [i for i in drive.items if i[0] != '/tf_static']),
     )
-    request = Request(paths, points='/points', start=0.25, end=0.75, config=QUICK)
+    request = Request(paths, lidars=Lidars(('/points',)), start=0.25, end=0.75, config=QUICK)
     relabel(request, tmp_path / 'out')
     assert rows_of(tmp_path / 'out') == expected
 
