@@ -10,7 +10,6 @@ from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars
-from boxreg_ros.io.markers import text_marker
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
@@ -272,10 +271,7 @@ class BoxregNode(Node):
         message.header.stamp = now.to_msg()
         self._diagnostics.publish(message)
         if self._markers.get_subscription_count() and self.worker.cloud_frame:
-            recording = self.recording
-            self._markers.publish(
-                text_marker(self.worker.cloud_frame, recording.text, recording.has_failed)
-            )
+            self.recording.show(self._markers, self.worker.cloud_frame)
 
 
 class _TransformsToInbox:

@@ -7,6 +7,7 @@ import os
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.label_feed import RecorderSettings, Split
+from boxreg_ros.io.markers import text_marker
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import NodeOptions
@@ -15,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -54,6 +56,7 @@ class Recording:
         self._begun = Future()
         self._ended = Future()
         self._error = ''
+        self._is_shown = False
         # Its callbacks wait: in the group of the others, these would wait with them.
         group = ReentrantCallbackGroup()
         services = {'start_recording': self._on_start, 'stop_recording': self._on_stop}
@@ -99,10 +102,12 @@ class Recording:
         left = status.seconds_left
         return text if left is None else f'{text}, disk full in {left / 3600:.1f} h'
 
-    @property
-    def has_failed(self) -> bool:
-        """Return whether an error has stopped the recording."""
-        return bool(self._error)
+    def show(self, markers: Publisher, frame_id: str) -> None:
+        """Publish the state as a text above a sensor; once more to delete it."""
+        text = self.text
+        if text or self._is_shown:
+            markers.publish(text_marker(frame_id, text, bool(self._error)))
+        self._is_shown = bool(text)
 
     def diagnosis(self, name: str) -> DiagnosticStatus:
         """Return the state for /diagnostics, under a name."""
