@@ -42,6 +42,7 @@ ROAD_SIZE = 160.0  # side of the square with the other points [m]
 BOX_ERRORS = (0.1, 0.1, 0.05, 0.1, 0.1, 0.1, 0.0, 0.0, 0.03)  # standard deviations [m, rad]
 CDR_HEADER = 4  # bytes before the first member of a serialised message
 FIRST_MARKER = 8  # bytes before the first marker: the header and the length of the list
+COMPLETION_TIME = 60.0  # for the last segment of recorded labels [s]
 RECORDING_TURNS = 2  # runs without and with recording
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
 
@@ -363,6 +364,9 @@ def recording(folder: Path, memory: list[float]) -> dict[str, float]:
         Resident memory of the recorder every `SAMPLE_PERIOD` [MB].
 
     """
+    deadline = time.monotonic() + COMPLETION_TIME
+    while list(folder.glob('.segment_*')) and time.monotonic() < deadline:
+        time.sleep(0.1)  # the recorder completes the last segment after the node has ended
     rows = read_index(folder)
     memory = memory or [0.0]
     return {
