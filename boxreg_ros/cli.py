@@ -144,8 +144,8 @@ def _run(arguments: list[str]) -> int:
         return int(_module('node').main(arguments[1:]) or DONE)
     whole = parser(command)
     if not arguments:
-        whole.print_help(sys.stderr)
-        return WRONG_USAGE
+        whole.print_help()
+        return DONE
     if command is not None and command not in COMMANDS:
         names = ', '.join(COMMANDS)
         proposal = _proposal([command], COMMANDS)

@@ -47,7 +47,7 @@ class LidarDrive(Drive):
     def _clouds(self, kind, cloud, k):
         """Yield topic and message of the clouds of sweep `k`."""
         stamp, m = self.stamps[k], self.messages
-        rows = cloud.data.view(np.float32).reshape(-1, 3) + [0.0, 0.0, 2.0]  # in base
+        rows = np.add(cloud.data.view(np.float32).reshape(-1, 3), [0.0, 0.0, 2.0])  # in base
         parts = {'front': rows[::2], 'rear': rows[1::2].copy()}
         is_moving = np.arange(len(rows))[1::2] >= len(rows) // 2  # of the second car
         parts['rear'][is_moving, 0] += CAR_SPEED * DELAY_NS / SECOND

@@ -295,27 +295,6 @@ class Recording:
             if topic in self.data_topics and self._decoded_topics.isdisjoint(alike):
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
-    def left_out(self, missing_transforms: Sequence[str]) -> str:
-        """
-        Return how many messages are not used, and why, in one line; empty if all are.
-
-        Parameters
-        ----------
-        missing_transforms : sequence of str
-            Errors of the messages without a transform.
-
-        """
-        parts = []
-        if self.unreadable.total():
-            first = next(iter(self.first_errors.values()))
-            parts.append(f'{self.unreadable.total()} messages could not be read, first: {first}')
-        if missing_transforms:
-            parts.append(
-                f'{len(missing_transforms)} messages had no transform, first: '
-                f'{missing_transforms[0]}'
-            )
-        return '; '.join(parts)
-
     def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
         """
         Return a message of the boxes' topic from its bytes, and its boxes.
@@ -741,33 +720,54 @@ def _malformed(origin: str) -> Iterator[None]:
         ) from None
 
 
+def left_out(source: ItemSource, missing_transforms: Sequence[str]) -> str:
+    """
+    Return how many messages of a source are not used, and why, in one line; empty if all are.
+
+    Parameters
+    ----------
+    source : ItemSource
+        After its last item.
+    missing_transforms : sequence of str
+        Errors of the messages without a transform.
+
+    """
+    parts = []
+    if source.unreadable.total():
+        first = next(iter(source.first_errors.values()))
+        parts.append(f'{source.unreadable.total()} messages could not be read, first: {first}')
+    if missing_transforms:
+        parts.append(
+            f'{len(missing_transforms)} messages had no transform, first: {missing_transforms[0]}'
+        )
+    return '; '.join(parts)
+
+
 def input_boxes(
-    path: Path, fixed_frame: str | None = None, **options: Any
+    source: AbstractContextManager[ItemSource], fixed_frame: str | None = None
 ) -> tuple[list[BoxArray], str]:
     """
     Return the input boxes of a recording in the fixed frame that `relabel` would choose.
 
     Parameters
     ----------
-    path : Path
-        Recording.
+    source : context manager of ItemSource
+        Recording that is not open yet.
     fixed_frame : str, optional
         Fixed frame to use instead.
-    **options
-        Of `Recording`.
 
     Returns
     -------
     arrays : list of BoxArray
         All that could be decoded and transformed.
-    left_out : str
+    others : str
         Number of the others, and why; empty if there are none.
 
     """
     tree = TransformTree()
     arrays: list[BoxArray] = []
     missing_transforms: list[str] = []
-    with Recording([path], **options) as recording:
+    with source as recording:
         fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
         for item in recording.items(tree, with_clouds=False):
             try:
@@ -777,5 +777,5 @@ def input_boxes(
                 continue
             if isinstance(moved, BoxArray):
                 arrays.append(moved)
-        left_out = recording.left_out(missing_transforms)
-    return arrays, left_out
+        others = left_out(recording, missing_transforms)
+    return arrays, others

@@ -11,7 +11,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.rotations import (
@@ -77,6 +77,15 @@ class TimeJumpDetector:
         return False
 
 
+class Link(NamedTuple):
+    """A pair of parent and child frame; `stamps_ns` ascend, and are one for a static pair."""
+
+    parent: str
+    child: str
+    is_static: bool
+    stamps_ns: tuple[int, ...]
+
+
 class TransformTree:
     """
     Frames and the transforms between them, looked up by integer stamp.
@@ -117,6 +126,10 @@ class TransformTree:
         for item in transforms:
             position, turn = item.transform.translation, item.transform.rotation
             self._add(self._tf, item, position, turn, is_static)
+
+    def add_pose(self, parent: str, child: str, stamp_ns: int, pose: Floats) -> None:
+        """Add the pose of `child` in `parent` at a stamp: x y z qx qy qz qw."""
+        self._add_to(self._tf, _name(parent), _name(child), stamp_ns, tuple(pose.tolist()), False)
 
     def add_odometry(self, msg: Any) -> None:
         """Add a ``nav_msgs/Odometry``: the pose of its child frame in its header's frame."""
@@ -192,6 +205,23 @@ class TransformTree:
         pairs = dict.fromkeys(f'{edge.parent} -> {edge.child}' for edge in self._edges())
         return ', '.join(pairs) or 'none'
 
+    def links(self) -> list[Link]:
+        """Return all pairs of parent and child with the stamps that are known."""
+        return [
+            Link(edge.parent, edge.child, edge.is_static, tuple(edge.stamps))
+            for edge in self._edges()
+        ]
+
+    def groups(self) -> list[list[str]]:
+        """Return the names of frames that transforms connect with each other, sorted."""
+        group_of: dict[str, list[str]] = {name: [name] for name in self.frames()}
+        for edge in self._edges():
+            ours, others = group_of[edge.parent], group_of[edge.child]
+            if ours is not others:
+                ours += others
+                group_of |= dict.fromkeys(others, ours)
+        return sorted({id(group): sorted(group) for group in group_of.values()}.values())
+
     def frames(self) -> list[str]:
         """Return the names of all frames, sorted."""
         return sorted({name for edge in self._edges() for name in (edge.parent, edge.child)})
@@ -202,13 +232,25 @@ class TransformTree:
         parent, child = _name(item.header.frame_id), _name(item.child_frame_id)
         if not parent or not child:
             return  # refused by tf2, too; errors of lookups list the known transforms
+        stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
+        pose = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
+        self._add_to(edges, parent, child, stamp_ns, pose, is_static)
+
+    def _add_to(
+        self,
+        edges: dict[str, _Edge],
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        pose: tuple[float, ...],
+        is_static: bool,
+    ) -> None:
         edge = edges.get(child)
         if edge is None or edge.parent != parent:
             edge = edges[child] = _Edge(parent, child, self._buffer_ns)
             self._routes.clear()
         edge.is_static |= is_static
-        stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
-        edge.add(stamp_ns, (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w))
+        edge.add(stamp_ns, pose)
         if len(edges) > self._frames_limit:
             oldest_ns = stamp_ns - self._buffer_ns
             for name in [name for name, edge in edges.items() if edge.is_older(oldest_ns)]:

@@ -7,7 +7,14 @@ To add a format, write a module with ``FORMAT``, ``Writer`` and, where files can
 """
 
 from boxreg_ros.labels.output import LabelOutput
-from boxreg_ros.labels.protocol import Format, LabelFrame, LabelWriter, Options, Provenance
+from boxreg_ros.labels.protocol import (
+    Format,
+    LabelFrame,
+    LabelWriter,
+    Options,
+    Provenance,
+    SceneFrames,
+)
 from boxreg_ros.labels.registry import (
     can_read,
     check_options,
@@ -31,5 +38,6 @@ __all__ = [
     'module_of',
     'Options',
     'Provenance',
+    'SceneFrames',
     'writer_for',
 ]

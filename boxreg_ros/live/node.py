@@ -13,6 +13,7 @@ from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
+from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
@@ -79,6 +80,8 @@ class BoxregNode(Node):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         warm_up(config)
+        budget = TickBudget(options.deadline)
+        warm_up(config, budget.submit)  # once more, timed without imports and compilation
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
         self._health = Health(self.get_logger())
@@ -93,10 +96,16 @@ class BoxregNode(Node):
         )
         live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
-            self._health.report, options.convention, lidars,
+            self._health.report, options.convention, lidars, budget,
         )  # fmt: skip
         self.worker = Worker(
-            live, self._inbox, self._health, self.get_logger(), options.backlog, self._markers
+            live,
+            self._inbox,
+            self._health,
+            self.get_logger(),
+            budget,
+            options.backlog,
+            self._markers,
         )
         self.recording = Recording(self, self._inbox, self._health, lambda: self._settings)
         if options.record_to:

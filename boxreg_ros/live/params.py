@@ -58,6 +58,13 @@ NODE_SETTINGS = (
         's', 0.0, 60.0,
     ),
     Setting(
+        'deadline', -1.0,
+        'maximum time from complete data to refined boxes: tracks that the solver has no time for '
+        'are kept, and solved first at the next stamp; negative: most of the measured period of '
+        'the boxes',
+        's', -1.0, 3600.0,
+    ),
+    Setting(
         'backlog', 0.1,
         'maximum wait of a cloud for the solver before it is dropped; of a box array ten times '
         'that, before it passes through unrefined',
@@ -87,8 +94,8 @@ NODE_SETTINGS = (
 
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
-    *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'config_file'),
-    'record_',
+    *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
+    *('config_file', 'record_'),
 )
 """Prefixes of the parameters that may change while the node runs."""
 READ_ONLY = 'read-only: windows, threads or subscriptions are built from it at start-up'
@@ -110,6 +117,7 @@ class NodeOptions(NamedTuple):
     fixed_frame: str
     output_frame: str
     transform_timeout: float
+    deadline: float
     backlog: float
     config_file: str
     record_to: str
@@ -318,4 +326,9 @@ def _checked(item: Setting, value: Any) -> Any:
         raise ConfigError(f'{item.name}: expected {kind.__name__}, got {value!r}')
     if item.low is not None and item.high is not None and not item.low <= value <= item.high:
         raise ConfigError(f'{item.name}: expected {_bounds_of(item)}, got {value!r}')
+    if item.name == 'deadline' and value == 0:
+        raise ConfigError(
+            'deadline: expected more than 0 s, or a negative number for most of the measured '
+            'period, got 0.0: no box could be refined; raise it or leave it out'
+        )
     return value

@@ -12,6 +12,7 @@ from typing import Any
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
+from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
 from boxreg_ros.live.inbox import Inbox, Message
@@ -55,6 +56,8 @@ class Worker:
         Counters and log.
     logger : RcutilsLogger
         Logger of the node.
+    budget : TickBudget
+        That of `live`.
     backlog : float
         How long a cloud may wait for the solver [s].
     markers : Publisher
@@ -81,6 +84,7 @@ class Worker:
         inbox: Inbox,
         health: Health,
         logger: RcutilsLogger,
+        budget: TickBudget,
         backlog: float,
         markers: Publisher,
     ) -> None:
@@ -93,6 +97,7 @@ class Worker:
         self._inbox = inbox
         self._health = health
         self._logger = logger
+        self._budget = budget
         self._backlog = backlog
         self._idle_at = 0.0
         self._waited = 0.0
@@ -111,7 +116,7 @@ class Worker:
 
     def facts(self) -> dict[str, object]:
         """Return what /diagnostics reports about the boxes beside the counters."""
-        return self._live.facts
+        return {**self._live.facts, 'deadline [ms]': f'{1e3 * self._budget.seconds:.0f}'}
 
     def stop(self) -> None:
         """Make `run` return after the message at hand."""
@@ -252,6 +257,7 @@ class Worker:
                 self._live.config, options = content
                 self._live.output_frame = options.output_frame.lstrip('/')
                 self._live.transform_timeout = options.transform_timeout
+                self._budget.deadline = options.deadline
             else:
                 self._live.tree.add_transforms(content, is_static=kind == '/tf_static')
         self.newest_transform_ns = self._live.tree.newest_ns()
@@ -263,11 +269,15 @@ class Worker:
             self._health.report('unreadable', f'points_info: {error}')
 
     def _process(self, item: ReceivedMessage) -> None:
+        if isinstance(item.content, BoxArray):
+            self._budget.add_arrival(item.received)
+        self._budget.begin(max(item.received, self._idle_at))
         ready = self._guarded(partial(self._live.process, item), item)
         if self.fixed_frame != self._live.fixed_frame:
             self.fixed_frame = self._live.fixed_frame
             self._logger.info(f'fixed frame is {self.fixed_frame!r}')
         self._publish(ready)
+        self._budget.end()
         if is_placeholder(item.content) and self._board.is_showing:
             self._markers.publish(self._board.clear())
 

@@ -13,14 +13,34 @@ import yaml
 if TYPE_CHECKING:
     from boxreg_ros.io.lidars import Lidars
 
+RECORDINGS = (
+    'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag, or a scene of a data set as in '
+    'nuscenes:/data#scene-0061'
+)
+"""What a recording can be, for the help of options."""
+
 
 def add_recording_arguments(
-    parser: argparse.ArgumentParser, several: str = 'several are merged by time'
+    parser: argparse.ArgumentParser,
+    several: str = 'several are merged by time',
+    count: str = '+',
 ) -> None:
-    """Add the recordings, their topics and the settings; the help states the use of `several`."""
+    """
+    Add the recordings, their topics and the settings.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Gets the arguments.
+    several : str
+        Use of several recordings, for the help.
+    count : str
+        How many recordings are expected: ``+`` or ``*``.
+
+    """
     parser.add_argument(
-        'recordings', nargs='+', type=Path, metavar='RECORDING',
-        help=f'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; {several}',
+        'recordings', nargs=count, type=Path, metavar='RECORDING',
+        help=f'{RECORDINGS}; {several}',
     )  # fmt: skip
     add_topic_arguments(parser)
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')

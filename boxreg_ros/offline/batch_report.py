@@ -7,6 +7,7 @@ import csv
 from html import escape
 from pathlib import Path
 from typing import Any, TextIO
+from urllib.parse import quote
 
 REVIEW = 'review.csv'
 RISK = 'risk_m'
@@ -76,4 +77,4 @@ def _write_table(file: TextIO, rows: Sequence[dict[str, Any]]) -> None:
 
 def _cell(name: str, value: Any) -> str:
     text = escape(str(value))
-    return f'<a href="{text}/">{text}</a>' if name == 'drive' else text
+    return f'<a href="{quote(str(value))}/">{text}</a>' if name == 'drive' else text

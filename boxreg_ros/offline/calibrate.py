@@ -31,8 +31,6 @@ from boxreg_ros.core.input_model import (
 from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.window import group_windows, stack_windows, Window
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.arguments import (
     add_recording_arguments,
     config_from,
@@ -41,6 +39,7 @@ from boxreg_ros.offline.arguments import (
 )
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.result_folder import spare_file
+from boxreg_ros.offline.sources import source_of, true_boxes
 from boxreg_ros.structures import Floats, is_valid_box
 import numpy as np
 import torch
@@ -286,8 +285,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.output:  # may be the file of --config
         spare_file(args.output, [*args.recordings, args.truth])
-    truth = BoxTable.read(args.truth)
-    recording = Recording(
+    truth = true_boxes(args.truth)
+    recording = source_of(
         args.recordings,
         lidars_from(args),
         args.boxes,

@@ -25,6 +25,7 @@ from boxreg_ros.offline.box_scores import (
 from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
 from boxreg_ros.offline.result_folder import earlier_summary
+from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.track_scores import (
     has_trackeval,
     LEAST_IOU,
@@ -42,7 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='result folder or boxes.csv, or a recording, whose input boxes are compared',
     )  # fmt: skip
     parser.add_argument(
-        'truth', type=Path, metavar='TRUTH.csv', help='true boxes, with the columns of boxes.csv'
+        'truth',
+        type=Path,
+        metavar='TRUTH',
+        help='true boxes: CSV with the columns of boxes.csv, or a scene of a data set',
     )
     parser.add_argument(
         '--min-points', type=int, default=0, metavar='N',
@@ -63,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the scores of a table of boxes or of the input boxes of a recording."""
-    truth = BoxTable.read(args.truth)
+    truth = true_boxes(args.truth)
     predicted = _predicted(args, truth.frame_id)
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes, by_overlap)
@@ -142,12 +146,12 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
         found = _table_in_frame(BoxTable.read_frames(source), frame_id)
         return found.rows(np.array([status != REJECTED for status in found.status], bool))
     from boxreg_ros.io.recording import input_boxes  # slow to import: it reads bags
+    from boxreg_ros.offline.sources import source_of
 
-    arrays, left_out = input_boxes(
-        source, args.fixed_frame, convention=convention, lidars=lidars_from(args), **topics
-    )
-    if left_out:
-        _warn(left_out)
+    recording = source_of([source], lidars_from(args), convention=convention, **topics)
+    arrays, others = input_boxes(recording, args.fixed_frame)
+    if others:
+        _warn(others)
     return BoxTable.from_arrays(arrays)
 
 

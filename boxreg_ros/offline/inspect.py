@@ -26,10 +26,14 @@ from boxreg_ros.offline.arguments import (
     convention_from,
     lidar_options,
     lidars_from,
+    RECORDINGS,
 )
+from boxreg_ros.offline.result_folder import spare_file
+from boxreg_ros.offline.timeline import check_plotly, merged_spans, write_timeline
 
 if TYPE_CHECKING:
-    from boxreg_ros.io.recording import Item, Recording
+    from boxreg_ros.io.recording import Item, ItemSource
+    from boxreg_ros.io.transforms import Link
 
 DONE = 0
 FAILED = 1
@@ -45,19 +49,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg inspect`."""
     parser.add_argument(
         'recordings', nargs='+', type=Path, metavar='RECORDING',
-        help='MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; several are merged by time',
+        help=f'{RECORDINGS}; several are merged by time; a data set without a scene is listed',
     )  # fmt: skip
     add_topic_arguments(parser)
     parser.add_argument('--json', action='store_true', help='print JSON')
+    parser.add_argument(
+        '--html', type=Path, metavar='FILE',
+        help='also write a page with a picture of the timeline: messages, gaps and damages',
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Print what is in the recording; return 1 if it cannot be relabelled."""
+    scenes = _scenes(args.recordings)
+    if scenes:
+        print(json.dumps(scenes) if args.json else '\n'.join(scenes))
+        return DONE
+    if args.html is not None:
+        check_plotly()
+        spare_file(args.html, args.recordings)
     facts = inspect(args)
-    if args.json:
-        print(json.dumps(facts, indent=2))
-    else:
-        print('\n'.join(_lines(facts)))
+    lines = list(_lines(facts))
+    if args.html is not None:
+        write_timeline(args.html, facts, lines)
+    print(json.dumps(facts, indent=2) if args.json else '\n'.join(lines))
     return DONE if facts['command'] else FAILED
 
 
@@ -76,13 +91,17 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
         If nothing in it can be read.
 
     """
-    from boxreg_ros.io.recording import Recording
+    from boxreg_ros.offline.sources import scene_address, source_of
 
-    facts = _contents(args.recordings)
     convention = convention_from(args)
-    options = {'boxes': args.boxes, 'odometry': args.odometry, 'convention': convention}
+    lidars = lidars_from(args)
+    source = source_of(args.recordings, lidars, args.boxes, args.odometry, convention=convention)
+    if scene_address(args.recordings) is None:
+        facts = _contents(args.recordings)
+    else:
+        facts = _scene_contents(args.recordings)
     try:
-        with Recording(args.recordings, lidars_from(args), **options) as recording:
+        with source as recording:
             facts |= _sampled(recording, convention)
             facts['damage'] = [damage._asdict() for damage in recording.damages]
     except BoxregError as error:
@@ -105,6 +124,7 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
         counts: Counter[tuple[str, str]] = Counter()
         for connection in reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
+        presence = reader.presence()
         damages = [damage._asdict() for damage in reader.damages]
     return {
         'files': [str(file) for part in parts for file in part.files],
@@ -112,10 +132,65 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
         'begin_ns': begin_ns,
         'seconds': seconds,
         'topics': [
-            {'topic': topic, 'type': kind, 'messages': count, 'rate': _rate(count, seconds)}
+            {
+                'topic': topic,
+                'type': kind,
+                'messages': count,
+                'rate': _rate(count, seconds),
+                'presence_s': merged_spans(presence[topic], begin_ns, seconds),
+                'gaps_s': _pauses(presence[topic], begin_ns, _rate(count, seconds)),
+            }
             for (topic, kind), count in sorted(counts.items())
         ],
         'damage': damages,
+        'problems': [],
+        'warnings': [],
+    }
+
+
+def _scenes(paths: list[Path]) -> list[str]:
+    """Return the addresses of all scenes of a data set, if none of several is named."""
+    from boxreg_ros.datasets import scene_names
+    from boxreg_ros.offline.sources import scene_address
+
+    address = scene_address(paths)
+    if address is None or address.scene:
+        return []
+    names = scene_names(address)
+    return [str(address._replace(scene=name)) for name in names] if len(names) > 1 else []
+
+
+def _scene_contents(paths: list[Path]) -> dict[str, Any]:
+    """Return files, times and numbers of sweeps and boxes of a scene."""
+    from boxreg_ros.datasets import SceneRecording
+    from boxreg_ros.offline.sources import scene_address
+
+    address = scene_address(paths)
+    assert address is not None
+    recording = SceneRecording(address)
+    recording.has_boxes = False
+    with recording:
+        seconds = (recording.end_ns - recording.start_ns) * 1e-9
+        files = recording.files
+        topics = [
+            {
+                'topic': name,
+                'type': 'data set',
+                'messages': count,
+                'rate': _rate(count, seconds),
+                'presence_s': [[0.0, seconds]],
+                'gaps_s': [],  # the stamps of a scene are in files that are not opened here
+            }
+            for name, count in recording.topics.items()
+        ]
+        begin_ns = recording.start_ns
+    return {
+        'files': [str(file) for file in files],
+        'bytes': sum(file.stat().st_size for file in files),
+        'begin_ns': begin_ns,
+        'seconds': seconds,
+        'topics': topics,
+        'damage': [],
         'problems': [],
         'warnings': [],
     }
@@ -126,12 +201,26 @@ def _rate(count: int, seconds: float) -> float:
     return (count - 1) / seconds if count > 1 and seconds > 0 else 0.0
 
 
+def _pauses(parts: list[tuple[int, int]], begin_ns: int, rate: float) -> list[list[float]]:
+    """Return begin and end of the pauses between parts with messages [s from the begin]."""
+    if not rate:
+        return []
+    pauses = []
+    last_ns = parts[0][1]
+    for first_ns, end_ns in parts:
+        if (first_ns - last_ns) * 1e-9 > GAP_PERIODS / rate:
+            pauses.append([(last_ns - begin_ns) * 1e-9, (first_ns - begin_ns) * 1e-9])
+        last_ns = max(last_ns, end_ns)
+    return pauses
+
+
 @dataclass
 class _Sample:
-    """What the first messages of clouds and boxes show."""
+    """What the first messages of clouds and boxes show; `late` is receive time less stamp [ns]."""
 
     sweeps: list[int] = field(default_factory=list)
     arrays: list[int] = field(default_factory=list)
+    late: list[int] = field(default_factory=list)
     points: list[int] = field(default_factory=list)
     durations: list[float] = field(default_factory=list)
     classes: Counter[str] = field(default_factory=Counter)
@@ -144,6 +233,8 @@ class _Sample:
         from boxreg_ros.structures import Sweep
 
         content = item.content
+        if content.stamp_ns > 0:
+            self.late.append(item.received_ns - content.stamp_ns)
         if isinstance(content, Sweep):
             self.sweeps.append(content.stamp_ns)
             self.points.append(len(content.points))
@@ -157,7 +248,7 @@ class _Sample:
             self.tracks[name].append(content.stamp_ns)
 
 
-def _sampled(recording: Recording, convention: Any) -> dict[str, Any]:
+def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
     """Return what the first seconds of a recording show."""
     from boxreg_ros.io.session import Session
 
@@ -180,9 +271,22 @@ def _sampled(recording: Recording, convention: Any) -> dict[str, Any]:
         'recorded_apart': recording.apart,
         'fixed_frame': session.fixed_frame,
         'sensor_frame': recording.sensor_frame(),
-        'transforms': str(session.tree).split(', '),
+        'transforms': [_transform(link) for link in session.tree.links()],
+        'connected_frames': session.tree.groups(),
         'sample': _summary(sample),
         'warnings': list(_warnings(sample, session.finding, recording)),
+    }
+
+
+def _transform(link: Link) -> dict[str, Any]:
+    """Return what is known of the transform between two frames."""
+    stamps = list(link.stamps_ns)
+    return {
+        'parent': link.parent,
+        'child': link.child,
+        'is_static': link.is_static,
+        'period_s': None if link.is_static else _period(stamps),
+        'gaps_s': [] if link.is_static else _gaps(stamps),
     }
 
 
@@ -202,6 +306,7 @@ def _summary(sample: _Sample) -> dict[str, Any]:
         'boxes_period_s': _period(sample.arrays),
         'gaps': {'sweeps': _gaps(sample.sweeps), 'box_arrays': _gaps(sample.arrays)},
         'stamp_offset_s': max(offsets) * 1e-9 if offsets else None,
+        'received_after_stamp_s': float(np.median(sample.late)) * 1e-9 if sample.late else None,
         'classes': {name: _kind(name) for name, _ in sample.classes.most_common()},
         'tracks': len(lengths),
         'boxes_per_track': lengths[len(lengths) // 2] if lengths else 0,
@@ -209,7 +314,7 @@ def _summary(sample: _Sample) -> dict[str, Any]:
     }
 
 
-def _warnings(sample: _Sample, finding: str, recording: Recording) -> Iterator[str]:
+def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[str]:
     """Yield what makes results worse, one line each."""
     if finding:
         yield finding
@@ -219,6 +324,13 @@ def _warnings(sample: _Sample, finding: str, recording: Recording) -> Iterator[s
         unusable = sum(stamp <= 0 for stamp in stamps)
         if unusable:
             yield f'{unusable} {name} have the stamp 0 in their header and cannot be used'
+        usable = [stamp for stamp in stamps if stamp > 0]
+        repeated = len(usable) - len(set(usable))
+        if repeated:
+            yield f'{repeated} {name} repeat the stamp of another one'
+        backward = sum(later < earlier for earlier, later in pairwise(usable))
+        if backward:
+            yield f'{backward} {name} have a stamp before that of the one received before them'
     if sample.without_transform:
         yield (
             f'{len(sample.without_transform)} messages have no transform; first: '
@@ -267,7 +379,11 @@ def _kind(class_name: str) -> str:
 
 def _command(args: argparse.Namespace, facts: dict[str, Any]) -> str:
     """Return the relabel command with the same recordings and topics."""
-    out = f'out/{args.recordings[0].stem}'
+    from boxreg_ros.offline.sources import scene_address
+
+    first = args.recordings[0]
+    scene = scene_address([first])
+    out = f'out/{first.stem if scene is None else scene.scene or scene.root.name}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
     words += lidar_options(args)
     for name in ('boxes', 'odometry'):
@@ -290,7 +406,7 @@ def _lines(facts: dict[str, Any]) -> Iterator[str]:
     for entry in facts['topics']:
         yield (
             f'  {entry["topic"]:{width}}  {entry["messages"]:8,}  {entry["rate"]:7.1f} Hz  '
-            f'{entry["type"]}'
+            f'{entry["type"]}{_gap_text(entry["gaps_s"])}'
         )
     if 'sample' in facts:
         yield from _sample_lines(facts)
@@ -306,12 +422,27 @@ def _lines(facts: dict[str, Any]) -> Iterator[str]:
         yield f'next: {facts["command"]}'
 
 
+def _gap_text(gaps: list[list[float]]) -> str:
+    """Return number and place of the longest of the gaps of a topic; empty without."""
+    if not gaps:
+        return ''
+    begin, end = max(gaps, key=lambda gap: gap[1] - gap[0])
+    return f', {len(gaps)} gaps, the longest {begin:,.1f} to {end:,.1f} s'
+
+
 def _sample_lines(facts: dict[str, Any]) -> Iterator[str]:
     sample = facts['sample']
     yield f'fixed frame {facts["fixed_frame"]}, clouds in {facts["sensor_frame"]}'
-    yield f'transforms {", ".join(facts["transforms"])}'
+    for transform in facts['transforms']:
+        yield f'  {_transform_line(transform)}'
+    if len(facts['connected_frames']) > 1:
+        groups = [' + '.join(group) for group in facts['connected_frames']]
+        yield f'no transform connects {"; ".join(groups)}'
     if facts['odometry_topic']:
         yield f'odometry {facts["odometry_topic"]}'
+    late = sample['received_after_stamp_s']
+    if late is not None:
+        yield f'received {late:+,.3f} s after the stamp (median)'
     yield f'of the first {SAMPLE_SECONDS:g} s:'
     times = sample['point_times_s']
     shown = 'no times' if times is None else f'times over {times:.3f} s'
@@ -329,6 +460,15 @@ def _sample_lines(facts: dict[str, Any]) -> Iterator[str]:
     yield f'  classes (treated as): {classes or "none"}'
     for topic, late in facts['recorded_apart'].items():
         yield f'  {topic} was recorded apart from the clouds, {late:+.1f} s'
+
+
+def _transform_line(transform: dict[str, Any]) -> str:
+    pair = f'{transform["parent"]} -> {transform["child"]}'
+    if transform['is_static']:
+        return f'{pair}: static'
+    gaps = [end - begin for begin, end in transform['gaps_s']]
+    longest = f', the longest {max(gaps):.3f} s' if gaps else ''
+    return f'{pair}: {_seconds(transform["period_s"])} apart, {len(gaps)} gaps{longest}'
 
 
 def _seconds(value: float | None) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.stamp_order import kept, Slot, StampOrder
 from boxreg_ros.labels import LabelFrame, LabelOutput, Provenance
 from boxreg_ros.labels.cloud_spool import Spool
@@ -78,7 +79,9 @@ class Sink:
         if request.options.with_points:
             self._spool = Spool(folder, request.config)
         provenance = Provenance.of(request.recordings, request.config)
-        options = replace(request.options, recording=request.recording())
+        recording = request.recording()
+        bags = recording if isinstance(recording, Recording) else None
+        options = replace(request.options, recording=bags)
         self._output = LabelOutput(folder, request.formats, provenance, options)
         self.corrections = Corrections(
             read_decisions(request.decisions) if request.decisions is not None else ()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import asdict
 from datetime import datetime, UTC
 from importlib.metadata import version
@@ -30,7 +30,8 @@ from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import CONFIG, SUMMARY, whole_folder
+from boxreg_ros.offline.result_folder import CONFIG, delete_remains, SUMMARY, whole_folder, writing
+from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
@@ -40,8 +41,9 @@ import numpy as np
 import yaml
 
 if TYPE_CHECKING:
-    from boxreg_ros.core.registrar import BoxRegistrar
+    from boxreg_ros.core.registrar import BoxRegistrar, Submit
     from boxreg_ros.offline.completion import Completion
+    from boxreg_ros.offline.journal import Journal
     from boxreg_ros.review.changes import TrackChanges
     from boxreg_ros.review.track_points import PointCollector
     from boxreg_ros.tracks.complete import Plan
@@ -56,7 +58,9 @@ FEW_REFINED = 0.5
 """A run that refines a smaller part of its boxes says why."""
 
 
-def relabel(request: Request, out: Path, progress: Progress | None = None) -> dict[str, Any]:
+def relabel(
+    request: Request, out: Path, progress: Progress | None = None, resume: bool = False
+) -> dict[str, Any]:
     """
     Refine all boxes of a recording and write ``boxes.csv``, ``summary.json`` and other files.
 
@@ -69,6 +73,8 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     progress : Progress, optional
         Shows the duration of the recording that has been read and its whole duration [s]. Both
         count once for each time that the recording is read: with completed tracks once more.
+    resume : bool
+        Keep a journal of the run, and go on with that of an interrupted one; see `Journal`.
 
     Returns
     -------
@@ -78,7 +84,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     Raises
     ------
     RecordingError
-        If the recording lacks something, or `out` is not an earlier result.
+        If the recording lacks something, `out` is not an earlier result, or cannot be written.
     UnsupportedMessage
         If none of its clouds, or none of its messages of boxes, can be read.
 
@@ -87,8 +93,9 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
     shown = _Passes(progress, 1 + bool(request.config.complete.steps))
-    plan, completion = _survey(request, clock, shown)
-    with ExitStack() as workers:
+    with writing(out), ExitStack() as workers:
+        journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
+        plan, completion = _survey(request, clock, shown, journal)
         process = workers.enter_context(reader(request))
         # The recording is opened while this process imports torch, which takes a second.
         from boxreg_ros.core.registrar import BoxRegistrar
@@ -100,7 +107,7 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
         recording = ReadAhead(process)
         if plan is None:
             clock.begun('start')
-        registrar = BoxRegistrar(request.config, submit)
+        registrar = BoxRegistrar(request.config, _journaled(submit, journal))
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
                 _register(recording, registrar, completion, sink, clock, shown)
@@ -123,6 +130,25 @@ def relabel(request: Request, out: Path, progress: Progress | None = None) -> di
     return summary
 
 
+@contextmanager
+def _journal(out: Path, fingerprint: str) -> Iterator[Journal]:
+    """Yield the journal of a run; while it is locked, other partial results are remains."""
+    from boxreg_ros.offline.journal import Journal, journal_path
+
+    path = journal_path(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with Journal(path, fingerprint) as journal:
+        delete_remains(out)
+        yield journal
+
+
+def _journaled(submit: Submit | None, journal: Journal | None) -> Submit | None:
+    """Return `submit` with the estimates that a journal has."""
+    from boxreg_ros.core.registrar import submit_locally
+
+    return submit if journal is None else journal.journaled(submit or submit_locally)
+
+
 class _Passes:
     """Progress over several passes through a recording."""
 
@@ -141,7 +167,7 @@ class _Passes:
 
 
 def _survey(
-    request: Request, clock: Stopwatch, progress: _Passes
+    request: Request, clock: Stopwatch, progress: _Passes, journal: Journal | None
 ) -> tuple[Plan | None, Completion | None]:
     """Register the recording a first time and plan its whole tracks; None without steps."""
     if not request.config.complete.steps:
@@ -157,6 +183,7 @@ def _survey(
         recording = ReadAhead(process)
         clock.begun('start')
         items = ((item.moved, item.restarts) for item in progress.each(recording))
+        submit = _journaled(submit, journal)
         plan = survey(items, recording.source.fixed_frame, request.config, submit)
         return plan, Completion(plan, request.config)
 
@@ -257,7 +284,7 @@ def _truth(
         return None
     from boxreg_ros.offline.evaluate import time_range
 
-    truth = BoxTable.read(request.truth)
+    truth = true_boxes(request.truth)
     stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
     names = {track.track_id for track in tracks}
     problem = ''

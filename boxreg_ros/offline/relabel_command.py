@@ -75,11 +75,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--truth', type=Path, metavar='FILE',
-        help='true boxes that the report shows, as CSV with the columns of boxes.csv',
+        help='true boxes that the report shows: CSV with the columns of boxes.csv, or a scene of '
+        'a data set',
     )  # fmt: skip
     parser.add_argument(
         '--resume', action='store_true',
-        help='do nothing if OUT holds the result of the same request, files and settings',
+        help='go on with an interrupted run of the same request, files and settings; do nothing '
+        'if OUT holds its result',
     )  # fmt: skip
     parser.add_argument(
         '--strict', action='store_true',
@@ -152,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
     with ProgressBar() as bar:
-        summary = relabel(request, args.out, bar)
+        summary = relabel(request, args.out, bar, args.resume)
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+import errno
+from glob import escape
 import json
 import os
 from pathlib import Path
@@ -14,6 +16,8 @@ from uuid import uuid4
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.whole_files import DISK_ERRORS
 
+REFUSED_ERRORS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
+"""No permission, read-only file system, a file where a folder is needed."""
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
 
@@ -75,34 +79,63 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
     ConfigError
         If one of `inputs` is in `out`.
     RecordingError
-        If `out` exists and is not the unchanged result of an earlier run, or its disk is full.
+        If `out` exists and is not the unchanged result of an earlier run, or cannot be written.
 
     """
     spare(out, inputs)
     _check_replaceable(out)
     out = out.resolve()
-    out.parent.mkdir(parents=True, exist_ok=True)
     unique = f'.{out.name}.{uuid4().hex[:8]}'
     partial = out.with_name(f'{unique}.partial')
     earlier = out.with_name(f'{unique}.earlier')
     try:
-        partial.mkdir()
-        yield partial
-        if out.exists():
-            os.replace(out, earlier)
-        os.replace(partial, out)
-    except OSError as error:
-        if error.filename is None and error.errno in DISK_ERRORS:  # of a write, which has no name
-            raise RecordingError(
-                f'output {str(out)!r}: expected room for all files, got: {error.strerror}; '
-                f'nothing was written: free some space, or choose another disk with -o'
-            ) from None
-        raise
+        with writing(out):
+            partial.mkdir(parents=True)
+            yield partial
+            if out.exists():
+                os.replace(out, earlier)
+            os.replace(partial, out)
     finally:
         if earlier.exists() and not out.exists():
             os.replace(earlier, out)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(earlier, ignore_errors=True)
+
+
+@contextmanager
+def writing(out: Path) -> Iterator[None]:
+    """
+    Name the output in errors of the file system.
+
+    Raises
+    ------
+    RecordingError
+        If the disk of `out` is full, or it cannot be written.
+
+    """
+    try:
+        yield
+    except OSError as error:
+        # A write has no file name; errors of inputs have that of the input.
+        is_own = error.filename is None or _is_near(Path(error.filename), out)
+        if is_own and error.errno in DISK_ERRORS:
+            raise RecordingError(
+                f'output {str(out)!r}: expected room for all files, got: {error.strerror}; '
+                f'nothing was written: free some space, or choose another disk with -o'
+            ) from None
+        if is_own and error.errno in REFUSED_ERRORS:
+            raise RecordingError(
+                f'output {str(out)!r}: expected a folder that can be written, got: '
+                f'{error.strerror} ({error.filename}); nothing was written: choose another with -o'
+            ) from None
+        raise
+
+
+def delete_remains(out: Path) -> None:
+    """Delete the partial results of runs that were killed; none may be running."""
+    whole = out.resolve()
+    for remains in whole.parent.glob(f'.{escape(whole.name)}.*.partial'):
+        shutil.rmtree(remains, ignore_errors=True)
 
 
 def _check_replaceable(out: Path) -> None:
@@ -131,6 +164,15 @@ def _changed_since(out: Path) -> Path | None:
         if file.is_file() and file.stat().st_mtime_ns > made_ns:
             return file.relative_to(out)
     return None
+
+
+def _is_near(path: Path, out: Path) -> bool:
+    """Return whether a path is `out`, a folder above it, or a temporary one beside it."""
+    whole = out.resolve()
+    if whole.is_relative_to(path.resolve()):
+        return True
+    hidden = str(whole.with_name(f'.{whole.name}.'))
+    return str(path.resolve()).startswith(hidden)
 
 
 def _is_empty(folder: Path) -> bool:

@@ -68,7 +68,7 @@ def test_a_silent_lidar_is_waited_for_one_second_only():
 
 
 def test_a_lidar_that_was_never_heard_does_not_hold_back_the_others():
-    complete, rest = groups(periods(15, {'a': 0, 'b': 10}))
+    complete, _ = groups(periods(15, {'a': 0, 'b': 10}))
     assert complete[0] == [1000, 1010]
     assert len(complete) == 15
 

@@ -2,10 +2,15 @@
 
 import csv
 import json
+from pathlib import Path
+import subprocess
+import sys
+import time
 
 from boxreg_ros.cli import main
-from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.offline.batch import jobs_of
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.offline.job import jobs_of
+from boxreg_ros.offline.job_process import JobRunner, memory_bytes
 from boxreg_ros.offline.result_folder import whole_folder
 import pytest
 from ros_messages import Drive
@@ -73,17 +78,92 @@ def test_manifests_patterns_and_their_errors(tmp_path):
     assert [job.name for job in jobs] == ['a', 'x_a', 'c']
     assert jobs[0].recordings == (tmp_path / 'a.mcap', tmp_path / 'b.mcap')
     manifest.write_text('a.mcap\nmissing.mcap\n../' + tmp_path.name + '/a.mcap\n')
-    with pytest.raises(ConfigError) as caught:
-        jobs_of([manifest])
-    assert 'missing.mcap: expected a recording' in str(caught.value)
-    assert 'got it twice' in str(caught.value)
+    first, missing, again = jobs_of([manifest])
+    assert (first.name, first.status) == ('a', 'waiting')
+    assert missing.status == again.status == 'failed'
+    assert 'got no such file; correct its path' in missing.last_line
+    assert 'got it a second time; leave one out' in again.last_line
 
 
-def test_shards_cover_all_drives_once(tmp_path, capsys):
-    assert main(['batch', 'x.mcap', '-o', str(tmp_path), '--shard=1/2']) == 2
+def test_missing_and_repeated_drives_fail_and_the_others_go_on(tmp_path, capsys):
+    path = Drive(sweeps=6).write(tmp_path / 'one')
+    out = tmp_path / 'out'
+    missing = tmp_path / 'missing.mcap'
+    command = ['batch', str(path), str(missing), str(path), '-o', str(out), *QUICK]
+    assert main(command) == 1
+    streams = capsys.readouterr()
+    assert f'{out}: 1 of 3 drives done' in streams.out
+    assert sorted(streams.err.splitlines()) == sorted(
+        [
+            f'boxreg: {missing}: expected a recording, got no such file; correct its path, or '
+            f'leave it out',
+            f'boxreg: {path}: expected each recording once, got it a second time; leave one out',
+        ]
+    )
+
+
+def test_shards_are_merged_to_the_results_of_one_run(tmp_path, capsys):
+    paths = [str(Drive(sweeps=n).write(tmp_path / str(n))) for n in (5, 6)]
+    out = tmp_path / 'out'
+    assert main(['batch', *paths, '-o', str(out), '--shard=1/2', *QUICK]) == 0
+    assert main(['batch', '-o', str(out), '--merge']) == 1
+    assert 'got all but 2; run these first' in capsys.readouterr().err
+    assert main(['batch', *paths, '-o', str(out), '--shard=2/2', *QUICK]) == 0
+    assert main(['batch', '-o', str(out), '--merge']) == 0
+    assert f'{out}: 2 of 2 drives done' in capsys.readouterr().out
+    assert [row['boxes_in'] for row in index_of(out).values()] == ['10', '12']
+    merged = json.loads((out / 'summary.json').read_text())
+    # One run over all drives finds them done, and writes the same.
+    assert main(['batch', *paths, '-o', str(out), *QUICK]) == 0
+    assert '2 of them earlier' in capsys.readouterr().out
+    again = json.loads((out / 'summary.json').read_text())
+    times = dict.fromkeys(('seconds', 'peak_mb'))
+    assert {**merged, **times} == {**again, **times}
+    assert merged['boxes_in'] == 2 * (5 + 6)
+
+
+def test_wrong_shards_and_no_drives_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(['batch', 'x.mcap', '-o', str(tmp_path), '--shard=3/2'])
     assert 'expected I/N' in capsys.readouterr().err
+    assert main(['batch', '-o', str(tmp_path)]) == 2
+    assert main(['batch', 'x.mcap', '-o', str(tmp_path), '--address=x:1']) == 2
+    assert 'add --engine ray' in capsys.readouterr().err
+
+
+def test_a_killed_process_is_tried_again_and_named(tmp_path, monkeypatch):
+    path = Drive(sweeps=6).write(tmp_path / 'one')
+    script = tmp_path / 'python'
+    script.write_text('#!/bin/sh\nkill -9 $$\n')  # as the system does where memory is short
+    script.chmod(0o755)
+    monkeypatch.setattr('sys.executable', str(script))
+    (job,) = jobs_of([path])
+    JobRunner(tmp_path / 'out', (), '', retries=2)(job)
+    assert (job.status, job.exit_status, job.attempts) == ('failed', -9, 3)
+    assert 'killed by signal 9; the most frequent cause is too little memory' in job.last_line
+
+
+def test_a_batch_that_is_killed_takes_its_processes_with_it(tmp_path):
+    path = Drive(sweeps=60).write(tmp_path / 'one')
+    out = tmp_path / 'out'
+    batch = subprocess.Popen(
+        [sys.executable, '-m', 'boxreg_ros.cli', 'batch', str(path), '-o', str(out)],
+        stdout=subprocess.DEVNULL,
+    )
+    children = Path(f'/proc/{batch.pid}/task')
+    found = []
+    while not found:
+        assert batch.poll() is None
+        time.sleep(0.05)
+        lists = [task / 'children' for task in children.iterdir()]
+        found = [child for text in lists for child in text.read_text().split()]
+    assert memory_bytes(batch.pid) > 0
+    batch.kill()
+    batch.wait()
+    deadline = time.monotonic() + 20
+    while Path(f'/proc/{found[0]}/exe').exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f'/proc/{found[0]}/exe').exists()
 
 
 def test_a_full_disk_is_named_and_nothing_is_written(tmp_path):

@@ -5,7 +5,7 @@ import shlex
 
 from boxreg_ros.cli import main
 import pytest
-from ros_messages import Drive, SECOND, START
+from ros_messages import Drive, SECOND, START, write_recording
 
 
 def facts_of(capsys, *arguments):
@@ -24,7 +24,10 @@ def test_contents_and_the_command_to_run(tmp_path, capsys, storage):
     assert topics['/points']['messages'] == 12
     assert topics['/points']['rate'] == pytest.approx(10)
     assert facts['fixed_frame'] == 'odom'
-    assert set(facts['transforms']) == {'base -> lidar', 'odom -> base'}
+    pairs = {(link['parent'], link['child']): link['is_static'] for link in facts['transforms']}
+    assert pairs == {('base', 'lidar'): True, ('odom', 'base'): False}
+    assert facts['connected_frames'] == [['base', 'lidar', 'odom']]
+    assert topics['/points']['gaps_s'] == []
     sample = facts['sample']
     assert (sample['tracks'], sample['boxes_per_track']) == (2, 12)
     assert sample['classes'] == {'car': 'vehicle'}
@@ -65,6 +68,59 @@ def test_warnings_gaps_and_damage(tmp_path, capsys):
     assert 'warning: 60 boxes have no track id' in out
     assert 'away from the nearest cloud' in out
     assert out.splitlines()[-1].endswith('--associate')
+
+
+@pytest.mark.parametrize('storage', ['rosbag1', 'sqlite3'])
+def test_timeline_shows_messages_and_gaps(tmp_path, capsys, storage):
+    drive = Drive(sweeps=60, boxes='markers', ros1=storage == 'rosbag1')
+    drive.items = [
+        item
+        for item in drive.items
+        if not (item[0] == '/points' and 20 <= (item[1] - START) * 10 // SECOND < 40)
+    ]
+    path = write_recording(
+        tmp_path / 'drive', drive.items, storage, drive.messages, chunk_bytes=2000
+    )
+    page = tmp_path / 'page.html'
+    assert main(['inspect', str(path), '--html', str(page), '--json']) == 0
+    facts = json.loads(capsys.readouterr().out)
+    topics = {entry['topic']: entry for entry in facts['topics']}
+    ((begin, end),) = topics['/points']['gaps_s']
+    assert (begin, end) == pytest.approx((1.9, 4.0), abs=0.3)
+    assert topics['/boxes']['gaps_s'] == []
+    text = page.read_text()
+    assert 'Plotly.newPlot' in text and '/points' in text and 'next: boxreg relabel' in text
+    assert 'cdn.plot.ly/plotly' not in text.split('Plotly.newPlot')[-1]
+
+
+def test_page_over_the_recording_is_refused(tmp_path, capsys):
+    path = Drive(sweeps=3).write(tmp_path / 'drive')
+    assert main(['inspect', str(path), '--html', str(path)]) == 2
+    assert 'expected a file that is no input' in capsys.readouterr().err
+
+
+def test_transforms_with_gaps_and_frames_without_connection(tmp_path, capsys):
+    drive = Drive(sweeps=30)
+    kept = [item for item in drive.items if item[0] == '/tf']
+    drive.items = [item for item in drive.items if item not in kept[8:14]]
+    status, facts = facts_of(capsys, drive.write(tmp_path / 'drive'))
+    assert status == 0
+    moving = next(link for link in facts['transforms'] if not link['is_static'])
+    assert len(moving['gaps_s']) == 1
+
+
+def test_stamps_that_repeat_or_go_back_are_warnings(tmp_path, capsys):
+    drive = Drive(sweeps=12)
+
+    def repeat(message):
+        message.header.stamp.sec = START // SECOND
+        message.header.stamp.nanosec = 0
+
+    drive.replace('/points', 5, repeat)
+    _, facts = facts_of(capsys, drive.write(tmp_path / 'drive'))
+    assert '1 clouds repeat the stamp of another one' in facts['warnings']
+    assert any('before that of the one received' in line for line in facts['warnings'])
+    assert facts['sample']['received_after_stamp_s'] == pytest.approx(0, abs=0.2)
 
 
 def clear_ids(message):

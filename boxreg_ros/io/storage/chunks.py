@@ -123,6 +123,12 @@ class ChunkedFile(ABC):
         ]
         return _merged(chunks, load, BUFFER_BYTES)
 
+    def spans(self) -> Iterator[tuple[int, int, int]]:
+        """Yield connection id, first and last receive time [ns] of chunks with its messages."""
+        for chunk in self._chunks:
+            for number in chunk.counts:
+                yield number, chunk.start_ns, chunk.last_ns
+
     @abstractmethod
     def _open(self) -> None:
         """Set `connections` and `_chunks`, from the index of the file or by a scan."""

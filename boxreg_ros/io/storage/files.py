@@ -162,12 +162,7 @@ class Files:
         self, connections: Collection[Connection], start: int | None, stop: int | None
     ) -> Iterator[Record]:
         """Yield the messages of all files, each opened when the stream reaches it."""
-        shared = {
-            (id(own.owner), own.id): connection
-            for connection, group in zip(self.connections, self._own.values(), strict=True)
-            if connection in connections
-            for own in group
-        }
+        shared = self._shared(connections)
         streams = []
         for file in self._files:
             wanted = [c for c in file.connections if (id(c.owner), c.id) in shared]
@@ -176,6 +171,23 @@ class Files:
         for record in merged(streams):
             connection = record.connection
             yield record._replace(connection=shared[id(connection.owner), connection.id])
+
+    def spans(self) -> Iterator[tuple[int, int, int]]:
+        """Yield connection id, first and last receive time [ns] of the parts of all files."""
+        shared = self._shared(self.connections)
+        for file in self._files:
+            for number, first_ns, last_ns in file.spans():
+                if (id(file), number) in shared:
+                    yield shared[id(file), number].id, first_ns, last_ns
+
+    def _shared(self, connections: Collection[Connection]) -> dict[tuple[int, int], Connection]:
+        """Return those of `connections` by file and id of the files' own connections."""
+        return {
+            (id(own.owner), own.id): connection
+            for connection, group in zip(self.connections, self._own.values(), strict=True)
+            if connection in connections
+            for own in group
+        }
 
 
 def merged(streams: Sequence[tuple[int, Iterator[Record]]]) -> Iterator[Record]:

@@ -78,6 +78,15 @@ class Reader:
         """Return the parts that cannot be read, as far as they are known."""
         return [damage for file in self._files for damage in file.damages]
 
+    def presence(self) -> dict[str, list[tuple[int, int]]]:
+        """Return first and last receive times [ns] of parts with messages, by topic, ascending."""
+        found: dict[str, set[tuple[int, int]]] = {c.topic: set() for c in self.connections}
+        for file in self._files:
+            topics = {connection.id: connection.topic for connection in file.connections}
+            for number, first_ns, last_ns in file.spans():
+                found[topics[number]].add((first_ns, last_ns))
+        return {topic: sorted(parts) for topic, parts in found.items()}
+
     @staticmethod
     def span_ns(connection: Connection) -> tuple[int, int]:
         """Return the receive times of the first message and of the end of a path [ns]."""

@@ -95,6 +95,9 @@ class StorageFile(Protocol):
     ) -> Iterator[Record]:
         """Yield the messages on `connections`, ordered by receive time from start to stop [ns]."""
 
+    def spans(self) -> Iterator[tuple[int, int, int]]:
+        """Yield connection id, first and last receive time [ns] of each part with messages."""
+
     def close(self) -> None:
         """Close the file."""
 

@@ -105,6 +105,12 @@ class SqliteFile:
                 continue
             yield Record(wanted[topic], received_ns, data, received_ns)
 
+    def spans(self) -> Iterator[tuple[int, int, int]]:
+        """Yield connection id and, twice, the receive time [ns] of each message."""
+        topics = [connection.id for connection in self.connections]
+        for _, topic, received_ns in self._ordered(topics, -MAX_ID, MAX_ID):
+            yield topic, received_ns, received_ns
+
     def _ordered(self, topics: list[int], begin: int, end: int) -> Iterator[tuple[int, int, int]]:
         """Yield id, topic and receive time of messages, in the order of these times."""
         if self._surviving is None:

@@ -1,0 +1,182 @@
+"""
+The journal of a run: the estimates of each batch of windows, to go on after an interruption.
+
+A run that is resumed reads the recording again, takes the estimates that the journal has, and
+solves only the batches behind them. The registrar is deterministic, so the results are the same
+bytes as those of a run without interruption.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import fcntl
+from io import BytesIO
+from pathlib import Path
+import pickle
+import struct
+from types import TracebackType
+from typing import Any, BinaryIO, cast, Self, TYPE_CHECKING
+import zlib
+
+from boxreg_ros.errors import RecordingError
+import numpy as np
+
+if TYPE_CHECKING:  # these import torch
+    from boxreg_ros.config import Config
+    from boxreg_ros.core.input_model import InputModel
+    from boxreg_ros.core.registrar import GetEstimates, Submit
+    from boxreg_ros.core.registration import Estimate
+    from boxreg_ros.core.window import Window
+
+HEAD = struct.Struct('<QI')
+"""Size [bytes] and CRC-32 of the record that follows."""
+TRUSTED_PACKAGES = ('boxreg_ros', 'numpy')
+TRUSTED_NAMES = (
+    'Estimate', 'MarginalisationPrior', 'ndarray', 'dtype', 'scalar', '_reconstruct',
+    '_frombuffer',
+)  # fmt: skip
+"""What a record may refer to: a pickle of other names could run any code."""
+
+
+class Journal:
+    """
+    Store estimates in the order their windows are submitted; use as a context manager.
+
+    Parameters
+    ----------
+    path : Path
+        File of the journal. It is deleted after success, and where it has no record.
+    fingerprint : str
+        Of the request. A journal of another request is begun again.
+
+    Raises
+    ------
+    RecordingError
+        On entering, if another run uses the journal, or its folder cannot be written.
+
+    """
+
+    def __init__(self, path: Path, fingerprint: str) -> None:
+        self._path = path
+        self._fingerprint = fingerprint.encode()
+        self._earlier: Iterator[Any] = iter(())
+
+    def __enter__(self) -> Self:
+        """Open the journal, find the records of an earlier run, and lock it."""
+        self._file = cast(BinaryIO, self._path.open('a+b'))
+        try:
+            # Not flock: forked workers would hold that lock after this process is killed.
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):  # POSIX allows both
+            self._file.close()
+            raise RecordingError(
+                f'{self._path}: expected no other run with the same output, got one that goes on; '
+                f'wait until it has ended, or choose another output with -o'
+            ) from None
+        self._file.seek(0)
+        if self._next() == self._fingerprint:
+            self._earlier = iter(self._next, None)
+        else:
+            self._file.truncate(0)
+            self._append(self._fingerprint)
+        self._num_records = 0
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        _error: BaseException | None,
+        _traceback: TracebackType | None,
+    ) -> None:
+        """Close the journal; delete it if nothing is left to go on with."""
+        if kind is None or not self._num_records:
+            self._path.unlink(missing_ok=True)
+        self._file.close()
+
+    def journaled(self, submit: Submit) -> Submit:
+        """Return a function like `submit` that takes estimates from the journal where it can."""
+
+        def submit_or_recall(
+            windows: list[Window], config: Config, model: InputModel
+        ) -> GetEstimates:
+            checksum = _checksum(windows)
+            recalled = self._recalled(checksum)
+            if recalled is not None:
+                estimates, state = recalled
+
+                def recall() -> list[Estimate | None]:
+                    vars(model).update(state)
+                    return estimates
+
+                return recall
+            get_estimates = submit(windows, config, model)
+
+            def await_and_store() -> list[Estimate | None]:
+                found = get_estimates()
+                self._append(pickle.dumps((checksum, found, vars(model)), pickle.HIGHEST_PROTOCOL))
+                self._num_records += 1
+                return found
+
+            return await_and_store
+
+        return submit_or_recall
+
+    def _recalled(self, checksum: int) -> tuple[list[Estimate | None], dict[str, Any]] | None:
+        """Return the estimates and the state of the next record; None behind the last one."""
+        content = next(self._earlier, None)
+        if content is None:
+            return None
+        stored_checksum, estimates, state = _TrustedUnpickler(BytesIO(content)).load()
+        if stored_checksum != checksum:
+            raise RecordingError(
+                f'{self._path}: expected the journal of the same run, got one of other windows; '
+                f'delete it to begin again'
+            )
+        self._num_records += 1
+        return estimates, state
+
+    def _next(self) -> bytes | None:
+        """Return the next record; None behind the last whole one, where the file is cut off."""
+        begin = self._file.tell()
+        head = self._file.read(HEAD.size)
+        if len(head) == HEAD.size:
+            size, crc = HEAD.unpack(head)
+            content = self._file.read(size)
+            if len(content) == size and zlib.crc32(content) == crc:
+                return content
+        self._file.truncate(begin)
+        return None
+
+    def _append(self, content: bytes) -> None:
+        self._file.write(HEAD.pack(len(content), zlib.crc32(content)) + content)
+        self._file.flush()
+
+
+class _TrustedUnpickler(pickle.Unpickler):
+    """Unpickle arrays and the classes of the core, nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return what a trusted name refers to."""
+        if module.split('.')[0] in TRUSTED_PACKAGES and name in TRUSTED_NAMES:
+            return super().find_class(module, name)
+        raise RecordingError(
+            f'journal: expected arrays and estimates, got {module}.{name}; delete the journal'
+        )
+
+
+def journal_path(out: Path) -> Path:
+    """Return the file of the journal of a result folder: beside it, hidden."""
+    whole = out.resolve()
+    return whole.with_name(f'.{whole.name}.journal')
+
+
+def _checksum(windows: Sequence[Window]) -> int:
+    """Return a checksum of the ids, stamps and boxes of windows."""
+    checksum = 0
+    for window in windows:
+        checksum = zlib.crc32(window.track_id.encode(errors='surrogateescape'), checksum)
+        stamps = np.array([observation.stamp_ns for observation in window.observations])
+        boxes = np.array([observation.box for observation in window.observations])
+        checksum = zlib.crc32(boxes.tobytes(), zlib.crc32(stamps.tobytes(), checksum))
+    return checksum

@@ -1,0 +1,193 @@
+"""Interrupted runs: the journal, equal bytes, full disks and outputs that cannot be written."""
+
+import errno
+import json
+import os
+import pickle
+import random
+import resource
+import subprocess
+import sys
+
+from boxreg_ros.cli import main
+from boxreg_ros.config import Config
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.offline.journal import Journal, journal_path
+from boxreg_ros.offline.relabel import relabel
+from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.result_folder import whole_folder
+import pytest
+from ros_messages import Drive
+
+SETTINGS = {'track_window': 16, 'min_observations': 3}
+"""Windows of sixteen observations, so that there are several batches."""
+
+
+def content_of(folder):
+    """Return the bytes of all files by name, without the times in the summary."""
+    content = {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob('*'))
+        if path.is_file()
+    }
+    summary = json.loads(content['summary.json'])
+    del summary['seconds']
+    return content | {'summary.json': summary}
+
+
+@pytest.fixture(scope='module')
+def request_of_drive(tmp_path_factory):
+    recording = Drive(sweeps=60).write(tmp_path_factory.mktemp('drive') / 'drive')
+    return Request((recording,), formats=('csv', 'openlabel', 'mcap'), config=Config(**SETTINGS))
+
+
+@pytest.fixture(scope='module')
+def uninterrupted(request_of_drive, tmp_path_factory):
+    out = tmp_path_factory.mktemp('whole') / 'out'
+    relabel(request_of_drive, out)
+    return content_of(out)
+
+
+class Interruption(BaseException):
+    """Ends a run as a signal does."""
+
+
+def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
+    tmp_path, request_of_drive, uninterrupted, monkeypatch
+):
+    out = tmp_path / 'out'
+    append = Journal._append
+    solved = []
+
+    def append_until(limit):
+        def limited(journal, content):
+            append(journal, content)
+            solved.append(content)
+            if len(solved) == limit:
+                raise Interruption
+
+        return limited
+
+    for limit in (3, 2, 1):  # the first record has the fingerprint
+        solved.clear()
+        monkeypatch.setattr(Journal, '_append', append_until(limit))
+        with pytest.raises(Interruption):
+            relabel(request_of_drive, out, resume=True)
+        assert [path.name for path in tmp_path.iterdir()] == ['.out.journal']
+    # A record that was cut off is solved again; the remains of a killed run are deleted.
+    journal = journal_path(out)
+    journal.write_bytes(journal.read_bytes()[:-1])
+    (tmp_path / '.out.0123.partial').mkdir()
+    solved.clear()
+    monkeypatch.setattr(Journal, '_append', append_until(0))
+    relabel(request_of_drive, out, resume=True)
+    assert content_of(out) == uninterrupted
+    assert solved
+    assert [path.name for path in tmp_path.iterdir()] == ['out']
+
+
+def test_runs_that_are_killed_at_random_leave_nothing_half_written(tmp_path, uninterrupted):
+    recording = Drive(sweeps=60).write(tmp_path / 'drive')
+    out = tmp_path / 'results' / 'out'
+    settings = [f'--set={name}={value}' for name, value in SETTINGS.items()]
+    command = [
+        *(sys.executable, '-m', 'boxreg_ros.cli', 'relabel', str(recording), '-o', str(out)),
+        *('--formats=csv,openlabel,mcap', '--resume', *settings),
+    ]
+    draw = random.Random(1)
+    kills = 0
+    while not out.exists():
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        try:
+            process.wait(draw.uniform(0.5, 2.0) * 1.5**kills)
+            assert process.returncode == 0
+        except subprocess.TimeoutExpired:
+            assert not out.exists() or (out / 'summary.json').exists()
+            process.kill()
+            process.wait()
+            kills += 1
+    assert kills
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # removes what is left
+    found = content_of(out)
+    assert found['boxes.csv'] == uninterrupted['boxes.csv']
+    assert found['covariances.csv'] == uninterrupted['covariances.csv']
+
+
+@pytest.mark.parametrize('options', [{'estimate': 'final'}, {'complete': {'fill': True}}])
+def test_other_estimates_and_both_passes_are_resumed(tmp_path, options, monkeypatch):
+    recording = Drive(sweeps=12).write(tmp_path / 'drive')
+    config = Config.from_dict({**SETTINGS, 'window': 4, 'lag': 2, **options})
+    request = Request((recording,), formats=('csv',), config=config)
+    relabel(request, tmp_path / 'whole')
+    out = tmp_path / 'out'
+
+    def fail(*_):
+        raise Interruption
+
+    with monkeypatch.context() as patched:
+        patched.setattr('boxreg_ros.offline.relabel._write_tables', fail)
+        with pytest.raises(Interruption):
+            relabel(request, out, resume=True)
+    appended = []
+    monkeypatch.setattr(Journal, '_append', lambda _, content: appended.append(content))
+    relabel(request, out, resume=True)
+    assert content_of(out) == content_of(tmp_path / 'whole')
+    assert not appended
+
+
+def test_journals_of_others_are_not_used(tmp_path):
+    path = tmp_path / '.out.journal'
+    code = (
+        'import pathlib, sys; from boxreg_ros.offline.journal import Journal; '
+        'Journal(pathlib.Path(sys.argv[1]), "one").__enter__()'
+    )
+    with Journal(path, 'one'):
+        ran = subprocess.run([sys.executable, '-c', code, path], capture_output=True, text=True)
+        assert 'expected no other run with the same output' in ran.stderr
+    with Journal(path, 'one') as journal, pytest.raises(Interruption):
+        raise Interruption
+    with Journal(path, 'two') as journal:  # another request
+        assert journal._recalled(0) is None
+    with Journal(path, 'one') as journal:
+        journal._earlier = iter([pickle.dumps((0, [], {'x': print}))])
+        with pytest.raises(RecordingError, match=r'got builtins\.print'):
+            journal.journaled(None)([], None, None)
+
+
+def test_file_size_limit_is_an_error_and_leaves_nothing(tmp_path, request_of_drive):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    code = (
+        f'import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, {limits[1]})); '
+        f'from boxreg_ros.cli import main; sys.exit(main(sys.argv[1:]))'
+    )
+    out = tmp_path / 'results' / 'out'
+    command = ['relabel', str(request_of_drive.recordings[0]), '-o', str(out)]
+    for formats in ('csv', 'openlabel,mcap'):
+        ran = subprocess.run(
+            [sys.executable, '-c', code, *command, f'--formats={formats}'],
+            capture_output=True, text=True,
+        )  # fmt: skip
+        assert ran.returncode == 1
+        assert ran.stderr.startswith(f"boxreg: output '{out}': expected room for all files")
+        assert len(ran.stderr.splitlines()) == 1
+        assert not list((tmp_path / 'results').iterdir())
+
+
+def test_outputs_that_cannot_be_written_are_named(tmp_path, capsys, monkeypatch):
+    file = tmp_path / 'file'
+    file.touch()
+    recording = Drive(sweeps=6).write(tmp_path / 'drive')
+    out = file / 'out'
+    for options in ([], ['--resume']):
+        assert main(['relabel', str(recording), '-o', str(out), *options]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"boxreg: output '{out}': expected a folder that can be written")
+
+    # Root may write everywhere, so the error of a read-only file system is raised here.
+    def refuse(path, *_args, **_options):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr('pathlib.Path.mkdir', refuse)
+    with pytest.raises(RecordingError, match='Read-only file system'):  # noqa: SIM117
+        with whole_folder(tmp_path / 'out'):
+            pass
