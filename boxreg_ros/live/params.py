@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars
+from msg_adapters import CLOUD_TYPES, POINTS_TYPE
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -24,6 +25,10 @@ NODE_SETTINGS = (
     Setting(
         'points', (),
         'topics of the clouds of several LiDARs, which are merged; empty: the topic points',
+    ),
+    Setting(
+        'points_type', POINTS_TYPE, 'message type of the clouds, as package/msg/Type',
+        choices=CLOUD_TYPES,
     ),
     Setting(
         'sensor_frames', (),
@@ -108,6 +113,7 @@ class NodeOptions(NamedTuple):
 
     boxes_type: str
     points: tuple[str, ...]
+    points_type: str
     sensor_frames: tuple[str, ...]
     points_info: str
     pose_reference: str
@@ -324,6 +330,8 @@ def _checked(item: Setting, value: Any) -> Any:
         value = float(value)
     if type(value) is not kind:
         raise ConfigError(f'{item.name}: expected {kind.__name__}, got {value!r}')
+    if item.choices and value not in item.choices:
+        raise ConfigError(f'{item.name}: expected one of {", ".join(item.choices)}, got {value!r}')
     if item.low is not None and item.high is not None and not item.low <= value <= item.high:
         raise ConfigError(f'{item.name}: expected {_bounds_of(item)}, got {value!r}')
     if item.name == 'deadline' and value == 0:

@@ -23,7 +23,7 @@ from boxreg_ros.io.label_feed import (
 )
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.structures import Floats, Sweep
-from msg_adapters import pointcloud
+from msg_adapters import clouds, pointcloud
 import numpy as np
 
 CAPACITY = {'clouds': 50, 'boxes': 1000}
@@ -211,7 +211,7 @@ def _decoded(item: Any) -> Any:
 def _intensities(messages: Sequence[Any]) -> Floats | None:
     """Return the intensities of all clouds; None if one has none."""
     try:
-        found = [pointcloud.intensities(message) for message in messages]
+        found = [pointcloud.intensities(clouds.plain(message)) for message in messages]
     except UnsupportedMessage:
         return None
     known = [values for values in found if values is not None]

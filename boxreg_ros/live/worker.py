@@ -19,11 +19,11 @@ from boxreg_ros.live.inbox import Inbox, Message
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import Adapter
+from msg_adapters.clouds import header_of
 from msg_adapters.poses import stamp_ns
 from rclpy.duration import Duration
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.publisher import Publisher
-from sensor_msgs.msg import PointCloud2
 
 TRANSFORM_PERIOD = 0.02
 """Longest pause between two looks whether the transforms of a message have arrived [s]."""
@@ -159,7 +159,7 @@ class Worker:
             self._publish([Outgoing(message.content, False)])
             self._inbox.put_passing(message)  # the final copy, in the order of all
         else:
-            lost = stamp_ns(message.content.header), message.lidar
+            lost = stamp_ns(header_of(message.content)), message.lidar
             self._inbox.put_event('lost', lost)
 
     def _next(self) -> ReceivedMessage | None:
@@ -233,7 +233,7 @@ class Worker:
 
     def _release_boxes_without_cloud(self, item: ReceivedMessage | None) -> None:
         """Release boxes that have waited too long for a cloud, unless one is at hand."""
-        is_cloud = item is not None and isinstance(item.message, PointCloud2)
+        is_cloud = item is not None and isinstance(item.content, Sweep)
         if is_cloud or self._inbox.sizes()['points_waiting']:
             return
         release = partial(self._live.lose_overdue, time.monotonic(), self.cloud_received)
@@ -314,7 +314,7 @@ class Worker:
         self._take_events()
         self._publish(self._guarded(self._live.flush))
         for waiting in (item, *self._confirmed, *self._live.release()):
-            if waiting is not None and not isinstance(waiting.message, PointCloud2):
+            if waiting is not None and not isinstance(waiting.content, Sweep):
                 self._publish(self._live.passed_through(waiting.message, NO_TIME))
         message = self._inbox.take()
         while message is not None:
