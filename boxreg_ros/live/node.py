@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 import gc
-import os
 from pathlib import Path
 import time
 from typing import Any
@@ -12,12 +11,14 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.warm_up import warm_up
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
+from boxreg_ros.live.recording import Recording
 from boxreg_ros.live.topics import Topics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
@@ -54,6 +55,8 @@ class BoxregNode(Node):
     ----------
     worker : Worker
         Registers boxes and publishes them, once ``worker.run`` runs in a thread.
+    recording : Recording
+        Writes the final boxes as label files, where that is asked for.
 
     Raises
     ------
@@ -85,7 +88,9 @@ class BoxregNode(Node):
         lidars = options.lidars
         self._inbox = Inbox(config.queue, max(1, len(lidars.topics)))
         self._topics = Topics(self, self._health)
-        markers = self._topics.publish('visualization_msgs/msg/MarkerArray', 'refined_markers', 10)
+        self._markers = self._topics.publish(
+            'visualization_msgs/msg/MarkerArray', 'refined_markers', 10
+        )
         self._diagnostics = self._topics.publish(
             'diagnostic_msgs/msg/DiagnosticArray', '/diagnostics', 10
         )
@@ -94,8 +99,17 @@ class BoxregNode(Node):
             self._health.report, options.convention, lidars, budget,
         )  # fmt: skip
         self.worker = Worker(
-            live, self._inbox, self._health, self.get_logger(), budget, options.backlog, markers
+            live,
+            self._inbox,
+            self._health,
+            self.get_logger(),
+            budget,
+            options.backlog,
+            self._markers,
         )
+        self.recording = Recording(self, self._inbox, self._health, lambda: self._settings)
+        if options.record_to:
+            self.recording.start()
         self._subscribe_to_points(options.points_type, lidars)
         self._subscribe_to_motion()
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -207,7 +221,8 @@ class BoxregNode(Node):
         config, options = self._settings
         path = Path(options.config_file).absolute()
         try:
-            _write_whole(path, parameters_yaml(config, options))
+            with written_whole(path) as file:
+                file.write(parameters_yaml(config, options))
         except (OSError, ValueError) as error:  # ValueError: a file name with a NUL character
             response.message = f'{error}; choose another config_file'
         else:
@@ -256,20 +271,16 @@ class BoxregNode(Node):
             **self._inbox.sizes(),
         }
         message = DiagnosticArray(
-            status=[self._health.status(f'{name}: registration', facts), topics]
+            status=[
+                self._health.status(f'{name}: registration', facts),
+                topics,
+                self.recording.diagnosis(f'{name}: recording'),
+            ]
         )
         message.header.stamp = now.to_msg()
         self._diagnostics.publish(message)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Write a file so that it appears whole or not at all."""
-    partial_path = path.parent / f'.{path.name}.partial'
-    try:
-        partial_path.write_text(text, encoding='utf-8')
-        os.replace(partial_path, path)
-    finally:
-        partial_path.unlink(missing_ok=True)
+        if self._markers.get_subscription_count() and self.worker.cloud_frame:
+            self.recording.show(self._markers, self.worker.cloud_frame)
 
 
 class _TransformsToInbox:

@@ -84,13 +84,29 @@ NODE_SETTINGS = (
     Setting(
         'config_file', 'boxreg_node.yaml', 'file that ~/save_config writes all parameters to'
     ),
+    Setting(
+        'record_to', '',
+        'folder to write the final boxes to as label files while driving; empty: none are written',
+    ),
+    Setting(
+        'record_formats', ('csv', 'openlabel'),
+        'label formats to record, see `boxreg formats`; csv is always written',
+    ),
+    Setting('record_points', False, 'record the clouds that the formats need, too'),
+    Setting(
+        'record_segment', '60 s',
+        'length of a segment of label files: a number with the unit s, min, h, MB or GB',
+    ),
+    Setting(
+        'record_camera', '', 'calibration file, for recorded formats in the frame of a camera'
+    ),
 )  # fmt: skip
 """Options of the node beside `Config`; `config.NODE_OPTIONS` holds their names."""
 
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
     *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
-    *('config_file',),
+    *('config_file', 'record_'),
 )
 """Prefixes of the parameters that may change while the node runs."""
 READ_ONLY = 'read-only: windows, threads or subscriptions are built from it at start-up'
@@ -117,6 +133,11 @@ class NodeOptions(NamedTuple):
     deadline: float
     backlog: float
     config_file: str
+    record_to: str
+    record_formats: tuple[str, ...]
+    record_points: bool
+    record_segment: str
+    record_camera: str
 
     @property
     def convention(self) -> Convention:

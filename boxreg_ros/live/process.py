@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 import os
 import signal
+import sys
 from threading import Event, Thread
 import time
 
@@ -18,6 +19,14 @@ from rclpy.utilities import remove_ros_args
 
 ENDING_TIME = 0.9
 """Time the threads have to end after a signal: 0.5 s to solve, 0.4 s for acknowledgements [s]."""
+
+RECORDING_TIME = 3.0
+"""
+Wait for the last segment of recorded labels [s].
+
+The recorder completes it in any case; launch files send SIGTERM after 5 s.
+
+"""
 
 
 def make_node(program: str, arguments: list[str]) -> BoxregNode:
@@ -77,6 +86,10 @@ def run(node: BoxregNode) -> list[Exception]:
     else:
         node.destroy_node()
         shut_down()
+    if not node.recording.wait(RECORDING_TIME):
+        print(
+            f'the recorder completes the last segment in {node.recording.folder}', file=sys.stderr
+        )
     return failures
 
 
