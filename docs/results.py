@@ -245,6 +245,12 @@ def _figures(results: Any) -> Iterable[str]:
     yield _table(['', ''], _flat(results))
 
 
+def _lidars(results: Any) -> Iterable[str]:
+    """Yield the accuracy of each way to record several LiDARs."""
+    rows = [[name, _number(found['bev']), _number(found['3d'])] for name, found in results.items()]
+    yield _table(['recorded', 'BEV', '3D'], rows)
+
+
 def _review(results: Any) -> Iterable[str]:
     """Yield the share of bad tracks at the top of each list, per recording and input."""
     for recording, inputs in results.items():
@@ -326,6 +332,15 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'One setting or constant halved or doubled. A positive loss means that the default is '
         'better.',
         _sensitivity,
+    ),
+    'lidars': (
+        'Several LiDARs',
+        'A simulated truck with four LiDARs at its corners, which turn a quarter of a period\n'
+        'apart, on three drives: a topic per LiDAR (*corners*), a cloud concatenated in the\n'
+        'frame of the truck with its info message (*concatenated*) and without\n'
+        '(*concatenated-alone*), and a single LiDAR on the roof. Input boxes and truth are the\n'
+        'same.',
+        _lidars,
     ),
     'covariance': (
         'Covariances',

@@ -26,6 +26,7 @@ from typing import Any
 
 from boxreg_ros.bench.common import add_json_argument, print_json
 from boxreg_ros.errors import BoxregError
+from boxreg_ros.labels.segments import read_index
 from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
 import numpy as np
 
@@ -41,6 +42,8 @@ ROAD_SIZE = 160.0  # side of the square with the other points [m]
 BOX_ERRORS = (0.1, 0.1, 0.05, 0.1, 0.1, 0.1, 0.0, 0.0, 0.03)  # standard deviations [m, rad]
 CDR_HEADER = 4  # bytes before the first member of a serialised message
 FIRST_MARKER = 8  # bytes before the first marker: the header and the length of the list
+COMPLETION_TIME = 60.0  # for the last segment of recorded labels [s]
+RECORDING_TURNS = 2  # runs without and with recording
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
 
 
@@ -67,6 +70,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--set', action='append', default=[], metavar='KEY:=VALUE', help='parameter of the node'
     )
+    parser.add_argument(
+        '--record', metavar='FORMAT,...',
+        help='also record labels in these formats, with their clouds: runs without and with it '
+        'alternate',
+    )  # fmt: skip
     add_json_argument(parser)
     parser.add_argument('--role', choices=('publish',), help=argparse.SUPPRESS)
     parser.add_argument('--log', type=Path, help=argparse.SUPPRESS)
@@ -89,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
     if args.role:
         publish(args)
         return 0
-    report = measure(args)
+    report = measure(args) if args.record is None else compare(args)
     if args.json:
         print_json(report)
         return 0
@@ -229,6 +237,24 @@ def _marker_array(boxes: Any) -> Any:
 # ----------------------------------------------------------------- process of the observer
 
 
+def compare(args: argparse.Namespace) -> dict[str, Any]:
+    """Measure without and with recording in turn, and return the latencies of all runs."""
+    formats = args.record
+    report: dict[str, Any] = {}
+    for turn in range(RECORDING_TURNS):
+        for args.record in (None, formats):
+            kind = 'recording' if args.record else 'not recording'
+            report |= {f'{kind} {turn + 1}: {k}': v for k, v in measure(args).items()}
+    for name in ('p50', 'p99'):
+        key = f': latency {name} [ms]'
+        sums = [
+            sum(report[f'{kind} {turn + 1}{key}'] for turn in range(RECORDING_TURNS))
+            for kind in ('recording', 'not recording')
+        ]
+        report[f'{name} with / without recording'] = sums[0] / sums[1]
+    return report
+
+
 def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str, Any]:
     """
     Run node and publisher, and return the report of the observer.
@@ -252,7 +278,9 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         arrivals = stack.enter_context(observer(keeps_messages))
-        parameters = [part for text in args.set for part in ('-p', text)]
+        labels = folder / 'labels'
+        given = [*args.set, *recording_parameters(args.record, labels)]
+        parameters = [part for text in given for part in ('-p', text)]
         node = stack.enter_context(
             process([*command, 'node', '--ros-args', *parameters], folder / 'node.log')
         )
@@ -264,11 +292,13 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
         load = os.getloadavg()[0]
         publisher = stack.enter_context(process([*command, *role, *options], folder / 'sent.log'))
         samples = []
+        recorder_samples = []
         while publisher.poll() is None:
             if node.poll() is not None:
                 raise BoxregError(f'the node ended: {(folder / "node.log").read_text()}')
             if arrivals['early']:
                 samples.append(vitals(node.pid))
+                recorder_samples += [vitals(child)[0] for child in children_of(node.pid)]
             time.sleep(SAMPLE_PERIOD)
         if publisher.returncode:
             raise BoxregError(f'the publisher failed: {(folder / "sent.log").read_text()}')
@@ -276,14 +306,16 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
         sent = np.loadtxt(folder / 'sent', dtype=np.int64, ndmin=2)
         begin = time.monotonic()
         node.send_signal(signal.SIGINT)
-        node.wait(timeout=10.0)
+        node.wait(timeout=30.0)
         shutdown_time = time.monotonic() - begin
         time.sleep(0.5)
         log = (folder / 'node.log').read_text()
+        recorded = {} if args.record is None else recording(labels, recorder_samples)
     return {
         'load before, during': f'{load:.2f}, {os.getloadavg()[0]:.2f}',
         **results(sent, arrivals, args.rate),
         **growth(samples),
+        **recorded,
         'shutdown [s]': shutdown_time,
         'exit status': node.returncode,
         'log lines': len(log.splitlines()),
@@ -344,6 +376,40 @@ def results(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, float
     return report
 
 
+def recording_parameters(formats: str | None, folder: Path) -> list[str]:
+    """Return the parameters of a node that records labels and clouds; none without formats."""
+    if formats is None:
+        return []
+    return [f'record_to:={folder}', f'record_formats:=[{formats}]', 'record_points:=true']
+
+
+def recording(folder: Path, memory: list[float]) -> dict[str, float]:
+    """
+    Return what was recorded, and the memory of the recorder.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the segments.
+    memory : list of float
+        Resident memory of the recorder every `SAMPLE_PERIOD` [MB].
+
+    """
+    deadline = time.monotonic() + COMPLETION_TIME
+    while list(folder.glob('.segment_*')) and time.monotonic() < deadline:
+        time.sleep(0.1)  # the recorder completes the last segment after the node has ended
+    rows = read_index(folder)
+    memory = memory or [0.0]
+    return {
+        'recorded box arrays': float(sum(row.frames for row in rows)),
+        'recorded clouds': float(sum(row.clouds for row in rows)),
+        'recorded segments': float(len(rows)),
+        'recorded [MB]': 1e-6 * sum(row.bytes for row in rows),
+        'recorder memory in the middle [MB]': memory[len(memory) // 2],
+        'recorder memory at the end [MB]': memory[-1],
+    }
+
+
 def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
     """
     Return memory, handles, threads and cores used by the node.
@@ -366,6 +432,11 @@ def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
         'threads': float(samples[end][2]),
         'cores used': cpu_time / SAMPLE_PERIOD / max(1, end - begin),
     }
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the processes that a process has started."""
+    return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
 def vitals(pid: int) -> tuple[float, int, int, float]:

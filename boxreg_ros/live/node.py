@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import ExitStack
 from functools import partial
 import gc
-import os
 from pathlib import Path
 import time
 from typing import Any
@@ -13,12 +12,14 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.warm_up import warm_up
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
+from boxreg_ros.live.recording import Recording
 from boxreg_ros.live.topics import Topics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
@@ -58,6 +59,8 @@ class BoxregNode(Node):
     ----------
     worker : Worker
         Registers boxes and publishes them in the thread of `run_worker`; made by `open`.
+    recording : Recording
+        Writes the final boxes as label files, where that is asked for.
 
     Raises
     ------
@@ -80,6 +83,7 @@ class BoxregNode(Node):
         self._health = Health(self.get_logger())
         config, options = self._settings
         self._inbox = Inbox(config.queue, max(1, len(options.lidars.topics)))
+        self.recording = Recording(self, self._inbox, self._health, lambda: self._settings)
         self._opened = ExitStack()
 
     def configure(self) -> None:
@@ -118,14 +122,18 @@ class BoxregNode(Node):
         _, options = self._settings
         self._topics = Topics(self, self._health)
         self._opened.callback(self._topics.close)
-        markers = self._topics.publish('visualization_msgs/msg/MarkerArray', 'refined_markers', 10)
+        self._markers = self._topics.publish(
+            'visualization_msgs/msg/MarkerArray', 'refined_markers', 10
+        )
         self._diagnostics = self._topics.publish(
             'diagnostic_msgs/msg/DiagnosticArray', '/diagnostics', 10
         )
         self.worker = Worker(
             self._live, self._inbox, self._health, self.get_logger(), self._budget,
-            options.backlog, markers,
+            options.backlog, self._markers,
         )  # fmt: skip
+        if options.record_to:
+            self.recording.start()
         self._subscribe_to_points(options.points_type, options.lidars)
         self._subscribe_to_motion()
         for name, callback in (
@@ -256,7 +264,8 @@ class BoxregNode(Node):
         config, options = self._settings
         path = Path(options.config_file).absolute()
         try:
-            _write_whole(path, parameters_yaml(config, options))
+            with written_whole(path) as file:
+                file.write(parameters_yaml(config, options))
         except (OSError, ValueError) as error:  # ValueError: a file name with a NUL character
             response.message = f'{error}; choose another config_file'
         else:
@@ -305,20 +314,16 @@ class BoxregNode(Node):
             **self._inbox.sizes(),
         }
         message = DiagnosticArray(
-            status=[self._health.status(f'{name}: registration', facts), topics]
+            status=[
+                self._health.status(f'{name}: registration', facts),
+                topics,
+                self.recording.diagnosis(f'{name}: recording'),
+            ]
         )
         message.header.stamp = now.to_msg()
         self._diagnostics.publish(message)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Write a file so that it appears whole or not at all."""
-    partial_path = path.parent / f'.{path.name}.partial'
-    try:
-        partial_path.write_text(text, encoding='utf-8')
-        os.replace(partial_path, path)
-    finally:
-        partial_path.unlink(missing_ok=True)
+        if self._markers.get_subscription_count() and self.worker.cloud_frame:
+            self.recording.show(self._markers, self.worker.cloud_frame)
 
 
 class _TransformsToInbox:

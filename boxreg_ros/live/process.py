@@ -7,11 +7,13 @@ from collections.abc import Callable
 from functools import partial
 import os
 import signal
+import sys
 from threading import Event, Thread
 import time
 
 from boxreg_ros.live.lifecycle import BoxregLifecycleNode
 from boxreg_ros.live.node import BoxregNode
+from boxreg_ros.live.recording import RECORDING_TIME
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
@@ -85,6 +87,10 @@ def run(node: BoxregNode) -> list[Exception]:
     else:
         node.destroy_node()
         shut_down()
+    if not node.recording.wait(RECORDING_TIME):
+        print(
+            f'the recorder completes the last segment in {node.recording.folder}', file=sys.stderr
+        )
     return failures
 
 

@@ -9,7 +9,7 @@ from threading import Event, Thread
 import time
 
 from boxreg_ros.config import Config, settings
-from boxreg_ros.io.markers import MarkerBoard, NAMESPACES
+from boxreg_ros.io.markers import BOX_NAMESPACES, MarkerBoard
 from boxreg_ros.live.topics import import_message
 from boxreg_ros.offline.calibrate import calibrated, GAPS, Measured, write_settings
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
@@ -88,7 +88,7 @@ def test_odometry_replaces_tf(graph, tmp_path):
     array = markers.from_msg(early[-1])
     assert array.frame_id == 'lidar' and array.track_ids == ('1',)
     added = [{m.ns for m in message.markers if m.action == 0} for message in shown[:6]]
-    assert added == [set(NAMESPACES)] * 6
+    assert added == [set(BOX_NAMESPACES)] * 6
     colours = {(m.ns, m.color.g) for m in shown[3].markers if m.ns in ('input', 'refined')}
     assert len({green for _, green in colours}) == 2
     numbers = {m.text: m.id for m in shown[3].markers if m.ns == 'id'}
@@ -513,7 +513,7 @@ def test_markers_keep_one_id_per_track():
     second = board.update(given, refined_of(given, KEPT, KEPT)).markers
     assert {m.id for m in second if m.action == 0} == {1}
     assert {(m.ns, m.id) for m in second if m.action == 2} == {
-        (ns, number) for ns in NAMESPACES for number in (0, 2, 3)
+        (ns, number) for ns in BOX_NAMESPACES for number in (0, 2, 3)
     }
     assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
     assert board.is_showing and board.clear() and not board.is_showing
