@@ -22,7 +22,11 @@ setup(
     # Read by `boxreg bench node` and `relabel --report`, without an installation too.
     package_data={NAME: ['py.typed', 'share/*'], 'msg_adapters': ['py.typed']},
     entry_points={
-        'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.live.main:main']
+        'console_scripts': [
+            f'boxreg = {NAME}.cli:main',
+            f'boxreg_node = {NAME}.live.main:main',
+            f'boxreg_lifecycle_node = {NAME}.live.main:lifecycle',
+        ]
     },
     # Where `ros2 run` looks. Only colcon installs by these commands; pip has its own place.
     options={

@@ -13,8 +13,10 @@ so its axes are those of the map, and clouds are map coordinates minus its posit
 import json
 
 import numpy as np
-import pyarrow
-from pyarrow import feather
+import pytest
+
+pyarrow = pytest.importorskip('pyarrow', reason='pyarrow is not installed')
+feather = pytest.importorskip('pyarrow.feather')
 
 FRAMES = 12
 STEP_NS = 100_000_000
