@@ -132,6 +132,8 @@ class BoxregNode(Node):
             self._live, self._inbox, self._health, self.get_logger(), self._budget,
             options.backlog, self._markers,
         )  # fmt: skip
+        self.recording.open()
+        self._opened.callback(self.recording.close)
         if options.record_to:
             self.recording.start()
         self._subscribe_to_points(options.points_type, options.lidars)
