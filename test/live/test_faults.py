@@ -245,9 +245,9 @@ def without(topic, first, last, sweeps):
         pytest.param(
             without('/points', 6, 9, 16), [0, 0, *[2] * 4, *[0] * 4, *[2] * 6], id='LiDAR restarts'
         ),
-        # The first transform is extrapolated by 0.1 s.
+        # The last transform is extrapolated by up to 0.2 s.
         pytest.param(
-            without('/tf', 4, 13, 20), [0, 0, *[2] * 3, *[0] * 9, *[2] * 6], id='TF stops for 1 s'
+            without('/tf', 4, 13, 20), [0, 0, *[2] * 4, *[0] * 8, *[2] * 6], id='TF stops for 1 s'
         ),
     ],
 )
