@@ -31,7 +31,8 @@ REMOVED = {'solver.history': 'no result depends on it'}
 """Settings of earlier versions that are gone, and why."""
 
 NODE_OPTIONS = (
-    *('boxes_type', 'pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
+    *('boxes_type', 'points', 'sensor_frames', 'points_info'),
+    *('pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
     *('output_frame', 'transform_timeout', 'backlog', 'config_file'),
     *('use_sim_time', 'start_type_description_service', 'qos_overrides'),
 )
@@ -343,6 +344,13 @@ class Config:
         0.06,
         'maximum time offset between a box array and a sweep; points are motion-compensated to '
         'the box stamp',
+        's',
+        0.0,
+        10.0,
+    )
+    merge_span: float = setting(
+        0.1,
+        'maximum time between the clouds of several LiDARs that are merged into one sweep',
         's',
         0.0,
         10.0,

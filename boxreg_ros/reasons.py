@@ -70,6 +70,30 @@ REASONS = {
         'is written in its own frame',
         CHECK_TRANSFORMS,
     ),
+    'sensor_without_transform': Reason(
+        'cloud',
+        'no transform to the frame of a LiDAR; the origin of the frame of the cloud is used '
+        'as its position',
+        'publish the frames of the LiDARs on `/tf_static`, or correct `sensor_frames`',
+    ),
+    'cloud_without_info': Reason(
+        'cloud',
+        'concatenated, and no info message with its stamp and size arrived; the origin of its '
+        'frame is used as the position of the LiDARs',
+        'record or publish the info message with the cloud; raise `transform_timeout` if it is '
+        'late',
+    ),
+    'cloud_late': Reason(
+        'cloud',
+        'of one of several LiDARs, arrived after the others of its time were merged',
+        'synchronise the clocks of the LiDARs; raise `merge_span` if their stamps are further '
+        'apart than that',
+    ),
+    'cloud_missing': Reason(
+        'cloud',
+        'one of several LiDARs has no cloud for a sweep; the others were used',
+        'check the LiDAR and its driver; leave its topic out of `points` if it is off',
+    ),
     'time_jump': Reason(
         'jump',
         'stamps went back by more than a second; tracks and transforms were reset',

@@ -92,9 +92,17 @@ class Sweep:
         Time of measurement of each point relative to the stamp [s].
     origin : array, shape (3,)
         Position of the sensor at the stamp [m]; zero in the frame of the sensor; NaN where
-        unknown.
+        unknown. The mean of `origins` for several sensors.
     is_dropped : bool
         True for a sweep whose points were lost: boxes of its stamp do not wait for another.
+    topic : str
+        Topic that it was received on; empty if there is only one topic of point clouds.
+    origins : array, shape (K, 3), or None
+        Positions of several sensors [m]; None if all points are of the one at `origin`.
+    sensors : array, shape (M,), or None
+        Row of `origins` of the sensor that measured each point; None without `origins`.
+    rows : array, shape (M,), or None
+        Row of each point in its message; None where no point was left out.
 
     """
 
@@ -104,6 +112,10 @@ class Sweep:
     times: Floats | None = None
     origin: Floats = field(default_factory=lambda: np.zeros(3))
     is_dropped: bool = False
+    topic: str = ''
+    origins: Floats | None = None
+    sensors: NDArray[np.uint8] | None = None
+    rows: Ints | None = None
 
     def __post_init__(self) -> None:
         """Check the shapes."""
@@ -111,6 +123,12 @@ class Sweep:
             raise ShapeError(f'points: expected shape (M, 3), got {self.points.shape}')
         if self.times is not None and self.times.shape != self.points.shape[:1]:
             raise ShapeError(f'times: expected {self.points.shape[:1]}, got {self.times.shape}')
+        if (self.origins is None) != (self.sensors is None):
+            raise ShapeError('origins and sensors: expected both or neither, got one of them')
+        if self.sensors is not None and self.sensors.shape != self.points.shape[:1]:
+            raise ShapeError(
+                f'sensors: expected {self.points.shape[:1]}, got {self.sensors.shape}'
+            )
 
 
 @dataclass(frozen=True, slots=True)

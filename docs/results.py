@@ -5,7 +5,8 @@ Make `docs/results.md` from the measurements stored in `docs/results/`.
     python docs/results.py --check    exit with status 1 if the page is not what would be written
 
 A measurement is the output of ``boxreg bench ... --json``, stored as ``KIND_DATA.json``, for
-example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a --json``.
+example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a --json``. A text of the
+name ``KIND.md`` follows the tables of its kind.
 
 """
 
@@ -85,6 +86,9 @@ def page(store: Path) -> str:
                 parts.append(f'### {DATA[data]}\n')
             parts.append(_origin(document))
             parts += [f'{part}\n' for part in render(document['results'])]
+        verdict = store / f'{kind}.md'
+        if verdict.is_file():
+            parts.append(verdict.read_text(encoding='utf-8'))
     parts.append((store / 'dead_ends.md').read_text(encoding='utf-8'))
     return '\n'.join(parts)
 

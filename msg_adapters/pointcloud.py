@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
-from boxreg_ros.structures import Floats, Sweep
+from boxreg_ros.structures import Floats, Ints, Sweep
 from msg_adapters.poses import stamp_ns
 import numpy as np
 from numpy.typing import NDArray
 
 DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 """``PointField.datatype`` -> dtype of numpy."""
-POINT_TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time')
+POINT_TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time', 'time_stamp')
 TIME_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 """Possible units of point times [s], coarsest first."""
 INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
@@ -36,12 +36,12 @@ def from_msg(msg: Any) -> Sweep:
 
     Notes
     -----
-    Times are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``.
-    Unit and origin differ between drivers, so both are derived from type and magnitude. A float64
-    field within 1 s of the stamp in s, ms, us or ns is absolute (Hesai, RoboSense, Livox). Other
-    fields are relative to the stamp, in the coarsest of these units in which all points are
-    within 1 s of it; seconds only for floats (Velodyne: s, Ouster: ns). If none fits, ``times``
-    is None. A point whose time is not finite gets the time of the stamp.
+    Times are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``,
+    ``time_stamp``. Unit and origin differ between drivers, so both are derived from type and
+    magnitude. A float64 field within 1 s of the stamp in s, ms, us or ns is absolute (Hesai,
+    RoboSense, Livox). Other fields are relative to the stamp, in the coarsest of these units in
+    which all points are within 1 s of it; seconds only for floats (Velodyne: s, Ouster: ns). If
+    none fits, ``times`` is None. A point whose time is not finite gets the time of the stamp.
 
     """
     stamp = stamp_ns(msg.header)
@@ -66,6 +66,16 @@ def from_msg(msg: Any) -> Sweep:
     if not is_finite.all():
         columns = columns[:, is_finite]
     return Sweep(stamp, msg.header.frame_id, columns.T, times)
+
+
+def finite_rows(msg: Any) -> Ints | None:
+    """Return the rows (M,) of the points of `from_msg` in the message; None if these are all."""
+    if not msg.width * msg.height:
+        return None
+    fields = _fields(msg)
+    table = _table(msg, [fields[key] for key in 'xyz'])
+    is_finite = np.logical_and.reduce([np.isfinite(table[key].reshape(-1)) for key in 'xyz'])
+    return None if is_finite.all() else np.flatnonzero(is_finite)
 
 
 def intensities(msg: Any) -> Floats | None:

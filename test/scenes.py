@@ -127,7 +127,7 @@ def problem_of(boxes, **changes):
         'start': boxes,
         'valid': torch.ones(B, N, dtype=torch.bool),
         'times': 0.1 * torch.arange(N, dtype=torch.float64).expand(B, N),
-        'origins': torch.full((B, N, 3), torch.nan, dtype=torch.float64),
+        'origins': torch.full((B, N, 1, 3), torch.nan, dtype=torch.float64),
         'ground': torch.full((B, N), torch.nan, dtype=torch.float64),
         'prior_mean': torch.zeros(B, PRIOR_SIZE, dtype=torch.float64),
         'prior_information': torch.zeros(B, PRIOR_SIZE, PRIOR_SIZE, dtype=torch.float64),
@@ -140,6 +140,8 @@ def problem_of(boxes, **changes):
         given['class_numbers'][:, CLASS_NUMBERS.index(name)] = torch.as_tensor(values)
     mask = torch.as_tensor(changes.pop('mask', points[..., 0] != PADDING_POSITION))
     delays = torch.as_tensor(changes.pop('delays', torch.zeros(mask.shape, dtype=torch.float64)))
+    if 'origins' in changes:  # (B, N, 3): of one sensor
+        changes['origins'] = np.expand_dims(changes['origins'], -2)
     more = {name: torch.as_tensor(np.asarray(value)) for name, value in changes.items()}
     return Problem(**{**given, **more, **returns_of(points, mask, delays)})
 

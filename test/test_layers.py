@@ -15,11 +15,15 @@ MAY_IMPORT = {
     'core': {BASE},
     'io': {BASE, 'core', 'msg_adapters'},
     'labels': {BASE, 'core', 'io', 'msg_adapters'},
+    'datasets': {BASE, 'core', 'io', 'labels', 'msg_adapters'},
     'live': {BASE, 'core', 'io', 'msg_adapters'},
     'simulation': {BASE, 'core', 'io', 'msg_adapters'},
     'tracks': {BASE, 'core', 'io', 'msg_adapters'},
     'review': {BASE, 'core', 'io', 'msg_adapters'},
-    'offline': {BASE, 'core', 'io', 'labels', 'simulation', 'tracks', 'review', 'msg_adapters'},
+    'offline': {
+        *(BASE, 'core', 'io', 'labels', 'datasets', 'simulation', 'tracks', 'review'),
+        'msg_adapters',
+    },
 }
 MAY_IMPORT['bench'] = {*MAY_IMPORT['offline'], 'offline'}
 FRONT_DOORS = {ROOT / 'boxreg_ros' / '__init__.py', ROOT / 'boxreg_ros' / 'cli.py'}

@@ -4,6 +4,7 @@ import csv
 import json
 
 from boxreg_ros.cli import main
+from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, ADAPTERS, WITHOUT_IDS
 from msg_adapters.poses import quaternions_of
 import numpy as np
@@ -79,6 +80,49 @@ def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
     difference = np.abs(np.array([found[k] for k in keys]) - [expected[k] for k in keys])
     assert difference.max() < 1e-6
     assert [stamp_of(message) for message in final] == sorted({stamp for stamp, _ in expected})
+
+
+def final_of_node(tmp_path, records, *parameters):
+    """Return the final boxes of the node for records, as of `as_published`, and its output."""
+    with graph_in(tmp_path) as graph:
+        options = ['output_frame:=odom', 'transform_timeout:=20.0', 'backlog:=60.0']
+        options += [f'{key}:={value}' for key, value in SETTINGS.items()]
+        topics = {record.topic for record in records if record.topic not in ('/tf', '/tf_static')}
+        options += [
+            f'qos_overrides.{topic}.subscription.reliability:=reliable' for topic in sorted(topics)
+        ]
+        publishers_for(graph, records)
+        early = graph.collect(DETECTIONS, '/refined_boxes')
+        final = graph.collect(DETECTIONS, '/refined_boxes_final')
+        every = [part for option in [*options, *parameters] for part in ('-p', option)]
+        node = graph.start(*every)
+        graph.wait_until_connected()
+        play(graph, records, early)
+        node.stop()
+        assert node.popen.returncode == 0, node.output()
+        return as_published(final, DETECTIONS), node.output()
+
+
+def assert_equal_boxes(found, expected):
+    assert found.keys() == expected.keys()
+    keys = sorted(expected)
+    difference = np.abs(np.array([found[k] for k in keys]) - [expected[k] for k in keys])
+    assert difference.max() < 1e-6
+
+
+@pytest.mark.parametrize('clouds', ['topics', 'info'])
+def test_two_lidars_give_the_same_boxes_live_and_offline(tmp_path, clouds):
+    path = LidarDrive(8, clouds).write(tmp_path / 'drive')
+    options = ['--points', '/front', '--points', '/rear'] if clouds == 'topics' else []
+    expected = relabelled(path, tmp_path / 'out', *options)
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    assert summary['sweeps'] == 8
+    parameters = ['points_info:=/points_info']
+    if clouds == 'topics':
+        assert summary['lidars'] == {'/front': {'merged': 8}, '/rear': {'merged': 8}}
+        parameters = ['points:=[/front, /rear]']
+    found, _ = final_of_node(tmp_path, records_of(path), *parameters)
+    assert_equal_boxes(found, expected)
 
 
 @pytest.mark.parametrize('type_name', [t for t in ADAPTERS if t not in (DETECTIONS, MARKERS)])

@@ -16,8 +16,8 @@ from typing import Any
 from boxreg_ros.bench.common import add_scope_arguments, in_scope, line, print_json
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.box_scores import Scores, summarise
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import Scores, summarise
 import numpy as np
 from tqdm import tqdm
 

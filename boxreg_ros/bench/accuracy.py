@@ -25,8 +25,8 @@ from boxreg_ros.bench.common import (
 )
 from boxreg_ros.bench.methods import add_method_argument, run_methods
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.box_scores import groups, match, Matches, RECALLS, Scores, summarise
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import groups, match, Matches, RECALLS, Scores, summarise
 from boxreg_ros.structures import Floats
 import numpy as np
 

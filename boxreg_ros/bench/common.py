@@ -13,7 +13,8 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.evaluate import finite, match, Matches
+from boxreg_ros.offline.box_scores import match, Matches
+from boxreg_ros.offline.evaluate import finite
 from tqdm import tqdm
 
 NAME_WIDTH = 22  # characters of the first column

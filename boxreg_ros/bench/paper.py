@@ -13,8 +13,8 @@ from boxreg_ros.bench.common import add_json_argument, line, print_json, progres
 from boxreg_ros.bench.methods import add_method_argument, Methods, run_methods
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.box_scores import match, Matches
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import match, Matches
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import Floats, LENGTH, ROLL, WIDTH

@@ -41,8 +41,8 @@ from boxreg_ros.bench.common import (
 )
 from boxreg_ros.config import Config, KINDS, Setting
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import match, summarise
 from boxreg_ros.structures import BoxArray
 import numpy as np
 import torch
@@ -51,7 +51,8 @@ FACTORS = (0.5, 2.0)
 CORE = 'boxreg_ros.core'
 PACKAGE = 'boxreg_ros'
 CONSTANT_NAME = re.compile(r'_?[A-Z][A-Z0-9_]*')
-OTHER_OBJECTIVE = 'paper'  # group of settings that the default objective does not read
+PAPER = 'paper'
+"""The objective of the paper, and the group of settings that it alone reads."""
 
 SourcePlace = tuple[str, int, int]
 """Where a number stands in a source: module, line and column."""
@@ -80,6 +81,30 @@ class Variation:
     default: float
     value: float
     place: SourcePlace | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """
+    What is measured.
+
+    Attributes
+    ----------
+    config : Config
+        The settings that are varied.
+    estimate : str
+        ``early``, ``final`` or ``track``.
+    min_points : int
+        Fewest points of true boxes that count.
+    classes : sequence of str
+        Words of the classes that count, as in `match`.
+
+    """
+
+    config: Config
+    estimate: str
+    min_points: int
+    classes: Sequence[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,11 +155,13 @@ def variations_of_settings(config: Config, kinds: Sequence[str] = KINDS) -> list
     """
     Return every numeric setting halved and doubled.
 
-    Left out are settings of the other objective, of kinds of objects that are not in `kinds`, and
-    values that the bounds or rounding leave as they are.
+    Left out are settings of the paper's objective where it is not in use, of kinds of objects
+    that are not in `kinds`, and values that the bounds or rounding leave as they are.
 
     """
-    unread = {OTHER_OBJECTIVE, *KINDS} - set(kinds)
+    unread = set(KINDS) - set(kinds)
+    if config.objective != PAPER:
+        unread.add(PAPER)
     found = []
     for item, default in config.items():
         group = item.name.partition('.')[0]
@@ -366,9 +393,7 @@ def _is_renewed(name: str) -> bool:
 # ----------------------------------------------------------------------------------- runs
 
 
-def measure(
-    drive: Drive, scope: tuple[int, Sequence[str]], estimate: str, variation: Variation | None
-) -> Outcome:
+def measure(drive: Drive, measurement: Measurement, variation: Variation | None) -> Outcome:
     """
     Return the mean IoU of one run.
 
@@ -376,16 +401,14 @@ def measure(
     ----------
     drive : Drive
         Sweeps, boxes and truth.
-    scope : tuple of int and sequence of str
-        Fewest points and class words of true boxes that count, as in `match`.
-    estimate : str
-        ``early``, ``final`` or ``track``.
+    measurement : Measurement
+        Settings, estimate and scope.
     variation : Variation or None
-        None for the defaults.
+        None for the settings as they are.
 
     """
-    run = 'track' if estimate == 'track' else 'final'  # the run for final has the early boxes too
-    config = Config(estimate=run)
+    config = measurement.config
+    estimate = measurement.estimate
     try:
         if variation is None:
             predicted = drive.registered(config)[estimate]
@@ -397,6 +420,7 @@ def measure(
                 # The class that the changed core is imported by; it reads attributes only.
                 changed: Any = import_module(Drive.__module__).Drive
                 predicted = changed.registered(drive, config)[estimate]
+        scope = (measurement.min_points, measurement.classes)
         scores = summarise(match(predicted, drive.truth, *scope))
     except Exception as error:  # a number out of its range may fail anywhere in the core
         return Outcome(np.nan, np.nan, f'{type(error).__name__}: {error}'.splitlines()[0])
@@ -405,14 +429,14 @@ def measure(
 
 def run_all(
     drives: Mapping[str, Drive],
+    measurement: Measurement,
     variations: Sequence[Variation],
     args: argparse.Namespace,
 ) -> tuple[dict[str, Outcome], list[list[Outcome]]]:
-    """Return the outcome of each drive with the defaults, and per variation those of all."""
-    scope = (args.min_points, class_words(args))
+    """Return the outcome of each drive without variation, and per variation those of all."""
     wanted: list[Variation | None] = [None, *variations]
     jobs = [(name, variation) for variation in wanted for name in drives]
-    initial = (dict(drives), scope, args.estimate)
+    initial = (dict(drives), measurement)
     # Fresh processes: each has the memory of one run, and no threads are copied into it.
     with (
         get_context('spawn').Pool(args.workers, _start_worker, initial) as pool,
@@ -429,13 +453,9 @@ def run_all(
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(
-    drives: dict[str, Drive], scope: tuple[int, Sequence[str]], estimate: str
-) -> None:
+def _start_worker(drives: dict[str, Drive], measurement: Measurement) -> None:
     torch.set_num_threads(1)
-    _worker['run'] = {
-        name: partial(measure, drive, scope, estimate) for name, drive in drives.items()
-    }
+    _worker['run'] = {name: partial(measure, drive, measurement) for name, drive in drives.items()}
 
 
 def _work(job: tuple[str, Variation | None]) -> Outcome:
@@ -477,6 +497,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scope_arguments(parser)
     add_estimate_argument(parser)
     parser.add_argument(
+        '--objective',
+        choices=('robust', PAPER),
+        default='robust',
+        help='objective whose numbers are varied (default: robust)',
+    )
+    parser.add_argument(
         '--only', nargs='+', default=['*'], metavar='PATTERN',
         help="only settings and constants of these names, as in 'faces.*' or 'lbfgs.*'",
     )  # fmt: skip
@@ -502,8 +528,12 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f'--workers: expected 1 or more, got {args.workers}')
     drives = {str(folder): Drive.read(folder) for folder in args.data}
     arrays = [array for drive in drives.values() for array in drive.boxes]
+    # The run for the final estimate has the early one too.
+    run_estimate = 'track' if args.estimate == 'track' else 'final'
+    config = Config(objective=args.objective, estimate=run_estimate)
+    measurement = Measurement(config, args.estimate, args.min_points, class_words(args))
     everything = [
-        *variations_of_settings(Config(), kinds_of(arrays, Config())),
+        *variations_of_settings(config, kinds_of(arrays, config)),
         *variations_of_constants(),
     ]
     chosen = [
@@ -514,11 +544,12 @@ def run(args: argparse.Namespace) -> int:
     if not chosen:
         names = ', '.join(dict.fromkeys(variation.name for variation in everything))
         raise ConfigError(f'--only {" ".join(args.only)}: matches none of {names}')
-    baseline, outcomes = run_all(drives, chosen, args)
+    baseline, outcomes = run_all(drives, measurement, chosen, args)
     found = losses(chosen, baseline, outcomes)
     if args.json:
         print_json(
             {
+                'objective': args.objective,
                 'estimate': args.estimate,
                 'baseline': {name: asdict(outcome) for name, outcome in baseline.items()},
                 'losses': [asdict(loss) for loss in found],

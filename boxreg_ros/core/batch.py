@@ -102,8 +102,8 @@ class Problem(NamedTuple):
         The returns of all observations.
     first, counts : Tensor, shape (B, N)
         First of the returns of each observation, and their number.
-    origins : Tensor, shape (B, N, 3)
-        Sensor minus the centre of the input box [m]; NaN if unknown.
+    origins : Tensor, shape (B, N, K, 3)
+        Each sensor that sees the object minus the centre of the input box [m]; NaN if unknown.
     ground : Tensor, shape (B, N)
         Height of the road minus that of the input centre [m]; NaN if unknown.
     prior_mean, prior_information : Tensor, shapes (B, 34) and (B, 34, 34)

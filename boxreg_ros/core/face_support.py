@@ -117,7 +117,7 @@ class FaceObservations(NamedTuple):
 
 def visibility(problem: Problem) -> Tensor:
     """
-    Return the visibility of each face from the sensor, shape (B, N, 6).
+    Return the visibility of each face from the sensor that sees it best, shape (B, N, 6).
 
     The tangent of the angle between the plane of the face and the line of sight, in the
     horizontal for the four upright faces: positive where the sensor is on the outer side,
@@ -127,18 +127,18 @@ def visibility(problem: Problem) -> Tensor:
 
     """
     R = rotation_from_rpy(problem.pose[..., 3:])
-    toward = problem.origins
+    toward = problem.origins  # (B, N, K, 3)
     is_known = toward.isfinite().all(-1, keepdim=True)
     if not is_known.all():
         points, mask, _ = problem.padded()
         weight = mask.to(points)[..., None]
         mean = (points * weight).sum(-2) / weight.sum(-2).clamp(min=1)
-        toward = torch.where(is_known, toward, 1e6 * mean)
-    toward = (toward[..., None, :] @ R)[..., 0, :]
-    half = problem.boxes[..., 3:6] / 2
+        toward = torch.where(is_known, toward, 1e6 * mean[..., None, :])
+    toward = (toward[..., None, :] @ R[..., None, :, :])[..., 0, :]
+    half = problem.boxes[..., None, 3:6] / 2
     outward = toward[..., [0, 0, 1, 1]] * FACE_SIGN[:4].to(R) - half[..., [0, 0, 1, 1]]
     along = toward[..., [1, 1, 0, 0]].abs() - half[..., [1, 1, 0, 0]]
-    sides = outward / along.clamp(min=MIN_ALONG)
+    sides = (outward / along.clamp(min=MIN_ALONG)).amax(-2)
     roof_and_bottom = sides.new_tensor([9.0, -9.0]).expand(*sides.shape[:2], 2)
     return torch.cat([sides, roof_and_bottom], -1)
 
@@ -148,14 +148,16 @@ def inset_shares(problem: Problem, tangent: Tensor, config: Config) -> Tensor:
     Return the multiples of the two insets of `FaceOffsets` (M11), shape (2, B, N, 6).
 
     Of the occlusion inset, by the `tangent` (B, N, 6) of `visibility`: a body is round at its
-    edges. And of the range inset: fewer points reach the outermost parts of a distant object.
+    edges. And of the range inset: fewer points reach the outermost parts of an object that is
+    distant from its nearest sensor.
 
     """
     shifted = tangent + tangent.new_tensor(EDGE_LEAD)
     occluded = 0.5 - 0.5 * shifted / (shifted.square() + VISIBILITY_SOFTNESS).sqrt()
     if not config.ingredients.range_inset:
         return torch.stack([occluded, torch.zeros_like(occluded)])
-    beyond = problem.origins[..., :2].norm(dim=-1, keepdim=True).nan_to_num() - NEAR_RANGE
+    reach = problem.origins[..., :2].norm(dim=-1).amin(-1, keepdim=True)
+    beyond = reach.nan_to_num() - NEAR_RANGE
     distant = (1 - occluded) * (beyond / RANGE_SPAN).clamp(0, MAX_RANGE_SHARE)
     return torch.stack([occluded, distant])
 

@@ -25,6 +25,8 @@ MIN_ROAD_POINTS = 5
 """Fewer points beside a box give no road height; chosen."""
 GROUND_CLEARANCE = 0.2
 """Points less than this above the road may be of the road [m]; chosen: below most bumpers."""
+MIN_SENSOR_PART = 0.1
+"""Least part of the points of an object by a sensor that sees it; chosen: fewer are stray."""
 OWNERSHIP_TOLERANCE = 0.2
 """A point less deep in one of two boxes, by less than this, belongs to both [m]; chosen."""
 
@@ -64,8 +66,8 @@ class Observation(NamedTuple):
         Points near the box and above the road, minus its centre; axes of the fixed frame [m].
     delays : array, shape (M,)
         Time of each point relative to the stamp [s]; 0 without `sampling.deskew`.
-    origin : array, shape (3,)
-        Sensor minus centre [m]; NaN where unknown.
+    origins : array, shape (K, 3)
+        Each sensor that sees the object minus centre [m]; NaN where unknown.
     ground : float
         Height of the road beside the box minus z of the centre [m]; NaN where not found.
     num_points : int
@@ -81,7 +83,7 @@ class Observation(NamedTuple):
     box: Floats
     points: NDArray[np.float32]
     delays: NDArray[np.float32]
-    origin: Floats
+    origins: Floats
     ground: float
     num_points: int
     sight: float = 0.0
@@ -92,7 +94,7 @@ class Observation(NamedTuple):
         return self._replace(
             box=box,
             points=self.points + shift.astype(np.float32),
-            origin=self.origin + shift,
+            origins=self.origins + shift,
             ground=self.ground + float(shift[2]),
         )
 
@@ -142,13 +144,31 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
         boxes,
         [points[part] for part in parts],
         [delays[part] for part in parts],
-        sweep.origin - centers,
+        _origins(sweep, rows, parts, centers),
         ground.tolist(),
         own.num_inside.tolist(),
         sights.tolist(),
         strict=True,
     )
     return [Observation(stamp_ns, *values) for values in columns]
+
+
+def _origins(sweep: Sweep, rows: Ints, parts: list[slice], centers: Floats) -> list[Floats]:
+    """
+    Return the sensors that see each of n objects, minus its centre, n arrays (K, 3) [m].
+
+    These are the sensors with `MIN_SENSOR_PART` of the points in `rows[part]`; all of them for an
+    object without points.
+
+    """
+    if sweep.origins is None or sweep.sensors is None:
+        return list((sweep.origin - centers)[:, None])
+    origins = []
+    for part, center in zip(parts, centers, strict=True):
+        counts = np.bincount(sweep.sensors[rows[part]], minlength=len(sweep.origins))
+        sees = counts >= MIN_SENSOR_PART * counts.sum()
+        origins.append(sweep.origins[sees] - center)
+    return origins
 
 
 class OwnPoints(NamedTuple):

@@ -228,8 +228,8 @@ def _stack_observations(
     """
     Return input boxes, times, sensor origins and ground heights, padded.
 
-    Shapes (B, N, 9), (B, N), (B, N, 3) and (B, N). Padding repeats the last box of a window, at
-    later times.
+    Shapes (B, N, 9), (B, N), (B, N, K, 3) and (B, N). Padding repeats the last box of a window, at
+    later times, and the last sensor of an observation.
 
     """
     B, N = valid.shape
@@ -237,9 +237,9 @@ def _stack_observations(
     lengths = valid.sum(1)
     boxes = np.zeros((B, N, 9))
     boxes[valid] = np.concatenate([observation.box for observation in every]).reshape(-1, 9)
-    origins = np.zeros((B, N, 3))
-    sensors = np.concatenate([observation.origin for observation in every])
-    origins[valid] = sensors.reshape(-1, 3)
+    sensors = stack_origins([observation.origins for observation in every])
+    origins = np.zeros((B, N, *sensors.shape[1:]))
+    origins[valid] = sensors
     ground = np.full((B, N), np.nan)
     ground[valid] = [observation.ground for observation in every]
     first_ns = np.repeat([window.observations[0].stamp_ns for window in windows], lengths)
@@ -251,6 +251,15 @@ def _stack_observations(
     source = np.minimum(column, last)
     times = times[row, source] + PADDING_PERIOD * np.maximum(column - last, 0)
     return boxes[row, source], times, origins, ground
+
+
+def stack_origins(origins: Sequence[Floats]) -> Floats:
+    """Return the sensors (k, 3) of O observations as one array (O, K, 3); the last repeats."""
+    counts = np.array([len(sensors) for sensors in origins])
+    first = np.cumsum(counts) - counts
+    column = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # (O, K)
+    stacked: Floats = np.concatenate(origins)[first[:, None] + column]
+    return stacked
 
 
 def _places_of_returns(windows: Sequence[Window], valid: NDArray[np.bool_]) -> tuple[Ints, Ints]:

@@ -16,6 +16,7 @@ from typing import Any, cast, NamedTuple, Protocol, runtime_checkable, Self
 
 from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.foxglove import encoded
+from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.resync import Timeline
 from boxreg_ros.io.storage.files import is_ros1, part_of
 from boxreg_ros.io.storage.reader import is_message, Reader
@@ -23,6 +24,7 @@ from boxreg_ros.io.storage.record import Damage, one_line, Record
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, poses, WITHOUT_IDS
+from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.convention import Convention, STANDARD
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -30,6 +32,9 @@ from rosbags.typesys.store import Typestore
 
 TF_TYPES = ('tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage')
 ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
+INFO_SUFFIX = '_info'
+"""Autoware publishes the info on a topic of clouds under its name with this suffix."""
+SEVERAL_LIDARS = ', or merge several LiDARs: repeat --points'
 
 LOOKAHEAD_NS = 2 * 10**9
 """Transforms are read this far ahead of clouds and boxes [ns]: publishers of TF are late."""
@@ -93,7 +98,11 @@ class ItemSource(Protocol):
     Attributes
     ----------
     points_topic, boxes_topic, odometry_topic
-        Topics; `boxes_topic` is empty if the boxes are not from a topic.
+        Topics; `points_topic` is the first of several, `boxes_topic` is empty if the boxes are
+        not from a topic.
+    placement
+        Topics of several LiDARs and the frames of their sensors; knows the info messages of
+        concatenated clouds once these have been read.
     start_ns, end_ns
         Part that is read, in receive time [ns].
     unreadable, first_errors
@@ -106,6 +115,7 @@ class ItemSource(Protocol):
     points_topic: str
     boxes_topic: str
     odometry_topic: str | None
+    placement: SensorPlacement
     start_ns: int
     end_ns: int
     unreadable: Counter[str]
@@ -152,7 +162,9 @@ class Recording:
     ----------
     paths : sequence of Path
         MCAP files, rosbag2 folders, .db3 files, or ROS 1 bags.
-    points, boxes, odometry : str, optional
+    lidars : Lidars
+        Topics of the clouds, found by type if only one topic has it, and their LiDARs.
+    boxes, odometry : str, optional
         Topics; found by type if only one topic has it.
     start, end : float, optional
         Part to read, from the beginning of the recording [s].
@@ -163,7 +175,9 @@ class Recording:
     ----------
     has_boxes : bool
         Whether a topic of boxes is required; without, `boxes_topic` is empty.
-    points_topic, boxes_topic, odometry_topic, start_ns, end_ns, unreadable, first_errors, outside
+    points_topic, boxes_topic, odometry_topic, placement
+        See `ItemSource`.
+    start_ns, end_ns, unreadable, first_errors, outside
         See `ItemSource`.
     part_ns : tuple of int or None
         Begin and end of the part that was asked for, in receive time [ns]; None if it was not.
@@ -182,7 +196,7 @@ class Recording:
     def __init__(
         self,
         paths: Sequence[Path],
-        points: str | None = None,
+        lidars: Lidars = SINGLE_LIDAR,
         boxes: str | None = None,
         odometry: str | None = None,
         start: float | None = None,
@@ -191,7 +205,9 @@ class Recording:
     ) -> None:
         self._convention = convention
         self._paths = [Path(path) for path in paths]
-        self._asked = {'points': points, 'boxes': boxes, 'odometry': odometry}
+        self._lidars = lidars
+        self._sensor_frame = ''
+        self._asked = {'boxes': boxes, 'odometry': odometry}
         self._start, self._end = start, end
         self.odometry_topic: str | None = None
         self.unreadable: Counter[str] = Counter()
@@ -275,29 +291,9 @@ class Recording:
 
         """
         for topic, first in self.first_errors.items():
-            if topic in self.data_topics and topic not in self._decoded_topics:
+            alike = self.points_topics if topic in self.points_topics else {topic}
+            if topic in self.data_topics and self._decoded_topics.isdisjoint(alike):
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
-
-    def left_out(self, missing_transforms: Sequence[str]) -> str:
-        """
-        Return how many messages are not used, and why, in one line; empty if all are.
-
-        Parameters
-        ----------
-        missing_transforms : sequence of str
-            Errors of the messages without a transform.
-
-        """
-        parts = []
-        if self.unreadable.total():
-            first = next(iter(self.first_errors.values()))
-            parts.append(f'{self.unreadable.total()} messages could not be read, first: {first}')
-        if missing_transforms:
-            parts.append(
-                f'{len(missing_transforms)} messages had no transform, first: '
-                f'{missing_transforms[0]}'
-            )
-        return '; '.join(parts)
 
     def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
         """
@@ -350,7 +346,12 @@ class Recording:
     @property
     def data_topics(self) -> set[str]:
         """Return the topics of clouds and boxes."""
-        return {self.points_topic, self.boxes_topic}
+        return {*self.points_topics, self.boxes_topic}
+
+    @property
+    def points_topics(self) -> tuple[str, ...]:
+        """Return the topics of clouds."""
+        return self.placement.lidars.topics
 
     @property
     def topics(self) -> dict[str, str]:
@@ -377,7 +378,21 @@ class Recording:
             If no motion is known, or no transforms connect `fixed_frame` with the clouds.
 
         """
-        frame = self.sensor_frame()
+        first_error: RecordingError | None = None
+        for frame in self._sensor_frames():  # the others go on where TF does not know one
+            try:
+                found = self._choose_fixed_frame(tree, frame, fixed_frame)
+            except RecordingError as error:
+                first_error = first_error or error
+                tree.clear()
+            else:
+                self._sensor_frame = frame
+                return found
+        assert first_error is not None  # there is a frame
+        raise first_error
+
+    def _choose_fixed_frame(self, tree: TransformTree, frame: str, fixed_frame: str | None) -> str:
+        """Return the fixed frame that the LiDAR frame `frame` moves in."""
         for record in self._read(self._connections(self._static_topics())):
             self._add_motion(tree, record)
         if fixed_frame is not None and fixed_frame.lstrip('/') == frame:
@@ -419,11 +434,17 @@ class Recording:
         return found
 
     def sensor_frame(self) -> str:
-        """Return the frame of the first point cloud."""
-        cloud = self._first(self.points_topic)
-        if cloud is None:
-            raise RecordingError(f'{self}: no point clouds on {self.points_topic!r} in this part')
-        return str(cloud.header.frame_id).lstrip('/')
+        """Return the frame of the first cloud, of the first LiDAR that TF or odometry moves."""
+        return self._sensor_frame or self._sensor_frames()[0]
+
+    def _sensor_frames(self) -> list[str]:
+        """Return the frame of the first cloud of each topic that has any."""
+        clouds = [self._first(topic) for topic in self.points_topics]
+        frames = [str(cloud.header.frame_id).lstrip('/') for cloud in clouds if cloud is not None]
+        if not frames:
+            topics = ', '.join(map(repr, self.points_topics))
+            raise RecordingError(f'{self}: no point clouds on {topics} in this part')
+        return frames
 
     def _first(self, topic: str) -> Any:
         """Return the first readable message on a topic in the part that is read; None without."""
@@ -443,12 +464,14 @@ class Recording:
             c.topic: c.msgtype for c in sorted(self._reader.connections, key=lambda c: c.topic)
         }
         self._filled = {c.topic for c in self._reader.connections if c.msgcount}
-        self.points_topic = self._topic('points', 'point clouds', (POINTS_TYPE,))
+        self._find_clouds()
         self.boxes_topic = ''
         if self.has_boxes:
-            self.boxes_topic = self._topic('boxes', 'boxes', self._box_types())
+            types = self._box_types()
+            self.boxes_topic = self._topic('boxes', 'boxes', types, self._asked['boxes'])
         if self._asked['odometry']:
-            self.odometry_topic = self._topic('odometry', 'odometry', (ODOMETRY_TYPE,))
+            asked = self._asked['odometry']
+            self.odometry_topic = self._topic('odometry', 'odometry', (ODOMETRY_TYPE,), asked)
         if self.has_boxes:
             self._adapter = adapter_for(self._topics[self.boxes_topic], self._convention)
 
@@ -478,9 +501,22 @@ class Recording:
                 f'choose a smaller --start, or leave it out'
             )
 
-    def _topic(self, role: str, what: str, types: tuple[str, ...]) -> str:
+    def _find_clouds(self) -> None:
+        """Find the topics of the clouds, and that of info messages."""
+        lidars = self._lidars
+        asked: Sequence[str | None] = lidars.topics or (None,)
+        topics = [self._topic('points', 'point clouds', (POINTS_TYPE,), topic) for topic in asked]
+        filled = [topic for topic in topics if topic in self._filled]
+        self.points_topic = (filled or topics)[0]
+        info = lidars.info
+        if info:
+            info = self._topic('points-info', 'info on concatenated clouds', (INFO_TYPE,), info)
+        elif len(topics) == 1 and self._topics.get(topics[0] + INFO_SUFFIX) == INFO_TYPE:
+            info = topics[0] + INFO_SUFFIX
+        self.placement = SensorPlacement(Lidars(tuple(topics), lidars.frames, info))
+
+    def _topic(self, role: str, what: str, types: tuple[str, ...], asked: str | None) -> str:
         """Return the topic asked for, or the only one of these types."""
-        asked = self._asked[role]
         there = ', '.join(f'{t} ({kind})' for t, kind in self._topics.items()) or 'no topics'
         candidates = self._candidates(types)
         if asked is not None:
@@ -502,7 +538,7 @@ class Recording:
         if len(candidates) > 1:
             raise RecordingError(
                 f'{self}: several topics have {what}: {", ".join(candidates)}; choose one with '
-                f'--{role}'
+                f'--{role}{SEVERAL_LIDARS if role == "points" else ""}'
             )
         return candidates[0]
 
@@ -541,7 +577,9 @@ class Recording:
         return {topic for topic in self._tf_topics() if topic.endswith('tf_static')}
 
     def _motion_topics(self) -> set[str]:
-        return self._tf_topics() | ({self.odometry_topic} if self.odometry_topic else set())
+        """Return the topics that are read ahead of clouds and boxes."""
+        others = {self.odometry_topic, self.placement.lidars.info}
+        return self._tf_topics() | {topic for topic in others if topic}
 
     def _connections(self, topics: Collection[str]) -> list[Connection]:
         return [c for c in self._reader.connections if c.topic in topics]
@@ -605,10 +643,11 @@ class Recording:
 
     def _content(self, topic: str, message: Any) -> Sweep | BoxArray:
         """Return the sweep or the boxes of a message; UnsupportedMessage if it has none."""
-        adapter: Any = pointcloud if topic == self.points_topic else self._adapter
         with _malformed(f'topic {topic!r}'):
-            content: Sweep | BoxArray = adapter.from_msg(message)
-        return content
+            if topic in self.points_topics:
+                return self.placement.sweep_of(message, topic)
+            boxes: BoxArray = self._adapter.from_msg(message)
+        return boxes
 
     def _stamp_of(self, connection: Connection, data: bytes) -> int | None:
         """Return the stamp of clouds, boxes and motion [ns]; None if there is none."""
@@ -631,6 +670,8 @@ class Recording:
             with _malformed(f'topic {topic!r}'):
                 if record.connection.msgtype == ODOMETRY_TYPE:
                     tree.add_odometry(message)
+                elif record.connection.msgtype == INFO_TYPE:
+                    self.placement.add_info(message)
                 else:
                     is_static = topic in self._static_topics()
                     tree.add_transforms(message.transforms, is_static)
@@ -679,33 +720,54 @@ def _malformed(origin: str) -> Iterator[None]:
         ) from None
 
 
+def left_out(source: ItemSource, missing_transforms: Sequence[str]) -> str:
+    """
+    Return how many messages of a source are not used, and why, in one line; empty if all are.
+
+    Parameters
+    ----------
+    source : ItemSource
+        After its last item.
+    missing_transforms : sequence of str
+        Errors of the messages without a transform.
+
+    """
+    parts = []
+    if source.unreadable.total():
+        first = next(iter(source.first_errors.values()))
+        parts.append(f'{source.unreadable.total()} messages could not be read, first: {first}')
+    if missing_transforms:
+        parts.append(
+            f'{len(missing_transforms)} messages had no transform, first: {missing_transforms[0]}'
+        )
+    return '; '.join(parts)
+
+
 def input_boxes(
-    path: Path, fixed_frame: str | None = None, **options: Any
+    source: AbstractContextManager[ItemSource], fixed_frame: str | None = None
 ) -> tuple[list[BoxArray], str]:
     """
     Return the input boxes of a recording in the fixed frame that `relabel` would choose.
 
     Parameters
     ----------
-    path : Path
-        Recording.
+    source : context manager of ItemSource
+        Recording that is not open yet.
     fixed_frame : str, optional
         Fixed frame to use instead.
-    **options
-        Of `Recording`.
 
     Returns
     -------
     arrays : list of BoxArray
         All that could be decoded and transformed.
-    left_out : str
+    others : str
         Number of the others, and why; empty if there are none.
 
     """
     tree = TransformTree()
     arrays: list[BoxArray] = []
     missing_transforms: list[str] = []
-    with Recording([path], **options) as recording:
+    with source as recording:
         fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
         for item in recording.items(tree, with_clouds=False):
             try:
@@ -715,5 +777,5 @@ def input_boxes(
                 continue
             if isinstance(moved, BoxArray):
                 arrays.append(moved)
-        left_out = recording.left_out(missing_transforms)
-    return arrays, left_out
+        others = left_out(recording, missing_transforms)
+    return arrays, others

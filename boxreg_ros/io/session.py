@@ -1,20 +1,28 @@
 """
 The way of sweeps and boxes to the registrar, the same for the live node and for recordings.
 
-`JumpConfirmation` detects time jumps, a `Session` brings each item into the fixed frame, assigns
-ids where they are asked for and checks the poses of the boxes, and `register` hands the result to
-the registrar. The live node adds waiting for transforms and publishing; `boxreg relabel` adds
-reading and writing.
+`JumpConfirmation` detects time jumps, a `Session` brings each item into the fixed frame, merges
+the clouds of several LiDARs, assigns ids where they are asked for and checks the poses of the
+boxes, and `register` hands the result to the registrar. The live node adds waiting for transforms
+and publishing; `boxreg relabel` adds reading and writing.
 
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import TransformUnavailable
 from boxreg_ros.io.id_assignment import Tracker
+from boxreg_ros.io.lidars import (
+    ignore,
+    MergedSweep,
+    Report,
+    SensorPlacement,
+    SweepMerger,
+)
 from boxreg_ros.io.pose_check import PoseCheck
 from boxreg_ros.io.transforms import move_to_frame, TIME_JUMP, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
@@ -38,9 +46,10 @@ class Admitted(NamedTuple):
     T_fixed_item : array, shape (4, 4), or None
         Maps the frame of the item to the fixed frame.
     reason : str
-        ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; else empty.
+        ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; what is
+        missing to know the LiDARs of a cloud; else empty.
     detail : str
-        The transform that is missing; empty if none is.
+        The transform or message that is missing; empty if none is.
 
     """
 
@@ -61,7 +70,7 @@ class JumpConfirmation(Generic[_T]):
     """
 
     def __init__(self) -> None:
-        self._newest_ns: dict[type[Sweep | BoxArray], int] = {}
+        self._newest_ns: dict[str, int] = {}  # by stream
         self._held: tuple[_T, Sweep | BoxArray] | None = None
 
     def add(self, item: _T, content: Sweep | BoxArray) -> tuple[list[_T], bool]:
@@ -100,19 +109,26 @@ class JumpConfirmation(Generic[_T]):
         return None if self._held is None else self._held[0]
 
     def _is_old(self, content: Sweep | BoxArray) -> bool:
-        newest_ns = self._newest_ns.get(type(content), content.stamp_ns)
+        newest_ns = self._newest_ns.get(_stream_of(content), content.stamp_ns)
         return content.stamp_ns < newest_ns - round(TIME_JUMP * 1e9)
 
     def _note(self, content: Sweep | BoxArray) -> None:
-        newest_ns = self._newest_ns.get(type(content), content.stamp_ns)
-        self._newest_ns[type(content)] = max(newest_ns, content.stamp_ns)
+        stream = _stream_of(content)
+        newest_ns = self._newest_ns.get(stream, content.stamp_ns)
+        self._newest_ns[stream] = max(newest_ns, content.stamp_ns)
+
+
+def _stream_of(content: Sweep | BoxArray) -> str:
+    """Return what stamps ascend within: the boxes, or the clouds of one LiDAR."""
+    return f'clouds {content.topic}' if isinstance(content, Sweep) else 'boxes'
 
 
 class Session:
     """
     Prepare sweeps and boxes for the registrar.
 
-    State: the transforms, the tracks of id assignment, and the pose check. Not thread-safe.
+    State: the transforms, the clouds that wait for those of other LiDARs, the tracks of id
+    assignment, and the pose check. Not thread-safe.
 
     Parameters
     ----------
@@ -120,9 +136,13 @@ class Session:
         Convention of the box poses and sizes, and whether ids are to be assigned. Adapters have
         applied the convention already; the pose check compares it with the others.
     config : Config
-        `max_gap` and `tolerance` are used.
+        `max_gap`, `tolerance` and `merge_span` are used.
     fixed_frame : str
         Frame to refine in; empty to choose it with `require_fixed_frame`.
+    placement : SensorPlacement, optional
+        Topics of the clouds and frames of the LiDARs; fed by the caller with info messages.
+    report : callable
+        Called with reason, text and count for clouds that are not merged.
 
     Attributes
     ----------
@@ -140,13 +160,20 @@ class Session:
         convention: Convention,
         config: Config,
         fixed_frame: str = '',
+        placement: SensorPlacement | None = None,
+        report: Report = ignore,
     ) -> None:
         self.tree = TransformTree()
+        self._placement = placement or SensorPlacement()
         self.fixed_frame = fixed_frame.lstrip('/')
         self.sensor_frame = ''
         self._convention = convention
         self._config = config
         self._tracker = Tracker(config.max_gap) if convention.associate else None
+        self._merger: SweepMerger | None = None
+        topics = self._placement.lidars.topics
+        if len(topics) > 1:
+            self._merger = SweepMerger(topics, config.merge_span, report)
         self.restart()
 
     @property
@@ -163,6 +190,8 @@ class Session:
     def restart(self) -> None:
         """Forget all but the transforms; ids that were assigned are not used again."""
         self._pose_check = PoseCheck(self._convention, self._config.tolerance)
+        if self._merger is not None:
+            self._merger.reset()
         if self._tracker is not None:
             self._tracker.forget()
 
@@ -186,11 +215,39 @@ class Session:
             is_sweep = isinstance(item, Sweep)
             reason = 'sweep_without_transform' if is_sweep else 'no_transform'
             return Admitted(None, None, reason, str(error))
+        reason, detail = '', ''
+        if isinstance(item, Sweep):
+            item, reason, detail = self._placement.placed(item, self.tree)
         moved = move_to_frame(item, T_fixed_item, self.fixed_frame)
         self._pose_check.add(moved)
         if self._tracker is not None and isinstance(moved, BoxArray):
             moved = self._tracker.identify(moved)
-        return Admitted(moved, T_fixed_item)
+        return Admitted(moved, T_fixed_item, reason, detail)
+
+    def merged(self, sweep: Sweep, extra: object = None) -> list[MergedSweep]:
+        """
+        Return the sweeps that are complete with a cloud; this one, if there is a single topic.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            In the fixed frame.
+        extra : object
+            Returned with the sweep that the cloud is part of.
+
+        """
+        if self._merger is None:
+            return [MergedSweep(sweep, (extra,))]
+        return self._merger.add(sweep, extra)
+
+    @property
+    def lidar_counts(self) -> dict[str, Counter[str]]:
+        """Return for each of several topics of clouds how many were merged, late or missing."""
+        return {} if self._merger is None else self._merger.counts
+
+    def unmerged(self) -> list[MergedSweep]:
+        """Return the sweeps that wait for clouds of other LiDARs, without waiting on."""
+        return [] if self._merger is None else self._merger.flush()
 
     def require_fixed_frame(self, item: Sweep | BoxArray) -> str:
         """
@@ -204,7 +261,7 @@ class Session:
         """
         if self.fixed_frame:
             return self.fixed_frame
-        sensor_frame = self.sensor_frame
+        sensor_frame = item.frame_id if isinstance(item, Sweep) else self.sensor_frame
         if not sensor_frame:
             raise TransformUnavailable(
                 f'no point cloud has arrived, so the motion of the boxes in {item.frame_id!r} is '

@@ -127,6 +127,10 @@ class TransformTree:
             position, turn = item.transform.translation, item.transform.rotation
             self._add(self._tf, item, position, turn, is_static)
 
+    def add_pose(self, parent: str, child: str, stamp_ns: int, pose: Floats) -> None:
+        """Add the pose of `child` in `parent` at a stamp: x y z qx qy qz qw."""
+        self._add_to(self._tf, _name(parent), _name(child), stamp_ns, tuple(pose.tolist()), False)
+
     def add_odometry(self, msg: Any) -> None:
         """Add a ``nav_msgs/Odometry``: the pose of its child frame in its header's frame."""
         pose = msg.pose.pose
@@ -228,13 +232,25 @@ class TransformTree:
         parent, child = _name(item.header.frame_id), _name(item.child_frame_id)
         if not parent or not child:
             return  # refused by tf2, too; errors of lookups list the known transforms
+        stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
+        pose = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
+        self._add_to(edges, parent, child, stamp_ns, pose, is_static)
+
+    def _add_to(
+        self,
+        edges: dict[str, _Edge],
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        pose: tuple[float, ...],
+        is_static: bool,
+    ) -> None:
         edge = edges.get(child)
         if edge is None or edge.parent != parent:
             edge = edges[child] = _Edge(parent, child, self._buffer_ns)
             self._routes.clear()
         edge.is_static |= is_static
-        stamp_ns = item.header.stamp.sec * 10**9 + item.header.stamp.nanosec
-        edge.add(stamp_ns, (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w))
+        edge.add(stamp_ns, pose)
         if len(edges) > self._frames_limit:
             oldest_ns = stamp_ns - self._buffer_ns
             for name in [name for name, edge in edges.items() if edge.is_older(oldest_ns)]:
@@ -369,7 +385,7 @@ def interpolated(first: Floats, second: Floats, share: float) -> Floats:
 
 def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     """
-    Return the sweep, points and origin, in another frame.
+    Return the sweep, points and positions of the sensors, in another frame.
 
     float32 points stay float32 while the sensor is within `FLOAT32_RANGE` of the origin of the
     frame; farther away (a map in UTM) they become float64.
@@ -383,7 +399,10 @@ def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     moved = np.empty((3, len(sweep.points)), kind)
     for i, (a, b, c) in enumerate(R.astype(kind)):  # not R @: BLAS starts threads of its own
         moved[i] = a * x + b * y + c * z + t[i].astype(kind)
-    return replace(sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t)
+    origins = None if sweep.origins is None else sweep.origins @ R.T + t
+    return replace(
+        sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t, origins=origins
+    )
 
 
 def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -> Sweep | BoxArray:

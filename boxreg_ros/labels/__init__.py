@@ -6,7 +6,14 @@ To add a format, write a module with ``FORMAT``, ``Writer`` and, where files can
 
 """
 
-from boxreg_ros.labels.protocol import Format, LabelFrame, LabelWriter, Options, Provenance
+from boxreg_ros.labels.protocol import (
+    Format,
+    LabelFrame,
+    LabelWriter,
+    Options,
+    Provenance,
+    SceneFrames,
+)
 from boxreg_ros.labels.registry import (
     can_read,
     check_options,
@@ -29,5 +36,6 @@ __all__ = [
     'module_of',
     'Options',
     'Provenance',
+    'SceneFrames',
     'writer_for',
 ]

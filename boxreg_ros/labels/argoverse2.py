@@ -14,15 +14,22 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.labels.arrow import read_rows, Table
+from boxreg_ros.labels.arrow import read_rows, read_table, Table
 from boxreg_ros.labels.files import frame_names, to_json, write_provenance
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import (
+    Format,
+    LabelFrame,
+    Options,
+    Provenance,
+    SceneFrames,
+)
 from boxreg_ros.labels.records import boxes_from_quaternions, finite_or_none, refined_boxes
 from boxreg_ros.rotations import quaternion_from_matrix
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, X, Z
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, Sweep, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
 
@@ -56,6 +63,10 @@ STATUS_COLUMNS = {
 }
 """Additional columns; the devkit ignores them."""
 POINT_COLUMNS = {'intensity': 'uint8', 'laser_number': 'uint8', 'offset_ns': 'int32'}
+OPTIONAL_COLUMNS = {'track_uuid', 'num_interior_pts'}
+"""Detections that are submitted lack these."""
+LOG_COLUMN = 'log_id'
+FIXED_FRAME, EGO_FRAME = 'city', 'egovehicle'
 ANNOTATIONS_FILE = 'annotations.feather'
 EGO_POSES_FILE = 'city_SE3_egovehicle.feather'
 LIDAR_NAME = 'up_lidar'
@@ -108,7 +119,7 @@ class Writer:
             self._poses.add(array.stamp_ns, *_pose_values(frame.T_fixed_sensor))
         if frame.sweep is not None:
             path = self._clouds / f'{array.stamp_ns}.feather'
-            _write_cloud(path, frame.sweep.points, frame.intensities)
+            _write_cloud(path, array.stamp_ns, frame.sweep, frame.intensities)
         self._provenance['fixed_frame'] = frame.fixed_frame
         self._provenance['sensor_frame'] = frame.sensor_frame
 
@@ -124,33 +135,69 @@ def read(path: Path) -> Iterator[LabelFrame]:
     if path.is_dir():
         path = path / ANNOTATIONS_FILE
     folder = path.parent
-    rows = read_rows(path)
-    missing = [name for name in ANNOTATION_COLUMNS if rows and name not in rows[0]]
-    if missing:
-        raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
     pose_file = folder / EGO_POSES_FILE
     poses = read_rows(pose_file) if pose_file.exists() else []
-    T_city_ego = {row['timestamp_ns']: matrix(_xyz_xyzw(row)) for row in poses}
-    fixed_frame, sensor_frame = frame_names(folder, 'city', 'egovehicle')
+    T_city_ego = {row['timestamp_ns']: matrix(xyz_xyzw(row)) for row in poses}
+    fixed_frame, sensor_frame = frame_names(folder, FIXED_FRAME, EGO_FRAME)
+    for refined in _refined(path, read_table(path), sensor_frame):
+        T = T_city_ego.get(refined.boxes.stamp_ns)
+        yield LabelFrame(refined, fixed_frame, sensor_frame, T)
+
+
+def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
+    """
+    Yield the frames of one log.
+
+    Parameters
+    ----------
+    path : Path
+        Annotations of the log, or detections of many logs as they are submitted, with the
+        column ``log_id``.
+    scene : SceneFrames
+        The log.
+
+    """
+    if path.is_dir():
+        path = path / ANNOTATIONS_FILE
+    table = read_table(path)
+    if LOG_COLUMN in table.column_names:
+        logs = table.column(LOG_COLUMN)
+        mine = table.filter(_equal(logs, scene.name))
+        if not mine.num_rows:
+            raise RecordingError(
+                f'{path}: expected boxes of log {scene.name}, got {table.num_rows} boxes of '
+                f'{len(logs.unique())} other logs; name the file with this log'
+            )
+        table = mine
+    for refined in _refined(path, table, scene.sensor_frame):
+        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
+
+
+def _refined(path: Path, table: Any, frame_id: str) -> Iterator[RefinedBoxes]:
+    """Yield the boxes of each stamp of a table, in the frame of the ego vehicle."""
+    needed = ANNOTATION_COLUMNS.keys() - OPTIONAL_COLUMNS
+    missing = sorted(needed.difference(table.column_names))
+    if missing:
+        raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
+    rows = table.to_pylist()
     rows.sort(key=lambda row: row['timestamp_ns'])
     for stamp_ns, group in groupby(rows, lambda row: row['timestamp_ns']):
         items = list(group)
-        poses_xyz_xyzw = np.array([_xyz_xyzw(item) for item in items])
+        poses_xyz_xyzw = np.array([xyz_xyzw(item) for item in items])
         extents = np.array([[item[name] for name in EXTENT_COLUMNS] for item in items])
-        refined = refined_boxes(
+        yield refined_boxes(
             stamp_ns,
-            sensor_frame,
-            [item['track_uuid'] for item in items],
+            frame_id,
+            [item.get('track_uuid') or '' for item in items],
             [item['category'] for item in items],
             boxes_from_quaternions(poses_xyz_xyzw[:, :3], extents, poses_xyz_xyzw[:, 3:]),
             [item.get('score') for item in items],
             [item.get('status') for item in items],
-            [item['num_interior_pts'] for item in items],
+            [item.get('num_interior_pts') or 0 for item in items],
             [item.get('covariance') for item in items],
             [item.get('reason') for item in items],
             [item.get('extent_covariance') for item in items],
         )
-        yield LabelFrame(refined, fixed_frame, sensor_frame, T_city_ego.get(stamp_ns))
 
 
 def _pose_values(T: Floats) -> list[float]:
@@ -159,12 +206,20 @@ def _pose_values(T: Floats) -> list[float]:
     return [qw, qx, qy, qz, *T[:3, 3].tolist()]
 
 
-def _xyz_xyzw(row: dict[str, float]) -> Floats:
+def _equal(column: Any, value: str) -> Any:
+    """Return for each row of a column whether it is `value`."""
+    from pyarrow import compute
+
+    return compute.equal(column, value)
+
+
+def xyz_xyzw(row: dict[str, float]) -> Floats:
+    """Return x y z qx qy qz qw of a row with a pose."""
     names = ('tx_m', 'ty_m', 'tz_m', 'qx', 'qy', 'qz', 'qw')
     return np.array([row[name] for name in names])
 
 
-def _write_cloud(path: Path, points: np.ndarray, intensities: Floats | None) -> None:
+def _write_cloud(path: Path, stamp_ns: int, sweep: Sweep, intensities: Floats | None) -> None:
     """
     Write a sweep as a table; fields that are not known are 0.
 
@@ -174,10 +229,13 @@ def _write_cloud(path: Path, points: np.ndarray, intensities: Floats | None) -> 
     import pyarrow
     from pyarrow import feather
 
-    n = len(points)
-    columns = dict(zip('xyz', points.T.astype(np.float32), strict=True))
+    n = len(sweep.points)
+    columns = dict(zip('xyz', sweep.points.T.astype(np.float32), strict=True))
     for name, dtype in POINT_COLUMNS.items():
         columns[name] = np.zeros(n, dtype)
+    if sweep.times is not None:
+        delays_ns = np.rint(sweep.times * 1e9) + (sweep.stamp_ns - stamp_ns)
+        columns['offset_ns'] = delays_ns.astype(np.int32)
     if intensities is not None:
         scale = 255 if intensities.max(initial=0) <= 1 else 1
         columns['intensity'] = (intensities * scale).clip(0, 255).astype(np.uint8)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from boxreg_ros.errors import RecordingError
 import orjson
@@ -51,6 +51,47 @@ def from_json(path: Path) -> Any:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
     except ValueError as error:
         raise RecordingError(f'{path}: not JSON: {error}') from None
+
+
+def json_items(path: Path, prefix: str = 'item') -> Iterator[Any]:
+    """
+    Yield the items of a list in a JSON file one by one, without holding the list.
+
+    Parameters
+    ----------
+    path : Path
+        JSON file.
+    prefix : str
+        Place of the items in the words of ijson; by default the file is one list.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read or is not JSON.
+
+    """
+    import ijson
+
+    yield from _streamed(path, lambda file: ijson.items(file, prefix, use_float=True))
+
+
+def json_members(path: Path, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Yield the names and values of an object in a JSON file; as `json_items`."""
+    import ijson
+
+    yield from _streamed(path, lambda file: ijson.kvitems(file, prefix, use_float=True))
+
+
+def _streamed(path: Path, parse: Callable[[BinaryIO], Iterator[Any]]) -> Iterator[Any]:
+    import ijson
+
+    try:
+        with path.open('rb') as file:
+            yield from parse(file)
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+    except ijson.JSONError as error:
+        raise RecordingError(f'{path}: not JSON: {" ".join(str(error).split())}') from None
 
 
 class JsonList:

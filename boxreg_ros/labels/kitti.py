@@ -10,19 +10,26 @@ of -1. Occlusion is 3, unknown. Stamps and poses are in the files of `sidecar`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import require_single
-from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.files import read_provenance, require_single
+from boxreg_ros.labels.protocol import (
+    absolute,
+    Format,
+    LabelFrame,
+    Options,
+    Provenance,
+    SceneFrames,
+)
 from boxreg_ros.labels.records import refined_boxes, TrackNumbers
 from boxreg_ros.labels.sidecar import read_sidecar, SidecarWriter
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, WIDTH
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH
 import numpy as np
 
 FORMAT = Format(
@@ -132,16 +139,73 @@ def read(path: Path) -> Iterator[LabelFrame]:
     sidecar = read_sidecar(folder, 1 + max(lines_by_frame, default=-1))
     for index, stamp_ns in enumerate(sidecar.stamps_ns):
         lines = lines_by_frame.get(index, [])
-        numbers = np.array([line.numbers for line in lines]).reshape(-1, 7)
-        refined = refined_boxes(
-            stamp_ns,
-            sidecar.sensor_frame,
-            [sidecar.tracks.get(line.track, line.track) for line in lines],
-            [line.class_name for line in lines],
-            _boxes(camera, numbers),
-            [line.score for line in lines],
+        yield sidecar.frame(
+            index, _refined(lines, stamp_ns, sidecar.sensor_frame, camera, sidecar.tracks)
         )
-        yield sidecar.frame(index, refined)
+
+
+def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
+    """
+    Yield the frames of a sequence, by the stamps and the camera of the data set.
+
+    Parameters
+    ----------
+    path : Path
+        Label file as the benchmark has it and trackers submit it, or a folder with
+        ``NAME.txt`` or ``label_02/NAME.txt`` of the sequence.
+    scene : SceneFrames
+        The sequence.
+
+    """
+    if path.is_dir():
+        path = _file_of_sequence(path, scene.name)
+    lines_by_frame = _read_lines(path)
+    unknown = [number for number in lines_by_frame if str(number) not in scene.stamps_ns]
+    if unknown:
+        raise RecordingError(
+            f'{path}: expected frames 0 to {len(scene.stamps_ns) - 1} of sequence {scene.name}, '
+            f'got frame {max(unknown)}; name the file of this sequence'
+        )
+    if scene.camera is None:
+        raise RecordingError(
+            f'{path}: expected the calibration of a camera, which the scene {scene.name!r} '
+            f'lacks; read it with a scene of kitti-tracking'
+        )
+    tracks = read_provenance(absolute(path).parent.parent).get('tracks', {})
+    for number, stamp_ns in scene.stamps_ns.items():
+        lines = lines_by_frame.get(int(number), [])
+        refined = _refined(lines, stamp_ns, scene.sensor_frame, scene.camera, tracks)
+        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
+
+
+def _file_of_sequence(folder: Path, name: str) -> Path:
+    """Return the label file of a sequence."""
+    for path in (folder / f'{name}.txt', folder / 'label_02' / f'{name}.txt'):
+        if path.is_file():
+            return path
+    there = ', '.join(sorted(path.name for path in folder.glob('*.txt'))) or 'none'
+    raise RecordingError(
+        f'{folder}: expected {name}.txt or label_02/{name}.txt, got {there}; name the file'
+    )
+
+
+def _refined(
+    lines: list[_Line],
+    stamp_ns: int,
+    frame_id: str,
+    camera: Camera,
+    tracks: Mapping[str, str],
+) -> RefinedBoxes:
+    """Return the boxes of a frame; `tracks` are track ids by the numbers in the file."""
+    numbers = np.array([line.numbers for line in lines]).reshape(-1, 7)
+    return refined_boxes(
+        stamp_ns,
+        frame_id,
+        [tracks.get(line.track, line.track) for line in lines],
+        [line.class_name for line in lines],
+        _boxes(camera, numbers),
+        [line.score for line in lines],
+    )
 
 
 def _read_lines(path: Path) -> dict[int, list[_Line]]:

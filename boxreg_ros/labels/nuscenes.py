@@ -4,14 +4,14 @@ nuScenes: its thirteen tables with one scene, boxes in the global frame. T4 is a
 The sensor frame is written as the ego vehicle frame, with an identity calibration;
 ``--label-frame`` chooses another frame. A sample is a box array with a known pose. Additional
 columns of annotations are status, reason, score, covariance and the stamp in nanoseconds, of
-instances the track id. A track that changes its class is several instances.
+sweeps the stamp, of instances the track id. A track that changes its class is several instances.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 import hashlib
 from pathlib import Path
@@ -25,14 +25,23 @@ from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import (
     frame_names,
     from_json,
+    json_items,
+    json_members,
     JsonList,
     require_single,
     write_provenance,
 )
-from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import (
+    absolute,
+    Format,
+    LabelFrame,
+    Options,
+    Provenance,
+    SceneFrames,
+)
 from boxreg_ros.labels.records import boxes_from_quaternions, finite_or_none, refined_boxes
 from boxreg_ros.rotations import quaternion_from_matrix
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, WIDTH, X, Z
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
 
@@ -92,8 +101,7 @@ class Writer:
         number = self._num_samples
         self._num_samples += 1
         cloud_file = f'{self.clouds}/{number:05d}.pcd.bin'
-        timestamp = round(frame.refined.boxes.stamp_ns / 1000)
-        self._add_sample(number, timestamp, cloud_file, frame.T_fixed_sensor)
+        self._add_sample(number, frame.refined.boxes.stamp_ns, cloud_file, frame.T_fixed_sensor)
         if frame.sweep is not None:
             write_cloud(self._folder / cloud_file, frame.sweep.points, frame.intensities)
         self._add_annotations(frame, self._token('sample', number), rows.tolist(), boxes)
@@ -117,9 +125,10 @@ class Writer:
         write_provenance(self._folder, self._provenance)
 
     def _add_sample(
-        self, number: int, timestamp: int, cloud_file: str, T_fixed_sensor: Floats
+        self, number: int, stamp_ns: int, cloud_file: str, T_fixed_sensor: Floats
     ) -> None:
         """Add the rows of a sample: itself, its sweep and the pose of the ego vehicle."""
+        timestamp = round(stamp_ns / 1000)
         sample = self._token('sample', number)
         pose = self._token('ego_pose', number)
         self._link(
@@ -148,6 +157,7 @@ class Writer:
                 'prev': '',
                 'next': '',
                 'is_valid': True,
+                'stamp_ns': stamp_ns,
             },
         )
         qx, qy, qz, qw = quaternion_from_matrix(T_fixed_sensor[:3, :3]).tolist()
@@ -318,37 +328,124 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
 
 def _read_tables(tables: Path) -> Iterator[LabelFrame]:
-    category = {item['token']: item['name'] for item in from_json(tables / 'category.json')}
-    instance = {item['token']: item for item in from_json(tables / 'instance.json')}
+    instances = {item['token']: item for item in from_json(tables / 'instance.json')}
     poses = _poses(tables)
     annotations: dict[str, list[dict[str, Any]]] = {}
     for item in from_json(tables / 'sample_annotation.json'):
         annotations.setdefault(item['sample_token'], []).append(item)
     samples = sorted(from_json(tables / 'sample.json'), key=lambda item: item['timestamp'])
     fixed_frame, sensor_frame = frame_names(tables.parent)
+    names = _category_names(tables)
     for sample in samples:
         items = annotations.get(sample['token'], [])
-        instances = [instance[item['instance_token']] for item in items]
-        # x y z, width length height, qw qx qy qz
-        numbers = np.array(
-            [[*item['translation'], *item['size'], *item['rotation']] for item in items]
-        ).reshape(-1, 10)
-        refined = refined_boxes(
-            _stamp_ns(sample, items),
-            fixed_frame,
-            [item.get('instance_name') or item['token'] for item in instances],
-            [category[item['category_token']] for item in instances],
-            boxes_from_quaternions(
-                numbers[:, :3], numbers[:, [4, 3, 5]], numbers[:, [7, 8, 9, 6]]
-            ),
-            [item.get('score') for item in items],
-            [item.get('status') for item in items],
-            [item['num_lidar_pts'] for item in items],
-            [item.get('covariance') for item in items],
-            [item.get('reason') for item in items],
-            [item.get('extent_covariance') for item in items],
-        )
+        refined = _annotated(_stamp_ns(sample, items), fixed_frame, items, instances, names)
         yield LabelFrame(refined, fixed_frame, sensor_frame, poses.get(sample['token']))
+
+
+def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
+    """
+    Yield the samples of one scene; memory does not grow with the other scenes.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the tables, or results of the detection or the tracking task as they are
+        submitted: ``{"meta": ..., "results": {sample_token: [...]}}``.
+    scene : SceneFrames
+        The scene.
+
+    """
+    read_boxes = _scene_annotations if path.is_dir() else _scene_results
+    try:
+        boxes_by_sample = read_boxes(path, scene)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(
+            f'{path}: expected the tables or results of nuScenes: {type(error).__name__} {error}'
+        ) from None
+    for token in scene.stamps_ns:
+        yield LabelFrame(boxes_by_sample[token], scene.fixed_frame, scene.sensor_frame)
+
+
+def _scene_annotations(tables: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
+    """Return the annotations of a scene by sample."""
+    annotations: dict[str, list[dict[str, Any]]] = {token: [] for token in scene.stamps_ns}
+    for item in json_items(tables / 'sample_annotation.json'):
+        if item['sample_token'] in annotations:
+            annotations[item['sample_token']].append(item)
+    used = {item['instance_token'] for items in annotations.values() for item in items}
+    rows = json_items(tables / 'instance.json')
+    instances = {item['token']: item for item in rows if item['token'] in used}
+    names = _category_names(tables)
+    return {
+        token: _annotated(stamp_ns, scene.fixed_frame, annotations[token], instances, names)
+        for token, stamp_ns in scene.stamps_ns.items()
+    }
+
+
+def _scene_results(path: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
+    """Return the detections or tracked boxes of a scene by sample."""
+    results: dict[str, list[dict[str, Any]]] = {}
+    others = 0
+    for token, items in json_members(path, 'results'):
+        if token in scene.stamps_ns:
+            results[token] = items
+        else:
+            others += 1
+    if not results:
+        raise RecordingError(
+            f'{path}: expected results of the {len(scene.stamps_ns)} samples of {scene.name}, '
+            f'got those of {others} other samples; name the results of the split of this scene'
+        )
+    found = {}
+    for token, stamp_ns in scene.stamps_ns.items():
+        items = results.get(token, [])
+        task = 'tracking' if items and 'tracking_name' in items[0] else 'detection'
+        found[token] = refined_boxes(
+            stamp_ns,
+            scene.fixed_frame,
+            [str(item.get('tracking_id', '')) for item in items],
+            [item[f'{task}_name'] for item in items],
+            _boxes_of(items),
+            [item[f'{task}_score'] for item in items],
+        )
+    return found
+
+
+def _category_names(tables: Path) -> dict[str, str]:
+    return {item['token']: item['name'] for item in from_json(tables / 'category.json')}
+
+
+def _annotated(
+    stamp_ns: int,
+    frame_id: str,
+    items: list[dict[str, Any]],
+    instances: Mapping[str, dict[str, Any]],
+    names: Mapping[str, str],
+) -> RefinedBoxes:
+    """Return the boxes of the annotations of a sample."""
+    tracks = [instances[item['instance_token']] for item in items]
+    return refined_boxes(
+        stamp_ns,
+        frame_id,
+        [track.get('instance_name') or track['token'] for track in tracks],
+        [names[track['category_token']] for track in tracks],
+        _boxes_of(items),
+        [item.get('score') for item in items],
+        [item.get('status') for item in items],
+        [item['num_lidar_pts'] for item in items],
+        [item.get('covariance') for item in items],
+        [item.get('reason') for item in items],
+        [item.get('extent_covariance') for item in items],
+    )
+
+
+def _boxes_of(items: list[dict[str, Any]]) -> Floats:
+    """Return the boxes (n, 9) of annotations or results."""
+    # x y z, width length height, qw qx qy qz
+    numbers = np.array(
+        [[*item['translation'], *item['size'], *item['rotation']] for item in items], np.float64
+    ).reshape(-1, 10)
+    return boxes_from_quaternions(numbers[:, :3], numbers[:, [4, 3, 5]], numbers[:, [7, 8, 9, 6]])
 
 
 def _stamp_ns(sample: dict[str, Any], annotations: list[dict[str, Any]]) -> int:
@@ -363,7 +460,7 @@ def _poses(tables: Path) -> dict[str, Floats]:
     sensors = from_json(tables / 'sensor.json')
     lidars = {sensor['token'] for sensor in sensors if sensor['modality'] == 'lidar'}
     T_ego_lidar = {
-        item['token']: _matrix(item)
+        item['token']: pose_matrix(item)
         for item in from_json(tables / 'calibrated_sensor.json')
         if item['sensor_token'] in lidars
     }
@@ -372,12 +469,13 @@ def _poses(tables: Path) -> dict[str, Floats]:
     for item in from_json(tables / 'sample_data.json'):
         calibration = item['calibrated_sensor_token']
         if item['is_key_frame'] and calibration in T_ego_lidar:
-            T_global_ego = _matrix(ego_poses[item['ego_pose_token']])
+            T_global_ego = pose_matrix(ego_poses[item['ego_pose_token']])
             poses[item['sample_token']] = T_global_ego @ T_ego_lidar[calibration]
     return poses
 
 
-def _matrix(item: dict[str, list[float]]) -> Floats:
+def pose_matrix(item: dict[str, Any]) -> Floats:
+    """Return the pose (4, 4) of a row of ``ego_pose`` or ``calibrated_sensor``."""
     qw, *qxyz = item['rotation']
     return matrix(np.array([*item['translation'], *qxyz, qw]))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 import hashlib
 import json
@@ -19,6 +19,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from boxreg_ros.io.recording import Recording
+    from boxreg_ros.labels.camera import Camera
 
 INPUT_STATUS = 'input'
 """Status of boxes whose label file states none."""
@@ -145,6 +146,32 @@ class LabelFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class SceneFrames:
+    """
+    The frames of one scene of a data set, for label files that leave these facts to it.
+
+    Attributes
+    ----------
+    name : str
+        Of the scene, as in file names and ids of its data set.
+    stamps_ns : mapping of str to int
+        Stamp of each frame [ns], by the name that label files give it: the token of a sample of
+        nuScenes, the number of a frame of KITTI. Stamps ascend.
+    fixed_frame, sensor_frame : str
+        Names of the fixed frame, and of the frame of the clouds.
+    camera : Camera or None
+        Camera that the boxes of KITTI refer to.
+
+    """
+
+    name: str
+    stamps_ns: Mapping[str, int]
+    fixed_frame: str
+    sensor_frame: str
+    camera: Camera | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Provenance:
     """
     Origin of labels, for the formats with a field for it.
@@ -241,7 +268,9 @@ class FormatModule(Protocol):
     A module of `registry.FORMATS`.
 
     A module whose files can be read back also has ``read(path)``, which yields a `LabelFrame`
-    per stamp and raises `RecordingError` for files that do not follow the format.
+    per stamp and raises `RecordingError` for files that do not follow the format. A module of a
+    data set may have ``read_scene(path, scene)``: it reads files, results of detectors and
+    trackers among them, whose stamps or calibration are those of a `SceneFrames`.
 
     """
 
@@ -259,6 +288,13 @@ class ReadableModule(FormatModule, Protocol):
 
     def read(self, path: Path) -> Iterator[LabelFrame]:
         """Yield the frames of a label file or folder."""
+
+
+class SceneModule(FormatModule, Protocol):
+    """A format module that reads files of a data set, by the facts of one of its scenes."""
+
+    def read_scene(self, path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
+        """Yield the frames of one scene in a label file or folder."""
 
 
 def absolute(path: Path) -> Path:

@@ -15,6 +15,8 @@ from boxreg_ros.labels.protocol import (
     Options,
     Provenance,
     ReadableModule,
+    SceneFrames,
+    SceneModule,
 )
 
 FORMATS = {
@@ -113,12 +115,21 @@ def is_written(name: str, out: Path) -> bool:
     return first.is_file() or (first.is_dir() and any(first.iterdir()))
 
 
-def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
+def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterator[LabelFrame]:
     """
     Yield the frames of a label file or folder.
 
     Boxes whose file states no status or covariance have the status ``input`` and the unit
     matrix.
+
+    Parameters
+    ----------
+    name : str
+        Of the format.
+    path : Path
+        File or folder.
+    scene : SceneFrames, optional
+        Scene of a data set whose boxes are read; its facts complete those of the files.
 
     Raises
     ------
@@ -134,6 +145,8 @@ def frames_of(name: str, path: Path) -> Iterator[LabelFrame]:
         raise ConfigError(f'format {name!r} can only be written; readable: {able}')
     if not path.exists():
         raise RecordingError(f'labels {str(path)!r}: no such file or folder')
+    if scene is not None and hasattr(module, 'read_scene'):
+        return cast(SceneModule, module).read_scene(path, scene)
     return cast(ReadableModule, module).read(path)
 
 

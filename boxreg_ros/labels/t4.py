@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from boxreg_ros.labels import nuscenes
-from boxreg_ros.labels.nuscenes import read
+from boxreg_ros.labels.nuscenes import read, read_scene
 
-__all__ = ['FORMAT', 'read', 'Writer']
+__all__ = ['FORMAT', 'read', 'read_scene', 'Writer']
 
 FORMAT = replace(
     nuscenes.FORMAT, name='t4', title='T4', files='annotation/, data/LIDAR_CONCAT/, maps/'

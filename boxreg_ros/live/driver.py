@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.session import (
     covariances_to_write,
     is_placeholder,
@@ -130,9 +131,13 @@ class LiveRegistrar:
         Called with reason, text and count for everything that is not refined here.
     convention : Convention
         Convention of the boxes, and whether ids are to be assigned.
+    lidars : Lidars
+        Topics of the clouds and frames of the LiDARs.
 
     Attributes
     ----------
+    placement : SensorPlacement
+        Decodes clouds; to be fed by the caller with info messages.
     adapter : Adapter or None
         Reads and writes the boxes; to be set before the first of them.
     output_frame, transform_timeout
@@ -148,12 +153,15 @@ class LiveRegistrar:
         transform_timeout: float,
         trouble: Callable[[str, str, int], None],
         convention: Convention = STANDARD,
+        lidars: Lidars = SINGLE_LIDAR,
     ) -> None:
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
         self.adapter: Adapter | None = None
         self._trouble = trouble
-        self._session = Session(convention, config, fixed_frame)
+        self.placement = SensorPlacement(lidars)
+        self._unknown_frames: set[str] = set()  # of LiDARs; not waited for
+        self._session = Session(convention, config, fixed_frame, self.placement, trouble)
         self._registrar = BoxRegistrar(config)
         self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
@@ -231,10 +239,19 @@ class LiveRegistrar:
         return self._jumps.release()
 
     def is_ready(self, item: ReceivedMessage, now: float) -> bool:
-        """Return whether the transforms of a message have arrived or are not waited for."""
+        """Return whether what a message needs has arrived or is not waited for."""
         content = item.content
         if now >= item.received + self.transform_timeout or is_placeholder(content):
             return True
+        if isinstance(content, Sweep):
+            if self._is_unknown(content):
+                return True
+            if self.placement.awaits_info(content):
+                return False
+        return self._has_transforms(content, now)
+
+    def _has_transforms(self, content: Sweep | BoxArray, now: float) -> bool:
+        """Return whether the transforms of a message have arrived."""
         if self._choose_at is None:
             self._choose_at = now + SETTLING_TIME
         if not self.fixed_frame and now < self._choose_at:
@@ -248,6 +265,13 @@ class LiveRegistrar:
             return self.tree.covers(self.output_frame, fixed_frame, content.stamp_ns)
         return is_covered
 
+    def _is_unknown(self, sweep: Sweep) -> bool:
+        """Return whether one of several LiDARs still has no transform after one timeout."""
+        frame = sweep.frame_id
+        if frame in self._unknown_frames and self.tree.connects(self.fixed_frame, frame):
+            self._unknown_frames.remove(frame)
+        return frame in self._unknown_frames
+
     def process(self, item: ReceivedMessage) -> list[Outgoing]:
         """Register a message; return the messages that are ready to be published."""
         content = item.content
@@ -257,17 +281,48 @@ class LiveRegistrar:
         if admitted.reason:
             self._report_missing_transform(content, admitted.reason, admitted.detail)
         moved = admitted.moved
-        if isinstance(moved, BoxArray):
-            assert isinstance(content, BoxArray) and admitted.T_fixed_item is not None
+        if isinstance(content, Sweep):
+            if moved is None:
+                self._note_unknown(content)
+                return []
+            assert isinstance(moved, Sweep)
+            return self._register(self._session.merged(moved))
+        if moved is not None:
+            assert isinstance(moved, BoxArray) and admitted.T_fixed_item is not None
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
         ready = self._outgoing(register(self._registrar, moved, restarts=False))
-        if moved is None and isinstance(content, BoxArray):
+        if moved is None:
             ready += self.passed_through(item.message)
         return ready
 
-    def lose(self, stamp_ns: int) -> list[Outgoing]:
-        """Release the boxes that wait for a cloud that was dropped."""
-        sweep = Sweep(stamp_ns, self.fixed_frame, np.zeros((0, 3)), is_dropped=True)
+    def _note_unknown(self, sweep: Sweep) -> None:
+        """Do not let the other LiDARs wait for a frame that TF does not know."""
+        if sweep.topic and not self.tree.connects(self.fixed_frame, sweep.frame_id):
+            self._unknown_frames.add(sweep.frame_id)
+
+    def _register(self, complete: list[MergedSweep]) -> list[Outgoing]:
+        """Register sweeps; return the messages that are ready to be published."""
+        ready: list[Outgoing] = []
+        for sweep, _ in complete:
+            ready += self._outgoing(register(self._registrar, sweep, restarts=False))
+        return ready
+
+    def lose(self, stamp_ns: int, lidar: str = '') -> list[Outgoing]:
+        """
+        Release the boxes that wait for a cloud that was dropped.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp [ns].
+        lidar : str
+            Its topic, where the clouds of several are merged.
+
+        """
+        nothing = np.zeros((0, 3))
+        sweep = Sweep(stamp_ns, self.fixed_frame, nothing, is_dropped=True, topic=lidar)
+        if lidar:
+            return self._register(self._session.merged(sweep))
         return self._outgoing(self._registrar.add_sweep(sweep))
 
     def lose_overdue(self, now: float, cloud_received: float) -> list[Outgoing]:
@@ -283,9 +338,10 @@ class LiveRegistrar:
         ]
         if not overdue:
             return []
+        ready = self._register(self._session.unmerged())
         # Beyond the reach of these boxes: a cloud that arrived before them may still be theirs.
         reach = max(self.config.reach, self.config.tolerance)
-        return self.lose(max(overdue) + round(reach * 1e9) + 1)
+        return ready + self.lose(max(overdue) + round(reach * 1e9) + 1)
 
     @property
     def is_holding(self) -> bool:
@@ -302,7 +358,8 @@ class LiveRegistrar:
 
     def flush(self) -> list[Outgoing]:
         """Return everything that is held; tracks continue if further boxes arrive."""
-        return self._outgoing(self._registrar.flush())
+        ready = self._register(self._session.unmerged())
+        return ready + self._outgoing(self._registrar.flush())
 
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""

@@ -18,12 +18,29 @@ many more of them than of clouds may wait.
 
 
 class Message(NamedTuple):
-    """A received message with its order of arrival and its time of arrival (monotonic) [s]."""
+    """
+    A received message.
+
+    Attributes
+    ----------
+    number : int
+        Order of arrival.
+    topic : str
+        ``points``, ``boxes`` or ``passing``.
+    content : message
+        As received.
+    received : float
+        Time of arrival (monotonic) [s].
+    lidar : str
+        Topic of a cloud, where those of several are merged.
+
+    """
 
     number: int
     topic: str
     content: Any
     received: float
+    lidar: str = ''
 
 
 class Inbox:
@@ -36,7 +53,9 @@ class Inbox:
     Parameters
     ----------
     capacity : int
-        Number of clouds that may wait.
+        Number of clouds of each LiDAR that may wait.
+    lidars : int
+        Number of LiDARs.
 
     Attributes
     ----------
@@ -47,8 +66,8 @@ class Inbox:
 
     """
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = {'points': capacity, 'boxes': BOXES_PER_CLOUD * capacity}
+    def __init__(self, capacity: int, lidars: int = 1) -> None:
+        self.capacity = {'points': lidars * capacity, 'boxes': BOXES_PER_CLOUD * capacity}
         self.wake_up = Event()
         self._lock = Lock()
         self._number = 0
@@ -62,13 +81,13 @@ class Inbox:
         self._events.append((kind, content))
         self.wake_up.set()
 
-    def put(self, topic: str, content: Any) -> Message | None:
-        """Add a cloud or box array; return the oldest one of its topic if the queue is full."""
+    def put(self, topic: str, content: Any, lidar: str = '') -> Message | None:
+        """Add a cloud or box array; return the oldest one of its kind if the queue is full."""
         dropped = None
         with self._lock:
             self._number += 1
             queue = self._waiting[topic]
-            queue.append(Message(self._number, topic, content, time.monotonic()))
+            queue.append(Message(self._number, topic, content, time.monotonic(), lidar))
             if len(queue) > self.capacity[topic]:
                 dropped = queue.popleft()
         self.wake_up.set()

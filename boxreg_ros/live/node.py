@@ -10,6 +10,7 @@ import time
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
+from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
 from boxreg_ros.live.diagnostics import Health
@@ -20,6 +21,7 @@ from boxreg_ros.live.topics import Topics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
 from msg_adapters import adapter_for, canonical, POINTS_TYPE
+from msg_adapters.concatenation import INFO_TYPE
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -77,7 +79,8 @@ class BoxregNode(Node):
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
         self._health = Health(self.get_logger())
-        self._inbox = Inbox(config.queue)
+        lidars = options.lidars
+        self._inbox = Inbox(config.queue, max(1, len(lidars.topics)))
         self._topics = Topics(self, self._health)
         markers = self._topics.publish('visualization_msgs/msg/MarkerArray', 'refined_markers', 10)
         self._diagnostics = self._topics.publish(
@@ -85,12 +88,13 @@ class BoxregNode(Node):
         )
         live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
-            self._health.report, options.convention,
+            self._health.report, options.convention, lidars,
         )  # fmt: skip
         self.worker = Worker(
             live, self._inbox, self._health, self.get_logger(), options.backlog, markers
         )
-        self._subscribe_to_motion_and_points()
+        self._subscribe_to_points(lidars)
+        self._subscribe_to_motion()
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/save_config', self._on_save_config)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs on while /clock stands still
@@ -106,18 +110,26 @@ class BoxregNode(Node):
 
     # ------------------------------------------------------------ topics
 
-    def _subscribe_to_motion_and_points(self) -> None:
-        """Subscribe to clouds, odometry and transforms."""
+    def _subscribe_to_points(self, lidars: Lidars) -> None:
+        """Subscribe to the clouds of all LiDARs, and to the info on concatenated ones."""
         # While the process is suspended, messages wait in DDS, which drops without a count. Its
         # queue must be longer than the inbox, which counts.
-        depth = 2 * self._inbox.capacity['points']
-        best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._topics.subscribe(
-            POINTS_TYPE, 'points', self._on_points, best_effort(depth=depth), is_required=True
+        qos = partial(
+            QoSProfile,
+            depth=2 * self._inbox.capacity['points'],
+            reliability=ReliabilityPolicy.BEST_EFFORT,
         )
-        self._topics.subscribe(
-            'nav_msgs/msg/Odometry', 'odom', self._on_odometry, best_effort(depth=ODOMETRY_DEPTH)
-        )
+        for topic in lidars.topics or ('points',):
+            lidar = topic if len(lidars.topics) > 1 else ''
+            callback = partial(self._on_points, lidar)
+            self._topics.subscribe(POINTS_TYPE, topic, callback, qos(), is_required=True)
+        if lidars.info:
+            self._topics.subscribe(INFO_TYPE, lidars.info, self._on_info, qos(), is_required=True)
+
+    def _subscribe_to_motion(self) -> None:
+        """Subscribe to odometry and transforms."""
+        qos = QoSProfile(depth=ODOMETRY_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._topics.subscribe('nav_msgs/msg/Odometry', 'odom', self._on_odometry, qos)
         try:
             from tf2_ros import TransformListener
         except ImportError:
@@ -163,17 +175,20 @@ class BoxregNode(Node):
     def _on_odometry(self, msg: Odometry) -> None:
         self._inbox.put_event('odom', msg)
 
-    def _on_points(self, msg: PointCloud2) -> None:
+    def _on_info(self, msg: Any) -> None:
+        self._inbox.put_event('points_info', msg)
+
+    def _on_points(self, lidar: str, msg: PointCloud2) -> None:
         self.worker.cloud_frame = msg.header.frame_id
         self.worker.cloud_received = time.monotonic()
-        self._receive('points', msg)
+        self._receive('points', msg, lidar)
 
     def _on_boxes(self, msg: Any) -> None:
         self._receive('boxes', msg)
 
-    def _receive(self, topic: str, msg: Any) -> None:
+    def _receive(self, topic: str, msg: Any, lidar: str = '') -> None:
         self._health.count(f'{topic}_received')
-        dropped = self._inbox.put(topic, msg)
+        dropped = self._inbox.put(topic, msg, lidar)
         if dropped is not None:
             self.worker.drop(dropped)
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.lidars import Lidars
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -19,6 +20,20 @@ NODE_SETTINGS = (
         'boxes_type', '',
         'message type of the boxes, as package/msg/Type; empty: the first supported type '
         'published on the topic',
+    ),
+    Setting(
+        'points', (),
+        'topics of the clouds of several LiDARs, which are merged; empty: the topic points',
+    ),
+    Setting(
+        'sensor_frames', (),
+        'frames of the LiDARs where clouds are in another one: one for each of points, or all '
+        'LiDARs of a single concatenated cloud',
+    ),
+    Setting(
+        'points_info', '',
+        'topic of ConcatenatedPointCloudInfo, which divides a concatenated cloud among its '
+        'LiDARs; empty: none',
     ),
     Setting(
         'pose_reference', 'center',
@@ -68,6 +83,9 @@ class NodeOptions(NamedTuple):
     """Options of the node beside `Config`, described in `NODE_SETTINGS`."""
 
     boxes_type: str
+    points: tuple[str, ...]
+    sensor_frames: tuple[str, ...]
+    points_info: str
     pose_reference: str
     size_order: str
     forward_axis: str
@@ -82,6 +100,11 @@ class NodeOptions(NamedTuple):
     def convention(self) -> Convention:
         """Return the convention of the poses and sizes of the input boxes."""
         return Convention(self.pose_reference, self.size_order, self.forward_axis, self.associate)
+
+    @property
+    def lidars(self) -> Lidars:
+        """Return the topics of the clouds and the frames of the LiDARs."""
+        return Lidars(self.points, self.sensor_frames, self.points_info)
 
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:
@@ -263,6 +286,10 @@ def _values_of(parameters: Iterable[Parameter]) -> dict[str, Any]:
 def _checked(item: Setting, value: Any) -> Any:
     """Return the value of an option of the node in its type, or raise ConfigError."""
     kind: Any = type(item.default)
+    if kind is tuple:
+        if not isinstance(value, list | tuple) or not all(type(name) is str for name in value):
+            raise ConfigError(f'{item.name}: expected a list of names, got {value!r}')
+        return tuple(value)
     if kind is float and type(value) is int:
         value = float(value)
     if type(value) is not kind:

@@ -16,7 +16,8 @@ from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
 from boxreg_ros.live.inbox import Inbox, Message
 from boxreg_ros.reasons import REASONS
-from msg_adapters import Adapter, pointcloud
+from boxreg_ros.structures import BoxArray, Sweep
+from msg_adapters import Adapter
 from msg_adapters.poses import stamp_ns
 from rclpy.duration import Duration
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -151,7 +152,8 @@ class Worker:
             self._publish([Outgoing(message.content, False)])
             self._inbox.put_passing(message)  # the final copy, in the order of all
         else:
-            self._inbox.put_event('lost', stamp_ns(message.content.header))
+            lost = stamp_ns(message.content.header), message.lidar
+            self._inbox.put_event('lost', lost)
 
     def _next(self) -> ReceivedMessage | None:
         """Return the next message decoded, or None if there is none to process now."""
@@ -191,9 +193,13 @@ class Worker:
 
     def _decoded(self, message: Message) -> ReceivedMessage | None:
         """Return a message decoded; boxes that cannot be decoded pass through."""
-        reader: Any = pointcloud if message.topic == 'points' else self._live.adapter
+        content: Sweep | BoxArray
         try:
-            content = reader.from_msg(message.content)
+            if message.topic == 'points':
+                content = self._live.placement.sweep_of(message.content, message.lidar)
+            else:
+                assert self._live.adapter is not None  # set before boxes are subscribed to
+                content = self._live.adapter.from_msg(message.content)
         except UnsupportedMessage as error:
             self._health.report('unreadable', f'{message.topic}: {error}')
         except Exception as error:
@@ -230,8 +236,10 @@ class Worker:
         for kind, content in self._inbox.take_events():
             if kind == 'odom':
                 self._live.tree.add_odometry(content)
+            elif kind == 'points_info':
+                self._take_info(content)
             elif kind == 'lost':
-                self._publish(self._guarded(partial(self._live.lose, content)))
+                self._publish(self._guarded(partial(self._live.lose, *content)))
             elif kind == 'reset':
                 self._publish(self._guarded(self._live.reset))
             elif kind == 'settings':
@@ -241,6 +249,12 @@ class Worker:
             else:
                 self._live.tree.add_transforms(content, is_static=kind == '/tf_static')
         self.newest_transform_ns = self._live.tree.newest_ns()
+
+    def _take_info(self, message: Any) -> None:
+        try:
+            self._live.placement.add_info(message)
+        except UnsupportedMessage as error:
+            self._health.report('unreadable', f'points_info: {error}')
 
     def _process(self, item: ReceivedMessage) -> None:
         ready = self._guarded(partial(self._live.process, item), item)

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
 import yaml
+
+if TYPE_CHECKING:
+    from boxreg_ros.io.lidars import Lidars
+
+RECORDINGS = (
+    'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag, or a scene of a data set as in '
+    'nuscenes:/data#scene-0061'
+)
+"""What a recording can be, for the help of options."""
 
 
 def add_recording_arguments(
@@ -31,7 +40,7 @@ def add_recording_arguments(
     """
     parser.add_argument(
         'recordings', nargs=count, type=Path, metavar='RECORDING',
-        help=f'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; {several}',
+        help=f'{RECORDINGS}; {several}',
     )  # fmt: skip
     add_topic_arguments(parser)
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')
@@ -42,10 +51,22 @@ def add_recording_arguments(
 
 
 def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the topics to read, and the convention of the boxes."""
+    """Add the topics to read, the LiDARs, and the convention of the boxes."""
     parser.add_argument(
-        '--points', metavar='TOPIC', help='topic of the point clouds (default: found by type)'
-    )
+        '--points', action='append', default=[], metavar='TOPIC',
+        help='topic of the point clouds (default: found by type); repeat it to merge the clouds '
+        'of several LiDARs',
+    )  # fmt: skip
+    parser.add_argument(
+        '--sensor-frame', action='append', default=[], metavar='FRAME', dest='sensor_frames',
+        help='frame of the LiDAR where clouds are in another one: once per --points, or once per '
+        'LiDAR of a single concatenated cloud',
+    )  # fmt: skip
+    parser.add_argument(
+        '--points-info', metavar='TOPIC', default='',
+        help='topic of ConcatenatedPointCloudInfo, which divides a concatenated cloud among its '
+        'LiDARs (default: that of the clouds with _info behind it, if there is one)',
+    )  # fmt: skip
     parser.add_argument(
         '--boxes', metavar='TOPIC', help='topic of the boxes (default: found by type)'
     )
@@ -87,6 +108,20 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         '--label-frame', metavar='FRAME',
         help='sensor frame of the label files (default: frame of the clouds)',
     )  # fmt: skip
+
+
+def lidars_from(args: argparse.Namespace) -> Lidars:
+    """Return the topics of the clouds and the frames of the LiDARs of the arguments."""
+    from boxreg_ros.io.lidars import Lidars  # imports numpy
+
+    return Lidars(tuple(args.points), tuple(args.sensor_frames), args.points_info)
+
+
+def lidar_options(args: argparse.Namespace) -> list[str]:
+    """Return the options that `lidars_from` reads, as they are written."""
+    words = [f'--points={topic}' for topic in args.points]
+    words += [f'--sensor-frame={frame}' for frame in args.sensor_frames]
+    return words + [f'--points-info={args.points_info}'] * bool(args.points_info)
 
 
 def convention_from(args: argparse.Namespace, associate: bool = False) -> Convention:

@@ -18,7 +18,7 @@ import sys
 from typing import Any
 
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.offline.arguments import add_recording_arguments, config_from
+from boxreg_ros.offline.arguments import add_recording_arguments, config_from, lidar_options
 from boxreg_ros.offline.batch_results import row_of, rows_of_shards, write_results
 from boxreg_ros.offline.job import Job, JOB_FAILED, jobs_of, UP_TO_DATE
 from boxreg_ros.offline.job_process import JobRunner
@@ -160,8 +160,8 @@ def _ended(out: Path, rows: Sequence[dict[str, Any]]) -> int:
 
 def _options(args: argparse.Namespace) -> list[str]:
     """Return the options of `boxreg relabel` for every drive."""
-    options = ['--formats', args.formats]
-    for name in ('points', 'boxes', 'odometry', 'pose_reference', 'size_order', 'forward_axis'):
+    options = ['--formats', args.formats, *lidar_options(args)]
+    for name in ('boxes', 'odometry', 'pose_reference', 'size_order', 'forward_axis'):
         value = getattr(args, name)
         if value is not None:
             options.append(f'--{name.replace("_", "-")}={value}')

@@ -31,11 +31,15 @@ from boxreg_ros.core.input_model import (
 from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.window import group_windows, stack_windows, Window
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.recording import Recording
-from boxreg_ros.offline.arguments import add_recording_arguments, config_from, convention_from
+from boxreg_ros.offline.arguments import (
+    add_recording_arguments,
+    config_from,
+    convention_from,
+    lidars_from,
+)
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.result_folder import spare_file
+from boxreg_ros.offline.sources import source_of, true_boxes
 from boxreg_ros.structures import Floats, is_valid_box
 import numpy as np
 import torch
@@ -281,9 +285,13 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.output:  # may be the file of --config
         spare_file(args.output, [*args.recordings, args.truth])
-    truth = BoxTable.read(args.truth)
-    recording = Recording(
-        args.recordings, args.points, args.boxes, args.odometry, convention=convention_from(args)
+    truth = true_boxes(args.truth)
+    recording = source_of(
+        args.recordings,
+        lidars_from(args),
+        args.boxes,
+        args.odometry,
+        convention=convention_from(args),
     )
     recording.has_boxes = not args.no_boxes
     drive = Drive.of(recording, truth, config.tolerance)
@@ -353,7 +361,7 @@ def _model_of(windows: Sequence[Window], config: Config) -> InputModel:
 
 def _bare(rows: Iterable[Sequence[Any]]) -> Window:
     """Return a window of (stamp, box) without points."""
-    nowhere, no_points = np.full(3, np.nan), np.zeros((0, 3), np.float32)
+    nowhere, no_points = np.full((1, 3), np.nan), np.zeros((0, 3), np.float32)
     observations = [
         Observation(stamp_ns, box, no_points, no_points[:, 0], nowhere, np.nan, 0)
         for stamp_ns, box in rows

@@ -80,16 +80,28 @@ def _print(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> None:
 def _tracks(source: str, config: Config) -> list[LabelTrack]:
     """Read the tracks of label files or of a recording."""
     path = Path(source)
-    if path.suffix in RECORDING_SUFFIXES or (path / 'metadata.yaml').is_file():
+    if _is_recording(path):
         from boxreg_ros.io.recording import input_boxes  # slow to import: it reads bags
+        from boxreg_ros.offline.sources import source_of
 
-        arrays, _ = input_boxes(path)
+        arrays, _ = input_boxes(source_of([path]))
         return _grouped(((array, None) for array in arrays), config)
     from boxreg_ros.labels import frames_of
 
     name, path = _format_of(source)
     frames = (frame.moved('fixed').refined for frame in frames_of(name, path))
     return _grouped(((refined.boxes, refined.num_points) for refined in frames), config)
+
+
+def _is_recording(path: Path) -> bool:
+    """Return whether a path names a recording or a scene of a data set, not label files."""
+    from boxreg_ros.datasets import address_of
+
+    address = address_of(path)
+    if address is not None:
+        # Label formats of the same name are files, or folders without a scene.
+        return bool(address.scene)
+    return path.suffix in RECORDING_SUFFIXES or (path / 'metadata.yaml').is_file()
 
 
 def _format_of(source: str) -> tuple[str, Path]:

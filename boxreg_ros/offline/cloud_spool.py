@@ -53,11 +53,9 @@ class Spool:
             return
         insort(self._stamps, stamp_ns)
         self._frames[stamp_ns] = sweep.frame_id, T_fixed_sweep
-        columns = [sweep.points]
-        if intensities is not None:
-            columns.append(intensities[:, None])
-        table = np.hstack(columns, dtype=sweep.points.dtype, casting='same_kind')
-        np.save(self._file(stamp_ns), table)
+        columns = {'points': sweep.points, 'times': sweep.times, 'intensities': intensities}
+        known = {name: column for name, column in columns.items() if column is not None}
+        np.savez(self._file(stamp_ns), allow_pickle=False, **known)
 
     def take(
         self, stamp_ns: int, frame_id: str, T_fixed_frame: Floats
@@ -87,9 +85,9 @@ class Spool:
         if nearest is None or abs(nearest - stamp_ns) > self._max_offset_ns:
             return None, None
         own_frame, T_fixed_sweep = self._frames[nearest]
-        table = np.load(self._file(nearest))
-        intensities = table[:, 3] if table.shape[1] > 3 else None
-        sweep = Sweep(nearest, own_frame, table[:, :3])
+        with np.load(self._file(nearest)) as columns:
+            sweep = Sweep(nearest, own_frame, columns['points'], columns.get('times'))
+            intensities = columns.get('intensities')
         if (nearest, own_frame) != (stamp_ns, frame_id):
             sweep = sweep_to_frame(sweep, inverse(T_fixed_frame) @ T_fixed_sweep, frame_id)
         return sweep, intensities
@@ -106,4 +104,4 @@ class Spool:
         del self._stamps[:first]
 
     def _file(self, stamp_ns: int) -> Path:
-        return self._folder / f'{stamp_ns}.npy'
+        return self._folder / f'{stamp_ns}.npz'

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from boxreg_ros.io.box_table import BoxTable
-    from boxreg_ros.offline.evaluate import Matches
+    from boxreg_ros.offline.box_scores import Matches
 
 CONSISTENCY_VARIABLES = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
 RANGE_BINS = (0.0, 20.0, 40.0, math.inf)

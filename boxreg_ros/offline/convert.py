@@ -14,6 +14,7 @@ from typing import Any
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.transforms import boxes_to_frame, TransformTree
 from boxreg_ros.labels import (
     check_options,
@@ -26,8 +27,9 @@ from boxreg_ros.labels import (
 )
 from boxreg_ros.offline.arguments import add_label_arguments
 from boxreg_ros.offline.cloud_spool import Spool
-from boxreg_ros.offline.labelled_recording import label_frame_of, LabelledRecording, pose_of
+from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
 from boxreg_ros.offline.result_folder import SUMMARY, whole_folder
+from boxreg_ros.offline.sources import source_of
 from boxreg_ros.structures import Sweep
 
 
@@ -173,8 +175,9 @@ def _read_with_recording(
     tree = TransformTree()
     labels = (request.source_format, request.source)
     spool = Spool(folder, Config()) if request.options.with_points else None
-    topics = {'points': request.points, 'odometry': request.odometry}
-    with LabelledRecording(labels, request.recordings, **topics) as recording:
+    lidars = Lidars((request.points,) if request.points else ())
+    source = source_of(request.recordings, lidars, odometry=request.odometry, labels=labels)
+    with source as recording:
         fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
         sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
         for read in recording.items(tree, with_intensities=spool is not None):

@@ -9,9 +9,10 @@ from typing import Any
 from boxreg_ros.config import Config
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.datasets import SceneRecording
 from boxreg_ros.errors import RecordingError, TransformUnavailable
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.recording import left_out, Recording
 from boxreg_ros.io.session import register
 from boxreg_ros.io.transforms import sweep_to_frame, to_fixed_frame, TransformTree
 from boxreg_ros.rotations import matrix_from_rpy
@@ -84,7 +85,12 @@ class Drive:
         return cls.of(Recording(found), truth)
 
     @classmethod
-    def of(cls, recording: Recording, truth: BoxTable, within: float | None = None) -> Drive:
+    def of(
+        cls,
+        recording: Recording | SceneRecording,
+        truth: BoxTable,
+        within: float | None = None,
+    ) -> Drive:
         """
         Read a recording that is not open yet, in the frame of its true boxes.
 
@@ -117,15 +123,15 @@ class Drive:
                 away_ns = np.abs(truth.stamps_ns - moved.stamp_ns)
                 if within is None or (away_ns <= within * 1e9).any():
                     sweeps.append(moved)
-        left_out = recording.left_out(missing_transforms)
+        others = left_out(recording, missing_transforms)
         if not has_sweeps:
-            reason = f': {left_out}' if left_out else ''
+            reason = f': {others}' if others else ''
             raise RecordingError(f'{recording}: expected sweeps, got none{reason}')
         return cls(
             tuple(sorted(sweeps, key=lambda sweep: sweep.stamp_ns)),
             tuple(sorted(boxes, key=lambda array: array.stamp_ns)),
             truth,
-            left_out,
+            others,
         )
 
     def registered(self, config: Config) -> dict[str, BoxTable]:

@@ -3,299 +3,37 @@
 from __future__ import annotations
 
 import argparse
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 import json
 import math
 from pathlib import Path
 import sys
 from typing import Any
 
-from boxreg_ros.config import words_of
-from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
-from boxreg_ros.offline.arguments import add_topic_arguments, convention_from
+from boxreg_ros.offline.arguments import add_topic_arguments, convention_from, lidars_from
+from boxreg_ros.offline.box_scores import (
+    by_overlap,
+    groups,
+    match,
+    RECALLS,
+    Scores,
+    summarise,
+)
 from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
-from boxreg_ros.offline.overlap import best_pairs, overlaps
 from boxreg_ros.offline.result_folder import earlier_summary
+from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.track_scores import (
     has_trackeval,
     LEAST_IOU,
     track_scores,
     TrackScores,
 )
-from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, is_valid_box, REJECTED, YAW
+from boxreg_ros.structures import Ints, is_valid_box, REJECTED
 import numpy as np
-from numpy.typing import NDArray
-
-RECALLS = (0.5, 0.7, 0.8)
-"""IoU thresholds of the recalls."""
-POINT_BINS = (0, 10, 30, 100, 300, 1000)
-"""Lower limits of the groups by number of points."""
-MAX_STEP = 1.0
-"""Jitter is not computed across longer gaps [s]."""
-
-Mask = NDArray[np.bool_]
-Pairing = Callable[[BoxTable, BoxTable], Ints]
-"""Returns the row of the prediction of each true box (n,), -1 where there is none."""
-
-
-@dataclass(frozen=True, slots=True)
-class Matches:
-    """
-    All true boxes in scope, each with its prediction if there is one.
-
-    Attributes
-    ----------
-    rows : array, shape (n,)
-        Rows of the true boxes in their table.
-    predicted_rows : array, shape (n,)
-        Rows of their predictions in the table of these; -1 without one.
-    class_names : tuple of n str
-        Of the true boxes.
-    num_points : array, shape (n,)
-        Of the true boxes.
-    is_matched : array, shape (n,)
-        True where a finite prediction exists; the errors below are 0 elsewhere.
-    iou_bev, iou_3d : array, shape (n,)
-        Overlap with the prediction.
-    translation, extent, rotation : array, shape (n, 3)
-        Errors as in `PoseErrors`.
-    scale_iou : array, shape (n,)
-        3D IoU after alignment of centre and heading.
-    is_flipped : array, shape (n,)
-        True where the heading error is larger than 90 degrees.
-    jitter, turn_jitter : array, shape (n,)
-        Norm of the second difference over time of the predicted centre [m/s^2] and yaw
-        [rad/s^2]; NaN without a box of the track within `MAX_STEP` before and after.
-    true_jitter : array, shape (n,)
-        The same of the true centre, as a reference for `jitter`.
-    unmatched : int
-        Predictions without a true box.
-    invalid : int
-        True boxes that are out of scope because of NaN or an extent that is not positive.
-
-    """
-
-    rows: Ints
-    predicted_rows: Ints
-    class_names: tuple[str, ...]
-    num_points: Ints
-    is_matched: Mask
-    iou_bev: Floats
-    iou_3d: Floats
-    translation: Floats
-    extent: Floats
-    rotation: Floats
-    scale_iou: Floats
-    is_flipped: Mask
-    jitter: Floats
-    turn_jitter: Floats
-    true_jitter: Floats
-    unmatched: int
-    invalid: int
-
-
-@dataclass(frozen=True, slots=True)
-class Scores:
-    """
-    Means over true boxes: errors over those with a prediction, recalls over all.
-
-    Attributes
-    ----------
-    boxes, missing, unmatched : int
-        True boxes in scope, those without a prediction, and predictions without a true box.
-    iou_bev, iou_3d, iou_bev_median, iou_3d_median : float
-        Over matched boxes.
-    recall_bev, recall_3d : tuple of float
-        Fraction of the true boxes with at least each IoU of `RECALLS`; a missing prediction
-        counts as IoU 0.
-    ate, ase, aoe, aoe_median : float
-        Average translation error [m], average scale error (1 - IoU after alignment), and
-        average absolute yaw error [rad], as in nuScenes.
-    flips : float
-        Fraction of the matched boxes with a heading error larger than 90 degrees.
-    jitter, turn_jitter, true_jitter : float
-        Means of the values in `Matches` [m/s^2, rad/s^2].
-
-    """
-
-    boxes: int
-    missing: int
-    unmatched: int
-    iou_bev: float
-    iou_3d: float
-    iou_bev_median: float
-    iou_3d_median: float
-    recall_bev: tuple[float, ...]
-    recall_3d: tuple[float, ...]
-    ate: float
-    ase: float
-    aoe: float
-    aoe_median: float
-    flips: float
-    jitter: float
-    turn_jitter: float
-    true_jitter: float
-
-
-def by_id(predicted: BoxTable, truth: BoxTable) -> Ints:
-    """
-    Return the row of the prediction with the stamp and track id of each true box, or -1.
-
-    For boxes that follow from the true ones, such as the results of several methods for one
-    input: a box that is far off counts with its error. Of two predictions the first one counts.
-
-    """
-    row_of: dict[tuple[int, str], int] = {}
-    for row, key in enumerate(_keys(predicted)):
-        row_of.setdefault(key, row)
-    rows = np.array([row_of.get(key, -1) for key in _keys(truth)], np.int64)
-    is_finite = np.append(np.isfinite(predicted.boxes).all(axis=1), False)
-    return np.where(is_finite[rows], rows, -1)
-
-
-def by_overlap(predicted: BoxTable, truth: BoxTable) -> Ints:
-    """
-    Return the row of the prediction that overlaps each true box, or -1.
-
-    At each stamp the one-to-one pairs with the greatest sum of 3D IoU are chosen; ids play no
-    role.
-
-    """
-    rows = np.full(len(truth.boxes), -1, np.int64)
-    for stamp in overlaps(predicted, truth):
-        true, found = best_pairs(stamp.iou)
-        rows[stamp.true[true]] = stamp.predicted[found]
-    return rows
-
-
-def match(
-    predicted: BoxTable,
-    truth: BoxTable,
-    min_points: int = 0,
-    classes: Sequence[str] = (),
-    pair: Pairing = by_id,
-) -> Matches:
-    """
-    Compare predictions with true boxes of the same stamp.
-
-    Parameters
-    ----------
-    predicted, truth : BoxTable
-        Boxes in the same frame. Predictions of true boxes that are out of scope are ignored.
-    min_points : int
-        True boxes with fewer points are out of scope.
-    classes : sequence of str
-        True boxes whose class name contains none of these words are out of scope; case is
-        ignored. Empty: all classes are in scope.
-    pair : callable
-        Which prediction belongs to a true box: `by_id` or `by_overlap`.
-
-    Raises
-    ------
-    RecordingError
-        If the frames differ, or the truth has a track id twice at one stamp.
-
-    """
-    if len(predicted.boxes) and len(truth.boxes) and predicted.frame_id != truth.frame_id:
-        raise RecordingError(
-            f'predicted boxes: expected the frame of the true boxes, {truth.frame_id!r}, got '
-            f'{predicted.frame_id!r}; relabel with --fixed-frame {truth.frame_id}'
-        )
-    _check_unique(_keys(truth))
-    paired_rows = pair(predicted, truth)
-    is_valid = is_valid_box(truth.boxes)
-    is_in_class = np.array([has_word(name, classes) for name in truth.class_names], bool)
-    scope = np.flatnonzero(is_valid & is_in_class & (truth.num_points >= min_points))
-    predicted_rows = paired_rows[scope]
-    is_matched = predicted_rows >= 0
-    true_rows = scope[is_matched]
-    boxes = predicted.boxes[predicted_rows[is_matched]]
-    true_boxes = truth.boxes[true_rows]
-    stamps = truth.stamps_ns[true_rows]
-    tracks = [truth.track_ids[i] for i in true_rows]
-    errors = pose_errors(boxes, true_boxes)
-    jitter = _second_difference(stamps, tracks, boxes[:, :3])
-    turn_jitter = _second_difference(stamps, tracks, boxes[:, [YAW]], is_angle=True)
-    true_jitter = _second_difference(stamps, tracks, true_boxes[:, :3])
-    return Matches(
-        rows=scope,
-        predicted_rows=predicted_rows,
-        class_names=tuple(truth.class_names[i] for i in scope),
-        num_points=truth.num_points[scope],
-        is_matched=is_matched,
-        iou_bev=_spread(iou_bev(boxes, true_boxes), is_matched),
-        iou_3d=_spread(iou_3d(boxes, true_boxes), is_matched),
-        translation=_spread(errors.translation, is_matched),
-        extent=_spread(errors.extent, is_matched),
-        rotation=_spread(errors.rotation, is_matched),
-        scale_iou=_spread(_scale_iou(boxes, true_boxes), is_matched),
-        is_flipped=_spread(errors.is_flipped, is_matched),
-        jitter=_spread(jitter, is_matched, np.nan),
-        turn_jitter=_spread(turn_jitter, is_matched, np.nan),
-        true_jitter=_spread(true_jitter, is_matched, np.nan),
-        unmatched=len(predicted.boxes) - int((paired_rows >= 0).sum()),
-        invalid=int((~is_valid).sum()),
-    )
-
-
-def summarise(matches: Matches, mask: Mask | None = None) -> Scores:
-    """Return the scores over the true boxes where `mask` (n,) is True, or over all."""
-    chosen = np.ones(len(matches.is_matched), bool) if mask is None else mask
-    rows = chosen & matches.is_matched
-    yaw_errors = np.abs(matches.rotation[rows, 2])
-    return Scores(
-        boxes=int(chosen.sum()),
-        missing=int(chosen.sum() - rows.sum()),
-        unmatched=matches.unmatched if mask is None else 0,
-        iou_bev=_mean(matches.iou_bev[rows]),
-        iou_3d=_mean(matches.iou_3d[rows]),
-        iou_bev_median=_median(matches.iou_bev[rows]),
-        iou_3d_median=_median(matches.iou_3d[rows]),
-        recall_bev=tuple(_mean(matches.iou_bev[chosen] >= level) for level in RECALLS),
-        recall_3d=tuple(_mean(matches.iou_3d[chosen] >= level) for level in RECALLS),
-        ate=_mean(np.linalg.norm(matches.translation[rows], axis=1)),
-        ase=_mean(1 - matches.scale_iou[rows]),
-        aoe=_mean(yaw_errors),
-        aoe_median=_median(yaw_errors),
-        flips=_mean(matches.is_flipped[rows]),
-        jitter=_mean(matches.jitter[rows]),
-        turn_jitter=_mean(matches.turn_jitter[rows]),
-        true_jitter=_mean(matches.true_jitter[rows]),
-    )
-
-
-def evaluate(
-    predicted: BoxTable, truth: BoxTable, min_points: int = 0, classes: Sequence[str] = ()
-) -> Scores:
-    """Return the scores over all true boxes in scope; arguments and errors as of `match`."""
-    return summarise(match(predicted, truth, min_points, classes))
-
-
-def has_word(class_name: str, words: Sequence[str]) -> bool:
-    """Return whether a class name contains one of `words`, in any case; True without words."""
-    if not words:
-        return True
-    return not {word.lower() for word in words}.isdisjoint(words_of(class_name))
-
-
-def groups(matches: Matches) -> dict[str, dict[str, Scores]]:
-    """Return scores by class and by number of points of the true box, without empty groups."""
-    names = np.array(matches.class_names, object)
-    by_class = {name: summarise(matches, np.equal(names, name)) for name in sorted(set(names))}
-    by_points = {}
-    for low, high in zip(POINT_BINS, (*POINT_BINS[1:], math.inf), strict=True):
-        mask = (matches.num_points >= low) & (matches.num_points < high)
-        if mask.any():
-            name = f'{low}+' if high == math.inf else f'{low}-{high - 1}'
-            by_points[name] = summarise(matches, mask)
-    return {'by_class': by_class, 'by_points': by_points}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -305,7 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='result folder or boxes.csv, or a recording, whose input boxes are compared',
     )  # fmt: skip
     parser.add_argument(
-        'truth', type=Path, metavar='TRUTH.csv', help='true boxes, with the columns of boxes.csv'
+        'truth',
+        type=Path,
+        metavar='TRUTH',
+        help='true boxes: CSV with the columns of boxes.csv, or a scene of a data set',
     )
     parser.add_argument(
         '--min-points', type=int, default=0, metavar='N',
@@ -326,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the scores of a table of boxes or of the input boxes of a recording."""
-    truth = BoxTable.read(args.truth)
+    truth = true_boxes(args.truth)
     predicted = _predicted(args, truth.frame_id)
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes, by_overlap)
@@ -394,10 +135,10 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
     source: Path = args.predicted
     if (source / 'boxes.csv').is_file():
         source = source / 'boxes.csv'
-    topics = {name: getattr(args, name) for name in ('points', 'boxes', 'odometry')}
+    topics = {'boxes': args.boxes, 'odometry': args.odometry}
     convention = convention_from(args)
     if source.suffix == '.csv':
-        if any(topics.values()) or args.fixed_frame or not convention.is_standard:
+        if any(topics.values()) or args.points or args.fixed_frame or not convention.is_standard:
             raise ConfigError(
                 f'--points, --boxes, --odometry, --fixed-frame, {convention}: expected with a '
                 f'recording only, got the table {str(source)!r}; leave them out'
@@ -405,10 +146,12 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
         found = _table_in_frame(BoxTable.read_frames(source), frame_id)
         return found.rows(np.array([status != REJECTED for status in found.status], bool))
     from boxreg_ros.io.recording import input_boxes  # slow to import: it reads bags
+    from boxreg_ros.offline.sources import source_of
 
-    arrays, left_out = input_boxes(source, args.fixed_frame, convention=convention, **topics)
-    if left_out:
-        _warn(left_out)
+    recording = source_of([source], lidars_from(args), convention=convention, **topics)
+    arrays, others = input_boxes(recording, args.fixed_frame)
+    if others:
+        _warn(others)
     return BoxTable.from_arrays(arrays)
 
 
@@ -505,88 +248,3 @@ def finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def _check_unique(true_keys: Sequence[tuple[int, str]]) -> None:
-    """Refuse true boxes with the same stamp and track id."""
-    for (stamp_ns, track_id), count in Counter(true_keys).most_common(1):
-        if count == 1:
-            return
-        raise RecordingError(
-            f'true boxes: expected each track id once per stamp, got {track_id!r} {count} times '
-            f'at stamp {stamp_ns}; give every object an id of its own'
-        )
-
-
-def _spread(values: NDArray[Any], is_matched: Mask, absent: float = 0) -> NDArray[Any]:
-    """Return the values of matched boxes as rows of all true boxes; `absent` elsewhere."""
-    full = np.full((len(is_matched), *values.shape[1:]), absent, dtype=values.dtype)
-    full[is_matched] = values
-    return full
-
-
-def _scale_iou(boxes: Floats, true_boxes: Floats) -> Floats:
-    """Return the 3D IoU (n,) after alignment of centre and heading."""
-    aligned = true_boxes.copy()
-    aligned[:, BOX_EXTENT] = boxes[:, BOX_EXTENT]
-    return iou_3d(aligned, true_boxes)
-
-
-def _second_difference(
-    stamps_ns: Ints, track_ids: Sequence[str], values: Floats, is_angle: bool = False
-) -> Floats:
-    """
-    Return the norm of the second difference over time of the values of each track.
-
-    Parameters
-    ----------
-    stamps_ns : array, shape (n,)
-        Stamps [ns].
-    track_ids : sequence of n str
-        Tracks.
-    values : array, shape (n, D)
-        Values, in metres or radians.
-    is_angle : bool
-        Wrap differences to the half-open interval from -pi to pi.
-
-    Returns
-    -------
-    norms : array, shape (n,)
-        In units per s^2; NaN without a value of the track within `MAX_STEP` before and after.
-
-    """
-    norms = np.full(len(stamps_ns), np.nan)
-    _, codes = np.unique(np.array(track_ids, str), return_inverse=True)
-    order = np.lexsort((stamps_ns, codes))
-    before, here, after = order[:-2], order[1:-1], order[2:]
-    first_seconds = (stamps_ns[here] - stamps_ns[before]) / 1e9
-    second_seconds = (stamps_ns[after] - stamps_ns[here]) / 1e9
-    is_one_track = codes[before] == codes[after]
-    is_near = is_one_track & (np.maximum(first_seconds, second_seconds) <= MAX_STEP)
-    before, here, after = before[is_near], here[is_near], after[is_near]
-    first = values[here] - values[before]
-    second = values[after] - values[here]
-    if is_angle:
-        first = wrap_angle(first)
-        second = wrap_angle(second)
-    first_seconds = first_seconds[is_near, None]
-    second_seconds = second_seconds[is_near, None]
-    difference = second / second_seconds - first / first_seconds
-    norms[here] = np.linalg.norm(2 * difference / (first_seconds + second_seconds), axis=1)
-    return norms
-
-
-def _keys(boxes: BoxTable) -> list[tuple[int, str]]:
-    """Return stamp and track id of each box."""
-    return list(zip(boxes.stamps_ns.tolist(), boxes.track_ids, strict=True))
-
-
-def _mean(values: NDArray[Any]) -> float:
-    """Return the mean of the finite values; NaN without any."""
-    finite_values = values[np.isfinite(values)]
-    return float(finite_values.mean()) if len(finite_values) else math.nan
-
-
-def _median(values: NDArray[Any]) -> float:
-    """Return the median; NaN without a value."""
-    return float(np.median(values)) if len(values) else math.nan

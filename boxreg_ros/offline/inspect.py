@@ -21,12 +21,18 @@ from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.offline.arguments import add_topic_arguments, convention_from
+from boxreg_ros.offline.arguments import (
+    add_topic_arguments,
+    convention_from,
+    lidar_options,
+    lidars_from,
+    RECORDINGS,
+)
 from boxreg_ros.offline.result_folder import spare_file
 from boxreg_ros.offline.timeline import check_plotly, merged_spans, write_timeline
 
 if TYPE_CHECKING:
-    from boxreg_ros.io.recording import Item, Recording
+    from boxreg_ros.io.recording import Item, ItemSource
     from boxreg_ros.io.transforms import Link
 
 DONE = 0
@@ -43,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg inspect`."""
     parser.add_argument(
         'recordings', nargs='+', type=Path, metavar='RECORDING',
-        help='MCAP file, rosbag2 folder, .db3 file or ROS 1 bag; several are merged by time',
+        help=f'{RECORDINGS}; several are merged by time; a data set without a scene is listed',
     )  # fmt: skip
     add_topic_arguments(parser)
     parser.add_argument('--json', action='store_true', help='print JSON')
@@ -55,6 +61,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what is in the recording; return 1 if it cannot be relabelled."""
+    scenes = _scenes(args.recordings)
+    if scenes:
+        print(json.dumps(scenes) if args.json else '\n'.join(scenes))
+        return DONE
     if args.html is not None:
         check_plotly()
         spare_file(args.html, args.recordings)
@@ -81,13 +91,17 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
         If nothing in it can be read.
 
     """
-    from boxreg_ros.io.recording import Recording
+    from boxreg_ros.offline.sources import scene_address, source_of
 
-    facts = _contents(args.recordings)
     convention = convention_from(args)
-    options = {'points': args.points, 'boxes': args.boxes, 'odometry': args.odometry}
+    lidars = lidars_from(args)
+    source = source_of(args.recordings, lidars, args.boxes, args.odometry, convention=convention)
+    if scene_address(args.recordings) is None:
+        facts = _contents(args.recordings)
+    else:
+        facts = _scene_contents(args.recordings)
     try:
-        with Recording(args.recordings, **options, convention=convention) as recording:
+        with source as recording:
             facts |= _sampled(recording, convention)
             facts['damage'] = [damage._asdict() for damage in recording.damages]
     except BoxregError as error:
@@ -129,6 +143,47 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
             for (topic, kind), count in sorted(counts.items())
         ],
         'damage': damages,
+        'problems': [],
+        'warnings': [],
+    }
+
+
+def _scenes(paths: list[Path]) -> list[str]:
+    """Return the addresses of all scenes of a data set, if none of several is named."""
+    from boxreg_ros.datasets import scene_names
+    from boxreg_ros.offline.sources import scene_address
+
+    address = scene_address(paths)
+    if address is None or address.scene:
+        return []
+    names = scene_names(address)
+    return [str(address._replace(scene=name)) for name in names] if len(names) > 1 else []
+
+
+def _scene_contents(paths: list[Path]) -> dict[str, Any]:
+    """Return files, times and numbers of sweeps and boxes of a scene."""
+    from boxreg_ros.datasets import SceneRecording
+    from boxreg_ros.offline.sources import scene_address
+
+    address = scene_address(paths)
+    assert address is not None
+    recording = SceneRecording(address)
+    recording.has_boxes = False
+    with recording:
+        seconds = (recording.end_ns - recording.start_ns) * 1e-9
+        files = recording.files
+        topics = [
+            {'topic': name, 'type': 'data set', 'messages': count, 'rate': _rate(count, seconds)}
+            for name, count in recording.topics.items()
+        ]
+        begin_ns = recording.start_ns
+    return {
+        'files': [str(file) for file in files],
+        'bytes': sum(file.stat().st_size for file in files),
+        'begin_ns': begin_ns,
+        'seconds': seconds,
+        'topics': topics,
+        'damage': [],
         'problems': [],
         'warnings': [],
     }
@@ -186,11 +241,11 @@ class _Sample:
             self.tracks[name].append(content.stamp_ns)
 
 
-def _sampled(recording: Recording, convention: Any) -> dict[str, Any]:
+def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
     """Return what the first seconds of a recording show."""
     from boxreg_ros.io.session import Session
 
-    session = Session(convention, Config())
+    session = Session(convention, Config(), placement=recording.placement)
     session.fixed_frame = recording.choose_fixed_frame(session.tree)
     sample = _Sample()
     begin_ns = recording.start_ns
@@ -252,7 +307,7 @@ def _summary(sample: _Sample) -> dict[str, Any]:
     }
 
 
-def _warnings(sample: _Sample, finding: str, recording: Recording) -> Iterator[str]:
+def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[str]:
     """Yield what makes results worse, one line each."""
     if finding:
         yield finding
@@ -317,9 +372,14 @@ def _kind(class_name: str) -> str:
 
 def _command(args: argparse.Namespace, facts: dict[str, Any]) -> str:
     """Return the relabel command with the same recordings and topics."""
-    out = f'out/{args.recordings[0].stem}'
+    from boxreg_ros.offline.sources import scene_address
+
+    first = args.recordings[0]
+    scene = scene_address([first])
+    out = f'out/{first.stem if scene is None else scene.scene or scene.root.name}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
-    for name in ('points', 'boxes', 'odometry'):
+    words += lidar_options(args)
+    for name in ('boxes', 'odometry'):
         if getattr(args, name):
             words += [f'--{name}', getattr(args, name)]
     convention = convention_from(args)

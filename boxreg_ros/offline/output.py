@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import LabelFrame, Provenance, writer_for
 from boxreg_ros.offline.cloud_spool import Spool
 from boxreg_ros.offline.reader import ReadItem, Source
@@ -98,7 +99,9 @@ class Sink:
         if request.options.with_points:
             self._spool = Spool(folder, request.config)
         provenance = Provenance.of(request.recordings, request.config)
-        options = replace(request.options, recording=request.recording())
+        recording = request.recording()
+        bags = recording if isinstance(recording, Recording) else None
+        options = replace(request.options, recording=bags)
         self._writers = {
             name: writer_for(name, folder, provenance, options) for name in request.all_formats
         }

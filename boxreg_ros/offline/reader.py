@@ -12,16 +12,19 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, cast, NamedTuple
 
+from boxreg_ros.io.lidars import MergedSweep
 from boxreg_ros.io.recording import Item, ItemSource
 from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
 from boxreg_ros.io.storage.record import Damage
+from boxreg_ros.io.transforms import inverse, sweep_to_frame
 from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import run_in_worker, WorkerProcess
 from boxreg_ros.structures import BoxArray, Floats, Sweep
+import numpy as np
 
 
 class ReadItem(NamedTuple):
@@ -82,10 +85,14 @@ class Findings(NamedTuple):
     Attributes
     ----------
     counts : Counter
-        Sweeps, box arrays, time jumps, sweeps without a transform, and sweeps and box arrays
-        without a stamp.
+        Sweeps, box arrays, time jumps, clouds without a transform or whose LiDARs are not all
+        known, and clouds and box arrays without a stamp.
     first_missing_transform : str
         Error of the first item without a transform; empty if there is none.
+    first_unplaced : str
+        Error of the first cloud whose LiDARs are not all known; empty if there is none.
+    lidars : dict of str and Counter
+        Of each of several topics of clouds: clouds that were merged, late and missing.
     unreadable, first_unreadable : int and str
         Number of unreadable messages, and the first error of each topic.
     apart : dict
@@ -103,6 +110,8 @@ class Findings(NamedTuple):
 
     counts: Counter[str]
     first_missing_transform: str
+    first_unplaced: str
+    lidars: dict[str, Counter[str]]
     unreadable: int
     first_unreadable: str
     apart: dict[str, float]
@@ -138,7 +147,8 @@ class RecordingReader:
         self._clock = clock
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
-        self._session = Session(request.convention, request.config)
+        self._session = Session(request.convention, request.config, placement=recording.placement)
+        self._is_merging = len(recording.placement.lidars.topics) > 1
         self._jumps = JumpConfirmation[Item]()
         tree = self._session.tree
         with clock('read'):
@@ -146,7 +156,7 @@ class RecordingReader:
             sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
         self._session.fixed_frame = fixed_frame
         topics = {
-            'points': recording.points_topic,
+            'points': ', '.join(recording.placement.lidars.topics) or recording.points_topic,
             'boxes': recording.boxes_topic or None,
             'odometry': recording.odometry_topic,
         }
@@ -154,6 +164,8 @@ class RecordingReader:
         self.source = Source(topics, fixed_frame, sensor_frame, seconds)
         self._counts: Counter[str] = Counter()
         self._first_missing_transform = ''
+        self._first_unplaced = ''
+        self._restarts = False
 
     def __iter__(self) -> Iterator[ReadItem]:
         """
@@ -173,13 +185,16 @@ class RecordingReader:
             if not is_placeholder(item.content):
                 confirmed, restarts = self._jumps.add(item, item.content)
             if restarts:
+                yield from map(self._merged_item, self._session.unmerged())
                 # The tree, which is ahead of the items, has detected the jump itself.
                 self._session.restart()
                 self._counts['time_jump'] += 1
+                self._restarts = True
             for ready in confirmed:
-                yield self._read_item(ready, restarts and ready is confirmed[0])
+                yield from self._read_items(ready)
         for late in self._jumps.release():
-            yield self._read_item(late, restarts=False)
+            yield from self._read_items(late)
+        yield from map(self._merged_item, self._session.unmerged())
         self._recording.check_readable()
 
     def findings(self) -> Findings:
@@ -188,6 +203,8 @@ class RecordingReader:
         return Findings(
             self._counts,
             self._first_missing_transform,
+            self._first_unplaced,
+            self._session.lidar_counts,
             recording.unreadable.total(),
             '; '.join(map(str, recording.first_errors.values())),
             recording.apart,
@@ -199,23 +216,59 @@ class RecordingReader:
         )
 
     def _count(self, given: Sweep | BoxArray, admitted: Admitted) -> None:
-        is_sweep = isinstance(given, Sweep)
-        kind = 'sweeps' if is_sweep else 'box_arrays'
-        self._counts[kind] += 1
+        kind = 'sweeps' if isinstance(given, Sweep) else 'box_arrays'
+        if not (self._is_merging and isinstance(given, Sweep)):  # those are counted merged
+            self._counts[kind] += 1
         if given.stamp_ns <= 0 and not is_placeholder(given):
             self._counts[f'{kind}_without_stamp'] += 1
-        if admitted.detail:
-            self._counts['sweep_without_transform'] += is_sweep
+        if not admitted.reason:
+            return
+        if isinstance(given, Sweep):
+            self._counts[admitted.reason] += 1
+        if admitted.moved is None:
             self._first_missing_transform = self._first_missing_transform or admitted.detail
+        else:
+            self._first_unplaced = self._first_unplaced or admitted.detail
 
-    def _read_item(self, item: Item, restarts: bool) -> ReadItem:
-        """Return an item in the fixed frame, without what nobody reads: it is copied."""
+    def _read_items(self, item: Item) -> Iterator[ReadItem]:
+        """Yield an item in the fixed frame, or the sweeps that are complete with its cloud."""
         with self._clock('transform'):
             admitted = self._session.admit(item.content)
             self._count(item.content, admitted)
-            return self._trimmed(item, admitted, restarts)
+            if not self._is_merging or not isinstance(item.content, Sweep):
+                yield self._trimmed(item, admitted)
+                return
+            if not isinstance(admitted.moved, Sweep):
+                return  # the other LiDARs go on
+            complete = self._session.merged(admitted.moved, item)
+        yield from map(self._merged_item, complete)
 
-    def _trimmed(self, item: Item, admitted: Admitted, restarts: bool) -> ReadItem:
+    def _merged_item(self, merged: MergedSweep) -> ReadItem:
+        """Return a sweep of several LiDARs; files get it in their sensor frame."""
+        items = cast(tuple[Item, ...], merged.extras)
+        self._counts['sweeps'] += 1
+        with self._clock('transform'):
+            sweep = merged.sweep
+            sensor_frame = self.source.sensor_frame
+            T_fixed_sensor = pose_of(
+                self._session.tree, sweep.frame_id, sensor_frame, sweep.stamp_ns
+            )
+            given = sweep
+            if T_fixed_sensor is not None:
+                given = sweep_to_frame(sweep, inverse(T_fixed_sensor), sensor_frame)
+            intensities = [item.intensities for item in items]
+            known = [values for values in intensities if values is not None]
+            whole = Item(
+                items[-1].received_ns,
+                given,
+                np.concatenate(known) if len(known) == len(items) else None,
+            )
+            return self._trimmed(whole, Admitted(sweep, T_fixed_sensor))
+
+    def _trimmed(self, item: Item, admitted: Admitted) -> ReadItem:
+        """Return an item without what nobody reads: it is copied."""
+        restarts = self._restarts
+        self._restarts = False
         given = item.content
         moved = admitted.moved
         if isinstance(moved, Sweep) and not self._with_times:

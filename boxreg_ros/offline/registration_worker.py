@@ -14,7 +14,7 @@ from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.core.registrar import GetEstimates, Submit
 from boxreg_ros.core.registration import Estimate, register
-from boxreg_ros.core.window import Window
+from boxreg_ros.core.window import stack_origins, Window
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.offline.compilation import announced_compilation
 from boxreg_ros.offline.stopwatch import Stopwatch
@@ -122,7 +122,7 @@ def _packed(windows: Sequence[Window]) -> tuple[Any, ...]:
         np.array(boxes),
         np.concatenate(points),
         np.concatenate(delays),
-        np.array(origins),
+        stack_origins(origins),
         *others,
     )
 

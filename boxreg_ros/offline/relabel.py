@@ -23,6 +23,7 @@ from typing import Any, TYPE_CHECKING
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import LATE, MERGED, MISSING
 from boxreg_ros.io.session import register
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.output import Sink
@@ -30,6 +31,7 @@ from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, delete_remains, SUMMARY, whole_folder, writing
+from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
@@ -282,7 +284,7 @@ def _truth(
         return None
     from boxreg_ros.offline.evaluate import time_range
 
-    truth = BoxTable.read(request.truth)
+    truth = true_boxes(request.truth)
     stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
     names = {track.track_id for track in tracks}
     problem = ''
@@ -334,7 +336,9 @@ def _summary(
         'dropped': _dropped(registrar.counts, findings),
         'without_stamp': _without_stamp(findings),
         'damage': [damage._asdict() for damage in findings.damages],
+        'lidars': {topic: dict(counts) for topic, counts in findings.lidars.items()},
         'first_missing_transform': findings.first_missing_transform,
+        'first_unplaced': findings.first_unplaced,
         'first_unreadable': findings.first_unreadable,
         'warning': findings.warning or ('' if sink.boxes_in else NO_BOXES),
         **findings.facts,
@@ -358,7 +362,11 @@ def _dropped(registered: Counter[str], findings: Findings) -> dict[str, int]:
     counts = {
         name: count for name, count in registered.items() if name.startswith(UNUSED_PREFIXES)
     }
-    counts['sweep_without_transform'] = findings.counts['sweep_without_transform']
+    for name in ('sweep_without_transform', 'sensor_without_transform', 'cloud_without_info'):
+        counts[name] = findings.counts[name]
+    for lidar in findings.lidars.values():
+        for name in (LATE, MISSING):
+            counts[name] = counts.get(name, 0) + lidar[name]
     counts['unreadable'] = findings.unreadable
     return {name: count for name, count in sorted(counts.items()) if count}
 
@@ -422,6 +430,21 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
         yield (
             f'{boxes:,} boxes and {sweeps:,} clouds have no transform; first: '
             f'{summary["first_missing_transform"]}'
+        )
+    for topic, counts in summary['lidars'].items():
+        if counts.get(LATE) or counts.get(MISSING):
+            yield (
+                f'LiDAR {topic}: {counts.get(MERGED, 0):,} clouds merged, {counts.get(LATE, 0):,} '
+                f'late, {counts.get(MISSING, 0):,} missing; the others were used'
+            )
+    if summary['first_unplaced']:
+        clouds = sum(
+            summary['dropped'].get(name, 0)
+            for name in ('sensor_without_transform', 'cloud_without_info')
+        )
+        yield (
+            f'the LiDARs of {clouds:,} clouds are not all known, the origin of their frame is '
+            f'used; first: {summary["first_unplaced"]}'
         )
     for name, found in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())

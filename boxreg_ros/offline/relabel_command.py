@@ -13,6 +13,7 @@ from boxreg_ros.offline.arguments import (
     add_recording_arguments,
     config_from,
     convention_from,
+    lidars_from,
 )
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare
@@ -74,7 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--truth', type=Path, metavar='FILE',
-        help='true boxes that the report shows, as CSV with the columns of boxes.csv',
+        help='true boxes that the report shows: CSV with the columns of boxes.csv, or a scene of '
+        'a data set',
     )  # fmt: skip
     parser.add_argument(
         '--resume', action='store_true',
@@ -186,7 +188,7 @@ def _request(args: argparse.Namespace) -> Request:
         config = config.updated({'solver.threads': args.workers})
     return Request(
         recordings=tuple(args.recordings),
-        points=args.points,
+        lidars=lidars_from(args),
         boxes=args.boxes,
         odometry=args.odometry,
         fixed_frame=args.fixed_frame,

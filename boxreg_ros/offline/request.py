@@ -7,14 +7,15 @@ from dataclasses import dataclass, field
 import hashlib
 from math import isfinite
 from pathlib import Path
-from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
+from boxreg_ros.datasets import address_of, scene_inputs, SceneRecording
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.labels import check_options, module_of, Options
-from boxreg_ros.offline.labelled_recording import LabelledRecording
+from boxreg_ros.offline.sources import source_of
 from msg_adapters.convention import Convention, STANDARD
 
 
@@ -26,8 +27,10 @@ class Request:
     Attributes
     ----------
     recordings : tuple of Path
-        Files or folders of one drive, merged by time.
-    points, boxes, odometry : str or None
+        Files or folders of one drive, merged by time, or the address of a scene of a data set.
+    lidars : Lidars
+        Topics of the clouds, and their LiDARs.
+    boxes, odometry : str or None
         Topics; None where the only topic of the type is used.
     fixed_frame : str or None
         Frame to refine in; None for the topmost frame that the frame of the clouds moves in.
@@ -50,7 +53,7 @@ class Request:
     decisions : Path or None
         Decisions of `boxreg review`: rejected tracks and pinned boxes.
     truth : Path or None
-        True boxes that the report shows, in the columns of ``boxes.csv``.
+        True boxes that the report shows: the columns of ``boxes.csv``, or the address of a scene.
 
     Raises
     ------
@@ -60,7 +63,7 @@ class Request:
     """
 
     recordings: tuple[Path, ...]
-    points: str | None = None
+    lidars: Lidars = SINGLE_LIDAR
     boxes: str | None = None
     odometry: str | None = None
     fixed_frame: str | None = None
@@ -129,17 +132,18 @@ class Request:
                 f'--end or a smaller --start'
             )
 
-    def recording(self) -> Recording:
+    def recording(self) -> Recording | SceneRecording:
         """Return the recording, not yet open."""
-        options: dict[str, Any] = {
-            'points': self.points,
-            'odometry': self.odometry,
-            'start': self.start,
-            'end': self.end,
-        }
-        if self.labels is not None:
-            return LabelledRecording(self.labels, self.recordings, **options)
-        return Recording(self.recordings, boxes=self.boxes, convention=self.convention, **options)
+        return source_of(
+            self.recordings,
+            self.lidars,
+            self.boxes,
+            self.odometry,
+            self.start,
+            self.end,
+            self.convention,
+            self.labels,
+        )
 
     @property
     def all_formats(self) -> tuple[str, ...]:
@@ -148,12 +152,15 @@ class Request:
 
     def inputs(self) -> tuple[Path, ...]:
         """Return the input files and folders."""
-        paths = list(self.recordings)
+        paths = [part for path in self.recordings for part in _parts_of(path)]
         if self.options.camera is not None:
             paths.append(self.options.camera)
         if self.labels is not None:
             paths.append(self.labels[1])
-        paths += filter(None, (self.truth, self.decisions))
+        if self.truth is not None:
+            paths += _parts_of(self.truth)
+        if self.decisions is not None:
+            paths.append(self.decisions)
         return tuple(paths)
 
     def fingerprint(self) -> str:
@@ -173,3 +180,9 @@ class Request:
             # Subfolders of a recording are not part of it; one may hold the results.
             pattern = '*' if path in self.recordings else '**/*'
             yield from (file for file in sorted(path.glob(pattern)) if file.is_file())
+
+
+def _parts_of(path: Path) -> tuple[Path, ...]:
+    """Return the files and folders that a path stands for: those of a scene, or itself."""
+    address = address_of(path)
+    return (path,) if address is None else scene_inputs(address)

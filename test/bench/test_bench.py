@@ -11,8 +11,8 @@ from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.offline.evaluate import evaluate, match
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np

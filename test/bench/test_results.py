@@ -1,9 +1,12 @@
 """docs/results.md: made from the stored measurements alone."""
 
 import json
+import re
 import runpy
 import shutil
 
+from boxreg_ros.bench.sensitivity import variations_of_constants
+from boxreg_ros.config import Config
 from paths import ROOT
 import pytest
 
@@ -26,6 +29,16 @@ def test_page_follows_the_measurements(tmp_path):
     methods['ours, track']['iou_bev'] = 0.12345
     path.write_text(json.dumps(document), encoding='utf-8')
     assert '| ours, track | 0.123 |' in SCRIPT['page'](store)
+
+
+def test_numbers_without_an_effect_exist():
+    text = (STORE / 'sensitivity.md').read_text(encoding='utf-8')
+    rows = [line for line in text.splitlines() if line.startswith('| `')]
+    listed = {name for row in rows for name in re.findall(r'`([^`]+)`', row.split('|')[1])}
+    settings = {item.name for item, _ in Config().items()}
+    constants = {item.name.partition('[')[0] for item in variations_of_constants()}
+    assert listed
+    assert listed <= settings | constants
 
 
 @pytest.mark.parametrize('path', STORED, ids=lambda path: path.stem)

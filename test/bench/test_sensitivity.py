@@ -10,6 +10,7 @@ from boxreg_ros.bench.sensitivity import (
     kinds_of,
     losses,
     measure,
+    Measurement,
     Variation,
     variations_of_constants,
     variations_of_settings,
@@ -23,7 +24,7 @@ from boxreg_ros.simulation.simulate import simulate
 import numpy as np
 import pytest
 
-SCOPE = (50, ['car', 'van', 'truck'])
+TRACK = Measurement(Config(estimate='track'), 'track', 50, ['car', 'van', 'truck'])
 SOURCE = """
 WEIGHT = 0.5  # read by the method
 UNUSED = 4.0
@@ -143,25 +144,25 @@ def test_modules_are_restored_after_an_error():
 
 
 def test_constants_of_the_method_change_the_result(drive):
-    baseline = measure(drive, SCOPE, 'track', None)
+    baseline = measure(drive, TRACK, None)
     assert 0.6 < baseline.iou_3d < 1
     of_faces = [item for item in variations_of_constants() if item.name.startswith('face_support')]
     halved = [item for item in of_faces if item.factor == 0.5][:8]
-    outcomes = [measure(drive, SCOPE, 'track', item) for item in halved]
+    outcomes = [measure(drive, TRACK, item) for item in halved]
     assert not [outcome.failure for outcome in outcomes if outcome.failure]
     assert max(abs(outcome.iou_3d - baseline.iou_3d) for outcome in outcomes) > 1e-4
     # Constants of the evaluation are not read by the method: exactly the same boxes.
     unread = next(item for item in variations_of_constants() if item.name.startswith('metrics.'))
-    assert measure(drive, SCOPE, 'track', unread) == baseline
+    assert measure(drive, TRACK, unread) == baseline
 
 
 def test_losses_are_sorted_and_exact(drive):
-    baseline = measure(drive, SCOPE, 'track', None)
+    baseline = measure(drive, TRACK, None)
     unread = Variation('queue', 2.0, 20, 40)  # no box waits for its sweep in this scene
     harmful = Variation('vehicle.position', 0.02, 0.14, 0.003)  # input taken for almost exact
     failing = Variation('vehicle.position', 1e-9, 0.14, 1e-10)  # out of bounds
     variations = [unread, harmful, failing]
-    outcomes = [[measure(drive, SCOPE, 'track', item)] for item in variations]
+    outcomes = [[measure(drive, TRACK, item)] for item in variations]
     found = losses(variations, {'street': baseline}, outcomes)
     assert [loss.value for loss in found] == [1e-10, 0.003, 40]
     assert found[0].failure.startswith('ConfigError: vehicle.position')
@@ -193,6 +194,13 @@ def test_command_prints_every_chosen_number(folder, capsys):
     results = json.loads(capsys.readouterr().out)['results']
     assert [loss['volume'] for loss in results['losses']] == [0, 0]
     assert 0.6 < results['baseline'][str(folder)]['iou_3d'] < 1
+
+
+def test_the_objective_of_the_paper_has_its_own_settings(folder, capsys):
+    assert cli.main(['bench', 'sensitivity', str(folder), '--only', 'paper.closeness']) == 2
+    assert 'paper.closeness: matches none of' in capsys.readouterr().err
+    found = variations_of_settings(Config(objective='paper'), ['vehicle'])
+    assert {'paper.closeness', 'paper.smoothness'} <= {item.name for item in found}
 
 
 def test_command_refuses_unknown_names(folder, capsys):

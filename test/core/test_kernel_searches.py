@@ -126,11 +126,11 @@ def test_face_observations_equal_those_of_torch(case, share, strips):
         assert is_seen.sum() > 30
 
 
-@pytest.mark.parametrize('far', [10.0, 60.0])
-def test_observed_faces_from_a_known_sensor_equal_those_of_torch(far):
+@pytest.mark.parametrize('far, sensors', [(10.0, 1), (60.0, 1), (30.0, 3)])
+def test_observed_faces_from_known_sensors_equal_those_of_torch(far, sensors):
     problem, state = searched('a road')
     rng = np.random.default_rng(6)
-    origins = far * torch.from_numpy(rng.normal(size=(*problem.valid.shape, 3)))
+    origins = far * torch.from_numpy(rng.normal(size=(*problem.valid.shape, sensors, 3)))
     origins[0, 0] = torch.nan
     valid = problem.valid.clone()
     valid[1, 3:] = False

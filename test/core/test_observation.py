@@ -65,7 +65,7 @@ def test_observation_is_relative_to_the_center():
     (seen,) = observed(points, CAR, changes=changes, times=times, origin=origin)
     assert seen.stamp_ns == STAMP_NS
     np.testing.assert_array_equal(seen.box, CAR)
-    np.testing.assert_array_equal(seen.origin, origin - CAR[:3])
+    np.testing.assert_array_equal(seen.origins, [origin - CAR[:3]])
     assert seen.num_points == 2
     by_x = np.argsort(seen.points[:, 0])
     np.testing.assert_allclose(seen.points[by_x], [[-1, 0, 0], [1, 0, 0]], atol=1e-6)

@@ -63,7 +63,7 @@ def test_windows_are_padded():
         for i, observation in enumerate(one.observations):
             mask = problem.mask[b, i]
             np.testing.assert_array_equal(problem.points[b, i][mask], observation.points)
-            np.testing.assert_array_equal(problem.origins[b, i], observation.origin)
+            np.testing.assert_array_equal(problem.origins[b, i], observation.origins)
         assert not problem.mask[b, n:].any()
     assert problem.of_class('position')[:, 0].tolist() == [CONFIG.vehicle.position] * 4
 

@@ -3,6 +3,7 @@
 import sqlite3
 
 from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
+from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
@@ -245,7 +246,7 @@ def test_start_and_end_select_a_part(tmp_path):
 
 def test_unknown_topics_are_refused(tmp_path):
     path = Drive().write(tmp_path / 'drive')
-    text = error_of(path, points='/lidar')
+    text = error_of(path, lidars=Lidars(('/lidar',)))
     assert "no topic '/lidar'" in text
     assert 'topics with point clouds: /points' in text
     assert 'topics with boxes: /boxes' in error_of(path, boxes='/objects')
@@ -258,7 +259,7 @@ def test_a_topic_of_another_type_is_refused(tmp_path):
     assert "topic '/points'" in text
     assert 'vision_msgs/msg/Detection3DArray' in text
     assert 'got sensor_msgs/msg/PointCloud2' in text
-    assert 'got vision_msgs/msg/Detection3DArray' in error_of(path, points='/boxes')
+    assert 'got vision_msgs/msg/Detection3DArray' in error_of(path, lidars=Lidars(('/boxes',)))
 
 
 @pytest.mark.parametrize(('topic', 'kind'), [('/points', 'point clouds'), ('/boxes', 'boxes')])
@@ -306,7 +307,7 @@ def test_several_topics_of_one_kind_are_listed_in_the_error(tmp_path):
     text = error_of(path)
     assert '/points, /rear' in text
     assert '--points' in text
-    assert len(read(path, points='/rear')[0]) == 8
+    assert len(read(path, lidars=Lidars(('/rear',)))[0]) == 8
 
 
 def test_files_that_are_no_recordings_are_refused(tmp_path):

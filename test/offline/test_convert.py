@@ -11,6 +11,7 @@ from boxreg_ros.labels import FORMATS, frames_of, Options
 from boxreg_ros.offline.convert import Conversion, convert
 from boxreg_ros.offline.formats import FORMAT_COLUMNS, rows
 from boxreg_ros.offline.relabel import relabel, Request
+from boxreg_ros.offline.sources import source_of
 import numpy as np
 import pytest
 from relabel_results import QUICK, rows_of
@@ -35,7 +36,7 @@ def drive(tmp_path):
     """Return a recording, and a table of its boxes in the fixed frame."""
     recording = Drive(sweeps=7).write(tmp_path / 'drive')
     table = tmp_path / 'input.csv'
-    BoxTable.from_arrays(input_boxes(recording)[0]).write(table)
+    BoxTable.from_arrays(input_boxes(source_of([recording]))[0]).write(table)
     return recording, table
 
 

@@ -8,7 +8,7 @@ import json
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable, COLUMNS
 from boxreg_ros.offline import evaluate as cli
-from boxreg_ros.offline.evaluate import evaluate, groups, has_word, match, summarise
+from boxreg_ros.offline.box_scores import evaluate, groups, has_word, match, summarise
 from boxreg_ros.structures import BoxArray
 import numpy as np
 import pytest

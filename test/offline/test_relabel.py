@@ -11,11 +11,13 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import input_boxes
 from boxreg_ros.labels import Options
 from boxreg_ros.offline.cloud_spool import Spool
 from boxreg_ros.offline.convert import Conversion, convert
 from boxreg_ros.offline.relabel import closing_line, notes, relabel, Request
+from boxreg_ros.offline.sources import source_of
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention
 import numpy as np
@@ -194,7 +196,7 @@ def test_boxes_without_transform_stay_in_their_frame(tmp_path):
     assert 'odom -> base is known from' in summary['first_missing_transform']
     (note,) = notes(summary)
     assert note.startswith('4 boxes and 2 clouds have no transform; first: transform odom -> base')
-    arrays, left_out = input_boxes(tmp_path / 'drive')
+    arrays, left_out = input_boxes(source_of([tmp_path / 'drive']))
     assert len(arrays) == 8
     assert left_out.startswith('2 messages had no transform, first: transform odom -> base')
 
@@ -333,7 +335,7 @@ def test_start_counts_from_the_first_cloud(tmp_path):
         write_recording(tmp_path / 'rest', [*static, *other]),
         write_recording(tmp_path / 'main', [i for i in drive.items if i[0] != '/tf_static']),
     )
-    request = Request(paths, points='/points', start=0.25, end=0.75, config=QUICK)
+    request = Request(paths, lidars=Lidars(('/points',)), start=0.25, end=0.75, config=QUICK)
     relabel(request, tmp_path / 'out')
     assert rows_of(tmp_path / 'out') == expected
 
@@ -677,7 +679,7 @@ def test_box_topic_with_ids_is_preferred(tmp_path):
 
 def test_input_boxes_in_the_fixed_frame(tmp_path):
     drive = Drive(sweeps=4)
-    arrays, left_out = input_boxes(drive.write(tmp_path / 'drive'))
+    arrays, left_out = input_boxes(source_of([drive.write(tmp_path / 'drive')]))
     assert not left_out
     assert [array.stamp_ns for array in arrays] == drive.stamps
     for array in arrays:
@@ -692,7 +694,7 @@ def test_evaluate_and_convert_accept_the_options_they_propose(tmp_path, capsys):
     path = str(drive.write(tmp_path / 'drive'))
     table = str(tmp_path / 'input.csv')
     topics = {'boxes': '/boxes2', 'odometry': '/odom2'}
-    BoxTable.from_arrays(input_boxes(Path(path), **topics)[0]).write(table)
+    BoxTable.from_arrays(input_boxes(source_of([Path(path)], **topics))[0]).write(table)
     assert main(['evaluate', path, table]) == 1
     assert 'choose one with --boxes' in capsys.readouterr().err
     words = ['--boxes', '/boxes2', '--odometry', '/odom2', '--fixed-frame', 'odom']
@@ -720,7 +722,9 @@ def test_every_real_box_is_written_once(tmp_path, storage, boxes):
     subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL)
     recording = tmp_path / ('recording' if storage == 'sqlite3' else 'recording.mcap')
     given = [
-        (array.stamp_ns, track) for array in input_boxes(recording)[0] for track in array.track_ids
+        (array.stamp_ns, track)
+        for array in input_boxes(source_of([recording]))[0]
+        for track in array.track_ids
     ]
     summary, rows = run(recording, tmp_path / 'out')
     assert len(given) > 50

@@ -8,7 +8,7 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.offline.evaluate import evaluate
+from boxreg_ros.offline.box_scores import evaluate
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.simulation import simulate as cli
 from boxreg_ros.simulation.noise import detector_noise, TABLE_ONE

@@ -182,5 +182,5 @@ def _track(window: Window) -> Track:
         np.array([o.stamp_ns for o in observations]),
         boxes,
         [o.points + center for o, center in zip(observations, centers, strict=True)],
-        np.array([o.origin for o in observations]) + centers,
+        np.array([o.origins[0] for o in observations]) + centers,
     )

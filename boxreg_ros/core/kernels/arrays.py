@@ -21,8 +21,8 @@ class WindowArrays(NamedTuple):
         Observations of each window.
     times : array, shape (B, N)
         Time of each observation [s].
-    origins, ground : array, shapes (B, N, 3) and (B, N)
-        Sensor position and height of the road from the input centre [m]; NaN if unknown.
+    origins, ground : array, shapes (B, N, K, 3) and (B, N)
+        Sensor positions and height of the road from the input centre [m]; NaN if unknown.
     points, delays : array, shapes (P, 3) and (P,)
         Points minus the centre of their input box [m], and their measurement times relative to
         the stamp of the box [s].

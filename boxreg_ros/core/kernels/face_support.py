@@ -6,7 +6,7 @@ The torch twin is `boxreg_ros.core.face_support.observe_faces_torch`; the formul
 
 """
 
-from math import ceil, isfinite, isnan, sqrt
+from math import ceil, inf, isfinite, isnan, sqrt
 
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.rotation import fill_rotation
@@ -145,9 +145,19 @@ def centre_of(points, centre):
 
 
 @kernel
-def fill_visibility(box, origin, points, numbers, R, tangent):
-    """Write the visibility of each face of one input box from the sensor, (6,)."""
-    toward = np.empty(3)
+def fill_visibility(box, origins, points, numbers, R, toward, tangent):
+    """Write the visibility of each face of one input box from its best sensor, (6,)."""
+    fill_rotation(box[6], box[7], box[8], R)
+    tangent[:4] = -inf
+    for sensor in range(len(origins)):
+        raise_visibility(box, origins[sensor], points, numbers, R, toward, tangent)
+    tangent[4] = ALWAYS_VISIBLE
+    tangent[5] = -ALWAYS_VISIBLE
+
+
+@kernel
+def raise_visibility(box, origin, points, numbers, R, toward, tangent):
+    """Raise the visibility of the upright faces to that from one sensor."""
     if isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2]):
         for k in range(3):
             toward[k] = origin[k]
@@ -155,7 +165,6 @@ def fill_visibility(box, origin, points, numbers, R, tangent):
         centre_of(points, toward)
         for k in range(3):
             toward[k] *= FAR_SENSOR
-    fill_rotation(box[6], box[7], box[8], R)
     for face in range(4):
         axis = face // 2
         sign = 1.0 - 2.0 * (face % 2)
@@ -165,15 +174,15 @@ def fill_visibility(box, origin, points, numbers, R, tangent):
             outward += sign * toward[k] * R[k, axis]
             along += toward[k] * R[k, 1 - axis]
         along = abs(along) - box[4 - axis] / 2
-        tangent[face] = outward / max(along, numbers.min_along)
-    tangent[4] = ALWAYS_VISIBLE
-    tangent[5] = -ALWAYS_VISIBLE
+        tangent[face] = max(tangent[face], outward / max(along, numbers.min_along))
 
 
 @kernel
-def fill_insets(origin, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight):
+def fill_insets(origins, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight):
     """Write the shares (2, 6) of the two insets, their sum (6,), and the weights of faces (6,)."""
-    reach = sqrt(origin[0] ** 2 + origin[1] ** 2)
+    reach = sqrt(origins[0, 0] ** 2 + origins[0, 1] ** 2)
+    for sensor in range(1, len(origins)):
+        reach = min(reach, sqrt(origins[sensor, 0] ** 2 + origins[sensor, 1] ** 2))
     beyond = 0.0 if isnan(reach) else (reach - numbers.near_range) / numbers.range_span
     beyond = min(max(beyond, 0.0), numbers.max_range_share)
     for face in range(6):
@@ -263,6 +272,7 @@ def observe_faces(
     half = np.empty(3)
     shift = np.empty(3)
     level = np.empty(6)
+    toward = np.empty(3)
     tangent = np.empty(6)
     velocity = np.zeros(3)
     mean_depth = np.empty(FACES)
@@ -287,11 +297,12 @@ def observe_faces(
                 continue
             m = windows.counts[b, n]
             points = returns_of(windows, windows.points, b, n)
-            box, pose, origin = windows.boxes[b, n], poses[b, n], windows.origins[b, n]
-            fill_visibility(box, origin, points, numbers, R, tangent)
+            box, pose, origins = windows.boxes[b, n], poses[b, n], windows.origins[b, n]
+            fill_visibility(box, origins, points, numbers, R, toward, tangent)
             fill_insets(
-                origin, tangent, occlusion_inset[b], range_inset[b], numbers, shares, inset, weight
-            )
+                origins, tangent, occlusion_inset[b], range_inset[b], numbers, shares, inset,
+                weight,
+            )  # fmt: skip
             for k in range(3):
                 shift[k] = pose[k] - box[k]
             for face in range(6):

@@ -1,0 +1,34 @@
+"""
+Public data sets as recordings, from the folder as it is downloaded: one module per data set.
+
+Each is behind `protocol.DatasetModule` and listed in `registry.DATASETS`. To add a data set, write
+a module with ``DATASET``, ``scene_names``, ``inputs`` and ``open_scene``, and add it to the table.
+
+"""
+
+from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
+from boxreg_ros.datasets.recording import SceneRecording
+from boxreg_ros.datasets.registry import (
+    Address,
+    address_of,
+    DATASETS,
+    module_of,
+    open_scene,
+    scene_inputs,
+    scene_names,
+)
+
+__all__ = [
+    'Address',
+    'address_of',
+    'Cloud',
+    'Dataset',
+    'DATASETS',
+    'module_of',
+    'open_scene',
+    'Scene',
+    'scene_inputs',
+    'scene_names',
+    'SceneRecording',
+    'SweepFile',
+]

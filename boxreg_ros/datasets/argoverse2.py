@@ -1,0 +1,118 @@
+"""
+Argoverse 2 (sensor data set), as it is downloaded: one folder per log.
+
+Clouds are those of both LiDARs on the roof, in the frame of the ego vehicle at the stamp of the
+sweep; the motion of the ego vehicle is compensated, that of other objects is not.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+from boxreg_ros.datasets.files import finite_cloud, missing_sweep, require, require_lidar
+from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.labels import frames_of, SceneFrames
+from boxreg_ros.labels.argoverse2 import (
+    ANNOTATIONS_FILE,
+    EGO_FRAME,
+    EGO_POSES_FILE,
+    FIXED_FRAME,
+    xyz_xyzw,
+)
+from boxreg_ros.labels.arrow import read_rows, read_table
+from boxreg_ros.labels.files import frame_names
+from boxreg_ros.structures import Floats
+import numpy as np
+
+DATASET = Dataset(
+    name='argoverse2',
+    title='Argoverse 2 sensor',
+    folder=f'LOG/{EGO_POSES_FILE}, LOG/sensors/lidar/ (in the folder of a split or above it)',
+    scene='LOG',
+    labels='argoverse2',
+    packages=('pyarrow',),
+)
+LIDAR = 'lidar'
+CALIBRATION_FILE = 'calibration/egovehicle_SE3_sensor.feather'
+REMEDY = 'download the whole log'
+
+
+def scene_names(root: Path) -> list[str]:
+    """Return the names of all logs in a folder of one or several splits."""
+    return sorted(_logs(root))
+
+
+def inputs(root: Path, name: str) -> tuple[Path, ...]:
+    """Return the files and folders of a log."""
+    log = _logs(root)[name]
+    paths = [log / part for part in (ANNOTATIONS_FILE, EGO_POSES_FILE, CALIBRATION_FILE)]
+    return (log / 'sensors' / LIDAR, *(path for path in paths if path.is_file()))
+
+
+def open_scene(root: Path, name: str, points: str | None) -> Scene:
+    """Return a log; see `protocol.DatasetModule`."""
+    require_lidar(points, [LIDAR], LIDAR)
+    log = _logs(root)[name]
+    clouds = require(log / 'sensors' / LIDAR, 'the sweeps', REMEDY)
+    stamps_ns = sorted(int(path.stem) for path in clouds.glob('*.feather'))
+    if not stamps_ns:
+        raise RecordingError(f'{clouds}: expected sweeps STAMP.feather, got none; {REMEDY}')
+    origin = _origin(require(log / CALIBRATION_FILE, 'the calibration', REMEDY))
+    rows = sorted(read_rows(log / EGO_POSES_FILE), key=lambda row: row['timestamp_ns'])
+    frames = SceneFrames(
+        name,
+        {str(stamp_ns): stamp_ns for stamp_ns in stamps_ns},
+        *frame_names(log, FIXED_FRAME, EGO_FRAME),
+    )
+    annotations = log / ANNOTATIONS_FILE
+    return Scene(
+        frames,
+        LIDAR,
+        np.array(stamps_ns, np.int64),
+        partial(_sweep_files, clouds, stamps_ns, origin),
+        np.array([row['timestamp_ns'] for row in rows], np.int64),
+        np.array([xyz_xyzw(row) for row in rows]),
+        partial(frames_of, 'argoverse2', annotations, frames) if annotations.is_file() else None,
+        without_boxes=str(annotations),
+    )
+
+
+def _sweep_files(folder: Path, stamps_ns: list[int], origin: Floats) -> Iterator[SweepFile]:
+    for stamp_ns in stamps_ns:
+        path = folder / f'{stamp_ns}.feather'
+        yield SweepFile(stamp_ns, partial(_cloud, path, origin))
+
+
+def _cloud(path: Path, origin: Floats) -> Cloud:
+    """Return the cloud of a table with x y z, intensity and the time since the stamp."""
+    if not path.is_file():
+        raise missing_sweep(path, FileNotFoundError(2, 'No such file or directory'))
+    try:
+        table = read_table(path)
+        columns = {name: table.column(name).to_numpy() for name in ('x', 'y', 'z', 'intensity')}
+        delays_ns = table.column('offset_ns').to_numpy()
+    except (RecordingError, KeyError) as error:
+        raise UnsupportedMessage(f'{error}; download it again') from None
+    points = np.stack([columns[axis] for axis in 'xyz'], axis=1).astype(np.float32)
+    times = delays_ns * 1e-9 if delays_ns.any() else None  # exports without times have zeros
+    return finite_cloud(points, columns['intensity'].astype(np.float64), times, origin)
+
+
+def _origin(path: Path) -> Floats:
+    """Return the mean position of the LiDARs, which are on top of each other, in ego (3,)."""
+    rows = [row for row in read_rows(path) if 'lidar' in row['sensor_name']]
+    if not rows:
+        raise RecordingError(f'{path}: expected the pose of a LiDAR, got none; {REMEDY}')
+    positions = np.array([xyz_xyzw(row)[:3] for row in rows])
+    return np.asarray(positions.mean(axis=0))
+
+
+def _logs(root: Path) -> dict[str, Path]:
+    """Return the folders of all logs by name: the root itself, in it, or in its splits."""
+    found = [*root.glob(EGO_POSES_FILE), *root.glob(f'*/{EGO_POSES_FILE}')]
+    found += root.glob(f'*/*/{EGO_POSES_FILE}')
+    return {path.parent.absolute().name: path.parent for path in found}

@@ -1,0 +1,101 @@
+"""Files that several data sets share: clouds, and checks of what is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from boxreg_ros.datasets.protocol import Cloud
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.labels.clouds import BIN_COLUMNS
+from boxreg_ros.structures import Floats
+import numpy as np
+
+
+def read_bin(path: Path, suffix: str) -> Cloud:
+    """
+    Return the cloud of a BIN file: rows of little-endian float32 that begin x y z intensity.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    suffix : str
+        A key of `BIN_COLUMNS`: the number of columns.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the file is missing or is not a whole number of rows.
+
+    """
+    columns = BIN_COLUMNS[suffix]
+    try:
+        numbers = np.fromfile(path, '<f4')
+    except OSError as error:
+        raise missing_sweep(path, error) from None
+    if numbers.size % columns:
+        raise UnsupportedMessage(
+            f'{path}: expected rows of {columns} float32, got {path.stat().st_size} bytes; '
+            f'download it again'
+        )
+    rows = numbers.reshape(-1, columns)
+    return finite_cloud(rows[:, :3], rows[:, 3].astype(np.float64))
+
+
+def finite_cloud(
+    points: np.ndarray,
+    intensities: Floats | None = None,
+    times: Floats | None = None,
+    origin: Floats | None = None,
+) -> Cloud:
+    """Return a cloud without the points that are not finite."""
+    is_finite = np.isfinite(points).all(axis=1)
+    if not is_finite.all():
+        points = points[is_finite]
+        intensities = None if intensities is None else intensities[is_finite]
+        times = None if times is None else times[is_finite]
+    return Cloud(points, intensities, times, np.zeros(3) if origin is None else origin)
+
+
+def missing_sweep(path: Path, error: OSError) -> UnsupportedMessage:
+    """Return the error of a sweep whose file cannot be read."""
+    return UnsupportedMessage(
+        f'{path}: expected a sweep, got: {error.strerror}; download the archive that has it'
+    )
+
+
+def require(path: Path, what: str, remedy: str) -> Path:
+    """
+    Return a file or folder of a data set.
+
+    Raises
+    ------
+    RecordingError
+        If it does not exist; `what` names it and `remedy` says where it comes from.
+
+    """
+    if not path.exists():
+        raise RecordingError(f'{path}: expected {what}, got no such file; {remedy}')
+    return path
+
+
+def require_lidar(asked: str | None, names: list[str], main: str | None = None) -> str:
+    """
+    Return the LiDAR that is asked for, else the main one, else the only one.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such LiDAR, or several and none is the main one.
+
+    """
+    if asked is None and main is None and len(names) == 1:
+        return names[0]
+    name = asked or main
+    if name in names:
+        return str(name)
+    got = 'none' if name is None else repr(name)
+    raise RecordingError(
+        f'points: expected one of the LiDARs {", ".join(names) or "(none)"}, got {got}; choose '
+        f'one with --points'
+    )

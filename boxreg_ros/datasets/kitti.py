@@ -1,0 +1,119 @@
+"""
+What both data sets of KITTI share: poses of the GPS/IMU unit (OXTS), clouds, exported poses.
+
+OXTS states latitude and longitude [degrees], altitude [m], roll, pitch and yaw [rad] in the first
+six of its 30 columns. They become metres by a Mercator projection about the first latitude.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+from boxreg_ros.datasets.files import read_bin, require
+from boxreg_ros.datasets.poses import pose_rows
+from boxreg_ros.datasets.protocol import SweepFile
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.transforms import inverse
+from boxreg_ros.labels.sidecar import POSES_FILE, read_poses, read_stamps, STAMPS_FILE
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+
+EARTH_RADIUS = 6378137.0
+"""Radius of the Mercator projection [m]: that of the development kit of KITTI, of WGS 84."""
+OXTS_COLUMNS = 30
+
+
+def oxts_rows(path: Path) -> Floats:
+    """Return the rows (n, 30) of a file of OXTS; raises RecordingError if it has others."""
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+    except ValueError as error:
+        raise RecordingError(f'{path}: expected {OXTS_COLUMNS} numbers a line: {error}') from None
+    if rows.shape[1] != OXTS_COLUMNS or not np.isfinite(rows[:, :6]).all():
+        raise RecordingError(
+            f'{path}: expected {OXTS_COLUMNS} numbers a line, got {rows.shape[1]}, or NaN; '
+            f'download it again'
+        )
+    return rows
+
+
+def oxts_poses(rows: Floats, T_velo_imu: Floats) -> Floats:
+    """
+    Return the poses of the LiDAR, relative to the position of the first row.
+
+    Parameters
+    ----------
+    rows : array, shape (n, 30)
+        Of OXTS.
+    T_velo_imu : array, shape (4, 4)
+        Pose of the GPS/IMU unit in the frame of the LiDAR.
+
+    Returns
+    -------
+    poses : array, shape (n, 7)
+        x y z qx qy qz qw; x is east, y is north, z is up.
+
+    """
+    latitude, longitude = np.radians(rows[:, 0]), np.radians(rows[:, 1])
+    scale = EARTH_RADIUS * np.cos(latitude[0])
+    north = scale * np.log(np.tan(np.pi / 4 + latitude / 2))
+    positions = np.stack([scale * longitude, north, rows[:, 2]], axis=1)
+    T_map_imu = np.tile(np.eye(4), (len(rows), 1, 1))  # (n, row, column)
+    T_map_imu[:, :3, :3] = matrix_from_rpy(rows[:, 3:6])
+    T_map_imu[:, :3, 3] = positions - positions[0]
+    return pose_rows(list(T_map_imu @ inverse(T_velo_imu)))
+
+
+def exported_poses(folder: Path, count: int) -> tuple[Ints, Floats] | None:
+    """
+    Return stamps and poses of our own exports, which have no OXTS; None for other folders.
+
+    Frames whose pose is unknown are left out.
+
+    """
+    if not (folder / POSES_FILE).is_file():
+        return None
+    stamps_ns = np.array(read_stamps(folder / STAMPS_FILE), np.int64)
+    poses = read_poses(folder / POSES_FILE, len(stamps_ns))
+    known = [i for i, pose in enumerate(poses) if pose is not None]
+    if not known or len(stamps_ns) < count:
+        raise RecordingError(
+            f'{folder / POSES_FILE}: expected poses of {count} frames, got {len(known)}; export '
+            f'again'
+        )
+    return stamps_ns[known], pose_rows([pose for pose in poses if pose is not None])
+
+
+def sweep_files(folder: Path, digits: int, stamps_ns: Sequence[int]) -> Iterator[SweepFile]:
+    """Yield the sweeps of a folder, one per stamp; the file name is the number of the frame."""
+    for number, stamp_ns in enumerate(stamps_ns):
+        path = folder / f'{number:0{digits}d}.bin'
+        yield SweepFile(stamp_ns, partial(read_bin, path, '.bin'))
+
+
+def rigid_transform(numbers: Sequence[float], path: Path) -> Floats:
+    """Return T (4, 4) of the twelve numbers of its upper three rows."""
+    if len(numbers) != 12:
+        raise RecordingError(f'{path}: expected 12 numbers of a pose, got {len(numbers)}')
+    T = np.eye(4)
+    T[:3] = np.reshape(numbers, (3, 4))
+    return T
+
+
+def calibration_lines(path: Path, archive: str) -> dict[str, list[float]]:
+    """Return the numbers of each line of a calibration by the name before them."""
+    require(path, 'the calibration', f'unpack {archive}')
+    values = {}
+    for line in path.read_text(encoding='utf-8').splitlines():
+        name, *words = line.replace(':', ' ', 1).split() or ['']
+        try:
+            values[name] = [float(word) for word in words]
+        except ValueError:
+            continue  # the date of the calibration
+    return values

@@ -1,0 +1,143 @@
+"""What the module of a data set reads, and states about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from boxreg_ros.labels import LabelFrame, SceneFrames
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """
+    A data set, as the documentation and ``boxreg formats`` show it.
+
+    Attributes
+    ----------
+    name, title : str
+        Prefix on the command line, and name in prose.
+    folder : str
+        Files and folders that are expected in the root folder.
+    scene : str
+        What the name of a scene is.
+    labels : str
+        Label format of its results for ``--labels``; '' for none.
+    packages : tuple of str
+        Packages of pip that are needed beyond those of boxreg_ros itself.
+
+    """
+
+    name: str
+    title: str
+    folder: str
+    scene: str
+    labels: str
+    packages: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """
+    The points of a sweep, in the frame of the clouds of its scene.
+
+    Attributes
+    ----------
+    points : array, shape (M, 3)
+        Positions [m].
+    intensities : array, shape (M,), or None
+        In the unit of the data set.
+    times : array, shape (M,), or None
+        Time of measurement of each point relative to the stamp [s].
+    origin : array, shape (3,)
+        Position of the sensor [m].
+
+    """
+
+    points: NDArray[np.floating]
+    intensities: Floats | None = None
+    times: Floats | None = None
+    origin: Floats = field(default_factory=lambda: np.zeros(3))
+
+
+class SweepFile(NamedTuple):
+    """
+    A sweep that is not read yet.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Its stamp [ns].
+    read : callable
+        Returns its points; raises UnsupportedMessage if they cannot be read.
+
+    """
+
+    stamp_ns: int
+    read: Callable[[], Cloud]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """
+    One drive of a data set.
+
+    Attributes
+    ----------
+    frames : SceneFrames
+        Names and stamps of its frames, and the names of the coordinate frames.
+    points_topic : str
+        Name of the LiDAR.
+    sweep_stamps_ns : array, shape (S,)
+        Stamps of the sweeps [ns], ascending.
+    sweeps : callable
+        Yields the sweeps in this order; one is in memory at a time.
+    pose_stamps_ns : array, shape (P,)
+        Stamps of the poses [ns], ascending.
+    poses : array, shape (P, 7)
+        Pose x y z qx qy qz qw of the frame of the clouds in the fixed frame.
+    boxes : callable or None
+        Yields the annotations of the data set; None if the scene has none.
+    without_boxes : str
+        File or folder that would have annotations.
+
+    """
+
+    frames: SceneFrames
+    points_topic: str
+    sweep_stamps_ns: Ints
+    sweeps: Callable[[], Iterator[SweepFile]]
+    pose_stamps_ns: Ints
+    poses: Floats
+    boxes: Callable[[], Iterator[LabelFrame]] | None
+    without_boxes: str = ''
+
+
+class DatasetModule(Protocol):
+    """A module of `registry.DATASETS`."""
+
+    @property
+    def DATASET(self) -> Dataset:
+        """Return what the data set is."""
+
+    def scene_names(self, root: Path) -> list[str]:
+        """Return the names of all scenes in a folder; empty if it is not of this data set."""
+
+    def inputs(self, root: Path, name: str) -> tuple[Path, ...]:
+        """Return the files and folders that a scene is read from, for its fingerprint."""
+
+    def open_scene(self, root: Path, name: str, points: str | None) -> Scene:
+        """
+        Return a scene; `points` is the name of a LiDAR, None for the main one.
+
+        Raises
+        ------
+        RecordingError
+            If a table or another file of the scene is missing or does not follow the layout.
+
+        """

@@ -1,0 +1,235 @@
+"""A scene of a data set as a source of clouds and boxes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self
+
+from boxreg_ros.datasets.protocol import Scene, SweepFile
+from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_inputs
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.lidars import SensorPlacement
+from boxreg_ros.io.recording import Item, LOOKAHEAD_NS, not_measured, Stage
+from boxreg_ros.io.storage.record import Damage
+from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.labels import frames_of, LabelFrame
+from boxreg_ros.labels.merging import LabelMerger
+from boxreg_ros.structures import Sweep
+import numpy as np
+
+ANNOTATIONS = 'annotations'
+"""Name of the boxes of a data set, where recordings have a topic."""
+
+
+class SceneRecording:
+    """
+    Clouds, poses and boxes of a scene, as `Recording` has those of a bag: an `ItemSource`.
+
+    One sweep is in memory at a time. Sweeps that cannot be read are counted and left out.
+
+    Parameters
+    ----------
+    address : Address
+        Data set, folder and scene.
+    points : str, optional
+        Name of the LiDAR; by default the main one of the data set.
+    start, end : float, optional
+        Part to read, from the first sweep [s].
+    labels : tuple of str and Path, optional
+        Format and path of label files to read the boxes from, in place of the annotations.
+
+    Attributes
+    ----------
+    has_boxes : bool
+        Whether boxes are required.
+    points_topic, boxes_topic, odometry_topic, start_ns, end_ns, unreadable, first_errors, outside
+        See `ItemSource`.
+
+    Raises
+    ------
+    RecordingError
+        On entering, if the scene or a part of it is missing.
+
+    """
+
+    has_boxes = True
+    odometry_topic: str | None = None
+
+    def __init__(
+        self,
+        address: Address,
+        points: str | None = None,
+        start: float | None = None,
+        end: float | None = None,
+        labels: tuple[str, Path] | None = None,
+    ) -> None:
+        self._address = address
+        self._points = points
+        self._start, self._end = start, end
+        self._labels = labels
+        self.boxes_topic = '' if labels else ANNOTATIONS
+        self.unreadable: Counter[str] = Counter()
+        self.first_errors: dict[str, UnsupportedMessage] = {}
+        self.placement = SensorPlacement()
+        self.outside = 0
+        self._readable = 0
+
+    def __enter__(self) -> Self:
+        """Read what is known about the scene, but no cloud."""
+        self._address = resolved(self._address)
+        self._scene: Scene = open_scene(self._address, self._points)
+        self.points_topic = self._scene.points_topic
+        first_ns, last_ns = self._scene.sweep_stamps_ns[[0, -1]].tolist()
+        self.start_ns = first_ns + round((self._start or 0.0) * 1e9)
+        self.end_ns = last_ns + 1
+        if self._end is not None:
+            self.end_ns = min(self.end_ns, first_ns + round(self._end * 1e9))
+        if self.start_ns >= self.end_ns:
+            raise RecordingError(
+                f'start and end: expected a part of the {(last_ns - first_ns) * 1e-9:.1f} s of '
+                f'{self}, got {self._start or 0:g} to '
+                f'{"the end" if self._end is None else f"{self._end:g}"}; choose a smaller '
+                f'--start, or leave it out'
+            )
+        if self.has_boxes:
+            self._frames()  # raises if there are no boxes
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release nothing: files are open only while they are read."""
+
+    def __str__(self) -> str:
+        """Return the address."""
+        return str(self._address)
+
+    @property
+    def apart(self) -> dict[str, float]:
+        """Return the topics that were recorded apart: none."""
+        return {}
+
+    @property
+    def damages(self) -> list[Damage]:
+        """Return the damages of files: none; sweeps that cannot be read are counted."""
+        return []
+
+    @property
+    def topics(self) -> dict[str, int]:
+        """Return the number of sweeps of the LiDAR, and of frames with boxes."""
+        counts = {self.points_topic: len(self._scene.sweep_stamps_ns)}
+        if self._labels is None and self._scene.boxes is not None:
+            counts[ANNOTATIONS] = len(self._scene.frames.stamps_ns)
+        return counts
+
+    @property
+    def files(self) -> list[Path]:
+        """Return the files that the scene is read from."""
+        found: list[Path] = []
+        for path in scene_inputs(self._address):
+            found += sorted(path.rglob('*')) if path.is_dir() else [path]
+        return [path for path in found if path.is_file()]
+
+    def sensor_frame(self) -> str:
+        """Return the frame of the clouds."""
+        return self._scene.frames.sensor_frame
+
+    def choose_fixed_frame(self, tree: TransformTree, fixed_frame: str | None = None) -> str:
+        """
+        Return the fixed frame of the scene, and add its first pose to `tree`.
+
+        Raises
+        ------
+        RecordingError
+            If `fixed_frame` is neither this frame nor that of the clouds.
+
+        """
+        frames = self._scene.frames
+        known = (frames.fixed_frame, frames.sensor_frame)
+        if fixed_frame is not None and fixed_frame.lstrip('/') not in known:
+            raise RecordingError(
+                f'{self}: expected the fixed frame {" or ".join(map(repr, known))}, got '
+                f'{fixed_frame!r}; leave --fixed-frame out'
+            )
+        self._add_poses(tree, 0, int(self._scene.pose_stamps_ns[0]))
+        return (fixed_frame or frames.fixed_frame).lstrip('/')
+
+    def items(
+        self,
+        tree: TransformTree,
+        *,
+        with_clouds: bool = True,
+        with_intensities: bool = False,
+        stage: Stage = not_measured,
+    ) -> Iterator[Item]:
+        """Yield clouds and boxes in order while `tree` follows; see `Recording.items`."""
+        self.unreadable.clear()
+        self.first_errors.clear()
+        self._readable = 0
+        tree.rewind(0)  # the pose that was read to choose a frame is read again
+        frames = self._frames() if self.has_boxes else iter(())
+        is_part = self._start is not None or self._end is not None
+        sensor_frame = self.sensor_frame()
+        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part)
+        num_poses = 0
+        for sweep in self._scene.sweeps():
+            stamp_ns = sweep.stamp_ns
+            if not self.start_ns <= stamp_ns < self.end_ns:
+                continue
+            num_poses = self._add_poses(tree, num_poses, stamp_ns + LOOKAHEAD_NS)
+            if with_clouds:
+                with stage('read'):
+                    item = self._item(sweep, sensor_frame, with_intensities)
+                if item is not None:
+                    yield item
+            yield from merger.after(stamp_ns, stamp_ns)
+        self._add_poses(tree, num_poses, int(self._scene.pose_stamps_ns[-1]))
+        yield from merger.rest()
+        self.outside = merger.outside
+
+    def check_readable(self) -> None:
+        """Raise UnsupportedMessage if sweeps were missing and none was readable."""
+        for topic, first in self.first_errors.items():
+            if not self._readable:
+                raise UnsupportedMessage(
+                    f'none of {self.unreadable[topic]} sweeps of {topic!r} can be read; first: '
+                    f'{first}'
+                )
+
+    def _frames(self) -> Iterator[LabelFrame]:
+        """Return the boxes to refine, by stamp."""
+        scene = self._scene
+        if self._labels is not None:
+            return frames_of(*self._labels, scene.frames)
+        if scene.boxes is not None:
+            return scene.boxes()
+        dataset = module_of(self._address.dataset).DATASET
+        remedy = 'give label files with --labels'
+        if dataset.labels:
+            remedy = f'give detections or tracks with --labels {dataset.labels}:PATH'
+        raise RecordingError(
+            f'{self}: no boxes: expected {scene.without_boxes}, got none (a test split has none); '
+            f'{remedy}'
+        )
+
+    def _item(self, sweep: SweepFile, frame_id: str, with_intensities: bool) -> Item | None:
+        """Return a sweep; None, and counted, if it cannot be read."""
+        try:
+            cloud = sweep.read()
+        except UnsupportedMessage as error:
+            self.unreadable[self.points_topic] += 1
+            self.first_errors.setdefault(self.points_topic, error)
+            return None
+        self._readable += 1
+        content = Sweep(sweep.stamp_ns, frame_id, cloud.points, cloud.times, cloud.origin)
+        return Item(sweep.stamp_ns, content, cloud.intensities if with_intensities else None)
+
+    def _add_poses(self, tree: TransformTree, first: int, until_ns: int) -> int:
+        """Add the poses from number `first` up to a stamp [ns]; return the number of the next."""
+        scene = self._scene
+        end = int(np.searchsorted(scene.pose_stamps_ns, until_ns, side='right'))
+        for stamp_ns, pose in zip(
+            scene.pose_stamps_ns[first:end].tolist(), scene.poses[first:end], strict=True
+        ):
+            tree.add_pose(scene.frames.fixed_frame, scene.frames.sensor_frame, stamp_ns, pose)
+        return end

@@ -1,0 +1,161 @@
+"""The table of data sets, and access to their scenes by address."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from importlib import import_module
+from pathlib import Path
+from typing import cast, NamedTuple
+
+from boxreg_ros.datasets.protocol import DatasetModule, Scene
+from boxreg_ros.errors import ConfigError, RecordingError
+
+DATASETS = {
+    'nuscenes': 'boxreg_ros.datasets.nuscenes',
+    'kitti-tracking': 'boxreg_ros.datasets.kitti_tracking',
+    'kitti-raw': 'boxreg_ros.datasets.kitti_raw',
+    'argoverse2': 'boxreg_ros.datasets.argoverse2',
+    'waymo': 'boxreg_ros.datasets.waymo',
+    'pandaset': 'boxreg_ros.datasets.pandaset',
+}
+"""Prefix on the command line -> module that implements `protocol.DatasetModule`."""
+MAX_NAMED = 5
+"""Most scenes that an error names; chosen."""
+
+
+class Address(NamedTuple):
+    """
+    A scene of a data set, on the command line ``PREFIX:FOLDER#SCENE``.
+
+    Attributes
+    ----------
+    dataset : str
+        A name of `DATASETS`.
+    root : Path
+        Folder of the data set.
+    scene : str
+        Name of the scene; '' for the only one.
+
+    """
+
+    dataset: str
+    root: Path
+    scene: str
+
+    def __str__(self) -> str:
+        """Return the address as on the command line."""
+        scene = f'#{self.scene}' if self.scene else ''
+        return f'{self.dataset}:{self.root}{scene}'
+
+
+def address_of(path: Path) -> Address | None:
+    """
+    Return the address that the text of a path states; None for a file or folder.
+
+    Raises
+    ------
+    RecordingError
+        If the text has the form of an address, but no data set has its prefix.
+
+    """
+    prefix, colon, rest = str(path).partition(':')
+    if not colon:
+        return None
+    if prefix in DATASETS:
+        root, _, scene = rest.partition('#')
+        return Address(prefix, Path(root).expanduser(), scene)
+    if '#' not in rest or path.exists():
+        return None
+    similar = get_close_matches(prefix, DATASETS, 1)
+    meant = f'; did you mean {similar[0]}:{rest}?' if similar else ''
+    raise RecordingError(
+        f'recording {str(path)!r}: expected a data set among {", ".join(DATASETS)}, got '
+        f'{prefix!r}{meant}'
+    )
+
+
+def module_of(name: str) -> DatasetModule:
+    """Return the module of a data set, whether or not the packages it needs are installed."""
+    return cast(DatasetModule, import_module(DATASETS[name]))
+
+
+def scene_names(address: Address) -> list[str]:
+    """
+    Return the names of all scenes in the folder of a data set.
+
+    Raises
+    ------
+    RecordingError
+        If there are none; the message names the files that are expected.
+    ConfigError
+        If the data set needs a package that is not installed.
+
+    """
+    module = module_of(address.dataset)
+    for package in module.DATASET.packages:
+        try:
+            import_module(package)
+        except ImportError as error:
+            raise ConfigError(
+                f'data set {address.dataset!r} needs {package}: pip install {package} ({error})'
+            ) from None
+    root = address.root
+    if not root.is_dir():
+        raise RecordingError(f'{address}: no such folder: {str(root)!r}')
+    names = module.scene_names(root)
+    if not names:
+        there = sorted(path.name for path in root.iterdir())
+        raise RecordingError(
+            f'{address}: expected {module.DATASET.folder} in {str(root)!r}, got '
+            f'{_listed(there)}; name the folder that the archives were unpacked in'
+        )
+    return names
+
+
+def resolved(address: Address) -> Address:
+    """
+    Return the address with the name of its scene.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such scene, or several and none is named; also as `scene_names`.
+
+    """
+    names = scene_names(address)
+    if not address.scene and len(names) == 1:
+        return address._replace(scene=names[0])
+    if address.scene in names:
+        return address
+    title = module_of(address.dataset).DATASET.title
+    if not address.scene:
+        raise RecordingError(
+            f'{address}: expected the name of a scene of {title}, as in '
+            f'{address._replace(scene=names[0])}, got none; there: {_listed(names)}'
+        )
+    similar = get_close_matches(address.scene, names, 1)
+    meant = f'; did you mean {similar[0]}?' if similar else ''
+    raise RecordingError(
+        f'{address}: no scene {address.scene!r} of {title} in {str(address.root)!r}{meant} '
+        f'there: {_listed(names)}; is its split downloaded?'
+    )
+
+
+def scene_inputs(address: Address) -> tuple[Path, ...]:
+    """Return the files and folders that a scene is read from; raises as `resolved`."""
+    address = resolved(address)
+    return module_of(address.dataset).inputs(address.root, address.scene)
+
+
+def open_scene(address: Address, points: str | None = None) -> Scene:
+    """Return a scene, with the LiDAR `points`; raises as `resolved` and as its module."""
+    address = resolved(address)
+    return module_of(address.dataset).open_scene(address.root, address.scene, points)
+
+
+def _listed(names: list[str]) -> str:
+    """Return the first of some names, and how many there are."""
+    if not names:
+        return 'nothing'
+    shown = ', '.join(names[:MAX_NAMED])
+    return shown if len(names) <= MAX_NAMED else f'{shown}, ... ({len(names)})'

@@ -1,0 +1,436 @@
+"""
+Several LiDARs: the positions of those that measured a cloud, and clouds merged by time.
+
+Both are the same for the live node and for recordings. A cloud that is concatenated from those of
+several LiDARs is divided among them by `SensorPlacement`. Clouds of several topics are brought
+into the fixed frame, each by the pose of its own stamp, and merged by `SweepMerger`.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.structures import Floats, Sweep
+from msg_adapters import concatenation, pointcloud
+from msg_adapters.concatenation import ConcatenationInfo
+import numpy as np
+from numpy.typing import NDArray
+
+INFO_CAPACITY = 200
+"""Info messages held; derived: 10 s at 20 Hz, and each arrives within 2 s of its cloud."""
+LIDAR_SILENCE = 1.0
+"""A LiDAR without a cloud in so long is not waited for [s]; chosen: ten periods at 10 Hz."""
+MAX_OPEN_GROUPS = 2
+"""
+Sweeps that wait for clouds at once; chosen.
+
+A cloud may arrive after the first cloud of the next period, but not after two periods.
+
+"""
+MERGED, LATE, MISSING = 'merged', 'cloud_late', 'cloud_missing'
+"""Counters of a LiDAR; the last two are reasons of `boxreg_ros.reasons`."""
+
+Report = Callable[[str, str, int], None]
+"""Takes reason, text and count of something that is not used."""
+
+
+def ignore(reason: str, text: str, count: int) -> None:
+    """Report nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lidars:
+    """
+    Topics of the clouds, and frames of the LiDARs that measured them.
+
+    Attributes
+    ----------
+    topics : tuple of str
+        Topics whose clouds are merged, or the only one; empty for the only one that there is.
+    frames : tuple of str
+        Frames of the LiDARs where clouds are in another one: of each topic, or all LiDARs of a
+        single topic. Empty if the frame of each cloud is that of its LiDAR.
+    info : str
+        Topic of the messages that divide the clouds among the LiDARs; empty for none.
+
+    Raises
+    ------
+    ConfigError
+        If the number of frames is not that of several topics, a topic is named twice, or info
+        messages are expected for several topics.
+
+    """
+
+    topics: tuple[str, ...] = ()
+    frames: tuple[str, ...] = ()
+    info: str = ''
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit each other."""
+        topics, frames = self.topics, self.frames
+        if len(set(topics)) < len(topics):
+            raise ConfigError(
+                f'points: expected each topic once, got {", ".join(topics)}; leave the second '
+                f'one out'
+            )
+        if len(topics) > 1 and frames and len(frames) != len(topics):
+            raise ConfigError(
+                f'sensor_frames: expected one frame for each of the {len(topics)} topics of '
+                f'points, in their order, got {len(frames)} ({", ".join(frames)}); name them '
+                f'all, or none'
+            )
+        if len(topics) > 1 and self.info:
+            raise ConfigError(
+                f'points_info: expected for one topic of concatenated clouds, got the topics '
+                f'{", ".join(topics)}; leave points_info out, or name the concatenated topic only'
+            )
+
+
+SINGLE_LIDAR = Lidars()
+"""One topic, whose clouds are in the frame of their LiDAR."""
+
+
+class SensorPlacement:
+    """
+    Find the LiDARs that measured the points of a cloud.
+
+    State: the newest info messages of concatenated clouds. Not thread-safe.
+
+    Parameters
+    ----------
+    lidars : Lidars
+        Topics and frames.
+
+    Attributes
+    ----------
+    lidars : Lidars
+        As above.
+
+    """
+
+    def __init__(self, lidars: Lidars = SINGLE_LIDAR) -> None:
+        self.lidars = lidars
+        self._frames: Mapping[str, Sequence[str]] = {'': lidars.frames}
+        if len(lidars.topics) > 1:
+            pairs = zip(lidars.topics, lidars.frames, strict=False)  # all of them, or none
+            self._frames = {topic: (frame,) for topic, frame in pairs}
+        self._infos: dict[int, ConcatenationInfo] = {}
+        self._is_awaited = True
+
+    def sweep_of(self, msg: Any, topic: str) -> Sweep:
+        """
+        Return the sweep of a cloud, with its topic if there are several.
+
+        Raises
+        ------
+        UnsupportedMessage
+            If the cloud cannot be read.
+
+        """
+        sweep = pointcloud.from_msg(msg)
+        if self.lidars.info:
+            return replace(sweep, rows=pointcloud.finite_rows(msg))
+        return replace(sweep, topic=topic) if len(self.lidars.topics) > 1 else sweep
+
+    def add_info(self, msg: Any) -> None:
+        """Add a ``ConcatenatedPointCloudInfo``."""
+        info = concatenation.from_msg(msg)
+        self._is_awaited = True
+        self._infos[info.stamp_ns] = info
+        if len(self._infos) > INFO_CAPACITY:
+            del self._infos[next(iter(self._infos))]
+
+    def awaits_info(self, sweep: Sweep) -> bool:
+        """Return whether the info message of a cloud may still arrive."""
+        return self.lidars.info != '' and self._is_awaited and sweep.stamp_ns not in self._infos
+
+    def placed(self, sweep: Sweep, tree: TransformTree) -> tuple[Sweep, str, str]:
+        """
+        Return a cloud with the positions of its LiDARs, in its own frame.
+
+        Points of a concatenated cloud without an info message are attributed to the nearest of
+        the LiDARs that are named: the one with the densest points, and rarely blocked by the
+        vehicle.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            As its message has it.
+        tree : TransformTree
+            Transforms to the frames of the LiDARs.
+
+        Returns
+        -------
+        sweep : Sweep
+            Unchanged where nothing is known of its LiDARs.
+        reason, detail : str
+            What is missing; empty if nothing is.
+
+        """
+        if self.lidars.info and not sweep.is_dropped:
+            info = self._infos.get(sweep.stamp_ns)
+            if info is None:
+                self._is_awaited = False  # later ones do not wait until there is one again
+                return sweep, 'cloud_without_info', f'no info of the cloud at {sweep.stamp_ns} ns'
+            return _divided(sweep, info, tree)
+        frames = self._frames.get(sweep.topic, ())
+        if not frames or sweep.is_dropped:
+            return sweep, '', ''
+        try:
+            origins = _positions(frames, sweep, tree)
+        except TransformUnavailable as error:
+            return sweep, 'sensor_without_transform', str(error)
+        if len(frames) == 1:
+            return replace(sweep, origin=origins[0]), '', ''
+        return _with_sensors(sweep, origins, _nearest(sweep.points, origins)), '', ''
+
+
+def _positions(frames: Sequence[str], sweep: Sweep, tree: TransformTree) -> Floats:
+    """Return the origins (K, 3) of frames in the frame of a cloud [m]."""
+    return np.array(
+        [tree.lookup(sweep.frame_id, frame, sweep.stamp_ns)[:3, 3] for frame in frames]
+    )
+
+
+def _nearest(points: NDArray[np.floating], origins: Floats) -> NDArray[np.uint8]:
+    """Return the row of the sensor that is nearest to each point in the ground plane, (M,)."""
+    squares = [np.square(points[:, :2] - origin[:2]).sum(axis=1) for origin in origins]
+    nearest: NDArray[np.uint8] = np.argmin(squares, axis=0).astype(np.uint8)
+    return nearest
+
+
+def _with_sensors(sweep: Sweep, origins: Floats, sensors: NDArray[np.uint8]) -> Sweep:
+    return replace(sweep, origin=origins.mean(axis=0), origins=origins, sensors=sensors)
+
+
+def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tuple[Sweep, str, str]:
+    """
+    Return a concatenated cloud with the positions and times of its LiDARs; as of `placed`.
+
+    Its points are in its frame at its stamp: the concatenation has compensated the motion of the
+    vehicle. Their times, if any, are relative to the stamps of the LiDARs, and so are the points
+    of other moving objects.
+
+    """
+    rows = np.arange(len(sweep.points)) if sweep.rows is None else sweep.rows
+    parts = info.sources
+    ends = [part.begin + part.length for part in parts]
+    if len(rows) and (not ends or max(ends) <= rows.max()):
+        reason = (
+            f'the info at {info.stamp_ns} ns is of {max(ends, default=0)} points, its cloud has'
+        )
+        return sweep, 'cloud_without_info', f'{reason} {rows.max() + 1}'
+    if not parts:
+        return sweep, '', ''
+    try:
+        origins = _positions([part.frame_id for part in parts], sweep, tree)
+    except TransformUnavailable as error:
+        return sweep, 'sensor_without_transform', str(error)
+    owner = np.zeros(max(ends), np.uint8)
+    for number, part in enumerate(parts):
+        owner[part.begin : part.begin + part.length] = number
+    sensors = owner[rows]
+    delays = np.array([part.stamp_ns - sweep.stamp_ns for part in parts]) * 1e-9
+    times = delays[sensors]
+    if sweep.times is not None:
+        times = times + sweep.times
+    return replace(_with_sensors(sweep, origins, sensors), times=times, rows=None), '', ''
+
+
+class MergedSweep(NamedTuple):
+    """A merged sweep, and what the caller gave with each of its clouds, in their order."""
+
+    sweep: Sweep
+    extras: tuple[Any, ...]
+
+
+@dataclass(slots=True)
+class _Group:
+    """Clouds of one period, by topic."""
+
+    clouds: dict[str, tuple[Sweep, Any]] = field(default_factory=dict)
+
+    @property
+    def first_ns(self) -> int:
+        return min(sweep.stamp_ns for sweep, _ in self.clouds.values())
+
+    @property
+    def last_ns(self) -> int:
+        return max(sweep.stamp_ns for sweep, _ in self.clouds.values())
+
+    def takes(self, sweep: Sweep, span_ns: int) -> bool:
+        """Return whether a cloud belongs here: the first of its topic, within the span."""
+        first_ns = min(self.first_ns, sweep.stamp_ns)
+        last_ns = max(self.last_ns, sweep.stamp_ns)
+        return sweep.topic not in self.clouds and last_ns - first_ns <= span_ns
+
+
+class SweepMerger:
+    """
+    Merge the clouds of several LiDARs into one sweep per period.
+
+    A sweep has at most one cloud of each topic, and their stamps are within `merge_span`. It is
+    complete with a cloud of every LiDAR that was heard in the last second; without one of them it
+    is returned once a later sweep is complete, or two later ones have begun. The rule reads
+    stamps and the order of arrival only, no clock. A sweep has the stamp of the first topic in it,
+    in the order of `topics`; the times of its points are relative to that.
+
+    Parameters
+    ----------
+    topics : sequence of str
+        Topics of the clouds.
+    span : float
+        `merge_span` of the settings [s].
+    report : callable
+        Called for each cloud that is late, and each that a sweep lacks.
+
+    Attributes
+    ----------
+    counts : dict of str and Counter
+        Of each topic, clouds that were ``merged``, and those by the reasons of `report`.
+
+    """
+
+    def __init__(self, topics: Sequence[str], span: float, report: Report) -> None:
+        self._topics = topics
+        self._span_ns = round(span * 1e9)
+        self._report = report
+        self.counts = {topic: Counter[str]() for topic in topics}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all clouds; keep the counts."""
+        self._groups: list[_Group] = []  # ascending by stamp
+        self._heard_ns: dict[str, int] = {}
+        self._returned_ns: int | None = None
+
+    def add(self, sweep: Sweep, extra: Any = None) -> list[MergedSweep]:
+        """
+        Add a cloud; return the sweeps that are complete, in the order of their stamps.
+
+        Parameters
+        ----------
+        sweep : Sweep
+            In the fixed frame, with its topic.
+        extra : object
+            Returned with the merged sweep.
+
+        """
+        group = self._group_for(sweep)
+        if group is None:
+            self._note(
+                sweep.topic,
+                LATE,
+                f'a cloud of {sweep.stamp_ns} ns arrived after the others of its time were merged',
+            )
+            return []
+        group.clouds[sweep.topic] = sweep, extra
+        if not self._heard_ns:  # those that have not been heard are waited for at the start
+            self._heard_ns = dict.fromkeys(self._topics, sweep.stamp_ns)
+        self._heard_ns[sweep.topic] = sweep.stamp_ns
+        return self._pop_complete()
+
+    def flush(self) -> list[MergedSweep]:
+        """Return all sweeps that are held, complete or not."""
+        return self._pop(len(self._groups))
+
+    def _group_for(self, sweep: Sweep) -> _Group | None:
+        """Return the oldest group that takes a cloud, a new one, or None for a late cloud."""
+        for group in self._groups:
+            if group.takes(sweep, self._span_ns):
+                return group
+        newest_ns = self._groups[-1].first_ns if self._groups else self._returned_ns
+        if newest_ns is not None and sweep.stamp_ns <= newest_ns:
+            return None
+        self._groups.append(_Group())
+        return self._groups[-1]
+
+    def _pop_complete(self) -> list[MergedSweep]:
+        complete = [i for i, group in enumerate(self._groups) if not self._awaited(group)]
+        count = complete[-1] + 1 if complete else 0
+        return self._pop(max(count, len(self._groups) - MAX_OPEN_GROUPS))
+
+    def _awaited(self, group: _Group) -> list[str]:
+        """Return the topics that lack in a group and are not silent."""
+        oldest_ns = group.first_ns - round(LIDAR_SILENCE * 1e9)
+        return [
+            topic
+            for topic in self._topics
+            if topic not in group.clouds and self._heard_ns[topic] >= oldest_ns
+        ]
+
+    def _pop(self, count: int) -> list[MergedSweep]:
+        groups = self._groups[:count]
+        del self._groups[:count]
+        return [self._merged(group) for group in groups]
+
+    def _merged(self, group: _Group) -> MergedSweep:
+        lacking = [topic for topic in self._topics if topic not in group.clouds]
+        for topic in lacking:
+            self._note(topic, MISSING, f'no cloud at {group.first_ns} ns')
+        for topic in group.clouds:
+            self.counts[topic][MERGED] += 1
+        self._returned_ns = group.last_ns
+        clouds = [group.clouds[topic] for topic in self._topics if topic in group.clouds]
+        there = [(sweep, extra) for sweep, extra in clouds if not sweep.is_dropped]
+        if not there:
+            return MergedSweep(clouds[0][0], ())
+        return MergedSweep(
+            merged([sweep for sweep, _ in there]), tuple(extra for _, extra in there)
+        )
+
+    def _note(self, topic: str, reason: str, text: str) -> None:
+        self.counts[topic][reason] += 1
+        self._report(reason, f'{topic}: {text}; the other LiDARs are used', 1)
+
+
+def merged(sweeps: Sequence[Sweep]) -> Sweep:
+    """
+    Return one sweep of clouds that are in the same frame, with the stamp of the first.
+
+    Parameters
+    ----------
+    sweeps : sequence of Sweep
+        One or more.
+
+    """
+    stamp_ns = sweeps[0].stamp_ns
+    delays = [(sweep.stamp_ns - stamp_ns) * 1e-9 for sweep in sweeps]
+    times = None
+    if any(delays) or any(sweep.times is not None for sweep in sweeps):
+        times = np.concatenate(
+            [_times(sweep, delay) for sweep, delay in zip(sweeps, delays, strict=True)]
+        )
+    origins = [sweep.origin[None] if sweep.origins is None else sweep.origins for sweep in sweeps]
+    first = np.cumsum([0, *map(len, origins)])[:-1]
+    sensors = [_sensors(sweep, number) for sweep, number in zip(sweeps, first, strict=True)]
+    stacked = np.concatenate(origins)
+    return replace(
+        sweeps[0],
+        points=np.concatenate([sweep.points.T for sweep in sweeps], axis=1).T,
+        times=times,
+        origin=stacked.mean(axis=0),
+        origins=stacked,
+        sensors=np.concatenate(sensors),
+        topic='',
+        rows=None,
+    )
+
+
+def _times(sweep: Sweep, delay: float) -> Floats:
+    """Return the times of the points of a sweep (M,) with a delay added [s]."""
+    times = np.zeros(len(sweep.points)) if sweep.times is None else sweep.times
+    return times + delay
+
+
+def _sensors(sweep: Sweep, first: int) -> NDArray[np.uint8]:
+    """Return the sensor of each point (M,), counted from `first`."""
+    if sweep.sensors is None:
+        return np.full(len(sweep.points), first, np.uint8)
+    return (sweep.sensors + first).astype(np.uint8)

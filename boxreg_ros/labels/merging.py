@@ -1,0 +1,94 @@
+"""Boxes of label files between the clouds of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from boxreg_ros.io.recording import Item
+from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.labels.protocol import LabelFrame
+
+
+class LabelMerger:
+    """
+    Yield the boxes of a stamp after the sweep of that stamp, or the next one.
+
+    Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and
+    move with the recording; the others are taken in the frame that the labels name.
+
+    Parameters
+    ----------
+    frames : iterator of LabelFrame
+        Stamps ascend.
+    tree : TransformTree
+        Of the recording.
+    sensor_frame : str
+        Frame of its clouds.
+    start_ns : int
+        Begin of the recording [ns].
+    is_part : bool
+        Whether only a part of the recording is read; boxes before and after it are left out.
+
+    Attributes
+    ----------
+    outside : int
+        Boxes left out.
+
+    """
+
+    def __init__(
+        self,
+        frames: Iterator[LabelFrame],
+        tree: TransformTree,
+        sensor_frame: str,
+        start_ns: int,
+        is_part: bool,
+    ) -> None:
+        self.outside = 0
+        self._frames = frames
+        self._next = next(frames, None)
+        self._tree = tree
+        self._sensor_frame = sensor_frame
+        self._received_ns = start_ns
+        self._is_part = is_part
+        self._first_ns: int | None = None
+        self._newest_ns = 0
+
+    def after(self, received_ns: int, stamp_ns: int) -> Iterator[Item]:
+        """Yield the boxes up to the stamp of a sweep [ns], which is the next of the recording."""
+        self._received_ns = received_ns
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        if self._first_ns is None:
+            self._first_ns = self._newest_ns
+        while self._next is not None and _stamp(self._next) <= self._newest_ns:
+            yield from self._take(self._is_part and _stamp(self._next) < self._first_ns)
+
+    def rest(self) -> Iterator[Item]:
+        """Yield the boxes later than the last sweep."""
+        while self._next is not None:
+            yield from self._take(self._is_part)
+
+    def _take(self, is_outside: bool) -> Iterator[Item]:
+        """Yield the next boxes, or count them as outside, and go on to those after them."""
+        frame = self._next
+        assert frame is not None
+        if is_outside:
+            self.outside += len(frame.refined.status)
+        else:
+            yield _item(frame, self._received_ns, self._tree, self._sensor_frame)
+        self._next = next(self._frames, None)
+
+
+def _item(frame: LabelFrame, received_ns: int, tree: TransformTree, sensor_frame: str) -> Item:
+    """Return the boxes of a label frame, in a frame that the transforms know if possible."""
+    placed = frame.moved('sensor')
+    boxes = placed.refined.boxes
+    is_sensor = frame.sensor_frame != '' and boxes.frame_id == frame.sensor_frame
+    if is_sensor and not tree.connects(boxes.frame_id, sensor_frame):
+        boxes = replace(boxes, frame_id=sensor_frame)
+    return Item(received_ns, boxes, refined=replace(placed.refined, boxes=boxes))
+
+
+def _stamp(frame: LabelFrame) -> int:
+    return frame.refined.boxes.stamp_ns

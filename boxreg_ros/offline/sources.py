@@ -1,0 +1,132 @@
+"""The source of clouds and boxes that paths on the command line name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from boxreg_ros.datasets import Address, address_of, SceneRecording
+from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
+from boxreg_ros.offline.labelled_recording import LabelledRecording
+from boxreg_ros.structures import BoxArray
+from msg_adapters.convention import Convention, STANDARD
+import numpy as np
+
+
+def source_of(
+    paths: Sequence[Path],
+    lidars: Lidars = SINGLE_LIDAR,
+    boxes: str | None = None,
+    odometry: str | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    convention: Convention = STANDARD,
+    labels: tuple[str, Path] | None = None,
+) -> Recording | SceneRecording:
+    """
+    Return the recording or the scene of a data set, not yet open.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Recordings of one drive, or one address of a scene.
+    lidars, boxes, odometry, start, end, convention
+        As those of `Recording`.
+    labels : tuple of str and Path, optional
+        Format and path of label files to read the boxes from.
+
+    Raises
+    ------
+    ConfigError
+        If an option does not apply to a scene, or there are several.
+
+    """
+    address = scene_address(paths)
+    if address is not None:
+        _check_scene(address, lidars, boxes, odometry, convention)
+        sensor = lidars.topics[0] if lidars.topics else None
+        return SceneRecording(address, sensor, start, end, labels)
+    if labels is not None:
+        return LabelledRecording(
+            labels, paths, lidars=lidars, odometry=odometry, start=start, end=end
+        )
+    return Recording(paths, lidars, boxes, odometry, start, end, convention)
+
+
+def scene_address(paths: Sequence[Path]) -> Address | None:
+    """
+    Return the address of a scene among paths; None if all are recordings.
+
+    Raises
+    ------
+    ConfigError
+        If there are other paths beside it.
+
+    """
+    addresses = [address for address in map(address_of, paths) if address is not None]
+    if not addresses:
+        return None
+    if len(paths) > 1:
+        raise ConfigError(
+            f'recordings: expected one scene of a data set, got {", ".join(map(str, paths))}; '
+            f'relabel them one by one, or with boxreg batch'
+        )
+    return addresses[0]
+
+
+def _check_scene(
+    address: Address,
+    lidars: Lidars,
+    boxes: str | None,
+    odometry: str | None,
+    convention: Convention,
+) -> None:
+    """Refuse options of topics."""
+    if len(lidars.topics) > 1 or lidars.frames or lidars.info:
+        raise ConfigError(
+            f'points, sensor_frames, points_info: expected at most one sensor for a scene of a '
+            f'data set, got {lidars} with {address}; leave out all but one --points'
+        )
+    for name, topic in (('boxes', boxes), ('odometry', odometry)):
+        if topic is not None:
+            raise ConfigError(
+                f'{name}: expected for recordings with topics only, got {topic!r} with {address}; '
+                f'leave --{name} out'
+            )
+    if not convention.is_standard:
+        raise ConfigError(
+            f'{convention}: expected for boxes of a topic only, got {address}; leave it out: a '
+            f'data set has its own convention'
+        )
+
+
+def true_boxes(path: Path) -> BoxTable:
+    """
+    Return true boxes: of a table, or the annotations of a scene of a data set.
+
+    Raises
+    ------
+    RecordingError
+        If they cannot be read.
+
+    """
+    address = address_of(path)
+    if address is None:
+        return BoxTable.read(path)
+    tree = TransformTree()
+    arrays: list[BoxArray] = []
+    num_points = [np.zeros(0, np.int64)]
+    with SceneRecording(address) as scene:
+        fixed_frame = scene.choose_fixed_frame(tree)
+        for item in scene.items(tree, with_clouds=False):
+            moved = to_fixed_frame(item.content, tree, fixed_frame)
+            assert isinstance(moved, BoxArray)
+            assert item.refined is not None  # annotations have it
+            arrays.append(moved)
+            num_points.append(item.refined.num_points)
+    return replace(BoxTable.from_arrays(arrays), num_points=np.concatenate(num_points))

@@ -1,0 +1,340 @@
+"""Public data sets as recordings: clouds, poses and boxes by hand-derived values."""
+
+from pathlib import Path
+import shutil
+from typing import NamedTuple
+
+from boxreg_ros.cli import main
+from boxreg_ros.datasets import address_of, SceneRecording
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.recording import ItemSource
+from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
+from boxreg_ros.structures import Sweep
+import layouts
+from layouts import FRAMES
+import numpy as np
+import pytest
+from relabel_results import rows_of
+
+
+class Case(NamedTuple):
+    """A data set: how its folder is written, and what is expected of its drive."""
+
+    write: object
+    scene: str
+    track: str
+    class_name: str
+    origin: object
+    points: object = layouts.face_in_map
+    box: object = layouts.car_in_map
+    stamps_ns: object = layouts.stamps_ns
+    step: int = 1
+    has_times: bool = False
+
+
+def kitti_points(i):
+    return layouts.face_in_ego(i) - [0, 0, 1.7] + layouts.kitti_position(i)
+
+
+def kitti_box(i):
+    box = layouts.car_in_velo(i)
+    box[:3] += layouts.kitti_position(i)
+    return box
+
+
+CASES = {
+    'nuscenes': Case(
+        layouts.nuscenes, 'scene-0061', 'car', 'vehicle.car', layouts.lidar_position, step=2
+    ),
+    'kitti-tracking': Case(
+        layouts.kitti_tracking,
+        '0004',
+        '3',
+        'Car',
+        layouts.kitti_position,
+        kitti_points,
+        kitti_box,
+        lambda: [(1 + i) * 100_000_000 for i in range(FRAMES)],
+    ),
+    'argoverse2': Case(
+        layouts.argoverse2,
+        layouts.LOG,
+        'car-1',
+        'REGULAR_VEHICLE',
+        # Both LiDARs are 1.35 m ahead of the ego frame, 1.6 m high in the mean.
+        lambda i: np.add(layouts.ego_position(i), [0, 1.35, 1.6]),
+        has_times=True,
+    ),
+}
+
+
+def source_of(name, root, **options):
+    return SceneRecording(address_of(Path(f'{name}:{root}')), **options)
+
+
+def read(source, **options):
+    """Return the sweeps and the boxes of a source in its fixed frame."""
+    tree = TransformTree()
+    sweeps, boxes = [], []
+    with source:
+        assert isinstance(source, ItemSource)
+        fixed_frame = source.choose_fixed_frame(tree)
+        for item in source.items(tree, **options):
+            moved = to_fixed_frame(item.content, tree, fixed_frame)
+            (sweeps if isinstance(moved, Sweep) else boxes).append(moved)
+        source.check_readable()
+    return sweeps, boxes
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_clouds_poses_and_boxes_are_those_of_the_drive(tmp_path, name):
+    case = CASES[name]
+    case.write(tmp_path)
+    sweeps, arrays = read(source_of(name, f'{tmp_path}#{case.scene}'), with_intensities=True)
+    stamps = case.stamps_ns()
+    assert [sweep.stamp_ns for sweep in sweeps] == stamps
+    for i, sweep in enumerate(sweeps):
+        np.testing.assert_allclose(sweep.points, case.points(i), atol=3e-5)
+        np.testing.assert_allclose(sweep.origin, case.origin(i), atol=1e-6)
+    assert all((sweep.times is not None) == case.has_times for sweep in sweeps)
+    assert [array.stamp_ns for array in arrays] == stamps[:: case.step]
+    for i, array in zip(range(0, FRAMES, case.step), arrays, strict=True):
+        np.testing.assert_allclose(array.boxes, [case.box(i)], atol=2e-6)
+        assert array.track_ids == (case.track,)
+        assert array.class_names == (case.class_name,)
+
+
+def test_times_of_points_are_seconds_after_the_stamp(tmp_path):
+    layouts.argoverse2(tmp_path)
+    sweeps, _ = read(source_of('argoverse2', tmp_path))
+    assert sweeps[0].times[[0, -1]].tolist() == pytest.approx([0.0, 0.099])
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_one_command_relabels_a_scene(tmp_path, name, capsys):
+    case = CASES[name]
+    case.write(tmp_path / 'data')
+    address = f'{name}:{tmp_path / "data"}#{case.scene}'
+    out = tmp_path / 'out'
+    assert main(['relabel', address, '-o', str(out), f'--truth={address}', '--report']) == 0
+    assert len(rows_of(out)) == len(range(0, FRAMES, case.step))
+    assert 'truth' not in capsys.readouterr().err
+    # The input is the truth, and the points are exact.
+    assert main(['evaluate', str(out), address]) == 0
+    assert main(['evaluate', address, address, '--json']) == 0
+    assert '"iou_3d": 1.0' in capsys.readouterr().out
+    assert main(['relabel', address, '-o', str(out), '--resume', '--formats=csv']) == 0
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_inspect_prints_the_command_for_a_scene(tmp_path, name, capsys):
+    case = CASES[name]
+    case.write(tmp_path)
+    address = f'{name}:{tmp_path}#{case.scene}'
+    assert main(['inspect', address]) == 0
+    printed = capsys.readouterr().out
+    assert 'next: boxreg relabel ' in printed
+    assert f'-o out/{case.scene}' in printed
+    assert '143 points' in printed
+
+
+def test_inspect_lists_the_scenes_of_a_folder(tmp_path, capsys):
+    layouts.nuscenes(tmp_path)
+    assert main(['inspect', f'nuscenes:{tmp_path}']) == 0
+    root = f'nuscenes:{tmp_path}'
+    assert capsys.readouterr().out.split() == [f'{root}#scene-0061', f'{root}#scene-0103']
+
+
+def test_a_part_of_a_scene(tmp_path):
+    layouts.argoverse2(tmp_path)
+    source = source_of('argoverse2', tmp_path, start=0.2, end=0.65)
+    sweeps, boxes = read(source)
+    stamps = layouts.stamps_ns()[2:7]
+    assert [item.stamp_ns for item in sweeps] == stamps
+    assert [item.stamp_ns for item in boxes] == stamps
+    assert source.outside == FRAMES - 5
+
+
+def test_one_sweep_is_in_memory_at_a_time(tmp_path):
+    layouts.kitti_tracking(tmp_path)
+    source = source_of('kitti-tracking', tmp_path)
+    tree = TransformTree()
+    with source:
+        source.choose_fixed_frame(tree)
+        items = source.items(tree)
+        next(items)
+        # Sweeps are read when they are asked for: this one disappears before that.
+        shutil.rmtree(tmp_path / 'training' / 'velodyne')
+        assert not [item for item in items if isinstance(item.content, Sweep)]
+    assert source.unreadable['velodyne'] == FRAMES - 1
+
+
+RESULTS = {
+    'nuscenes-detection': ('nuscenes', lambda p: layouts.nuscenes_results(p, 'detection', 0.1)),
+    'nuscenes-tracking': ('nuscenes', lambda p: layouts.nuscenes_results(p, 'tracking', 0.1)),
+    'argoverse2': ('argoverse2', layouts.argoverse2_detections),
+}
+
+
+@pytest.mark.parametrize('name', RESULTS)
+def test_results_as_they_are_submitted_are_labels(tmp_path, name):
+    dataset, write = RESULTS[name]
+    case = CASES[dataset]
+    case.write(tmp_path / 'data')
+    suffix = '.feather' if dataset == 'argoverse2' else '.json'
+    labels = (dataset, write(tmp_path / f'results{suffix}'))
+    address = f'{tmp_path / "data"}#{case.scene}'
+    _, arrays = read(source_of(dataset, address, labels=labels))
+    assert len(arrays) == len(range(0, FRAMES, case.step))
+    shift = 0.1 if dataset == 'nuscenes' else 0.0
+    track = '5' if name == 'nuscenes-tracking' else ''
+    for i, array in zip(range(0, FRAMES, case.step), arrays, strict=True):
+        expected = case.box(i)
+        expected[1] += shift
+        np.testing.assert_allclose(array.boxes, [expected], atol=2e-6)
+        assert array.track_ids == (track,)
+        assert array.scores.tolist() == [0.75]
+
+
+def test_tracks_of_kitti_need_neither_stamps_nor_calibration_of_their_own(tmp_path):
+    layouts.kitti_tracking(tmp_path / 'data', labels=False)
+    results = tmp_path / 'results'
+    results.mkdir()
+    lines = [layouts.kitti_line(i, 0.5) for i in range(0, FRAMES, 2)]
+    (results / '0004.txt').write_text('\n'.join(lines))
+    case = CASES['kitti-tracking']
+    source = source_of('kitti-tracking', tmp_path / 'data', labels=('kitti', results))
+    _, arrays = read(source)
+    assert [len(array.boxes) for array in arrays] == [1, 0] * (FRAMES // 2)
+    np.testing.assert_allclose(arrays[2].boxes, [case.box(2)], atol=2e-6)
+    assert arrays[2].scores.tolist() == [0.5]
+
+
+def test_detections_are_associated_and_relabelled(tmp_path, capsys):
+    layouts.nuscenes(tmp_path / 'data')
+    results = layouts.nuscenes_results(tmp_path / 'results.json', 'detection')
+    address = f'nuscenes:{tmp_path / "data"}#scene-0061'
+    arguments = ['relabel', address, '-o', str(tmp_path / 'out'), '--formats=csv']
+    assert main([*arguments, f'--labels=nuscenes:{results}', '--associate']) == 0
+    assert {row['track_id'] for row in rows_of(tmp_path / 'out')} == {'1'}
+
+
+def broken(name, tmp_path, *parts):
+    """Write a data set and delete a part of it."""
+    CASES[name].write(tmp_path)
+    for path in tmp_path.glob('/'.join(parts)):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    return source_of(name, f'{tmp_path}#{CASES[name].scene}')
+
+
+@pytest.mark.parametrize(
+    ('name', 'deleted', 'message'),
+    [
+        ('nuscenes', ['v1.0-mini', 'ego_pose.json'], "the table 'ego_pose' of nuScenes"),
+        ('nuscenes', ['v1.0-mini', 'sensor.json'], 'sensor.json: cannot be read'),
+        ('nuscenes', ['v1.0-mini'], r'expected v1.0-\*/scene.json'),
+        ('kitti-tracking', ['training', 'oxts', '*'], 'unpack data_tracking_oxts.zip'),
+        ('kitti-tracking', ['training', 'calib', '*'], 'unpack data_tracking_calib.zip'),
+        ('kitti-tracking', ['training', 'velodyne', '*', '*'], 'data_tracking_velodyne.zip'),
+        ('argoverse2', ['val', '*', 'sensors', 'lidar'], 'the sweeps, got no such file'),
+        ('argoverse2', ['val', '*', 'calibration', '*'], 'the calibration, got no such file'),
+        (
+            'argoverse2',
+            ['val', '*', 'annotations.feather'],
+            'no boxes: expected .*argoverse2:PATH',
+        ),
+        ('kitti-tracking', ['training', 'label_02', '*'], 'no boxes: expected .*kitti:PATH'),
+    ],
+)
+def test_a_missing_part_is_named_with_a_remedy(tmp_path, name, deleted, message):
+    with pytest.raises(RecordingError, match=message):
+        broken(name, tmp_path, *deleted).__enter__()
+
+
+def test_a_pose_that_is_missing_is_named(tmp_path):
+    layouts.nuscenes(tmp_path)
+    path = tmp_path / 'v1.0-mini' / 'ego_pose.json'
+    path.write_text(path.read_text().replace('pose3', 'lost'))
+    with pytest.raises(RecordingError, match=r'poses of 12 sweeps, got 11, .* is pose3'):
+        source_of('nuscenes', f'{tmp_path}#scene-0061').__enter__()
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_a_missing_or_damaged_sweep_is_counted_and_the_others_go_on(tmp_path, name):
+    case = CASES[name]
+    case.write(tmp_path)
+    clouds = sorted(p for p in tmp_path.rglob('*') if p.suffix == '.bin' or 'lidar' in p.parts)
+    clouds = [path for path in clouds if path.is_file()]
+    clouds[0].unlink()
+    clouds[1].write_bytes(clouds[1].read_bytes()[:-5])
+    source = source_of(name, f'{tmp_path}#{case.scene}')
+    sweeps, _ = read(source)
+    lost = 1 if name == 'argoverse2' else 2  # its list of sweeps is that of the files
+    assert len(sweeps) == len(clouds) - 2
+    assert source.unreadable.total() == lost
+    assert 'download' in str(next(iter(source.first_errors.values())))
+
+
+def test_a_scene_without_any_sweep_is_an_error(tmp_path):
+    source = broken('nuscenes', tmp_path, 's*s')
+    with pytest.raises(UnsupportedMessage, match="none of 12 sweeps of 'LIDAR_TOP' can be read"):
+        read(source)
+
+
+@pytest.mark.parametrize(
+    ('address', 'message'),
+    [
+        ('nuscenes:{}#scene-0062', 'no scene .* did you mean scene-0061.*is its split downloaded'),
+        ('nuscenes:{}', 'expected the name of a scene .* there: scene-0061, scene-0103'),
+        ('nuscene:{}#scene-0061', 'did you mean nuscenes:'),
+        ('nuscenes:{}/none#scene-0061', 'no such folder'),
+        ('argoverse2:{}#x', 'expected LOG/city_SE3_egovehicle.feather'),
+    ],
+)
+def test_a_wrong_address_is_explained_in_one_line(tmp_path, capsys, address, message):
+    layouts.nuscenes(tmp_path)
+    out = tmp_path / 'out'
+    assert main(['relabel', address.format(tmp_path), '-o', str(out)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert __import__('re').search(message, line), line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        (['--boxes=/boxes'], 'boxes: expected for recordings with topics only'),
+        (['--odometry=/odom'], 'odometry: expected for recordings with topics only'),
+        (['--pose-reference=bottom'], 'a data set has its own convention'),
+    ],
+)
+def test_options_of_topics_are_refused(tmp_path, capsys, options, message):
+    layouts.argoverse2(tmp_path / 'data')
+    arguments = ['relabel', f'argoverse2:{tmp_path / "data"}', '-o', str(tmp_path / 'out')]
+    assert main([*arguments, *options]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_another_lidar_or_fixed_frame_is_refused(tmp_path):
+    layouts.nuscenes(tmp_path)
+    address = f'{tmp_path}#scene-0061'
+    with pytest.raises(RecordingError, match="LiDARs LIDAR_TOP, got 'LIDAR_BACK'"):
+        source_of('nuscenes', address, points='LIDAR_BACK').__enter__()
+    with (
+        source_of('nuscenes', address) as source,
+        pytest.raises(RecordingError, match="'map' or 'LIDAR_TOP', got 'utm'"),
+    ):
+        source.choose_fixed_frame(TransformTree(), 'utm')
+
+
+def test_results_of_other_scenes_are_refused(tmp_path):
+    layouts.nuscenes(tmp_path)
+    results = layouts.nuscenes_results(tmp_path / 'results.json', 'detection')
+    source = source_of('nuscenes', f'{tmp_path}#scene-0103', labels=('nuscenes', results))
+    with pytest.raises(RecordingError, match='got none'):  # it has no sweeps either
+        source.__enter__()
+    layouts.argoverse2(tmp_path / 'av2', log='unknown-log')
+    detections = layouts.argoverse2_detections(tmp_path / 'detections.feather')
+    source = source_of('argoverse2', tmp_path / 'av2', labels=('argoverse2', detections))
+    with pytest.raises(RecordingError, match='expected boxes of log unknown-log'):
+        read(source)

@@ -1,0 +1,208 @@
+"""Several LiDARs: which clouds are merged, and which LiDAR measured which point."""
+
+from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.lidars import ignore, Lidars, merged, SensorPlacement, SweepMerger
+from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.structures import Sweep
+from lidar_drives import LidarDrive, LIDARS
+import numpy as np
+import pytest
+
+MS = 10**6
+PERIOD = 100 * MS
+NAMES = ('a', 'b', 'c')
+
+
+def cloud(topic, stamp_ms, count=2, **fields):
+    """Return a cloud whose points have the x of its stamp [ms]."""
+    points = np.full((count, 3), stamp_ms, np.float32)
+    origin = np.array([NAMES.index(topic), 0.0, 0.0]) if topic else np.zeros(3)
+    return Sweep(stamp_ms * MS, 'odom', points, None, origin, topic=topic, **fields)
+
+
+def groups(clouds, topics=NAMES, span=0.1, reports=None):
+    """Return the stamps [ms] of the clouds in each merged sweep, and those left at the end."""
+    found = []
+    report = ignore if reports is None else lambda *args: reports.append(args[:2])
+    merger = SweepMerger(topics, span, report)
+    for topic, stamp in clouds:
+        found += merger.add(cloud(topic, stamp))
+    return [
+        [sorted({int(x) for x in part.sweep.points[:, 0]}) for part in parts]
+        for parts in (found, merger.flush())
+    ]
+
+
+def periods(count, offsets, skip=()):
+    """Return (topic, stamp) of `count` periods in the order of their stamps."""
+    every = [
+        (name, 1000 + 100 * k + offset)
+        for k in range(count)
+        for name, offset in offsets.items()
+        if (name, k) not in skip
+    ]
+    return sorted(every, key=lambda item: item[1])
+
+
+def test_clouds_of_one_period_are_merged():
+    offsets = {'a': 0, 'b': 33, 'c': 66}
+    complete, rest = groups(periods(3, offsets))
+    assert complete == [[1000 + 100 * k + offset for offset in offsets.values()] for k in range(3)]
+    assert rest == []
+
+
+def test_a_cloud_may_arrive_after_one_of_the_next_period():
+    order = [('a', 0), ('b', 30), ('a', 100), ('c', 60), ('b', 130), ('c', 160)]
+    assert groups(order) == [[[0, 30, 60], [100, 130, 160]], []]
+
+
+def test_a_silent_lidar_is_waited_for_one_second_only():
+    reports = []
+    offsets = {'a': 0, 'b': 10, 'c': 20}
+    skip = {('c', k) for k in range(1, 30)}
+    complete, rest = groups(periods(30, offsets, skip), reports=reports)
+    assert len(complete) == 30  # the last ones at once
+    assert rest == []
+    assert [reason for reason, _ in reports] == ['cloud_missing'] * 29
+    assert all(text.startswith('c: ') for _, text in reports)
+
+
+def test_a_lidar_that_was_never_heard_does_not_hold_back_the_others():
+    complete, _ = groups(periods(15, {'a': 0, 'b': 10}))
+    assert complete[0] == [1000, 1010]
+    assert len(complete) == 15
+
+
+def test_a_lidar_that_is_a_second_late_is_counted_and_left_out():
+    reports = []
+    order = []
+    for k in range(30):
+        order += [('a', 2000 + 100 * k), ('b', 2010 + 100 * k), ('c', 1020 + 100 * k)]
+    complete, _ = groups(order, reports=reports)
+    assert complete == [[2000 + 100 * k, 2010 + 100 * k] for k in range(len(complete))]
+    assert len(complete) >= 29
+    reasons = [reason for reason, _ in reports]
+    assert reasons.count('cloud_late') >= 29
+
+
+def test_a_missing_cloud_delays_its_sweep_by_one_period():
+    merger = SweepMerger(NAMES, 0.1, ignore)
+    for topic, stamp in periods(3, {'a': 0, 'b': 10, 'c': 20}, skip={('b', 1)}):
+        found = merger.add(cloud(topic, stamp))
+        if (topic, stamp) == ('c', 1120):
+            assert found == []
+        if (topic, stamp) == ('c', 1220):
+            assert [part.sweep.stamp_ns for part in found] == [1100 * MS, 1200 * MS]
+    assert merger.counts['b'] == {'merged': 2, 'cloud_missing': 1}
+    assert merger.counts['a'] == {'merged': 3}
+
+
+def test_a_merged_sweep_has_times_and_sensors_of_every_point():
+    first = cloud('a', 1000)
+    second = cloud('b', 1030, 1)
+    third = Sweep(
+        1060 * MS, 'odom', np.zeros((2, 3), np.float32), np.array([0.0, -0.01]), np.zeros(3),
+        topic='c', origins=np.array([[5.0, 0, 0], [7.0, 0, 0]]),
+        sensors=np.array([1, 0], np.uint8),
+    )  # fmt: skip
+    whole = merged([first, second, third])
+    assert (whole.stamp_ns, whole.topic) == (1000 * MS, '')
+    np.testing.assert_allclose(whole.times, [0, 0, 0.03, 0.06, 0.05], atol=1e-12)
+    assert whole.sensors.tolist() == [0, 0, 1, 3, 2]
+    np.testing.assert_array_equal(whole.origins[:, 0], [0, 1, 5, 7])
+    assert whole.points.shape == (5, 3)
+    assert merged([cloud('a', 1000), cloud('b', 1000)]).times is None
+
+
+def test_the_stamp_is_that_of_the_first_topic_that_is_there():
+    found = SweepMerger(('b', 'a'), 0.1, ignore)
+    found.add(cloud('a', 1000))
+    (part,) = found.add(cloud('b', 1020))
+    assert part.sweep.stamp_ns == 1020 * MS
+    np.testing.assert_allclose(part.sweep.times, [0, 0, -0.02, -0.02], atol=1e-12)
+
+
+def test_a_dropped_cloud_is_not_waited_for():
+    merger = SweepMerger(('a', 'b'), 0.1, ignore)
+    merger.add(cloud('a', 1000, is_dropped=True))
+    (part,) = merger.add(cloud('b', 1010))
+    assert not part.sweep.is_dropped
+    assert part.sweep.points[:, 0].tolist() == [1010, 1010]
+    merger.add(cloud('a', 1100, is_dropped=True))
+    (part,) = merger.add(cloud('b', 1110, is_dropped=True))
+    assert part.sweep.is_dropped
+
+
+@pytest.mark.parametrize(
+    'fields, text',
+    [
+        ({'topics': ('a', 'a')}, 'each topic once'),
+        ({'topics': ('a', 'b'), 'frames': ('x',)}, 'got 1'),
+        ({'topics': ('a', 'b'), 'info': 'i'}, 'concatenated topic only'),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(fields, text):
+    with pytest.raises(ConfigError, match=text):
+        Lidars(**fields)
+
+
+def placement_of(drive, lidars):
+    """Return the sweep of the first cloud of a drive in its frame, placed, and what is missing."""
+    tree = TransformTree()
+    placement = SensorPlacement(lidars)
+    cloud = None
+    for topic, _, message in drive.items:
+        if topic.startswith('/tf'):
+            tree.add_transforms(message.transforms, topic == '/tf_static')
+        elif topic == '/points_info':
+            placement.add_info(message)
+        elif topic == '/points':
+            cloud = cloud or placement.sweep_of(message, topic)
+    return placement.placed(cloud, tree)
+
+
+def test_the_info_names_the_lidar_and_the_time_of_every_point():
+    sweep, reason, _ = placement_of(LidarDrive(2, 'info'), Lidars(info='/points_info'))
+    assert reason == ''
+    half = len(sweep.points) // 2
+    assert sweep.sensors.tolist() == [0] * half + [1] * half
+    np.testing.assert_allclose(sweep.origins, list(LIDARS.values()))
+    np.testing.assert_allclose(sweep.times, [0.0] * half + [0.03] * half)
+
+
+def test_rows_of_the_info_count_points_that_are_not_finite():
+    drive = LidarDrive(1, 'info')
+    xyz = np.ones((4, 3))
+    xyz[1] = np.nan
+    points = drive.messages.points(drive.stamps[0], 'base', xyz)
+    places = [i for i, item in enumerate(drive.items) if item[0] == '/points']
+    drive.items[places[0]] = '/points', 0, points
+    stamps = {'front': drive.stamps[0], 'rear': drive.stamps[0]}
+    drive.items.append(('/points_info', 0, drive.info(drive.stamps[0], stamps, [2, 2])))
+    sweep, _, _ = placement_of(drive, Lidars(info='/points_info'))
+    assert sweep.sensors.tolist() == [0, 1, 1]
+
+
+def test_without_info_points_belong_to_the_nearest_lidar_that_is_named():
+    drive = LidarDrive(1, 'alone')
+    sweep, reason, _ = placement_of(drive, Lidars(frames=('front', 'rear')))
+    assert reason == ''
+    to_front = np.hypot(*(sweep.points[:, :2] - [2, 0]).T)
+    to_rear = np.hypot(*(sweep.points[:, :2] - [-2, 0]).T)
+    np.testing.assert_array_equal(sweep.sensors, to_rear < to_front)
+    sweep, _, _ = placement_of(drive, Lidars(frames=('rear',)))
+    np.testing.assert_allclose(sweep.origin, LIDARS['rear'])
+
+
+@pytest.mark.parametrize(
+    'kind, lidars, reason, text',
+    [
+        ('alone', Lidars(info='/points_info'), 'cloud_without_info', 'no info of the cloud'),
+        ('alone', Lidars(frames=('left',)), 'sensor_without_transform', "from 'left' to 'base'"),
+    ],
+)
+def test_what_is_missing_of_a_lidar_is_named(kind, lidars, reason, text):
+    sweep, found, detail = placement_of(LidarDrive(1, kind), lidars)
+    assert found == reason
+    assert text in detail
+    assert sweep.origins is None
