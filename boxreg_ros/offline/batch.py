@@ -18,6 +18,7 @@ import sys
 from typing import Any
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.arguments import add_recording_arguments, config_from, lidar_options
 from boxreg_ros.offline.batch_results import row_of, rows_of_shards, write_results
 from boxreg_ros.offline.job import Job, JOB_FAILED, jobs_of, UP_TO_DATE
@@ -86,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
     index, count = args.shard
     jobs = jobs_of(args.recordings)[index - 1 :: count]
     with writing(args.out):
-        args.out.mkdir(parents=True, exist_ok=True)
+        if url_of(args.out) is None:
+            args.out.mkdir(parents=True, exist_ok=True)
         _run_all(jobs, args)
         rows = [row_of(job) for job in jobs]
         write_results(args.out, rows, '' if count == 1 else f'.{index}-of-{count}')

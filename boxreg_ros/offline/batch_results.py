@@ -16,7 +16,7 @@ from boxreg_ros.offline.job import Job, JOB_FAILED
 from boxreg_ros.offline.result_folder import SUMMARY, written_whole
 
 COUNTS = ('sweeps', 'boxes_in', 'refined', 'kept', 'damages')
-COLUMNS = (
+INDEX_COLUMNS = (
     'drive', 'status', 'exit_status', 'attempts', 'seconds', 'peak_mb', *COUNTS, 'last_line',
     'key',
 )  # fmt: skip
@@ -58,7 +58,7 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
 
     """
     with written_whole(out / f'index{shard}.csv') as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator='\n')
+        writer = csv.DictWriter(file, INDEX_COLUMNS, lineterminator='\n')
         writer.writeheader()
         writer.writerows(rows)
     merged = {

@@ -12,6 +12,7 @@ import shlex
 from typing import Any
 
 from boxreg_ros import __version__
+from boxreg_ros.io.storage.urls import entries_of, Entry, url_of
 
 MANIFESTS = ('.txt', '.lst')
 JOB_FAILED = 'failed'
@@ -61,14 +62,23 @@ class Job:
     summary: dict[str, Any] = field(default_factory=dict)
 
     def files(self) -> Iterator[Path]:
-        """Yield all files of the recordings."""
+        """Yield all files of the recordings on this machine."""
         for path in self.recordings:
+            if url_of(path) is not None:
+                continue
             inner = sorted(path.iterdir()) if path.is_dir() else [path]
             yield from (file for file in inner if file.is_file())
 
     def size(self) -> int:
         """Return the size of all files [bytes]."""
-        return sum(file.stat().st_size for file in self.files())
+        local = sum(file.stat().st_size for file in self.files())
+        return local + sum(entry.size for entry in self.entries())
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield all files of the recordings behind URLs."""
+        for path in self.recordings:
+            if url_of(path) is not None:
+                yield from entries_of(path)
 
     def fail(self, reason: str) -> None:
         """Note why the job cannot be done."""
@@ -77,7 +87,7 @@ class Job:
 
     def hashes(self, earlier: Sequence[Sequence[Any]]) -> list[list[Any]]:
         """
-        Return path, size, time and hash of each file, and set the status of a missing one.
+        Return path, size, time and hash of each file; of a URL the tag or time of its server.
 
         Parameters
         ----------
@@ -91,6 +101,7 @@ class Job:
             about = file.stat()
             place = str(file.resolve()), about.st_size, about.st_mtime_ns
             hashes.append([*place, known.get(place) or _hash(file)])
+        hashes += [[str(one.path), one.size, 0, one.version] for one in self.entries()]
         return hashes
 
     def set_key(self, hashes: Sequence[Sequence[Any]], settings: Sequence[str]) -> None:
@@ -112,7 +123,7 @@ def jobs_of(arguments: Sequence[Path]) -> list[Job]:
     for argument in arguments:
         if argument.suffix in MANIFESTS and argument.is_file():
             drives += _manifest(argument)
-        elif not argument.exists() and glob(str(argument)):
+        elif url_of(argument) is None and not argument.exists() and glob(str(argument)):
             drives += [(Path(path),) for path in sorted(glob(str(argument)))]
         else:
             drives.append((argument,))
@@ -138,7 +149,7 @@ def _manifest(path: Path) -> Iterator[tuple[Path, ...]]:
 def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
     """Return why a drive cannot be done; empty if it can. Its recordings become `seen`."""
     for path in drive:
-        if not path.exists():
+        if url_of(path) is None and not path.exists():
             return 'expected a recording, got no such file; correct its path, or leave it out'
         if path.resolve() in seen:
             return 'expected each recording once, got it a second time; leave one out'

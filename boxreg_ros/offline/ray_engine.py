@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import logging
+from pathlib import Path
 import signal
 import socket
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.job import Job
 from boxreg_ros.offline.job_process import JobRunner
 
@@ -128,8 +130,12 @@ def _take_result(ray: Any, reference: Any, job: Job) -> None:
 
 def _absolute(runner: JobRunner) -> JobRunner:
     """Return a runner with paths that do not depend on the current folder."""
-    return replace(runner, out=runner.out.resolve(), running=set())
+    return replace(runner, out=_absolute_path(runner.out), running=set())
 
 
 def _absolute_job(job: Job) -> Job:
-    return replace(job, recordings=tuple(path.resolve() for path in job.recordings))
+    return replace(job, recordings=tuple(map(_absolute_path, job.recordings)))
+
+
+def _absolute_path(path: Path) -> Path:
+    return path if url_of(path) else path.resolve()

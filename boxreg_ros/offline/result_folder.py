@@ -6,14 +6,17 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 import errno
 from glob import escape
+from io import StringIO
 import json
 import os
 from pathlib import Path
 import shutil
+from tempfile import TemporaryDirectory
 from typing import Any, TextIO
 from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.storage.urls import names_of, read_text, upload, url_of, write_text
 
 DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 """Disk full, file larger than the limit of the process, quota used up."""
@@ -26,7 +29,7 @@ CONFIG = 'config.yaml'
 def earlier_summary(out: Path) -> dict[str, Any] | None:
     """Return the summary of an earlier run in `out`; None if there is none."""
     try:
-        summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
+        summary = json.loads(read_text(out / SUMMARY))
     except (OSError, ValueError):
         return None
     return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
@@ -83,6 +86,10 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
         If `out` exists and is not the unchanged result of an earlier run, or cannot be written.
 
     """
+    if url_of(out) is not None:
+        with _uploaded_folder(out) as folder:
+            yield folder
+        return
     spare(out, inputs)
     _check_replaceable(out)
     out = out.resolve()
@@ -101,6 +108,16 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
             os.replace(earlier, out)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(earlier, ignore_errors=True)
+
+
+@contextmanager
+def _uploaded_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder of this machine that is uploaded to the URL `out` on success."""
+    if earlier_summary(out) is None and names_of(out):
+        raise _other_files(out)
+    with TemporaryDirectory() as folder:
+        yield Path(folder)
+        upload(Path(folder), out, SUMMARY)
 
 
 @contextmanager
@@ -134,6 +151,8 @@ def writing(out: Path) -> Iterator[None]:
 
 def delete_remains(out: Path) -> None:
     """Delete the partial results of runs that were killed; none may be running."""
+    if url_of(out) is not None:
+        return
     whole = out.resolve()
     for remains in whole.parent.glob(f'.{escape(whole.name)}.*.partial'):
         shutil.rmtree(remains, ignore_errors=True)
@@ -142,6 +161,11 @@ def delete_remains(out: Path) -> None:
 @contextmanager
 def written_whole(path: Path) -> Iterator[TextIO]:
     """Yield a file that replaces `path` on success and is deleted on failure."""
+    if url_of(path) is not None:
+        text = StringIO()
+        yield text
+        write_text(path, text.getvalue())
+        return
     partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
     try:
         with partial.open('w', encoding='utf-8', newline='') as file:
@@ -154,10 +178,7 @@ def written_whole(path: Path) -> Iterator[TextIO]:
 def _check_replaceable(out: Path) -> None:
     """Refuse a folder that is not the unchanged result of an earlier run."""
     if out.exists() and earlier_summary(out) is None and not _is_empty(out):
-        raise RecordingError(
-            f'output {str(out)!r}: expected a new folder or an earlier result, got other files; '
-            f'choose another with -o'
-        )
+        raise _other_files(out)
     changed = _changed_since(out)
     if changed is not None:
         raise RecordingError(
@@ -165,6 +186,13 @@ def _check_replaceable(out: Path) -> None:
             f'{str(changed)!r} changed or added since, which would be lost; choose another with '
             f'-o, or delete this one'
         )
+
+
+def _other_files(out: Path) -> RecordingError:
+    return RecordingError(
+        f'output {str(out)!r}: expected a new folder or an earlier result, got other files; '
+        f'choose another with -o'
+    )
 
 
 def _changed_since(out: Path) -> Path | None:
