@@ -22,6 +22,7 @@ MEASUREMENTS = {
     'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),
     'review': Measurement('review', 'how early the review list shows the bad tracks'),
     'speed': Measurement('speed.command', 'time per tick, per box and per window'),
+    'scale': Measurement('scale', 'core hours and memory per hour, and a simulated fleet'),
     'node': Measurement('node', 'latency and memory of the live node, over DDS'),
 }
 

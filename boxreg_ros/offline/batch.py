@@ -114,6 +114,7 @@ def _run_all(jobs: list[Job], args: argparse.Namespace) -> None:
     """Run all jobs, and show the progress and the jobs that fail."""
     from tqdm import tqdm
 
+    jobs = sorted(jobs, key=_begins)
     options = tuple(_options(args))
     runner = JobRunner(args.out, options, str(config_from(args)), args.retries, args.timeout)
     total = sum(job.size() for job in jobs if job.status != JOB_FAILED)
@@ -127,6 +128,11 @@ def _run_all(jobs: list[Job], args: argparse.Namespace) -> None:
             else:
                 bar.update(job.size())
             bar.set_postfix_str(f'{failed} failed')
+
+
+def _begins(job: Job) -> int:
+    """Return a key that sorts the largest drives first: none of them is left to the end."""
+    return 0 if job.status == JOB_FAILED else -job.size()
 
 
 def _ended_jobs(jobs: list[Job], runner: JobRunner, args: argparse.Namespace) -> Iterator[Job]:

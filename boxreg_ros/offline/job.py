@@ -12,6 +12,7 @@ import shlex
 from typing import Any
 
 from boxreg_ros import __version__
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.urls import entries_of, Entry, url_of
 
 MANIFESTS = ('.txt', '.lst')
@@ -70,9 +71,12 @@ class Job:
             yield from (file for file in inner if file.is_file())
 
     def size(self) -> int:
-        """Return the size of all files [bytes]."""
-        local = sum(file.stat().st_size for file in self.files())
-        return local + sum(entry.size for entry in self.entries())
+        """Return the size of all files [bytes]; 0 where that is unknown, as the job will report."""
+        try:
+            local = sum(file.stat().st_size for file in self.files())
+            return local + sum(entry.size for entry in self.entries())
+        except (OSError, RecordingError):
+            return 0
 
     def entries(self) -> Iterator[Entry]:
         """Yield all files of the recordings behind URLs."""
