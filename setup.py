@@ -45,6 +45,8 @@ setup(
         'zstandard>=0.21',
     ],
     extras_require={
+        # Point clouds that are compressed by Draco.
+        'compressed': ['DracoPy>=2,<3'],
         # A baseline of `boxreg bench`, and its figures.
         'bench': ['matplotlib', 'small-gicp'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
@@ -67,7 +69,7 @@ setup(
             'check-jsonschema',
             'codespell',
             'colcon-common-extensions',
-            'flask-cors',
+            'DracoPy>=2,<3',
             'flake8-blind-except',
             'flake8-builtins',
             'flake8-class-newline',
@@ -77,6 +79,7 @@ setup(
             'flake8-import-order',
             'flake8-quotes',
             'flask',
+            'flask-cors',
             'foxglove-schemas-protobuf',
             'jinja2',
             'matplotlib',

@@ -153,6 +153,11 @@ REASONS = {
         'the solution of its window is not finite',
         'check stamps and coordinates of the boxes',
     ),
+    'budget': Reason(
+        'box',
+        'not solved before `deadline`: other tracks came first; its track is solved at a later '
+        'stamp, which refines the final box too if that is within `lag`',
+    ),
     'sweep_without_boxes': Reason('cloud', 'no boxes arrived for it, or too late'),
     'no_points': Reason('box', 'no points near any box of its window: occluded or too far away'),
     'no_gain': Reason(

@@ -252,6 +252,28 @@ def _review(results: Any) -> Iterable[str]:
             rows = [[order, *map(_number, shares)] for order, shares in found['shares'].items()]
             head = f'{recording}, {name}: worst {found["bad"]} of {found["tracks"]}'
             yield _table([head, '1 %', '5 %', '10 %', '20 %'], rows)
+            pins = found['pins']
+            yield (
+                f'One box of each pinned at the truth: {pins["before"]:.3f} -> '
+                f'{pins["after"]:.3f}, {pins["gained"]:.0%} of what is missing.'
+            )
+
+
+def _covariance(results: Any) -> Iterable[str]:
+    """Yield coverage and NEES of each variable, by estimate and class, one table per recording."""
+    for recording, estimates in results.items():
+        rows = [
+            [f'{estimate}, {name}', str(group['boxes']), *_consistent(group)]
+            for estimate, groups in estimates.items()
+            for name, group in groups.items()
+        ]
+        variables = next(iter(next(iter(estimates.values())).values()))['nees']
+        yield _table([recording, 'boxes', *variables], rows)
+
+
+def _consistent(group: Any) -> Iterable[str]:
+    pairs = zip(group['coverage'].values(), group['nees'].values(), strict=True)
+    return (f'{coverage:.2f} / {nees:.1f}' for coverage, nees in pairs)
 
 
 def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
@@ -297,11 +319,20 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'better.',
         _sensitivity,
     ),
+    'covariance': (
+        'Covariances',
+        'Part of the errors within two standard deviations (0.95 is consistent) / mean squared\n'
+        'error over variance (1 is consistent), along the axes of the true boxes; no heading\n'
+        'flips. All boxes of a track share its constant errors: classes of one or two tracks say\n'
+        'little. "Without input errors" are the inverse curvature and the model error alone.',
+        _covariance,
+    ),
     'review': (
         'Review list',
         'Share of the tracks with the worst 3D IoU within the first part of the list, by risk,\n'
         'by points, by deviation, and by chance. Inputs: noisy boxes, and true boxes with errors\n'
-        'planted in a fifth of the tracks.',
+        'planted in a fifth of the tracks. Then one box of each of the worst tracks is pinned at\n'
+        'the truth, the one that the list names: mean 3D IoU of the other boxes of these tracks.',
         _review,
     ),
     'speed': (

@@ -7,6 +7,7 @@ protobuf, and no ROS installation is needed. `protocol.Adapter` states what a mo
 
 """
 
+from msg_adapters.clouds import CLOUD_TYPES, POINTS_TYPE
 from msg_adapters.protocol import Adapter
 from msg_adapters.registry import (
     adapter_for,
@@ -18,13 +19,12 @@ from msg_adapters.registry import (
     WITHOUT_IDS,
 )
 
-POINTS_TYPE = 'sensor_msgs/msg/PointCloud2'
-
 __all__ = [
     'Adapter',
     'adapter_for',
     'ADAPTERS',
     'canonical',
+    'CLOUD_TYPES',
     'MESSAGE_COLUMNS',
     'MESSAGE_TYPES',
     'POINTS_TYPE',

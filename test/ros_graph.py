@@ -24,6 +24,8 @@ RELIABLE = [
     for topic in ('/points', '/odom')
     for part in ('-p', f'qos_overrides.{topic}.subscription.reliability:=reliable')
 ]
+RELIABLE += ['-p', 'deadline:=3600.0']
+"""Arguments with which no message is lost and all windows are solved on a busy machine."""
 QUICK = ('-p', 'window:=4', '-p', 'lag:=2', '-p', 'backlog:=60.0')
 """Arguments for short windows; no box is dropped on a busy machine."""
 

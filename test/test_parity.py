@@ -6,6 +6,7 @@ import json
 from boxreg_ros.cli import main
 from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, ADAPTERS, WITHOUT_IDS
+from msg_adapters.clouds import COMPRESSED_TYPE
 from msg_adapters.poses import quaternions_of
 import numpy as np
 import pytest
@@ -110,17 +111,19 @@ def assert_equal_boxes(found, expected):
     assert difference.max() < 1e-6
 
 
-@pytest.mark.parametrize('clouds', ['topics', 'info'])
+@pytest.mark.parametrize('clouds', ['topics', 'compressed', 'info'])
 def test_two_lidars_give_the_same_boxes_live_and_offline(tmp_path, clouds):
     path = LidarDrive(8, clouds).write(tmp_path / 'drive')
-    options = ['--points', '/front', '--points', '/rear'] if clouds == 'topics' else []
+    options = [] if clouds == 'info' else ['--points', '/front', '--points', '/rear']
     expected = relabelled(path, tmp_path / 'out', *options)
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
     assert summary['sweeps'] == 8
     parameters = ['points_info:=/points_info']
-    if clouds == 'topics':
+    if clouds != 'info':
         assert summary['lidars'] == {'/front': {'merged': 8}, '/rear': {'merged': 8}}
         parameters = ['points:=[/front, /rear]']
+    if clouds == 'compressed':
+        parameters.append(f'points_type:={COMPRESSED_TYPE}')
     found, _ = final_of_node(tmp_path, records_of(path), *parameters)
     assert_equal_boxes(found, expected)
 

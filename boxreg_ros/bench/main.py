@@ -20,6 +20,7 @@ MEASUREMENTS = {
     'tracks': Measurement('tracks', 'broken tracks before and after each completing step'),
     'ablation': Measurement('ablation', 'accuracy without each ingredient of the method'),
     'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),
+    'covariance': Measurement('covariance', 'covariances against errors, by estimate and class'),
     'review': Measurement('review', 'how early the review list shows the bad tracks'),
     'speed': Measurement('speed.command', 'time per tick, per box and per window'),
     'scale': Measurement('scale', 'core hours and memory per hour, and a simulated fleet'),

@@ -2,14 +2,15 @@
 `boxreg bench review`: how early the review list shows the bad tracks.
 
 Bad tracks are those with the worst mean 3D IoU against the truth. Two inputs of each recording
-are refined: its own boxes, and its true boxes with errors planted in some tracks.
+are refined: its own boxes, and its true boxes with errors planted in some tracks. Then one box of
+each bad track, the one that the list names, is pinned at the true box, as by a person.
 
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -22,7 +23,7 @@ from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, median, TrackChanges
-from boxreg_ros.review.risk import assess
+from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
 import numpy as np
@@ -70,8 +71,9 @@ def measure(drive: Drive) -> dict[str, Any]:
     Returns
     -------
     found : dict
-        Number of ``tracks`` and of ``bad`` ones; by order the share of bad tracks within each
-        of `CUTS`.
+        Number of ``tracks`` and of ``bad`` ones; by order the ``shares`` of bad tracks within each
+        of `CUTS`; mean 3D IoU of bad tracks ``before`` and ``after`` one box is pinned, and the
+        part ``gained`` of what is missing. Pinned boxes do not count.
 
     """
     tracks = [track for track in refined_tracks(drive) if track.track_id]
@@ -81,14 +83,21 @@ def measure(drive: Drive) -> dict[str, Any]:
     count = max(1, math.ceil(BAD_PART * len(tracks)))
     is_bad = np.zeros(len(tracks), bool)
     is_bad[np.argsort(overlap[known], kind='stable')[:count]] = True
+    usual = Usual.of(tracks)
+    risks = [assess(track, usual) for track in tracks]
     orders = {
-        'risk': [-assess(track).track for track in tracks],
+        'risk': [-risk.track for risk in risks],
         'fewest points': [median(track.num_points) for track in tracks],
         'largest deviation': [-np.nan_to_num(track.deviation, nan=np.inf) for track in tracks],
     }
     shares = {name: _shares(is_bad, values) for name, values in orders.items()}
     shares['random'] = [_first(cut, len(tracks)) / max(1, len(tracks)) for cut in CUTS]
-    return {'tracks': len(tracks), 'bad': count, 'shares': shares}
+    pins = {
+        tracks[i].track_id: int(tracks[i].stamps_ns[np.argmax(risks[i].boxes)])
+        for i in np.flatnonzero(is_bad)
+    }
+    bad = [tracks[i] for i in np.flatnonzero(is_bad)]
+    return {'tracks': len(tracks), 'bad': count, 'shares': shares, 'pins': _gain(drive, bad, pins)}
 
 
 def refined_tracks(drive: Drive) -> list[TrackChanges]:
@@ -106,6 +115,35 @@ def refined_tracks(drive: Drive) -> list[TrackChanges]:
     for refined in [*results, *registrar.flush()]:
         changes.add(given[refined.boxes.ticket], refined)
     return changes.tracks()
+
+
+def _gain(drive: Drive, bad: Sequence[TrackChanges], pins: Mapping[str, int]) -> dict[str, float]:
+    """Return the 3D IoU of `bad` tracks before and after `pins`, and the part gained."""
+    corrected = refined_tracks(with_pins(drive, pins))
+    before = np.nanmean(_mean_overlap(drive, bad, pins))
+    after = np.nanmean(
+        _mean_overlap(drive, [track for track in corrected if track.track_id in pins], pins)
+    )
+    gained = (after - before) / max(1 - before, np.finfo(float).eps)
+    return {'before': float(before), 'after': float(after), 'gained': float(gained)}
+
+
+def with_pins(drive: Drive, pins: Mapping[str, int]) -> Drive:
+    """Return a drive with one pinned box of some tracks, at the true box: stamps by track id."""
+    truth = drive.truth
+    keys = zip(truth.stamps_ns.tolist(), truth.track_ids, strict=True)
+    true_boxes = {key: box for key, box in zip(keys, truth.boxes, strict=True)}
+    arrays = []
+    for array in drive.boxes:
+        boxes = array.boxes.copy()
+        pinned = np.zeros(len(boxes), bool)
+        for row, track_id in enumerate(array.track_ids):
+            true = true_boxes.get((array.stamp_ns, track_id))
+            if pins.get(track_id) == array.stamp_ns and true is not None:
+                boxes[row] = true
+                pinned[row] = True
+        arrays.append(replace(array, boxes=boxes, pinned=pinned))
+    return replace(drive, boxes=tuple(arrays))
 
 
 def planted(drive: Drive) -> Drive:
@@ -169,18 +207,30 @@ def _swap(names: Any, rows: Any, stamps_ns: Any) -> None:
         return
 
 
-def _mean_overlap(drive: Drive, tracks: Sequence[TrackChanges]) -> Floats:
-    """Return the mean 3D IoU of each track with the truth of its id, NaN without any."""
+def _mean_overlap(
+    drive: Drive, tracks: Sequence[TrackChanges], left_out: Mapping[str, int] | None = None
+) -> Floats:
+    """
+    Return the mean 3D IoU of each track with the truth of its id, NaN without any.
+
+    Boxes of the stamps `left_out`, by track id, do not count.
+
+    """
+    without = left_out or {}
     truth = drive.truth
     keys = zip(truth.stamps_ns.tolist(), truth.track_ids, strict=True)
     row_of = {key: row for row, key in enumerate(keys)}
     means = np.full(len(tracks), np.nan)
     for index, track in enumerate(tracks):
         rows = [row_of.get((stamp_ns, track.track_id)) for stamp_ns in track.stamps_ns.tolist()]
-        found = [i for i, row in enumerate(rows) if row is not None]
-        if found:
-            true = truth.boxes[[row for row in rows if row is not None]]
-            means[index] = iou_3d(track.boxes[found], true).mean()
+        pairs = [
+            (i, row)
+            for i, row in enumerate(rows)
+            if row is not None and track.stamps_ns[i] != without.get(track.track_id)
+        ]
+        if pairs:
+            found, known = np.array(pairs).T
+            means[index] = iou_3d(track.boxes[found], truth.boxes[known]).mean()
     return means
 
 
@@ -201,3 +251,7 @@ def _print(title: str, found: dict[str, Any]) -> None:
     print(line('share of these in the', [f'{cut:.0%}' for cut in CUTS]))
     for name, shares in found['shares'].items():
         print(line(name, shares))
+    pins = found['pins']
+    print(
+        line('3D IoU of these, pinned, gained', [pins[k] for k in ('before', 'after', 'gained')])
+    )

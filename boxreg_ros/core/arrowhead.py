@@ -166,11 +166,18 @@ class Factor(NamedTuple):
             ahead = parts[i][:, :NEXT]
         return torch.cat([torch.cat(parts, 1)[:, : D - S], border], 1)[..., 0]
 
-    def inverse_of_links(self, length: int) -> Tensor:
-        """Return the diagonal blocks of the inverse, of the first N links (M26), (B, N, 6, 6)."""
+    def inverse_of_links(self, length: int) -> tuple[Tensor, Tensor]:
+        """
+        Return blocks of the inverse (M26), of the first N links.
+
+        Their diagonal blocks, shape (B, N, 6, 6), and their rows in the columns of the border,
+        shape (B, N, 6, S).
+
+        """
         # Known of the inverse: the two links after the present block, and the border.
         ahead = pad(torch.cholesky_inverse(self.corner), (NEXT, 0, NEXT, 0))
         found: list[Tensor] = []
+        columns: list[Tensor] = []
         for L, V in reversed(self.blocks):
             root = solve_triangular(L, torch.eye(L.shape[1]).to(L).expand_as(L), upper=False)
             K = root.mT @ V
@@ -178,10 +185,11 @@ class Factor(NamedTuple):
             own = root.mT @ root - across @ K.mT
             blocks = own.unflatten(1, (-1, LINK)).unflatten(3, (-1, LINK)).diagonal(dim1=1, dim2=3)
             found.insert(0, blocks.permute(0, 3, 1, 2))
+            columns.insert(0, across[:, :, NEXT:].unflatten(1, (-1, LINK)))
             ahead[:, :NEXT, :NEXT] = own[:, :NEXT, :NEXT]
             ahead[:, :NEXT, NEXT:] = across[:, :NEXT, NEXT:]
             ahead[:, NEXT:, :NEXT] = across[:, :NEXT, NEXT:].mT
-        return torch.cat(found, 1)[:, :length]
+        return torch.cat(found, 1)[:, :length], torch.cat(columns, 1)[:, :length]
 
 
 class BandedFactor(NamedTuple):
@@ -227,15 +235,16 @@ class BandedFactor(NamedTuple):
         )  # fmt: skip
         return torch.from_numpy(x)
 
-    def inverse_of_links(self, length: int) -> Tensor:
-        """Return the blocks of the first `length` links in the inverse, (B, N, 6, 6)."""
+    def inverse_of_links(self, length: int) -> tuple[Tensor, Tensor]:
+        """Return blocks of the inverse, see `Factor.inverse_of_links`."""
         B, S = self.border.shape[0], self.border.shape[2]
         blocks = np.empty((B, length, LINK, LINK))
+        columns = np.empty((B, length, LINK, S))
         kernels = compiled(self.band)
         assert kernels is not None
         arrays = (np.ascontiguousarray(part.numpy()) for part in self)
-        run(kernels.arrowhead.invert_windows, B, *arrays, blocks, np.empty((B, S, S)))
-        return torch.from_numpy(blocks)
+        run(kernels.arrowhead.invert_windows, B, *arrays, blocks, columns, np.empty((B, S, S)))
+        return torch.from_numpy(blocks), torch.from_numpy(columns)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:

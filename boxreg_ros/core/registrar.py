@@ -9,6 +9,7 @@ from math import dist, inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.batch import PRIOR_POSES
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
@@ -34,6 +35,8 @@ GetEstimates = Callable[[], list[Estimate | None]]
 """Waits for the estimates of submitted windows, None for windows that are too short."""
 Submit = Callable[[list[Window], Config, InputModel], GetEstimates]
 """Starts `register` with the same arguments, perhaps in another process."""
+Budget = Callable[[], int]
+"""Returns how many windows may be solved for the box array at hand."""
 
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
@@ -75,6 +78,9 @@ class BoxRegistrar:
         Starts `register` elsewhere, with its arguments, and returns a callable that waits for
         the estimates. With `estimate` 'track' the registrar goes on meanwhile: the boxes returned
         are the same, but one call of `register` later. Default: `register` runs at once.
+    budget : callable, optional
+        Called once for each box array with `estimate` 'early' or 'final'; limits the windows that
+        are solved for it. Default: all are.
 
     Attributes
     ----------
@@ -113,13 +119,20 @@ class BoxRegistrar:
     to another object, or, with 'track', at `flush`. It is then estimated a last time with the next
     windows, which settles all its observations.
 
+    With a **budget**, the tracks that have waited longest are solved first, then those whose
+    newest estimate is least certain, then the nearest. The boxes of the others are kept for now,
+    with the reason ``budget``; their observations join the next window that is solved.
+
     """
 
-    def __init__(self, config: Config, submit: Submit | None = None) -> None:
+    def __init__(
+        self, config: Config, submit: Submit | None = None, budget: Budget | None = None
+    ) -> None:
         _check_device(config.device)
         self.config = config
         self.counts: Counter[str] = Counter()
         self._submit = submit
+        self._budget = budget
         self.reset()
 
     def reset(self) -> None:
@@ -171,7 +184,8 @@ class BoxRegistrar:
             if self.config.estimate == 'track':
                 self._solve_full_windows()
             else:
-                self._solve([track for track in self._tracks.values() if track.is_in(array)])
+                observed = [track for track in self._tracks.values() if track.is_in(array)]
+                self._solve(self._within_budget(observed))
                 yield array.result(is_final=False)
                 self._settle_after_lag()
             yield from self._pop_settled()
@@ -264,6 +278,27 @@ class BoxRegistrar:
             # More tracks at once give a better estimate of the errors of the input.
             tracks = self._tracks.values()
             self._solve([track for track in tracks if len(track.entries) > full // 2])
+
+    def _within_budget(self, tracks: list['_Track']) -> list['_Track']:
+        """Return the tracks to solve now; the others are carried to the next box array."""
+        if self._budget is None:
+            return tracks
+        ready = [t for t in tracks if len(t.entries) >= self.config.min_observations]
+        limit = self._budget()
+        self._settle_ended_tracks_beyond(max(0, limit - len(ready)))
+        if len(ready) <= limit:
+            return tracks
+        ready.sort(key=_Track.urgency)
+        for track in ready[limit:]:
+            track.carry(self._num_overlapping)
+        return ready[:limit]
+
+    def _settle_ended_tracks_beyond(self, limit: int) -> None:
+        """Settle ended tracks but the first ones: each has an estimate, and none can wait."""
+        for track in self._ended_tracks[limit:]:
+            for entry in track.entries:
+                entry.settle()
+        del self._ended_tracks[limit:]
 
     def _solve(self, tracks: list['_Track']) -> None:
         """Submit the windows of `tracks` and of ended tracks, after collecting those before."""
@@ -401,12 +436,24 @@ class _Entry:
 
 @dataclass(eq=False, slots=True)
 class _Track:
-    """The observations of a track that windows still need, oldest first."""
+    """
+    The observations of a track that windows still need, oldest first.
+
+    Attributes
+    ----------
+    variance : float
+        Of the position of the newest estimate, the sum over its axes [m^2].
+    num_carried : int
+        Newest observations that have been in no window for want of a budget.
+
+    """
 
     track_id: str
     class_name: str
     entries: list[_Entry] = field(default_factory=list)
     prior: MarginalisationPrior | None = None
+    variance: float = inf
+    num_carried: int = 0
 
     @property
     def newest_ns(self) -> int:
@@ -424,6 +471,28 @@ class _Track:
         num_new = len(observations) - len(estimates)
         start = np.array(estimates).reshape(-1, 9)
         return Window(self.track_id, self.class_name, observations, num_new, start, self.prior)
+
+    def urgency(self) -> tuple[int, float, float]:
+        """Return the key that sorts tracks by the gain of solving them, highest gain first."""
+        sensors = self.entries[-1].observation.origins
+        distance = float(np.linalg.norm(sensors, axis=1).min())  # NaN if unknown
+        return -self.num_carried, -self.variance, distance if distance >= 0 else inf
+
+    def carry(self, length: int) -> None:
+        """
+        Leave the newest observation to a later window, which then starts from its input box.
+
+        At most `length` observations are held. Those in excess are removed behind the two oldest,
+        which the marginalisation prior refers to.
+
+        """
+        self.num_carried += 1
+        before, newest = self.entries[-2:]
+        newest.array.reasons[newest.row] = 'budget'
+        if before.estimate is not None:  # else the track is cold: its first window is to come
+            newest.estimate = newest.observation.box
+        excess = max(0, len(self.entries) - length)
+        del self.entries[PRIOR_POSES : PRIOR_POSES + excess]
 
     def split_at_id_switch(self) -> '_Track | None':
         """
@@ -458,6 +527,8 @@ class _Track:
     def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
         """Write the estimate of the window of `entries` to their box arrays."""
         self.prior = estimate.prior
+        self.variance = float(np.trace(estimate.covariances[-1, :3, :3]))
+        self.num_carried = 0
         for i, entry in enumerate(entries):
             entry.write(estimate, i)
 

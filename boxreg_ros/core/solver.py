@@ -262,7 +262,7 @@ def run_round(
     done = is_done.nonzero()[:, 0]
     faces = observations.moments, observations.inset, observations.weight
     covariance = torch.cholesky_inverse(objective.factor.corner)
-    settled = select((problem, found, *faces, objective.factor, covariance), done)
+    settled = select((problem, found, *faces, expected, free, objective.factor, covariance), done)
     prior = None
     is_full = plan.marginalises and problem.length == config.window
     if is_full and len(done):

@@ -22,6 +22,7 @@ FOXGLOVE_ENCODINGS = ('protobuf', 'json')
 ROS_TYPES = {
     'foxglove.SceneUpdate': 'foxglove_msgs/msg/SceneUpdate',
     'foxglove.PointCloud': 'sensor_msgs/msg/PointCloud2',
+    'foxglove.CompressedPointCloud': 'foxglove_msgs/msg/CompressedPointCloud',
     'foxglove.FrameTransform': 'tf2_msgs/msg/TFMessage',
     'foxglove.FrameTransforms': 'tf2_msgs/msg/TFMessage',
 }
@@ -52,6 +53,9 @@ JSON_FIELDS: dict[str, Any] = {
     'foxglove.PointCloud': {
         'timestamp': _TIME, 'frame_id': str, 'pose?': _POSE, 'point_stride': int,
         'fields': [_FIELD], 'data': str,
+    },
+    'foxglove.CompressedPointCloud': {
+        'timestamp': _TIME, 'frame_id': str, 'pose?': _POSE, 'data': str, 'format': str,
     },
 }  # fmt: skip
 """
@@ -179,20 +183,7 @@ def time_of(time: Any) -> SimpleNamespace:
 
 def _cloud(message: Any) -> Any:
     """Return a foxglove PointCloud as a PointCloud2."""
-    pose = getattr(message, 'pose', None)
-    if pose is not None:
-        p, q = pose.position, pose.orientation
-        if any((p.x, p.y, p.z, q.x, q.y, q.z)):
-            raise UnsupportedMessage(
-                'PointCloud: expected its pose to be that of its frame, got another; publish the '
-                'pose as a transform'
-            )
-    data = message.data
-    if isinstance(data, str):
-        try:
-            data = b64decode(data)
-        except ValueError as error:
-            raise UnsupportedMessage(f'PointCloud.data: expected base64: {error}') from None
+    data = _cloud_data(message)
     fields = [_field(field) for field in message.fields]
     header = SimpleNamespace(stamp=time_of(message.timestamp), frame_id=message.frame_id)
     stride = message.point_stride
@@ -202,6 +193,32 @@ def _cloud(message: Any) -> Any:
         header=header, height=1, width=len(data) // stride if stride else 0, fields=fields,
         is_bigendian=False, point_step=stride, row_step=len(data), data=data, is_dense=False,
     )  # fmt: skip
+
+
+def _compressed_cloud(message: Any) -> Any:
+    """Return a foxglove CompressedPointCloud as the ROS message of that name."""
+    return SimpleNamespace(
+        timestamp=time_of(message.timestamp), frame_id=message.frame_id, format=message.format,
+        data=_cloud_data(message),
+    )  # fmt: skip
+
+
+def _cloud_data(message: Any) -> bytes:
+    """Return the bytes of a cloud, whose pose is that of its frame."""
+    pose = getattr(message, 'pose', None)
+    if pose is not None:
+        p, q = pose.position, pose.orientation
+        if any((p.x, p.y, p.z, q.x, q.y, q.z)):
+            raise UnsupportedMessage(
+                'PointCloud: expected its pose to be that of its frame, got another; publish the '
+                'pose as a transform'
+            )
+    if not isinstance(message.data, str):
+        return bytes(message.data)
+    try:
+        return b64decode(message.data)
+    except ValueError as error:
+        raise UnsupportedMessage(f'PointCloud.data: expected base64: {error}') from None
 
 
 def _field(field: Any) -> Any:
@@ -232,6 +249,7 @@ def _transforms(message: Any) -> Any:
 
 CONVERTERS = {
     'foxglove.PointCloud': _cloud,
+    'foxglove.CompressedPointCloud': _compressed_cloud,
     'foxglove.FrameTransform': _transforms,
     'foxglove.FrameTransforms': _transforms,
 }

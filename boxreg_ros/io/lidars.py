@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.errors import ConfigError, TransformUnavailable
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import Floats, Sweep
-from msg_adapters import concatenation, pointcloud
+from msg_adapters import clouds, concatenation, pointcloud
 from msg_adapters.concatenation import ConcatenationInfo
 import numpy as np
 from numpy.typing import NDArray
@@ -133,9 +133,10 @@ class SensorPlacement:
             If the cloud cannot be read.
 
         """
-        sweep = pointcloud.from_msg(msg)
+        cloud = clouds.plain(msg)
+        sweep = pointcloud.from_msg(cloud)
         if self.lidars.info:
-            return replace(sweep, rows=pointcloud.finite_rows(msg))
+            return replace(sweep, rows=pointcloud.finite_rows(cloud))
         return replace(sweep, topic=topic) if len(self.lidars.topics) > 1 else sweep
 
     def add_info(self, msg: Any) -> None:

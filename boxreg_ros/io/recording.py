@@ -23,7 +23,7 @@ from boxreg_ros.io.storage.reader import is_message, Reader
 from boxreg_ros.io.storage.record import Damage, one_line, Record
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
-from msg_adapters import adapter_for, ADAPTERS, pointcloud, POINTS_TYPE, poses, WITHOUT_IDS
+from msg_adapters import adapter_for, ADAPTERS, CLOUD_TYPES, clouds, pointcloud, poses, WITHOUT_IDS
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.convention import Convention, STANDARD
 from rosbags.interfaces import Connection
@@ -439,8 +439,9 @@ class Recording:
 
     def _sensor_frames(self) -> list[str]:
         """Return the frame of the first cloud of each topic that has any."""
-        clouds = [self._first(topic) for topic in self.points_topics]
-        frames = [str(cloud.header.frame_id).lstrip('/') for cloud in clouds if cloud is not None]
+        found = [self._first(topic) for topic in self.points_topics]
+        headers = [clouds.header_of(cloud) for cloud in found if cloud is not None]
+        frames = [str(header.frame_id).lstrip('/') for header in headers]
         if not frames:
             topics = ', '.join(map(repr, self.points_topics))
             raise RecordingError(f'{self}: no point clouds on {topics} in this part')
@@ -505,7 +506,7 @@ class Recording:
         """Find the topics of the clouds, and that of info messages."""
         lidars = self._lidars
         asked: Sequence[str | None] = lidars.topics or (None,)
-        topics = [self._topic('points', 'point clouds', (POINTS_TYPE,), topic) for topic in asked]
+        topics = [self._topic('points', 'point clouds', CLOUD_TYPES, topic) for topic in asked]
         filled = [topic for topic in topics if topic in self._filled]
         self.points_topic = (filled or topics)[0]
         info = lidars.info
@@ -624,7 +625,7 @@ class Recording:
         intensities = None
         if with_intensities and isinstance(content, Sweep):
             try:
-                intensities = pointcloud.intensities(message)
+                intensities = pointcloud.intensities(clouds.plain(message))
             except UnsupportedMessage as error:
                 self._count_unreadable(topic, error)
         return Item(record.received_ns, content, intensities)
@@ -659,7 +660,8 @@ class Recording:
                 return self._content(connection.topic, message).stamp_ns or None
             stamped = getattr(message, 'transforms', [message])
             with _malformed(f'topic {connection.topic!r}'):
-                return poses.stamp_ns(stamped[0].header) or None if len(stamped) else None
+                header = clouds.header_of(stamped[0]) if len(stamped) else None
+                return header and (poses.stamp_ns(header) or None)
         except UnsupportedMessage:
             return None
 

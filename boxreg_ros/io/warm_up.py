@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from boxreg_ros.config import Config, PaperConfig, SolverConfig
-from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 
 
-def warm_up(config: Config) -> None:
+def warm_up(config: Config, submit: Submit | None = None) -> None:
     """
     Register a synthetic stream, so that the first real one does not wait.
 
@@ -20,6 +20,8 @@ def warm_up(config: Config) -> None:
     ----------
     config : Config
         Objective, estimate, mode and device are those of the stream to come.
+    submit : callable, optional
+        As for `BoxRegistrar`, which it is given to.
 
     Raises
     ------
@@ -33,7 +35,7 @@ def warm_up(config: Config) -> None:
         estimate=config.estimate, window=4, lag=3, solver=SolverConfig(rounds=2, iterations=2),
         paper=PaperConfig(multiplier_rounds=1, iterations=2),
     )  # fmt: skip
-    registrar = BoxRegistrar(quick)
+    registrar = BoxRegistrar(quick, submit)
     for k in range(6):
         stamp_ns = k * 10**8
         box = np.array([[10.0 + 0.5 * k, 0, 0, 4, 2, 1.5, 0, 0, 0]])

@@ -20,6 +20,7 @@ from boxreg_ros.io.session import (
     Session,
 )
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
+from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -133,6 +134,8 @@ class LiveRegistrar:
         Convention of the boxes, and whether ids are to be assigned.
     lidars : Lidars
         Topics of the clouds and frames of the LiDARs.
+    budget : TickBudget, optional
+        Limits the windows that are solved for a box array. Default: all are solved.
 
     Attributes
     ----------
@@ -154,6 +157,7 @@ class LiveRegistrar:
         trouble: Callable[[str, str, int], None],
         convention: Convention = STANDARD,
         lidars: Lidars = SINGLE_LIDAR,
+        budget: TickBudget | None = None,
     ) -> None:
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
@@ -163,6 +167,8 @@ class LiveRegistrar:
         self._unknown_frames: set[str] = set()  # of LiDARs; not waited for
         self._session = Session(convention, config, fixed_frame, self.placement, trouble)
         self._registrar = BoxRegistrar(config)
+        if budget is not None:
+            self._registrar = BoxRegistrar(config, budget.submit, budget.windows)
         self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
         self._made: list[Outgoing] = []  # survives an error while further messages are made

@@ -13,6 +13,7 @@ from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.live.boxes_type import BoxesTypeSearch
+from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
@@ -20,7 +21,8 @@ from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from
 from boxreg_ros.live.topics import Topics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
-from msg_adapters import adapter_for, canonical, POINTS_TYPE
+from msg_adapters import adapter_for, canonical
+from msg_adapters.clouds import header_of
 from msg_adapters.concatenation import INFO_TYPE
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
@@ -28,7 +30,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 NAME = 'boxreg_node'
@@ -76,6 +77,8 @@ class BoxregNode(Node):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         warm_up(config)
+        budget = TickBudget(options.deadline)
+        warm_up(config, budget.submit)  # once more, timed without imports and compilation
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
         self._health = Health(self.get_logger())
@@ -88,12 +91,12 @@ class BoxregNode(Node):
         )
         live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
-            self._health.report, options.convention, lidars,
+            self._health.report, options.convention, lidars, budget,
         )  # fmt: skip
         self.worker = Worker(
-            live, self._inbox, self._health, self.get_logger(), options.backlog, markers
+            live, self._inbox, self._health, self.get_logger(), budget, options.backlog, markers
         )
-        self._subscribe_to_points(lidars)
+        self._subscribe_to_points(options.points_type, lidars)
         self._subscribe_to_motion()
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/save_config', self._on_save_config)
@@ -110,7 +113,7 @@ class BoxregNode(Node):
 
     # ------------------------------------------------------------ topics
 
-    def _subscribe_to_points(self, lidars: Lidars) -> None:
+    def _subscribe_to_points(self, points_type: str, lidars: Lidars) -> None:
         """Subscribe to the clouds of all LiDARs, and to the info on concatenated ones."""
         # While the process is suspended, messages wait in DDS, which drops without a count. Its
         # queue must be longer than the inbox, which counts.
@@ -122,7 +125,7 @@ class BoxregNode(Node):
         for topic in lidars.topics or ('points',):
             lidar = topic if len(lidars.topics) > 1 else ''
             callback = partial(self._on_points, lidar)
-            self._topics.subscribe(POINTS_TYPE, topic, callback, qos(), is_required=True)
+            self._topics.subscribe(points_type, topic, callback, qos(), is_required=True)
         if lidars.info:
             self._topics.subscribe(INFO_TYPE, lidars.info, self._on_info, qos(), is_required=True)
 
@@ -178,8 +181,8 @@ class BoxregNode(Node):
     def _on_info(self, msg: Any) -> None:
         self._inbox.put_event('points_info', msg)
 
-    def _on_points(self, lidar: str, msg: PointCloud2) -> None:
-        self.worker.cloud_frame = msg.header.frame_id
+    def _on_points(self, lidar: str, msg: Any) -> None:
+        self.worker.cloud_frame = header_of(msg).frame_id
         self.worker.cloud_received = time.monotonic()
         self._receive('points', msg, lidar)
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.config import Config, Setting, settings
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars
+from msg_adapters import CLOUD_TYPES, POINTS_TYPE
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -24,6 +25,10 @@ NODE_SETTINGS = (
     Setting(
         'points', (),
         'topics of the clouds of several LiDARs, which are merged; empty: the topic points',
+    ),
+    Setting(
+        'points_type', POINTS_TYPE, 'message type of the clouds, as package/msg/Type',
+        choices=CLOUD_TYPES,
     ),
     Setting(
         'sensor_frames', (),
@@ -58,6 +63,13 @@ NODE_SETTINGS = (
         's', 0.0, 60.0,
     ),
     Setting(
+        'deadline', -1.0,
+        'maximum time from complete data to refined boxes: tracks that the solver has no time for '
+        'are kept, and solved first at the next stamp; negative: most of the measured period of '
+        'the boxes',
+        's', -1.0, 3600.0,
+    ),
+    Setting(
         'backlog', 0.1,
         'maximum wait of a cloud for the solver before it is dropped; of a box array ten times '
         'that, before it passes through unrefined',
@@ -71,7 +83,8 @@ NODE_SETTINGS = (
 
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
-    *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'config_file'),
+    *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
+    *('config_file',),
 )
 """Prefixes of the parameters that may change while the node runs."""
 READ_ONLY = 'read-only: windows, threads or subscriptions are built from it at start-up'
@@ -84,6 +97,7 @@ class NodeOptions(NamedTuple):
 
     boxes_type: str
     points: tuple[str, ...]
+    points_type: str
     sensor_frames: tuple[str, ...]
     points_info: str
     pose_reference: str
@@ -93,6 +107,7 @@ class NodeOptions(NamedTuple):
     fixed_frame: str
     output_frame: str
     transform_timeout: float
+    deadline: float
     backlog: float
     config_file: str
 
@@ -294,6 +309,13 @@ def _checked(item: Setting, value: Any) -> Any:
         value = float(value)
     if type(value) is not kind:
         raise ConfigError(f'{item.name}: expected {kind.__name__}, got {value!r}')
+    if item.choices and value not in item.choices:
+        raise ConfigError(f'{item.name}: expected one of {", ".join(item.choices)}, got {value!r}')
     if item.low is not None and item.high is not None and not item.low <= value <= item.high:
         raise ConfigError(f'{item.name}: expected {_bounds_of(item)}, got {value!r}')
+    if item.name == 'deadline' and value == 0:
+        raise ConfigError(
+            'deadline: expected more than 0 s, or a negative number for most of the measured '
+            'period, got 0.0: no box could be refined; raise it or leave it out'
+        )
     return value

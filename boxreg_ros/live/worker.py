@@ -12,17 +12,18 @@ from typing import Any
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import is_placeholder
+from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
 from boxreg_ros.live.inbox import Inbox, Message
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import Adapter
+from msg_adapters.clouds import header_of
 from msg_adapters.poses import stamp_ns
 from rclpy.duration import Duration
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.publisher import Publisher
-from sensor_msgs.msg import PointCloud2
 
 TRANSFORM_PERIOD = 0.02
 """Longest pause between two looks whether the transforms of a message have arrived [s]."""
@@ -53,6 +54,8 @@ class Worker:
         Counters and log.
     logger : RcutilsLogger
         Logger of the node.
+    budget : TickBudget
+        That of `live`.
     backlog : float
         How long a cloud may wait for the solver [s].
     markers : Publisher
@@ -79,6 +82,7 @@ class Worker:
         inbox: Inbox,
         health: Health,
         logger: RcutilsLogger,
+        budget: TickBudget,
         backlog: float,
         markers: Publisher,
     ) -> None:
@@ -91,6 +95,7 @@ class Worker:
         self._inbox = inbox
         self._health = health
         self._logger = logger
+        self._budget = budget
         self._backlog = backlog
         self._idle_at = 0.0
         self._waited = 0.0
@@ -109,7 +114,7 @@ class Worker:
 
     def facts(self) -> dict[str, object]:
         """Return what /diagnostics reports about the boxes beside the counters."""
-        return self._live.facts
+        return {**self._live.facts, 'deadline [ms]': f'{1e3 * self._budget.seconds:.0f}'}
 
     def stop(self) -> None:
         """Make `run` return after the message at hand."""
@@ -152,7 +157,7 @@ class Worker:
             self._publish([Outgoing(message.content, False)])
             self._inbox.put_passing(message)  # the final copy, in the order of all
         else:
-            lost = stamp_ns(message.content.header), message.lidar
+            lost = stamp_ns(header_of(message.content)), message.lidar
             self._inbox.put_event('lost', lost)
 
     def _next(self) -> ReceivedMessage | None:
@@ -226,7 +231,7 @@ class Worker:
 
     def _release_boxes_without_cloud(self, item: ReceivedMessage | None) -> None:
         """Release boxes that have waited too long for a cloud, unless one is at hand."""
-        is_cloud = item is not None and isinstance(item.message, PointCloud2)
+        is_cloud = item is not None and isinstance(item.content, Sweep)
         if is_cloud or self._inbox.sizes()['points_waiting']:
             return
         release = partial(self._live.lose_overdue, time.monotonic(), self.cloud_received)
@@ -246,6 +251,7 @@ class Worker:
                 self._live.config, options = content
                 self._live.output_frame = options.output_frame.lstrip('/')
                 self._live.transform_timeout = options.transform_timeout
+                self._budget.deadline = options.deadline
             else:
                 self._live.tree.add_transforms(content, is_static=kind == '/tf_static')
         self.newest_transform_ns = self._live.tree.newest_ns()
@@ -257,11 +263,15 @@ class Worker:
             self._health.report('unreadable', f'points_info: {error}')
 
     def _process(self, item: ReceivedMessage) -> None:
+        if isinstance(item.content, BoxArray):
+            self._budget.add_arrival(item.received)
+        self._budget.begin(max(item.received, self._idle_at))
         ready = self._guarded(partial(self._live.process, item), item)
         if self.fixed_frame != self._live.fixed_frame:
             self.fixed_frame = self._live.fixed_frame
             self._logger.info(f'fixed frame is {self.fixed_frame!r}')
         self._publish(ready)
+        self._budget.end()
         if is_placeholder(item.content) and self._board.is_showing:
             self._markers.publish(self._board.clear())
 
@@ -298,7 +308,7 @@ class Worker:
         self._take_events()
         self._publish(self._guarded(self._live.flush))
         for waiting in (item, *self._confirmed, *self._live.release()):
-            if waiting is not None and not isinstance(waiting.message, PointCloud2):
+            if waiting is not None and not isinstance(waiting.content, Sweep):
                 self._publish(self._live.passed_through(waiting.message))
         message = self._inbox.take()
         while message is not None:

@@ -136,17 +136,24 @@ class Drive:
 
     def registered(self, config: Config) -> dict[str, BoxTable]:
         """Return refined boxes by estimate: 'early' and that of `config`, from one run."""
+        return {
+            name: BoxTable.from_arrays([result.boxes for result in results])
+            for name, results in self.refined(config).items()
+        }
+
+    def refined(self, config: Config) -> dict[str, list[RefinedBoxes]]:
+        """Return the same with covariances and status, one result for each box array."""
         registrar = BoxRegistrar(config)
         results: list[RefinedBoxes] = []
         items: list[Sweep | BoxArray] = [*self.sweeps, *self.boxes]
         for item in sorted(items, key=lambda item: item.stamp_ns):
             results += register(registrar, item, restarts=False)
         results += registrar.flush()
-        found: dict[str, list[BoxArray]] = {}
+        found: dict[str, list[RefinedBoxes]] = {}
         for result in results:
             estimate = config.estimate if result.is_final else 'early'
-            found.setdefault(estimate, []).append(result.boxes)
-        return {name: BoxTable.from_arrays(arrays) for name, arrays in sorted(found.items())}
+            found.setdefault(estimate, []).append(result)
+        return dict(sorted(found.items()))
 
     def tracks(self) -> list[Track]:
         """Return the boxes as tracks, with the points around each."""

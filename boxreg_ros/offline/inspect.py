@@ -173,7 +173,14 @@ def _scene_contents(paths: list[Path]) -> dict[str, Any]:
         seconds = (recording.end_ns - recording.start_ns) * 1e-9
         files = recording.files
         topics = [
-            {'topic': name, 'type': 'data set', 'messages': count, 'rate': _rate(count, seconds)}
+            {
+                'topic': name,
+                'type': 'data set',
+                'messages': count,
+                'rate': _rate(count, seconds),
+                'presence_s': [[0.0, seconds]],
+                'gaps_s': [],  # the stamps of a scene are in files that are not opened here
+            }
             for name, count in recording.topics.items()
         ]
         begin_ns = recording.start_ns

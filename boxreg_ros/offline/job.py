@@ -71,7 +71,7 @@ class Job:
             yield from (file for file in inner if file.is_file())
 
     def size(self) -> int:
-        """Return the size of all files [bytes]; 0 where that is unknown, as the job will report."""
+        """Return the size of all files [bytes]; 0 where it is unknown, which the job reports."""
         try:
             local = sum(file.stat().st_size for file in self.files())
             return local + sum(entry.size for entry in self.entries())

@@ -25,6 +25,8 @@ from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.review.changes import mean, TrackChanges
 from boxreg_ros.review.payload import as_json, compressed, points_per_box, TrackPart, true_boxes
 from boxreg_ros.review.quality import CELL, Quality
+from boxreg_ros.review.rules import RULES
+from boxreg_ros.review.rules.protocol import Rule
 from boxreg_ros.review.track_points import PointCollector
 from boxreg_ros.structures import REFINED
 import numpy as np
@@ -130,6 +132,7 @@ def write_report(
         turn=float(np.degrees(mean(np.abs(changes[:, 3])))),
         reasons=_explained(summary['reasons']),
         dropped=_explained(summary['dropped']),
+        rules=_violated(summary['rules']),
         settings=[(item, value) for item, value in config.items() if value != item.default],
         count=len(tracks),
         css=css,
@@ -186,6 +189,12 @@ def _explained(counts: Mapping[str, int]) -> list[tuple[str, int, Reason]]:
     """Return reasons with their count and explanation, the most frequent first."""
     found = [(name, count, REASONS.get(name, Reason('', ''))) for name, count in counts.items()]
     return sorted(found, key=lambda item: -item[1])
+
+
+def _violated(counts: Mapping[str, Mapping[str, int]]) -> list[tuple[Rule, int, int]]:
+    """Return rules with their violations before and after the run; those never violated not."""
+    found = [(rule, counts['before'][name], counts['after'][name]) for name, rule in RULES.items()]
+    return [row for row in found if row[1] or row[2]]
 
 
 def _code(text: str) -> Any:

@@ -9,12 +9,14 @@ as much 3D IoU as the errors to expect. So boxes of all sizes and errors of all 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from boxreg_ros.config import Config
 from boxreg_ros.review.changes import TrackChanges
-from boxreg_ros.structures import BOX_EXTENT, Floats, KEPT, LENGTH, X, Y
+from boxreg_ros.structures import BOX_EXTENT, Floats, KEPT, LENGTH, WIDTH, X, Y, YAW
 import numpy as np
+from scipy.special import erf
 
 REFERENCE_LENGTH = 4.5
 """Length of the car whose shift a risk is [m]. Chosen: a mid-size car."""
@@ -24,11 +26,9 @@ MAX_LOSS = 1.0
 """Largest loss of 3D IoU."""
 KEPT_LOSS = 0.25
 """Loss to expect of an input box that is kept: 1 - 3D IoU of the inputs of docs/results.md."""
-USUAL_MISFIT = 0.05
-"""Distance of a face from its points that is noise [m]. Chosen: near the median of true boxes."""
-USUAL_OUTSIDE = 0.2
-"""Part of the points in and near a box that are of other things. Chosen: near the upper quartile
-of tracks with true boxes on PandaSet."""
+USUAL_OUTSIDE = 0.1
+"""Part of the points in and near a box that are of other things, where too few tracks are known
+to measure it. Chosen."""
 NEAR_MARGIN = 0.6
 """How far outside of a box points count as near [m]: the default of `sampling.margin`."""
 USUAL_FILL = 0.34
@@ -37,6 +37,15 @@ SWITCH_SPEED = 10.0
 """Deviation from constant velocity that is an id switch [m/s], as in `core.registrar`."""
 SWITCH_LOSS = 0.5
 """Loss to expect where the id of a track has switched: half its boxes are of another object."""
+MIN_TRACKS = 8
+"""Fewest tracks of a class, and fewest of a recording, that show what is usual. Chosen: quartiles
+of fewer are the values of single tracks."""
+MAX_DEVIATIONS = 2.0
+"""Extents within this many deviations of their class are usual: 95 % of a normal variable."""
+MIN_SIZE_SPREAD = 0.03
+"""Least relative deviation of the extents of a class. Chosen: models of one maker differ so."""
+QUARTILES_TO_DEVIATION = 0.74
+"""Standard deviation over interquartile range of a normal variable. Derived: 1 / 1.349."""
 FEW_POINTS = 10
 """Boxes with fewer points are reported as such. Chosen."""
 
@@ -63,31 +72,75 @@ class Risk(NamedTuple):
         return float(self.boxes.mean()) if len(self.boxes) else 0.0
 
 
-def assess(track: TrackChanges) -> Risk:
+class Usual(NamedTuple):
     """
-    Return the risk of each box of a track.
+    What is usual among the tracks of a recording.
 
-    The loss of 3D IoU to expect of independent errors is linear in their magnitudes: a shift d
-    along an axis of extent L costs 2 d / L, an error e of the extent e / L, and a turn by a
-    costs a l / (2 w). `MEAN_OF_NORMAL` turns deviations to mean magnitudes.
+    Attributes
+    ----------
+    outside : float
+        Part of the points in and near a box that are outside of it.
+    sizes : mapping of str to array, shape (2, 3)
+        By class: median and deviation of the logarithms of length, width and height.
 
     """
-    extents = np.nan_to_num(track.boxes[:, BOX_EXTENT], nan=1.0)
+
+    outside: float = USUAL_OUTSIDE
+    sizes: Mapping[str, Floats] = {}
+
+    @classmethod
+    def of(cls, tracks: Sequence[TrackChanges]) -> Usual:
+        """Return what is usual; classes of fewer than `MIN_TRACKS` tracks have no sizes."""
+        outside = [track.outside.mean() for track in tracks if track.is_refined.any()]
+        usual = float(np.median(outside)) if len(outside) >= MIN_TRACKS else USUAL_OUTSIDE
+        by_class: dict[str, list[Floats]] = {}
+        for track in tracks:
+            size = np.log(_extents(track)).mean(axis=0)
+            by_class.setdefault(track.class_name, []).append(size)
+        sizes = {
+            name: _median_and_deviation(np.array(of_class))
+            for name, of_class in by_class.items()
+            if len(of_class) >= MIN_TRACKS
+        }
+        return cls(usual, sizes)
+
+
+UNKNOWN = Usual()
+
+
+def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
+    """
+    Return the risk of each box of a track among tracks of which `usual` is known.
+
+    A face that is off by d costs d / L of 3D IoU, L the extent across it; a turn by a costs
+    a l / (2 w). The error of a face is normal. Its deviation is that of the centre and half the
+    extent. Its mean is how far the face is off its points, beyond what surfaces of its kind are
+    off a rigid box. Its mean magnitude is that of a folded normal variable. What its mean adds to
+    its deviation is a reason of its own.
+
+    """
+    extents = _extents(track)
     length, width, _ = extents.T
-    shift = 2 * track.deviations[:, :3] / extents
-    size = track.extent_deviations / extents
-    turn = track.deviations[:, 3] * length / (2 * width)
+    deviations = np.nan_to_num(track.deviations)
+    face = np.hypot(deviations[:, :3], np.nan_to_num(track.extent_deviations) / 2)
+    face_pairs = np.repeat(face, 2, axis=1)
+    across = np.repeat(extents, 2, axis=1)
+    uncertain = MEAN_OF_NORMAL * face_pairs / across
+    shape = Config().class_config(track.class_name).shape
+    off = (np.abs(track.face_distances) - shape).clip(0)
+    misfit = _folded_mean(off, face_pairs) / across
+    turn = deviations[:, 3] * length / (2 * width)
     is_refined = track.is_refined
     losses = {
-        'uncertain position': MEAN_OF_NORMAL * shift.sum(axis=1),
+        'uncertain position and size': uncertain.sum(axis=1),
         'uncertain heading': MEAN_OF_NORMAL * turn,
-        'uncertain size': MEAN_OF_NORMAL * size.sum(axis=1),
-        'faces off their points': _misfit(track, extents),
-        'points left outside': _left_outside(track, extents),
+        'faces off their points': (misfit - uncertain).sum(axis=1),
+        'points left outside': _left_outside(track, extents, usual.outside),
     }
     losses = {reason: np.where(is_refined, loss, 0.0) for reason, loss in losses.items()}
     is_kept = track.status == KEPT
     losses['kept as in the input'] = np.where(is_kept, KEPT_LOSS, 0.0)
+    losses['size unlike its class'] = _unlike(track, extents, usual)
     losses['id switch'] = np.full(len(is_kept), SWITCH_LOSS * _has_id_switch(track))
     parts = {reason: np.nan_to_num(loss) * REFERENCE_LENGTH / 2 for reason, loss in losses.items()}
     total = np.sum(list(parts.values()), axis=0)
@@ -109,38 +162,72 @@ def reasons_of(track: TrackChanges, risk: Risk, row: int | None = None) -> str:
     return '; '.join(words)
 
 
-def _misfit(track: TrackChanges, extents: Floats) -> Floats:
-    """
-    Return the loss of 3D IoU if the points of the faces were right, shape (n,).
-
-    A face that is off by d costs d / L, L the extent across it; `USUAL_MISFIT` of d is noise.
-
-    """
-    excess = (np.abs(track.face_distances) - USUAL_MISFIT).clip(0)
-    return np.asarray((excess / np.repeat(extents, 2, axis=1)).sum(axis=1))
+def _extents(track: TrackChanges) -> Floats:
+    """Return length, width and height of each box, 1 m where unknown, shape (n, 3)."""
+    return np.nan_to_num(track.boxes[:, BOX_EXTENT], nan=1.0)
 
 
-def _left_outside(track: TrackChanges, extents: Floats) -> Floats:
+def _median_and_deviation(logs: Floats) -> Floats:
+    """Return median and robust deviation of the columns of `logs` (n, 3), shape (2, 3)."""
+    low, median, high = np.quantile(logs, (0.25, 0.5, 0.75), axis=0)
+    deviation = (QUARTILES_TO_DEVIATION * (high - low)).clip(min=MIN_SIZE_SPREAD)
+    return np.array([median, deviation])
+
+
+def _folded_mean(mean: Floats, deviation: Floats) -> Floats:
+    """Return the mean magnitude of normal variables."""
+    deviation = deviation.clip(min=1e-9)
+    ratio = mean / deviation
+    of_noise = MEAN_OF_NORMAL * deviation * np.exp(-(ratio**2) / 2)
+    return np.asarray(of_noise + mean * erf(ratio / np.sqrt(2)))
+
+
+def _left_outside(track: TrackChanges, extents: Floats, usual: float) -> Floats:
     """
     Return the loss of 3D IoU that points outside of each box are evidence for, shape (n,).
 
     Of a box off its object, the part of the points that is outside is about the loss. The space
-    around a small object has more room for points of others: they count less.
+    around a small object has more room for points of others: they count less. So do those beside a
+    box with few points: of an object that gives few, many near points are of others.
 
     """
-    excess = (track.outside - USUAL_OUTSIDE).clip(0)
+    excess = (track.outside - usual).clip(0) * track.num_points / (track.num_points + FEW_POINTS)
     fill = (extents / (extents + 2 * NEAR_MARGIN)).prod(axis=1) / USUAL_FILL
-    return np.asarray(excess * fill.clip(max=1.0))
+    shift = excess * fill.clip(max=1.0)
+    return np.asarray(2 * shift / (1 + shift))
+
+
+def _unlike(track: TrackChanges, extents: Floats, usual: Usual) -> Floats:
+    """
+    Return the loss of 3D IoU if extents unlike those of their class are wrong, shape (n,).
+
+    What they are beyond `MAX_DEVIATIONS` of the class. An extent that is e too large or too small
+    costs e / L.
+
+    """
+    if track.class_name not in usual.sizes:
+        return np.zeros(len(extents))
+    median, deviation = usual.sizes[track.class_name]
+    excess = np.abs(np.log(extents) - median) - MAX_DEVIATIONS * deviation
+    return np.asarray(1 - np.exp(-excess.clip(0).sum(axis=1)))
 
 
 def _has_id_switch(track: TrackChanges) -> bool:
-    """Return whether the boxes jump by more than half a length off constant velocity."""
+    """
+    Return whether the boxes jump by more than half their extents off constant velocity.
+
+    Along the heading or across it.
+
+    """
     is_known = np.isfinite(track.boxes[:, X])
     boxes = track.boxes[is_known]
     seconds = np.diff(track.stamps_ns[is_known]) * 1e-9
     if len(seconds) < 2 or (seconds <= 0).any():
         return False
     velocity = np.diff(boxes[:, [X, Y]], axis=0) / seconds[:, None]
-    jump = np.linalg.norm(np.diff(velocity, axis=0), axis=1) * seconds[1:]
-    gate = boxes[1:-1, LENGTH] / 2 + SWITCH_SPEED * seconds[1:]
-    return bool((jump > gate).any())
+    jump = np.diff(velocity, axis=0) * seconds[1:, None]
+    yaw = boxes[1:-1, YAW]
+    along = jump[:, 0] * np.cos(yaw) + jump[:, 1] * np.sin(yaw)
+    across = jump[:, 1] * np.cos(yaw) - jump[:, 0] * np.sin(yaw)
+    gate = boxes[1:-1, [LENGTH, WIDTH]] / 2 + SWITCH_SPEED * seconds[1:, None]
+    return bool((np.abs(np.column_stack([along, across])) > gate).any())

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from boxreg_ros.review.changes import median, TrackChanges
-from boxreg_ros.review.risk import assess, reasons_of, Risk
+from boxreg_ros.review.risk import assess, reasons_of, Risk, Usual
 from boxreg_ros.structures import ADDED, BOX_EXTENT, INTERPOLATED, KEPT, REFINED
 import numpy as np
 
@@ -54,7 +54,8 @@ REVIEW_COLUMNS = ('rank', 'track_id', 'class_name', 'stamp_ns', 'risk_m', 'reaso
 
 def assessed(tracks: Sequence[TrackChanges]) -> list[TrackRow]:
     """Return the rows of all tracks, largest risk first, ties by track id."""
-    rows = [TrackRow(track, assess(track)) for track in tracks]
+    usual = Usual.of(tracks)
+    rows = [TrackRow(track, assess(track, usual)) for track in tracks]
     return sorted(rows, key=lambda row: (-row.risk.track, row.track.track_id))
 
 

@@ -10,6 +10,7 @@ from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
+from boxreg_ros.bench.review import with_pins
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
@@ -165,6 +166,44 @@ def test_json_names_version_and_command(folder, capsys, monkeypatch):
     assert document['version'] == __version__
     assert document['command'] == ' '.join(['boxreg', *words])
     assert set(document) == {'version', 'command', 'results'}
+
+
+def test_covariances_are_measured_for_each_estimate(folder, capsys):
+    assert run('covariance', folder, '--json') == 0
+    report = json.loads(capsys.readouterr().out)['results'][str(folder)]
+    assert set(report) == {'early', 'final', 'track'}
+    for groups in report.values():
+        group = groups['all']
+        assert group['boxes'] > 10
+        assert all(0.6 < value <= 1 for value in group['coverage'].values())
+        assert all(0 < value < 6 for value in group['nees'].values())
+    assert run('covariance', folder) == 0
+    assert 'early' in capsys.readouterr().out
+
+
+def test_review_ranks_tracks_and_pins_a_box_of_the_worst(folder, capsys):
+    assert run('review', folder, '--json') == 0
+    report = json.loads(capsys.readouterr().out)['results'][str(folder)]
+    assert set(report) == {'own boxes', 'planted errors'}
+    for found in report.values():
+        assert found['bad'] == np.ceil(0.1 * found['tracks'])
+        pins = found['pins']
+        missing = 1 - pins['before']
+        assert pins['gained'] == pytest.approx((pins['after'] - pins['before']) / missing)
+    assert report['own boxes']['tracks'] == 4
+    assert report['own boxes']['pins']['gained'] > 0
+
+
+def test_a_pin_holds_the_true_box_at_its_stamp(folder):
+    drive = Drive.read(folder)
+    array = drive.boxes[2]
+    pinned = with_pins(drive, {'9': array.stamp_ns}).boxes
+    row = array.track_ids.index('9')
+    true = drive.truth.boxes[
+        (drive.truth.stamps_ns == array.stamp_ns) & (np.array(drive.truth.track_ids) == '9')
+    ]
+    np.testing.assert_array_equal(pinned[2].boxes[[row]], true)
+    assert sum(int(array.pinned.sum()) for array in pinned) == 1
 
 
 @pytest.mark.parametrize('name', bench.MEASUREMENTS)

@@ -267,7 +267,9 @@ def fitted(given, measured, own, part=0.05):
     error, precision = part * given, torch.ones(1, 22, dtype=D)
     precision[:, :3] = error**-2 + own**-2
     spread = torch.cat([error, torch.ones(1, 19, dtype=D)], 1)
-    expected = Expectation(shared_of(given[0].tolist()), spread, *torch.ones(3, 1, 6))
+    expected = Expectation(
+        shared_of(given[0].tolist()), spread, *torch.ones(3, 1, 6), spread[:, :9]
+    )
     known = own**-2 / precision[:, :3]
     shared = shared_of((given * (measured / given) ** known)[0].tolist())
     covariance = torch.diag_embed(1 / precision)

@@ -30,19 +30,19 @@ def assert_close(found, known, tolerance=TOLERANCE):
 
 
 def both_sides(terms, x, free):
-    """Return (value, gradient, steps, blocks of the inverse) by the kernels and by torch."""
+    """Return value, gradient, steps, and blocks of the inverse, by the kernels and by torch."""
     N = (x.shape[1] - SHARED) // 6
     objective = Objective(terms, x, N, free)
     assert isinstance(objective.terms, TermArrays)
     rows = torch.arange(len(x))
     value, gradient = objective(x.clone(), rows)  # a copy: not the result kept for the start
     steps = objective.newton(gradient, rows)
-    kernel = value, gradient, steps, objective.factor.inverse_of_links(N)
+    kernel = value, gradient, steps, *objective.factor.inverse_of_links(N)
     chain = Chain.zeros(x, N)
     value, gradient = value_and_gradient(terms, x, N, chain)
     gradient = gradient * free
     factor = chain.factorised(free)
-    twin = value, gradient, factor.solve(gradient), factor.inverse_of_links(N)
+    twin = value, gradient, factor.solve(gradient), *factor.inverse_of_links(N)
     return kernel, twin
 
 
@@ -109,8 +109,7 @@ def test_huge_coordinates_equal_those_of_torch():
     moved.boxes[..., :3] += 1e6
     x = random_variables(moved)
     terms = regular_terms(moved)
-    value, gradient, steps, blocks = zip(*both_sides(terms, x, every_variable(x)), strict=True)
-    for found, known in (value, gradient, steps, blocks):
+    for found, known in zip(*both_sides(terms, x, every_variable(x)), strict=True):
         assert_close(found, known, 1e-6)
 
 

@@ -1,6 +1,7 @@
 """Each box is returned once, in order, with its status; the same calls return the same boxes."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 from boxreg_ros import Config, refine
 from boxreg_ros.config import Ingredients
@@ -513,6 +514,79 @@ def test_live_windows_are_warm_after_the_first_one(monkeypatch):
     config = config_with()
     fed(BoxRegistrar(config), stream_of([track_of(drive(8), np.random.default_rng(0), 'a')]))
     assert asked == [(3, False), (4, True), (5, True), (6, True), (6, True), (6, True)]
+
+
+# --- budget --------------------------------------------------------------------------------------
+
+
+def fed_within(budget, tracks, **changes):
+    """Return results and registrar of tracks that are solved within a budget of windows."""
+    registrar = BoxRegistrar(config_with(**changes), budget=budget)
+    results = fed(registrar, stream_of(tracks))
+    return results + registrar.flush(), registrar
+
+
+def test_an_ample_budget_changes_nothing(stream):
+    known, _ = run(stream, config_with())
+    registrar = BoxRegistrar(config_with(), budget=lambda: 100)
+    assert_equal(fed(registrar, stream) + registrar.flush(), known)
+
+
+def test_tracks_beyond_the_budget_are_kept_and_solved_first_in_the_next_tick():
+    rng = np.random.default_rng(0)
+    cars = [track_of(drive(12, start=(5.0, 8.0 * i, 0.0)), rng, str(i)) for i in range(4)]
+    results, _ = fed_within(lambda: 2, cars)
+    early = [result for result in results if not result.is_final]
+    solved = [{i for i, word in enumerate(r.status) if word == 'refined'} for r in early[2:]]
+    for one, next_one in pairwise(solved):
+        assert len(one) == 2
+        assert one | next_one == {0, 1, 2, 3}
+    for result in early[2:]:
+        for i, word in enumerate(result.status):
+            if word == 'kept':
+                assert result.reasons[i] == 'budget'
+                at = np.flatnonzero(cars[i].stamps_ns == result.boxes.stamp_ns)[0]
+                np.testing.assert_array_equal(result.boxes.boxes[i], cars[i].boxes[at])
+
+
+def test_final_boxes_are_refined_in_the_windows_of_later_ticks():
+    rng = np.random.default_rng(0)
+    truths = [drive(16, start=(5.0, 8.0 * i, 0.0)) for i in range(3)]
+    cars = [track_of(truth, rng, str(i)) for i, truth in enumerate(truths)]
+    overlap = {}
+    for budget in (0, 1, 3):
+        results, registrar = fed_within(lambda budget=budget: budget, cars)
+        within = finals(results)[:-3]
+        boxes = np.concatenate([result.boxes.boxes for result in within])
+        truth = np.stack(truths, 1)[: len(within)].reshape(-1, 9)
+        overlap[budget] = iou_3d(boxes, truth).mean()
+    assert registrar.counts['budget'] == 0
+    assert set(np.ravel([result.reasons for result in within[2:]])) == {''}
+    gain = overlap[3] - overlap[0]
+    assert gain > 0.02
+    assert overlap[1] > overlap[0] + 0.7 * gain
+
+
+def test_the_least_certain_track_is_solved_first_then_the_nearest():
+    rng = np.random.default_rng(0)
+    far = track_of(drive(8, start=(30.0, 4.0, 0.0)), rng, 'far')
+    near = track_of(drive(8, start=(8.0, 4.0, 0.0)), rng, 'near')
+    budgets = iter([2, 2, 1, 2, 2, 2, 1, 2])  # the third stamp has the first windows
+    results, _ = fed_within(lambda: next(budgets), [far, near])
+    early = [result for result in results if not result.is_final]
+    assert early[2].status == ('kept', 'refined')
+    variance = np.trace(early[5].covariances[:, :3, :3], axis1=1, axis2=2)
+    assert early[6].status[variance.argmax()] == 'refined'
+    assert early[6].reasons[variance.argmin()] == 'budget'
+
+
+def test_ended_tracks_beyond_the_budget_release_their_boxes():
+    # Without boxes of the second car the arrays that hold its last boxes must not wait for it.
+    rng = np.random.default_rng(0)
+    cars = [track_of(drive(20, start=(5.0, 8.0 * i, 0.0)), rng, str(i)) for i in range(2)]
+    results, registrar = fed_within(lambda: 1, [cars[0], cut(cars[1], slice(5))], max_gap=0.3)
+    assert len(finals(results)) == 20
+    assert not registrar._ended_tracks
 
 
 def test_a_track_that_ends_does_not_hold_back_others():

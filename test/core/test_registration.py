@@ -7,7 +7,7 @@ from boxreg_ros.core import batch, paper, registration, solver, terms
 from boxreg_ros.core.batch import POSE_ERRORS, State
 from boxreg_ros.core.face_support import FaceOffsets, observe_faces
 from boxreg_ros.core.geometry import rotation_from_rpy
-from boxreg_ros.core.input_model import expect, InputModel, InputNoise
+from boxreg_ros.core.input_model import CONSTANT_EXTENT_ERRORS, expect, InputModel, InputNoise
 from boxreg_ros.core.lbfgs import minimize, Minimum, select
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.paper import solve_paper
@@ -322,6 +322,25 @@ def test_expected_bias_by_hand(weight, fast, slow):
     bias = information[:, batch.BIAS] ** -0.5 / error
     known = torch.tensor([[fast], [slow]], dtype=D) * torch.tensor([1, 1, 1, 1, 1, 0.5])
     np.testing.assert_allclose(bias, known, rtol=1e-9)
+
+
+def test_errors_of_the_input_by_hand():
+    # The mean of six extents, correlated by 0.2, errs by sqrt(1.2 / 0.8 / 6) = 1/2 of the measured
+    # error. Constant errors count by how far the correlation is above 0.15, of 0.3: 1/6. Biases
+    # likewise. The error of low-noise input is not lowered here.
+    kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
+    problem = problem_of(drive(6)[None], class_numbers=kinds)
+    for size in (2.0, 0.2):
+        deviation = torch.full((9,), size, dtype=D)
+        correlation = torch.full((9,), 0.2, dtype=D)
+        noise = InputNoise(deviation, correlation, weight=torch.tensor([1.0]))
+        expected = expect(problem, NO_OFFSETS, noise)
+        constant = torch.tensor(CONSTANT_EXTENT_ERRORS, dtype=D) / 6
+        of_mean = torch.full((3,), 0.5, dtype=D)
+        extent = problem.boxes[:, 0, 3:6] * kinds['extent'] * torch.hypot(constant, of_mean)
+        bias = problem.of_class(*POSE_ERRORS) * torch.tensor([1, 1, 1, 1, 1, 0.5]) / 6
+        known = size * torch.cat([extent, bias], 1)
+        np.testing.assert_allclose(expected.input_error, known, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

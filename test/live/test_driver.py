@@ -1,9 +1,11 @@
 """The driver of the node, without ROS: waiting, transforms, unchanged boxes, restarts."""
 
 from boxreg_ros.config import Config
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.transforms import matrix
 from boxreg_ros.live.driver import LiveRegistrar, ReceivedMessage, refined_to_frame
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
+from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, pointcloud, vision
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -15,13 +17,14 @@ class Live(LiveRegistrar):
     """A driver whose input is a `Drive`; `reports` are (reason, text, number)."""
 
     def __init__(
-        self, fixed_frame='', output_frame='', timeout=1.0, convention=STANDARD, **settings
-    ):
+        self, fixed_frame='', output_frame='', timeout=1.0, convention=STANDARD,
+        lidars=SINGLE_LIDAR, **settings,
+    ):  # fmt: skip
         self.reports = []
         config = Config(estimate='final').updated({'window': 5, 'lag': 2} | settings)
         super().__init__(
             config, fixed_frame, output_frame, timeout,
-            lambda *report: self.reports.append(report), convention,
+            lambda *report: self.reports.append(report), convention, lidars,
         )  # fmt: skip
         self.adapter = adapter_for(DETECTIONS, convention)
         self.cloud_frame = 'lidar'
@@ -445,3 +448,31 @@ def test_covariances_are_rotated_to_the_output_frame(yaw):
     assert along @ covariance[:3, :3] @ along == pytest.approx(4.0)
     assert across @ covariance[:3, :3] @ across == pytest.approx(1.0)
     assert covariance[3:, 3:] == pytest.approx(spread[3:, 3:])
+
+
+def test_a_lidar_that_tf_does_not_know_holds_back_the_others_only_once():
+    drive = LidarDrive(6)
+    drive.items[0][2].transforms.pop(1)  # of the rear LiDAR
+    live = Live(timeout=1.0, lidars=Lidars(('/front', '/rear')))
+    out, not_ready = [], 0
+    for topic, stamp, message in drive.items:
+        if topic in ('/tf', '/tf_static'):
+            live.tree.add_transforms(message.transforms, topic == '/tf_static')
+            continue
+        now = (stamp - drive.stamps[0]) / SECOND
+        content = (
+            vision.from_msg(message)
+            if topic == '/boxes'
+            else live.placement.sweep_of(message, topic)
+        )
+        item = ReceivedMessage(message, content, now)
+        not_ready += bool(live.fixed_frame) and not live.is_ready(item, now + 0.5)
+        out += live.process(item)
+    out += live.flush()
+    finals = [item for item in out if item.is_final]
+    assert all(REFINED in item.refined.status for item in finals)
+    assert len(finals) == 6
+    assert not_ready == 1
+    reasons = [reason for reason, _, _ in live.reports]
+    assert reasons.count('sweep_without_transform') == 6
+    assert "from 'rear'" in live.reports[0][1]

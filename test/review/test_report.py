@@ -17,6 +17,7 @@ from boxreg_ros.offline.relabel import closing_line, relabel, Request
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.quality import quality
 from boxreg_ros.review.report import write_report
+from boxreg_ros.review.rules import RULES
 from boxreg_ros.review.track_points import PointCollector
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
@@ -105,6 +106,13 @@ def test_numbers_agree_with_the_summary(street):
     assert shifts == sorted(shifts, reverse=True)
     for name, count in summary['reasons'].items():
         assert f'{name} {count}' in page.text
+    for name, before in summary['rules']['before'].items():
+        after = summary['rules']['after'][name]
+        is_shown = before > 0 or after > 0
+        assert (f'{name} warning {before} {after}' in page.text) == (
+            is_shown and RULES[name].severity == 'warning'
+        )
+    assert 'Rules violated' in page.text
     input_total, refined_total = page.data['total']
     assert refined_total['flips'] == 0 < input_total['flips']
     for name in ('jitter', 'yaw_jitter', 'size_spread', 'cells'):
@@ -311,6 +319,7 @@ def test_changes_are_along_the_box_axes_without_half_turns():
 
 
 SUMMARY = {
+    'rules': {'before': dict.fromkeys(RULES, 0), 'after': dict.fromkeys(RULES, 0)},
     'recordings': ['drive.mcap'], 'topics': {}, 'labels': None, 'fixed_frame': 'odom',
     'sweeps': 30, 'box_arrays': 30, 'boxes_in': 30, 'status': {'refined': 30}, 'reasons': {},
     'heading_flips': 0, 'dropped': {}, 'first_missing_transform': '', 'first_unreadable': '',

@@ -3,13 +3,20 @@
 import csv
 
 from boxreg_ros.review.changes import Changes
-from boxreg_ros.review.risk import assess
+from boxreg_ros.review.risk import assess, MIN_TRACKS, Usual
 from boxreg_ros.review.tables import assessed, REVIEW_COLUMNS, write_tables
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
 import pytest
 
 CAR = [0.0, 0.0, 0.75, 4.5, 1.8, 1.5, 0.0, 0.0, 0.0]
+
+
+def boxes_of(size, n=4):
+    """Return boxes of a car of `size` times the usual extents."""
+    boxes = np.array([CAR] * n)
+    boxes[:, 3:6] *= size
+    return boxes
 
 
 def track_with(deviation=0.05, n=4, status='refined', boxes=None, **columns):
@@ -33,13 +40,42 @@ def track_with(deviation=0.05, n=4, status='refined', boxes=None, **columns):
 
 
 def test_risk_is_the_expected_loss_of_overlap():
-    # A shift by d along a car of 4.5 m costs 2 d / 4.5, and is its own risk.
+    # A face that is off by d costs d / L, and 4.5 / 2 turns a loss into a shift of a car. Errors
+    # of a face are those of the centre and half the extent: .05 m and .025 m.
     track = track_with(0.05)
-    parts = assess(track).parts
-    mean = 0.05 * np.sqrt(2 / np.pi)
-    expected = mean * (1 + 4.5 / 1.8 + 4.5 / 1.5)
-    np.testing.assert_allclose(parts['uncertain position'], expected)
-    np.testing.assert_allclose(parts['uncertain size'], expected / 2)
+    mean = np.hypot(0.05, 0.025) * np.sqrt(2 / np.pi)
+    expected = 2 * mean * (1 / 4.5 + 1 / 1.8 + 1 / 1.5) * 4.5 / 2
+    np.testing.assert_allclose(assess(track).parts['uncertain position and size'], expected)
+
+
+def test_a_face_far_off_its_points_costs_its_distance():
+    # .33 m beyond the .03 m of a car's surface is certain: the loss is .3 / 1.8, less what the
+    # deviation of the face costs anyway.
+    distances = np.array([[0.0, 0.0, 0.33, 0.0, 0.0, 0.0]])
+    parts = assess(track_with(0.001, face_distances=distances)).parts
+    noise = np.hypot(0.001, 0.0005) * np.sqrt(2 / np.pi)
+    np.testing.assert_allclose(
+        parts['faces off their points'], (0.3 - noise) / 1.8 * 4.5 / 2, rtol=1e-6
+    )
+
+
+def test_extents_unlike_those_of_the_class_raise_the_risk():
+    cars = [track_with(boxes=boxes_of(size)) for size in np.linspace(0.95, 1.05, MIN_TRACKS)]
+    usual = Usual.of(cars)
+    reason = 'size unlike its class'
+    assert assess(cars[0], usual).parts[reason].sum() == 0
+    assert assess(track_with(boxes=boxes_of(1.3)), usual).parts[reason].min() > 0.3
+    assert Usual.of(cars[1:]).sizes == {}  # too few tracks
+
+
+def test_points_outside_count_beyond_what_is_usual_and_by_the_points_inside():
+    reason = 'points left outside'
+    track = track_with(outside=np.array([0.3]))
+    fifty_points = 50 / (50 + 10)
+    fill = np.prod(np.array(CAR[3:6]) / (np.array(CAR[3:6]) + 1.2)) / 0.34
+    shift = (0.3 - 0.1) * fifty_points * fill
+    np.testing.assert_allclose(assess(track).parts[reason], 2 * shift / (1 + shift) * 4.5 / 2)
+    assert assess(track, Usual(outside=0.3)).parts[reason].sum() == 0
 
 
 @pytest.mark.parametrize(
@@ -58,10 +94,11 @@ def test_evidence_of_errors_raises_the_risk(worse):
 def test_an_id_switch_raises_the_risk_and_steady_motion_does_not():
     driving = np.array([CAR] * 8)
     driving[:, 0] = np.arange(8)
-    switched = driving.copy()
-    switched[4:, 1] += 8
     assert assess(track_with(n=8, boxes=driving)).parts['id switch'].sum() == 0
-    assert assess(track_with(n=8, boxes=switched)).parts['id switch'].all()
+    for across in (2.8, 8.0):  # a car in the next lane, and further
+        switched = driving.copy()
+        switched[4:, 1] += across
+        assert assess(track_with(n=8, boxes=switched)).parts['id switch'].all()
 
 
 def test_tables_list_the_riskiest_track_first(tmp_path):
@@ -76,7 +113,7 @@ def test_tables_list_the_riskiest_track_first(tmp_path):
     assert [line['rank'] for line in lines] == ['1', '2', '3']
     risks = [float(line['risk_m']) for line in lines]
     assert risks == sorted(risks, reverse=True)
-    assert 'uncertain position' in lines[0]['reasons']
+    assert 'uncertain position and size' in lines[0]['reasons']
 
 
 def test_no_tracks_give_empty_tables(tmp_path):

@@ -179,9 +179,12 @@ def shift_known(known, own, across):
 
 
 @kernel
-def invert_poses(band, border, corner, blocks, corner_inverse):
+def invert_poses(band, border, corner, blocks, columns, corner_inverse):
     """
-    Write the diagonal blocks (N, 6, 6) of the poses in the inverse, and that of the border.
+    Write blocks of the inverse: those of the poses, of poses and border, and of the border.
+
+    The diagonal blocks (N, 6, 6) of the poses, their rows in the columns of the border (N, 6, S),
+    and the block of the border (S, S).
 
     The blocks of the inverse Z within the pattern of U follow from the last pose backward
     (Takahashi). With r the two poses after p and the border, and W = inv(U_pp) U_pr:
@@ -212,6 +215,8 @@ def invert_poses(band, border, corner, blocks, corner_inverse):
                     total += across[a, c] * coupling[b, c]
                 own[a, b] = total
                 own[b, a] = total
+            for s in range(S):
+                columns[pose, a, s] = -across[a, NEXT + s]
         shift_known(known, own, across)
 
 
@@ -224,7 +229,7 @@ def solve_rows(begin, end, rows, band, border, corner, b, x):
 
 
 @kernel
-def invert_windows(begin, end, band, border, corner, blocks, corner_inverse):
-    """Write the blocks of the inverse, (B, N, 6, 6) and (B, S, S), of windows `begin` to `end`."""
+def invert_windows(begin, end, band, border, corner, blocks, columns, corner_inverse):
+    """Write the blocks of the inverse of windows `begin` to `end`, see `invert_poses`."""
     for b in range(begin, end):
-        invert_poses(band[b], border[b], corner[b], blocks[b], corner_inverse[b])
+        invert_poses(band[b], border[b], corner[b], blocks[b], columns[b], corner_inverse[b])

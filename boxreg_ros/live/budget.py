@@ -1,0 +1,105 @@
+"""Budget of a tick: the deadline of the boxes in windows, by the measured time of a window."""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+import time
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.registrar import GetEstimates
+from boxreg_ros.core.registration import Estimate, register
+from boxreg_ros.core.window import Window
+
+PART_OF_PERIOD = 0.8
+"""Part of the period of the boxes that is the default deadline; chosen: the rest is for decoding
+clouds, and for final boxes and markers, which are published after the early boxes."""
+FIRST_PERIOD = 0.1
+"""Period until it has been measured [s]; literature: LiDARs of 10 Hz are the most common ones."""
+LONGEST_PERIOD = 1.0
+"""A longer time between two box arrays is a pause [s]; chosen: the slowest sensors run at 2 Hz."""
+BATCH_OVERHEAD = 25
+"""Time of a batch that does not depend on its size, in windows; measured with
+`boxreg bench speed`: 10 ms beside 0.4 ms a window."""
+RECENT = 10
+"""Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
+
+
+class TickBudget:
+    """
+    How many windows may be solved for a box array, so that it is published by its deadline.
+
+    The registrar reads no clock; this object does for it. It times every batch, and returns a
+    number of windows by the second longest time of a window among the recent batches: a single
+    interruption of the process is ignored.
+
+    Parameters
+    ----------
+    deadline : float
+        Maximum time from complete data to published early boxes [s]; negative:
+        `PART_OF_PERIOD` of the measured period of the boxes.
+
+    Attributes
+    ----------
+    deadline : float
+        As above; may change.
+
+    """
+
+    def __init__(self, deadline: float) -> None:
+        self.deadline = deadline
+        self._since = time.monotonic()
+        self._solved_at = self._since
+        self._publishing_time = 0.0
+        self._times = deque[float](maxlen=RECENT)  # per window [s]
+        self._arrivals = deque[float](maxlen=RECENT)
+
+    def add_arrival(self, received: float) -> None:
+        """Add the time of arrival of a box array (monotonic) [s]."""
+        if self._arrivals and received > self._arrivals[-1] + LONGEST_PERIOD:
+            self._arrivals.clear()
+        self._arrivals.append(received)
+
+    def begin(self, since: float) -> None:
+        """Begin a tick whose data are complete and were not waited for after `since` [s]."""
+        self._since = since
+        self._solved_at = 0.0
+
+    def end(self) -> None:
+        """End a tick: its boxes are published."""
+        if self._solved_at:
+            self._publishing_time = time.monotonic() - self._solved_at
+
+    def windows(self) -> int:
+        """Return how many windows may be solved; at least one, so that its time is measured."""
+        if not self._times:
+            return 1
+        time_left = self._since + self.seconds - self._publishing_time - time.monotonic()
+        time_of_window = sorted(self._times)[-2:][0]
+        return max(1, int(time_left / time_of_window) - BATCH_OVERHEAD)
+
+    def submit(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
+        """Return a function that calls `register` with these arguments, and times it."""
+        return partial(self._timed, windows, config, model)
+
+    @property
+    def seconds(self) -> float:
+        """Return the present deadline [s]."""
+        if self.deadline >= 0:
+            return self.deadline
+        period = FIRST_PERIOD
+        if len(self._arrivals) > 1:
+            period = (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
+        return PART_OF_PERIOD * period
+
+    def _timed(
+        self, windows: list[Window], config: Config, model: InputModel
+    ) -> list[Estimate | None]:
+        begin = time.monotonic()
+        estimates = register(windows, config, model)
+        self._solved_at = time.monotonic()
+        num_solved = sum(estimate is not None for estimate in estimates)
+        if num_solved:
+            self._times.append((self._solved_at - begin) / (num_solved + BATCH_OVERHEAD))
+        return estimates

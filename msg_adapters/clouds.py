@@ -1,0 +1,184 @@
+"""
+Messages of point clouds that are not a ``sensor_msgs/PointCloud2``, converted to one.
+
+Compressed clouds are decompressed; Livox's own message gets the layout of a cloud. The result has
+the attributes of a PointCloud2.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+import zlib
+
+from boxreg_ros.errors import UnsupportedMessage
+from msg_adapters.pointcloud import DTYPES
+import numpy as np
+from numpy.typing import NDArray
+
+POINTS_TYPE = 'sensor_msgs/msg/PointCloud2'
+LIVOX_TYPES = ('livox_ros_driver2/msg/CustomMsg', 'livox_ros_driver/msg/CustomMsg')
+COMPRESSED_TYPE = 'point_cloud_interfaces/msg/CompressedPointCloud2'
+FOXGLOVE_TYPE = 'foxglove_msgs/msg/CompressedPointCloud'
+CLOUD_TYPES = (POINTS_TYPE, COMPRESSED_TYPE, FOXGLOVE_TYPE, *LIVOX_TYPES)
+"""Types of messages that `plain` reads."""
+
+GZIP_OR_ZLIB = 32 + zlib.MAX_WBITS
+"""``wbits`` of zlib that accept either header."""
+DRACO_POSITION = 0
+"""``attribute_type`` of coordinates in Draco."""
+NUMBERS = {kind: number for number, kind in DTYPES.items()}
+"""Kind of dtype -> ``PointField.datatype``."""
+LIVOX_FIELDS = {'x': 'f4', 'y': 'f4', 'z': 'f4', 'reflectivity': 'u1', 'offset_time': 'u4'}
+"""Fields of Livox's ``CustomPoint`` that are read; ``offset_time`` is in ns."""
+
+
+def plain(msg: Any) -> Any:
+    """
+    Return the cloud of a message of `CLOUD_TYPES` with the attributes of a PointCloud2.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the compressed data are damaged or of an unknown format, or a package that decompresses
+        them is not installed.
+
+    """
+    if hasattr(msg, 'compressed_data'):
+        return _decompressed(msg)
+    if hasattr(msg, 'format') and hasattr(msg, 'timestamp'):
+        header = SimpleNamespace(stamp=msg.timestamp, frame_id=msg.frame_id)
+        if msg.format != 'draco':
+            raise _unknown_format('CompressedPointCloud', msg.format, ('draco',))
+        return _cloud_of_columns(header, _draco_columns(bytes(msg.data), ()))
+    if hasattr(msg, 'point_num'):
+        columns = [
+            (name, np.array([getattr(point, name) for point in msg.points], kind))
+            for name, kind in LIVOX_FIELDS.items()
+        ]
+        return _cloud_of_columns(msg.header, columns)
+    return msg
+
+
+def header_of(msg: Any) -> Any:
+    """Return stamp and frame of a message of `CLOUD_TYPES`, without decompressing it."""
+    if hasattr(msg, 'header'):
+        return msg.header
+    return SimpleNamespace(stamp=msg.timestamp, frame_id=msg.frame_id)
+
+
+def _decompressed(msg: Any) -> Any:
+    """Return a CompressedPointCloud2 as a cloud."""
+    data = bytes(msg.compressed_data)
+    if msg.format == 'draco':
+        names = [name for field in msg.fields for name in _names(field)]
+        return _cloud_of_columns(msg.header, _draco_columns(data, names))
+    if msg.format not in DECOMPRESSORS:
+        raise _unknown_format('CompressedPointCloud2', msg.format, ('draco', *DECOMPRESSORS))
+    size = msg.height * max(msg.row_step, msg.width * msg.point_step)
+    raw = DECOMPRESSORS[msg.format](data, size)
+    return SimpleNamespace(
+        header=msg.header, height=msg.height, width=msg.width, fields=msg.fields,
+        is_bigendian=msg.is_bigendian, point_step=msg.point_step, row_step=msg.row_step,
+        data=raw, is_dense=msg.is_dense,
+    )  # fmt: skip
+
+
+def _inflated(data: bytes, size: int) -> bytes:
+    try:
+        return zlib.decompress(data, GZIP_OR_ZLIB, size or zlib.DEF_BUF_SIZE)
+    except zlib.error as error:
+        raise _damaged('zlib', len(data), str(error)) from None
+
+
+def _unzstd(data: bytes, size: int) -> bytes:
+    import zstandard
+
+    try:
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise _damaged('zstd', len(data), str(error)) from None
+
+
+DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {'zlib': _inflated, 'zstd': _unzstd}
+"""``format`` -> function of the compressed data and the size of the cloud in bytes."""
+
+
+def _draco_columns(data: bytes, names: Sequence[str]) -> list[tuple[str, NDArray[Any]]]:
+    """
+    Return name and values (M,) of all components of the attributes of a Draco point cloud.
+
+    Parameters
+    ----------
+    data : bytes
+        The stream.
+    names : sequence of str
+        Names of the components, in their order; empty to take x, y, z for the coordinates and
+        the names in the stream for the others.
+
+    """
+    try:
+        import DracoPy
+    except ImportError:
+        raise UnsupportedMessage(
+            'a point cloud is compressed by Draco, and the package that reads it is not '
+            'installed: pip install DracoPy'
+        ) from None
+    try:
+        attributes = DracoPy.decode(data).attributes
+    except (DracoPy.FileTypeException, ValueError) as error:
+        raise _damaged('draco', len(data), str(error)) from None
+    found = []
+    for attribute in attributes:
+        values = np.atleast_2d(np.asarray(attribute['data']))
+        prefix = attribute['name'] or f'attribute_{attribute["unique_id"]}'
+        own = [f'{prefix}_{k}' if k else prefix for k in range(values.shape[1])]
+        if attribute['attribute_type'] == DRACO_POSITION and values.shape[1] == 3:
+            own = ['x', 'y', 'z']
+        found += list(zip(own, values.T, strict=True))
+    if not names:
+        return found
+    if len(found) != len(names):
+        raise UnsupportedMessage(
+            f'point cloud compressed by Draco: expected a component for each of the fields '
+            f'{", ".join(names)}, got {len(found)}; publisher and recording have different fields'
+        )
+    return [(name, values) for name, (_, values) in zip(names, found, strict=True)]
+
+
+def _names(field: Any) -> list[str]:
+    """Return the names of the components of a field."""
+    return [f'{field.name}_{k}' if k else field.name for k in range(max(1, field.count))]
+
+
+def _cloud_of_columns(header: Any, columns: Sequence[tuple[str, NDArray[Any]]]) -> Any:
+    """Return columns (M,) by name as a cloud of one row."""
+    kinds = [(name, values.dtype.newbyteorder('<')) for name, values in columns]
+    table = np.zeros(len(columns[0][1]) if columns else 0, np.dtype(kinds))
+    fields = []
+    offset = 0
+    for (name, values), (_, kind) in zip(columns, kinds, strict=True):
+        table[name] = values
+        number = NUMBERS[kind.str[1:]]
+        fields.append(SimpleNamespace(name=name, offset=offset, datatype=number, count=1))
+        offset += kind.itemsize
+    return SimpleNamespace(
+        header=header, height=1, width=len(table), fields=fields, is_bigendian=False,
+        point_step=table.dtype.itemsize, row_step=table.nbytes, data=table.view(np.uint8),
+        is_dense=False,
+    )  # fmt: skip
+
+
+def _unknown_format(kind: str, given: str, known: Sequence[str]) -> UnsupportedMessage:
+    return UnsupportedMessage(
+        f'{kind}: format {given!r}: expected {" or ".join(known)}; publish it in one of these'
+    )
+
+
+def _damaged(kind: str, size: int, cause: str) -> UnsupportedMessage:
+    return UnsupportedMessage(
+        f'point cloud compressed by {kind}: expected a whole stream, got {size} bytes that do not '
+        f'decode ({cause}); it was cut short or damaged on its way'
+    )

@@ -1,0 +1,147 @@
+"""Clouds that are not a PointCloud2: compressed ones, and Livox's own message."""
+
+import sys
+from types import SimpleNamespace
+import zlib
+
+from boxreg_ros.errors import UnsupportedMessage
+from msg_adapters import clouds, pointcloud
+import numpy as np
+import pytest
+from ros_messages import Messages, START
+import zstandard
+
+MESSAGES = Messages()
+ROWS = 50
+
+
+def cloud():
+    """Return a PointCloud2 with coordinates, intensity and times."""
+    rng = np.random.default_rng(3)
+    columns = [(name, 'f4', rng.uniform(-20, 20, ROWS)) for name in 'xyz']
+    columns.append(('intensity', 'f4', rng.uniform(0, 255, ROWS)))
+    columns.append(('t', 'u4', np.linspace(0, 1e8, ROWS)))
+    return MESSAGES.cloud(START, 'lidar', columns)
+
+
+def compressed(message, kind, data):
+    """Return a CompressedPointCloud2 of a cloud."""
+    copied = ('height', 'width', 'fields', 'is_bigendian', 'point_step', 'row_step', 'is_dense')
+    fields = {name: getattr(message, name) for name in copied}
+    return MESSAGES.make(
+        clouds.COMPRESSED_TYPE, header=message.header, format=kind,
+        compressed_data=np.frombuffer(data, np.uint8), **fields,
+    )  # fmt: skip
+
+
+def gzipped(data):
+    """Return data as zlib_point_cloud_transport writes them, with a header of gzip."""
+    packer = zlib.compressobj(wbits=16 + zlib.MAX_WBITS)
+    return packer.compress(data) + packer.flush()
+
+
+PACKERS = {
+    'zlib': [zlib.compress, gzipped],
+    'zstd': [zstandard.ZstdCompressor().compress],
+}
+PAIRS = [(kind, pack) for kind, packers in PACKERS.items() for pack in packers]
+
+
+@pytest.mark.parametrize('kind, pack', PAIRS)
+def test_lossless_clouds_are_equal_to_the_original(kind, pack):
+    message = cloud()
+    found = clouds.plain(compressed(message, kind, pack(message.data.tobytes())))
+    sweep, known = pointcloud.from_msg(found), pointcloud.from_msg(message)
+    np.testing.assert_array_equal(sweep.points, known.points)
+    np.testing.assert_array_equal(sweep.times, known.times)
+    np.testing.assert_array_equal(pointcloud.intensities(found), pointcloud.intensities(message))
+
+
+def draco(points, **attributes):
+    """Return a stream of Draco that keeps the order of the points."""
+    encode = pytest.importorskip('DracoPy').encode
+    return encode(
+        points, quantization_bits=20, preserve_order=True, generic_attributes=attributes or None
+    )
+
+
+def test_draco_clouds_are_equal_to_the_original_within_their_quantisation():
+    message = cloud()
+    known = pointcloud.from_msg(message)
+    intensities = pointcloud.intensities(message).astype(np.float32)[:, None]
+    times = np.linspace(0, 1e8, ROWS).astype(np.uint32)[:, None]
+    data = draco(known.points, intensity=intensities, t=times)
+    found = clouds.plain(compressed(message, 'draco', data))
+    sweep = pointcloud.from_msg(found)
+    np.testing.assert_allclose(sweep.points, known.points, atol=1e-4)
+    np.testing.assert_allclose(sweep.times, known.times, atol=1e-9)
+    np.testing.assert_array_equal(pointcloud.intensities(found), intensities[:, 0])
+
+
+@pytest.mark.parametrize('name', ['intensity', 'i'])
+def test_clouds_of_foxglove_have_the_names_of_the_stream(name):
+    points = np.random.default_rng(4).uniform(-5, 5, (ROWS, 3)).astype(np.float32)
+    values = np.arange(ROWS, dtype=np.uint8)[:, None]
+    time = MESSAGES.header(START, '').stamp
+    message = MESSAGES.build(
+        clouds.FOXGLOVE_TYPE, timestamp=time, frame_id='lidar', format='draco',
+        data=list(draco(points, **{name: values})),
+    )  # fmt: skip
+    found = clouds.plain(message)
+    sweep = pointcloud.from_msg(found)
+    assert (sweep.stamp_ns, sweep.frame_id) == (START, 'lidar')
+    assert clouds.header_of(message).frame_id == 'lidar'
+    np.testing.assert_allclose(sweep.points, points, atol=1e-4)
+    np.testing.assert_array_equal(pointcloud.intensities(found), values[:, 0])
+
+
+@pytest.mark.parametrize('kind', ['zlib', 'zstd', 'draco'])
+@pytest.mark.parametrize('left', [0, 7, 300])
+def test_a_stream_that_is_cut_short_gives_one_clear_line(kind, left):
+    message = cloud()
+    data = message.data.tobytes()
+    points = pointcloud.from_msg(message).points
+    packed = draco(points) if kind == 'draco' else PACKERS[kind][0](data)
+    assert len(packed) > left
+    with pytest.raises(UnsupportedMessage, match=f'by {kind}: expected a whole stream') as caught:
+        clouds.plain(compressed(message, kind, packed[:left]))
+    assert f'got {left} bytes' in str(caught.value)
+    assert 'cut short' in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+def test_attributes_that_do_not_fit_the_fields_are_refused():
+    message = cloud()
+    data = draco(pointcloud.from_msg(message).points)
+    with pytest.raises(UnsupportedMessage, match='x, y, z, intensity, t, got 3'):
+        clouds.plain(compressed(message, 'draco', data))
+
+
+def test_unknown_formats_are_named():
+    with pytest.raises(UnsupportedMessage, match="'lz4': expected draco or zlib or zstd"):
+        clouds.plain(compressed(cloud(), 'lz4', b''))
+    message = SimpleNamespace(timestamp=None, frame_id='', format='ply', data=b'')
+    with pytest.raises(UnsupportedMessage, match="'ply': expected draco"):
+        clouds.plain(message)
+
+
+def test_without_its_package_draco_names_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'DracoPy', None)
+    with pytest.raises(UnsupportedMessage, match='pip install DracoPy'):
+        clouds.plain(compressed(cloud(), 'draco', b''))
+
+
+def test_livox_messages_are_read():
+    points = [
+        {'x': 1.0 + k, 'y': 2.0, 'z': 3.0, 'reflectivity': 7 + k, 'offset_time': k * 10**6}
+        for k in range(4)
+    ]
+    message = MESSAGES.build(
+        clouds.LIVOX_TYPES[0], header=MESSAGES.header(START, 'livox'), timebase=START,
+        point_num=4, points=points,
+    )  # fmt: skip
+    found = clouds.plain(message)
+    sweep = pointcloud.from_msg(found)
+    np.testing.assert_array_equal(sweep.points[:, 0], [1, 2, 3, 4])
+    np.testing.assert_allclose(sweep.times, [0, 1e-3, 2e-3, 3e-3], atol=1e-12)
+    np.testing.assert_array_equal(pointcloud.intensities(found), [7, 8, 9, 10])

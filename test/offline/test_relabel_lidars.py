@@ -1,0 +1,101 @@
+"""`boxreg relabel` with several LiDARs."""
+
+import json
+
+from boxreg_ros.cli import main
+from boxreg_ros.io.box_table import BoxTable
+from lidar_drives import LidarDrive
+import numpy as np
+import pytest
+
+TOPICS = ['--points', '/front', '--points', '/rear']
+
+
+def relabelled(path, out, *more):
+    """Return boxes and summary of `boxreg relabel`."""
+    command = ['relabel', str(path), '-o', str(out), '--formats=csv', '--set=window=5', *more]
+    assert main(command) == 0
+    return BoxTable.read(out / 'boxes.csv'), json.loads((out / 'summary.json').read_text())
+
+
+def errors_of(drive, table):
+    """Return the mean distance of the centres of boxes from the true ones [m]."""
+    truth = {
+        (stamp, str(track)): box[:3]
+        for stamp, boxes in drive.truth.items()
+        for track, box in enumerate(boxes, start=1)
+    }
+    keys = zip(table.stamps_ns.tolist(), table.track_ids, strict=True)
+    true = np.array([truth[key] for key in keys])
+    return np.linalg.norm((table.boxes[:, :3] - true)[:, :2], axis=1).mean()
+
+
+def test_topics_and_info_give_the_same_boxes_and_both_are_better_than_neither(tmp_path):
+    found = {}
+    for clouds in ('topics', 'info', 'alone'):
+        drive = LidarDrive(8, clouds)
+        path = drive.write(tmp_path / clouds)
+        more = ['--set=sampling.box_time=stamp', *(TOPICS if clouds == 'topics' else [])]
+        found[clouds], summary = relabelled(path, tmp_path / f'out-{clouds}', *more)
+        assert summary['sweeps'] == 8
+        assert summary['dropped'] == {}
+    difference = found['topics'].boxes - found['info'].boxes
+    assert np.abs(difference).max() < 1e-3  # coordinates of clouds are float32
+    errors = {name: errors_of(drive, table) for name, table in found.items()}
+    assert errors['info'] < errors['alone'] < 0.05
+
+
+@pytest.mark.parametrize('unknown', ['front', 'rear'])
+def test_a_lidar_that_tf_does_not_know_is_counted_and_the_other_goes_on(tmp_path, capsys, unknown):
+    drive = LidarDrive(6)
+    mounts = drive.items[0][2].transforms
+    mounts[:] = [mount for mount in mounts if mount.child_frame_id != unknown]
+    path = drive.write(tmp_path / 'drive')
+    table, summary = relabelled(path, tmp_path / 'out', *TOPICS)
+    assert set(table.status) == {'refined'}
+    assert summary['fixed_frame'] == 'odom'
+    assert summary['dropped'] == {'cloud_missing': 6, 'sweep_without_transform': 6}
+    (line,) = [text for text in capsys.readouterr().err.splitlines() if 'no transform' in text]
+    assert f"'{unknown}'" in line
+    assert '6 clouds' in line
+
+
+def test_a_silent_lidar_is_counted(tmp_path, capsys):
+    drive = LidarDrive(6)
+    rear = [item for item in drive.items if item[0] == '/rear']
+    drive.items = [item for item in drive.items if item[0] != '/rear' or item is rear[0]]
+    path = drive.write(tmp_path / 'drive')
+    _, summary = relabelled(path, tmp_path / 'out', *TOPICS)
+    assert summary['lidars'] == {
+        '/front': {'merged': 6},
+        '/rear': {'merged': 1, 'cloud_missing': 5},
+    }
+    assert 'LiDAR /rear: 1 clouds merged, 0 late, 5 missing' in capsys.readouterr().err
+
+
+def test_label_files_get_the_points_of_all_lidars_in_one_frame(tmp_path):
+    drive = LidarDrive(4)
+    path = drive.write(tmp_path / 'drive')
+    out = tmp_path / 'out'
+    relabelled(path, out, *TOPICS, '--formats=nuscenes', '--with-points')
+    clouds = sorted(out.glob('nuscenes/**/*.bin'))
+    assert len(clouds) == 4
+    rows = np.fromfile(clouds[0], np.float32).reshape(-1, 5)
+    assert len(rows) == 240  # of both
+    center = rows[:, :3].mean(axis=0) + np.array([2, 0, 1])  # from the front LiDAR to odom
+    np.testing.assert_allclose(center[:2], [12.5, 0.5], atol=1.5)
+
+
+def test_topics_that_are_merged_are_suggested(tmp_path, capsys):
+    path = LidarDrive(2).write(tmp_path / 'drive')
+    assert main(['relabel', str(path), '-o', str(tmp_path / 'out')]) == 1
+    assert '/front, /rear; choose one with --points, or merge' in capsys.readouterr().err
+    command = ['relabel', str(path), '-o', str(tmp_path / 'out'), *TOPICS, '--sensor-frame=front']
+    assert main(command) == 2
+    assert 'sensor_frames: expected one frame for each of the 2 topics' in capsys.readouterr().err
+
+
+def test_inspect_names_the_topics_in_its_command(tmp_path, capsys):
+    path = LidarDrive(3).write(tmp_path / 'drive')
+    assert main(['inspect', str(path), *TOPICS]) == 0
+    assert '--points=/front --points=/rear' in capsys.readouterr().out
