@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import Floats, Ints, Sweep
@@ -19,6 +19,14 @@ TIME_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
 MAX_TIME_OFFSET = 1.0
 """Largest difference between the time of a point and the stamp [s]; one revolution is shorter."""
+
+
+class TimeLayout(NamedTuple):
+    """Field of the times of points, its unit [s] (None if none fits), relative or absolute."""
+
+    field: str
+    unit: float | None
+    is_absolute: bool
 
 
 def from_msg(msg: Any) -> Sweep:
@@ -76,6 +84,31 @@ def finite_rows(msg: Any) -> Ints | None:
     table = _table(msg, [fields[key] for key in 'xyz'])
     is_finite = np.logical_and.reduce([np.isfinite(table[key].reshape(-1)) for key in 'xyz'])
     return None if is_finite.all() else np.flatnonzero(is_finite)
+
+
+def time_layout(msg: Any) -> TimeLayout | None:
+    """
+    Return where a PointCloud2 has the times of its points; None if it has none.
+
+    Raises
+    ------
+    UnsupportedMessage
+        As `from_msg`.
+
+    """
+    if not msg.width * msg.height:
+        return None
+    fields = _fields(msg)
+    name = _first(POINT_TIME_FIELDS, fields)
+    if name is None:
+        return None
+    raw = _table(msg, [fields[name]])[name].ravel()
+    raw = raw[np.isfinite(raw)]
+    found = _time_unit(raw, stamp_ns(msg.header)) if raw.size else None
+    if found is None:
+        return TimeLayout(name, None, False)
+    unit, origin = found
+    return TimeLayout(name, unit, bool(origin))
 
 
 def intensities(msg: Any) -> Floats | None:
@@ -185,6 +218,17 @@ def _seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
 
 def _known_seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
     """Return finite point times (M,), M > 0, relative to the stamp [s]."""
+    found = _time_unit(raw, stamp)
+    if found is None:
+        return None
+    unit, origin = found
+    if origin:
+        return np.asarray((raw.astype(np.float64) - origin) * unit)
+    return np.asarray(np.multiply(raw, unit, dtype=np.float64))
+
+
+def _time_unit(raw: NDArray[Any], stamp: int) -> tuple[float, float] | None:
+    """Return the unit [s] of finite times, and what the stamp is in it, 0 for relative times."""
     low = float(raw.min())
     high = float(raw.max())
     is_float = raw.dtype.kind == 'f'
@@ -194,8 +238,8 @@ def _known_seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
             offset = max(abs(low - origin), abs(high - origin)) * unit
             # A stamp near 0 does not separate absolute from relative times.
             if origin * unit > MAX_TIME_OFFSET and offset <= MAX_TIME_OFFSET:
-                return np.asarray((raw.astype(np.float64) - origin) * unit)
+                return unit, origin
     for unit in TIME_UNITS if is_float else TIME_UNITS[1:]:
         if max(abs(low), abs(high)) * unit <= MAX_TIME_OFFSET:
-            return np.asarray(np.multiply(raw, unit, dtype=np.float64))
+            return unit, 0.0
     return None

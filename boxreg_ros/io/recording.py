@@ -26,6 +26,7 @@ from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 from msg_adapters import adapter_for, ADAPTERS, CLOUD_TYPES, clouds, pointcloud, poses, WITHOUT_IDS
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.convention import Convention, STANDARD
+from msg_adapters.pointcloud import TimeLayout
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -446,6 +447,14 @@ class Recording:
             topics = ', '.join(map(repr, self.points_topics))
             raise RecordingError(f'{self}: no point clouds on {topics} in this part')
         return frames
+
+    def time_layout(self) -> TimeLayout | None:
+        """Return where the first readable cloud has the times of its points; None without."""
+        message = self._first(self.points_topics[0])
+        if message is None:
+            return None
+        with _malformed(f'topic {self.points_topics[0]!r}'):
+            return pointcloud.time_layout(clouds.plain(message))
 
     def _first(self, topic: str) -> Any:
         """Return the first readable message on a topic in the part that is read; None without."""
