@@ -81,6 +81,7 @@ setup(
             'flask',
             'flask-cors',
             'foxglove-schemas-protobuf',
+            'hypothesis',
             'jinja2',
             'matplotlib',
             'mcap-protobuf-support',

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import csv
+from io import StringIO
 import json
 from pathlib import Path
 import re
@@ -11,6 +12,7 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.storage.urls import names_of, read_text, url_of
 from boxreg_ros.offline.batch_report import write_batch_report
 from boxreg_ros.offline.job import Job, JOB_FAILED
 from boxreg_ros.offline.result_folder import SUMMARY, written_whole
@@ -89,11 +91,10 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
     """
     found = {}
     counts = set()
-    for path in out.glob('index.*-of-*.csv'):
-        match = SHARD_INDEX.fullmatch(path.name)
-        if match:
-            found[int(match[1])] = path
-            counts.add(int(match[2]))
+    names = names_of(out) if url_of(out) else [path.name for path in out.glob('index.*')]
+    for match in filter(None, map(SHARD_INDEX.fullmatch, names)):
+        found[int(match[1])] = out / match[0]
+        counts.add(int(match[2]))
     if len(counts) != 1:
         raise RecordingError(
             f'{out}: expected the indexes of all shards of one --shard I/N, got those of '
@@ -108,8 +109,7 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
         )
     rows: list[dict[str, Any]] = []
     for path in found.values():
-        with path.open(newline='', encoding='utf-8') as file:
-            rows += csv.DictReader(file)
+        rows += csv.DictReader(StringIO(read_text(path)))
     return sorted(rows, key=lambda row: str(row['drive']))
 
 

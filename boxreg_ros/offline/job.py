@@ -147,7 +147,12 @@ def _manifest(path: Path) -> Iterator[tuple[Path, ...]]:
     for line in path.read_text(encoding='utf-8').splitlines():
         words = shlex.split(line, comments=True)
         if words:
-            yield tuple(path.parent / word for word in words)
+            yield tuple(_place(word, path.parent) for word in words)
+
+
+def _place(word: str, folder: Path) -> Path:
+    """Return the URL that a word is, or a path that begins at a folder."""
+    return Path(word) if url_of(Path(word)) is not None else folder / word
 
 
 def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
