@@ -151,13 +151,15 @@ def labels(folder):
         for file in files[:2]:
             data = file.read_bytes()
 
-            def read(changed, file=file, place=place, name=name):
+            def read(changed, file=file, place=place, name=name, data=data):
                 file.write_bytes(changed)
-                for _ in frames_of(name, place):
-                    pass
+                try:
+                    for _ in frames_of(name, place):
+                        pass
+                finally:
+                    file.write_bytes(data)
 
             yield f'labels {name}/{file.name}', data, read
-            file.write_bytes(data)
 
 
 def configurations(folder):

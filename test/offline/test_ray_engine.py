@@ -24,9 +24,11 @@ def address():
     """Yield the address of a cluster of two nodes with one core each."""
     from ray.cluster_utils import Cluster
 
+    handler = signal.getsignal(signal.SIGTERM)
     node = {'num_cpus': 1, 'object_store_memory': MEMORY, 'include_dashboard': False}
     cluster = Cluster(initialize_head=True, head_node_args=node)
     cluster.add_node(num_cpus=1, object_store_memory=MEMORY)
+    signal.signal(signal.SIGTERM, handler)  # that of Ray would end the tests
     yield cluster.address
     cluster.shutdown()
 
