@@ -44,6 +44,11 @@ def label_formats() -> str:
     return table(formats.FORMAT_COLUMNS, formats.rows())
 
 
+def datasets() -> str:
+    """Return one row for each data set."""
+    return table(formats.DATASET_COLUMNS, formats.dataset_rows())
+
+
 def messages() -> str:
     """Return one row for each message type with boxes."""
     return table(registry.MESSAGE_COLUMNS, registry.rows())
@@ -91,6 +96,7 @@ TABLES = {
     'scale.md': scale,
     'parameters.md': parameters,
     'formats.md': label_formats,
+    'datasets.md': datasets,
     'messages.md': messages,
     'troubleshooting.md': counters,
 }

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 import shlex
 from typing import Any, cast, NamedTuple, Protocol, runtime_checkable, Self
@@ -26,7 +27,6 @@ from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 from msg_adapters import adapter_for, ADAPTERS, CLOUD_TYPES, clouds, pointcloud, poses, WITHOUT_IDS
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.convention import Convention, STANDARD
-from msg_adapters.pointcloud import TimeLayout
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -448,14 +448,6 @@ class Recording:
             raise RecordingError(f'{self}: no point clouds on {topics} in this part')
         return frames
 
-    def time_layout(self) -> TimeLayout | None:
-        """Return where the first readable cloud has the times of its points; None without."""
-        message = self._first(self.points_topics[0])
-        if message is None:
-            return None
-        with _malformed(f'topic {self.points_topics[0]!r}'):
-            return pointcloud.time_layout(clouds.plain(message))
-
     def _first(self, topic: str) -> Any:
         """Return the first readable message on a topic in the part that is read; None without."""
         first_error: UnsupportedMessage | None = None
@@ -523,7 +515,7 @@ class Recording:
             info = self._topic('points-info', 'info on concatenated clouds', (INFO_TYPE,), info)
         elif len(topics) == 1 and self._topics.get(topics[0] + INFO_SUFFIX) == INFO_TYPE:
             info = topics[0] + INFO_SUFFIX
-        self.placement = SensorPlacement(Lidars(tuple(topics), lidars.frames, info))
+        self.placement = SensorPlacement(replace(lidars, topics=tuple(topics), info=info))
 
     def _topic(self, role: str, what: str, types: tuple[str, ...], asked: str | None) -> str:
         """Return the topic asked for, or the only one of these types."""

@@ -204,8 +204,8 @@ def read_frames(
             refined = _refined(cuboids_by_name(name), sidecar, index)
         except (AttributeError, TypeError, ValueError) as error:
             raise RecordingError(
-                f'{folder}: frame {name!r}: expected attributes as boxreg writes them, got others: '
-                f'{error}; remove the attributes that were changed'
+                f'{folder}: frame {name!r}: expected attributes as boxreg writes them, got '
+                f'others: {error}; remove the attributes that were changed'
             ) from None
         yield sidecar.frame(index, refined).moved('fixed')
 

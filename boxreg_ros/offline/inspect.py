@@ -41,7 +41,6 @@ SAMPLE_SECONDS = 5.0
 """Part of the recording whose messages are read [s]: 50 sweeps at 10 Hz."""
 SAMPLE_ITEMS = 100
 """Clouds and box arrays that are read at most; the pose check needs some 30 of each."""
-UNIT_NAMES = {1.0: 's', 1e-3: 'ms', 1e-6: 'us', 1e-9: 'ns'}
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
 
@@ -151,14 +150,12 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
 
 def _scenes(paths: list[Path]) -> list[str]:
     """Return the addresses of all scenes of a data set, if none of several is named."""
-    from boxreg_ros.datasets import scene_names
+    from boxreg_ros.datasets import all_scenes
     from boxreg_ros.offline.sources import scene_address
 
     address = scene_address(paths)
-    if address is None or address.scene:
-        return []
-    names = scene_names(address)
-    return [str(address._replace(scene=name)) for name in names] if len(names) > 1 else []
+    found = [] if address is None else all_scenes(address)
+    return [str(scene) for scene in found] if len(found) > 1 else []
 
 
 def _scene_contents(paths: list[Path]) -> dict[str, Any]:
@@ -274,18 +271,10 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
         'sensor_frame': recording.sensor_frame(),
         'transforms': [_transform(link) for link in session.tree.links()],
         'connected_frames': session.tree.groups(),
-        'point_times': _point_times(recording),
+        'point_layouts': recording.placement.layouts,
         'sample': _summary(sample),
         'warnings': list(_warnings(sample, session.finding, recording)),
     }
-
-
-def _point_times(recording: ItemSource) -> dict[str, Any] | None:
-    """Return field, unit [s] and kind of the times of points; None without messages."""
-    from boxreg_ros.io.recording import Recording
-
-    layout = recording.time_layout() if isinstance(recording, Recording) else None
-    return None if layout is None else layout._asdict()
 
 
 def _transform(link: Link) -> dict[str, Any]:
@@ -456,13 +445,12 @@ def _sample_lines(facts: dict[str, Any]) -> Iterator[str]:
     yield f'of the first {SAMPLE_SECONDS:g} s:'
     times = sample['point_times_s']
     shown = 'no times' if times is None else f'times over {times:.3f} s'
-    layout = facts['point_times']
-    if layout is not None:
-        shown += f' ({_layout_text(layout)})'
     yield (
         f'  clouds {facts["points_topic"]}: {sample["points_per_sweep"]:,} points, {shown}, '
         f'{_seconds(sample["sweep_period_s"])} apart, {len(sample["gaps"]["sweeps"])} gaps'
     )
+    for topic, layout in facts['point_layouts'].items():
+        yield f'  layout {topic}: {layout}'
     yield (
         f'  boxes {facts["boxes_topic"]}: {_seconds(sample["boxes_period_s"])} apart, '
         f'{len(sample["gaps"]["box_arrays"])} gaps, at most '
@@ -482,15 +470,6 @@ def _transform_line(transform: dict[str, Any]) -> str:
     gaps = [end - begin for begin, end in transform['gaps_s']]
     longest = f', the longest {max(gaps):.3f} s' if gaps else ''
     return f'{pair}: {_seconds(transform["period_s"])} apart, {len(gaps)} gaps{longest}'
-
-
-def _layout_text(layout: dict[str, Any]) -> str:
-    """Return field and unit of the times of points."""
-    if layout['unit'] is None:
-        return f'field {layout["field"]} of no known unit'
-    unit = UNIT_NAMES[layout['unit']]
-    kind = 'absolute' if layout['is_absolute'] else 'relative to the stamp'
-    return f'field {layout["field"]} in {unit}, {kind}'
 
 
 def _seconds(value: float | None) -> str:

@@ -19,8 +19,9 @@ from typing import Any, BinaryIO
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.urls import names_of, read_text, url_of, write_text
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.job import Job, JOB_DONE, JOB_FAILED, UP_TO_DATE
-from boxreg_ros.offline.result_folder import delete_remains, earlier_summary, written_whole
+from boxreg_ros.offline.result_folder import delete_remains, earlier_summary
 
 JOBS = 'jobs'
 """Folder with the key and the log of each job."""

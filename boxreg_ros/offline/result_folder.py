@@ -6,20 +6,18 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 import errno
 from glob import escape
-from io import StringIO
 import json
 import os
 from pathlib import Path
 import shutil
 from tempfile import TemporaryDirectory
-from typing import Any, TextIO
+from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.storage.urls import names_of, read_text, upload, url_of, write_text
+from boxreg_ros.io.storage.urls import names_of, read_text, upload, url_of
+from boxreg_ros.io.whole_files import DISK_ERRORS
 
-DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-"""Disk full, file larger than the limit of the process, quota used up."""
 REFUSED_ERRORS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
 """No permission, read-only file system, a file where a folder is needed."""
 SUMMARY = 'summary.json'
@@ -156,23 +154,6 @@ def delete_remains(out: Path) -> None:
     whole = out.resolve()
     for remains in whole.parent.glob(f'.{escape(whole.name)}.*.partial'):
         shutil.rmtree(remains, ignore_errors=True)
-
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[TextIO]:
-    """Yield a file that replaces `path` on success and is deleted on failure."""
-    if url_of(path) is not None:
-        text = StringIO()
-        yield text
-        write_text(path, text.getvalue())
-        return
-    partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
-    try:
-        with partial.open('w', encoding='utf-8', newline='') as file:
-            yield file
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _check_replaceable(out: Path) -> None:

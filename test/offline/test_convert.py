@@ -287,7 +287,7 @@ def test_attributes_of_another_shape_are_refused(tmp_path, capsys):
     recording = Drive(sweeps=6).write(tmp_path / 'drive')
     out = tmp_path / 'out'
     quick = ['--set=min_observations=3', '--formats=datumaro']
-    assert main(['relabel', str(recording), '-o', str(out), *quick]) == 0
+    assert cli.main(['relabel', str(recording), '-o', str(out), *quick]) == 0
     (file,) = (out / 'datumaro' / 'annotations').glob('*.json')
     content = json.loads(file.read_text())
     for item in content['items']:
@@ -298,6 +298,6 @@ def test_attributes_of_another_shape_are_refused(tmp_path, capsys):
     file.write_text(json.dumps(content))
     capsys.readouterr()
     command = ['convert', str(out / 'datumaro'), '-o', str(tmp_path / 'csv'), '--from', 'datumaro']
-    assert main([*command, '--to', 'csv']) == 1
+    assert cli.main([*command, '--to', 'csv']) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert 'expected attributes as boxreg writes them' in line

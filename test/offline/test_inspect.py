@@ -4,7 +4,6 @@ import json
 import shlex
 
 from boxreg_ros.cli import main
-import numpy as np
 import pytest
 from ros_messages import Drive, SECOND, START, write_recording
 
@@ -122,28 +121,6 @@ def test_stamps_that_repeat_or_go_back_are_warnings(tmp_path, capsys):
     assert '1 clouds repeat the stamp of another one' in facts['warnings']
     assert any('before that of the one received' in line for line in facts['warnings'])
     assert facts['sample']['received_after_stamp_s'] == pytest.approx(0, abs=0.2)
-
-
-@pytest.mark.parametrize(
-    ('kind', 'unit', 'factor', 'shown'),
-    [('u4', 1e-9, 1e9, 'ns, relative'), ('f4', 1.0, 1.0, 's, relative'), (None, None, 0, '')],
-)
-def test_field_and_unit_of_point_times(tmp_path, capsys, kind, unit, factor, shown):
-    drive = Drive(sweeps=6)
-    times = np.linspace(0, 0.1, 20) * factor
-    columns = [(name, 'f4', np.arange(20.0)) for name in 'xyz']
-    if kind is not None:
-        columns.append(('t' if kind == 'u4' else 'time', kind, times))
-    for k, (topic, received, _) in enumerate(drive.items):
-        if topic == '/points':
-            cloud = drive.messages.cloud(received, 'lidar', columns)
-            drive.items[k] = (topic, received, cloud)
-    path = drive.write(tmp_path / 'drive')
-    _, facts = facts_of(capsys, path)
-    found = facts['point_times']
-    assert (found and found['unit']) == unit
-    main(['inspect', str(path)])
-    assert shown in capsys.readouterr().out
 
 
 def clear_ids(message):
