@@ -27,6 +27,9 @@ REDUCE_LOAD = (
     'compare the latencies in `/diagnostics`; lower `window`, `solver.rounds` or '
     '`sampling.points`, publish fewer boxes, or use more CPU cores (`solver.threads`)'
 )
+REDUCE_RECORDING = (
+    'record to a faster disk, fewer `record_formats`, or without clouds (`record_points:=false`)'
+)
 ENLARGE_TRANSPORT = 'see "Large clouds"'
 CHECK_TRANSFORMS = 'see "Requirements of your TF tree and stamps"'
 FAULTS = ('failed', 'qos_incompatible')
@@ -56,6 +59,17 @@ REASONS = {
     ),
     'boxes_queue_full': Reason(
         'message', 'published unchanged because the solver is slower than the data', REDUCE_LOAD
+    ),
+    'boxes_unrecorded': Reason(
+        'message',
+        'not written to the label files: the recorder, or its disk, is slower than the data; the '
+        'boxes are published as always',
+        REDUCE_RECORDING,
+    ),
+    'clouds_unrecorded': Reason(
+        'cloud',
+        'not written beside the labels: the recorder, or its disk, is slower than the data',
+        REDUCE_RECORDING,
     ),
     'points_lost': Reason('cloud', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
     'boxes_lost': Reason('message', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),

@@ -282,6 +282,14 @@ def _consistent(group: Any) -> Iterable[str]:
     return (f'{coverage:.2f} / {nees:.1f}' for coverage, nees in pairs)
 
 
+def _load(results: Any) -> Iterable[str]:
+    """Yield latency and accuracy by number of tracks, one table per way to treat overload."""
+    for policy, rows in results.items():
+        names = list(next(iter(rows.values())))
+        lines = [[tracks, *(_number(row[name]) for name in names)] for tracks, row in rows.items()]
+        yield _table([f'{policy}: tracks', *names], lines)
+
+
 def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
     for name, value in results.items():
         if isinstance(value, dict):
@@ -355,6 +363,13 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'Times in ms unless the name says otherwise. CUDA has not been run: the torch twins of\n'
         'the kernels are tested on the CPU only.',
         _figures,
+    ),
+    'load': (
+        'The live node under load',
+        'Latency from the later of cloud and boxes to the refined boxes, and mean 3D IoU of all\n'
+        'published boxes, kept ones included. With the default deadline, tracks that the solver\n'
+        'has no time for are kept; with a deadline of an hour, clouds are dropped.',
+        _load,
     ),
     'node': ('The live node', 'Publisher, node and observer each a process, over DDS.', _figures),
 }

@@ -26,7 +26,8 @@ from typing import Any
 
 from boxreg_ros.bench.common import add_json_argument, print_json
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.structures import LENGTH, ROLL, YAW
+from boxreg_ros.labels.segments import read_index
+from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
 import numpy as np
 
 PROFILE = Path(__file__).parents[1] / 'share' / 'fastdds.xml'
@@ -41,6 +42,8 @@ ROAD_SIZE = 160.0  # side of the square with the other points [m]
 BOX_ERRORS = (0.1, 0.1, 0.05, 0.1, 0.1, 0.1, 0.0, 0.0, 0.03)  # standard deviations [m, rad]
 CDR_HEADER = 4  # bytes before the first member of a serialised message
 FIRST_MARKER = 8  # bytes before the first marker: the header and the length of the list
+COMPLETION_TIME = 60.0  # for the last segment of recorded labels [s]
+RECORDING_TURNS = 2  # runs without and with recording
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
 
 
@@ -67,6 +70,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--set', action='append', default=[], metavar='KEY:=VALUE', help='parameter of the node'
     )
+    parser.add_argument(
+        '--record', metavar='FORMAT,...',
+        help='also record labels in these formats, with their clouds: runs without and with it '
+        'alternate',
+    )  # fmt: skip
     add_json_argument(parser)
     parser.add_argument('--role', choices=('publish',), help=argparse.SUPPRESS)
     parser.add_argument('--log', type=Path, help=argparse.SUPPRESS)
@@ -89,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
     if args.role:
         publish(args)
         return 0
-    report = measure(args)
+    report = measure(args) if args.record is None else compare(args)
     if args.json:
         print_json(report)
         return 0
@@ -102,8 +110,8 @@ def run(args: argparse.Namespace) -> int:
 # ---------------------------------------------------------------- process of the publisher
 
 
-def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tuple[Any, Any]:
-    """Return the points (M, 3) and noisy boxes (n, 9) of a sweep, in the sensor frame."""
+def true_boxes(args: argparse.Namespace, turn: int) -> Floats:
+    """Return the true boxes (n, 9) of a sweep, in the sensor frame."""
     side = int(np.ceil(np.sqrt(args.tracks)))
     index = np.arange(args.tracks)
     phase = 2 * np.pi * (turn / (CIRCLE_PERIOD * args.rate) + index / args.tracks)
@@ -112,9 +120,18 @@ def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tupl
     boxes[:, 1] = CAR_SPACING * (index // side - side / 2) - CIRCLE_RADIUS * np.cos(phase) + 5.0
     boxes[:, LENGTH:ROLL] = CAR_EXTENT
     boxes[:, YAW] = phase
-    local = rng.uniform(-0.5, 0.5, (args.tracks, POINTS_PER_CAR, 3))  # (n, points, xyz)
+    return boxes
+
+
+def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return the points (M, 3) and noisy boxes (n, 9) of a sweep, in the sensor frame."""
+    boxes = true_boxes(args, turn)
+    phase = boxes[:, YAW]
+    # Cars make at most half of the points, as in `boxreg bench speed`.
+    points_per_car = min(POINTS_PER_CAR, args.points // (2 * args.tracks))
+    local = rng.uniform(-0.5, 0.5, (args.tracks, points_per_car, 3))  # (n, points, xyz)
     near = -np.sign(boxes[:, :2])  # the end and the side that roughly face the sensor
-    half = POINTS_PER_CAR // 2
+    half = points_per_car // 2
     local[:, :half, 0] = 0.49 * near[:, :1]
     local[:, half:, 1] = 0.49 * near[:, 1:]
     local *= np.array(CAR_EXTENT)
@@ -220,8 +237,37 @@ def _marker_array(boxes: Any) -> Any:
 # ----------------------------------------------------------------- process of the observer
 
 
-def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """Run node and publisher, and return the report of the observer."""
+def compare(args: argparse.Namespace) -> dict[str, Any]:
+    """Measure without and with recording in turn, and return the latencies of all runs."""
+    formats = args.record
+    report: dict[str, Any] = {}
+    for turn in range(RECORDING_TURNS):
+        for args.record in (None, formats):
+            kind = 'recording' if args.record else 'not recording'
+            report |= {f'{kind} {turn + 1}: {k}': v for k, v in measure(args).items()}
+    for name in ('p50', 'p99'):
+        key = f': latency {name} [ms]'
+        sums = [
+            sum(report[f'{kind} {turn + 1}{key}'] for turn in range(RECORDING_TURNS))
+            for kind in ('recording', 'not recording')
+        ]
+        report[f'{name} with / without recording'] = sums[0] / sums[1]
+    return report
+
+
+def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str, Any]:
+    """
+    Run node and publisher, and return the report of the observer.
+
+    Parameters
+    ----------
+    args : Namespace
+        Options of `boxreg bench node`.
+    keeps_messages : bool
+        Whether the report has ``messages`` as well: for early and final boxes, each serialised
+        message by its sweep, after `STARTUP_TIME`.
+
+    """
     if args.transport == 'large':
         os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
     else:
@@ -231,8 +277,10 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     command = [sys.executable, '-m', 'boxreg_ros.cli']
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
-        arrivals = stack.enter_context(observer())
-        parameters = [part for text in args.set for part in ('-p', text)]
+        arrivals = stack.enter_context(observer(keeps_messages))
+        labels = folder / 'labels'
+        given = [*args.set, *recording_parameters(args.record, labels)]
+        parameters = [part for text in given for part in ('-p', text)]
         node = stack.enter_context(
             process([*command, 'node', '--ros-args', *parameters], folder / 'node.log')
         )
@@ -244,11 +292,13 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         load = os.getloadavg()[0]
         publisher = stack.enter_context(process([*command, *role, *options], folder / 'sent.log'))
         samples = []
+        recorder_samples = []
         while publisher.poll() is None:
             if node.poll() is not None:
                 raise BoxregError(f'the node ended: {(folder / "node.log").read_text()}')
             if arrivals['early']:
                 samples.append(vitals(node.pid))
+                recorder_samples += [vitals(child)[0] for child in children_of(node.pid)]
             time.sleep(SAMPLE_PERIOD)
         if publisher.returncode:
             raise BoxregError(f'the publisher failed: {(folder / "sent.log").read_text()}')
@@ -256,18 +306,31 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         sent = np.loadtxt(folder / 'sent', dtype=np.int64, ndmin=2)
         begin = time.monotonic()
         node.send_signal(signal.SIGINT)
-        node.wait(timeout=10.0)
+        node.wait(timeout=30.0)
         shutdown_time = time.monotonic() - begin
         time.sleep(0.5)
         log = (folder / 'node.log').read_text()
+        recorded = {} if args.record is None else recording(labels, recorder_samples)
     return {
         'load before, during': f'{load:.2f}, {os.getloadavg()[0]:.2f}',
         **results(sent, arrivals, args.rate),
         **growth(samples),
+        **recorded,
         'shutdown [s]': shutdown_time,
         'exit status': node.returncode,
         'log lines': len(log.splitlines()),
         'counters': arrivals['counters'],
+        **({'messages': _by_sweep(sent, arrivals, args.rate)} if keeps_messages else {}),
+    }
+
+
+def _by_sweep(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, dict[int, bytes]]:
+    """Return the serialised messages by the number of their sweep, after `STARTUP_TIME`."""
+    turns = {stamp_ns: turn for turn, stamp_ns in enumerate(sent[:, 0].tolist())}
+    begin = round(STARTUP_TIME * rate)
+    return {
+        name: {turns[s]: data for s, data in kept.items() if turns.get(s, -1) >= begin}
+        for name, kept in arrivals['messages'].items()
     }
 
 
@@ -313,6 +376,40 @@ def results(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, float
     return report
 
 
+def recording_parameters(formats: str | None, folder: Path) -> list[str]:
+    """Return the parameters of a node that records labels and clouds; none without formats."""
+    if formats is None:
+        return []
+    return [f'record_to:={folder}', f'record_formats:=[{formats}]', 'record_points:=true']
+
+
+def recording(folder: Path, memory: list[float]) -> dict[str, float]:
+    """
+    Return what was recorded, and the memory of the recorder.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the segments.
+    memory : list of float
+        Resident memory of the recorder every `SAMPLE_PERIOD` [MB].
+
+    """
+    deadline = time.monotonic() + COMPLETION_TIME
+    while list(folder.glob('.segment_*')) and time.monotonic() < deadline:
+        time.sleep(0.1)  # the recorder completes the last segment after the node has ended
+    rows = read_index(folder)
+    memory = memory or [0.0]
+    return {
+        'recorded box arrays': float(sum(row.frames for row in rows)),
+        'recorded clouds': float(sum(row.clouds for row in rows)),
+        'recorded segments': float(len(rows)),
+        'recorded [MB]': 1e-6 * sum(row.bytes for row in rows),
+        'recorder memory in the middle [MB]': memory[len(memory) // 2],
+        'recorder memory at the end [MB]': memory[-1],
+    }
+
+
 def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
     """
     Return memory, handles, threads and cores used by the node.
@@ -335,6 +432,11 @@ def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
         'threads': float(samples[end][2]),
         'cores used': cpu_time / SAMPLE_PERIOD / max(1, end - begin),
     }
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the processes that a process has started."""
+    return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
 def vitals(pid: int) -> tuple[float, int, int, float]:
@@ -364,15 +466,20 @@ def process(command: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @contextmanager
-def observer() -> Iterator[dict[str, Any]]:
+def observer(keeps_messages: bool = False) -> Iterator[dict[str, Any]]:
     """
     Subscribe to the outputs of the node while the context lasts.
+
+    Parameters
+    ----------
+    keeps_messages : bool
+        Whether ``messages`` are kept.
 
     Yields
     ------
     arrivals : dict
         ``early`` and ``final``: time of arrival by stamp [ns]. ``counters``: the counters of the
-        diagnostics.
+        diagnostics. ``messages``: of ``early`` and ``final``, serialised, by stamp.
 
     """
     from diagnostic_msgs.msg import DiagnosticArray
@@ -382,10 +489,14 @@ def observer() -> Iterator[dict[str, Any]]:
     from visualization_msgs.msg import MarkerArray
 
     arrivals: dict[str, Any] = {'early': {}, 'final': {}, 'counters': {}}
+    arrivals['messages'] = {'early': {}, 'final': {}}
 
     def add_arrival(name: str, data: bytes) -> None:
         sec, nanosec = struct.unpack_from('<iI', data, FIRST_MARKER)
-        arrivals[name].setdefault(sec * 10**9 + nanosec, time.monotonic_ns())
+        stamp_ns = sec * 10**9 + nanosec
+        arrivals[name].setdefault(stamp_ns, time.monotonic_ns())
+        if keeps_messages:
+            arrivals['messages'][name].setdefault(stamp_ns, data)
 
     def add_counters(message: DiagnosticArray) -> None:
         for item in message.status[0].values:

@@ -27,8 +27,13 @@ GREEN = (0.1, 0.8, 0.3, 0.45)
 ORANGE = (1.0, 0.6, 0.1, 0.45)
 BLUE = (0.2, 0.5, 1.0, 0.6)
 WHITE = (1.0, 1.0, 1.0, 1.0)
-NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
+RED = (0.9, 0.1, 0.1, 1.0)
+BOX_NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
+RECORDING = 'recording'
+NAMESPACES = (*BOX_NAMESPACES, RECORDING)
 DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
+TEXT_HEIGHT = 3.0
+"""Height of the state of the recording above the sensor [m]; chosen."""
 ARROW, CUBE, SPHERE, TEXT = 0, 1, 2, 9
 ADD, DELETE, DELETEALL = 0, 2, 3
 
@@ -99,7 +104,7 @@ class MarkerBoard:
         markers += [
             m.Marker(header=header, ns=ns, id=number, action=DELETE)
             for number in gone
-            for ns in NAMESPACES
+            for ns in BOX_NAMESPACES
         ]
         return m.MarkerArray(markers=markers)
 
@@ -163,6 +168,19 @@ def _pose(m: Any, position: Floats, quaternion_xyzw: Floats) -> Any:
     return m.Pose(
         position=m.Point(x=x, y=y, z=z), orientation=m.Quaternion(x=qx, y=qy, z=qz, w=qw)
     )
+
+
+def text_marker(frame_id: str, text: str, is_error: bool) -> Any:
+    """Return the state of the recording as text above the sensor; an empty text deletes it."""
+    m = ros_messages()
+    above = np.array([0.0, 0.0, TEXT_HEIGHT])
+    marker = m.Marker(
+        header=m.Header(frame_id=frame_id),
+        ns=RECORDING, type=TEXT, action=ADD if text else DELETE,
+        pose=_pose(m, above, np.array([0.0, 0.0, 0.0, 1.0])), scale=m.Vector3(z=0.8),
+        color=_colour(m, RED if is_error else WHITE), text=text, frame_locked=True,
+    )  # fmt: skip
+    return m.MarkerArray(markers=[marker])
 
 
 def _plain(values: Floats) -> Iterator[float]:

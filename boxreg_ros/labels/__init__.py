@@ -6,6 +6,7 @@ To add a format, write a module with ``FORMAT``, ``Writer`` and, where files can
 
 """
 
+from boxreg_ros.labels.output import LabelOutput
 from boxreg_ros.labels.protocol import (
     Format,
     LabelFrame,
@@ -32,6 +33,7 @@ __all__ = [
     'frames_of',
     'is_written',
     'LabelFrame',
+    'LabelOutput',
     'LabelWriter',
     'module_of',
     'Options',

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import cast
 
@@ -18,6 +19,7 @@ from boxreg_ros.labels.protocol import (
     SceneFrames,
     SceneModule,
 )
+from boxreg_ros.labels.segments import segments_of
 
 FORMATS = {
     'csv': 'boxreg_ros.labels.csv',
@@ -117,7 +119,7 @@ def is_written(name: str, out: Path) -> bool:
 
 def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterator[LabelFrame]:
     """
-    Yield the frames of a label file or folder.
+    Yield the frames of a label file or folder, or of all segments of a recording of labels.
 
     Boxes whose file states no status or covariance have the status ``input`` and the unit
     matrix.
@@ -147,7 +149,11 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
         raise RecordingError(f'labels {str(path)!r}: no such file or folder')
     if scene is not None and hasattr(module, 'read_scene'):
         return cast(SceneModule, module).read_scene(path, scene)
-    return cast(ReadableModule, module).read(path)
+    read = cast(ReadableModule, module).read
+    segments = segments_of(path)
+    if not segments:
+        return read(path)
+    return chain.from_iterable(read(_folder_of(name, segment)) for segment in segments)
 
 
 def _imported(name: str) -> FormatModule:

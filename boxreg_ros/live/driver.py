@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.session import (
     covariances_to_write,
@@ -21,6 +22,7 @@ from boxreg_ros.io.session import (
 )
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.live.budget import TickBudget
+from boxreg_ros.live.label_tap import LabelTap, Part
 from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -145,6 +147,8 @@ class LiveRegistrar:
         Reads and writes the boxes; to be set before the first of them.
     output_frame, transform_timeout
         As above; may change.
+    tap : LabelTap
+        Records labels, once it has a recorder.
 
     """
 
@@ -166,6 +170,7 @@ class LiveRegistrar:
         self.placement = SensorPlacement(lidars)
         self._unknown_frames: set[str] = set()  # of LiDARs; not waited for
         self._session = Session(convention, config, fixed_frame, self.placement, trouble)
+        self.tap = LabelTap(self._session)
         self._registrar = BoxRegistrar(config)
         if budget is not None:
             self._registrar = BoxRegistrar(config, budget.submit, budget.windows)
@@ -292,13 +297,15 @@ class LiveRegistrar:
                 self._note_unknown(content)
                 return []
             assert isinstance(moved, Sweep)
-            return self._register(self._session.merged(moved))
+            assert admitted.T_fixed_item is not None
+            part = Part(item.message, content, admitted.T_fixed_item)
+            return self._register(self._session.merged(moved, part))
         if moved is not None:
             assert isinstance(moved, BoxArray) and admitted.T_fixed_item is not None
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
         ready = self._outgoing(register(self._registrar, moved, restarts=False))
         if moved is None:
-            ready += self.passed_through(item.message)
+            ready += self.passed_through(item.message, 'no_transform')
         return ready
 
     def _note_unknown(self, sweep: Sweep) -> None:
@@ -309,7 +316,8 @@ class LiveRegistrar:
     def _register(self, complete: list[MergedSweep]) -> list[Outgoing]:
         """Register sweeps; return the messages that are ready to be published."""
         ready: list[Outgoing] = []
-        for sweep, _ in complete:
+        for sweep, parts in complete:
+            self.tap.add_cloud(sweep, [part for part in parts if part is not None])
             ready += self._outgoing(register(self._registrar, sweep, restarts=False))
         return ready
 
@@ -393,6 +401,7 @@ class LiveRegistrar:
         self._session.restart()
         held = list(self._held)
         self._held.clear()
+        self.tap.keep_all('failed')
         ready = self._made
         self._made = []
         for waiting in held:
@@ -401,15 +410,28 @@ class LiveRegistrar:
             ready += self.last(waiting.message)
         is_held = item is None or any(waiting.message is item.message for waiting in held)
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
-            ready += self.passed_through(item.message)
+            ready += self.passed_through(item.message, 'failed')
         return ready
 
-    def passed_through(self, message: Any) -> list[Outgoing]:
+    def passed_through(self, message: Any, reason: str = '') -> list[Outgoing]:
         """Return an input message as early boxes and, once those before it are, as final."""
-        return [Outgoing(message, False), *self.last(message)]
+        return [Outgoing(message, False), *self.last(message, reason)]
 
-    def last(self, message: Any) -> list[Outgoing]:
-        """Return an input message as final boxes, or hold it behind those before it."""
+    def last(self, message: Any, reason: str = '') -> list[Outgoing]:
+        """
+        Return an input message as final boxes, or hold it behind those before it.
+
+        Parameters
+        ----------
+        message : message
+            As it was received.
+        reason : str
+            Reason for its boxes to be kept, in label files; empty: they are in no label file.
+
+        """
+        if reason and self.adapter is not None:
+            with suppress(UnsupportedMessage):
+                self.tap.add_kept(self.adapter.from_msg(message), reason)
         if not self._held:
             return [Outgoing(message, True)]
         self._held.append(_Passing(message))
@@ -448,6 +470,7 @@ class LiveRegistrar:
             T_output_fixed, T_output_item, moved.track_ids != content.track_ids,
         )  # fmt: skip
         self._held.append(pending)
+        self.tap.expect(pending, moved, T_fixed_item)
         return replace(moved, ticket=pending)
 
     def _changes_frame(self, content: Sweep | BoxArray) -> bool:
@@ -462,6 +485,7 @@ class LiveRegistrar:
             assert isinstance(pending, _Pending)
             self._made.append(self._message_of(refined, pending))
             pending.is_early_out = True
+            self.tap.take(refined)
             if refined.is_final:
                 self._held.remove(pending)
                 self._release_passing()

@@ -84,13 +84,29 @@ NODE_SETTINGS = (
     Setting(
         'config_file', 'boxreg_node.yaml', 'file that ~/save_config writes all parameters to'
     ),
+    Setting(
+        'record_to', '',
+        'folder to write the final boxes to as label files while driving; empty: none are written',
+    ),
+    Setting(
+        'record_formats', ('csv', 'openlabel'),
+        'label formats to record, see `boxreg formats`; csv is always written',
+    ),
+    Setting('record_points', False, 'record the clouds that the formats need, too'),
+    Setting(
+        'record_segment', '60 s',
+        'length of a segment of label files: a number with the unit s, min, h, MB or GB',
+    ),
+    Setting(
+        'record_camera', '', 'calibration file, for recorded formats in the frame of a camera'
+    ),
 )  # fmt: skip
 """Options of the node beside `Config`; `config.NODE_OPTIONS` holds their names."""
 
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
     *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
-    *('config_file',),
+    *('config_file', 'record_'),
 )
 """Prefixes of the parameters that may change while the node runs."""
 READ_ONLY = 'read-only: windows, threads or subscriptions are built from it at start-up'
@@ -117,6 +133,11 @@ class NodeOptions(NamedTuple):
     deadline: float
     backlog: float
     config_file: str
+    record_to: str
+    record_formats: tuple[str, ...]
+    record_points: bool
+    record_segment: str
+    record_camera: str
 
     @property
     def convention(self) -> Convention:
@@ -239,6 +260,46 @@ def parameters_yaml(config: Config, options: NodeOptions | None = None) -> str:
         if item.name != 'estimate':
             lines.append(_yaml_line(item, '      ' if group else '    ', name, value))
     return '\n'.join(lines) + '\n'
+
+
+def parameters_schema() -> dict[str, Any]:
+    """Return the JSON schema of a ROS parameter file of the node, such as `params.yaml`."""
+    values: dict[str, Any] = {'use_sim_time': {'type': 'boolean'}, 'qos_overrides': {}}
+    for item in (*NODE_SETTINGS, *settings()):
+        group, _, name = item.name.rpartition('.')
+        target = values
+        if group:
+            target = values.setdefault(group, _object_schema({}))['properties']
+        target[name] = _schema_of(item)
+    parameters = _object_schema({'ros__parameters': _object_schema(values)})
+    return {
+        '$schema': 'http://json-schema.org/draft-07/schema#',
+        'title': 'Parameters of boxreg_node',
+        'type': 'object',
+        'additionalProperties': parameters,  # by the name of the node, or /** for any
+    }
+
+
+def _object_schema(properties: dict[str, Any]) -> dict[str, Any]:
+    return {'type': 'object', 'properties': properties, 'additionalProperties': False}
+
+
+def _schema_of(item: Setting) -> dict[str, Any]:
+    """Return the JSON schema of one setting: type, default, meaning and bounds."""
+    names = {bool: 'boolean', int: 'integer', float: 'number', str: 'string', tuple: 'array'}
+    unit = f' [{item.unit}]' if item.unit else ''
+    schema = {
+        'type': names[type(item.default)],
+        'default': _plain(item.default),
+        'description': f'{item.meaning}{unit}',
+    }
+    if isinstance(item.default, tuple):
+        schema['items'] = {'type': 'string'}
+    if item.choices:
+        schema['enum'] = list(item.choices)
+    if item.low is not None:
+        schema |= {'minimum': item.low, 'maximum': item.high}
+    return schema
 
 
 def describe(item: Setting) -> ParameterDescriptor:

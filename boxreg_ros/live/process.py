@@ -7,9 +7,11 @@ from collections.abc import Callable
 from functools import partial
 import os
 import signal
+import sys
 from threading import Event, Thread
 import time
 
+from boxreg_ros.live.lifecycle import BoxregLifecycleNode
 from boxreg_ros.live.node import BoxregNode
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -19,10 +21,18 @@ from rclpy.utilities import remove_ros_args
 ENDING_TIME = 0.9
 """Time the threads have to end after a signal: 0.5 s to solve, 0.4 s for acknowledgements [s]."""
 
+RECORDING_TIME = 3.0
+"""
+Wait for the last segment of recorded labels [s].
 
-def make_node(program: str, arguments: list[str]) -> BoxregNode:
+The recorder completes it in any case; launch files send SIGTERM after 5 s.
+
+"""
+
+
+def make_node(program: str, arguments: list[str], is_managed: bool = False) -> BoxregNode:
     """
-    Initialise ROS and return the node.
+    Initialise ROS and return the node: open, or unconfigured if it is managed.
 
     Parameters
     ----------
@@ -30,6 +40,8 @@ def make_node(program: str, arguments: list[str]) -> BoxregNode:
         Name of the program, for its help text.
     arguments : list of str
         Its arguments, those of ROS included.
+    is_managed : bool
+        Whether it is a lifecycle node, which waits for its transitions.
 
     Raises
     ------
@@ -42,7 +54,12 @@ def make_node(program: str, arguments: list[str]) -> BoxregNode:
         program, description='Refine boxes live. Parameters: --ros-args -p NAME:=VALUE ...'
     )
     parser.parse_args(remove_ros_args(arguments))
-    return BoxregNode()
+    if is_managed:
+        return BoxregLifecycleNode()
+    node = BoxregNode()
+    node.configure()
+    node.open()
+    return node
 
 
 def run(node: BoxregNode) -> list[Exception]:
@@ -59,7 +76,7 @@ def run(node: BoxregNode) -> list[Exception]:
     executor.add_node(node)
     stop = Event()
     failures: list[Exception] = []
-    tasks: list[Callable[[], None]] = [partial(_spin, executor, stop), node.worker.run]
+    tasks: list[Callable[[], None]] = [partial(_spin, executor, stop), node.run_worker]
     threads = [
         Thread(target=_run_task, args=(task, failures, ask_end), daemon=True) for task in tasks
     ]
@@ -68,7 +85,7 @@ def run(node: BoxregNode) -> list[Exception]:
     os.read(end_asked, 1)
     # `Executor.shutdown` would destroy entities that its thread may be about to wait for.
     executor.create_task(stop.set)
-    node.worker.stop()
+    node.stop_worker()
     end = time.monotonic() + ENDING_TIME
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()))
@@ -77,6 +94,10 @@ def run(node: BoxregNode) -> list[Exception]:
     else:
         node.destroy_node()
         shut_down()
+    if not node.recording.wait(RECORDING_TIME):
+        print(
+            f'the recorder completes the last segment in {node.recording.folder}', file=sys.stderr
+        )
     return failures
 
 

@@ -33,6 +33,8 @@ IDLE_PERIOD = 1.0
 """Longest pause while nothing is held [s]."""
 BOXES_PATIENCE = 10.0
 """Boxes wait for the solver this many times longer than clouds before they pass through."""
+NO_TIME = 'boxes_queue_full'
+"""Reason of boxes that the solver has no time for."""
 ACKNOWLEDGEMENT_TIME = 0.4
 """Wait at shutdown for subscribers to acknowledge the last messages, over all publishers [s]."""
 
@@ -174,7 +176,7 @@ class Worker:
         if message is None:
             return
         if message.topic == 'passing':
-            self._publish(self._live.last(message.content))
+            self._publish(self._live.last(message.content, NO_TIME))
         elif self._is_overdue(message):
             self.drop(message)
         else:
@@ -256,6 +258,10 @@ class Worker:
                 self._publish(self._guarded(partial(self._live.lose, *content)))
             elif kind == 'reset':
                 self._publish(self._guarded(self._live.reset))
+            elif kind == 'record':
+                self._live.tap.start(content)
+            elif kind == 'end_recording':
+                self._live.tap.finish()
             elif kind == 'settings':
                 self._live.config, options = content
                 self._live.output_frame = options.output_frame.lstrip('/')
@@ -318,14 +324,15 @@ class Worker:
         self._publish(self._guarded(self._live.flush))
         for waiting in (item, *self._confirmed, *self._live.release()):
             if waiting is not None and not isinstance(waiting.content, Sweep):
-                self._publish(self._live.passed_through(waiting.message))
+                self._publish(self._live.passed_through(waiting.message, NO_TIME))
         message = self._inbox.take()
         while message is not None:
             if message.topic == 'boxes':
-                self._publish(self._live.passed_through(message.content))
+                self._publish(self._live.passed_through(message.content, NO_TIME))
             elif message.topic == 'passing':
-                self._publish(self._live.last(message.content))
+                self._publish(self._live.last(message.content, NO_TIME))
             message = self._inbox.take()
+        self._live.tap.finish()
         self._markers.publish(self._board.clear())
         publishers = [p for p in (self._early, self._final, self._markers) if p is not None]
         for publisher in publishers:

@@ -11,9 +11,10 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.batch_report import write_batch_report
 from boxreg_ros.offline.job import Job, JOB_FAILED
-from boxreg_ros.offline.result_folder import SUMMARY, written_whole
+from boxreg_ros.offline.result_folder import SUMMARY
 
 COUNTS = ('sweeps', 'boxes_in', 'refined', 'kept', 'damages')
 COLUMNS = (

@@ -25,8 +25,8 @@ from boxreg_ros.labels import (
     Provenance,
     writer_for,
 )
+from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.arguments import add_label_arguments
-from boxreg_ros.offline.cloud_spool import Spool
 from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
 from boxreg_ros.offline.result_folder import SUMMARY, whole_folder
 from boxreg_ros.offline.sources import source_of

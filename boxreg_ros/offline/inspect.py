@@ -150,14 +150,12 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
 
 def _scenes(paths: list[Path]) -> list[str]:
     """Return the addresses of all scenes of a data set, if none of several is named."""
-    from boxreg_ros.datasets import scene_names
+    from boxreg_ros.datasets import all_scenes
     from boxreg_ros.offline.sources import scene_address
 
     address = scene_address(paths)
-    if address is None or address.scene:
-        return []
-    names = scene_names(address)
-    return [str(address._replace(scene=name)) for name in names] if len(names) > 1 else []
+    found = [] if address is None else all_scenes(address)
+    return [str(scene) for scene in found] if len(found) > 1 else []
 
 
 def _scene_contents(paths: list[Path]) -> dict[str, Any]:

@@ -14,8 +14,9 @@ import sys
 import time
 from typing import Any
 
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.job import Job, JOB_DONE, JOB_FAILED, UP_TO_DATE
-from boxreg_ros.offline.result_folder import delete_remains, earlier_summary, written_whole
+from boxreg_ros.offline.result_folder import delete_remains, earlier_summary
 
 JOBS = 'jobs'
 """Folder with the key and the log of each job."""

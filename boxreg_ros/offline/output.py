@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from bisect import insort
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.labels import LabelFrame, Provenance, writer_for
-from boxreg_ros.offline.cloud_spool import Spool
+from boxreg_ros.io.stamp_order import kept, Slot, StampOrder
+from boxreg_ros.labels import LabelFrame, LabelOutput, Provenance
+from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.reader import ReadItem, Source
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
@@ -18,32 +18,12 @@ from boxreg_ros.review.decisions import Corrections, read_decisions
 from boxreg_ros.structures import (
     ADDED,
     BoxArray,
-    Floats,
-    KEPT,
     REFINED,
     RefinedBoxes,
-    REJECTED,
     Sweep,
     YAW,
 )
 import numpy as np
-
-WITH_REJECTED = ('csv', 'mcap')
-"""Formats that hold every box of the input; the messages of an overlay are those of the input."""
-
-
-@dataclass(eq=False, slots=True)
-class _Slot:
-    """The place of one box array in the output."""
-
-    boxes: BoxArray
-    T_fixed_sensor: Floats | None
-    T_fixed_boxes: Floats | None
-    result: RefinedBoxes | None = None
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.boxes.stamp_ns
 
 
 class Sink:
@@ -102,9 +82,7 @@ class Sink:
         recording = request.recording()
         bags = recording if isinstance(recording, Recording) else None
         options = replace(request.options, recording=bags)
-        self._writers = {
-            name: writer_for(name, folder, provenance, options) for name in request.all_formats
-        }
+        self._output = LabelOutput(folder, request.formats, provenance, options)
         self.corrections = Corrections(
             read_decisions(request.decisions) if request.decisions is not None else ()
         )
@@ -114,8 +92,7 @@ class Sink:
 
         self.changes = Changes(self._fixed_frame)
         self.points = PointCollector(request.config) if request.report else None
-        self._by_stamp: list[_Slot] = []  # not yet written
-        self._by_ticket: dict[object, _Slot] = {}  # without a result
+        self._order = StampOrder()
         self._last_ticket = 0
         self.boxes_in = 0
         self.boxes_out = 0
@@ -149,15 +126,12 @@ class Sink:
         """Take results of the registrar; write arrays up to the first one without a result."""
         for refined in ready:
             if refined.is_final or self._writes_early:
-                slot = self._by_ticket.pop(refined.boxes.ticket, None)
+                ticket = refined.boxes.ticket
+                slot = self._order.waiting_for(ticket)
                 if slot is not None:  # otherwise its early result has been taken
-                    slot.result = self.corrections.apply(slot.boxes, refined)
-        while self._by_stamp:
-            first = self._by_stamp[0]
-            if first.result is None:
-                return
-            del self._by_stamp[0]
-            self._put(first.result, first)
+                    self._order.take(ticket, self.corrections.apply(slot.boxes, refined))
+        for slot, result in self._order.ready():
+            self._put(result, slot)
 
     def __enter__(self) -> Sink:
         """Return the sink."""
@@ -170,15 +144,13 @@ class Sink:
         if self.points is not None:
             self.points.flush()
         with self._clock('write'):
-            for writer in self._writers.values():
-                writer.close()
+            self._output.close()
             if self._spool is not None:
                 self._spool.remove()
 
     def left_out(self) -> dict[str, dict[str, int]]:
         """Return the number of boxes that a format cannot represent, by format and reason."""
-        counts = {name: dict(+writer.dropped) for name, writer in self._writers.items()}
-        return {name: dropped for name, dropped in counts.items() if dropped}
+        return self._output.left_out()
 
     def missing(self) -> int:
         """Return the number of input boxes that have not been written."""
@@ -201,19 +173,17 @@ class Sink:
             if not self._config.knows_class(name):
                 self.unknown_classes[name] += 1
         if isinstance(item.moved, BoxArray):
-            slot = _Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
+            slot = Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
             self._last_ticket += 1
-            self._by_ticket[self._last_ticket] = slot
+            self._order.expect(slot, self._last_ticket)
             moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
             item = item._replace(moved=moved)
         elif count:
-            slot = _Slot(given, item.T_fixed_sensor, item.T_fixed_given, _kept(given))
-        else:
-            return item
-        insort(self._by_stamp, slot, key=lambda slot: slot.stamp_ns)
+            result = kept(given, 'no_transform')
+            self._order.expect(Slot(given, item.T_fixed_sensor, item.T_fixed_given, result))
         return item
 
-    def _put(self, refined: RefinedBoxes, slot: _Slot) -> None:
+    def _put(self, refined: RefinedBoxes, slot: Slot) -> None:
         """Count the boxes of one array and write them in all formats."""
         self.boxes_out += len(refined.status)
         self.status.update(refined.status)
@@ -221,40 +191,18 @@ class Sink:
         self.heading_flips += _heading_flips(slot.boxes, refined)
         self.changes.add(slot.boxes, refined)
         with self._clock('write'):
-            frame = self._frame(refined, slot)
-            accepted = replace(frame, refined=_accepted(refined))
-            for name, writer in self._writers.items():
-                writer.write(frame if name in WITH_REJECTED else accepted)
+            self._output.write(self._frame(refined, slot))
 
-    def _frame(self, refined: RefinedBoxes, slot: _Slot) -> LabelFrame:
+    def _frame(self, refined: RefinedBoxes, slot: Slot) -> LabelFrame:
         """Return all that label writers need about one array, its cloud included."""
-        sweep = intensities = None
-        if self._spool is not None:
-            if slot.T_fixed_sensor is not None:
-                sweep, intensities = self._spool.take(
-                    slot.stamp_ns, self._sensor_frame, slot.T_fixed_sensor
-                )
-            self.without_cloud += sweep is None
-        return LabelFrame(
-            refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor, sweep,
-            intensities, slot.T_fixed_boxes,
+        frame = LabelFrame(
+            refined, self._fixed_frame, self._sensor_frame, slot.T_fixed_sensor,
+            T_fixed_given=slot.T_fixed_boxes,
         )  # fmt: skip
-
-
-def _kept(boxes: BoxArray) -> RefinedBoxes:
-    """Return the result of boxes in a frame that no transform connects with the fixed frame."""
-    n = len(boxes.track_ids)
-    unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
-    reasons = ('no_transform',) * n
-    return RefinedBoxes(boxes, (KEPT,) * n, reasons, np.zeros(n, np.int64), unknown)
-
-
-def _accepted(refined: RefinedBoxes) -> RefinedBoxes:
-    """Return a result without the rejected boxes."""
-    if REJECTED not in refined.status:
-        return refined
-    rows = [row for row, status in enumerate(refined.status) if status != REJECTED]
-    return refined.take(rows)
+        if self._spool is not None:
+            frame = self._spool.with_cloud(frame)
+            self.without_cloud += frame.sweep is None
+        return frame
 
 
 def _heading_flips(boxes: BoxArray, refined: RefinedBoxes) -> int:

@@ -10,13 +10,12 @@ import json
 import os
 from pathlib import Path
 import shutil
-from typing import Any, TextIO
+from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.whole_files import DISK_ERRORS
 
-DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-"""Disk full, file larger than the limit of the process, quota used up."""
 REFUSED_ERRORS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
 """No permission, read-only file system, a file where a folder is needed."""
 SUMMARY = 'summary.json'
@@ -137,18 +136,6 @@ def delete_remains(out: Path) -> None:
     whole = out.resolve()
     for remains in whole.parent.glob(f'.{escape(whole.name)}.*.partial'):
         shutil.rmtree(remains, ignore_errors=True)
-
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[TextIO]:
-    """Yield a file that replaces `path` on success and is deleted on failure."""
-    partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
-    try:
-        with partial.open('w', encoding='utf-8', newline='') as file:
-            yield file
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _check_replaceable(out: Path) -> None:

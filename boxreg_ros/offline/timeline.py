@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.offline.result_folder import written_whole
+from boxreg_ros.io.whole_files import written_whole
 
 MAX_PARTS = 500
 """Parts of a line that a picture of 1,000 pixels can show."""

@@ -9,7 +9,7 @@ from threading import Event, Thread
 import time
 
 from boxreg_ros.config import Config, settings
-from boxreg_ros.io.markers import MarkerBoard, NAMESPACES
+from boxreg_ros.io.markers import BOX_NAMESPACES, MarkerBoard
 from boxreg_ros.live.topics import import_message
 from boxreg_ros.offline.calibrate import calibrated, GAPS, Measured, write_settings
 from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
@@ -88,7 +88,7 @@ def test_odometry_replaces_tf(graph, tmp_path):
     array = markers.from_msg(early[-1])
     assert array.frame_id == 'lidar' and array.track_ids == ('1',)
     added = [{m.ns for m in message.markers if m.action == 0} for message in shown[:6]]
-    assert added == [set(NAMESPACES)] * 6
+    assert added == [set(BOX_NAMESPACES)] * 6
     colours = {(m.ns, m.color.g) for m in shown[3].markers if m.ns in ('input', 'refined')}
     assert len({green for _, green in colours}) == 2
     numbers = {m.text: m.id for m in shown[3].markers if m.ns == 'id'}
@@ -457,6 +457,8 @@ def refused(tmp_path_factory):
         'device': ['--ros-args', '-p', 'device:=abacus'],
         'file': ['--ros-args', '--params-file', 'missing.yaml'],
         'qos': ['--ros-args', '-p', 'qos_overrides./points.subscription.depth:=deep'],
+        'depth': ['--ros-args', '-p', 'qos_overrides./points.subscription.depth:=-1'],
+        'deadline': ['--ros-args', '-p', 'deadline:=0'],
         'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
     }
     started = {
@@ -481,6 +483,8 @@ def refused(tmp_path_factory):
         ('device', 2, ('device', 'abacus', 'cpu')),
         ('file', 2, ('missing.yaml',)),
         ('qos', 2, ('qos_overrides./points.subscription', 'depth')),
+        ('depth', 2, ('qos_overrides./points.subscription.depth', 'expected 1 to', 'got -1')),
+        ('deadline', 2, ('deadline', 'more than 0 s', 'got 0')),
         ('list', 2, ('vehicle.names', "['']")),
     ],
 )
@@ -518,7 +522,7 @@ def test_markers_keep_one_id_per_track():
     second = board.update(given, refined_of(given, KEPT, KEPT)).markers
     assert {m.id for m in second if m.action == 0} == {1}
     assert {(m.ns, m.id) for m in second if m.action == 2} == {
-        (ns, number) for ns in NAMESPACES for number in (0, 2, 3)
+        (ns, number) for ns in BOX_NAMESPACES for number in (0, 2, 3)
     }
     assert len(board.update(given, refined_of(given, KEPT, KEPT)).markers) == 5
     assert board.is_showing and board.clear() and not board.is_showing

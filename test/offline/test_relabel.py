@@ -14,7 +14,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import input_boxes
 from boxreg_ros.labels import Options
-from boxreg_ros.offline.cloud_spool import Spool
+from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.convert import Conversion, convert
 from boxreg_ros.offline.relabel import closing_line, notes, relabel, Request
 from boxreg_ros.offline.sources import source_of

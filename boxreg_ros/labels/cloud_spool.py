@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from bisect import bisect_left, insort
+from dataclasses import replace
 from pathlib import Path
 import shutil
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import inverse, sweep_to_frame
+from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.structures import Floats, Sweep
 import numpy as np
 
@@ -80,7 +82,7 @@ class Spool:
             None where the cloud has none.
 
         """
-        self._delete_before(stamp_ns - self._max_offset_ns)
+        self.delete_before(stamp_ns)
         nearest = min(self._stamps, key=lambda stamp: abs(stamp - stamp_ns), default=None)
         if nearest is None or abs(nearest - stamp_ns) > self._max_offset_ns:
             return None, None
@@ -92,12 +94,22 @@ class Spool:
             sweep = sweep_to_frame(sweep, inverse(T_fixed_frame) @ T_fixed_sweep, frame_id)
         return sweep, intensities
 
+    def with_cloud(self, frame: LabelFrame) -> LabelFrame:
+        """Return a frame with the cloud nearest to its stamp; as it is where there is none."""
+        T_fixed_sensor = frame.T_fixed_sensor
+        if T_fixed_sensor is None:
+            return frame
+        stamp_ns = frame.refined.boxes.stamp_ns
+        sweep, intensities = self.take(stamp_ns, frame.sensor_frame, T_fixed_sensor)
+        return replace(frame, sweep=sweep, intensities=intensities)
+
     def remove(self) -> None:
         """Delete the folder with the clouds that are left."""
         shutil.rmtree(self._folder)
 
-    def _delete_before(self, oldest_ns: int) -> None:
-        first = bisect_left(self._stamps, oldest_ns)
+    def delete_before(self, stamp_ns: int) -> None:
+        """Delete the clouds that are too old for boxes of a stamp [ns] and of all later ones."""
+        first = bisect_left(self._stamps, stamp_ns - self._max_offset_ns)
         for stamp_ns in self._stamps[:first]:
             self._file(stamp_ns).unlink()
             del self._frames[stamp_ns]

@@ -1,0 +1,143 @@
+"""
+What the live node sends to the recorder, a process of its own that writes the label files.
+
+The node starts ``python -m boxreg_ros.recorder.main`` and writes pickled objects of these classes
+to its standard input: `RecorderSettings` first, the end of the input last. The recorder writes
+`Status` to its standard output, one JSON object per line.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+import json
+from typing import NamedTuple
+
+from boxreg_ros.config import Config
+from boxreg_ros.structures import Floats, RefinedBoxes, Sweep
+
+PROGRAM = 'boxreg_ros.recorder.main'
+"""Module that the node runs; it is named here because the node does not import it."""
+
+
+class RecorderSettings(NamedTuple):
+    """
+    Settings of one recording of labels.
+
+    Attributes
+    ----------
+    folder : str
+        Absolute path of the folder of the segments.
+    formats : tuple of str
+        Label formats; ``csv`` is always written.
+    with_points : bool
+        Also write the clouds.
+    segment : str
+        Length of a segment: a number with the unit s, min, h, MB or GB.
+    camera : str
+        Path of a calibration file, for formats in a camera frame; empty for none.
+    config : Config
+        Settings of the core.
+
+    """
+
+    folder: str
+    formats: tuple[str, ...]
+    with_points: bool
+    segment: str
+    camera: str
+    config: Config
+
+
+class Cloud(NamedTuple):
+    """
+    A cloud that label files may need.
+
+    Attributes
+    ----------
+    sweep : Sweep
+        Points in the frame of the sensor.
+    T_fixed_sweep : array, shape (4, 4)
+        Pose of that frame at the stamp.
+    intensities : array, shape (M,), or None
+        One value per point.
+    needed_from_ns : int
+        No further boxes have a smaller stamp [ns], except those that are late.
+
+    """
+
+    sweep: Sweep
+    T_fixed_sweep: Floats
+    intensities: Floats | None
+    needed_from_ns: int
+
+
+class FinalBoxes(NamedTuple):
+    """Final boxes of one array, in the order of stamps; attributes as of `labels.LabelFrame`."""
+
+    refined: RefinedBoxes
+    fixed_frame: str
+    sensor_frame: str
+    T_fixed_sensor: Floats | None
+    T_fixed_given: Floats | None
+
+
+class Split(NamedTuple):
+    """End the open segment; the next boxes start another."""
+
+
+class Tick(NamedTuple):
+    """Nothing to write; sent once a second, so that the status stays up to date."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """
+    State of the recorder.
+
+    Attributes
+    ----------
+    segment : str
+        Name of the open segment; empty while there is none.
+    segments : int
+        Segments completed since the start.
+    frames, boxes, clouds : int
+        Written since the start.
+    bytes : int
+        Size of the label files written since the start.
+    rate : float
+        Growth of these files over the last seconds [bytes/s].
+    free : int
+        Room on the disk [bytes].
+    recovered : int
+        Segments recovered from the journals of earlier recordings.
+    without_cloud : int
+        Frames without a cloud, where clouds are written.
+    left_out : int
+        Boxes that a format cannot represent, summed over formats.
+    error : str
+        Reason why the recording ended; empty for none.
+
+    """
+
+    segment: str = ''
+    segments: int = 0
+    frames: int = 0
+    boxes: int = 0
+    clouds: int = 0
+    bytes: int = 0
+    rate: float = 0.0
+    free: int = 0
+    recovered: int = 0
+    without_cloud: int = 0
+    left_out: int = 0
+    error: str = ''
+
+    def line(self) -> str:
+        """Return the status as a line of JSON."""
+        return json.dumps(asdict(self)) + '\n'
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Return for how long the disk has room at this rate [s]; None while it is unknown."""
+        return self.free / self.rate if self.rate > 0 else None

@@ -1,0 +1,73 @@
+"""Label files of one drive in several formats, written by `boxreg relabel` and by the recorder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.registry import writer_for
+from boxreg_ros.structures import RefinedBoxes, REJECTED
+
+WITH_REJECTED = ('csv', 'mcap')
+"""Formats that hold every box of the input; the messages of an overlay are those of the input."""
+
+
+class LabelOutput:
+    """
+    Write each frame in every format.
+
+    Parameters
+    ----------
+    folder : Path
+        Exists; ``boxes.csv`` and one folder per other format are written into it.
+    formats : sequence of str
+        Formats to write; ``csv`` is always written.
+    provenance : Provenance
+        Origin of the labels.
+    options : Options
+        Settings of the formats.
+
+    Raises
+    ------
+    ConfigError
+        As `writer_for`.
+
+    """
+
+    def __init__(
+        self, folder: Path, formats: Sequence[str], provenance: Provenance, options: Options
+    ) -> None:
+        self._writers = {
+            name: writer_for(name, folder, provenance, options) for name in with_csv(formats)
+        }
+
+    def write(self, frame: LabelFrame) -> None:
+        """Add the boxes of one stamp to every format."""
+        accepted = replace(frame, refined=_accepted(frame.refined))
+        for name, writer in self._writers.items():
+            writer.write(frame if name in WITH_REJECTED else accepted)
+
+    def close(self) -> None:
+        """Complete the files."""
+        for writer in self._writers.values():
+            writer.close()
+
+    def left_out(self) -> dict[str, dict[str, int]]:
+        """Return the number of boxes that a format cannot represent, by format and reason."""
+        counts = {name: dict(+writer.dropped) for name, writer in self._writers.items()}
+        return {name: dropped for name, dropped in counts.items() if dropped}
+
+
+def with_csv(formats: Sequence[str]) -> tuple[str, ...]:
+    """Return the formats to write, each once, ``csv`` first."""
+    return tuple(dict.fromkeys(('csv', *formats)))
+
+
+def _accepted(refined: RefinedBoxes) -> RefinedBoxes:
+    """Return a result without the rejected boxes."""
+    if REJECTED not in refined.status:
+        return refined
+    rows = [row for row, status in enumerate(refined.status) if status != REJECTED]
+    return refined.take(rows)

@@ -1,0 +1,367 @@
+"""The recorder: writes the label files of the live node, in a process of its own."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
+import os
+from pathlib import Path
+import pickle
+import re
+import shutil
+import signal
+import sys
+import time
+from typing import Any, IO
+
+from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
+from boxreg_ros.io.label_feed import Cloud, FinalBoxes, RecorderSettings, Split, Status
+from boxreg_ros.io.transforms import TIME_JUMP
+from boxreg_ros.io.whole_files import DISK_ERRORS
+from boxreg_ros.labels import LabelFrame, module_of
+from boxreg_ros.labels.cloud_spool import FOLDER as CLOUDS
+from boxreg_ros.labels.cloud_spool import Spool
+from boxreg_ros.recorder.folder import locked, recover_all
+from boxreg_ros.recorder.segment import (
+    journal_settings,
+    next_number,
+    open_segments,
+    Segment,
+    SegmentFiles,
+)
+
+UNITS = {'s': 1.0, 'min': 60.0, 'h': 3600.0, 'MB': 1e6, 'GB': 1e9}
+SIZE_UNITS = ('MB', 'GB')
+STATUS_PERIOD = 1.0
+"""Time between two lines of status [s]; that of /diagnostics."""
+RATE_PERIODS = 10
+"""Lines of status over which the rate is averaged: as long as a log period; chosen."""
+SIZING_PART = 0.1
+"""Largest part of the time that may be spent on measuring the size of the files; chosen."""
+NICENESS = 10
+"""Lower priority than the node: where cores are few, labels wait and boxes do not; chosen."""
+NOT_LIVE = ('mcap',)
+"""Formats that copy a recording, which does not exist while driving."""
+
+
+class Recorder:
+    """
+    Write final boxes and clouds as segments of label files.
+
+    The last steps of a segment, until it is on the disk itself, run in a thread beside the next
+    segment.
+
+    Parameters
+    ----------
+    settings : RecorderSettings
+        Settings of the recording. Its folder exists and is locked.
+
+    Raises
+    ------
+    ConfigError
+        For formats that cannot be written, or a length of segments that is none.
+
+    """
+
+    def __init__(self, settings: RecorderSettings) -> None:
+        self._folder = Path(settings.folder)
+        self._limit, self._limits_bytes = segment_limit(settings.segment)
+        check_formats(settings)
+        self._settings = journal_settings(settings)
+        cut_off = open_segments(self._folder)  # before one is opened here
+        self._number = next_number(self._folder)
+        self._segment: Segment | None = None
+        self._spool: Spool | None = None
+        shutil.rmtree(self._folder / CLOUDS, ignore_errors=True)
+        if settings.with_points:
+            self._spool = Spool(self._folder, settings.config)
+        self._thread = ThreadPoolExecutor(1)
+        self._recovery: Future[int] | None = self._thread.submit(recover_all, cut_off)
+        self._completions: deque[tuple[Segment, Future[None]]] = deque()
+        self._written: Counter[str] = Counter()  # by field of `Status`
+        self._growth = Growth()
+
+    def take(self, item: Any) -> None:
+        """Write what the node has sent."""
+        if isinstance(item, Cloud):
+            self._add_cloud(item)
+        elif isinstance(item, FinalBoxes):
+            self._write(item)
+        elif isinstance(item, Split):
+            self._end_segment()
+
+    def finish(self) -> None:
+        """Complete the open segment and wait until all are on the disk."""
+        self._end_segment()
+        self._thread.shutdown(wait=True)
+        self._collect()
+        if self._spool is not None:
+            self._spool.remove()
+
+    def abandon(self) -> None:
+        """Stop writing; the journal of the open segment stays."""
+        self._thread.shutdown(wait=True)
+        for segment, completion in self._completions:
+            if completion.exception() is not None:
+                segment.abandon()
+        if self._segment is not None:
+            self._segment.abandon()
+        shutil.rmtree(self._folder / CLOUDS, ignore_errors=True)
+
+    def status(self) -> Status:
+        """
+        Return the present state, and end a segment that has reached its size.
+
+        Raises
+        ------
+        RecordingError
+            If the folder was deleted.
+
+        """
+        self._collect()
+        segment = self._segment
+        if segment is not None and segment.is_deleted:
+            raise RecordingError(
+                f'record_to {str(self._folder)!r}: expected a folder until the recording ends, '
+                f'got one that was deleted, with the labels in it; call ~/start_recording, and '
+                f'let nothing delete it meanwhile'
+            )
+        open_bytes = 0 if segment is None else self._growth.measure(segment.files)
+        size = self._written['bytes'] + open_bytes
+        if segment is not None and self._limits_bytes and open_bytes >= self._limit:
+            self._end_segment()
+        left_out = 0 if segment is None else segment.files.left_out
+        return replace(
+            self._counted(),
+            segment='' if segment is None else segment.name,
+            bytes=size,
+            rate=self._growth.rate(size),
+            free=shutil.disk_usage(self._folder).free,
+            left_out=self._written['left_out'] + left_out,
+        )
+
+    def _counted(self) -> Status:
+        """Return a status with the counters only."""
+        counts: dict[str, Any] = dict(self._written)
+        return Status(**counts)
+
+    def _add_cloud(self, cloud: Cloud) -> None:
+        if self._spool is not None:
+            self._spool.delete_before(cloud.needed_from_ns)
+            self._spool.add(cloud.sweep, cloud.T_fixed_sweep, cloud.intensities)
+
+    def _write(self, final: FinalBoxes) -> None:
+        """Write final boxes to the open segment, or to a new one where that is at its end."""
+        frame = LabelFrame(
+            final.refined, final.fixed_frame, final.sensor_frame, final.T_fixed_sensor,
+            T_fixed_given=final.T_fixed_given,
+        )  # fmt: skip
+        if self._spool is not None:
+            frame = self._spool.with_cloud(frame)
+            self._written['without_cloud'] += frame.sweep is None
+        if self._segment is not None and self._is_beyond(self._segment, frame):
+            self._end_segment()
+        if self._segment is None:
+            self._segment = Segment(self._folder, self._number, self._settings)
+            self._number += 1
+        self._segment.write(frame)
+        self._written['frames'] += 1
+        self._written['boxes'] += len(frame.refined.status)
+        self._written['clouds'] += frame.sweep is not None
+
+    def _is_beyond(self, segment: Segment, frame: LabelFrame) -> bool:
+        """Return whether a frame is too late for a segment, or time went back before it."""
+        after_ns = frame.refined.boxes.stamp_ns - segment.files.newest_ns
+        if after_ns < -TIME_JUMP * 1e9:
+            return True
+        seconds = segment.files.seconds + after_ns * 1e-9
+        return not self._limits_bytes and seconds >= self._limit
+
+    def _end_segment(self) -> None:
+        segment = self._segment
+        if segment is not None:
+            self._segment = None
+            self._completions.append((segment, self._thread.submit(segment.complete)))
+
+    def _collect(self) -> None:
+        """Count completed segments; raise the error of one that could not be completed."""
+        if self._recovery is not None and self._recovery.done():
+            self._written['recovered'] = self._recovery.result()
+            self._recovery = None
+        while self._completions and self._completions[0][1].done():
+            segment, completion = self._completions[0]
+            completion.result()
+            self._completions.popleft()
+            self._written['segments'] += 1
+            self._written['bytes'] += segment.files.size
+            self._written['left_out'] += segment.files.left_out
+
+
+class Growth:
+    """Size of the open segment and growth of all files, measured at a bounded cost."""
+
+    def __init__(self) -> None:
+        self._size = 0
+        self._files: SegmentFiles | None = None
+        self._due = 0.0
+        self._samples: deque[tuple[float, int]] = deque(maxlen=RATE_PERIODS)
+
+    def measure(self, files: SegmentFiles) -> int:
+        """Return the size of the files [bytes]; measured again when that is due."""
+        begun = time.monotonic()
+        if files is not self._files or begun >= self._due:
+            self._files = files
+            self._size = files.measured_size()
+            ended = time.monotonic()
+            self._due = ended + (ended - begun) / SIZING_PART
+        return self._size
+
+    def rate(self, written: int) -> float:
+        """Return the growth over the last calls [bytes/s], with the size of now."""
+        self._samples.append((time.monotonic(), written))
+        (since, before), (now, after) = self._samples[0], self._samples[-1]
+        return max(after - before, 0) / (now - since) if now > since else 0.0
+
+
+def segment_limit(text: str) -> tuple[float, bool]:
+    """
+    Return the length of a segment [s or bytes], and whether it is in bytes.
+
+    Raises
+    ------
+    ConfigError
+        If the text is not a positive number with a unit of `UNITS`.
+
+    """
+    found = re.fullmatch(r'\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]+)\s*', text)
+    if found is None or found[2] not in UNITS or float(found[1]) <= 0:
+        raise ConfigError(
+            f'record_segment: expected a positive number with one of the units '
+            f'{", ".join(UNITS)}, got {text!r}; write for example 60 s or 2 GB'
+        )
+    return float(found[1]) * UNITS[found[2]], found[2] in SIZE_UNITS
+
+
+def check_formats(settings: RecorderSettings) -> None:
+    """
+    Refuse formats that do not exist, lack a package or an option, or need a recording.
+
+    Raises
+    ------
+    ConfigError
+        By name of the parameter.
+
+    """
+    for name in settings.formats:
+        if name in NOT_LIVE:
+            raise ConfigError(
+                f'record_formats: expected formats of labels alone, got {name!r}, which copies a '
+                f'recording; leave it out, and record the topics with ros2 bag record'
+            )
+        if 'camera' in options_of(name) and not settings.camera:
+            raise ConfigError(
+                f'record_camera: expected a calibration file for the format {name!r}, got none; '
+                f'set it, or leave the format out'
+            )
+    if settings.with_points:
+        able = {name for name in settings.formats if 'with_points' in options_of(name)}
+        if not able:
+            raise ConfigError(
+                f'record_points: expected a format with clouds in record_formats, got '
+                f'{", ".join(settings.formats)}; add one, see boxreg formats'
+            )
+
+
+def options_of(name: str) -> tuple[str, ...]:
+    """Return the options that the writer of a format uses."""
+    return module_of(name).FORMAT.options
+
+
+def serve(source: IO[bytes], report: Callable[[Status], None]) -> None:
+    """
+    Record what arrives on `source`, until its end.
+
+    Raises
+    ------
+    BoxregError
+        If nothing can be written, or not any more.
+
+    """
+    settings: RecorderSettings = pickle.load(source)
+    folder = Path(settings.folder)
+    recorder: Recorder | None = None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with locked(folder):
+            recorder = Recorder(settings)
+            report(recorder.status())
+            _record(recorder, source, report)
+            recorder.finish()
+            report(recorder.status())
+    except (BoxregError, OSError) as error:
+        if recorder is not None:
+            recorder.abandon()
+        if isinstance(error, OSError):
+            raise _explained(error, folder) from None
+        raise
+
+
+def _record(recorder: Recorder, source: IO[bytes], report: Callable[[Status], None]) -> None:
+    """Hand items on until the end of the input; report once per `STATUS_PERIOD`."""
+    due = time.monotonic() + STATUS_PERIOD
+    while True:
+        try:
+            item = pickle.load(source)
+        except EOFError:  # the node has ended the recording, or has been killed
+            return
+        except pickle.UnpicklingError:  # killed while it was sending
+            return
+        recorder.take(item)
+        if time.monotonic() >= due:
+            report(recorder.status())
+            due = time.monotonic() + STATUS_PERIOD
+
+
+def _explained(error: OSError, folder: Path) -> RecordingError:
+    """Return what an error of the disk means for the recording."""
+    place = f'record_to {str(folder)!r}'
+    if error.errno in DISK_ERRORS:
+        return RecordingError(
+            f'{place}: expected room for labels, got: {error.strerror}; free some space and call '
+            f'~/start_recording, which completes the segment that was open'
+        )
+    if not folder.exists():
+        return RecordingError(
+            f'{place}: expected a folder, got: {error.strerror}; it was deleted, or cannot be made'
+        )
+    return RecordingError(
+        f'{place}: expected a folder that can be written to, got: {error.strerror} '
+        f'({error.filename}); choose another, or change its owner or mode'
+    )
+
+
+def main() -> int:
+    """Record from standard input; exit with 1 after an error, which the last status has."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # the end of the input is the signal to end
+        signal.signal(number, signal.SIG_IGN)
+    os.nice(NICENESS)
+    try:
+        serve(sys.stdin.buffer, _print)
+    except BoxregError as error:
+        _print(Status(error=' '.join(str(error).split())))
+        os._exit(1)  # the files that cannot be written would raise again when they are closed
+    return 0
+
+
+def _print(status: Status) -> None:
+    """Write a line of status; the node may have been killed."""
+    with suppress(BrokenPipeError):
+        sys.stdout.write(status.line())
+        sys.stdout.flush()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,241 @@
+"""The node writes labels while it drives: equal to those of `relabel`, in whole segments."""
+
+import csv
+
+from boxreg_ros.cli import main
+from boxreg_ros.labels import FORMATS
+from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+import orjson
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from ros_graph import (
+    DIAGNOSTICS,
+    ended_cleanly,
+    graph_in,
+    play,
+    publishers_for,
+    records_of,
+    RELIABLE,
+)
+from ros_messages import DETECTIONS, Drive, MARKERS
+from std_srvs.srv import Trigger
+
+SETTINGS = {'window': 5, 'lag': 3}
+LIVE_FORMATS = [name for name in FORMATS if name != 'mcap']
+CALIBRATION = """\
+P2: 700 0 600 0 0 700 180 0 0 0 1 0
+R_rect: 1 0 0 0 1 0 0 0 1
+Tr_velo_cam: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.5
+"""
+OWN_FILES = ('summary.json', 'config.yaml', 'tracks.csv', 'review.csv')
+"""Files of `relabel` about the run, and of the segment about the settings; no labels."""
+
+
+class Robot:
+    """A node that records, and the publishers of a drive."""
+
+    def __init__(self, graph, path, **parameters):
+        self.graph = graph
+        self.records = records_of(path)
+        publishers_for(graph, self.records)
+        self.early = graph.collect(DETECTIONS, '/refined_boxes')
+        self.diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+        parameters = {'transform_timeout': 20.0, 'backlog': 60.0, **SETTINGS, **parameters}
+        given = [part for item in parameters.items() for part in ('-p', '{}:={}'.format(*item))]
+        self.node = graph.start(*RELIABLE, *given)
+        graph.wait_until_connected()
+
+    def play(self, records=None):
+        """Publish messages, and wait after each box array until it is refined."""
+        play(self.graph, self.records if records is None else records, self.early)
+
+    def call(self, name):
+        """Call a service of the node and return its response."""
+        return self._request(Trigger, name, Trigger.Request())
+
+    def set(self, name, value):
+        """Set a parameter of the node."""
+        parameters = [Parameter(name, value=value).to_parameter_msg()]
+        request = SetParameters.Request(parameters=parameters)
+        (result,) = self._request(SetParameters, 'set_parameters', request).results
+        assert result.successful, result.reason
+
+    def _request(self, kind, name, request):
+        client = self.graph.node.create_client(kind, f'/boxreg_node/{name}')
+        self.graph.wait(client.service_is_ready, f'the service {name}')
+        future = client.call_async(request)
+        self.graph.wait(future.done, f'the response of {name}')
+        return future.result()
+
+    def state(self):
+        """Return the newest state of the recording in /diagnostics, as level, text and values."""
+        every = [status for message in self.diagnostics for status in message.status]
+        status = [one for one in every if one.name == '/boxreg_node: recording'][-1]
+        return status.level, status.message, {v.key: v.value for v in status.values}
+
+    def stop(self):
+        self.node.stop()
+        assert self.node.popen.returncode == 0, self.node.output()
+        assert 'Traceback' not in self.node.output()
+
+
+def index_of(folder):
+    with (folder / 'index.csv').open() as file:
+        return list(csv.DictReader(file))
+
+
+def files_of(folder):
+    """Return the label files of a folder, by their relative path."""
+    files = [path for path in folder.rglob('*') if path.is_file()]
+    return {path.relative_to(folder): path for path in files if path.name not in OWN_FILES}
+
+
+def assert_equal_files(live, offline):
+    """Compare two label files: numbers to 1e-6, all else exactly."""
+    if live.suffix == '.json':
+        assert_equal(from_json(live), from_json(offline), live)
+    elif live.suffix in ('.csv', '.txt', '.xml'):
+        words = [path.read_text().replace(',', ' ').split() for path in (live, offline)]
+        assert_equal([number(w) for w in words[0]], [number(w) for w in words[1]], live)
+    elif live.suffix in ('.parquet', '.feather'):
+        assert_equal(table_of(live), table_of(offline), live)
+    else:
+        assert live.read_bytes() == offline.read_bytes(), live
+
+
+def from_json(path):
+    text = path.read_bytes()
+    return orjson.loads(text)
+
+
+def table_of(path):
+    from pyarrow import feather, parquet
+
+    read = parquet.read_table if path.suffix == '.parquet' else feather.read_table
+    return read(path).to_pydict()
+
+
+def number(word):
+    try:
+        return float(word)
+    except ValueError:
+        return word
+
+
+def assert_equal(live, offline, where):
+    if isinstance(live, dict):
+        assert live.keys() == offline.keys(), where
+        for key in live:
+            assert_equal(live[key], offline[key], f'{where}: {key}')
+    elif isinstance(live, list):
+        assert len(live) == len(offline), where
+        for one, other in zip(live, offline, strict=True):
+            assert_equal(one, other, where)
+    elif isinstance(live, float) and isinstance(offline, float):
+        assert np.isclose(live, offline, rtol=0, atol=1e-6, equal_nan=True), where
+    else:
+        assert live == offline, where
+
+
+def test_labels_in_every_format_equal_those_of_relabel(tmp_path):
+    # Label files state the name of their recording; a segment has this one.
+    path = Drive(sweeps=10).write(tmp_path / 'live_segment_000001', 'mcap-folder')
+    camera = tmp_path / 'calibration.txt'
+    camera.write_text(CALIBRATION)
+    options = [f'--set={key}={value}' for key, value in SETTINGS.items()]
+    options += ['--set=estimate=final', '--with-points', f'--camera={camera}']
+    formats = ','.join(LIVE_FORMATS)
+    out = tmp_path / 'out'
+    assert main(['relabel', str(path), '-o', str(out), f'--formats={formats}', *options]) == 0
+    folder = tmp_path / 'live'
+    with graph_in(tmp_path) as graph:
+        robot = Robot(
+            graph, path, record_to=folder, record_formats=f'[{formats}]', record_points=True,
+            record_camera=camera, record_segment='1 h',
+        )  # fmt: skip
+        robot.play()
+        robot.stop()
+    (row,) = index_of(folder)
+    assert (row['segment'], row['frames'], row['boxes']) == ('segment_000001', '10', '20')
+    assert (row['clouds'], row['recovered']) == ('10', '0')
+    assert sorted(p.name for p in folder.iterdir()) == ['.lock', 'index.csv', 'segment_000001']
+    live = files_of(folder / 'segment_000001')
+    offline = files_of(out)
+    assert live.keys() == offline.keys()
+    assert {path.parts[0] for path in live} >= {*LIVE_FORMATS} - {'csv'}
+    for name, file in live.items():
+        assert_equal_files(file, offline[name])
+
+
+def test_services_start_split_and_stop_a_recording(tmp_path):
+    """Labels are read back by `relabel`; what goes wrong is one line, and boxes go on."""
+    path = Drive(sweeps=20).write(tmp_path / 'drive')
+    folder = tmp_path / 'labels'
+    with graph_in(tmp_path) as graph:
+        robot = Robot(graph, path)
+        markers = graph.collect(MARKERS, '/refined_markers')
+        for name, error in (
+            ('start_recording', 'record_to: expected a folder, got none'),
+            ('stop_recording', 'expected a recording, got none'),
+            ('split', 'expected a recording, got none'),
+        ):
+            answer = robot.call(name)
+            assert not answer.success
+            assert error in answer.message
+        (tmp_path / 'file').write_text('')
+        robot.set('record_to', str(tmp_path / 'file'))
+        answer = robot.call('start_recording')
+        assert not answer.success
+        assert 'file' in answer.message
+        graph.wait(lambda: robot.state()[0] == DiagnosticStatus.ERROR, 'an ERROR')
+        robot.set('record_to', str(folder))
+        answer = robot.call('start_recording')
+        assert answer.success, answer.message
+        assert 'call ~/stop_recording first' in robot.call('start_recording').message
+        per_sweep = 3  # transform, cloud, boxes
+        robot.play(robot.records[: 1 + 10 * per_sweep])
+        graph.wait(lambda: robot.state()[2].get('frames') == '7', 'final boxes')  # lag 3
+        level, text, values = robot.state()
+        assert level == DiagnosticStatus.OK
+        assert text.startswith('recording segment_000001, ')
+        assert (values['folder'], values['boxes'], values['boxes waiting']) == (
+            str(folder), '14', '0',
+        )  # fmt: skip
+        assert float(values['disk free [GB]']) > 0
+        assert robot.call('split').success
+        graph.wait(lambda: 'segment_000001' in str(markers), 'the marker of the recording')
+        robot.play(robot.records[1 + 10 * per_sweep : 1 + 15 * per_sweep])
+        answer = robot.call('stop_recording')  # waits until the last boxes are final
+        assert answer.success
+        assert answer.message == f'{folder}: 30 boxes in 2 segments'
+        assert [row['frames'] for row in index_of(folder)] == ['7', '8']
+        robot.play(robot.records[1 + 15 * per_sweep :])  # not recorded
+        graph.wait(lambda: robot.state()[1] == 'off', 'the end of the recording')
+        robot.stop()
+    assert len(robot.early) == 20
+    out = tmp_path / 'out'
+    assert main(['relabel', str(path), '--labels', f'openlabel:{folder}', '-o', str(out)]) == 0
+    with (out / 'boxes.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 30
+    assert {row['track_id'] for row in rows} == {'1', '2'}
+
+
+def test_two_nodes_and_a_killed_node(tmp_path):
+    """The second node does not record; the recorder of a killed node completes the segment."""
+    path = Drive(sweeps=12).write(tmp_path / 'drive')
+    folder = tmp_path / 'labels'
+    with graph_in(tmp_path) as graph:
+        robot = Robot(graph, path, record_to=folder)
+        graph.wait(lambda: (folder / '.lock').exists(), 'the recorder')
+        second = graph.start('-p', f'record_to:={folder}', '-r', '__node:=second')
+        graph.wait(lambda: 'nobody records into, got one in use' in second.output(), 'an error')
+        assert second.output().count('ERROR') == 1
+        robot.play()
+        graph.wait(lambda: robot.state()[2].get('frames') == '9', 'final boxes')
+        robot.node.kill()
+        graph.wait((folder / 'index.csv').exists, 'a whole segment')
+        assert ended_cleanly(second)
+    (row,) = index_of(folder)
+    assert (row['frames'], row['recovered']) == ('9', '0')  # those before the lag

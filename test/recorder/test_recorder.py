@@ -1,0 +1,334 @@
+"""Segments of label files: whole, indexed, and recovered after any end."""
+
+from io import BytesIO
+import json
+import os
+from pathlib import Path
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+from boxreg_ros.cli import main
+from boxreg_ros.config import Config
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.label_feed import (
+    Cloud,
+    FinalBoxes,
+    PROGRAM,
+    RecorderSettings,
+    Split,
+    Status,
+)
+from boxreg_ros.labels import frames_of, LabelFrame
+from boxreg_ros.labels.segments import read_index
+from boxreg_ros.recorder.folder import locked
+from boxreg_ros.recorder.journal import from_bytes, Journal, read_journal, to_bytes
+from boxreg_ros.recorder.main import Recorder, segment_limit, serve
+from boxreg_ros.recorder.segment import journal_settings, Segment
+from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
+import numpy as np
+from paths import ROOT
+import pytest
+
+SECOND = 10**9
+START = 1_700_000_000 * SECOND
+T_FIXED_SENSOR = np.array([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
+
+
+def settings_of(folder, **changes):
+    given = RecorderSettings(str(folder), ('csv', 'openlabel'), False, '1 h', '', Config())
+    return given._replace(**changes)
+
+
+def final_boxes(k, tracks=2):
+    """Return final boxes of the sweep number `k` at 10 Hz."""
+    boxes = np.zeros((tracks, 9))
+    boxes[:, :6] = [1.0 * k, 2, 3, 4, 2, 1.5]
+    boxes[:, 1] += 10 * np.arange(tracks)
+    names = tuple(str(track) for track in range(tracks))
+    refined = RefinedBoxes(
+        BoxArray(
+            START + k * SECOND // 10, 'odom', names, ('car',) * tracks, np.full(tracks, 0.5), boxes
+        ),
+        ('refined', 'kept')[:tracks], ('', 'no_points')[:tracks], np.arange(tracks) + k,
+        np.tile(np.diag(np.arange(1.0, 7.0)), (tracks, 1, 1)),
+    )  # fmt: skip
+    return FinalBoxes(refined, 'odom', 'lidar', T_FIXED_SENSOR, T_FIXED_SENSOR)
+
+
+def cloud(k, points=50):
+    sweep = Sweep(START + k * SECOND // 10, 'lidar', np.full((points, 3), k, np.float32))
+    return Cloud(sweep, T_FIXED_SENSOR, np.arange(points, dtype=float), sweep.stamp_ns)
+
+
+def record(settings, items):
+    """Let a recorder in this process record items, and return its last status."""
+    source = BytesIO(b''.join(pickle.dumps(item) for item in (settings, *items)))
+    states = []
+    serve(source, states.append)
+    return states[-1]
+
+
+def stamps_in(folder, name='csv'):
+    """Return the numbers of the sweeps whose boxes are in a folder, read as labels."""
+    return [
+        (frame.refined.boxes.stamp_ns - START) * 10 // SECOND for frame in frames_of(name, folder)
+    ]
+
+
+def start_recorder(settings, **options):
+    """Start a recorder as the node does."""
+    return subprocess.Popen(
+        [sys.executable, '-m', PROGRAM], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        **options,
+    )  # fmt: skip
+
+
+def last_status(output):
+    return Status(**json.loads(output.decode().splitlines()[-1]))
+
+
+def test_a_frame_in_the_journal_is_what_was_written(tmp_path):
+    final = final_boxes(3)
+    sweep = Sweep(START, 'lidar', np.arange(12, dtype=np.float32).reshape(4, 3))
+    with_cloud = LabelFrame(
+        final.refined, 'odom', 'lidar', T_FIXED_SENSOR, sweep, np.arange(4.0), np.eye(4)
+    )
+    without = LabelFrame(final_boxes(4, tracks=0).refined, 'odom', 'lidar')
+    for frame in (with_cloud, without):
+        back = from_bytes(to_bytes(frame))
+        assert to_bytes(back) == to_bytes(frame)
+        assert back.refined.boxes.track_ids == frame.refined.boxes.track_ids
+        assert back.refined.reasons == frame.refined.reasons
+        np.testing.assert_array_equal(back.refined.boxes.boxes, frame.refined.boxes.boxes)
+    assert from_bytes(to_bytes(with_cloud)).sweep.points.dtype == np.float32
+    assert from_bytes(to_bytes(without)).sweep is None
+
+
+@pytest.mark.parametrize('tail', [b'', b'\0' * 4096], ids=['cut off', 'zeros'])
+def test_every_complete_frame_of_a_journal_is_read(tmp_path, tail):
+    path = tmp_path / 'journal.mcap'
+    journal = Journal(path, {'formats': 'csv'})
+    ends = []
+    for k in range(4):
+        journal.add(LabelFrame(final_boxes(k).refined, 'odom', 'lidar'))
+        ends.append(path.stat().st_size)
+    journal.close()
+    whole = path.read_bytes()
+    for size in (*ends, *range(ends[0] + 1, ends[3], 997)):
+        path.write_bytes(whole[:size] + tail)
+        settings, frames = read_journal(path)
+        assert settings == {'formats': 'csv'}
+        assert len(list(frames)) == sum(end <= size for end in ends)
+
+
+@pytest.mark.parametrize(
+    ('segment', 'expected'),
+    [('1 s', [10, 10, 5]), ('1min', [25]), ('0.5 h', [25])],
+)
+def test_segments_end_after_their_time(tmp_path, segment, expected):
+    status = record(settings_of(tmp_path, segment=segment), map(final_boxes, range(25)))
+    rows = read_index(tmp_path)
+    assert [row.frames for row in rows] == expected
+    assert (status.frames, status.boxes, status.segments) == (25, 50, len(expected))
+    assert status.bytes == sum(row.bytes for row in rows)
+    for row, part in zip(rows, np.split(np.arange(25), np.cumsum(expected))[:-1], strict=True):
+        assert row.first_stamp_ns == START + part[0] * SECOND // 10
+        assert row.last_stamp_ns == START + part[-1] * SECOND // 10
+        files = {path for path in (tmp_path / row.segment).rglob('*') if path.is_file()}
+        assert row.bytes == sum(path.stat().st_size for path in files)
+    for name in ('csv', 'openlabel'):
+        assert stamps_in(tmp_path, name) == list(range(25))
+
+
+def test_a_segment_ends_by_service_and_where_time_goes_back(tmp_path):
+    items = [*map(final_boxes, range(100, 104)), Split(), *map(final_boxes, (104, 105, 0, 1))]
+    record(settings_of(tmp_path), items)
+    assert [row.frames for row in read_index(tmp_path)] == [4, 2, 2]
+    record(settings_of(tmp_path), [final_boxes(7)])  # continues
+    assert [row.segment[-1] for row in read_index(tmp_path)] == ['1', '2', '3', '4']
+    assert stamps_in(tmp_path) == [100, 101, 102, 103, 104, 105, 0, 1, 7]
+
+
+def test_segments_end_at_their_size(tmp_path):
+    recorder = start_recorder(tmp_path)
+    settings = settings_of(
+        tmp_path, formats=('sustechpoints',), with_points=True, segment='0.2 MB'
+    )
+    pickle.dump(settings, recorder.stdin)
+    for k in range(28):
+        for item in (cloud(k, 2000), final_boxes(k)):
+            pickle.dump(item, recorder.stdin)
+        recorder.stdin.flush()
+        time.sleep(0.1)
+    output, _ = recorder.communicate(timeout=30)
+    rows = read_index(tmp_path)
+    assert len(rows) > 1
+    assert all(row.bytes >= 0.2e6 for row in rows[:-1])
+    status = last_status(output)
+    assert (status.clouds, status.without_cloud, status.error) == (28, 0, '')
+    assert status.free > 0
+    assert sum(row.clouds for row in rows) == 28
+
+
+def test_clouds_that_no_boxes_need_are_deleted(tmp_path):
+    """Without boxes, the disk would fill with clouds; those that boxes may need are kept."""
+    settings = settings_of(tmp_path, formats=('sustechpoints',), with_points=True)
+    recorder = Recorder(settings)
+    for k in range(20):
+        needed_from_ns = START + max(k - 3, 0) * SECOND // 10
+        recorder.take(cloud(k)._replace(needed_from_ns=needed_from_ns))
+        assert len(list((tmp_path / '.clouds').iterdir())) <= 5
+    recorder.take(final_boxes(17))
+    recorder.finish()
+    (row,) = read_index(tmp_path)
+    assert row.clouds == 1
+    assert not (tmp_path / '.clouds').exists()
+
+
+def test_killed_recorder_loses_nothing_that_it_has_taken(tmp_path):
+    """SIGKILL at random moments; recovery gives whole files with all frames but the last few."""
+    rng = np.random.default_rng(35)
+    taken = 0
+    for round_number in range(4):
+        recorder = start_recorder(tmp_path)
+        pickle.dump(settings_of(tmp_path, segment='1 s'), recorder.stdin)
+        recorder.stdin.flush()
+        recorder.stdout.readline()  # it has recovered or is about to
+        count = int(rng.integers(3, 30))
+        for k in range(count):
+            pickle.dump(final_boxes(100 * round_number + k), recorder.stdin)
+        recorder.stdin.flush()
+        time.sleep(rng.uniform(0, 0.3))
+        recorder.send_signal(signal.SIGKILL)
+        recorder.communicate()
+        taken += count
+    assert main(['recover', str(tmp_path)]) == 0
+    names = [path.name for path in tmp_path.iterdir() if path.name.startswith('.')]
+    assert names == ['.lock']
+    stamps = stamps_in(tmp_path)
+    assert stamps == sorted(set(stamps))
+    assert stamps == stamps_in(tmp_path, 'openlabel')
+    for round_number in range(4):  # no gaps: only the end of a round may be missing
+        part = [stamp % 100 for stamp in stamps if stamp // 100 == round_number]
+        assert part == list(range(len(part)))
+    assert len(stamps) <= taken
+
+
+def test_every_step_of_completion_may_be_the_last(tmp_path):
+    """A segment that has its name but is not in the index is made again from its journal."""
+    settings = journal_settings(settings_of(tmp_path))
+    segment = Segment(tmp_path, 1, settings)
+    for k in range(3):
+        final = final_boxes(k)
+        segment.write(LabelFrame(final.refined, 'odom', 'lidar', T_FIXED_SENSOR))
+    opened = tmp_path / '.segment_000001.open'
+    (opened / 'labels').rename(tmp_path / 'segment_000001')  # incomplete files, not in the index
+    assert main(['recover', str(tmp_path)]) == 0
+    assert stamps_in(tmp_path) == [0, 1, 2]
+    (row,) = read_index(tmp_path)
+    assert (row.frames, row.recovered) == (3, 1)
+    # In the index, and only the deletion of the journal is missing.
+    (tmp_path / '.segment_000001.open').mkdir()
+    (tmp_path / '.segment_000001.open' / 'journal.mcap').write_bytes(b'')
+    assert main(['recover', str(tmp_path)]) == 0
+    assert read_index(tmp_path) == [row]
+    assert not opened.exists()
+
+
+def test_recovery_says_what_it_did_and_what_it_expected(tmp_path, capsys):
+    assert main(['recover', str(tmp_path)]) == 1
+    assert 'expected the folder of a recording of labels' in capsys.readouterr().err
+    Segment(tmp_path, 1, journal_settings(settings_of(tmp_path)))
+    assert main(['recover', str(tmp_path)]) == 0  # nothing was written before it was cut off
+    record(settings_of(tmp_path), map(final_boxes, range(3)))
+    assert main(['recover', str(tmp_path)]) == 0
+    assert '0 segments recovered; 6 boxes in 1 segments' in capsys.readouterr().out
+    with locked(tmp_path):
+        assert main(['recover', str(tmp_path)]) == 1
+    assert f'in use by process {os.getpid()}' in capsys.readouterr().err
+
+
+def test_two_recorders_do_not_share_a_folder(tmp_path):
+    with locked(tmp_path), pytest.raises(RecordingError, match='nobody records into'):
+        record(settings_of(tmp_path), [final_boxes(0)])
+    record(settings_of(tmp_path), [final_boxes(0)])
+
+
+def test_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match=r'record_to .*file/labels.*Not a directory'):
+        record(settings_of(tmp_path / 'file' / 'labels'), [final_boxes(0)])
+
+
+def test_full_disk_ends_the_recording_and_keeps_the_journal(tmp_path):
+    """The limit on the size of files stands for a full disk; both are one error of `write`."""
+    limit = 60_000
+    recorder = start_recorder(
+        tmp_path,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+    items = [settings_of(tmp_path), *map(final_boxes, range(100))]
+    output, _ = recorder.communicate(b''.join(map(pickle.dumps, items)), timeout=30)
+    assert recorder.returncode == 1
+    assert 'expected room for labels, got: File too large' in last_status(output).error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['.lock', '.segment_000001.open']
+    assert main(['recover', str(tmp_path)]) == 0  # there is room now
+    stamps = stamps_in(tmp_path)
+    assert 5 < len(stamps) < 100
+    assert stamps == list(range(len(stamps)))
+
+
+def test_deleted_folder_ends_the_recording(tmp_path):
+    folder = tmp_path / 'labels'
+    recorder = start_recorder(folder)
+    pickle.dump(settings_of(folder), recorder.stdin)
+    pickle.dump(final_boxes(0), recorder.stdin)
+    recorder.stdin.flush()
+    while not (folder / '.segment_000001.open' / 'journal.mcap').exists():
+        time.sleep(0.01)
+    subprocess.run(['rm', '-r', str(folder)], check=True)
+    time.sleep(1.1)  # a status is due
+    output, _ = recorder.communicate(pickle.dumps(final_boxes(1)), timeout=30)
+    assert recorder.returncode == 1
+    error = last_status(output).error
+    assert 'deleted' in error and 'expected a folder' in error
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize('text', ['', '60', 's', '-1 s', '0 s', '1 week', '1 mb'])
+def test_length_of_segments_is_a_number_with_a_unit(text):
+    with pytest.raises(ConfigError, match='record_segment: expected a positive number'):
+        segment_limit(text)
+
+
+def test_lengths_of_segments():
+    assert segment_limit('90 s') == (90.0, False)
+    assert segment_limit('1.5min') == (90.0, False)
+    assert segment_limit('2 GB') == (2e9, True)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'formats': ('csv', 'mcap')}, "got 'mcap', which copies a recording"),
+        ({'formats': ('kity',)}, "'kity': expected one of"),
+        ({'formats': ('csv',), 'with_points': True}, 'expected a format with clouds'),
+        ({'formats': ('kitti',)}, 'record_camera'),
+        ({'segment': '5'}, 'record_segment'),
+    ],
+)
+def test_settings_that_cannot_work_are_named(tmp_path, changes, error):
+    with pytest.raises(ConfigError, match=error):
+        record(settings_of(tmp_path, **changes), [final_boxes(0)])
+    assert not read_index(tmp_path)
+
+
+def test_index_that_was_edited_is_named(tmp_path):
+    record(settings_of(tmp_path), [final_boxes(0)])
+    (tmp_path / 'index.csv').write_text('segment,frames\nsegment_000001,many\n')
+    with pytest.raises(RecordingError, match=r'index\.csv: expected the columns segment, first'):
+        list(frames_of('csv', Path(tmp_path)))
