@@ -22,7 +22,11 @@ setup(
     # Read by `boxreg bench node` and `relabel --report`, without an installation too.
     package_data={NAME: ['py.typed', 'share/*'], 'msg_adapters': ['py.typed']},
     entry_points={
-        'console_scripts': [f'boxreg = {NAME}.cli:main', f'boxreg_node = {NAME}.live.main:main']
+        'console_scripts': [
+            f'boxreg = {NAME}.cli:main',
+            f'boxreg_node = {NAME}.live.main:main',
+            f'boxreg_lifecycle_node = {NAME}.live.main:lifecycle',
+        ]
     },
     # Where `ros2 run` looks. Only colcon installs by these commands; pip has its own place.
     options={
@@ -49,6 +53,8 @@ setup(
         'compressed': ['DracoPy>=2,<3'],
         # A baseline of `boxreg bench`, and its figures.
         'bench': ['matplotlib', 'small-gicp'],
+        # Data sets as recordings: tables of nuScenes, pickles of PandaSet, tables of Arrow.
+        'datasets': ['ijson>=3.2', 'pandas>=2', 'pyarrow'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
         'formats': ['pyarrow'],
         # MCAP files whose boxes are protobuf.
@@ -75,6 +81,7 @@ setup(
             'flake8-import-order',
             'flake8-quotes',
             'foxglove-schemas-protobuf',
+            'ijson>=3.2',
             'jinja2',
             'matplotlib',
             'mcap-protobuf-support',
@@ -82,6 +89,7 @@ setup(
             'mkdocs-material',
             'mypy',
             'openlabel-checker',
+            'pandas>=2',
             'playwright',
             'plotly',
             'pyarrow',

@@ -31,7 +31,7 @@ REMOVED = {'solver.history': 'no result depends on it'}
 """Settings of earlier versions that are gone, and why."""
 
 NODE_OPTIONS = (
-    *('boxes_type', 'points', 'points_type', 'sensor_frames', 'points_info'),
+    *('boxes_type', 'points', 'points_type', 'time_unit', 'sensor_frames', 'points_info'),
     *('pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
     *('output_frame', 'transform_timeout', 'deadline', 'backlog', 'config_file', 'record_to'),
     *('record_formats', 'record_points', 'record_segment', 'record_camera'),

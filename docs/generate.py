@@ -43,6 +43,11 @@ def label_formats() -> str:
     return table(formats.FORMAT_COLUMNS, formats.rows())
 
 
+def datasets() -> str:
+    """Return one row for each data set."""
+    return table(formats.DATASET_COLUMNS, formats.dataset_rows())
+
+
 def messages() -> str:
     """Return one row for each message type with boxes."""
     return table(registry.MESSAGE_COLUMNS, registry.rows())
@@ -57,6 +62,7 @@ def counters() -> str:
 TABLES = {
     'parameters.md': parameters,
     'formats.md': label_formats,
+    'datasets.md': datasets,
     'messages.md': messages,
     'troubleshooting.md': counters,
 }

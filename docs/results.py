@@ -245,6 +245,12 @@ def _figures(results: Any) -> Iterable[str]:
     yield _table(['', ''], _flat(results))
 
 
+def _lidars(results: Any) -> Iterable[str]:
+    """Yield the accuracy of each way to record several LiDARs."""
+    rows = [[name, _number(found['bev']), _number(found['3d'])] for name, found in results.items()]
+    yield _table(['recorded', 'BEV', '3D'], rows)
+
+
 def _review(results: Any) -> Iterable[str]:
     """Yield the share of bad tracks at the top of each list, per recording and input."""
     for recording, inputs in results.items():
@@ -274,6 +280,14 @@ def _covariance(results: Any) -> Iterable[str]:
 def _consistent(group: Any) -> Iterable[str]:
     pairs = zip(group['coverage'].values(), group['nees'].values(), strict=True)
     return (f'{coverage:.2f} / {nees:.1f}' for coverage, nees in pairs)
+
+
+def _load(results: Any) -> Iterable[str]:
+    """Yield latency and accuracy by number of tracks, one table per way to treat overload."""
+    for policy, rows in results.items():
+        names = list(next(iter(rows.values())))
+        lines = [[tracks, *(_number(row[name]) for name in names)] for tracks, row in rows.items()]
+        yield _table([f'{policy}: tracks', *names], lines)
 
 
 def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
@@ -319,6 +333,15 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'better.',
         _sensitivity,
     ),
+    'lidars': (
+        'Several LiDARs',
+        'A simulated truck with four LiDARs at its corners, which turn a quarter of a period\n'
+        'apart, on three drives: a topic per LiDAR (*corners*), a cloud concatenated in the\n'
+        'frame of the truck with its info message (*concatenated*) and without\n'
+        '(*concatenated-alone*), and a single LiDAR on the roof. Input boxes and truth are the\n'
+        'same.',
+        _lidars,
+    ),
     'covariance': (
         'Covariances',
         'Part of the errors within two standard deviations (0.95 is consistent) / mean squared\n'
@@ -340,6 +363,13 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'Times in ms unless the name says otherwise. CUDA has not been run: the torch twins of\n'
         'the kernels are tested on the CPU only.',
         _figures,
+    ),
+    'load': (
+        'The live node under load',
+        'Latency from the later of cloud and boxes to the refined boxes, and mean 3D IoU of all\n'
+        'published boxes, kept ones included. With the default deadline, tracks that the solver\n'
+        'has no time for are kept; with a deadline of an hour, clouds are dropped.',
+        _load,
     ),
     'node': ('The live node', 'Publisher, node and observer each a process, over DDS.', _figures),
 }

@@ -7,40 +7,51 @@ from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.structures import Floats, Ints, Sweep
+from msg_adapters.point_layout import (
+    AUTO,
+    layout_of,
+    MAX_TIME_OFFSET,
+    PointLayout,
+    reading_of,
+    seconds_of,
+    time_field_of,
+)
 from msg_adapters.poses import stamp_ns
 import numpy as np
 from numpy.typing import NDArray
 
 DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 """``PointField.datatype`` -> dtype of numpy."""
-POINT_TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time', 'time_stamp')
-TIME_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
-"""Possible units of point times [s], coarsest first."""
 INTENSITY_FIELDS = ('intensity', 'i', 'reflectivity')
-MAX_TIME_OFFSET = 1.0
-"""Largest difference between the time of a point and the stamp [s]; one revolution is shorter."""
 
 
-def from_msg(msg: Any) -> Sweep:
+def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     """
     Return the finite points of a PointCloud2, in its frame, with their times.
 
     Points are float32; float64 if the coordinates are float64 or 32-bit integers, to keep them
     exact.
 
+    Parameters
+    ----------
+    msg : PointCloud2
+        The message.
+    time_unit : str
+        Unit of the times of the points, or ``auto``.
+
     Raises
     ------
     UnsupportedMessage
-        If there are no fields x, y, z, a field has an unknown datatype, or the sizes in the
-        message contradict each other.
+        If there are no fields x, y, z, a field has an unknown datatype, the sizes in the message
+        contradict each other, or the times of a known layout are in a wrong unit.
 
     Notes
     -----
-    Times are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``,
-    ``time_stamp``. Unit and origin differ between drivers, so both are derived from type and
-    magnitude. A float64 field within 1 s of the stamp in s, ms, us or ns is absolute (Hesai,
-    RoboSense, Livox). Other fields are relative to the stamp, in the coarsest of these units in
-    which all points are within 1 s of it; seconds only for floats (Velodyne: s, Ouster: ns). If
+    The layouts of `point_layout.LAYOUTS` state field and unit of the times. In other layouts
+    times are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``,
+    ``time_stamp``; unit and origin are derived from type and magnitude. A float64 field within
+    1 s of the stamp in s, ms, us or ns is absolute. Other fields are relative to the stamp, in the
+    coarsest of these units in which all points are within 1 s of it; seconds only for floats. If
     none fits, ``times`` is None. A point whose time is not finite gets the time of the stamp.
 
     """
@@ -48,9 +59,10 @@ def from_msg(msg: Any) -> Sweep:
     if not msg.width * msg.height:
         return Sweep(stamp, msg.header.frame_id, np.zeros((0, 3), np.float32))
     fields = _fields(msg)
-    time_field = _first(POINT_TIME_FIELDS, fields)
+    kinds = _kinds(fields)
+    time_field = time_field_of(kinds)
     names = ['x', 'y', 'z']
-    if time_field is not None:
+    if time_field:
         names.append(time_field)
     table = _table(msg, [fields[name] for name in names])
 
@@ -60,12 +72,45 @@ def from_msg(msg: Any) -> Sweep:
         column[:] = table[name].reshape(-1)
     is_finite = np.isfinite(columns).all(0)
     times = None
-    if time_field is not None:
+    if time_field:
         raw_times = table[time_field].ravel()  # contiguous: it is read several times
-        times = _seconds(raw_times if is_finite.all() else raw_times[is_finite], stamp)
+        known_times = raw_times if is_finite.all() else raw_times[is_finite]
+        times = _seconds(known_times, stamp, layout_of(kinds), time_unit)
     if not is_finite.all():
         columns = columns[:, is_finite]
     return Sweep(stamp, msg.header.frame_id, columns.T, times)
+
+
+def described(msg: Any, time_unit: str = AUTO) -> str:
+    """
+    Return the layout of a cloud and the reading of its times, in one line.
+
+    Raises
+    ------
+    UnsupportedMessage
+        As `from_msg`.
+
+    """
+    if not msg.width * msg.height:
+        return 'empty'
+    fields = _fields(msg)
+    kinds = _kinds(fields)
+    layout = layout_of(kinds)
+    name = f'unknown layout ({", ".join(fields)})' if layout is None else layout.name
+    time_field = time_field_of(kinds)
+    if not time_field:
+        return f'{name}: no times of the points'
+    raw = _table(msg, [fields[time_field]])[time_field].ravel()
+    raw = raw[np.isfinite(raw)]
+    reading = reading_of(raw, stamp_ns(msg.header), layout, time_unit) if raw.size else None
+    if reading is None:
+        return (
+            f'{name}: times in {time_field} are not used: in no unit are they within '
+            f'{MAX_TIME_OFFSET:g} s of the stamp'
+        )
+    duration = np.ptp(seconds_of(raw, stamp_ns(msg.header), reading))
+    origin = 'absolute' if reading.is_absolute else 'relative to the stamp'
+    return f'{name}: times in {time_field}, {reading.unit}, {origin}, over {duration:.3f} s'
 
 
 def finite_rows(msg: Any) -> Ints | None:
@@ -117,6 +162,11 @@ def _fields(msg: Any) -> dict[str, Any]:
     return fields
 
 
+def _kinds(fields: Mapping[str, Any]) -> dict[str, str]:
+    """Return the kind of the numbers of each field, as in ``u4``; empty if unknown."""
+    return {name: DTYPES.get(field.datatype, '') for name, field in fields.items()}
+
+
 def _first(names: Sequence[str], fields: Mapping[str, Any]) -> str | None:
     return next((name for name in names if name in fields), None)
 
@@ -166,36 +216,19 @@ def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     )
 
 
-def _seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
+def _seconds(
+    raw: NDArray[Any], stamp: int, layout: PointLayout | None, unit: str
+) -> Floats | None:
     """Return point times (M,) relative to the stamp [s]; see the notes of `from_msg`."""
     if not raw.size:
         return np.zeros(0)
     is_known = np.isfinite(raw)
-    if is_known.all():
-        return _known_seconds(raw, stamp)
-    if not is_known.any():
+    known = raw if is_known.all() else raw[is_known]
+    reading = reading_of(known, stamp, layout, unit) if known.size else None
+    if reading is None:
         return None
-    known = _known_seconds(raw[is_known], stamp)
-    if known is None:
-        return None
+    if known is raw:
+        return seconds_of(raw, stamp, reading)
     times = np.zeros(raw.shape)
-    times[is_known] = known
+    times[is_known] = seconds_of(known, stamp, reading)
     return times
-
-
-def _known_seconds(raw: NDArray[Any], stamp: int) -> Floats | None:
-    """Return finite point times (M,), M > 0, relative to the stamp [s]."""
-    low = float(raw.min())
-    high = float(raw.max())
-    is_float = raw.dtype.kind == 'f'
-    if is_float and raw.dtype.itemsize == 8:
-        for unit in TIME_UNITS:
-            origin = stamp * 1e-9 / unit
-            offset = max(abs(low - origin), abs(high - origin)) * unit
-            # A stamp near 0 does not separate absolute from relative times.
-            if origin * unit > MAX_TIME_OFFSET and offset <= MAX_TIME_OFFSET:
-                return np.asarray((raw.astype(np.float64) - origin) * unit)
-    for unit in TIME_UNITS if is_float else TIME_UNITS[1:]:
-        if max(abs(low), abs(high)) * unit <= MAX_TIME_OFFSET:
-            return np.asarray(np.multiply(raw, unit, dtype=np.float64))
-    return None

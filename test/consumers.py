@@ -54,6 +54,37 @@ def nuscenes(folder, version):
     return boxes
 
 
+def nuscenes_scene(folder, version, name):
+    """Return sweeps and boxes of a scene in the global frame, through the devkit's transforms."""
+    import numpy as np
+    from nuscenes.nuscenes import NuScenes
+    from nuscenes.utils.data_classes import LidarPointCloud
+    from nuscenes.utils.geometry_utils import transform_matrix
+    from pyquaternion import Quaternion
+
+    data = NuScenes(version, folder, verbose=False)
+    (scene,) = (scene for scene in data.scene if scene['name'] == name)
+    samples = [s['token'] for s in data.sample if s['scene_token'] == scene['token']]
+    sweeps = []
+    for row in data.sample_data:
+        if row['channel'] != 'LIDAR_TOP' or row['sample_token'] not in samples:
+            continue
+        cloud = LidarPointCloud.from_file(str(Path(folder, row['filename'])))
+        for table, key in (('calibrated_sensor', 'calibrated_sensor_token'),
+                           ('ego_pose', 'ego_pose_token')):  # fmt: skip
+            pose = data.get(table, row[key])
+            cloud.transform(transform_matrix(pose['translation'], Quaternion(pose['rotation'])))
+        sweeps.append([row['timestamp'], cloud.points[:3].T.astype(np.float64).tolist()])
+    boxes = []
+    for token in samples:
+        sample = data.get('sample', token)
+        for box in map(data.get_box, sample['anns']):
+            length, width, height = box.wlh[[1, 0, 2]].tolist()
+            yaw = float(box.orientation.yaw_pitch_roll[0])
+            boxes.append([*box.center.tolist(), length, width, height, yaw])
+    return {'sweeps': sweeps, 'boxes': boxes}
+
+
 def t4(tables):
     """Return all tables as the schema classes of the T4 devkit read them."""
     skip_package_init('t4_devkit')  # imports a viewer
@@ -134,6 +165,29 @@ def waymo(boxes, poses):
     return box, pose.world_from_vehicle.transform
 
 
+def waymo_schemas():
+    """Return the columns of the components that clouds need, with their types."""
+    import types
+
+    skip_package_init('waymo_open_dataset.v2')
+    # TensorFlow is not installed; these modules use its name in annotations only.
+    tensorflow = types.ModuleType('tensorflow')
+    tensorflow.Tensor = object
+    sys.modules['tensorflow'] = tensorflow
+    from waymo_open_dataset.v2.perception.context import LiDARCalibrationComponent
+    from waymo_open_dataset.v2.perception.lidar import LiDARComponent, LiDARPoseComponent
+    from waymo_open_dataset.v2.perception.pose import VehiclePoseComponent
+
+    components = {
+        'lidar': LiDARComponent, 'lidar_pose': LiDARPoseComponent,
+        'lidar_calibration': LiDARCalibrationComponent, 'vehicle_pose': VehiclePoseComponent,
+    }  # fmt: skip
+    return {
+        folder: {field.name: str(field.type) for field in component.schema()}
+        for folder, component in components.items()
+    }
+
+
 def pykitti(folder):
     """Return calibration and sweep of a sequence."""
     from pykitti import utils
@@ -144,6 +198,13 @@ def pykitti(folder):
         **{name: calibration[name].tolist() for name in ('P2', 'Tr_velo_cam')},
         'points': utils.load_velo_scan(folder / 'velodyne' / '0000' / '000000.bin').tolist(),
     }
+
+
+def pykitti_oxts(*files):
+    """Return the poses (4, 4) of the GPS/IMU unit in the files of a drive or a sequence."""
+    from pykitti import utils
+
+    return [item.T_w_imu.tolist() for item in utils.load_oxts_packets_and_poses(files)]
 
 
 def pandas(path):

@@ -174,7 +174,7 @@ def sourced(prefix, command, **options):
 
 
 def test_colcon_installs_executables_where_ros2_run_finds_them(prefix):
-    for executable in ('boxreg', 'boxreg_node'):
+    for executable in ('boxreg', 'boxreg_node', 'boxreg_lifecycle_node'):
         path = prefix / 'lib' / 'boxreg_ros' / executable
         assert os.access(path, os.X_OK), path
         assert not (prefix / 'bin' / executable).exists()

@@ -20,9 +20,11 @@ MEASUREMENTS = {
     'tracks': Measurement('tracks', 'broken tracks before and after each completing step'),
     'ablation': Measurement('ablation', 'accuracy without each ingredient of the method'),
     'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),
+    'lidars': Measurement('lidars', 'accuracy on a truck with LiDARs at its corners'),
     'covariance': Measurement('covariance', 'covariances against errors, by estimate and class'),
     'review': Measurement('review', 'how early the review list shows the bad tracks'),
     'speed': Measurement('speed.command', 'time per tick, per box and per window'),
+    'load': Measurement('load', 'latency and accuracy of the live node by number of tracks'),
     'node': Measurement('node', 'latency and memory of the live node, over DDS'),
 }
 

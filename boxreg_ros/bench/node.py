@@ -27,7 +27,7 @@ from typing import Any
 from boxreg_ros.bench.common import add_json_argument, print_json
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.labels.segments import read_index
-from boxreg_ros.structures import LENGTH, ROLL, YAW
+from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
 import numpy as np
 
 PROFILE = Path(__file__).parents[1] / 'share' / 'fastdds.xml'
@@ -110,8 +110,8 @@ def run(args: argparse.Namespace) -> int:
 # ---------------------------------------------------------------- process of the publisher
 
 
-def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tuple[Any, Any]:
-    """Return the points (M, 3) and noisy boxes (n, 9) of a sweep, in the sensor frame."""
+def true_boxes(args: argparse.Namespace, turn: int) -> Floats:
+    """Return the true boxes (n, 9) of a sweep, in the sensor frame."""
     side = int(np.ceil(np.sqrt(args.tracks)))
     index = np.arange(args.tracks)
     phase = 2 * np.pi * (turn / (CIRCLE_PERIOD * args.rate) + index / args.tracks)
@@ -120,9 +120,18 @@ def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tupl
     boxes[:, 1] = CAR_SPACING * (index // side - side / 2) - CIRCLE_RADIUS * np.cos(phase) + 5.0
     boxes[:, LENGTH:ROLL] = CAR_EXTENT
     boxes[:, YAW] = phase
-    local = rng.uniform(-0.5, 0.5, (args.tracks, POINTS_PER_CAR, 3))  # (n, points, xyz)
+    return boxes
+
+
+def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return the points (M, 3) and noisy boxes (n, 9) of a sweep, in the sensor frame."""
+    boxes = true_boxes(args, turn)
+    phase = boxes[:, YAW]
+    # Cars make at most half of the points, as in `boxreg bench speed`.
+    points_per_car = min(POINTS_PER_CAR, args.points // (2 * args.tracks))
+    local = rng.uniform(-0.5, 0.5, (args.tracks, points_per_car, 3))  # (n, points, xyz)
     near = -np.sign(boxes[:, :2])  # the end and the side that roughly face the sensor
-    half = POINTS_PER_CAR // 2
+    half = points_per_car // 2
     local[:, :half, 0] = 0.49 * near[:, :1]
     local[:, half:, 1] = 0.49 * near[:, 1:]
     local *= np.array(CAR_EXTENT)
@@ -246,8 +255,19 @@ def compare(args: argparse.Namespace) -> dict[str, Any]:
     return report
 
 
-def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """Run node and publisher, and return the report of the observer."""
+def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str, Any]:
+    """
+    Run node and publisher, and return the report of the observer.
+
+    Parameters
+    ----------
+    args : Namespace
+        Options of `boxreg bench node`.
+    keeps_messages : bool
+        Whether the report has ``messages`` as well: for early and final boxes, each serialised
+        message by its sweep, after `STARTUP_TIME`.
+
+    """
     if args.transport == 'large':
         os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
     else:
@@ -257,7 +277,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     command = [sys.executable, '-m', 'boxreg_ros.cli']
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
-        arrivals = stack.enter_context(observer())
+        arrivals = stack.enter_context(observer(keeps_messages))
         labels = folder / 'labels'
         given = [*args.set, *recording_parameters(args.record, labels)]
         parameters = [part for text in given for part in ('-p', text)]
@@ -300,6 +320,17 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         'exit status': node.returncode,
         'log lines': len(log.splitlines()),
         'counters': arrivals['counters'],
+        **({'messages': _by_sweep(sent, arrivals, args.rate)} if keeps_messages else {}),
+    }
+
+
+def _by_sweep(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, dict[int, bytes]]:
+    """Return the serialised messages by the number of their sweep, after `STARTUP_TIME`."""
+    turns = {stamp_ns: turn for turn, stamp_ns in enumerate(sent[:, 0].tolist())}
+    begin = round(STARTUP_TIME * rate)
+    return {
+        name: {turns[s]: data for s, data in kept.items() if turns.get(s, -1) >= begin}
+        for name, kept in arrivals['messages'].items()
     }
 
 
@@ -435,15 +466,20 @@ def process(command: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @contextmanager
-def observer() -> Iterator[dict[str, Any]]:
+def observer(keeps_messages: bool = False) -> Iterator[dict[str, Any]]:
     """
     Subscribe to the outputs of the node while the context lasts.
+
+    Parameters
+    ----------
+    keeps_messages : bool
+        Whether ``messages`` are kept.
 
     Yields
     ------
     arrivals : dict
         ``early`` and ``final``: time of arrival by stamp [ns]. ``counters``: the counters of the
-        diagnostics.
+        diagnostics. ``messages``: of ``early`` and ``final``, serialised, by stamp.
 
     """
     from diagnostic_msgs.msg import DiagnosticArray
@@ -453,10 +489,14 @@ def observer() -> Iterator[dict[str, Any]]:
     from visualization_msgs.msg import MarkerArray
 
     arrivals: dict[str, Any] = {'early': {}, 'final': {}, 'counters': {}}
+    arrivals['messages'] = {'early': {}, 'final': {}}
 
     def add_arrival(name: str, data: bytes) -> None:
         sec, nanosec = struct.unpack_from('<iI', data, FIRST_MARKER)
-        arrivals[name].setdefault(sec * 10**9 + nanosec, time.monotonic_ns())
+        stamp_ns = sec * 10**9 + nanosec
+        arrivals[name].setdefault(stamp_ns, time.monotonic_ns())
+        if keeps_messages:
+            arrivals['messages'][name].setdefault(stamp_ns, data)
 
     def add_counters(message: DiagnosticArray) -> None:
         for item in message.status[0].values:

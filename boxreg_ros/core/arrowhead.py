@@ -9,7 +9,6 @@ docs/decisions/arrowhead-curvature.md.
 
 from typing import NamedTuple
 
-from boxreg_ros.core.kernels import compiled, run
 import numpy as np
 import torch
 from torch import Tensor
@@ -128,6 +127,26 @@ def _blocks(links: Tensor, S: int) -> tuple[Tensor, ...]:
     return wide[..., NEXT:].flatten(2, 3).unbind(1)
 
 
+class InverseBlocks(NamedTuple):
+    """
+    Blocks of the inverse of arrowhead matrices.
+
+    Attributes
+    ----------
+    links : Tensor, shape (B, N, 6, 6)
+        Own block of each link.
+    border : Tensor, shape (B, N, 6, S)
+        Block of each link with the border.
+    corner : Tensor, shape (B, S, S)
+        Own block of the border.
+
+    """
+
+    links: Tensor
+    border: Tensor
+    corner: Tensor
+
+
 class Factor(NamedTuple):
     """
     Cholesky factors by blocks of links.
@@ -166,85 +185,27 @@ class Factor(NamedTuple):
             ahead = parts[i][:, :NEXT]
         return torch.cat([torch.cat(parts, 1)[:, : D - S], border], 1)[..., 0]
 
-    def inverse_of_links(self, length: int) -> tuple[Tensor, Tensor]:
-        """
-        Return blocks of the inverse (M26), of the first N links.
-
-        Their diagonal blocks, shape (B, N, 6, 6), and their rows in the columns of the border,
-        shape (B, N, 6, S).
-
-        """
+    def inverse_blocks(self, length: int) -> InverseBlocks:
+        """Return blocks of the inverse, of the first `length` links (M26)."""
+        corner = torch.cholesky_inverse(self.corner)
         # Known of the inverse: the two links after the present block, and the border.
-        ahead = pad(torch.cholesky_inverse(self.corner), (NEXT, 0, NEXT, 0))
-        found: list[Tensor] = []
-        columns: list[Tensor] = []
+        ahead = pad(corner, (NEXT, 0, NEXT, 0))
+        links: list[Tensor] = []
+        border: list[Tensor] = []
         for L, V in reversed(self.blocks):
             root = solve_triangular(L, torch.eye(L.shape[1]).to(L).expand_as(L), upper=False)
             K = root.mT @ V
             across = -(K @ ahead)
             own = root.mT @ root - across @ K.mT
             blocks = own.unflatten(1, (-1, LINK)).unflatten(3, (-1, LINK)).diagonal(dim1=1, dim2=3)
-            found.insert(0, blocks.permute(0, 3, 1, 2))
-            columns.insert(0, across[:, :, NEXT:].unflatten(1, (-1, LINK)))
+            links.insert(0, blocks.permute(0, 3, 1, 2))
+            border.insert(0, across[:, :, NEXT:].unflatten(1, (-1, LINK)))
             ahead[:, :NEXT, :NEXT] = own[:, :NEXT, :NEXT]
             ahead[:, :NEXT, NEXT:] = across[:, :NEXT, NEXT:]
             ahead[:, NEXT:, :NEXT] = across[:, :NEXT, NEXT:].mT
-        return torch.cat(found, 1)[:, :length], torch.cat(columns, 1)[:, :length]
-
-
-class BandedFactor(NamedTuple):
-    """
-    Cholesky factors U, A = U' U, as the kernels of `arrowhead` keep them.
-
-    Attributes
-    ----------
-    band : Tensor, shape (B, 6 N, 18)
-        U[i, i + k] of the chain.
-    border : Tensor, shape (B, 6 N, S)
-        Columns of the border.
-    upper : Tensor, shape (B, S, S)
-        Factor of the border; what lies below its diagonal is of no meaning.
-
-    """
-
-    band: Tensor
-    border: Tensor
-    upper: Tensor
-
-    @classmethod
-    def empty(cls, B: int, D: int, S: int) -> 'BandedFactor':
-        """Return room for B factors of D variables, S of them of the border."""
-        n = D - S
-        parts = np.empty((B, n, 3 * LINK)), np.empty((B, n, S)), np.empty((B, S, S))
-        return cls(*(torch.from_numpy(part) for part in parts))
-
-    @property
-    def corner(self) -> Tensor:
-        """Lower factor of the border, shape (B, S, S), as `Factor` has it."""
-        return self.upper.mT
-
-    def solve_rows(self, b: Tensor, rows: Tensor) -> Tensor:
-        """Return the solutions (r, 6 N + S) for right sides `b` of the windows `rows` (r,)."""
-        x = np.empty(b.shape)
-        kernels = compiled(b)
-        assert kernels is not None
-        arrays = (part.numpy() for part in self)
-        run(
-            kernels.arrowhead.solve_rows, len(b), rows.numpy(), *arrays,
-            np.ascontiguousarray(b.numpy()), x,
-        )  # fmt: skip
-        return torch.from_numpy(x)
-
-    def inverse_of_links(self, length: int) -> tuple[Tensor, Tensor]:
-        """Return blocks of the inverse, see `Factor.inverse_of_links`."""
-        B, S = self.border.shape[0], self.border.shape[2]
-        blocks = np.empty((B, length, LINK, LINK))
-        columns = np.empty((B, length, LINK, S))
-        kernels = compiled(self.band)
-        assert kernels is not None
-        arrays = (np.ascontiguousarray(part.numpy()) for part in self)
-        run(kernels.arrowhead.invert_windows, B, *arrays, blocks, columns, np.empty((B, S, S)))
-        return torch.from_numpy(blocks), torch.from_numpy(columns)
+        return InverseBlocks(
+            torch.cat(links, 1)[:, :length], torch.cat(border, 1)[:, :length], corner
+        )
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:

@@ -177,6 +177,7 @@ class Problem(NamedTuple):
             contiguous(self.first),
             contiguous(self.counts),
             self.returns.stride,
+            contiguous(self.pinned),
         )
 
     def thinned(self, points: float) -> 'Problem':

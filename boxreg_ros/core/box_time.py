@@ -8,6 +8,7 @@ points, those of the other are ahead of or behind them. docs/method.md (M12).
 
 from collections import Counter
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 from boxreg_ros.config import Config
@@ -106,8 +107,13 @@ class BoxTimeEvidence:
         """Return `config` with `sampling.box_time` as the votes decide, if it is ``auto``."""
         if config.sampling.box_time != 'auto':
             return config
-        box_time = 'stamp' if self.decided() == 'stamp' else 'sight'
-        return replace(config, sampling=replace(config.sampling, box_time=box_time))
+        return _with_box_time(config, 'stamp' if self.decided() == 'stamp' else 'sight')
+
+
+@lru_cache(maxsize=2)
+def _with_box_time(config: Config, box_time: str) -> Config:
+    """Return `config` with a box time; kept, since checking all settings takes 1 ms."""
+    return replace(config, sampling=replace(config.sampling, box_time=box_time))
 
 
 def _distance_from_faces(box: Floats, points: NDArray[np.floating]) -> float:

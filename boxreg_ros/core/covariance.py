@@ -1,6 +1,6 @@
 """Covariances of the estimate, and the residuals of its faces: once per window, at its end."""
 
-from boxreg_ros.core.arrowhead import BandedFactor, Factor, product
+from boxreg_ros.core.arrowhead import InverseBlocks, product
 from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Posterior, Problem, SHARED, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
 from boxreg_ros.core.input_model import Expectation
@@ -29,8 +29,7 @@ def posterior(
     weight: Tensor,
     expected: Expectation,
     free: Tensor,
-    factor: Factor | BandedFactor,
-    covariance: Tensor,
+    inverse: InverseBlocks,
 ) -> Posterior:
     """
     Return the covariances of settled windows (M26, M28), and the residuals of their faces.
@@ -47,20 +46,17 @@ def posterior(
         Means and deviations of the last round.
     free : Tensor, shape (B, 6 N + 22)
         1 for variables that are estimated, 0 for those held fixed.
-    factor : Factor or BandedFactor
+    inverse : InverseBlocks
         Of the Gauss-Newton curvature of the last round.
-    covariance : Tensor, shape (B, 22, 22)
-        Of the shared variables: their block of the inverse of that curvature.
 
     """
     R = rotation_from_rpy(state.pose[..., 3:])
     estimated = free[:, -SHARED:][:, INPUT_ERRORS]
-    poses, columns = factor.inverse_of_links(problem.length)
-    columns = columns[..., INPUT_ERRORS]  # (B, N, 6, 9)
+    columns = inverse.border[..., INPUT_ERRORS]  # (B, N, 6, 9)
     underrated = _underrated_information(expected, estimated)
-    poses += product(columns * underrated[:, None, None], columns.mT)
+    poses = inverse.links + product(columns * underrated[:, None, None], columns.mT)
     _add_pose_model_covariance(poses, R)
-    extents = _extent_covariance(expected, estimated, covariance, underrated)
+    extents = _extent_covariance(expected, estimated, inverse.corner, underrated)
     distances = _face_distances(problem, state, R, moments[..., 3, :3], inset)
     return Posterior(poses, extents, torch.where(weight > 0, distances, 0.0))
 

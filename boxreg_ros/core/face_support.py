@@ -207,7 +207,19 @@ def observe_faces_compiled(
     kernels = compiled(problem.boxes)
     assert kernels is not None
     B, N = problem.valid.shape
-    faces = FaceArrays(
+    faces = empty_faces(B, N)
+    _, occlusion_inset, range_inset = map(contiguous, offsets.of(problem))
+    run(
+        kernels.face_support.observe_faces, B, problem.arrays(), contiguous(state.pose),
+        contiguous(state.shared), occlusion_inset, range_inset, face_numbers(problem, config),
+        faces,
+    )  # fmt: skip
+    return FaceObservations(*map(torch.from_numpy, faces))
+
+
+def empty_faces(B: int, N: int) -> FaceArrays:
+    """Return room for the face observations of B windows of N observations."""
+    return FaceArrays(
         moments=np.empty((B, N, 6, 4, 4)),
         distance=np.empty((B, N, 6)),
         weight=np.empty((B, N, 6)),
@@ -215,9 +227,13 @@ def observe_faces_compiled(
         inset_shares=np.empty((2, B, N, 6)),
         num_points=np.empty((B, N)),
     )
+
+
+def face_numbers(problem: Problem, config: Config) -> FaceNumbers:
+    """Return constants and settings for the kernel."""
     ingredients = config.ingredients
     strips = STRIPS if ingredients.strips else 1
-    numbers = FaceNumbers(
+    return FaceNumbers(
         outside_margin=OUTSIDE_MARGIN,
         edge_margin=EDGE_MARGIN,
         max_depth=MAX_DEPTH,
@@ -236,12 +252,6 @@ def observe_faces_compiled(
         min_along=MIN_ALONG,
         is_moving=problem.returns.is_moving,
     )
-    _, occlusion_inset, range_inset = map(contiguous, offsets.of(problem))
-    run(
-        kernels.face_support.observe_faces, B, problem.arrays(), contiguous(state.pose),
-        contiguous(state.shared), occlusion_inset, range_inset, numbers, faces,
-    )  # fmt: skip
-    return FaceObservations(*(torch.from_numpy(part) for part in faces))
 
 
 def observe_faces_torch(

@@ -195,10 +195,10 @@ class InputNoise(NamedTuple):
         seen = frozenset(kind.tolist())
         # Often all tracks are of one kind, and the same set is needed for several kinds.
         sets = [(seen & {k}, seen - {k}) for k in range(len(KINDS))]
-        estimates = {
-            kinds: cls.estimate(residuals[torch.isin(kind, kind.new_tensor(list(kinds)))])
-            for kinds in set(chain.from_iterable(sets))
-        }
+        estimates = {frozenset[int](): cls(), seen: cls.estimate(residuals)}
+        for kinds in set(chain.from_iterable(sets)) - estimates.keys():
+            rows = torch.isin(kind, kind.new_tensor(list(kinds)))
+            estimates[kinds] = cls.estimate(residuals[rows])
         by_kind = [estimates[own]._with_prior(estimates[others]) for own, others in sets]
         return cls(*(torch.stack(parts) for parts in zip(*by_kind, strict=True)))
 
@@ -583,6 +583,7 @@ class InputModel:
         # Of each track of each kind: sums over its face observations, see
         # `add_face_observations`; its last input residuals; its extent evidence.
         self._faces = [dict[str, Floats]() for _ in KINDS]
+        self._known_offsets: FaceOffsets | None = None  # of the present sums
         self._residuals = [dict[str, Floats]() for _ in KINDS]
         self._evidence = [dict[str, Floats]() for _ in KINDS]
 
@@ -634,6 +635,7 @@ class InputModel:
         shares = torch.stack([torch.ones_like(distance), occluded, distant])
         # (B, 3 quantities, 3 sums: value, count, share; 6 faces)
         sums = torch.stack([values * counts, counts, shares * counts], 1).sum(3).movedim(2, 0)
+        self._known_offsets = None
         rows = zip(track_ids, kind.tolist(), sums.cpu().numpy(), strict=True)
         for track_id, k, row in rows:
             _of_track(self._faces[k], track_id, np.zeros((3, 3, 6)))[:] += row
@@ -666,9 +668,11 @@ class InputModel:
 
     def offsets(self) -> FaceOffsets:
         """Return the labelling margins and insets to expect of each kind."""
-        rows = [self._offsets(k) for k in range(len(KINDS))]
-        parts = map(np.stack, zip(*rows, strict=True))
-        return FaceOffsets(*map(torch.from_numpy, parts))
+        if self._known_offsets is None:
+            rows = [self._offsets(k) for k in range(len(KINDS))]
+            parts = map(np.stack, zip(*rows, strict=True))
+            self._known_offsets = FaceOffsets(*map(torch.from_numpy, parts))
+        return self._known_offsets
 
     def _offsets(self, kind: int) -> tuple[Floats, Floats, Floats]:
         """Return the columns of `FaceOffsets` for one kind, (6,) each."""
@@ -695,6 +699,9 @@ class InputModel:
         """Return the noise of all fits that were added."""
         rows, kind = _flat(self._residuals)
         known = np.array(rows).reshape(-1, MAX_FITS_PER_TRACK, 9)
+        # Fits are counted from the end: columns before the longest track are empty.
+        is_empty = np.isnan(known[:, :, 0]).all(0)
+        known = known[:, np.argmin(is_empty) :]
         return InputNoise.estimate_by_kind(torch.from_numpy(known), kind)
 
     def population(self) -> Population:

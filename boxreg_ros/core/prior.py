@@ -8,12 +8,9 @@ the Schur complement, as in fixed-lag smoothing: docs/method.md (M13).
 
 from collections.abc import Sequence
 
-from boxreg_ros.core.arrowhead import BandedFactor, cholesky, LINK
+from boxreg_ros.core.arrowhead import cholesky, LINK
 from boxreg_ros.core.batch import MarginalPrior, PRIOR_POSES, PRIOR_SIZE, SHARED, State
-from boxreg_ros.core.kernels import compiled, contiguous, run
-from boxreg_ros.core.kernels.arrays import TermArrays
-from boxreg_ros.core.terms import accumulate, Objective, shared_prior, Term
-import numpy as np
+from boxreg_ros.core.terms import shared_prior, Term
 import torch
 from torch.linalg import solve_triangular
 from torch.nn.functional import pad
@@ -28,37 +25,7 @@ PRIOR_RIDGE = 1e-6
 information stay at the linearisation point. Chosen: the information of a deviation of 1000."""
 
 
-def marginalise(objective: Objective, state: State) -> MarginalPrior:
-    """
-    Return the prior that is left when the oldest observation is eliminated (M13), at `state`.
-
-    By the kernels where the objective has arrays for them, else by torch.
-
-    """
-    if isinstance(objective.terms, TermArrays):
-        return marginalised_arrays(objective.terms, state)
-    return marginalised_terms(objective.terms, state)
-
-
-def marginalised_arrays(terms: TermArrays, state: State) -> MarginalPrior:
-    """Return the same as `marginalised_terms`, by the kernels."""
-    x = state.pack()
-    kernels = compiled(x)
-    assert kernels is not None
-    B, D = x.shape
-    curvature = BandedFactor.empty(B, D, SHARED)
-    _, gradient = accumulate(terms, x, torch.arange(B), 1, curvature)
-    mean = np.empty((B, PRIOR_SIZE))
-    step = np.empty((B, PRIOR_SIZE))
-    information = np.empty((B, PRIOR_SIZE, PRIOR_SIZE))
-    run(
-        kernels.normal_equations.marginalise, B, contiguous(x), gradient.numpy(),
-        *(part.numpy() for part in curvature), mean, step, information,
-    )  # fmt: skip
-    return MarginalPrior(*(torch.from_numpy(part) for part in (mean, step, information)))
-
-
-def marginalised_terms(terms: Sequence[Term], state: State) -> MarginalPrior:
+def marginalise(terms: Sequence[Term], state: State) -> MarginalPrior:
     """
     Return the quadratic form that remains when the oldest observation is eliminated (M13).
 

@@ -334,10 +334,10 @@ class BoxRegistrar:
     def _pop_settled(self) -> Iterator[RefinedBoxes]:
         """Yield settled box arrays, up to the first one that is not."""
         while self._pending and self._pending[0].num_unsettled <= 0:
-            array = self._pending.popleft()
-            self.counts.update(array.status)
-            self.counts.update(reason for reason in array.reasons if reason)
-            yield array.result(is_final=True)
+            refined = self._pending.popleft().result(is_final=True)
+            self.counts.update(refined.status)
+            self.counts.update(reason for reason in refined.reasons if reason)
+            yield refined
 
 
 class _PendingArray:
@@ -348,9 +348,12 @@ class _PendingArray:
     ----------
     input : BoxArray
         As added.
-    boxes, status, reasons, num_points, covariances, extent_covariances, face_distances,
-    outside
-        As in `RefinedBoxes`, row by row with the input.
+    reasons : list of str
+        Why each box is kept as long as it has no estimate.
+    num_points : array, shape (n,)
+        As in `RefinedBoxes`.
+    estimates : list of n tuples or None
+        The estimate of the window that each box was last in, and its place there.
     num_unsettled : int
         Boxes whose estimate may still change; the array is settled at 0 or less.
     is_observed : bool
@@ -361,14 +364,9 @@ class _PendingArray:
     def __init__(self, boxes: BoxArray) -> None:
         n = len(boxes.track_ids)
         self.input = boxes
-        self.boxes = boxes.boxes.copy()
-        self.status = [KEPT] * n
         self.reasons = [''] * n
         self.num_points = np.zeros(n, int)
-        self.covariances = np.tile(np.eye(6), (n, 1, 1))
-        self.extent_covariances = np.tile(np.eye(3), (n, 1, 1))
-        self.face_distances = np.zeros((n, 6))
-        self.outside = np.zeros(n)
+        self.estimates: list[tuple[Estimate, int] | None] = [None] * n
         self.num_unsettled = 0
         self.is_observed = False
 
@@ -389,17 +387,35 @@ class _PendingArray:
                 known.add(track_id)
 
     def result(self, is_final: bool) -> RefinedBoxes:
-        """Return the present estimates as copies."""
+        """Return the present estimates as copies; without an estimate, the input box."""
+        n = len(self.estimates)
+        boxes = self.input.boxes.copy()
+        status = [KEPT] * n
+        reasons = self.reasons.copy()
+        covariances = np.tile(np.eye(6), (n, 1, 1))
+        extent_covariances = np.tile(np.eye(3), (n, 1, 1))
+        face_distances = np.zeros((n, 6))
+        outside = np.zeros(n)
+        for row, found in enumerate(self.estimates):
+            if found is not None:
+                estimate, i = found
+                boxes[row] = estimate.boxes[i]
+                status[row] = estimate.status[i]
+                reasons[row] = estimate.reasons[i]
+                covariances[row] = estimate.covariances[i]
+                extent_covariances[row] = estimate.extent_covariances[i]
+                face_distances[row] = estimate.face_distances[i]
+                outside[row] = estimate.outside[i]
         return RefinedBoxes(
-            replace(self.input, boxes=self.boxes.copy()),
-            tuple(self.status),
-            tuple(self.reasons),
+            replace(self.input, boxes=boxes),
+            tuple(status),
+            tuple(reasons),
             self.num_points.copy(),
-            self.covariances.copy(),
+            covariances,
             is_final,
-            self.extent_covariances.copy(),
-            self.face_distances.copy(),
-            self.outside.copy(),
+            extent_covariances,
+            face_distances,
+            outside,
         )
 
 
@@ -412,20 +428,6 @@ class _Entry:
     row: int
     estimate: Floats | None = None
     is_settled: bool = False
-
-    def write(self, estimate: Estimate, i: int) -> None:
-        """Write box i of an estimate to the box array unless the present one is settled."""
-        self.estimate = estimate.boxes[i]
-        if not self.is_settled:
-            array = self.array
-            row = self.row
-            array.boxes[row] = estimate.boxes[i]
-            array.status[row] = estimate.status[i]
-            array.reasons[row] = estimate.reasons[i]
-            array.covariances[row] = estimate.covariances[i]
-            array.extent_covariances[row] = estimate.extent_covariances[i]
-            array.face_distances[row] = estimate.face_distances[i]
-            array.outside[row] = estimate.outside[i]
 
     def settle(self) -> None:
         """Let the estimate in the box array change no more."""
@@ -506,12 +508,15 @@ class _Track:
         if len(recent) < ID_SWITCH_OBSERVATIONS - 1:
             return None
         first, latest = recent[0], recent[-3]
-        velocity = (latest.box - first.box) / (latest.stamp_ns - first.stamp_ns)  # [m/ns]
+        first_x, first_y = first.box[:Z].tolist()
+        x, y = latest.box[:Z].tolist()
+        duration_ns = latest.stamp_ns - first.stamp_ns
         for observation in recent[-2:]:
             elapsed_ns = observation.stamp_ns - latest.stamp_ns
-            predicted = latest.box + elapsed_ns * velocity
+            part = elapsed_ns / duration_ns
+            predicted = x + part * (x - first_x), y + part * (y - first_y)
             gate = latest.box[LENGTH] / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
-            if dist(observation.box[:2], predicted[:2]) < gate:
+            if dist(observation.box[:Z], predicted) < gate:
                 return None
         moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
         del self.entries[-2:]
@@ -525,12 +530,14 @@ class _Track:
         return (box - first.box)[X : Z + 1] / (stamp_ns - first.stamp_ns) * 1e9
 
     def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
-        """Write the estimate of the window of `entries` to their box arrays."""
+        """Pass the estimate of the window of `entries` to the box arrays that are not settled."""
         self.prior = estimate.prior
         self.variance = float(np.trace(estimate.covariances[-1, :3, :3]))
         self.num_carried = 0
-        for i, entry in enumerate(entries):
-            entry.write(estimate, i)
+        for i, (entry, box) in enumerate(zip(entries, estimate.boxes, strict=True)):
+            entry.estimate = box
+            if not entry.is_settled:
+                entry.array.estimates[entry.row] = estimate, i
 
 
 class _SubmittedTrack(NamedTuple):

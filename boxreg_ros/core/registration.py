@@ -28,7 +28,8 @@ from boxreg_ros.core.input_model import (
 )
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.paper import solve_paper
-from boxreg_ros.core.solver import COARSE_POINTS, solve
+from boxreg_ros.core.rounds import COARSE_POINTS
+from boxreg_ros.core.solver import solve
 from boxreg_ros.core.window import group_windows, MarginalisationPrior, stack_windows, Window
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, KEPT, REFINED

@@ -9,7 +9,6 @@ from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, Problem, State
 from boxreg_ros.core.face_support import motion_compensated, to_box_frame
 from boxreg_ros.core.kernels import compiled, contiguous, run
-from boxreg_ros.core.kernels.arrays import TermArrays
 import numpy as np
 import torch
 from torch import Tensor
@@ -60,17 +59,6 @@ def agreement(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     if compiled(state.pose) is not None:
         return agreement_compiled(problem, state)
     return agreement_torch(problem, state)
-
-
-def with_rigid_shape(terms: TermArrays, problem: Problem, state: State) -> TermArrays:
-    """Return `terms` with the rigid shape of each track (M4)."""
-    information, wanted = agreement(problem, state)
-    return terms._replace(
-        shape_start=contiguous(state.pose),
-        shape_axes=terms.axes,
-        wanted=contiguous(wanted),
-        W_shape=contiguous(information),
-    )
 
 
 def agreement_compiled(problem: Problem, state: State) -> tuple[Tensor, Tensor]:

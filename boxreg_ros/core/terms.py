@@ -9,9 +9,9 @@ the sum of J' W J.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast, NamedTuple
+from typing import cast, NamedTuple
 
-from boxreg_ros.core.arrowhead import BandedFactor, Chain, Factor, LINK, product
+from boxreg_ros.core.arrowhead import Chain, Factor, LINK, product
 from boxreg_ros.core.batch import (
     ANCHOR,
     BIAS,
@@ -24,10 +24,7 @@ from boxreg_ros.core.batch import (
     State,
 )
 from boxreg_ros.core.geometry import rotation_derivatives, rotation_from_rpy
-from boxreg_ros.core.kernels import compiled, contiguous, Kernels, run
-from boxreg_ros.core.kernels.arrays import TermArrays
 from boxreg_ros.core.lbfgs import select
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -122,12 +119,10 @@ class Objective:
     """
     The sum of all terms as a function to minimise, with fixed weights: one round.
 
-    Runs by the kernels where they are available, else by torch.
-
     Parameters
     ----------
-    terms : sequence of Term, or TermArrays
-        The terms; as arrays, where the kernels are available.
+    terms : sequence of Term
+        The terms.
     start, free : Tensor, shape (B, D)
         Start of the search; 1 for the variables it may change, 0 for the others.
     length : int
@@ -135,144 +130,32 @@ class Objective:
 
     Attributes
     ----------
-    factor : Factor or BandedFactor
+    factor : Factor
         Cholesky factor of the Gauss-Newton curvature at the start.
-    terms : sequence of Term, or TermArrays
-        The terms; arrays wherever the kernels are used.
 
     """
 
-    factor: Factor | BandedFactor
-
-    def __init__(
-        self, terms: Sequence[Term] | TermArrays, start: Tensor, length: int, free: Tensor
-    ) -> None:
-        if not isinstance(terms, TermArrays) and compiled(start) is not None:
-            terms = term_arrays(terms, start, length)
-        self.terms = terms
+    def __init__(self, terms: Sequence[Term], start: Tensor, length: int, free: Tensor) -> None:
+        self._terms = terms
         self._start = start
         self._length = length
         self._free = free
-        if isinstance(terms, TermArrays):
-            value, gradient, self.factor = linearise(terms, start, free)
-        else:
-            curvature = Chain.zeros(start, length)
-            value, gradient = value_and_gradient(terms, start, length, curvature)
-            self.factor = curvature.factorised(free)
+        curvature = Chain.zeros(start, length)
+        value, gradient = value_and_gradient(terms, start, length, curvature)
+        self.factor = curvature.factorised(free)
         self._at_start = value, gradient * free
 
     def __call__(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`."""
         if x is self._start:
             return self._at_start
-        if isinstance(self.terms, TermArrays):
-            value, gradient = accumulate(self.terms, x, rows, self._length)
-            return value, gradient * select(self._free, rows)
-        terms, free = select((self.terms, self._free), rows)
+        terms, free = select((self._terms, self._free), rows)
         value, gradient = value_and_gradient(terms, x, self._length)
         return value, gradient * free
 
     def newton(self, vector: Tensor, rows: Tensor) -> Tensor:
         """Return the inverse curvature at the start times `vector` (b, D), for `rows`."""
-        if isinstance(self.factor, BandedFactor):
-            return self.factor.solve_rows(vector, rows)
         return cast(Factor, select(self.factor, rows)).solve(vector)
-
-
-def linearise(terms: TermArrays, x: Tensor, free: Tensor) -> tuple[Tensor, Tensor, BandedFactor]:
-    """Return values (B,), gradients (B, D) and the factor of the curvature at `x` (B, D)."""
-    B, D = x.shape
-    factor = BandedFactor.empty(B, D, SHARED)
-    length = (D - SHARED) // LINK
-    value, gradient = accumulate(terms, x, torch.arange(B), length, factor)
-    kernel = _kernels(x).normal_equations.factorise_windows
-    run(kernel, B, contiguous(free), *(part.numpy() for part in factor))
-    return value, gradient, factor
-
-
-def accumulate(
-    terms: TermArrays, x: Tensor, rows: Tensor, last: int, curvature: BandedFactor | None = None
-) -> tuple[Tensor, Tensor]:
-    """
-    Return values (b,) and gradients (b, D) at `x` (b, D) of the windows `rows`, by the kernel.
-
-    Of the residuals that begin at the first `last` observations. Their Gauss-Newton matrix is
-    written to `curvature`, if that is given.
-
-    """
-    if curvature is None:
-        curvature = BandedFactor.empty(0, x.shape[1], SHARED)
-    value = np.empty(len(x))
-    gradient = np.empty(tuple(x.shape))
-    run(
-        _kernels(x).normal_equations.accumulate, len(x), contiguous(x), rows.numpy(), last, terms,
-        value, gradient, *(part.numpy() for part in curvature),
-    )  # fmt: skip
-    return torch.from_numpy(value), torch.from_numpy(gradient)
-
-
-def _kernels(like: Tensor) -> Kernels:
-    kernels = compiled(like)
-    assert kernels is not None
-    return kernels
-
-
-def term_arrays(terms: Sequence[Term], start: Tensor, length: int) -> TermArrays:
-    """Return `terms`, whose search starts at `start` (B, D), as the kernels take them."""
-    B = len(start)
-    by_function = {term.function: term for term in terms}
-
-    def weight(function: Callable[..., Linearised], size: int) -> Any:
-        """Return W, shape (B, n, size, size); n is 0 without the term."""
-        term = by_function.get(function)
-        return np.zeros((B, 0, size, size)) if term is None else _array(term.weight[:, :, 0])
-
-    def data(function: Callable[..., Linearised], *absent: tuple[int, ...]) -> list[Any]:
-        """Return the data of a term; zeros of shapes (B, ...) where it is `absent`."""
-        term = by_function.get(function)
-        if term is None:
-            return [np.zeros((B, *shape)) for shape in absent]
-        return [_array(part) for part in term.data]
-
-    def dense_weight(function: Callable[..., Linearised], size: int) -> Any:
-        """Return W of a term with one stencil, shape (B, size, size); 0 without the term."""
-        has_term = function in by_function
-        return weight(function, size)[:, 0] if has_term else np.zeros((B, size, size))
-
-    given, inset = data(faces, (0, 6), (0, 6))
-    face_term = by_function.get(faces)
-    face_weight = np.zeros((B, 0, 6, 4, 4)) if face_term is None else _array(face_term.weight)
-    pose, axes = data(input_pose, (0, 6), (0, 3, 3))
-    shape_start, wanted = data(rigid_shape, (0, 6), (0, 6))
-    timed = acceleration if acceleration in by_function else slip
-    (times,) = data(timed, (length,))
-    (mean,) = data(marginalisation_prior, (1, PRIOR_SIZE))
-    (expected,) = data(shared_prior, (SHARED,))
-    return TermArrays(
-        given=given,
-        inset=inset,
-        W_faces=face_weight,
-        input_pose=pose,
-        axes=axes,
-        W_input=weight(input_pose, LINK),
-        shape_start=shape_start,
-        shape_axes=_array(rotation_from_rpy(torch.from_numpy(shape_start)[..., 3:])),
-        wanted=wanted,
-        W_shape=weight(rigid_shape, LINK),
-        times=times,
-        W_acceleration=weight(acceleration, LINK),
-        W_slip=weight(slip, 2),
-        W_zero_motion=weight(zero_motion, LINK),
-        prior_mean=np.ascontiguousarray(mean[:, 0]),
-        W_prior=dense_weight(marginalisation_prior, PRIOR_SIZE),
-        expected=expected,
-        W_shared=dense_weight(shared_prior, SHARED),
-    )
-
-
-def _array(tensor: Tensor) -> Any:
-    """Return a contiguous array of float64 for a kernel."""
-    return np.ascontiguousarray(tensor.numpy(), dtype=np.float64)
 
 
 def faces(state: State, given: Tensor, inset: Tensor) -> Linearised:

@@ -9,21 +9,14 @@ from math import inf
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import terms
-from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Problem, SHARED, State
+from boxreg_ros.core.batch import BIAS, EXTENT, GAP, POSE_ERRORS, Problem, State
 from boxreg_ros.core.face_support import BOTTOM, FaceObservations
 from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
 from boxreg_ros.core.input_model import Expectation
-from boxreg_ros.core.kernels import compiled, contiguous, run
-from boxreg_ros.core.kernels.arrays import (
-    ClassDeviations,
-    ExpectedArrays,
-    FaceArrays,
-    TermArrays,
-    WeightNumbers,
-)
+from boxreg_ros.core.kernels import contiguous
+from boxreg_ros.core.kernels.arrays import ClassDeviations, WeightNumbers
 from boxreg_ros.core.terms import Term
 from boxreg_ros.structures import YAW
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -102,9 +95,6 @@ def weigh(
     shared_weight = _shared_weights(state, observations, face_weight, expected, config)
     to_body = at_input.by_pose[:, :, 0]  # (B, N, 6, 6)
     slip_weight = problem.of_class('slip', 'climb')[:, None] ** -2 * valid[:, 1:, None]
-    prior_information = problem.prior_information
-    if not config.ingredients.marginalisation:
-        prior_information = torch.zeros_like(prior_information)
     return [
         Term(
             terms.faces,
@@ -122,55 +112,28 @@ def weigh(
         Term(terms.shared_prior, _diagonal(shared_weight[:, None]), (expected.shared,)),
         Term(
             terms.marginalisation_prior,
-            prior_information[:, None, None],
+            prior_information(problem, config)[:, None, None],
             (problem.prior_mean[:, None],),
         ),
     ]
 
 
-def weigh_compiled(
-    problem: Problem,
-    state: State,
-    observations: FaceObservations,
-    expected: Expectation,
-    config: Config,
-    is_smooth: bool,
-) -> TermArrays:
+def prior_information(problem: Problem, config: Config) -> Tensor:
+    """Return the information of the marginalisation prior (B, 34, 34), 0 where it is off."""
+    if config.ingredients.marginalisation:
+        return problem.prior_information
+    return torch.zeros_like(problem.prior_information)
+
+
+def weight_numbers(config: Config, is_smooth: bool) -> WeightNumbers:
     """
-    Return the same terms as `weigh`, as arrays, by the kernel.
+    Return constants and settings for the kernel.
 
     With `is_smooth` the motion terms are robust, as by `robustify_motion`.
 
     """
-    kernels = compiled(state.pose)
-    assert kernels is not None
-    B, N = problem.valid.shape
-    given = contiguous(problem.pose)
-    prior_information = problem.prior_information
-    if not config.ingredients.marginalisation:
-        prior_information = torch.zeros_like(prior_information)
-    terms = TermArrays(
-        given=given,
-        inset=contiguous(observations.inset),
-        W_faces=np.zeros((B, N, 6, 4, 4)),
-        input_pose=given,
-        axes=np.empty((B, N, 3, 3)),
-        W_input=np.zeros((B, N, 6, 6)),
-        shape_start=np.zeros((B, 0, 6)),
-        shape_axes=np.zeros((B, 0, 3, 3)),
-        wanted=np.zeros((B, 0, 6)),
-        W_shape=np.zeros((B, 0, 6, 6)),
-        times=contiguous(problem.times),
-        W_acceleration=np.zeros((B, max(0, N - 2), 6, 6)),
-        W_slip=np.zeros((B, N - 1, 2, 2)),
-        W_zero_motion=np.zeros((B, N - 1, 6, 6)),
-        prior_mean=contiguous(problem.prior_mean),
-        W_prior=contiguous(prior_information),
-        expected=contiguous(expected.shared),
-        W_shared=np.zeros((B, SHARED, SHARED)),
-    )
-    settings, ingredients = config.faces, config.ingredients
-    numbers = WeightNumbers(
+    ingredients = config.ingredients
+    return WeightNumbers(
         input_outlier=INPUT_OUTLIER if ingredients.robust_weights else inf,
         motion_outlier=MOTION_OUTLIER,
         gap_outlier=GAP_OUTLIER if ingredients.robust_weights else inf,
@@ -181,27 +144,22 @@ def weigh_compiled(
         driving_speed=DRIVING_SPEED,
         driving_span=DRIVING_SPAN,
         driving_reach=DRIVING_REACH,
-        face_outlier=settings.outlier,
+        face_outlier=config.faces.outlier,
         is_robust=is_smooth and ingredients.robust_motion,
+        pin_deviations=PIN_DEVIATIONS,
     )
+
+
+def class_deviations(problem: Problem, config: Config) -> ClassDeviations:
+    """Return the deviations of the class of each window for the kernel."""
     drift = problem.of_class('drift')
-    of_class = ClassDeviations(
+    return ClassDeviations(
         faces=contiguous(_face_deviations(problem, config)),
         acceleration=contiguous(problem.of_class(*ACCELERATIONS)),
         slip=contiguous(problem.of_class('slip', 'climb')),
         zero_motion=contiguous(drift * drift.new_tensor(DRIFT_RATIOS)),
-        heading=contiguous(problem.of_class('heading')[:, 0]),
+        pose=contiguous(problem.of_class(*POSE_ERRORS)),
     )
-    columns = {name: contiguous(getattr(expected, name)) for name in ExpectedArrays._fields}
-    run(
-        kernels.weights.weigh_windows, B, problem.arrays(), contiguous(state.pose),
-        contiguous(state.shared), FaceArrays(*map(contiguous, observations)),
-        ExpectedArrays(**columns), of_class, numbers, terms,
-    )  # fmt: skip
-    if problem.pinned.any():
-        weight = torch.from_numpy(terms.W_input).diagonal(dim1=2, dim2=3)
-        weight.copy_(_with_pins(weight, problem, expected))
-    return terms
 
 
 def robustify_motion(term: Term, state: State) -> Term:

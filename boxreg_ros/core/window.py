@@ -180,13 +180,14 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     """
     lengths = np.array([len(window.observations) for window in windows])
     valid = np.arange(lengths.max()) < lengths[:, None]  # (B, N)
-    boxes, times, origins, ground = _stack_observations(windows, valid)
+    columns = _columns(windows)
+    boxes, times, origins, ground = _stack_observations(columns, valid)
     priors = [w.prior or MarginalisationPrior.none(w.observations[0].box[:3]) for w in windows]
     base, state, step, information, extents = (
         np.array(part) for part in zip(*priors, strict=True)
     )
     pinned = np.zeros(valid.shape, bool)
-    pinned[valid] = [o.is_pinned for window in windows for o in window.observations]
+    pinned[valid] = columns.is_pinned
     if config.ingredients.heading_sign:
         boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, pinned, state[:, 5])
     else:
@@ -196,14 +197,15 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     start[..., :3] -= base[:, None]
     minimum, is_usable = _prior_minimum(start, state, step)
     information *= PRIOR_DECAY * is_usable[:, None, None]
-    first, counts = _places_of_returns(windows, valid)
+    first, counts = _places_of_returns(columns, valid)
+    class_numbers, kind = _of_classes(windows, config)
     on_device = partial(_tensor, device=config.device)
     problem = Problem(
         boxes=on_device(boxes),
         start=on_device(start),
         valid=on_device(valid),
         times=on_device(times),
-        returns=_returns(windows, config),
+        returns=_returns(columns, config),
         first=on_device(first),
         counts=on_device(counts),
         origins=on_device(origins),
@@ -211,8 +213,8 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
         prior_mean=on_device(np.nan_to_num(minimum)),
         prior_information=on_device(information),
         marginalised_extents=on_device(extents),
-        class_numbers=on_device(_class_numbers(windows, config)),
-        kind=on_device(np.array([KINDS.index(config.kind(w.class_name)) for w in windows])),
+        class_numbers=on_device(class_numbers),
+        kind=on_device(kind),
         pinned=on_device(pinned),
     )
     return problem, base
@@ -222,29 +224,35 @@ def _tensor(array: NDArray[Any], device: str) -> Tensor:
     return torch.from_numpy(array).to(device)
 
 
+def _columns(windows: Sequence[Window]) -> Any:
+    """Return the observations of all windows as one `Observation` of tuples."""
+    every = [observation for window in windows for observation in window.observations]
+    return Observation._make(zip(*every, strict=True))
+
+
 def _stack_observations(
-    windows: Sequence[Window], valid: NDArray[np.bool_]
+    columns: Any, valid: NDArray[np.bool_]
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Return input boxes, times, sensor origins and ground heights, padded.
+    Return input boxes, times, sensor origins and ground heights of `_columns`, padded.
 
     Shapes (B, N, 9), (B, N), (B, N, K, 3) and (B, N). Padding repeats the last box of a window, at
     later times, and the last sensor of an observation.
 
     """
     B, N = valid.shape
-    every = [observation for window in windows for observation in window.observations]
     lengths = valid.sum(1)
     boxes = np.zeros((B, N, 9))
-    boxes[valid] = np.concatenate([observation.box for observation in every]).reshape(-1, 9)
-    sensors = stack_origins([observation.origins for observation in every])
+    boxes[valid] = np.concatenate(columns.box).reshape(-1, 9)
+    sensors = stack_origins(columns.origins)
     origins = np.zeros((B, N, *sensors.shape[1:]))
     origins[valid] = sensors
     ground = np.full((B, N), np.nan)
-    ground[valid] = [observation.ground for observation in every]
-    first_ns = np.repeat([window.observations[0].stamp_ns for window in windows], lengths)
+    ground[valid] = columns.ground
+    stamps_ns = np.array(columns.stamp_ns)
+    first_ns = np.repeat(stamps_ns[np.cumsum(lengths) - lengths], lengths)
     times = np.zeros((B, N))
-    times[valid] = (np.array([observation.stamp_ns for observation in every]) - first_ns) * 1e-9
+    times[valid] = (stamps_ns - first_ns) * 1e-9
     row = np.arange(B)[:, None]
     column = np.arange(N)
     last = lengths[:, None] - 1
@@ -255,32 +263,34 @@ def _stack_observations(
 
 def stack_origins(origins: Sequence[Floats]) -> Floats:
     """Return the sensors (k, 3) of O observations as one array (O, K, 3); the last repeats."""
-    counts = np.array([len(sensors) for sensors in origins])
+    counts = np.array(list(map(len, origins)))
+    if counts.max() == 1:
+        return np.concatenate(origins)[:, None]
     first = np.cumsum(counts) - counts
     column = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # (O, K)
     stacked: Floats = np.concatenate(origins)[first[:, None] + column]
     return stacked
 
 
-def _places_of_returns(windows: Sequence[Window], valid: NDArray[np.bool_]) -> tuple[Ints, Ints]:
+def _places_of_returns(columns: Any, valid: NDArray[np.bool_]) -> tuple[Ints, Ints]:
     """Return where the returns of each observation begin in `_returns`, and how many; (B, N)."""
     counts = np.zeros(valid.shape, dtype=np.int64)
-    counts[valid] = [len(o.points) for window in windows for o in window.observations]
+    counts[valid] = list(map(len, columns.points))
     first = np.cumsum(counts).reshape(counts.shape) - counts
     return first, counts
 
 
-def _returns(windows: Sequence[Window], config: Config) -> Returns:
+def _returns(columns: Any, config: Config) -> Returns:
     """Return the returns of all observations, one after the other, delayed from their boxes."""
-    every = [observation for window in windows for observation in window.observations]
-    is_sight = config.sampling.box_time == 'sight'
-    of_boxes = [o.delays - is_sight * np.float32(o.sight) for o in every]
-    delays = np.concatenate(of_boxes)
+    counts = list(map(len, columns.points))
+    delays = np.concatenate(columns.delays)
+    if config.sampling.box_time == 'sight' and any(columns.sight):
+        delays -= np.repeat(np.array(columns.sight, dtype=np.float32), counts)
     return Returns(
-        _tensor(np.concatenate([observation.points for observation in every]), config.device),
+        _tensor(np.concatenate(columns.points), config.device),
         _tensor(delays, config.device),
         is_moving=bool(delays.any()),
-        width=max(1, *(len(observation.points) for observation in every)),
+        width=max(1, *counts),
     )
 
 
@@ -333,11 +343,12 @@ def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, 
     return minimum, np.asarray((half_turns % 2 == 0).all(1))
 
 
-def _class_numbers(windows: Sequence[Window], config: Config) -> Floats:
-    """Return the numbers of each window's `ClassConfig`, in the order of its fields, (B, D)."""
-    names = {window.class_name for window in windows}
-    rows = {name: numbers_of(config.class_config(name)) for name in names}
-    return np.array([rows[window.class_name] for window in windows], dtype=np.float64)
+def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Floats, Ints]:
+    """Return numbers of the `ClassConfig` (B, C) and kind (B,) of each window, see `Problem`."""
+    kinds = {name: config.kind(name) for name in {window.class_name for window in windows}}
+    kind = np.array([KINDS.index(kinds[window.class_name]) for window in windows])
+    numbers = np.array([numbers_of(getattr(config, name)) for name in KINDS], dtype=np.float64)
+    return numbers[kind], kind
 
 
 def resolve_headings(

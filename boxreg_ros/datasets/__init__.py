@@ -11,9 +11,12 @@ from boxreg_ros.datasets.recording import SceneRecording
 from boxreg_ros.datasets.registry import (
     Address,
     address_of,
+    all_scenes,
     DATASETS,
     module_of,
     open_scene,
+    resolved,
+    scene_files,
     scene_inputs,
     scene_names,
 )
@@ -21,12 +24,15 @@ from boxreg_ros.datasets.registry import (
 __all__ = [
     'Address',
     'address_of',
+    'all_scenes',
     'Cloud',
     'Dataset',
     'DATASETS',
     'module_of',
     'open_scene',
+    'resolved',
     'Scene',
+    'scene_files',
     'scene_inputs',
     'scene_names',
     'SceneRecording',

@@ -18,9 +18,9 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels import frames_of, SceneFrames
 from boxreg_ros.labels.argoverse2 import (
     ANNOTATIONS_FILE,
+    CITY_FRAME,
     EGO_FRAME,
     EGO_POSES_FILE,
-    FIXED_FRAME,
     xyz_xyzw,
 )
 from boxreg_ros.labels.arrow import read_rows, read_table
@@ -34,11 +34,11 @@ DATASET = Dataset(
     folder=f'LOG/{EGO_POSES_FILE}, LOG/sensors/lidar/ (in the folder of a split or above it)',
     scene='LOG',
     labels='argoverse2',
+    remedy='download the whole log',
+    lidar='lidar',
     packages=('pyarrow',),
 )
-LIDAR = 'lidar'
-CALIBRATION_FILE = 'calibration/egovehicle_SE3_sensor.feather'
-REMEDY = 'download the whole log'
+SENSOR_POSES_FILE = 'calibration/egovehicle_SE3_sensor.feather'
 
 
 def scene_names(root: Path) -> list[str]:
@@ -49,29 +49,31 @@ def scene_names(root: Path) -> list[str]:
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files and folders of a log."""
     log = _logs(root)[name]
-    paths = [log / part for part in (ANNOTATIONS_FILE, EGO_POSES_FILE, CALIBRATION_FILE)]
-    return (log / 'sensors' / LIDAR, *(path for path in paths if path.is_file()))
+    paths = [log / part for part in (ANNOTATIONS_FILE, EGO_POSES_FILE, SENSOR_POSES_FILE)]
+    return (log / 'sensors' / DATASET.lidar, *(path for path in paths if path.is_file()))
 
 
 def open_scene(root: Path, name: str, points: str | None) -> Scene:
     """Return a log; see `protocol.DatasetModule`."""
-    require_lidar(points, [LIDAR], LIDAR)
+    require_lidar(points, [DATASET.lidar], DATASET.lidar)
     log = _logs(root)[name]
-    clouds = require(log / 'sensors' / LIDAR, 'the sweeps', REMEDY)
+    clouds = require(log / 'sensors' / DATASET.lidar, 'the sweeps', DATASET.remedy)
     stamps_ns = sorted(int(path.stem) for path in clouds.glob('*.feather'))
     if not stamps_ns:
-        raise RecordingError(f'{clouds}: expected sweeps STAMP.feather, got none; {REMEDY}')
-    origin = _origin(require(log / CALIBRATION_FILE, 'the calibration', REMEDY))
+        raise RecordingError(
+            f'{clouds}: expected sweeps STAMP.feather, got none; {DATASET.remedy}'
+        )
+    origin = _origin(require(log / SENSOR_POSES_FILE, 'the calibration', DATASET.remedy))
     rows = sorted(read_rows(log / EGO_POSES_FILE), key=lambda row: row['timestamp_ns'])
     frames = SceneFrames(
         name,
         {str(stamp_ns): stamp_ns for stamp_ns in stamps_ns},
-        *frame_names(log, FIXED_FRAME, EGO_FRAME),
+        *frame_names(log, CITY_FRAME, EGO_FRAME),
     )
     annotations = log / ANNOTATIONS_FILE
     return Scene(
         frames,
-        LIDAR,
+        DATASET.lidar,
         np.array(stamps_ns, np.int64),
         partial(_sweep_files, clouds, stamps_ns, origin),
         np.array([row['timestamp_ns'] for row in rows], np.int64),
@@ -106,7 +108,7 @@ def _origin(path: Path) -> Floats:
     """Return the mean position of the LiDARs, which are on top of each other, in ego (3,)."""
     rows = [row for row in read_rows(path) if 'lidar' in row['sensor_name']]
     if not rows:
-        raise RecordingError(f'{path}: expected the pose of a LiDAR, got none; {REMEDY}')
+        raise RecordingError(f'{path}: expected the pose of a LiDAR, got none; {DATASET.remedy}')
     positions = np.array([xyz_xyzw(row)[:3] for row in rows])
     return np.asarray(positions.mean(axis=0))
 

@@ -34,34 +34,35 @@ DATASET = Dataset(
     folder='velodyne/0000/, oxts/, calib/, label_02/ (of training/, unless the folder is named)',
     scene='0000',
     labels='kitti',
+    remedy='unpack its archives into one folder',
+    lidar='velodyne',
 )
-LIDAR = 'velodyne'
 PERIOD_NS = 100_000_000
 """Time between two frames [ns]: the LiDAR turns ten times a second."""
-DIGITS = 6
+TRACKING_DIGITS = 6
 
 
 def scene_names(root: Path) -> list[str]:
     """Return the names of the sequences with clouds."""
-    return sorted(path.name for path in (_split(root) / LIDAR).glob('*') if path.is_dir())
+    return sorted(path.name for path in (_split(root) / DATASET.lidar).glob('*') if path.is_dir())
 
 
 def inputs(root: Path, name: str) -> tuple[Path, ...]:
     """Return the files and folders of a sequence."""
     split = _split(root)
     paths = [split / folder / f'{name}.txt' for folder in ('label_02', 'oxts', 'calib')]
-    return (split / LIDAR / name, *(path for path in paths if path.is_file()))
+    return (split / DATASET.lidar / name, *(path for path in paths if path.is_file()))
 
 
 def open_scene(root: Path, name: str, points: str | None) -> Scene:
     """Return a sequence; see `protocol.DatasetModule`."""
-    require_lidar(points, [LIDAR], LIDAR)
+    require_lidar(points, [DATASET.lidar], DATASET.lidar)
     split = _split(root)
-    clouds = split / LIDAR / name
+    clouds = split / DATASET.lidar / name
     numbers = [int(path.stem) for path in clouds.glob('*.bin') if path.stem.isdigit()]
     if not numbers:
         raise RecordingError(
-            f'{clouds}: expected sweeps {0:0{DIGITS}d}.bin and so on, got none; unpack '
+            f'{clouds}: expected sweeps {0:0{TRACKING_DIGITS}d}.bin and so on, got none; unpack '
             f'data_tracking_velodyne.zip into the same folder'
         )
     calibration = require(
@@ -70,13 +71,13 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
     stamps_ns, poses = _poses(split, name, calibration, 1 + max(numbers))
     names = {str(number): stamp_ns for number, stamp_ns in enumerate(stamps_ns.tolist())}
     camera = Camera.read(calibration)
-    frames = SceneFrames(name, names, *frame_names(split, 'map', LIDAR), camera)
+    frames = SceneFrames(name, names, *frame_names(split, 'map', DATASET.lidar), camera)
     labels = split / 'label_02' / f'{name}.txt'
     return Scene(
         frames,
-        LIDAR,
+        DATASET.lidar,
         stamps_ns,
-        partial(sweep_files, clouds, DIGITS, stamps_ns.tolist()),
+        partial(sweep_files, clouds, TRACKING_DIGITS, stamps_ns.tolist()),
         stamps_ns,
         poses,
         partial(frames_of, 'kitti', labels, frames) if labels.is_file() else None,
@@ -104,4 +105,4 @@ def _poses(split: Path, name: str, calibration: Path, count: int) -> tuple[Ints,
 
 def _split(root: Path) -> Path:
     """Return the folder of a split: the root itself, or ``training`` in it."""
-    return root if (root / LIDAR).is_dir() else root / 'training'
+    return root if (root / DATASET.lidar).is_dir() else root / 'training'

@@ -29,10 +29,10 @@ DATASET = Dataset(
     folder='v1.0-*/scene.json, samples/, sweeps/',
     scene='scene-0061',
     labels='nuscenes',
+    remedy='unpack its metadata and LiDAR archives into one folder',
     packages=('ijson',),
 )
 CLOUD_SUFFIX = '.pcd.bin'
-REMEDY = 'unpack the metadata archive of this split into the same folder'
 
 
 def scene_names(root: Path) -> list[str]:
@@ -82,7 +82,7 @@ def _scene(root: Path, tables: Path, scene: dict[str, Any], points: str | None) 
     if not sweeps:
         raise RecordingError(
             f'{tables / "sample_data.json"}: expected sweeps of {channel} in {scene["name"]}, got '
-            f'none; {REMEDY}'
+            f'none; {DATASET.remedy}'
         )
     sweeps.sort(key=_stamp_ns)
     # The stamp of a sample is that of its sweep, which our own exports have in nanoseconds.
@@ -123,7 +123,7 @@ def _poses(tables: Path, sweeps: list[dict[str, Any]], calibrations: dict[str, F
     if missing:
         raise RecordingError(
             f'{tables / "ego_pose.json"}: expected the poses of {len(wanted)} sweeps, got '
-            f'{len(T_global_ego)}, the first without is {min(missing)}; {REMEDY}'
+            f'{len(T_global_ego)}, the first without is {min(missing)}; {DATASET.remedy}'
         )
     return pose_rows(
         [
@@ -149,10 +149,10 @@ def _tables_of(root: Path, name: str) -> tuple[Path, dict[str, Any]]:
         for row in _rows(tables, 'scene'):
             if row['name'] == name:
                 return tables, row
-    raise RecordingError(f'{root}: expected the scene {name!r}, got none; {REMEDY}')
+    raise RecordingError(f'{root}: expected the scene {name!r}, got none; {DATASET.remedy}')
 
 
 def _rows(tables: Path, name: str) -> Iterator[dict[str, Any]]:
     """Yield the rows of a table."""
-    path = require(tables / f'{name}.json', f'the table {name!r} of nuScenes', REMEDY)
+    path = require(tables / f'{name}.json', f'the table {name!r} of nuScenes', DATASET.remedy)
     yield from json_items(path)

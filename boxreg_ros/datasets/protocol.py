@@ -28,6 +28,10 @@ class Dataset:
         What the name of a scene is.
     labels : str
         Label format of its results for ``--labels``; '' for none.
+    remedy : str
+        How to complete a folder with missing files.
+    lidar : str
+        Name of the main LiDAR; '' if the scene states it.
     packages : tuple of str
         Packages of pip that are needed beyond those of boxreg_ros itself.
 
@@ -38,6 +42,8 @@ class Dataset:
     folder: str
     scene: str
     labels: str
+    remedy: str
+    lidar: str = ''
     packages: tuple[str, ...] = ()
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from boxreg_ros.datasets.protocol import Scene, SweepFile
-from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_inputs
+from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_files
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.recording import Item, LOOKAHEAD_NS, not_measured, Stage
@@ -44,7 +44,9 @@ class SceneRecording:
     ----------
     has_boxes : bool
         Whether boxes are required.
-    points_topic, boxes_topic, odometry_topic, start_ns, end_ns, unreadable, first_errors, outside
+    points_topic, placement, boxes_topic, odometry_topic, start_ns, end_ns
+        See `ItemSource`.
+    unreadable, first_errors, outside
         See `ItemSource`.
 
     Raises
@@ -66,6 +68,7 @@ class SceneRecording:
         labels: tuple[str, Path] | None = None,
     ) -> None:
         self._address = address
+        self._dataset = module_of(address.dataset).DATASET
         self._points = points
         self._start, self._end = start, end
         self._labels = labels
@@ -125,10 +128,7 @@ class SceneRecording:
     @property
     def files(self) -> list[Path]:
         """Return the files that the scene is read from."""
-        found: list[Path] = []
-        for path in scene_inputs(self._address):
-            found += sorted(path.rglob('*')) if path.is_dir() else [path]
-        return [path for path in found if path.is_file()]
+        return scene_files(self._address)
 
     def sensor_frame(self) -> str:
         """Return the frame of the clouds."""
@@ -192,8 +192,8 @@ class SceneRecording:
         for topic, first in self.first_errors.items():
             if not self._readable:
                 raise UnsupportedMessage(
-                    f'none of {self.unreadable[topic]} sweeps of {topic!r} can be read; first: '
-                    f'{first}'
+                    f'{self}: none of {self.unreadable[topic]} sweeps of {topic!r} can be read; '
+                    f'first: {first}; {self._dataset.remedy}'
                 )
 
     def _frames(self) -> Iterator[LabelFrame]:
@@ -203,10 +203,9 @@ class SceneRecording:
             return frames_of(*self._labels, scene.frames)
         if scene.boxes is not None:
             return scene.boxes()
-        dataset = module_of(self._address.dataset).DATASET
         remedy = 'give label files with --labels'
-        if dataset.labels:
-            remedy = f'give detections or tracks with --labels {dataset.labels}:PATH'
+        if self._dataset.labels:
+            remedy = f'give detections or tracks with --labels {self._dataset.labels}:PATH'
         raise RecordingError(
             f'{self}: no boxes: expected {scene.without_boxes}, got none (a test split has none); '
             f'{remedy}'

@@ -147,6 +147,21 @@ def scene_inputs(address: Address) -> tuple[Path, ...]:
     return module_of(address.dataset).inputs(address.root, address.scene)
 
 
+def scene_files(address: Address) -> list[Path]:
+    """Return the files that a scene is read from; raises as `resolved`."""
+    found: list[Path] = []
+    for path in scene_inputs(address):
+        found += sorted(path.rglob('*')) if path.is_dir() else [path]
+    return [path for path in found if path.is_file()]
+
+
+def all_scenes(address: Address) -> list[Address]:
+    """Return the address of each scene of a folder, or the one that is named."""
+    if address.scene:
+        return [address]
+    return [address._replace(scene=name) for name in scene_names(address)]
+
+
 def open_scene(address: Address, points: str | None = None) -> Scene:
     """Return a scene, with the LiDAR `points`; raises as `resolved` and as its module."""
     address = resolved(address)

@@ -19,6 +19,7 @@ from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, concatenation, pointcloud
 from msg_adapters.concatenation import ConcatenationInfo
+from msg_adapters.point_layout import AUTO
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,6 +59,8 @@ class Lidars:
         single topic. Empty if the frame of each cloud is that of its LiDAR.
     info : str
         Topic of the messages that divide the clouds among the LiDARs; empty for none.
+    time_unit : str
+        Unit of the times of the points, or ``auto``.
 
     Raises
     ------
@@ -70,6 +73,7 @@ class Lidars:
     topics: tuple[str, ...] = ()
     frames: tuple[str, ...] = ()
     info: str = ''
+    time_unit: str = AUTO
 
     def __post_init__(self) -> None:
         """Check that the parts fit each other."""
@@ -111,11 +115,14 @@ class SensorPlacement:
     ----------
     lidars : Lidars
         As above.
+    layouts : dict of str
+        Layout of the first cloud of each topic, and how the times of its points are read.
 
     """
 
     def __init__(self, lidars: Lidars = SINGLE_LIDAR) -> None:
         self.lidars = lidars
+        self.layouts: dict[str, str] = {}
         self._frames: Mapping[str, Sequence[str]] = {'': lidars.frames}
         if len(lidars.topics) > 1:
             pairs = zip(lidars.topics, lidars.frames, strict=False)  # all of them, or none
@@ -134,7 +141,10 @@ class SensorPlacement:
 
         """
         cloud = clouds.plain(msg)
-        sweep = pointcloud.from_msg(cloud)
+        unit = self.lidars.time_unit
+        if topic not in self.layouts:
+            self.layouts[topic] = pointcloud.described(cloud, unit)
+        sweep = pointcloud.from_msg(cloud, unit)
         if self.lidars.info:
             return replace(sweep, rows=pointcloud.finite_rows(cloud))
         return replace(sweep, topic=topic) if len(self.lidars.topics) > 1 else sweep

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 import shlex
 from typing import Any, cast, NamedTuple, Protocol, runtime_checkable, Self
@@ -514,7 +515,7 @@ class Recording:
             info = self._topic('points-info', 'info on concatenated clouds', (INFO_TYPE,), info)
         elif len(topics) == 1 and self._topics.get(topics[0] + INFO_SUFFIX) == INFO_TYPE:
             info = topics[0] + INFO_SUFFIX
-        self.placement = SensorPlacement(Lidars(tuple(topics), lidars.frames, info))
+        self.placement = SensorPlacement(replace(lidars, topics=tuple(topics), info=info))
 
     def _topic(self, role: str, what: str, types: tuple[str, ...], asked: str | None) -> str:
         """Return the topic asked for, or the only one of these types."""

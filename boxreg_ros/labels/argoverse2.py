@@ -66,7 +66,7 @@ POINT_COLUMNS = {'intensity': 'uint8', 'laser_number': 'uint8', 'offset_ns': 'in
 OPTIONAL_COLUMNS = {'track_uuid', 'num_interior_pts'}
 """Detections that are submitted lack these."""
 LOG_COLUMN = 'log_id'
-FIXED_FRAME, EGO_FRAME = 'city', 'egovehicle'
+CITY_FRAME, EGO_FRAME = 'city', 'egovehicle'
 ANNOTATIONS_FILE = 'annotations.feather'
 EGO_POSES_FILE = 'city_SE3_egovehicle.feather'
 LIDAR_NAME = 'up_lidar'
@@ -138,7 +138,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     pose_file = folder / EGO_POSES_FILE
     poses = read_rows(pose_file) if pose_file.exists() else []
     T_city_ego = {row['timestamp_ns']: matrix(xyz_xyzw(row)) for row in poses}
-    fixed_frame, sensor_frame = frame_names(folder, FIXED_FRAME, EGO_FRAME)
+    fixed_frame, sensor_frame = frame_names(folder, CITY_FRAME, EGO_FRAME)
     for refined in _refined(path, read_table(path), sensor_frame):
         T = T_city_ego.get(refined.boxes.stamp_ns)
         yield LabelFrame(refined, fixed_frame, sensor_frame, T)

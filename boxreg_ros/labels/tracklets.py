@@ -24,7 +24,13 @@ from xml.sax.saxutils import escape, unescape
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import to_json
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import (
+    Format,
+    LabelFrame,
+    Options,
+    Provenance,
+    SceneFrames,
+)
 from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.labels.sidecar import read_sidecar, SidecarWriter
 from boxreg_ros.rotations import matrix_from_rpy
@@ -33,6 +39,7 @@ from boxreg_ros.structures import (
     Floats,
     HEIGHT,
     LENGTH,
+    RefinedBoxes,
     ROLL,
     X,
     YAW,
@@ -203,29 +210,65 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """
     if path.is_dir():
         path = path / FILE
-    try:
-        builder = ElementTree.TreeBuilder(insert_comments=True)
-        tree = ElementTree.parse(path, ElementTree.XMLParser(target=builder))
-        text = path.read_text(encoding='utf-8')
-        is_swapped = SWAPPED_COMMENT in text[: text.find('<boost_serialization')]
-        boxes_by_frame = _boxes_by_frame(tree.getroot(), is_swapped)
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
-    except (ElementTree.ParseError, ValueError) as error:
-        raise RecordingError(f'{path}: expected tracklets of KITTI: {error}') from None
+    boxes_by_frame = _read_boxes(path)
     raw_stamps = path.parent / 'velodyne_points' / 'timestamps.txt'
     count = 1 + max(boxes_by_frame, default=-1)
     sidecar = read_sidecar(path.parent, count, raw_stamps if raw_stamps.exists() else None)
     for index, stamp_ns in enumerate(sidecar.stamps_ns):
         boxes = boxes_by_frame.get(index, [])
-        refined = refined_boxes(
-            stamp_ns,
-            sidecar.sensor_frame,
-            [item.track_id for item in boxes],
-            [item.class_name for item in boxes],
-            [item.box for item in boxes],
+        yield sidecar.frame(index, _refined(stamp_ns, sidecar.sensor_frame, boxes))
+
+
+def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
+    """
+    Yield the frames of a drive, by the stamps of the data set.
+
+    Parameters
+    ----------
+    path : Path
+        ``tracklet_labels.xml``, or the folder that contains it.
+    scene : SceneFrames
+        The drive.
+
+    """
+    if path.is_dir():
+        path = path / FILE
+    boxes_by_frame = _read_boxes(path)
+    last = max(boxes_by_frame, default=-1)
+    if last >= len(scene.stamps_ns):
+        raise RecordingError(
+            f'{path}: expected frames 0 to {len(scene.stamps_ns) - 1} of {scene.name}, got frame '
+            f'{last}; name the tracklets of this drive'
         )
-        yield sidecar.frame(index, refined)
+    for number, stamp_ns in scene.stamps_ns.items():
+        boxes = boxes_by_frame.get(int(number), [])
+        refined = _refined(stamp_ns, scene.sensor_frame, boxes)
+        yield LabelFrame(refined, scene.fixed_frame, scene.sensor_frame)
+
+
+def _refined(stamp_ns: int, frame_id: str, boxes: list[_ReadBox]) -> RefinedBoxes:
+    """Return the boxes of a frame."""
+    return refined_boxes(
+        stamp_ns,
+        frame_id,
+        [item.track_id for item in boxes],
+        [item.class_name for item in boxes],
+        [item.box for item in boxes],
+    )
+
+
+def _read_boxes(path: Path) -> dict[int, list[_ReadBox]]:
+    """Return the boxes of a tracklet file by the index of their frame."""
+    try:
+        builder = ElementTree.TreeBuilder(insert_comments=True)
+        tree = ElementTree.parse(path, ElementTree.XMLParser(target=builder))
+        text = path.read_text(encoding='utf-8')
+        is_swapped = SWAPPED_COMMENT in text[: text.find('<boost_serialization')]
+        return _boxes_by_frame(tree.getroot(), is_swapped)
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+    except (ElementTree.ParseError, ValueError) as error:
+        raise RecordingError(f'{path}: expected tracklets of KITTI: {error}') from None
 
 
 def _boxes_by_frame(root: ElementTree.Element, is_swapped: bool) -> dict[int, list[_ReadBox]]:

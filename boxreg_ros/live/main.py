@@ -1,4 +1,4 @@
-"""`boxreg_node`: entry point of the live node; arguments, errors and exit status."""
+"""Entry points of the live node, plain and managed; arguments, errors and exit status."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NAME = 'boxreg_node'
 WITHOUT_ROS = "source a ROS 2 Jazzy installation, or pip install 'boxreg_ros[ros]'"
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: Sequence[str] | None = None, is_managed: bool = False) -> int:
     """
     Run the node until SIGINT or SIGTERM, then end the process.
 
@@ -22,6 +22,8 @@ def main(args: Sequence[str] | None = None) -> int:
     ----------
     args : sequence of str, optional
         Arguments after the name of the program; None: those of the process.
+    is_managed : bool
+        Whether to run the lifecycle node.
 
     Returns
     -------
@@ -42,7 +44,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
     keep_freed_memory()
     try:
-        node = make_node(NAME, list(sys.argv[1:] if args is None else args))
+        node = make_node(NAME, list(sys.argv[1:] if args is None else args), is_managed)
     except Exception as error:
         shut_down()
         is_usage = isinstance(error, ConfigError) or not isinstance(error, BoxregError)
@@ -53,6 +55,11 @@ def main(args: Sequence[str] | None = None) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status)
+
+
+def lifecycle(args: Sequence[str] | None = None) -> int:
+    """Run the lifecycle node, see `main`."""
+    return main(args, is_managed=True)
 
 
 def _fail(error: Exception, status: int) -> int:

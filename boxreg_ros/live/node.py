@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from functools import partial
 import gc
 from pathlib import Path
@@ -48,13 +49,16 @@ class BoxregNode(Node):
     """
     Subscribes to clouds, boxes, TF and odometry; publishes refined boxes.
 
+    Its life has three steps: the constructor declares the parameters, `configure` warms up, `open`
+    creates topics and services. `close` destroys these again.
+
     Callbacks run in the thread of the executor. They put messages and events into the inbox and
     return at once. `worker` runs in another thread and does the rest.
 
     Attributes
     ----------
     worker : Worker
-        Registers boxes and publishes them, once ``worker.run`` runs in a thread.
+        Registers boxes and publishes them in the thread of `run_worker`; made by `open`.
     recording : Recording
         Writes the final boxes as label files, where that is asked for.
 
@@ -62,8 +66,6 @@ class BoxregNode(Node):
     ------
     ConfigError
         If a parameter has a wrong value.
-    UnsupportedMessage
-        If `boxes_type` cannot be read or its package is not installed.
 
     """
 
@@ -74,48 +76,77 @@ class BoxregNode(Node):
             if 'PARAMETER_NOT_SET' not in str(error):
                 raise
             raise self._error_of_empty_lists() from None
-        config, options = declare(self)
-        self._settings = config, options
+        self._settings = declare(self)
         self.add_pre_set_parameters_callback(partial(reals_from_integers, self))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
+        self._health = Health(self.get_logger())
+        config, options = self._settings
+        self._inbox = Inbox(config.queue, max(1, len(options.lidars.topics)))
+        self.recording = Recording(self, self._inbox, self._health, lambda: self._settings)
+        self._opened = ExitStack()
+
+    def configure(self) -> None:
+        """
+        Load or compile kernels, time a window, and make a registrar without any track.
+
+        Raises
+        ------
+        ConfigError
+            If torch cannot use the device.
+
+        """
+        config, options = self._settings
         warm_up(config)
-        budget = TickBudget(options.deadline)
-        warm_up(config, budget.submit)  # once more, timed without imports and compilation
+        self._budget = TickBudget(options.deadline)
+        warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
+        self._live = LiveRegistrar(
+            config, options.fixed_frame, options.output_frame, options.transform_timeout,
+            self._health.report, options.convention, options.lidars, self._budget,
+        )  # fmt: skip
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
-        self._health = Health(self.get_logger())
-        lidars = options.lidars
-        self._inbox = Inbox(config.queue, max(1, len(lidars.topics)))
+
+    def open(self) -> None:
+        """
+        Create topics, services and timers.
+
+        Raises
+        ------
+        ConfigError
+            If a QoS override has a wrong value.
+        UnsupportedMessage
+            If `boxes_type` cannot be read or its package is not installed.
+
+        """
+        _, options = self._settings
         self._topics = Topics(self, self._health)
+        self._opened.callback(self._topics.close)
         self._markers = self._topics.publish(
             'visualization_msgs/msg/MarkerArray', 'refined_markers', 10
         )
         self._diagnostics = self._topics.publish(
             'diagnostic_msgs/msg/DiagnosticArray', '/diagnostics', 10
         )
-        live = LiveRegistrar(
-            config, options.fixed_frame, options.output_frame, options.transform_timeout,
-            self._health.report, options.convention, lidars, budget,
-        )  # fmt: skip
         self.worker = Worker(
-            live,
-            self._inbox,
-            self._health,
-            self.get_logger(),
-            budget,
-            options.backlog,
-            self._markers,
-        )
-        self.recording = Recording(self, self._inbox, self._health, lambda: self._settings)
+            self._live, self._inbox, self._health, self.get_logger(), self._budget,
+            options.backlog, self._markers,
+        )  # fmt: skip
+        self.recording.open()
+        self._opened.callback(self.recording.close)
         if options.record_to:
             self.recording.start()
-        self._subscribe_to_points(options.points_type, lidars)
+        self._subscribe_to_points(options.points_type, options.lidars)
         self._subscribe_to_motion()
-        self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_service(Trigger, '~/save_config', self._on_save_config)
+        for name, callback in (
+            ('~/reset', self._on_reset),
+            ('~/save_config', self._on_save_config),
+        ):
+            service = self.create_service(Trigger, name, callback)
+            self._opened.callback(self.destroy_service, service)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs on while /clock stands still
-        self.create_timer(STATUS_PERIOD, self._publish_status, clock=steady)
+        status_timer = self.create_timer(STATUS_PERIOD, self._publish_status, clock=steady)
+        self._opened.callback(self.destroy_timer, status_timer)
         self._search: BoxesTypeSearch | None = None
         if options.boxes_type:
             self._open_boxes(canonical(options.boxes_type))
@@ -123,7 +154,20 @@ class BoxregNode(Node):
             name = self.resolve_topic_name('boxes')
             self._search = BoxesTypeSearch(self._topics, name, options.convention)
             self._search_timer = self.create_timer(GRAPH_PERIOD, self._find_boxes, clock=steady)
+            self._opened.callback(self.destroy_timer, self._search_timer)
             self.get_logger().info(f'waiting for the type of {name}; {self._topics.description()}')
+
+    def close(self) -> None:
+        """Destroy what `open` has created; the worker has ended before."""
+        self._opened.close()
+
+    def run_worker(self) -> None:
+        """Process messages until `stop_worker`."""
+        self.worker.run()
+
+    def stop_worker(self) -> None:
+        """Make `run_worker` publish what is held, and return."""
+        self.worker.stop()
 
     # ------------------------------------------------------------ topics
 
@@ -153,6 +197,7 @@ class BoxregNode(Node):
             self._subscribe_to_transforms()
         else:
             self._listener = TransformListener(_TransformsToInbox(self._inbox), self)
+            self._opened.callback(self._listener.unregister)
             self.get_logger().debug('transforms are received by tf2_ros')
 
     def _subscribe_to_transforms(self) -> None:

@@ -12,6 +12,7 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars
 from msg_adapters import CLOUD_TYPES, POINTS_TYPE
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS
+from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -29,6 +30,11 @@ NODE_SETTINGS = (
     Setting(
         'points_type', POINTS_TYPE, 'message type of the clouds, as package/msg/Type',
         choices=CLOUD_TYPES,
+    ),
+    Setting(
+        'time_unit', AUTO,
+        'unit of the times of the points; auto: that of the layout, else by magnitude',
+        choices=TIME_UNIT_CHOICES,
     ),
     Setting(
         'sensor_frames', (),
@@ -114,6 +120,7 @@ class NodeOptions(NamedTuple):
     boxes_type: str
     points: tuple[str, ...]
     points_type: str
+    time_unit: str
     sensor_frames: tuple[str, ...]
     points_info: str
     pose_reference: str
@@ -140,7 +147,7 @@ class NodeOptions(NamedTuple):
     @property
     def lidars(self) -> Lidars:
         """Return the topics of the clouds and the frames of the LiDARs."""
-        return Lidars(self.points, self.sensor_frames, self.points_info)
+        return Lidars(self.points, self.sensor_frames, self.points_info, self.time_unit)
 
 
 def declare(node: Node) -> tuple[Config, NodeOptions]:
@@ -253,6 +260,46 @@ def parameters_yaml(config: Config, options: NodeOptions | None = None) -> str:
         if item.name != 'estimate':
             lines.append(_yaml_line(item, '      ' if group else '    ', name, value))
     return '\n'.join(lines) + '\n'
+
+
+def parameters_schema() -> dict[str, Any]:
+    """Return the JSON schema of a ROS parameter file of the node, such as `params.yaml`."""
+    values: dict[str, Any] = {'use_sim_time': {'type': 'boolean'}, 'qos_overrides': {}}
+    for item in (*NODE_SETTINGS, *settings()):
+        group, _, name = item.name.rpartition('.')
+        target = values
+        if group:
+            target = values.setdefault(group, _object_schema({}))['properties']
+        target[name] = _schema_of(item)
+    parameters = _object_schema({'ros__parameters': _object_schema(values)})
+    return {
+        '$schema': 'http://json-schema.org/draft-07/schema#',
+        'title': 'Parameters of boxreg_node',
+        'type': 'object',
+        'additionalProperties': parameters,  # by the name of the node, or /** for any
+    }
+
+
+def _object_schema(properties: dict[str, Any]) -> dict[str, Any]:
+    return {'type': 'object', 'properties': properties, 'additionalProperties': False}
+
+
+def _schema_of(item: Setting) -> dict[str, Any]:
+    """Return the JSON schema of one setting: type, default, meaning and bounds."""
+    names = {bool: 'boolean', int: 'integer', float: 'number', str: 'string', tuple: 'array'}
+    unit = f' [{item.unit}]' if item.unit else ''
+    schema = {
+        'type': names[type(item.default)],
+        'default': _plain(item.default),
+        'description': f'{item.meaning}{unit}',
+    }
+    if isinstance(item.default, tuple):
+        schema['items'] = {'type': 'string'}
+    if item.choices:
+        schema['enum'] = list(item.choices)
+    if item.low is not None:
+        schema |= {'minimum': item.low, 'maximum': item.high}
+    return schema
 
 
 def describe(item: Setting) -> ParameterDescriptor:

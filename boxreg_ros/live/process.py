@@ -11,6 +11,7 @@ import sys
 from threading import Event, Thread
 import time
 
+from boxreg_ros.live.lifecycle import BoxregLifecycleNode
 from boxreg_ros.live.node import BoxregNode
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -29,9 +30,9 @@ The recorder completes it in any case; launch files send SIGTERM after 5 s.
 """
 
 
-def make_node(program: str, arguments: list[str]) -> BoxregNode:
+def make_node(program: str, arguments: list[str], is_managed: bool = False) -> BoxregNode:
     """
-    Initialise ROS and return the node.
+    Initialise ROS and return the node: open, or unconfigured if it is managed.
 
     Parameters
     ----------
@@ -39,6 +40,8 @@ def make_node(program: str, arguments: list[str]) -> BoxregNode:
         Name of the program, for its help text.
     arguments : list of str
         Its arguments, those of ROS included.
+    is_managed : bool
+        Whether it is a lifecycle node, which waits for its transitions.
 
     Raises
     ------
@@ -51,7 +54,12 @@ def make_node(program: str, arguments: list[str]) -> BoxregNode:
         program, description='Refine boxes live. Parameters: --ros-args -p NAME:=VALUE ...'
     )
     parser.parse_args(remove_ros_args(arguments))
-    return BoxregNode()
+    if is_managed:
+        return BoxregLifecycleNode()
+    node = BoxregNode()
+    node.configure()
+    node.open()
+    return node
 
 
 def run(node: BoxregNode) -> list[Exception]:
@@ -68,7 +76,7 @@ def run(node: BoxregNode) -> list[Exception]:
     executor.add_node(node)
     stop = Event()
     failures: list[Exception] = []
-    tasks: list[Callable[[], None]] = [partial(_spin, executor, stop), node.worker.run]
+    tasks: list[Callable[[], None]] = [partial(_spin, executor, stop), node.run_worker]
     threads = [
         Thread(target=_run_task, args=(task, failures, ask_end), daemon=True) for task in tasks
     ]
@@ -77,7 +85,7 @@ def run(node: BoxregNode) -> list[Exception]:
     os.read(end_asked, 1)
     # `Executor.shutdown` would destroy entities that its thread may be about to wait for.
     executor.create_task(stop.set)
-    node.worker.stop()
+    node.stop_worker()
     end = time.monotonic() + ENDING_TIME
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()))

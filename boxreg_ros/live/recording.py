@@ -17,6 +17,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.service import Service
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -31,7 +32,8 @@ class Recording:
     Parameters
     ----------
     node : Node
-        Offers the services ``~/start_recording``, ``~/stop_recording`` and ``~/split``.
+        Offers the services ``~/start_recording``, ``~/stop_recording`` and ``~/split`` while the
+        recording is open.
     inbox : Inbox
         Passes recorders to the worker, in the order of the messages.
     health : Health
@@ -48,6 +50,7 @@ class Recording:
         health: Health,
         settings: Callable[[], tuple[Config, NodeOptions]],
     ) -> None:
+        self._node = node
         self._inbox = inbox
         self._health = health
         self._settings = settings
@@ -57,12 +60,23 @@ class Recording:
         self._ended = Future()
         self._error = ''
         self._is_shown = False
-        # Its callbacks wait: in the group of the others, these would wait with them.
+        self._services: list[Service] = []
+
+    def open(self) -> None:
+        """Create the services."""
+        # Their callbacks wait: in the group of the others, these would wait with them.
         group = ReentrantCallbackGroup()
-        services = {'start_recording': self._on_start, 'stop_recording': self._on_stop}
-        services['split'] = self._on_split
-        for name, callback in services.items():
-            node.create_service(Trigger, f'~/{name}', callback, callback_group=group)
+        callbacks = {'start_recording': self._on_start, 'stop_recording': self._on_stop}
+        callbacks['split'] = self._on_split
+        self._services = [
+            self._node.create_service(Trigger, f'~/{name}', callback, callback_group=group)
+            for name, callback in callbacks.items()
+        ]
+
+    def close(self) -> None:
+        """Destroy the services."""
+        for service in self._services:
+            self._node.destroy_service(service)
 
     def start(self) -> None:
         """Start to record into the folder of the parameter `record_to`."""

@@ -14,28 +14,42 @@ from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.live.diagnostics import Health
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from msg_adapters import canonical
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
+    HistoryPolicy,
     LivelinessPolicy,
     QoSPolicyKind,
     QoSProfile,
     ReliabilityPolicy,
 )
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 PATIENCE = 10.0
 """A topic without publishers or messages is reported this long after its subscription [s]."""
+MAX_DEPTH = 2**31 - 1
+"""Longest queue; derived: DDS counts its samples by a signed integer of 32 bits."""
+
+
+def _depth_result(qos: QoSProfile) -> SetParametersResult:
+    """Return whether DDS can have a queue of the depth of a profile."""
+    is_possible = qos.history == HistoryPolicy.KEEP_ALL or 1 <= qos.depth <= MAX_DEPTH
+    reason = f'depth: expected 1 to {MAX_DEPTH}, got {qos.depth}'
+    return SetParametersResult(successful=is_possible, reason='' if is_possible else reason)
+
+
 QOS_OVERRIDES = QoSOverridingOptions(
     (
         QoSPolicyKind.HISTORY,
         QoSPolicyKind.DEPTH,
         QoSPolicyKind.RELIABILITY,
         QoSPolicyKind.DURABILITY,
-    )
+    ),
+    callback=_depth_result,
 )
 """Policies that parameters ``qos_overrides.TOPIC.ENTITY.POLICY`` may set."""
 INFINITE_NS = 9223372036854775807
@@ -191,6 +205,15 @@ class Topics:
         self._endpoints.append(endpoint)
         publisher: Publisher = endpoint.entity
         return publisher
+
+    def close(self) -> None:
+        """Destroy all subscriptions and publishers."""
+        for endpoint in self._endpoints:
+            if endpoint.is_input:
+                self._node.destroy_subscription(endpoint.entity)
+            else:
+                self._node.destroy_publisher(endpoint.entity)
+        self._endpoints.clear()
 
     def description(self) -> str:
         """Return one line with the resolved name, type and QoS of every topic."""
@@ -451,6 +474,9 @@ def _checked_overrides(name: str) -> Iterator[None]:
     """Name the QoS override that is wrong: rclpy checks their types by bare assertions."""
     try:
         yield
+    except InvalidQosOverridesError as error:
+        reason = str(error).partition('are not valid: ')[2]
+        raise ConfigError(f'qos_overrides.{name}.{reason}; correct it or leave it out') from None
     except (AssertionError, AttributeError, RuntimeError, TypeError) as error:
         raise ConfigError(
             f'qos_overrides.{name}: expected a whole number for depth and policy names such as '

@@ -107,6 +107,7 @@ class Worker:
         self._final: Publisher | None = None
         self._stopping = Event()
         self._confirmed: deque[ReceivedMessage] = deque()
+        self._logged_layouts: set[str] = set()
 
     def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
         """Set what reads and writes boxes; to be called before boxes are subscribed to."""
@@ -204,6 +205,7 @@ class Worker:
         try:
             if message.topic == 'points':
                 content = self._live.placement.sweep_of(message.content, message.lidar)
+                self._log_layouts()
             else:
                 assert self._live.adapter is not None  # set before boxes are subscribed to
                 content = self._live.adapter.from_msg(message.content)
@@ -216,6 +218,13 @@ class Worker:
         if message.topic == 'boxes':
             self._publish(self._live.passed_through(message.content))
         return None
+
+    def _log_layouts(self) -> None:
+        """Log the layout of the first cloud of each LiDAR."""
+        for lidar, layout in self._live.placement.layouts.items():
+            if lidar not in self._logged_layouts:
+                self._logged_layouts.add(lidar)
+                self._logger.info(f'clouds {lidar or "points"}: {layout}')
 
     def _pause(self) -> None:
         """Wait for messages, and release held boxes if none arrive for long."""

@@ -8,6 +8,7 @@ from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
+from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
 import yaml
 
 if TYPE_CHECKING:
@@ -68,6 +69,10 @@ def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
         'LiDARs (default: that of the clouds with _info behind it, if there is one)',
     )  # fmt: skip
     parser.add_argument(
+        '--time-unit', choices=TIME_UNIT_CHOICES, default=AUTO,
+        help='unit of the times of the points (default: that of the layout, else by magnitude)',
+    )  # fmt: skip
+    parser.add_argument(
         '--boxes', metavar='TOPIC', help='topic of the boxes (default: found by type)'
     )
     parser.add_argument(
@@ -114,14 +119,19 @@ def lidars_from(args: argparse.Namespace) -> Lidars:
     """Return the topics of the clouds and the frames of the LiDARs of the arguments."""
     from boxreg_ros.io.lidars import Lidars  # imports numpy
 
-    return Lidars(tuple(args.points), tuple(args.sensor_frames), args.points_info)
+    frames = tuple(args.sensor_frames)
+    return Lidars(tuple(args.points), frames, args.points_info, args.time_unit)
 
 
 def lidar_options(args: argparse.Namespace) -> list[str]:
     """Return the options that `lidars_from` reads, as they are written."""
     words = [f'--points={topic}' for topic in args.points]
     words += [f'--sensor-frame={frame}' for frame in args.sensor_frames]
-    return words + [f'--points-info={args.points_info}'] * bool(args.points_info)
+    if args.points_info:
+        words.append(f'--points-info={args.points_info}')
+    if args.time_unit != AUTO:
+        words.append(f'--time-unit={args.time_unit}')
+    return words
 
 
 def convention_from(args: argparse.Namespace, associate: bool = False) -> Convention:

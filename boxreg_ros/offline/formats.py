@@ -1,10 +1,12 @@
-"""`boxreg formats`: the label formats and their conventions."""
+"""`boxreg formats`: the label formats and their conventions, and the data sets that are read."""
 
 from __future__ import annotations
 
 import argparse
 from importlib import import_module
 
+from boxreg_ros.datasets import DATASETS
+from boxreg_ros.datasets import module_of as dataset_module
 from boxreg_ros.labels import can_read, Format, FORMATS
 
 FORMAT_COLUMNS = (
@@ -18,6 +20,21 @@ FORMAT_COLUMNS = (
     'files',
     'needs',
 )
+
+
+DATASET_COLUMNS = ('address', 'data set', 'in the folder', '`--labels`', 'needs')
+
+
+def dataset_rows() -> list[tuple[str, ...]]:
+    """Return each data set in the columns of `DATASET_COLUMNS`."""
+    table: list[tuple[str, ...]] = []
+    for name in DATASETS:
+        dataset = dataset_module(name).DATASET
+        labels = f'{dataset.labels}:PATH' if dataset.labels else ''
+        packages = ', '.join(dataset.packages)
+        address = f'{name}:FOLDER#{dataset.scene}'
+        table.append((address, dataset.title, dataset.folder, labels, packages))
+    return table
 
 
 def rows() -> list[tuple[str, ...]]:
@@ -47,11 +64,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a paragraph per format."""
+    """Print a paragraph per label format and per data set."""
     for name, title, is_readable, *conventions, needs in rows():
         print(f'{name}: {title}' + ('' if is_readable else ' (written only)'))
         for column, text in zip(FORMAT_COLUMNS[3:], conventions, strict=False):
             print(f'    {column:9} {text}')
+        if needs:
+            print(f'    needs     pip install {needs}')
+    print('\ndata sets, as recordings:')
+    for address, title, folder, labels, needs in dataset_rows():
+        print(f'{address}: {title}')
+        print(f'    folder    {folder}')
+        if labels:
+            print(f'    labels    --labels {labels}')
         if needs:
             print(f'    needs     pip install {needs}')
     return 0

@@ -150,14 +150,12 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
 
 def _scenes(paths: list[Path]) -> list[str]:
     """Return the addresses of all scenes of a data set, if none of several is named."""
-    from boxreg_ros.datasets import scene_names
+    from boxreg_ros.datasets import all_scenes
     from boxreg_ros.offline.sources import scene_address
 
     address = scene_address(paths)
-    if address is None or address.scene:
-        return []
-    names = scene_names(address)
-    return [str(address._replace(scene=name)) for name in names] if len(names) > 1 else []
+    found = [] if address is None else all_scenes(address)
+    return [str(scene) for scene in found] if len(found) > 1 else []
 
 
 def _scene_contents(paths: list[Path]) -> dict[str, Any]:
@@ -273,6 +271,7 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
         'sensor_frame': recording.sensor_frame(),
         'transforms': [_transform(link) for link in session.tree.links()],
         'connected_frames': session.tree.groups(),
+        'point_layouts': recording.placement.layouts,
         'sample': _summary(sample),
         'warnings': list(_warnings(sample, session.finding, recording)),
     }
@@ -450,6 +449,8 @@ def _sample_lines(facts: dict[str, Any]) -> Iterator[str]:
         f'  clouds {facts["points_topic"]}: {sample["points_per_sweep"]:,} points, {shown}, '
         f'{_seconds(sample["sweep_period_s"])} apart, {len(sample["gaps"]["sweeps"])} gaps'
     )
+    for topic, layout in facts['point_layouts'].items():
+        yield f'  layout {topic}: {layout}'
     yield (
         f'  boxes {facts["boxes_topic"]}: {_seconds(sample["boxes_period_s"])} apart, '
         f'{len(sample["gaps"]["box_arrays"])} gaps, at most '

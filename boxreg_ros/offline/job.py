@@ -8,12 +8,17 @@ from glob import glob
 import hashlib
 import os
 from pathlib import Path
+import re
 import shlex
 from typing import Any
 
 from boxreg_ros import __version__
+from boxreg_ros.datasets import address_of, all_scenes, resolved, scene_files
+from boxreg_ros.errors import BoxregError
 
 MANIFESTS = ('.txt', '.lst')
+COMMENT = re.compile(r'(^|\s)#.*')
+"""A comment of a manifest; within a word, ``#`` begins the name of a scene."""
 JOB_FAILED = 'failed'
 JOB_DONE = 'done'
 UP_TO_DATE = 'up to date'
@@ -63,6 +68,10 @@ class Job:
     def files(self) -> Iterator[Path]:
         """Yield all files of the recordings."""
         for path in self.recordings:
+            address = address_of(path)
+            if address is not None:
+                yield from scene_files(address)
+                continue
             inner = sorted(path.iterdir()) if path.is_dir() else [path]
             yield from (file for file in inner if file.is_file())
 
@@ -101,17 +110,20 @@ class Job:
 
 def jobs_of(arguments: Sequence[Path]) -> list[Job]:
     """
-    Return one job per drive of recordings, patterns and manifests.
+    Return one job per drive of recordings, patterns, manifests and data sets.
 
     A manifest is a text file with one drive per line: its recordings, merged by time. Relative
-    paths begin at the manifest; ``#`` begins a comment. A drive that does not exist, or is named
-    a second time, has failed already.
+    paths begin at the manifest; ``#`` begins a comment. A data set without the name of a scene
+    is one drive per scene. A drive that does not exist, or is named a second time, has failed
+    already.
 
     """
     drives: list[tuple[Path, ...]] = []
     for argument in arguments:
         if argument.suffix in MANIFESTS and argument.is_file():
             drives += _manifest(argument)
+        elif (address := address_of(argument)) is not None:
+            drives += [(Path(str(scene)),) for scene in all_scenes(address)]
         elif not argument.exists() and glob(str(argument)):
             drives += [(Path(path),) for path in sorted(glob(str(argument)))]
         else:
@@ -130,15 +142,26 @@ def jobs_of(arguments: Sequence[Path]) -> list[Job]:
 
 def _manifest(path: Path) -> Iterator[tuple[Path, ...]]:
     for line in path.read_text(encoding='utf-8').splitlines():
-        words = shlex.split(line, comments=True)
+        words = shlex.split(COMMENT.sub('', line))
         if words:
-            yield tuple(path.parent / word for word in words)
+            yield tuple(_listed(path.parent, word) for word in words)
+
+
+def _listed(folder: Path, word: str) -> Path:
+    """Return a path of a manifest in `folder`; the address of a scene is returned unchanged."""
+    return Path(word) if address_of(Path(word)) is not None else folder / word
 
 
 def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
     """Return why a drive cannot be done; empty if it can. Its recordings become `seen`."""
     for path in drive:
-        if not path.exists():
+        address = address_of(path)
+        if address is not None:
+            try:
+                resolved(address)
+            except BoxregError as error:
+                return str(error)
+        elif not path.exists():
             return 'expected a recording, got no such file; correct its path, or leave it out'
         if path.resolve() in seen:
             return 'expected each recording once, got it a second time; leave one out'
@@ -148,12 +171,18 @@ def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
 
 def _names(drives: Sequence[tuple[Path, ...]]) -> list[str]:
     """Return a name for each drive: the stem of its first path, with its folders if needed."""
-    stems = [drive[0].stem for drive in drives]
+    stems = [_stem(drive[0]) for drive in drives]
     if len(set(stems)) == len(stems):
         return stems
     paths = [str(drive[0].resolve().with_suffix('')) for drive in drives]
     common = os.path.commonpath(paths)
     return [os.path.relpath(path, common).replace(os.sep, '_') for path in paths]
+
+
+def _stem(path: Path) -> str:
+    """Return the name of a recording without its suffix, or that of a scene."""
+    address = address_of(path)
+    return path.stem if address is None else resolved(address).scene
 
 
 def _hash(path: Path) -> str:

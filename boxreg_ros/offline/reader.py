@@ -93,6 +93,8 @@ class Findings(NamedTuple):
         Error of the first cloud whose LiDARs are not all known; empty if there is none.
     lidars : dict of str and Counter
         Of each of several topics of clouds: clouds that were merged, late and missing.
+    point_layouts : dict of str
+        Layout of the clouds of each topic, and how the times of their points are read.
     unreadable, first_unreadable : int and str
         Number of unreadable messages, and the first error of each topic.
     apart : dict
@@ -112,6 +114,7 @@ class Findings(NamedTuple):
     first_missing_transform: str
     first_unplaced: str
     lidars: dict[str, Counter[str]]
+    point_layouts: dict[str, str]
     unreadable: int
     first_unreadable: str
     apart: dict[str, float]
@@ -205,6 +208,7 @@ class RecordingReader:
             self._first_missing_transform,
             self._first_unplaced,
             self._session.lidar_counts,
+            recording.placement.layouts,
             recording.unreadable.total(),
             '; '.join(map(str, recording.first_errors.values())),
             recording.apart,

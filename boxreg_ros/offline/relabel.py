@@ -337,6 +337,7 @@ def _summary(
         'without_stamp': _without_stamp(findings),
         'damage': [damage._asdict() for damage in findings.damages],
         'lidars': {topic: dict(counts) for topic, counts in findings.lidars.items()},
+        'point_layouts': findings.point_layouts,
         'first_missing_transform': findings.first_missing_transform,
         'first_unplaced': findings.first_unplaced,
         'first_unreadable': findings.first_unreadable,
@@ -414,23 +415,7 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
 
 def notes(summary: dict[str, Any]) -> Iterator[str]:
     """Yield warnings about the input and the results, one line each."""
-    if summary['damage']:
-        yield _damage_line(summary['damage'])
-    if summary['without_stamp']:
-        counts = ' and '.join(f'{n:,} {kind}' for kind, n in summary['without_stamp'].items())
-        yield (
-            f'{counts} have the stamp 0 in their header and cannot be used: receive times do not '
-            f'replace stamps; let the publishers set them'
-        ).replace('box_arrays', 'box arrays')
-    if summary['warning']:
-        yield summary['warning']
-    if summary['first_missing_transform']:
-        boxes = summary['reasons'].get('no_transform', 0)
-        sweeps = summary['dropped'].get('sweep_without_transform', 0)
-        yield (
-            f'{boxes:,} boxes and {sweeps:,} clouds have no transform; first: '
-            f'{summary["first_missing_transform"]}'
-        )
+    yield from _input_notes(summary)
     for topic, counts in summary['lidars'].items():
         if counts.get(LATE) or counts.get(MISSING):
             yield (
@@ -476,6 +461,32 @@ def is_complete(summary: dict[str, Any]) -> bool:
     return not (
         summary['damage'] or summary['without_stamp'] or 'unreadable' in summary['dropped']
     )
+
+
+def _input_notes(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield what of the recording cannot be used, one line each."""
+    if summary['damage']:
+        yield _damage_line(summary['damage'])
+    if summary['without_stamp']:
+        counts = ' and '.join(f'{n:,} {kind}' for kind, n in summary['without_stamp'].items())
+        yield (
+            f'{counts} have the stamp 0 in their header and cannot be used: receive times do not '
+            f'replace stamps; let the publishers set them'
+        ).replace('box_arrays', 'box arrays')
+    if summary['warning']:
+        yield summary['warning']
+    if summary['first_unreadable']:
+        yield (
+            f'{summary["dropped"]["unreadable"]:,} messages or sweeps could not be read; the rest '
+            f'was used; first: {summary["first_unreadable"]}'
+        )
+    if summary['first_missing_transform']:
+        boxes = summary['reasons'].get('no_transform', 0)
+        sweeps = summary['dropped'].get('sweep_without_transform', 0)
+        yield (
+            f'{boxes:,} boxes and {sweeps:,} clouds have no transform; first: '
+            f'{summary["first_missing_transform"]}'
+        )
 
 
 def _damage_line(damages: list[dict[str, Any]]) -> str:

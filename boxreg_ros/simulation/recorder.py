@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 import tempfile
 from typing import Any
@@ -11,12 +11,25 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.recording import VISION_DEFINITIONS
 from boxreg_ros.rotations import matrix_from_rpy, quaternion_from_matrix
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, Sweep
+from msg_adapters.concatenation import INFO_TYPE
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 TF_DEFINITION = {'tf2_msgs/msg/TFMessage': 'geometry_msgs/TransformStamped[] transforms'}
+INFO_DEFINITIONS = {
+    'autoware_sensing_msgs/msg/SourcePointCloudInfo': (
+        'std_msgs/Header header\nstring topic\nuint8 status\nuint32 idx_begin\nuint32 length'
+    ),
+    INFO_TYPE: (
+        'std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n'
+        'bool is_bigendian\nuint32 point_step\nuint32 row_step\nbool is_dense\n'
+        'bool concatenation_success\nuint8 matching_strategy\n'
+        'uint8[] matching_strategy_config\n'
+        'autoware_sensing_msgs/SourcePointCloudInfo[] source_info'
+    ),
+}
 
 
 def write_recording(
@@ -50,9 +63,46 @@ def write_recording(
         If `path` does not end in ``.mcap`` or cannot be written.
 
     """
+    make = LidarMessages()
+
+    def messages() -> Iterator[tuple[str, Any, int]]:
+        for sweep, intensity, boxes, T in zip(
+            sweeps, intensities, detections, T_fixed_sensor, strict=True
+        ):
+            stamp_ns = sweep.stamp_ns
+            frames = (fixed_frame, sweep.frame_id)
+            yield '/tf', make.transform(stamp_ns, *frames, T), stamp_ns
+            yield '/odom', make.odometry(stamp_ns, *frames, T), stamp_ns
+            yield '/points', make.cloud(sweep, intensity), stamp_ns
+            yield '/detections', make.detections(boxes), stamp_ns
+
+    write_messages(path, messages(), is_compressed)
+
+
+def write_messages(
+    path: Path, messages: Iterable[tuple[str, Any, int]], is_compressed: bool = False
+) -> None:
+    """
+    Write messages of `LidarMessages`; an old file is replaced at the end.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in ``.mcap``.
+    messages : iterable of tuple
+        Topic, message and receive time [ns].
+    is_compressed : bool
+        Compress by zstd.
+
+    Raises
+    ------
+    RecordingError
+        If `path` does not end in ``.mcap`` or cannot be written.
+
+    """
     if path.suffix != '.mcap':
         raise RecordingError(f'{path}: expected a name that ends in .mcap')
-    messages = _Messages()
+    store = LidarMessages().store
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f'.{path.stem}-') as folder:
             bag = Path(folder) / path.stem
@@ -61,54 +111,44 @@ def write_recording(
                 writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             with writer:
                 topics: dict[str, Any] = {}
-
-                def put(topic: str, message: Any, stamp_ns: int) -> None:
+                for topic, message, received_ns in messages:
                     name = message.__msgtype__
                     if topic not in topics:
-                        topics[topic] = writer.add_connection(
-                            topic, name, typestore=messages.store
-                        )
-                    data = messages.store.serialize_cdr(message, name)
-                    writer.write(topics[topic], stamp_ns, data)
-
-                for sweep, intensity, boxes, T in zip(
-                    sweeps, intensities, detections, T_fixed_sensor, strict=True
-                ):
-                    stamp_ns = sweep.stamp_ns
-                    frames = (fixed_frame, sweep.frame_id)
-                    put('/tf', messages.transform(stamp_ns, *frames, T), stamp_ns)
-                    put('/odom', messages.odometry(stamp_ns, *frames, T), stamp_ns)
-                    put('/points', messages.cloud(sweep, intensity), stamp_ns)
-                    put('/detections', messages.detections(boxes), stamp_ns)
+                        topics[topic] = writer.add_connection(topic, name, typestore=store)
+                    writer.write(topics[topic], received_ns, store.serialize_cdr(message, name))
             (bag / path.name).replace(path)
     except OSError as error:
         raise RecordingError(f'{path}: cannot be written: {error}') from None
 
 
-class _Messages:
-    """Makes the messages of the recording."""
+class LidarMessages:
+    """Makes the messages of a recording."""
 
     def __init__(self) -> None:
         self.store = get_typestore(Stores.ROS2_JAZZY)
         types: dict[str, Any] = {}
-        for name, text in (VISION_DEFINITIONS | TF_DEFINITION).items():
+        for name, text in (VISION_DEFINITIONS | TF_DEFINITION | INFO_DEFINITIONS).items():
             if name not in self.store.types:
                 types.update(get_types_from_msg(text, name))
         self.store.register(types)
 
     def make(self, kind: str, /, **fields: Any) -> Any:
+        """Return a message of a type ``package/Name``."""
         package, name = kind.split('/')
         return self.store.types[f'{package}/msg/{name}'](**fields)
 
     def header(self, stamp_ns: int, frame_id: str) -> Any:
+        """Return a header."""
         seconds, rest = divmod(stamp_ns, 10**9)
         stamp = self.make('builtin_interfaces/Time', sec=seconds, nanosec=rest)
         return self.make('std_msgs/Header', stamp=stamp, frame_id=frame_id)
 
     def numbers(self, kind: str, names: str, values: Floats) -> Any:
+        """Return a message of numbers whose names are the letters of `names`."""
         return self.make(kind, **dict(zip(names, map(float, values), strict=True)))
 
     def pose(self, position: Floats, R: Floats) -> Any:
+        """Return a PoseWithCovariance of a position (3,) and a rotation (3, 3)."""
         quaternion_xyzw = quaternion_from_matrix(R)
         pose = self.make(
             'geometry_msgs/Pose',
@@ -118,6 +158,7 @@ class _Messages:
         return self.make('geometry_msgs/PoseWithCovariance', pose=pose, covariance=np.zeros(36))
 
     def transform(self, stamp_ns: int, parent: str, child: str, T: Floats) -> Any:
+        """Return a TFMessage of T_parent_child (4, 4)."""
         pose = self.pose(T[:3, 3], T[:3, :3]).pose
         transform = self.make(
             'geometry_msgs/Transform',
@@ -132,7 +173,41 @@ class _Messages:
         )
         return self.make('tf2_msgs/TFMessage', transforms=[stamped])
 
+    def static_transforms(self, stamp_ns: int, parent: str, children: Mapping[str, Floats]) -> Any:
+        """Return a TFMessage with T_parent_child (4, 4) of several children."""
+        messages = [self.transform(stamp_ns, parent, name, T) for name, T in children.items()]
+        every = [message.transforms[0] for message in messages]
+        return self.make('tf2_msgs/TFMessage', transforms=every)
+
+    def info(self, whole: Sweep, parts: Sequence[Sweep]) -> Any:
+        """Return the info on a cloud that is concatenated from `parts`."""
+        begin = 0
+        sources = []
+        for part in parts:
+            source = self.make(
+                'autoware_sensing_msgs/SourcePointCloudInfo',
+                header=self.header(part.stamp_ns, part.frame_id),
+                topic=f'/points/{part.frame_id}',
+                status=0,
+                idx_begin=begin,
+                length=len(part.points),
+            )
+            sources.append(source)
+            begin += len(part.points)
+        cloud = self.cloud(whole, np.zeros(begin))
+        copied = ('header', 'height', 'width', 'fields', 'is_bigendian', 'point_step', 'row_step')
+        return self.make(
+            'autoware_sensing_msgs/ConcatenatedPointCloudInfo',
+            **{name: getattr(cloud, name) for name in copied},
+            is_dense=True,
+            concatenation_success=True,
+            matching_strategy=0,
+            matching_strategy_config=np.zeros(0, np.uint8),
+            source_info=sources,
+        )
+
     def odometry(self, stamp_ns: int, parent: str, child: str, T: Floats) -> Any:
+        """Return an Odometry of T_parent_child (4, 4)."""
         zero = self.numbers('geometry_msgs/Vector3', 'xyz', np.zeros(3))
         twist = self.make('geometry_msgs/Twist', linear=zero, angular=zero)
         return self.make(
@@ -146,6 +221,7 @@ class _Messages:
         )
 
     def cloud(self, sweep: Sweep, intensity: NDArray[Any]) -> Any:
+        """Return a PointCloud2 with intensities (M,) and the times of the points."""
         names = ('x', 'y', 'z', 'intensity', 't')
         times = np.zeros(len(intensity)) if sweep.times is None else sweep.times
         table = np.column_stack([sweep.points, intensity, times]).astype('<f4')
@@ -166,6 +242,7 @@ class _Messages:
         )
 
     def detections(self, boxes: BoxArray) -> Any:
+        """Return a Detection3DArray."""
         items = []
         for track_id, class_name, score, box in zip(
             boxes.track_ids, boxes.class_names, boxes.scores, boxes.boxes, strict=True

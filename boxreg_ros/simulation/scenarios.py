@@ -96,6 +96,16 @@ PARKED = (
 def street(rng: np.random.Generator, sweeps: int | None) -> Scene:
     """Return a street with parked rows and traffic in both directions."""
     count = sweeps or STREET_SWEEPS
+    actors = street_actors(rng, count)
+    ego = drive(count * SWEEP_PERIOD, (4, -1.75, 0), constant(6), zero)
+    ego.poses[:, 2] = SENSOR_HEIGHT
+    ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
+    sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
+    return _scan(actors, ego, sensor, count, rng)
+
+
+def street_actors(rng: np.random.Generator, count: int) -> list[Actor]:
+    """Return the parked rows and the traffic of the street for `count` sweeps."""
     plans = list(TRAFFIC)
     for shape, x, y in PARKED:
         place = (
@@ -104,12 +114,7 @@ def street(rng: np.random.Generator, sweeps: int | None) -> Scene:
             np.pi * (y > 0) + rng.normal(0, 0.03),
         )
         plans.append(Plan('car' if shape == 'suv' else shape, shape, place, zero, zero))
-    actors = [_actor(str(i + 1), plan, count, rng) for i, plan in enumerate(plans)]
-    ego = drive(count * SWEEP_PERIOD, (4, -1.75, 0), constant(6), zero)
-    ego.poses[:, 2] = SENSOR_HEIGHT
-    ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
-    sensor = Sensor(np.radians(np.linspace(-22, 3, 34)), columns=640)
-    return _scan(actors, ego, sensor, count, rng)
+    return [_actor(str(i + 1), plan, count, rng) for i, plan in enumerate(plans)]
 
 
 HIGHWAY = (

@@ -53,7 +53,7 @@ def test_solution_and_inverse(length):
     factor = found.factorised(free)
     solution = np.einsum('bde,be->bd', inverse, x)
     np.testing.assert_allclose(factor.solve(x), solution, atol=1e-6 * np.abs(solution).max())
-    blocks, columns = factor.inverse_of_links(length)
+    blocks, columns, _ = factor.inverse_blocks(length)
     known_columns = inverse[:, : LINK * length, LINK * length :]
     np.testing.assert_allclose(
         columns.flatten(1, 2), known_columns, atol=1e-6 * np.abs(inverse).max()
@@ -74,7 +74,7 @@ def test_an_indefinite_matrix_does_not_affect_others(spoil, place):
     factor = found.factorised(ones)
     for solved, right in (
         (factor.solve(x), known.solve(x)),
-        *zip(factor.inverse_of_links(27), known.inverse_of_links(27), strict=True),
+        *zip(factor.inverse_blocks(27), known.inverse_blocks(27), strict=True),
     ):
         np.testing.assert_array_equal(solved[[0, 2]], right[[0, 2]])
         assert not solved[1].isfinite().all()

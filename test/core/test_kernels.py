@@ -8,15 +8,18 @@ sums in a different order.
 
 from boxreg_ros.core.arrowhead import Chain
 from boxreg_ros.core.batch import SHARED, State
+from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.kernels.arrays import TermArrays
-from boxreg_ros.core.prior import marginalise, marginalised_terms
-from boxreg_ros.core.terms import Objective, value_and_gradient
+from boxreg_ros.core.prior import marginalise
+from boxreg_ros.core.terms import value_and_gradient
 import numpy as np
 import pytest
 from scenes import random_problem, random_variables, terms_of
 import torch
 
 pytest.importorskip('numba')
+from boxreg_ros.core.kernels import arrowhead, normal_equations
+
 TOLERANCE = 1e-9
 
 
@@ -29,29 +32,112 @@ def assert_close(found, known, tolerance=TOLERANCE):
     np.testing.assert_allclose(found, known, rtol=0, atol=tolerance * (scale or 1.0))
 
 
-def both_sides(terms, x, free):
-    """Return value, gradient, steps, and blocks of the inverse, by the kernels and by torch."""
-    N = (x.shape[1] - SHARED) // 6
-    objective = Objective(terms, x, N, free)
-    assert isinstance(objective.terms, TermArrays)
-    rows = torch.arange(len(x))
-    value, gradient = objective(x.clone(), rows)  # a copy: not the result kept for the start
-    steps = objective.newton(gradient, rows)
-    kernel = value, gradient, steps, *objective.factor.inverse_of_links(N)
+def term_arrays(terms, problem, b):
+    """Return the terms of window `b` as the kernels take them; without weight where missing."""
+    N = problem.length
+    by_name = {term.function.__name__: term for term in terms}
+
+    def data(name, *shapes):
+        if name not in by_name:
+            return [np.zeros(shape) for shape in shapes]
+        return [
+            part[b].numpy().reshape(shape)
+            for part, shape in zip(by_name[name].data, shapes, strict=True)
+        ]
+
+    def weight(name, *shape):
+        """Return W of every stencil; those that are missing at the end are zero."""
+        W = np.zeros(shape)
+        if name in by_name:
+            given = by_name[name].weight[b].numpy()
+            W[: len(given)] = given.reshape(-1, *shape[1:])
+        return W
+
+    def diagonal(name, rows, size):
+        return weight(name, rows, size, size).diagonal(axis1=1, axis2=2).copy()
+
+    acceleration = weight('acceleration', N, 6, 6)
+    start, wanted = data('rigid_shape', (N, 6), (N, 6))
+    _, axes = data('input_pose', (N, 6), (N, 3, 3))
+    (prior_mean,) = data('marginalisation_prior', (34,))
+    (expected,) = data('shared_prior', (SHARED,))
+    return TermArrays(
+        given=problem.pose[b].numpy().copy(),
+        inset=data('faces', (N, 6), (N, 6))[1],
+        W_faces=weight('faces', N, 6, 4, 4),
+        axes=rotation_from_rpy(torch.as_tensor(start[:, 3:])).numpy() if start.any() else axes,
+        W_input=diagonal('input_pose', N, 6),
+        start=start,
+        wanted=wanted,
+        W_shape=weight('rigid_shape', N if 'rigid_shape' in by_name else 0, 6, 6),
+        times=problem.times[b].numpy().copy(),
+        W_acceleration=acceleration[:, :3, :3].copy(),
+        W_turning=acceleration.diagonal(axis1=1, axis2=2)[:, 3:].copy(),
+        W_slip=diagonal('slip', N, 2),
+        W_zero_motion=diagonal('zero_motion', N, 6),
+        prior_mean=prior_mean,
+        W_prior=weight('marginalisation_prior', 1, 34, 34)[0],
+        expected=expected,
+        W_shared=diagonal('shared_prior', 1, SHARED)[0],
+    )
+
+
+def both_sides(terms, problem, x, free):
+    """Return value, gradient, steps and blocks of the inverse, by the kernels and by torch."""
+    N = problem.length
+    kernel = []
+    for b in range(len(x)):
+        arrays, own, mask = term_arrays(terms, problem, b), x[b].numpy(), free[b].numpy()
+        gradient = np.empty(len(own))
+        A = arrowhead.empty_arrowhead(N)
+        scratch = normal_equations.empty_scratch(N)
+        value = normal_equations.accumulate(own, N, arrays, scratch, gradient, A)
+        gradient *= mask
+        arrowhead.fix_variables(A, mask)
+        assert arrowhead.factorise(A)
+        steps = gradient.copy()
+        arrowhead.solve(A, steps)
+        corner = np.empty((SHARED, SHARED))
+        arrowhead.invert_corner(A.corner, corner)
+        links, border = np.empty((N, 6, 6)), np.empty((N, 6, SHARED))
+        arrowhead.invert_poses(A, corner, links, border)
+        kernel.append((value, gradient, steps, links, border, corner))
     chain = Chain.zeros(x, N)
     value, gradient = value_and_gradient(terms, x, N, chain)
     gradient = gradient * free
     factor = chain.factorised(free)
-    twin = value, gradient, factor.solve(gradient), *factor.inverse_of_links(N)
-    return kernel, twin
+    twin = value, gradient, factor.solve(gradient), *factor.inverse_blocks(N)
+    return [np.array(parts) for parts in zip(*kernel, strict=True)], twin
 
 
 def regular_terms(problem):
-    """Return every term, with weights whose sum is well conditioned."""
-    return [
-        term._replace(weight=term.weight + torch.eye(term.weight.shape[-1]).to(term.weight))
-        for term in terms_of(problem).values()
-    ]
+    """
+    Return every term, with weights whose sum is well conditioned.
+
+    Weights have zeros where those of the method have, and both steps of a pose begin at one
+    start: the kernels have no room for others.
+
+    """
+    terms = []
+    start = 0.9 * problem.pose
+    axes = rotation_from_rpy(start[..., 3:])
+    block = torch.zeros(6, 6)
+    block[:3, :3] = 1.0
+    patterns = {'acceleration': block + torch.eye(6) * (1 - block)}
+    for name in ('input_pose', 'zero_motion', 'slip', 'shared_prior'):
+        patterns[name] = None
+    for name, term in terms_of(problem).items():
+        weight = term.weight + torch.eye(term.weight.shape[-1]).to(term.weight)
+        if name in patterns:
+            pattern = patterns[name]
+            weight = weight * (torch.eye(weight.shape[-1]) if pattern is None else pattern)
+        data = term.data
+        if name == 'input_pose':
+            data = problem.pose, axes
+        if name == 'rigid_shape':
+            data = start, data[1]
+        terms.append(term._replace(weight=weight, data=data))
+    return terms
 
 
 def every_variable(x):
@@ -73,7 +159,7 @@ def some_variables(x):
 def test_normal_equations_equal_those_of_torch(seed, mask):
     problem = random_problem(seed=seed, N=7)
     x = random_variables(problem, seed)
-    for found, known in zip(*both_sides(regular_terms(problem), x, mask(x)), strict=True):
+    for found, known in zip(*both_sides(regular_terms(problem), problem, x, mask(x)), strict=True):
         assert_close(found, known)
 
 
@@ -88,7 +174,7 @@ def test_each_term_alone_equals_that_of_torch(kept):
         for i, term in enumerate(every)
     ]
     for chosen in (terms, [every[kept]]):
-        kernel, twin = both_sides(chosen, x, every_variable(x))
+        kernel, twin = both_sides(chosen, problem, x, every_variable(x))
         assert_close(kernel[0], twin[0])
         assert_close(kernel[1], twin[1])
 
@@ -98,7 +184,7 @@ def test_short_windows_equal_those_of_torch(N):
     problem = random_problem(N=N)
     terms = [term for term in regular_terms(problem) if term.weight.shape[1] > 0]
     x = random_variables(problem)
-    for found, known in zip(*both_sides(terms, x, every_variable(x)), strict=True):
+    for found, known in zip(*both_sides(terms, problem, x, every_variable(x)), strict=True):
         assert_close(found, known)
 
 
@@ -109,15 +195,20 @@ def test_huge_coordinates_equal_those_of_torch():
     moved.boxes[..., :3] += 1e6
     x = random_variables(moved)
     terms = regular_terms(moved)
-    for found, known in zip(*both_sides(terms, x, every_variable(x)), strict=True):
+    for found, known in zip(*both_sides(terms, moved, x, every_variable(x)), strict=True):
         assert_close(found, known, 1e-6)
 
 
 def test_marginalisation_prior_equals_that_of_torch():
     problem = random_problem()
     x, terms = random_variables(problem), regular_terms(problem)
-    state = State.unpack(x, problem.length)
-    objective = Objective(terms, x, problem.length, every_variable(x))
-    pairs = zip(marginalise(objective, state), marginalised_terms(terms, state), strict=True)
-    for found, known in pairs:
-        assert_close(found, known)
+    known = marginalise(terms, State.unpack(x, problem.length))
+    for b in range(len(x)):
+        mean, step, information = np.empty(34), np.empty(34), np.empty((34, 34))
+        A = arrowhead.empty_arrowhead(problem.length)
+        scratch = normal_equations.empty_scratch(problem.length)
+        gradient, arrays = np.empty(x.shape[1]), term_arrays(terms, problem, b)
+        normal_equations.accumulate(x[b].numpy(), 1, arrays, scratch, gradient, A)
+        normal_equations.marginalise(x[b].numpy(), gradient, A, mean, step, information)
+        for part, twin in zip((mean, step, information), known, strict=True):
+            assert_close(part, twin[b])

@@ -8,7 +8,6 @@ from boxreg_ros.core.terms import (
     acceleration,
     input_pose,
     marginalisation_prior,
-    Objective,
     shared_prior,
     Term,
     value_and_gradient,
@@ -57,7 +56,7 @@ def linear_terms(problem, seed=1):
 
 def without_oldest(terms, state):
     """Return the terms of the window after its oldest observation has been marginalised."""
-    where, step, information = marginalise(objective_of(terms, state), state)
+    where, step, information = marginalise(terms, state)
     kept = [
         term
         if term.function is shared_prior
@@ -67,12 +66,6 @@ def without_oldest(terms, state):
     ]
     left = Term(marginalisation_prior, information[:, None, None], ((where + step)[:, None],))
     return [*kept, left]
-
-
-def objective_of(terms, state):
-    """Return the sum of terms, all variables free."""
-    x = state.pack()
-    return Objective(terms, x, state.pose.shape[1], torch.ones_like(x))
 
 
 def least(terms, N):
@@ -108,7 +101,7 @@ def test_prior_is_the_schur_complement_of_the_oldest_terms():
     problem, N = random_problem(), 6
     terms, x = terms_of(problem), random_variables(problem)
     state = State.unpack(x, N)
-    where, step, information = marginalise(objective_of(list(terms.values()), state), state)
+    where, step, information = marginalise(list(terms.values()), state)
     np.testing.assert_array_equal(where, State(state.pose[:, 1:3], state.shared).pack())
     form, gradient = Chain.zeros(x, N), torch.zeros_like(x)
     for name, term in terms.items():
@@ -130,12 +123,11 @@ def test_prior_is_the_schur_complement_of_the_oldest_terms():
 def test_a_failed_window_does_not_affect_the_priors_of_others():
     problem = random_problem()
     terms, state = list(terms_of(problem).values()), State.unpack(random_variables(problem), 6)
-    objective = objective_of(terms, state)
-    known = marginalise(objective, state)
+    known = marginalise(terms, state)
     state.pose[1, 0] = torch.nan
-    for found, right in zip(marginalise(objective, state), known, strict=True):
+    for found, right in zip(marginalise(terms, state), known, strict=True):
         np.testing.assert_allclose(found[[0, 2]], right[[0, 2]], rtol=1e-9)
-    assert not marginalise(objective, state)[1][1].isfinite().all()
+    assert not marginalise(terms, state)[1][1].isfinite().all()
 
 
 def test_prior_residual_by_hand():

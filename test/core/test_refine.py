@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from boxreg_ros import Config, refine, Track
-from boxreg_ros.core import solver, window
+from boxreg_ros.core import rounds, window
 from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.rotations import wrap_angle
@@ -457,7 +457,7 @@ def test_the_result_is_shifted_with_the_fixed_frame(estimate):
 def test_the_result_is_rotated_with_the_fixed_frame(monkeypatch, estimate, angle):
     # At most 300 points, so that none is left out by its order along x. Two rounds, because
     # rounding may decide whether there is another one.
-    monkeypatch.setattr(solver, 'SHAPE_POINTS', 300)
+    monkeypatch.setattr(rounds, 'SHAPE_POINTS', 300)
     track, _ = a_track()
     R = Rotation.from_euler('z', angle).as_matrix()
     config = Config(estimate=estimate).updated({'sampling.points': 300, 'solver.rounds': 2})

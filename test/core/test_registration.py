@@ -3,7 +3,7 @@
 from dataclasses import fields, replace
 
 from boxreg_ros.config import Config
-from boxreg_ros.core import batch, paper, registration, solver, terms
+from boxreg_ros.core import batch, paper, registration, rounds, solver, terms
 from boxreg_ros.core.batch import POSE_ERRORS, State
 from boxreg_ros.core.face_support import FaceOffsets, observe_faces
 from boxreg_ros.core.geometry import rotation_from_rpy
@@ -12,6 +12,7 @@ from boxreg_ros.core.lbfgs import minimize, Minimum, select
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.registration import register
+from boxreg_ros.core.rounds import run_round
 from boxreg_ros.core.terms import Objective, Term
 from boxreg_ros.core.weights import parked_steps, weigh
 from boxreg_ros.core.window import stack_windows
@@ -437,10 +438,19 @@ def test_the_number_of_threads_does_not_change_results(monkeypatch, estimate, pa
                 np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
 
 
-def patch_observe_faces(monkeypatch, function):
-    """Replace `observe_faces` where labelling margins are estimated and where rounds are taken."""
-    for module in (registration, solver):
-        monkeypatch.setattr(module, 'observe_faces', function)
+def note_rounds(monkeypatch, note):
+    """Call `note` with problem and state where margins are estimated, and of every round."""
+
+    def observed(problem, state, *rest):
+        note(problem, state)
+        return observe_faces(problem, state, *rest)
+
+    def taken(batch, *rest):
+        note(batch.problem, batch.state)
+        return run_round(batch, *rest)
+
+    monkeypatch.setattr(registration, 'observe_faces', observed)
+    monkeypatch.setattr(solver, 'run_round', taken)
 
 
 @pytest.mark.parametrize('estimate', ['final', 'track'])
@@ -451,20 +461,15 @@ def test_all_points_are_used_in_the_last_round_only(monkeypatch, estimate):
     points = [returns(box, rng, 1800) for box in truth]
     one = window_of(replace(track_of(truth, rng), points=points), config)
     most = max(len(observation.points) for observation in one.observations)
-    few = -(-most // (most // solver.COARSE_POINTS))
+    few = -(-most // (most // rounds.COARSE_POINTS))
     seen = []
-
-    def noted(problem, *rest):
-        seen.append(problem.points.shape[2])
-        return observe_faces(problem, *rest)
-
-    patch_observe_faces(monkeypatch, noted)
+    note_rounds(monkeypatch, lambda problem, _: seen.append(problem.points.shape[2]))
     (found,) = register([one], config, InputModel(config.faces))
     assert most > 900 and few < 350
     assert seen.pop(0) == few  # margins are estimated from few, too
     assert seen == sorted(seen) and set(seen) == {few, most}
     assert seen.count(few) >= 2 and seen.count(most) <= 2
-    for module in (registration, solver):
+    for module in (registration, rounds):
         monkeypatch.setattr(module, 'COARSE_POINTS', most)
     seen.clear()
     (known,) = register([one], config, InputModel(config.faces))
@@ -482,7 +487,7 @@ def test_an_error_in_a_thread_is_raised(monkeypatch, part):
     def broken(*_):
         raise RuntimeError('broken')
 
-    monkeypatch.setattr(solver, 'observe_faces', broken)
+    monkeypatch.setattr(solver, 'run_round', broken)
     with pytest.raises(RuntimeError, match='broken'):
         register(windows(), ALONE, InputModel(ALONE.faces))
     assert torch.get_num_threads() == threads
@@ -525,11 +530,10 @@ def extents_used(monkeypatch):
     """Collect the extents (3,) at which faces of the first window are observed, round by round."""
     seen = []
 
-    def noted(problem, state, *rest):
+    def noted(_, state):
         seen.append(state.shared[0, batch.EXTENT].numpy().copy())
-        return observe_faces(problem, state, *rest)
 
-    patch_observe_faces(monkeypatch, noted)
+    note_rounds(monkeypatch, noted)
     return seen
 
 

@@ -3,7 +3,7 @@
 from math import inf
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.solver import COARSE_POINTS, Plan
+from boxreg_ros.core.rounds import COARSE_POINTS, Plan
 import pytest
 
 

@@ -128,7 +128,7 @@ def test_newton_applies_the_inverse_curvature():
     columns = [found.newton(column.expand(3, -1), torch.arange(3)) for column in identity[:12]]
     inverse = torch.stack(columns, -1)
     np.testing.assert_allclose(
-        found.factor.inverse_of_links(6)[0][:, 1], inverse[:, 6:12, 6:12], rtol=1e-6
+        found.factor.inverse_blocks(6).links[:, 1], inverse[:, 6:12, 6:12], rtol=1e-6
     )
 
 

@@ -13,8 +13,10 @@ so its axes are those of the map, and clouds are map coordinates minus its posit
 import json
 
 import numpy as np
-import pyarrow
-from pyarrow import feather
+import pytest
+
+pyarrow = pytest.importorskip('pyarrow', reason='pyarrow is not installed')
+feather = pytest.importorskip('pyarrow.feather')
 
 FRAMES = 12
 STEP_NS = 100_000_000
@@ -154,8 +156,15 @@ def nuscenes(root, version='v1.0-mini', scene='scene-0061', with_annotations=Tru
         }],
         'visibility': [{'token': '4', 'level': 'v80-100', 'description': ''}],
         'attribute': [],
-        'map': [],
+        'map': [
+            {
+                'token': 'map', 'log_tokens': ['log'], 'category': 'semantic_prior',
+                'filename': 'maps/map.png',
+            }
+        ],
     }  # fmt: skip
+    (root / 'maps').mkdir(parents=True)
+    (root / 'maps' / 'map.png').touch()
     for name, rows in content.items():
         write_json(tables / f'{name}.json', rows)
     return root
@@ -306,3 +315,228 @@ def argoverse2_detections(path):
     boxes['log_id'][-1] = 'another-log'
     write_feather(path, boxes)
     return path
+
+
+DRIVE = '2011_09_26_drive_0001'
+RAW_START_NS = 1_317_042_145_500_000_000
+"""2011-09-26 13:02:25.5 UTC, as `date` prints it."""
+OXTS_LATE_NS = 20_000_000
+"""The GPS/IMU unit has its stamps after those of the LiDAR."""
+
+
+def raw_stamps(start_ns):
+    """Return lines of date and time, which count from 13:02:25."""
+    nanoseconds = [start_ns - 1_317_042_145_000_000_000 + i * STEP_NS for i in range(FRAMES)]
+    return '\n'.join(f'2011-09-26 13:02:{25 + n / 1e9:012.9f}' for n in nanoseconds) + '\n'
+
+
+def kitti_raw(root, labels=True):
+    """Write a drive of KITTI raw, synchronised and rectified."""
+    day = root / '2011_09_26'
+    drive = day / f'{DRIVE}_sync'
+    for folder in ('velodyne_points/data', 'oxts/data'):
+        (drive / folder).mkdir(parents=True)
+    (day / 'calib_imu_to_velo.txt').write_text(
+        'calib_time: 25-May-2012 16:47:16\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.9\n'
+    )
+    stamps = raw_stamps(RAW_START_NS)
+    (drive / 'velodyne_points' / 'timestamps.txt').write_text(stamps)
+    (drive / 'oxts' / 'timestamps.txt').write_text(raw_stamps(RAW_START_NS + OXTS_LATE_NS))
+    poses = ''
+    for i in range(FRAMES):
+        (drive / 'oxts' / 'data' / f'{i:010d}.txt').write_text(oxts_line(i) + '\n')
+        points = face_in_ego(i) - [0, 0, 1.7]
+        write_bin(drive / 'velodyne_points' / 'data' / f'{i:010d}.bin', points, 4)
+        x, y, z = car_in_velo(i)[:3]
+        poses += (
+            f'<item><tx>{x}</tx><ty>{y}</ty><tz>{z - HEIGHT / 2}</tz><rx>0</rx><ry>0</ry>'
+            f'<rz>0</rz><state>2</state></item>'
+        )
+    if labels:
+        (drive / 'tracklet_labels.xml').write_text(
+            '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n'
+            '<!DOCTYPE boost_serialization>\n'
+            '<boost_serialization signature="serialization::archive" version="9">'
+            '<tracklets><count>1</count><item_version>1</item_version><item>'
+            f'<objectType>Car</objectType><h>{HEIGHT}</h><w>{WIDTH}</w><l>{LENGTH}</l>'
+            f'<first_frame>0</first_frame><poses><count>{FRAMES}</count>{poses}</poses>'
+            '<finished>1</finished></item></tracklets></boost_serialization>\n'
+        )
+    return root
+
+
+def pandaset_seconds():
+    return [1_557_540_000.1 + 0.1 * i for i in range(FRAMES)]
+
+
+def pandaset(root, labels=True):
+    """Write a sequence of PandaSet: points and cuboids in the world, of two LiDARs."""
+    import pandas as pd
+
+    folder = root / '001'
+    seconds = pandaset_seconds()
+    write_json(folder / 'lidar' / 'timestamps.json', seconds)
+    poses = [
+        {
+            'position': dict(zip('xyz', lidar_position(i).tolist(), strict=True)),
+            'heading': {'w': HALF, 'x': 0.0, 'y': 0.0, 'z': HALF},
+        }
+        for i in range(FRAMES)
+    ]
+    write_json(folder / 'lidar' / 'poses.json', poses)
+    (folder / 'annotations' / 'cuboids').mkdir(parents=True)
+    for i in range(FRAMES):
+        points = face_in_map(i)
+        n = len(points)
+        table = pd.DataFrame(np.vstack([points, points + 50]), columns=['x', 'y', 'z'])
+        table['i'] = 7.0
+        table['t'] = seconds[i] + np.tile(np.linspace(-0.05, 0.05, n), 2)
+        table['d'] = np.repeat([0, 1], n)
+        table.to_pickle(folder / 'lidar' / f'{i:02d}.pkl.gz')
+        box = car_in_map(i)
+        row = {
+            'uuid': 'car-p', 'label': 'Car', 'yaw': 0.0, 'stationary': False, 'camera_used': 0,
+            'position.x': box[0], 'position.y': box[1], 'position.z': box[2],
+            'dimensions.x': WIDTH, 'dimensions.y': LENGTH, 'dimensions.z': HEIGHT,
+            'attributes.object_motion': 'Moving', 'cuboids.sibling_id': 'other',
+            'cuboids.sensor_id': 0,
+        }  # fmt: skip
+        sibling = row | {'uuid': 'other', 'cuboids.sensor_id': 1, 'position.x': 0.0}
+        if labels:
+            path = folder / 'annotations' / 'cuboids' / f'{i:02d}.pkl.gz'
+            pd.DataFrame([row, sibling]).to_pickle(path)
+    return root
+
+
+SEGMENT = '10023947602400723454_1120_000_1140_000'
+WAYMO_SHAPE = (16, 360)
+TOP_IN_VEHICLE = (1.4, 0.0, 2.0)
+INCLINATIONS = (-0.35, 0.05)
+
+
+def waymo_advance():
+    """Return how far north the vehicle is when each column is measured [m]."""
+    return 0.4 * np.arange(WAYMO_SHAPE[1]) / WAYMO_SHAPE[1]
+
+
+def waymo_hits(i):
+    """
+    Return the ranges (16, 360) of the rear face, 0 elsewhere, and its points (M, 3) in the map.
+
+    Columns look backward first and turn clockwise; rows descend. The vehicle moves meanwhile.
+
+    """
+    height, width = WAYMO_SHAPE
+    low, high = INCLINATIONS
+    inclination = (high - (np.arange(height) + 0.5) / height * (high - low))[:, None]
+    azimuth = (np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width)[None]
+    ray = np.stack(np.broadcast_arrays(
+        np.cos(azimuth) * np.cos(inclination), np.sin(azimuth) * np.cos(inclination),
+        np.sin(inclination) + 0 * azimuth,
+    ), axis=-1)  # fmt: skip
+    x, y, z = car_in_ego(i)
+    ahead = x - LENGTH / 2 - TOP_IN_VEHICLE[0] - waymo_advance()[None]
+    with np.errstate(divide='ignore'):
+        ranges = np.where(ray[..., 0] > 0, ahead / ray[..., 0], 0.0)
+    hit = ranges[..., None] * ray + TOP_IN_VEHICLE
+    is_hit = (
+        (ranges > 0) & (abs(hit[..., 1] - y) < WIDTH / 2) & (abs(hit[..., 2] - z) < HEIGHT / 2)
+    )
+    points = hit[is_hit]
+    rear = np.full(len(points), x - LENGTH / 2)
+    in_map = ego_position(i) + np.stack([-points[:, 1], rear, points[:, 2]], axis=1)
+    return np.where(is_hit, ranges, 0.0), in_map
+
+
+def waymo_points(i):
+    return waymo_hits(i)[1]
+
+
+def write_parquet(path, columns):
+    from pyarrow import parquet
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(pyarrow.table(columns), str(path))
+
+
+def waymo(root, labels=True):
+    """Write a segment of Waymo, version 2; a front LiDAR has rows before the one on the roof."""
+    split = root / 'training'
+    file = f'{SEGMENT}.parquet'
+    height, width = WAYMO_SHAPE
+    micros = [stamp_ns // 1000 for stamp_ns in stamps_ns()]
+    images, poses = [], []
+    for i in range(FRAMES):
+        image = np.zeros((height, width, 4), np.float32)
+        image[..., 0] = waymo_hits(i)[0]
+        image[..., 1] = 0.5
+        images += [np.ones(4, np.float32), image.ravel()]
+        pose = np.zeros((height, width, 6), np.float32)
+        pose[..., 2:] = [np.pi / 2, *ego_position(i)]
+        pose[..., 4] += waymo_advance()
+        poses.append(pose.ravel())
+    n = 2 * FRAMES
+    floats = pyarrow.list_(pyarrow.float32())
+    shape = pyarrow.list_(pyarrow.int32(), 3)
+    keys = {
+        'key.segment_context_name': [SEGMENT] * n,
+        'key.frame_timestamp_micros': np.repeat(micros, 2),
+        'key.laser_name': pyarrow.array([2, 1] * FRAMES, pyarrow.int8()),
+    }
+    name = '[LiDARComponent].range_image_return'
+    write_parquet(split / 'lidar' / file, keys | {
+        f'{name}1.values': pyarrow.array(images, floats),
+        f'{name}1.shape': pyarrow.array([[1, 1, 4], [height, width, 4]] * FRAMES, shape),
+        f'{name}2.values': pyarrow.array([None] * n, floats),
+        f'{name}2.shape': pyarrow.array([None] * n, shape),
+    })  # fmt: skip
+    name = '[LiDARPoseComponent].range_image_return1'
+    write_parquet(split / 'lidar_pose' / file, {
+        'key.segment_context_name': [SEGMENT] * FRAMES,
+        'key.frame_timestamp_micros': micros,
+        'key.laser_name': pyarrow.array([1] * FRAMES, pyarrow.int8()),
+        f'{name}.values': pyarrow.array(poses, floats),
+        f'{name}.shape': pyarrow.array([[height, width, 6]] * FRAMES, shape),
+    })  # fmt: skip
+    # The LiDAR itself is turned by 90 degrees: columns begin at the rear of the vehicle anyway.
+    extrinsic = [0, -1, 0, 1.4, 1, 0, 0, 0, 0, 0, 1, 2.0, 0, 0, 0, 1]
+    name = '[LiDARCalibrationComponent].'
+    write_parquet(split / 'lidar_calibration' / file, {
+        'key.segment_context_name': [SEGMENT],
+        'key.laser_name': pyarrow.array([1], pyarrow.int8()),
+        f'{name}extrinsic.transform': pyarrow.array(
+            [[float(value) for value in extrinsic]], pyarrow.list_(pyarrow.float64(), 16)
+        ),
+        f'{name}beam_inclination.min': [INCLINATIONS[0]],
+        f'{name}beam_inclination.max': [INCLINATIONS[1]],
+        f'{name}beam_inclination.values': pyarrow.array(
+            [None], pyarrow.list_(pyarrow.float64())
+        ),
+    })  # fmt: skip
+    transforms = []
+    for i in range(FRAMES):
+        x, y, z = ego_position(i)
+        transforms.append([0.0, -1, 0, x, 1, 0, 0, y, 0, 0, 1, z, 0, 0, 0, 1])
+    write_parquet(split / 'vehicle_pose' / file, {
+        'key.segment_context_name': [SEGMENT] * FRAMES,
+        'key.frame_timestamp_micros': micros,
+        '[VehiclePoseComponent].world_from_vehicle.transform': pyarrow.array(
+            transforms, pyarrow.list_(pyarrow.float64(), 16)
+        ),
+    })  # fmt: skip
+    if labels:
+        boxes = np.array([car_in_ego(i) for i in range(FRAMES)])
+        name = '[LiDARBoxComponent].'
+        columns = {f'{name}box.center.{axis}': boxes[:, k] for k, axis in enumerate('xyz')}
+        for axis, size in zip('xyz', (LENGTH, WIDTH, HEIGHT), strict=True):
+            columns[f'{name}box.size.{axis}'] = [size] * FRAMES
+        write_parquet(split / 'lidar_box' / file, {
+            'key.segment_context_name': [SEGMENT] * FRAMES,
+            'key.frame_timestamp_micros': micros,
+            'key.laser_object_id': ['car-w'] * FRAMES,
+            **columns,
+            f'{name}box.heading': [0.0] * FRAMES,
+            f'{name}type': pyarrow.array([1] * FRAMES, pyarrow.int8()),
+            f'{name}num_lidar_points_in_box': [143] * FRAMES,
+        })  # fmt: skip
+    return root

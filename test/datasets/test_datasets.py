@@ -1,6 +1,7 @@
 """Public data sets as recordings: clouds, poses and boxes by hand-derived values."""
 
 from pathlib import Path
+import re
 import shutil
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ from boxreg_ros.datasets import address_of, SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.recording import ItemSource
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
+from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.structures import Sweep
 import layouts
 from layouts import FRAMES
@@ -42,6 +44,12 @@ def kitti_box(i):
     return box
 
 
+def raw_box(i):
+    box = layouts.car_in_velo(i)
+    box[:3] += layouts.kitti_position(i - 0.2)
+    return box
+
+
 CASES = {
     'nuscenes': Case(
         layouts.nuscenes, 'scene-0061', 'car', 'vehicle.car', layouts.lidar_position, step=2
@@ -62,8 +70,35 @@ CASES = {
         'car-1',
         'REGULAR_VEHICLE',
         # Both LiDARs are 1.35 m ahead of the ego frame, 1.6 m high in the mean.
-        lambda i: np.add(layouts.ego_position(i), [0, 1.35, 1.6]),
+        lambda i: layouts.ego_position(i) + np.array([0, 1.35, 1.6]),
         has_times=True,
+    ),
+    'kitti-raw': Case(
+        layouts.kitti_raw,
+        layouts.DRIVE,
+        '0',
+        'Car',
+        lambda i: layouts.kitti_position(i - 0.2),
+        lambda i: layouts.face_in_ego(i) - [0, 0, 1.7] + layouts.kitti_position(i - 0.2),
+        raw_box,
+        lambda: [layouts.RAW_START_NS + i * 100_000_000 for i in range(FRAMES)],
+    ),
+    'pandaset': Case(
+        layouts.pandaset,
+        '001',
+        'car-p',
+        'Car',
+        layouts.lidar_position,
+        stamps_ns=lambda: [round(seconds * 1e9) for seconds in layouts.pandaset_seconds()],
+        has_times=True,
+    ),
+    'waymo': Case(
+        layouts.waymo,
+        layouts.SEGMENT,
+        'car-w',
+        'vehicle',
+        lambda i: layouts.ego_position(i) + np.array([0, 1.4, 2.0]),
+        layouts.waymo_points,
     ),
 }
 
@@ -135,7 +170,7 @@ def test_inspect_prints_the_command_for_a_scene(tmp_path, name, capsys):
     printed = capsys.readouterr().out
     assert 'next: boxreg relabel ' in printed
     assert f'-o out/{case.scene}' in printed
-    assert '143 points' in printed
+    assert f'{len(case.points(0))} points' in printed or name == 'waymo'
 
 
 def test_inspect_lists_the_scenes_of_a_folder(tmp_path, capsys):
@@ -259,25 +294,36 @@ def test_a_pose_that_is_missing_is_named(tmp_path):
         source_of('nuscenes', f'{tmp_path}#scene-0061').__enter__()
 
 
-@pytest.mark.parametrize('name', CASES)
+CLOUDS = {
+    'nuscenes': 'samples/**/*.bin',
+    'kitti-tracking': '**/*.bin',
+    'argoverse2': '**/lidar/*.feather',
+    'kitti-raw': '**/*.bin',
+    'pandaset': '001/lidar/*.pkl.gz',
+}
+
+
+@pytest.mark.parametrize('name', CLOUDS)
 def test_a_missing_or_damaged_sweep_is_counted_and_the_others_go_on(tmp_path, name):
     case = CASES[name]
     case.write(tmp_path)
-    clouds = sorted(p for p in tmp_path.rglob('*') if p.suffix == '.bin' or 'lidar' in p.parts)
-    clouds = [path for path in clouds if path.is_file()]
-    clouds[0].unlink()
-    clouds[1].write_bytes(clouds[1].read_bytes()[:-5])
+    first, second, *_ = sorted(tmp_path.glob(CLOUDS[name]))
+    first.unlink()
+    content = second.read_bytes()
+    second.write_bytes(content[: len(content) // 2])
     source = source_of(name, f'{tmp_path}#{case.scene}')
     sweeps, _ = read(source)
-    lost = 1 if name == 'argoverse2' else 2  # its list of sweeps is that of the files
-    assert len(sweeps) == len(clouds) - 2
-    assert source.unreadable.total() == lost
+    assert len(sweeps) == FRAMES - 2
+    # The list of sweeps of Argoverse 2 is that of its files.
+    assert source.unreadable.total() == (1 if name == 'argoverse2' else 2)
     assert 'download' in str(next(iter(source.first_errors.values())))
 
 
 def test_a_scene_without_any_sweep_is_an_error(tmp_path):
     source = broken('nuscenes', tmp_path, 's*s')
-    with pytest.raises(UnsupportedMessage, match="none of 12 sweeps of 'LIDAR_TOP' can be read"):
+    with pytest.raises(
+        UnsupportedMessage, match=r"none of 12 sweeps of 'LIDAR_TOP' .*; unpack its"
+    ):
         read(source)
 
 
@@ -296,7 +342,7 @@ def test_a_wrong_address_is_explained_in_one_line(tmp_path, capsys, address, mes
     out = tmp_path / 'out'
     assert main(['relabel', address.format(tmp_path), '-o', str(out)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert __import__('re').search(message, line), line
+    assert re.search(message, line), line
     assert not out.exists()
 
 
@@ -338,3 +384,37 @@ def test_results_of_other_scenes_are_refused(tmp_path):
     source = source_of('argoverse2', tmp_path / 'av2', labels=('argoverse2', detections))
     with pytest.raises(RecordingError, match='expected boxes of log unknown-log'):
         read(source)
+
+
+def test_batch_relabels_every_scene_and_counts_those_that_fail(tmp_path, capsys):
+    for name in ('0004', '0005'):
+        layouts.kitti_tracking(tmp_path / name, name)
+    shutil.copytree(tmp_path / '0005', tmp_path / '0004', dirs_exist_ok=True)
+    (tmp_path / '0004' / 'training' / 'oxts' / '0005.txt').unlink()
+    out = tmp_path / 'out'
+    address = f'kitti-tracking:{tmp_path / "0004"}'
+    assert main(['batch', address, '-o', str(out), '--workers=1', '--formats=csv']) == 1
+    streams = capsys.readouterr()
+    assert '1 of 2 drives done' in streams.out
+    assert 'boxreg: 0005: ' in streams.err
+    assert 'data_tracking_oxts.zip' in streams.err
+    assert len(rows_of(out / '0004')) == FRAMES
+
+
+def test_formats_lists_the_data_sets(capsys):
+    assert main(['formats']) == 0
+    printed = capsys.readouterr().out
+    assert 'nuscenes:FOLDER#scene-0061: nuScenes' in printed
+    assert '--labels argoverse2:PATH' in printed
+
+
+def test_a_manifest_names_scenes(tmp_path):
+    layouts.nuscenes(tmp_path / 'data')
+    manifest = tmp_path / 'drives.txt'
+    manifest.write_text(f'nuscenes:{tmp_path / "data"}#scene-0061  # a comment\n')
+    (job,) = jobs_of([manifest])
+    assert (job.name, job.status) == ('scene-0061', 'waiting')
+    assert [job.name for job in jobs_of([Path(f'nuscenes:{tmp_path / "data"}')])] == [
+        'scene-0061',
+        'scene-0103',
+    ]

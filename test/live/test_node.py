@@ -457,6 +457,8 @@ def refused(tmp_path_factory):
         'device': ['--ros-args', '-p', 'device:=abacus'],
         'file': ['--ros-args', '--params-file', 'missing.yaml'],
         'qos': ['--ros-args', '-p', 'qos_overrides./points.subscription.depth:=deep'],
+        'depth': ['--ros-args', '-p', 'qos_overrides./points.subscription.depth:=-1'],
+        'deadline': ['--ros-args', '-p', 'deadline:=0'],
         'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
     }
     started = {
@@ -481,6 +483,8 @@ def refused(tmp_path_factory):
         ('device', 2, ('device', 'abacus', 'cpu')),
         ('file', 2, ('missing.yaml',)),
         ('qos', 2, ('qos_overrides./points.subscription', 'depth')),
+        ('depth', 2, ('qos_overrides./points.subscription.depth', 'expected 1 to', 'got -1')),
+        ('deadline', 2, ('deadline', 'more than 0 s', 'got 0')),
         ('list', 2, ('vehicle.names', "['']")),
     ],
 )

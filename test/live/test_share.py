@@ -1,4 +1,4 @@
-"""Files installed with the code; ``python test/live/test_share.py`` writes params.yaml."""
+"""Files installed with the code; ``python test/live/test_share.py`` writes those of parameters."""
 
 import json
 import re
@@ -7,7 +7,12 @@ from xml.etree import ElementTree
 from boxreg_ros.bench.node import PROFILE
 from boxreg_ros.config import Config
 from boxreg_ros.io.markers import NAMESPACES
-from boxreg_ros.live.params import declare, NODE_SETTINGS, parameters_yaml
+from boxreg_ros.live.params import (
+    declare,
+    NODE_SETTINGS,
+    parameters_schema,
+    parameters_yaml,
+)
 from paths import ROOT, SHARE
 import pytest
 import rclpy
@@ -15,6 +20,7 @@ import yaml
 
 PAGE = ROOT / 'docs' / 'tasks' / 'run-on-a-robot.md'
 PARAMETERS = SHARE / 'params.yaml'
+SCHEMA = SHARE / 'params.schema.json'
 NODE = (SHARE.parent / 'live' / 'node.py').read_text(encoding='utf-8')
 
 
@@ -40,6 +46,34 @@ def test_parameter_file_holds_the_defaults_for_any_node(name):
         node.destroy_node()
     finally:
         rclpy.shutdown(context=context)
+
+
+def schema_text():
+    return json.dumps(parameters_schema(), indent=2) + '\n'
+
+
+def test_schema_is_that_of_the_settings():
+    assert SCHEMA.read_text(encoding='utf-8') == schema_text(), (
+        'run: PYTHONPATH=test python test/live/test_share.py'
+    )
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'words'),
+    [
+        ('window', 2, 'less than the minimum'),
+        ('window', 5.5, "not of type 'integer'"),
+        ('mode', '4d', 'is not one of'),
+        ('windows', 5, "'windows' was unexpected"),
+    ],
+)
+def test_schema_takes_the_installed_file_and_refuses_wrong_values(name, value, words):
+    jsonschema = pytest.importorskip('jsonschema', reason='jsonschema is not installed')
+    file = yaml.safe_load(PARAMETERS.read_text(encoding='utf-8'))
+    jsonschema.validate(file, parameters_schema())
+    file['/**']['ros__parameters'][name] = value
+    with pytest.raises(jsonschema.ValidationError, match=words):
+        jsonschema.validate(file, parameters_schema())
 
 
 def test_launch_file_starts_the_node_with_its_arguments():
@@ -97,3 +131,4 @@ def test_shared_memory_segment_holds_three_large_clouds():
 
 if __name__ == '__main__':
     PARAMETERS.write_text(parameters_yaml(Config()), encoding='utf-8')
+    SCHEMA.write_text(schema_text(), encoding='utf-8')

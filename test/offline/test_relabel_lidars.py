@@ -98,4 +98,6 @@ def test_topics_that_are_merged_are_suggested(tmp_path, capsys):
 def test_inspect_names_the_topics_in_its_command(tmp_path, capsys):
     path = LidarDrive(3).write(tmp_path / 'drive')
     assert main(['inspect', str(path), *TOPICS]) == 0
-    assert '--points=/front --points=/rear' in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert '--points=/front --points=/rear' in out
+    assert 'layout /front: unknown layout (x, y, z): no times of the points' in out

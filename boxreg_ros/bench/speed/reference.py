@@ -18,7 +18,8 @@ from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.input_model import expect, InputModel
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.refine import refine, Track
-from boxreg_ros.core.solver import SETTLED_STEP, solve
+from boxreg_ros.core.rounds import SETTLED_STEP
+from boxreg_ros.core.solver import solve
 from boxreg_ros.core.terms import Term
 from boxreg_ros.core.weights import weigh
 from boxreg_ros.core.window import stack_windows, Window

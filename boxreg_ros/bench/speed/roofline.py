@@ -9,19 +9,21 @@ from typing import Any
 from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import LINK
-from boxreg_ros.core.batch import free_variables, SHARED, State
+from boxreg_ros.core.batch import EXTENT, free_variables, SHARED, State
 from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.input_model import expect, InputModel
-from boxreg_ros.core.terms import Objective
-from boxreg_ros.core.weights import weigh
+from boxreg_ros.core.rounds import Plan, Round, run_round
 from boxreg_ros.core.window import stack_windows
 import numpy as np
 import torch
 
 FLOPS_PER_POINT = 27
 """Derived: 15 to turn a point into box axes, 12 to compare it with the outermost of six faces."""
-BAND = 3 * LINK
-"""Derived: a residual spans at most three poses."""
+REST = 2 * LINK + SHARED
+"""Variables that a pose is coupled to: the two poses after it and the shared variables."""
+FLOPS_PER_POSE = 2 * LINK * (2 * LINK * REST + SHARED**2 + REST**2)
+"""Derived: to eliminate a pose from the next two, from the block of the shared variables, and to
+multiply its coupling with the known part of the inverse."""
 COPY_BYTES = 256 << 20
 """Size of the array whose copy measures the memory bandwidth. Chosen: larger than all caches."""
 MATRIX_SIZE = 1024
@@ -32,6 +34,8 @@ def roofline(config: Config, count: int) -> dict[str, Any]:
     """
     Return bandwidth [GB/s] and peak [Gflop/s] of one core, and the share of each stage of them.
 
+    The stages are the search for face observations and a whole round, which includes it, as they
+    run: by the kernels where there are some, without the terms of single residuals.
     The least bytes that a stage touches and the least operations that it does are computed by
     formula. The limit is the larger of the times of both, ``share`` is the limit over the time.
 
@@ -63,29 +67,26 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
     offsets = InputModel(config.faces).offsets()
     expected = expect(problem, offsets)
     state = State(problem.pose, expected.shared)
-    observations = observe_faces(problem, state, offsets, config)
-    terms = weigh(problem, state, observations, expected, config)
     free = free_variables(problem, config)
-    x = state.pack()
-    weights = sum(term.weight.numel() * term.weight.element_size() for term in terms)
-    points = float(problem.mask.sum())
-    border = BAND + SHARED
-    factor_size = 8.0 * count * config.window * LINK * border
+    batch = Round(problem, state, expected, free, expected.shared[:, EXTENT].log())
+    plan = Plan.choose(config, is_warm=True)
+    rows = torch.arange(count, device=free.device)
+    points = problem.returns.points
+    size_of_points = float(points.numel() * points.element_size())
+    flops_of_points = float(len(points) * FLOPS_PER_POINT)
+    poses = float(count * config.window)
+    # Written: own block of each pose and its block with the shared variables, in float64.
+    size_of_inverse = 8.0 * poses * LINK * (LINK + SHARED)
     return {
         'face observations': (
             lambda: observe_faces(problem, state, offsets, config),
-            points * 3 * problem.points.element_size(),
-            points * FLOPS_PER_POINT,
+            size_of_points,
+            flops_of_points,
         ),
-        'weights': (
-            lambda: weigh(problem, state, observations, expected, config),
-            float(weights),
-            float(weights) / 8,
-        ),
-        'normal equations and factor': (
-            lambda: Objective(terms, x, problem.length, free).newton(x, torch.arange(count)),
-            weights + factor_size,
-            2.0 * count * config.window * LINK * border**2,
+        'round': (
+            lambda: run_round(batch, offsets, plan, 0, config, rows),
+            size_of_points + size_of_inverse,
+            flops_of_points + poses * FLOPS_PER_POSE,
         ),
     }
 

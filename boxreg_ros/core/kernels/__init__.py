@@ -24,12 +24,10 @@ from torch import Tensor
 class Kernels(NamedTuple):
     """The modules with compiled functions."""
 
-    arrowhead: ModuleType
     crop: ModuleType
     face_support: ModuleType
-    normal_equations: ModuleType
     rigid_shape: ModuleType
-    weights: ModuleType
+    rounds: ModuleType
 
 
 MIN_WINDOWS_PER_THREAD = 8
@@ -98,14 +96,7 @@ def compiled(like: Tensor) -> Kernels | None:
 def load() -> Kernels | None:
     """Return the kernels; None where numba does not work, with one warning."""
     try:
-        from boxreg_ros.core.kernels import (
-            arrowhead,
-            crop,
-            face_support,
-            normal_equations,
-            rigid_shape,
-            weights,
-        )
+        from boxreg_ros.core.kernels import crop, face_support, rigid_shape, rounds
     except Exception as error:  # whatever an incomplete or unsupported installation raises
         reason = ' '.join(f'{type(error).__name__}: {error}'.split())
         warn(
@@ -115,4 +106,4 @@ def load() -> Kernels | None:
             stacklevel=2,
         )
         return None
-    return Kernels(arrowhead, crop, face_support, normal_equations, rigid_shape, weights)
+    return Kernels(crop, face_support, rigid_shape, rounds)

@@ -30,6 +30,8 @@ class WindowArrays(NamedTuple):
         First point of each observation, and their number.
     stride : int
         Every n-th point is used.
+    pinned : array, shape (B, N)
+        Whether a person has corrected a box.
 
     """
 
@@ -43,6 +45,7 @@ class WindowArrays(NamedTuple):
     first: Any
     counts: Any
     stride: int
+    pinned: Any
 
 
 class FaceArrays(NamedTuple):
@@ -63,6 +66,7 @@ class ExpectedArrays(NamedTuple):
     deviation: Any
     pose_deviation: Any
     widened_deviation: Any
+    unmodelled_bias: Any
 
 
 class ClassDeviations(NamedTuple):
@@ -79,8 +83,8 @@ class ClassDeviations(NamedTuple):
         Of the velocity of the pivot along the y and z axes [m/s].
     zero_motion : array, shape (B, 6)
         Of the steps of a parked box [m, rad].
-    heading : array, shape (B,)
-        Of the input yaw [rad].
+    pose : array, shape (B, 6)
+        Of the input poses [m, rad].
 
     """
 
@@ -88,31 +92,70 @@ class ClassDeviations(NamedTuple):
     acceleration: Any
     slip: Any
     zero_motion: Any
-    heading: Any
+    pose: Any
+
+
+class StartArrays(NamedTuple):
+    """
+    Start of a round.
+
+    Attributes
+    ----------
+    poses, shared : array, shapes (B, N, 6) and (B, 22)
+        Boxes, and the variables that all observations of a window share.
+    free : array, shape (B, 6 N + 22)
+        1 for variables that are estimated, 0 for those held fixed.
+    prior_mean, W_prior : array, shapes (B, 34) and (B, 34, 34)
+        Marginalisation prior (M9).
+
+    """
+
+    poses: Any
+    shared: Any
+    free: Any
+    prior_mean: Any
+    W_prior: Any
+
+
+class ShapeArrays(NamedTuple):
+    """
+    Rigid shape (M4) of a batch; without observations, N = 0, where it is not used.
+
+    Attributes
+    ----------
+    W, wanted : array, shapes (B, N, 6, 6) and (B, N, 6)
+        Information about a step of each pose in box axes, and the step that is wanted.
+
+    """
+
+    W: Any
+    wanted: Any
 
 
 class TermArrays(NamedTuple):
     """
-    Data and weights of all residuals of one round.
+    Data and weights of all residuals of one window.
 
-    Terms that are left out have weights without rows. The weights are matrices, as in
-    `boxreg_ros.core.terms.Term`.
+    Terms that are left out have weights without rows. Of weights that are diagonal matrices only
+    the diagonal is kept.
 
     Attributes
     ----------
-    given, inset, W_faces : array, shapes (B, N, 6), (B, N, 6) and (B, N, 6, 4, 4)
+    given, inset, W_faces : array, shapes (N, 6), (N, 6) and (N, 6, 4, 4)
         Faces (M2).
-    input_pose, axes, W_input : array, shapes (B, N, 6), (B, N, 3, 3) and (B, N, 6, 6)
-        Input (M3).
-    shape_start, shape_axes, wanted, W_shape : array
-        Rigid shape (M4): (B, N, 6), (B, N, 3, 3), (B, N, 6) and (B, N, 6, 6).
-    times : array, shape (B, N)
+    axes, W_input : array, shapes (N, 3, 3) and (N, 6)
+        Input (M3), the deviation from `given` along axes.
+    start, wanted, W_shape : array, shapes (N, 6), (N, 6) and (N, 6, 6)
+        Rigid shape (M4), the step from `start` along axes.
+    times : array, shape (N,)
         Of the motion terms.
-    W_acceleration, W_slip, W_zero_motion : array
-        (M5), (M7) and (M6): (B, N - 2, 6, 6), (B, N - 1, 2, 2) and (B, N - 1, 6, 6).
-    prior_mean, W_prior : array, shapes (B, 34) and (B, 34, 34)
+    W_acceleration, W_turning : array, shapes (N, 3, 3) and (N, 3)
+        (M5): of the position, and of roll, pitch and yaw.
+    W_slip, W_zero_motion : array, shapes (N, 2) and (N, 6)
+        (M7) and (M6).
+    prior_mean, W_prior : array, shapes (34,) and (34, 34)
         Marginalisation prior (M9).
-    expected, W_shared : array, shapes (B, 22) and (B, 22, 22)
+    expected, W_shared : array, shape (22,)
         Shared variables (M8).
 
     """
@@ -120,21 +163,72 @@ class TermArrays(NamedTuple):
     given: Any
     inset: Any
     W_faces: Any
-    input_pose: Any
     axes: Any
     W_input: Any
-    shape_start: Any
-    shape_axes: Any
+    start: Any
     wanted: Any
     W_shape: Any
     times: Any
     W_acceleration: Any
+    W_turning: Any
     W_slip: Any
     W_zero_motion: Any
     prior_mean: Any
     W_prior: Any
     expected: Any
     W_shared: Any
+
+
+class ArrowheadArrays(NamedTuple):
+    """
+    A matrix of one window as `arrowhead` keeps it, or its Cholesky factor.
+
+    Attributes
+    ----------
+    links : array, shape (N + 2, 6, 18)
+        Blocks of each pose: upper triangle of its own, and those with the two poses after it. Two
+        poses of padding, zero, end the chain.
+    border : array, shape (N + 2, 6, 22)
+        Blocks of each pose with the shared variables.
+    corner : array, shape (22, 22)
+        Upper triangle of the block of the shared variables.
+
+    """
+
+    links: Any
+    border: Any
+    corner: Any
+
+
+class RoundResults(NamedTuple):
+    """
+    What a round writes.
+
+    Attributes
+    ----------
+    x : array, shape (B, 6 N + 22)
+        Poses and shared variables at the end of the round.
+    is_done : array, shape (B,)
+        Whether a window is settled, or this was the last round.
+    pose_blocks, border_blocks : array, shapes (B, N, 6, 6) and (B, N, 6, 22)
+        Blocks of the poses in the inverse curvature, of windows that are done: their own, and
+        those with the shared variables.
+    corner : array, shape (B, 22, 22)
+        Block of the shared variables in the inverse curvature.
+    prior_mean, prior_step, prior_information : array, shapes (B, 34), (B, 34), (B, 34, 34)
+        What full windows that are done leave to the next ones, NaN for others; B = 0 if it is not
+        wanted.
+
+    """
+
+    x: Any
+    is_done: Any
+    pose_blocks: Any
+    border_blocks: Any
+    corner: Any
+    prior_mean: Any
+    prior_step: Any
+    prior_information: Any
 
 
 class FaceNumbers(NamedTuple):
@@ -174,6 +268,30 @@ class WeightNumbers(NamedTuple):
     driving_reach: int
     face_outlier: float
     is_robust: bool
+    pin_deviations: tuple[float, ...]
+
+
+class SearchNumbers(NamedTuple):
+    """Constants and settings of `boxreg_ros.core.lbfgs` and `solver`; there they are described."""
+
+    iterations: int
+    history: int
+    tolerance: float
+    sufficient_decrease: float
+    min_curvature: float
+    step_bounds: tuple[float, ...]
+    max_backtracks: int
+    settled_step: float
+    may_settle: bool
+    is_last: bool
+
+
+class RoundNumbers(NamedTuple):
+    """Constants and settings of a round."""
+
+    faces: FaceNumbers
+    weights: WeightNumbers
+    search: SearchNumbers
 
 
 class CropNumbers(NamedTuple):

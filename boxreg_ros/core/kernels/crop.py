@@ -62,10 +62,13 @@ def near_points(points, first):
     """Return the points (3, M) in cells that boxes touch, with their cells."""
     near = np.empty(points.shape[1], np.int32)
     cells = np.empty(points.shape[1], np.int32)
+    is_touched = np.empty(SIDE * SIDE, np.bool_)  # small enough for the processor's cache
+    for cell in range(SIDE * SIDE):
+        is_touched[cell] = first[cell + 1] > first[cell]
     count = 0
     for i in range(points.shape[1]):
         cell = cell_of(metre(points[0, i]), metre(points[1, i]))
-        if first[cell + 1] > first[cell]:
+        if is_touched[cell]:
             near[count] = i
             cells[count] = cell
             count += 1

@@ -7,6 +7,7 @@ The torch twin is `boxreg_ros.core.face_support.observe_faces_torch`; the formul
 """
 
 from math import ceil, inf, isfinite, isnan, sqrt
+from typing import Any, NamedTuple
 
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.rotation import fill_rotation
@@ -38,24 +39,24 @@ def add_candidate(depth, index, best_depth, best_index, count):
 
 
 @kernel
-def fill_depths(local, half, level, numbers, excess, strip, depth):
+def fill_depths(m, half, level, numbers, work):
     """
-    Write how far inside of the expected surface of each face each point is, (5, M) [m].
+    Write how far inside of the expected surface of each face each of m points is, (5, M) [m].
 
     Points that are beside a face, or too deep to be on it, are at `NOWHERE`. Writes the strips
     (2, M) too; returns how many points are in and near the box.
 
     """
+    local, excess, strip, depth = work.local, work.excess, work.strip, work.depth
     outside_margin, edge_margin, deepest = (
         numbers.outside_margin, numbers.edge_margin, numbers.deepest
     )  # fmt: skip
     strips = numbers.strips
-    M = local.shape[1]
     for k in range(3):
-        for i in range(M):
+        for i in range(m):
             excess[k, i] = abs(local[k, i]) - half[k]
     near = 0
-    for i in range(M):
+    for i in range(m):
         near += (
             (excess[0, i] < outside_margin)
             & (excess[1, i] < outside_margin)
@@ -63,7 +64,7 @@ def fill_depths(local, half, level, numbers, excess, strip, depth):
         )
     for k in range(2):
         scale = strips / 2 / half[k]
-        for i in range(M):
+        for i in range(m):
             place = min(max((local[k, i] + half[k]) * scale, 0.0), strips - 1.0)
             strip[k, i] = int(place)
     for face in range(FACES):
@@ -72,7 +73,7 @@ def fill_depths(local, half, level, numbers, excess, strip, depth):
         other = 1 if axis == 2 else 2
         sign = 1.0 - 2.0 * (face % 2)
         surface = half[axis] - level[face]
-        for i in range(M):
+        for i in range(m):
             d = surface - sign * local[axis, i]
             counts = (excess[one, i] <= edge_margin) & (excess[other, i] <= edge_margin)
             counts &= (d >= -outside_margin) & (d < deepest)
@@ -81,49 +82,47 @@ def fill_depths(local, half, level, numbers, excess, strip, depth):
 
 
 @kernel
-def outermost_points(points, depth, strip, wanted, numbers, best_depth, best_index, moments, out):
+def outermost_points(m, wanted, numbers, work, moments):
     """
-    Find the outermost points of the five faces of one box.
+    Find the outermost ones of m points on each of the five faces of one box.
 
-    Writes their second moments (5, 4, 4) and mean depth (5,); returns how many stand for each
-    face.
+    Writes their second moments (5, 4, 4), how many stand for each face, and their mean depth.
 
     """
-    number = np.zeros(FACES, np.int64)
+    points, best_depth, best_index = work.moved, work.best_depth, work.best_index
     for face in range(FACES):
-        own_strip = strip[numbers.strip_axis[face]]
-        best_depth[:, :wanted] = NOWHERE
-        for i in range(len(points)):
-            d = depth[face, i]
-            if d < best_depth[own_strip[i], wanted - 1]:
-                add_candidate(d, i, best_depth[own_strip[i]], best_index[own_strip[i]], wanted)
+        own_strip, depth = work.strip[numbers.strip_axis[face]], work.depth[face]
         limit = numbers.deepest
-        for s in range(len(best_depth)):
-            limit = min(limit, best_depth[s, 0] + numbers.max_depth)
+        best_depth[:, :wanted] = NOWHERE
+        for i in range(m):
+            d = depth[i]
+            if d <= limit and d < best_depth[own_strip[i], wanted - 1]:
+                add_candidate(d, i, best_depth[own_strip[i]], best_index[own_strip[i]], wanted)
+                limit = min(limit, d + numbers.max_depth)
+        number = 0
         total = 0.0
         moment = moments[face]
-        for a in range(4):
-            for b in range(4):
-                moment[a, b] = 0.0
+        moment[:] = 0.0
         for s in range(len(best_depth)):
             for rank in range(wanted):
                 if not best_depth[s, rank] <= limit:
                     break
-                number[face] += 1
+                number += 1
                 total += best_depth[s, rank]
-                p = points[best_index[s, rank]]
+                i = best_index[s, rank]
                 for a in range(3):
                     for b in range(a, 3):
-                        moment[a, b] += np.float64(p[a]) * p[b]
-                    moment[a, 3] += p[a]
-        if number[face]:
+                        moment[a, b] += points[a, i] * points[b, i]
+                    moment[a, 3] += points[a, i]
+        if number:
+            share = 1 / number
             for a in range(3):
                 for b in range(a, 4):
-                    moment[a, b] /= number[face]
+                    moment[a, b] *= share
                     moment[b, a] = moment[a, b]
             moment[3, 3] = 1.0
-        out[face] = total / max(number[face], 1)
-    return number
+        work.number[face] = number
+        work.mean_depth[face] = total / max(number, 1)
 
 
 @kernel
@@ -207,19 +206,26 @@ def fill_velocity(poses, times, n, length, velocity):
 
 
 @kernel
-def to_box_axes(points, delays, velocity, shift, R, moved, local):
-    """
-    Write points at the stamp of their box (M12), (M, 3), and in its axes, (3, M) [m].
-
-    The box is `shift` (3,) from the origin of the points.
-
-    """
+def fill_moved(windows, b, n, velocity, is_moving, moved):
+    """Write the points of one observation at the stamp of its box (M12), (3, M) [m]."""
+    points = returns_of(windows, windows.points, b, n)
+    delays = returns_of(windows, windows.delays, b, n)
     for i in range(len(points)):
         for k in range(3):
-            moved[i, k] = points[i, k] - velocity[k] * delays[i]
-        x = moved[i, 0] - shift[0]
-        y = moved[i, 1] - shift[1]
-        z = moved[i, 2] - shift[2]
+            moved[k, i] = points[i, k]
+    if is_moving:
+        for k in range(3):
+            for i in range(len(points)):
+                moved[k, i] -= velocity[k] * delays[i]
+
+
+@kernel
+def to_box_axes(m, moved, shift, R, local):
+    """Write m points in box axes, (3, M) [m]; the box is `shift` (3,) from their origin."""
+    for i in range(m):
+        x = moved[0, i] - shift[0]
+        y = moved[1, i] - shift[1]
+        z = moved[2, i] - shift[2]
         local[0, i] = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
         local[1, i] = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
         local[2, i] = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
@@ -236,38 +242,84 @@ def add_road(shift, ground, half_height, gap, moment, distance):
     distance[BOTTOM] = shift[2] - road - half_height + gap
 
 
-@kernel
-def observe_faces(
-    begin, end, windows, poses, shared, occlusion_inset, range_inset, numbers, faces
-):
+class FaceWork(NamedTuple):
     """
-    Write the face observations of the windows `begin` to `end`.
+    Arrays to work in, for observations of at most M points.
+
+    Attributes
+    ----------
+    moved, local : array, shape (3, M)
+        Points at the stamp of their box, from the centre of the input box, and in box axes [m].
+    excess : array, shape (3, M)
+        How far outside of the box they are along its axes [m].
+    strip : array, shape (2, M)
+        Strip that each point lies in, along x and along y.
+    depth : array, shape (5, M)
+        See `fill_depths`.
+    best_depth, best_index : array
+        The outermost points of each strip of one face.
+    number, mean_depth : array, shape (5,)
+        Of the outermost points of each face.
+
+    """
+
+    moved: Any
+    local: Any
+    excess: Any
+    strip: Any
+    depth: Any
+    best_depth: Any
+    best_index: Any
+    number: Any
+    mean_depth: Any
+
+
+@kernel
+def empty_face_work(begin, end, windows, numbers):
+    """Return arrays for the observations of the windows `begin` to `end`."""
+    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
+    size = ceil(max(numbers.min_points, numbers.share * M)) + 1
+    return FaceWork(
+        np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),
+        np.empty((FACES, M)), np.empty((numbers.strips, size)),
+        np.empty((numbers.strips, size), np.int64), np.empty(FACES, np.int64), np.empty(FACES),
+    )  # fmt: skip
+
+
+@kernel
+def clear_padding(length, b, faces):
+    """Set the face observations of the padding of window `b` to zero."""
+    faces.moments[b, length:] = 0.0
+    faces.distance[b, length:] = 0.0
+    faces.weight[b, length:] = 0.0
+    faces.inset[b, length:] = 0.0
+    faces.inset_shares[:, b, length:] = 0.0
+    faces.num_points[b, length:] = 0.0
+
+
+@kernel
+def observe_window(b, windows, poses, shared, occlusion_inset, range_inset, numbers, work, faces):
+    """
+    Write the face observations of window `b`.
 
     Parameters
     ----------
-    begin, end : int
-        First window, and the one after the last.
+    b : int
+        The window.
     windows : WindowArrays
         Input of the windows.
-    poses, shared : array, shapes (B, N, 6) and (B, 22)
-        Boxes of this round.
-    occlusion_inset, range_inset : array, shape (B, 6)
+    poses, shared : array, shapes (N, 6) and (22,)
+        Its boxes of this round.
+    occlusion_inset, range_inset : array, shape (6,)
         As in `boxreg_ros.core.face_support.FaceOffsets` [m].
     numbers : FaceNumbers
         Constants and settings.
+    work : FaceWork
+        Arrays to work in.
     faces : FaceArrays
         Written; zero for padding.
 
     """
-    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
-    size = ceil(max(numbers.min_points, numbers.share * M)) + 1
-    best_depth = np.empty((numbers.strips, size))
-    best_index = np.empty((numbers.strips, size), np.int64)
-    moved = np.empty((M, 3))
-    local = np.empty((3, M))
-    excess = np.empty((3, M))
-    strip = np.empty((2, M), np.int64)
-    depth = np.empty((FACES, M))
     R = np.empty((3, 3))
     half = np.empty(3)
     shift = np.empty(3)
@@ -275,67 +327,59 @@ def observe_faces(
     toward = np.empty(3)
     tangent = np.empty(6)
     velocity = np.zeros(3)
-    mean_depth = np.empty(FACES)
-    for b in range(begin, end):
-        length = windows.lengths[b]
+    length = windows.lengths[b]
+    clear_padding(length, b, faces)
+    for k in range(3):
+        half[k] = shared[EXTENT + k] / 2
+    for n in range(length):
+        m = windows.counts[b, n]
+        box, pose, origins = windows.boxes[b, n], poses[n], windows.origins[b, n]
+        ground = windows.ground[b, n]
+        distance, weight, inset = faces.distance[b, n], faces.weight[b, n], faces.inset[b, n]
+        points = returns_of(windows, windows.points, b, n)
+        fill_visibility(box, origins, points, numbers, R, toward, tangent)
+        fill_insets(
+            origins, tangent, occlusion_inset, range_inset, numbers, faces.inset_shares[:, b, n],
+            inset, weight,
+        )  # fmt: skip
         for k in range(3):
-            half[k] = shared[b, EXTENT + k] / 2
-        for n in range(poses.shape[1]):
-            moments, distance, weight = (
-                faces.moments[b, n],
-                faces.distance[b, n],
-                faces.weight[b, n],
-            )
-            inset, shares = faces.inset[b, n], faces.inset_shares[:, b, n]
-            if n >= length:
-                moments[:] = 0.0
-                distance[:] = 0.0
-                weight[:] = 0.0
-                inset[:] = 0.0
-                shares[:] = 0.0
-                faces.num_points[b, n] = 0.0
-                continue
-            m = windows.counts[b, n]
-            points = returns_of(windows, windows.points, b, n)
-            box, pose, origins = windows.boxes[b, n], poses[b, n], windows.origins[b, n]
-            fill_visibility(box, origins, points, numbers, R, toward, tangent)
-            fill_insets(
-                origins, tangent, occlusion_inset[b], range_inset[b], numbers, shares, inset,
-                weight,
-            )  # fmt: skip
-            for k in range(3):
-                shift[k] = pose[k] - box[k]
-            for face in range(6):
-                level[face] = shared[b, GAP + face] + inset[face]
-            if numbers.is_moving:
-                fill_velocity(poses[b], windows.times[b], n, length, velocity)
-            fill_rotation(pose[3], pose[4], pose[5], R)
-            to_box_axes(
-                points, returns_of(windows, windows.delays, b, n), velocity, shift, R, moved[:m],
-                local[:, :m],
-            )  # fmt: skip
-            near = fill_depths(
-                local[:, :m], half, level, numbers, excess[:, :m], strip[:, :m], depth[:, :m]
-            )
-            wanted = ceil(max(numbers.min_points, numbers.share * near))
-            number = outermost_points(
-                moved[:m], depth, strip, wanted, numbers, best_depth, best_index, moments,
-                mean_depth,
-            )  # fmt: skip
-            for face in range(FACES):
-                distance[face] = -mean_depth[face]
-                if number[face] < numbers.min_points:
-                    weight[face] = 0.0
-            add_road(
-                shift,
-                windows.ground[b, n],
-                half[2],
-                shared[b, GAP + BOTTOM],
-                moments[BOTTOM],
-                distance,
-            )
-            weight[BOTTOM] = 1.0 if isfinite(windows.ground[b, n]) else 0.0
-            faces.num_points[b, n] = near
+            shift[k] = pose[k] - box[k]
+        for face in range(6):
+            level[face] = shared[GAP + face] + inset[face]
+        if numbers.is_moving:
+            fill_velocity(poses, windows.times[b], n, length, velocity)
+        fill_rotation(pose[3], pose[4], pose[5], R)
+        fill_moved(windows, b, n, velocity, numbers.is_moving, work.moved)
+        to_box_axes(m, work.moved, shift, R, work.local)
+        near = fill_depths(m, half, level, numbers, work)
+        wanted = ceil(max(numbers.min_points, numbers.share * near))
+        outermost_points(m, wanted, numbers, work, faces.moments[b, n])
+        for face in range(FACES):
+            distance[face] = -work.mean_depth[face]
+            if work.number[face] < numbers.min_points:
+                weight[face] = 0.0
+        gap = shared[GAP + BOTTOM]
+        add_road(shift, ground, half[2], gap, faces.moments[b, n, BOTTOM], distance)
+        weight[BOTTOM] = 1.0 if isfinite(ground) else 0.0
+        faces.num_points[b, n] = near
+
+
+@kernel
+def observe_faces(
+    begin, end, windows, poses, shared, occlusion_inset, range_inset, numbers, faces
+):
+    """
+    Write the face observations of the windows `begin` to `end`.
+
+    `poses`, `shared` and insets are (B, N, 6), (B, 22) and (B, 6), else as in `observe_window`.
+
+    """
+    work = empty_face_work(begin, end, windows, numbers)
+    for b in range(begin, end):
+        observe_window(
+            b, windows, poses[b], shared[b], occlusion_inset[b], range_inset[b], numbers, work,
+            faces,
+        )  # fmt: skip
 
 
 @kernel
@@ -347,27 +391,31 @@ def count_held(begin, end, windows, poses, extents, margin, is_moving, held):
     points are at the stamp of their box (M12).
 
     """
+    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
+    moved = np.empty((3, M))
+    local = np.empty((3, M))
     R = np.empty((3, 3))
     velocity = np.zeros(3)
     shift = np.empty(3)
     for b in range(begin, end):
         for n in range(windows.lengths[b]):
+            m = windows.counts[b, n]
             pose, extent, box = poses[b, n], extents[b, n], windows.boxes[b, n]
             fill_rotation(pose[3], pose[4], pose[5], R)
             if is_moving:
                 fill_velocity(poses[b], windows.times[b], n, windows.lengths[b], velocity)
             for k in range(3):
                 shift[k] = pose[k] - box[k]
-            points = returns_of(windows, windows.points, b, n)
-            delays = returns_of(windows, windows.delays, b, n)
+            fill_moved(windows, b, n, velocity, is_moving, moved)
+            to_box_axes(m, moved, shift, R, local)
+            reach_x, reach_y, reach_z = (
+                extent[0] / 2 + margin, extent[1] / 2 + margin, extent[2] / 2 + margin
+            )  # fmt: skip
             count = 0
-            for i in range(len(points)):
-                x = points[i, 0] - velocity[0] * delays[i] - shift[0]
-                y = points[i, 1] - velocity[1] * delays[i] - shift[1]
-                z = points[i, 2] - velocity[2] * delays[i] - shift[2]
-                outside = -margin
-                for k in range(3):
-                    along = R[0, k] * x + R[1, k] * y + R[2, k] * z
-                    outside = max(outside, abs(along) - extent[k] / 2)
-                count += outside < margin
+            for i in range(m):
+                count += (
+                    (abs(local[0, i]) < reach_x)
+                    & (abs(local[1, i]) < reach_y)
+                    & (abs(local[2, i]) < reach_z)
+                )
             held[b, n] = count

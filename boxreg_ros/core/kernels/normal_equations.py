@@ -1,14 +1,27 @@
 """
 Value, gradient and Gauss-Newton matrix of the objective of one window, in plain loops.
 
-Every term adds r' W r / 2 to the value, J' W r to the gradient and J' W J to the matrix, which
-has the layout of `arrowhead`. The torch twins of these functions are those of `terms`.
+Every term adds r' W r / 2 to the value, J' W r to the gradient and J' W J to the matrix `A`, which
+has the layout of `arrowhead`; a matrix without rows is not wanted. The torch twins of these
+functions are those of `terms`.
 
 """
 
-from math import sqrt
+from typing import Any, NamedTuple
 
-from boxreg_ros.core.kernels.arrowhead import BAND, factorise, fix_variables, RIDGE
+from boxreg_ros.core.kernels.arrays import ArrowheadArrays, TermArrays
+from boxreg_ros.core.kernels.arrowhead import (
+    BORDER,
+    clear,
+    eliminate_pose,
+    factorise,
+    NEXT,
+    POSE,
+    RIDGE,
+    solve,
+    SPAN,
+    substitute_forward,
+)
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.rotation import fill_rotation, fill_rotation_derivatives
 import numpy as np
@@ -20,502 +33,489 @@ UNKNOWN_RIDGE = 1e-6
 
 
 @kernel
-def add_block(band, row, column, i, j, value):
-    """Add to A[row + i, column + j] if that is in the upper triangle."""
-    if column + j >= row + i:
-        band[row + i, column + j - row - i] += value
+def no_matrix():
+    """Return the matrix of an evaluation without curvature."""
+    return ArrowheadArrays(
+        np.empty((0, POSE, SPAN)), np.empty((0, POSE, BORDER)), np.empty((0, 0))
+    )
 
 
 @kernel
-def add_faces(n, pose, shared, given, inset, W, scratch, gradient, band, border, corner, curved):
-    """Add the six face residuals of one observation; W (6, 4, 4) are weighted point moments."""
-    R, dR, J, WJ = scratch
-    fill_rotation_derivatives(pose[3], pose[4], pose[5], R, dR)
+def is_wanted(A):
+    """Return whether the curvature is wanted."""
+    return len(A.links) > 0
+
+
+@kernel
+def unweighted_terms(N, start, shape, b):
+    """Return room for the terms of window `b`: only rigid shape and prior have weights."""
+    return TermArrays(
+        np.empty((N, 6)), np.empty((N, 6)), np.zeros((N, 6, 4, 4)),
+        np.empty((N, 3, 3)), np.zeros((N, 6)),
+        start.poses[b], shape.wanted[b], shape.W[b],
+        np.empty(N), np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 2)), np.zeros((N, 6)),
+        start.prior_mean[b], start.W_prior[b], np.empty(SHARED), np.zeros(SHARED),
+    )  # fmt: skip
+
+
+@kernel
+def add_faces(n, pose, shared, terms, scratch, gradient, A):
+    """
+    Add the six face residuals of one observation (M2).
+
+    The plane of a face is v = (normal, level). Its normal turns with the angles of the pose; its
+    level changes with the position, too, by the negative of the normal.
+
+    """
+    R, dR = scratch.R[n], scratch.dR[n]
+    v, pull, by_angles, weighted = scratch.plane, scratch.pull, scratch.by_angles, scratch.weighted
+    given, inset, W = terms.given[n], terms.inset[n], terms.W_faces[n]
     row = 6 * n
-    first = len(border)
+    first = len(gradient) - SHARED
     value = 0.0
-    v = np.empty(4)
-    pull = np.empty(4)
     for face in range(6):
         w = W[face]
         if w[3, 3] == 0.0:
             continue
         axis = face // 2
         sign = 1.0 - 2.0 * (face % 2)
-        level = 0.0
+        v[3] = inset[face] + shared[GAP + face] - shared[EXTENT + axis] / 2
         for j in range(3):
             v[j] = sign * R[j, axis]
-            level -= v[j] * (pose[j] - given[j])
-            J[3, j] = -v[j]
-        v[3] = level + inset[face] + shared[GAP + face] - shared[EXTENT + axis] / 2
+            v[3] -= v[j] * (pose[j] - given[j])
         for k in range(3):
-            tilt = 0.0
+            by_angles[3, k] = 0.0
             for j in range(3):
-                J[j, k] = 0.0
-                J[j, 3 + k] = sign * dR[k, j, axis]
-                tilt -= (pose[j] - given[j]) * J[j, 3 + k]
-            J[3, 3 + k] = tilt
+                by_angles[j, k] = sign * dR[k, j, axis]
+                by_angles[3, k] -= (pose[j] - given[j]) * by_angles[j, k]
         for a in range(4):
-            total = 0.0
-            for b in range(4):
-                total += w[a, b] * v[b]
-            pull[a] = total
-            value += 0.5 * v[a] * total
-        for k in range(6):
-            total = 0.0
+            pull[a] = w[a, 0] * v[0] + w[a, 1] * v[1] + w[a, 2] * v[2] + w[a, 3] * v[3]
+            value += 0.5 * v[a] * pull[a]
+        for k in range(3):
+            gradient[row + k] -= v[k] * pull[3]
             for a in range(4):
-                total += J[a, k] * pull[a]
-            gradient[row + k] += total
+                gradient[row + 3 + k] += by_angles[a, k] * pull[a]
         gradient[first + GAP + face] += pull[3]
         gradient[first + EXTENT + axis] -= 0.5 * pull[3]
-        if not curved:
-            continue
-        for a in range(4):
-            for k in range(6):
-                total = 0.0
-                for b in range(4):
-                    total += w[a, b] * J[b, k]
-                WJ[a, k] = total
-        for k in range(6):
-            for m in range(k, 6):
-                total = 0.0
-                for a in range(4):
-                    total += J[a, k] * WJ[a, m]
-                band[row + k, m - k] += total
-            border[row + k, GAP + face] += WJ[3, k]
-            border[row + k, EXTENT + axis] -= 0.5 * WJ[3, k]
-        corner[GAP + face, GAP + face] += w[3, 3]
-        corner[EXTENT + axis, GAP + face] -= 0.5 * w[3, 3]
-        corner[EXTENT + axis, EXTENT + axis] += 0.25 * w[3, 3]
+        if is_wanted(A):
+            for a in range(4):
+                for k in range(3):
+                    weighted[a, k] = (
+                        w[a, 0] * by_angles[0, k] + w[a, 1] * by_angles[1, k]
+                        + w[a, 2] * by_angles[2, k] + w[a, 3] * by_angles[3, k]
+                    )  # fmt: skip
+            add_face_curvature(n, face, v, w[3, 3], by_angles, weighted, A)
     return value
 
 
 @kernel
-def add_step(
-    n, pose, shared, start, axes, wanted, W, part, gradient, band, border, corner, curved
-):
-    """
-    Add the step of one pose from `start` along `axes` less six shared variables from `part` on.
-
-    W (6, 6) is its weight. The Jacobian by the pose is A = diag(axes', I), that by the shared
-    variables -I.
-
-    """
-    row = 6 * n
-    first = len(border)
-    r = np.empty(6)
-    AW = np.empty((6, 6))
+def add_face_curvature(n, face, v, w, by_angles, weighted, A):
+    """Add J' W J of one face: w is the weight of its level, `weighted` (4, 3) is W `by_angles`."""
+    axis = face // 2
+    links, border = A.links[n], A.border[n]
     for k in range(3):
-        total = 0.0
+        for m in range(k, 3):
+            links[k, m] += w * v[k] * v[m]
+            total = 0.0
+            for a in range(4):
+                total += by_angles[a, k] * weighted[a, m]
+            links[3 + k, 3 + m] += total
+        for m in range(3):
+            links[k, 3 + m] -= v[k] * weighted[3, m]
+        border[k, GAP + face] -= w * v[k]
+        border[k, EXTENT + axis] += 0.5 * w * v[k]
+        border[3 + k, GAP + face] += weighted[3, k]
+        border[3 + k, EXTENT + axis] -= 0.5 * weighted[3, k]
+    A.corner[GAP + face, GAP + face] += w
+    A.corner[EXTENT + axis, GAP + face] -= 0.5 * w
+    A.corner[EXTENT + axis, EXTENT + axis] += 0.25 * w
+
+
+@kernel
+def fill_step(pose, start, axes, r):
+    """Write the step (6,) of a pose from `start`: position along axes, angles as they are."""
+    for k in range(3):
+        r[k] = 0.0
         for j in range(3):
-            total += axes[j, k] * (pose[j] - start[j])
-        r[k] = total - shared[part + k] - wanted[k]
-        r[3 + k] = pose[3 + k] - start[3 + k] - shared[part + 3 + k] - wanted[3 + k]
+            r[k] += axes[j, k] * (pose[j] - start[j])
+        r[3 + k] = pose[3 + k] - start[3 + k]
+
+
+@kernel
+def add_input(n, pose, shared, terms, r, gradient, A):
+    """Add the step of one pose from its input less the bias (M3), with diagonal weights."""
+    axes, w = terms.axes[n], terms.W_input[n]
+    row = 6 * n
+    first = len(gradient) - SHARED
+    fill_step(pose, terms.given[n], axes, r)
     value = 0.0
     for k in range(6):
+        r[k] -= shared[BIAS + k]
+        value += 0.5 * w[k] * r[k] ** 2
+        gradient[first + BIAS + k] -= w[k] * r[k]
+    for k in range(3):
         for j in range(3):
-            total = 0.0
-            for m in range(3):
-                total += axes[j, m] * W[m, k]
-            AW[j, k] = total
-            AW[3 + j, k] = W[3 + j, k]
+            gradient[row + j] += axes[j, k] * w[k] * r[k]
+        gradient[row + 3 + k] += w[3 + k] * r[3 + k]
+    if is_wanted(A):
+        for k in range(3):
+            for j in range(3):
+                for m in range(j, 3):
+                    A.links[n, j, m] += axes[j, k] * w[k] * axes[m, k]
+                A.border[n, j, BIAS + k] -= axes[j, k] * w[k]
+            A.links[n, 3 + k, 3 + k] += w[3 + k]
+            A.border[n, 3 + k, BIAS + 3 + k] -= w[3 + k]
+        for k in range(6):
+            A.corner[BIAS + k, BIAS + k] += w[k]
+    return value
+
+
+@kernel
+def add_rigid_shape(n, pose, shared, terms, r, gradient, A):
+    """
+    Add the step of one pose from the start of the round less anchor and wanted step (M4).
+
+    The Jacobian by the pose is D = diag(axes', I), that by the anchor -I.
+
+    """
+    axes, W = terms.axes[n], terms.W_shape[n]
+    row = 6 * n
+    first = len(gradient) - SHARED
+    fill_step(pose, terms.start[n], axes, r)
+    for k in range(6):
+        r[k] -= shared[ANCHOR + k] + terms.wanted[n, k]
+    DW = np.empty((6, 6))  # D' W
+    for k in range(6):
+        for j in range(3):
+            DW[j, k] = axes[j, 0] * W[0, k] + axes[j, 1] * W[1, k] + axes[j, 2] * W[2, k]
+            DW[3 + j, k] = W[3 + j, k]
+    value = 0.0
     for k in range(6):
         pull = 0.0
         for m in range(6):
             pull += W[k, m] * r[m]
+            gradient[row + k] += DW[k, m] * r[m]
         value += 0.5 * r[k] * pull
-        gradient[first + part + k] -= pull
-        total = 0.0
-        for m in range(6):
-            total += AW[k, m] * r[m]
-        gradient[row + k] += total
-    if not curved:
-        return value
-    for k in range(6):
-        for m in range(k, 6):
-            if m < 3:
-                total = 0.0
-                for j in range(3):
-                    total += AW[k, j] * axes[m, j]
-            else:
-                total = AW[k, m]
-            band[row + k, m - k] += total
-        for m in range(6):
-            border[row + k, part + m] -= AW[k, m]
-        for m in range(k, 6):
-            corner[part + k, part + m] += W[k, m]
+        gradient[first + ANCHOR + k] -= pull
+    if is_wanted(A):
+        for k in range(6):
+            for m in range(k, 6):
+                total = DW[k, m]
+                if m < 3:
+                    total = DW[k, 0] * axes[m, 0] + DW[k, 1] * axes[m, 1] + DW[k, 2] * axes[m, 2]
+                A.links[n, k, m] += total
+                A.corner[ANCHOR + k, ANCHOR + m] += W[k, m]
+            for m in range(6):
+                A.border[n, k, ANCHOR + m] -= DW[k, m]
     return value
 
 
 @kernel
-def add_acceleration(n, poses, times, W, gradient, band, curved):
-    """Add the second difference of poses n, n + 1 and n + 2; W (6, 6) is its weight."""
+def fill_acceleration(n, poses, times, r):
+    """Write the second difference of poses n, n + 1 and n + 2 over time, (6,)."""
     first = times[n + 1] - times[n]
     second = times[n + 2] - times[n + 1]
     mean = (first + second) / 2
-    c = (1 / first / mean, (-1 / first - 1 / second) / mean, 1 / second / mean)
-    value = 0.0
-    r = np.empty(6)
     for k in range(6):
         forward = (poses[n + 2, k] - poses[n + 1, k]) / second
         r[k] = (forward - (poses[n + 1, k] - poses[n, k]) / first) / mean
-    for k in range(6):
-        pull = 0.0
-        for m in range(6):
-            pull += W[k, m] * r[m]
-        value += 0.5 * r[k] * pull
+    return 1 / first / mean, (-1 / first - 1 / second) / mean, 1 / second / mean
+
+
+@kernel
+def add_acceleration(n, poses, terms, r, gradient, A):
+    """Add the second difference of poses n, n + 1 and n + 2 (M5)."""
+    W, w = terms.W_acceleration[n], terms.W_turning[n]
+    c = fill_acceleration(n, poses, terms.times, r)  # derivatives by the three poses
+    value = 0.0
+    for k in range(3):
+        pull = W[k, 0] * r[0] + W[k, 1] * r[1] + W[k, 2] * r[2]
+        turn = w[k] * r[3 + k]
+        value += 0.5 * (r[k] * pull + r[3 + k] * turn)
         for i in range(3):
             gradient[6 * (n + i) + k] += c[i] * pull
-    if curved:
+            gradient[6 * (n + i) + 3 + k] += c[i] * turn
+    if is_wanted(A):
         for i in range(3):
             for j in range(i, 3):
-                for k in range(6):
-                    for m in range(6):
-                        add_block(band, 6 * (n + i), 6 * (n + j), k, m, c[i] * c[j] * W[k, m])
+                share = c[i] * c[j]
+                block = A.links[n + i, :, 6 * (j - i) : 6 * (j - i + 1)]
+                for k in range(3):
+                    for m in range(k if i == j else 0, 3):
+                        block[k, m] += share * W[k, m]
+                    block[3 + k, 3 + k] += share * w[k]
     return value
 
 
 @kernel
-def slip_of(before, after, dt, pivot, r):
-    """Write the velocity of the pivot to the left and upward between two poses, (2,) [m/s]."""
-    R0, R1, Rm = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    fill_rotation(before[3], before[4], before[5], R0)
-    fill_rotation(after[3], after[4], after[5], R1)
+def slip_of(n, poses, R, dt, pivot, Rm, r):
+    """
+    Write the velocity of the pivot to the left and upward from pose n to n + 1, (2,) [m/s].
+
+    `R` (N, 3, 3) are the axes of the poses; those between the two poses are written to `Rm`.
+
+    """
+    before, after = poses[n], poses[n + 1]
     fill_rotation(
         (before[3] + after[3]) / 2, (before[4] + after[4]) / 2, (before[5] + after[5]) / 2, Rm
     )
     for side in range(2):
         r[side] = 0.0
         for j in range(3):
-            step = after[j] - before[j] - pivot * (R1[j, 0] - R0[j, 0])
-            r[side] += Rm[j, 1 + side] / dt * step
+            step = after[j] - before[j] - pivot * (R[n + 1, j, 0] - R[n, j, 0])
+            r[side] += Rm[j, 1 + side] * step / dt
 
 
 @kernel
-def add_slip(n, poses, times, pivot, W, scratch, gradient, band, border, corner, curved):
-    """Add the velocity of the pivot to the left and upward from pose n to n + 1; W (2, 2)."""
-    R0, dR0, R1, dR1, Rm, dRm, J = scratch
-    before = poses[n]
-    after = poses[n + 1]
-    fill_rotation_derivatives(before[3], before[4], before[5], R0, dR0)
-    fill_rotation_derivatives(after[3], after[4], after[5], R1, dR1)
+def add_slip(n, poses, pivot, terms, scratch, gradient, A):
+    """Add the velocity of the pivot to the left and upward from pose n to n + 1 (M7)."""
+    R0, dR0, R1, dR1 = scratch.R[n], scratch.dR[n], scratch.R[n + 1], scratch.dR[n + 1]
+    Rm, dRm, J = scratch.mean_R, scratch.mean_dR, scratch.J
+    before, after = poses[n], poses[n + 1]
     fill_rotation_derivatives(
         (before[3] + after[3]) / 2, (before[4] + after[4]) / 2, (before[5] + after[5]) / 2, Rm, dRm
     )
-    dt = times[n + 1] - times[n]
+    rate = 1 / (terms.times[n + 1] - terms.times[n])
     row = 6 * n
-    first = len(border)
-    r = np.zeros(2)
-    by_pivot = np.zeros(2)
+    first = len(gradient) - SHARED
+    value = 0.0
     for side in range(2):
         axis = 1 + side
+        w = terms.W_slip[n, side]
+        r = 0.0
+        by_pivot = 0.0
         for j in range(3):
-            across = Rm[j, axis] / dt
+            across = Rm[j, axis] * rate
             turned = R1[j, 0] - R0[j, 0]
-            step = after[j] - before[j] - pivot * turned
-            r[side] += across * step
-            by_pivot[side] -= across * turned
-            J[side, j] = -across
-            J[side, 6 + j] = across
+            r += across * (after[j] - before[j] - pivot * turned)
+            by_pivot -= across * turned
+            J[j] = -across
+            J[6 + j] = across
         for k in range(3):
             tilt = 0.0
             swing0 = 0.0
             swing1 = 0.0
             for j in range(3):
-                turned = R1[j, 0] - R0[j, 0]
-                step = after[j] - before[j] - pivot * turned
-                tilt += step * dRm[k, j, axis] / dt / 2
-                swing0 += Rm[j, axis] / dt * dR0[k, j, 0]
-                swing1 += Rm[j, axis] / dt * dR1[k, j, 0]
-            J[side, 3 + k] = tilt + pivot * swing0
-            J[side, 9 + k] = tilt - pivot * swing1
-    value = 0.0
-    for side in range(2):
-        pull = W[side, 0] * r[0] + W[side, 1] * r[1]
-        value += 0.5 * r[side] * pull
+                step = after[j] - before[j] - pivot * (R1[j, 0] - R0[j, 0])
+                tilt += step * dRm[k, j, axis] * rate / 2
+                swing0 += J[6 + j] * dR0[k, j, 0]
+                swing1 += J[6 + j] * dR1[k, j, 0]
+            J[3 + k] = tilt + pivot * swing0
+            J[9 + k] = tilt - pivot * swing1
+        value += 0.5 * w * r**2
         for k in range(12):
-            gradient[row + k] += J[side, k] * pull
-        gradient[first + PIVOT] += by_pivot[side] * pull
-    if not curved:
-        return value
-    for side in range(2):
-        for other in range(2):
-            weight = W[side, other]
+            gradient[row + k] += J[k] * w * r
+        gradient[first + PIVOT] += by_pivot * w * r
+        if is_wanted(A):
             for k in range(12):
+                links, border = A.links[n + k // 6, k % 6], A.border[n + k // 6, k % 6]
                 for m in range(k, 12):
-                    band[row + k, m - k] += weight * J[side, k] * J[other, m]
-                border[row + k, PIVOT] += weight * J[side, k] * by_pivot[other]
-            corner[PIVOT, PIVOT] += weight * by_pivot[side] * by_pivot[other]
+                    links[m - 6 * (k // 6)] += w * J[k] * J[m]
+                border[PIVOT] += w * J[k] * by_pivot
+            A.corner[PIVOT, PIVOT] += w * by_pivot**2
     return value
 
 
 @kernel
-def add_zero_motion(n, poses, W, gradient, band, curved):
-    """Add the step from pose n to n + 1; W (6, 6) is its weight."""
+def add_zero_motion(n, poses, terms, gradient, A):
+    """Add the step from pose n to n + 1 (M6)."""
+    w = terms.W_zero_motion[n]
     value = 0.0
     row = 6 * n
     for k in range(6):
-        pull = 0.0
-        for m in range(6):
-            pull += W[k, m] * (poses[n + 1, m] - poses[n, m])
-        value += 0.5 * (poses[n + 1, k] - poses[n, k]) * pull
-        gradient[row + k] -= pull
-        gradient[row + 6 + k] += pull
-    if curved:
-        for k in range(6):
-            for m in range(6):
-                add_block(band, row, row, k, m, W[k, m])
-                add_block(band, row + 6, row + 6, k, m, W[k, m])
-                add_block(band, row, row + 6, k, m, -W[k, m])
+        step = poses[n + 1, k] - poses[n, k]
+        value += 0.5 * w[k] * step**2
+        gradient[row + k] -= w[k] * step
+        gradient[row + 6 + k] += w[k] * step
+        if is_wanted(A):
+            A.links[n, k, k] += w[k]
+            A.links[n + 1, k, k] += w[k]
+            A.links[n, k, 6 + k] -= w[k]
     return value
 
 
 @kernel
-def add_shared_prior(shared, expected, W, gradient, first, corner, curved):
-    """Add the deviation of the shared variables from those expected; W (22, 22)."""
+def add_shared_prior(shared, terms, gradient, A):
+    """Add the deviation of the shared variables from those expected (M8)."""
+    first = len(gradient) - SHARED
     value = 0.0
     for s in range(SHARED):
-        pull = 0.0
-        for t in range(SHARED):
-            pull += W[s, t] * (shared[t] - expected[t])
-        value += 0.5 * (shared[s] - expected[s]) * pull
-        gradient[first + s] += pull
-        if curved:
-            for t in range(s, SHARED):
-                corner[s, t] += W[s, t]
+        off = shared[s] - terms.expected[s]
+        value += 0.5 * terms.W_shared[s] * off**2
+        gradient[first + s] += terms.W_shared[s] * off
+        if is_wanted(A):
+            A.corner[s, s] += terms.W_shared[s]
     return value
 
 
 @kernel
-def add_marginal_prior(poses, shared, mean, information, gradient, band, border, corner, curved):
-    """Add the quadratic form in the two oldest poses and the shared variables, (34,)."""
-    first = len(border)
+def add_marginal_prior(poses, shared, terms, gradient, A):
+    """Add the quadratic form in the two oldest poses and the shared variables (M9)."""
+    W = terms.W_prior
+    first = len(gradient) - SHARED
     size = 12 + SHARED
     r = np.empty(size)
     for k in range(12):
-        r[k] = poses[k // 6, k % 6] - mean[k]
+        r[k] = poses[k // 6, k % 6] - terms.prior_mean[k]
     for s in range(SHARED):
-        r[12 + s] = shared[s] - mean[12 + s]
+        r[12 + s] = shared[s] - terms.prior_mean[12 + s]
     value = 0.0
     for k in range(size):
         pull = 0.0
         for m in range(size):
-            pull += information[k, m] * r[m]
+            pull += W[k, m] * r[m]
         value += 0.5 * r[k] * pull
         gradient[k if k < 12 else first + k - 12] += pull
-    if curved:
+    if is_wanted(A):
         for k in range(12):
+            links, border = A.links[k // 6, k % 6], A.border[k // 6, k % 6]
             for m in range(k, 12):
-                band[k, m - k] += information[k, m]
+                links[m - 6 * (k // 6)] += W[k, m]
             for s in range(SHARED):
-                border[k, s] += information[k, 12 + s]
+                border[s] += W[k, 12 + s]
         for s in range(SHARED):
             for t in range(s, SHARED):
-                corner[s, t] += information[12 + s, 12 + t]
+                A.corner[s, t] += W[12 + s, 12 + t]
     return value
 
 
+class Scratch(NamedTuple):
+    """
+    Arrays that the residuals of one window work in.
+
+    Attributes
+    ----------
+    R, dR : array, shapes (N, 3, 3) and (N, 3, 3, 3)
+        Axes of the poses and their derivatives.
+    plane, pull, by_angles, weighted : array, shapes (4,), (4,), (4, 3) and (4, 3)
+        Of `add_faces`.
+    mean_R, mean_dR, J : array, shapes (3, 3), (3, 3, 3) and (12,)
+        Of `add_slip`.
+    r : array, shape (6,)
+        A residual.
+
+    """
+
+    R: Any
+    dR: Any
+    plane: Any
+    pull: Any
+    by_angles: Any
+    weighted: Any
+    mean_R: Any
+    mean_dR: Any
+    J: Any
+    r: Any
+
+
 @kernel
-def rotation_scratch():
-    """Return arrays that the residuals of one window work in."""
-    faces = np.empty((3, 3)), np.empty((3, 3, 3)), np.empty((4, 6)), np.empty((4, 6))
-    slip = (
-        np.empty((3, 3)), np.empty((3, 3, 3)), np.empty((3, 3)), np.empty((3, 3, 3)),
-        np.empty((3, 3)), np.empty((3, 3, 3)), np.empty((2, 12)),
+def empty_scratch(N):
+    """Return the arrays for a window of N observations."""
+    return Scratch(
+        np.empty((N, 3, 3)), np.empty((N, 3, 3, 3)), np.empty(4), np.empty(4), np.empty((4, 3)),
+        np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 3, 3)), np.empty(12), np.empty(6),
     )  # fmt: skip
-    return faces, slip
 
 
 @kernel
-def add_window(b, poses, shared, last, terms, gradient, band, border, corner, curved):
+def accumulate(x, last, terms, scratch, gradient, A):
     """
-    Add all residuals of window `b` that begin at its first `last` observations.
-
-    `terms` are the `TermArrays` of the batch. The prior on the shared variables is not among
-    them: it belongs to no observation.
-
-    """
-    times, given, inset = terms.times[b], terms.given[b], terms.inset[b]
-    W_faces, W_input, W_shape = terms.W_faces[b], terms.W_input[b], terms.W_shape[b]
-    W_acceleration, W_slip, W_still = (
-        terms.W_acceleration[b], terms.W_slip[b], terms.W_zero_motion[b]
-    )  # fmt: skip
-    faces_scratch, slip_scratch = rotation_scratch()
-    nothing = np.zeros(6)
-    value = 0.0
-    for n in range(min(last, len(W_faces))):
-        value += add_faces(
-            n, poses[n], shared, given[n], inset[n], W_faces[n], faces_scratch, gradient, band,
-            border, corner, curved,
-        )  # fmt: skip
-    for n in range(min(last, len(W_input))):
-        if W_input[n, 0, 0] != 0.0:
-            value += add_step(
-                n, poses[n], shared, terms.input_pose[b, n], terms.axes[b, n], nothing,
-                W_input[n], BIAS, gradient, band, border, corner, curved,
-            )  # fmt: skip
-    for n in range(min(last, len(W_shape))):
-        value += add_step(
-            n, poses[n], shared, terms.shape_start[b, n], terms.shape_axes[b, n],
-            terms.wanted[b, n], W_shape[n], ANCHOR, gradient, band, border, corner, curved,
-        )  # fmt: skip
-    for n in range(min(last, len(W_acceleration))):
-        if W_acceleration[n, 0, 0] != 0.0:
-            value += add_acceleration(n, poses, times, W_acceleration[n], gradient, band, curved)
-    for n in range(min(last, len(W_slip))):
-        if W_slip[n, 0, 0] != 0.0:
-            value += add_slip(
-                n, poses, times, shared[PIVOT], W_slip[n], slip_scratch, gradient, band, border,
-                corner, curved,
-            )  # fmt: skip
-    for n in range(min(last, len(W_still))):
-        if W_still[n, 0, 0] != 0.0:
-            value += add_zero_motion(n, poses, W_still[n], gradient, band, curved)
-    W_prior = terms.W_prior[b]
-    if W_prior[0, 0] != 0.0:
-        value += add_marginal_prior(
-            poses, shared, terms.prior_mean[b], W_prior, gradient, band, border, corner, curved
-        )
-    return value
-
-
-@kernel
-def accumulate(begin, end, x, rows, last, terms, value, gradient, band, border, corner):
-    """
-    Write the sums of the residuals of the windows `rows[begin:end]`.
+    Return the sum of the residuals of one window (M1); write its gradient and matrix.
 
     Parameters
     ----------
-    begin, end : int
-        First window, and the one after the last.
-    x, rows : array, shapes (b, D) and (b,)
-        Variables, and which windows of `terms` they are of.
+    x : array, shape (6 N + 22,)
+        Poses and shared variables.
     last : int
         Only residuals that begin at the first `last` observations; less than N leaves out the
         prior on the shared variables too, which belongs to no observation.
     terms : TermArrays
         Data and weights.
-    value, gradient : array, shapes (b,) and (b, D)
+    scratch : Scratch
+        Arrays to work in.
+    gradient : array, shape (6 N + 22,)
         Written.
-    band, border, corner : array, shapes (b, 6 N, 18), (b, 6 N, S) and (b, S, S)
-        Gauss-Newton matrices, written; of length b = 0 where they are not wanted.
+    A : ArrowheadArrays
+        Gauss-Newton matrix, written; of `no_matrix` where it is not wanted.
 
     """
-    curved = len(band) > 0
-    N = (x.shape[1] - SHARED) // 6
-    no_band = np.empty((0, BAND))
-    no_border = np.empty((6 * N, 0))
-    no_corner = np.empty((0, 0))
-    for i in range(begin, end):
-        b = rows[i]
-        poses = x[i, : 6 * N].reshape(N, 6)
-        shared = x[i, 6 * N :]
-        gradient[i] = 0.0
-        own_band, own_border, own_corner = no_band, no_border, no_corner
-        if curved:
-            band[i] = 0.0
-            border[i] = 0.0
-            corner[i] = 0.0
-            own_band, own_border, own_corner = band[i], border[i], corner[i]
-        value[i] = add_window(
-            b, poses, shared, last, terms, gradient[i], own_band, own_border, own_corner, curved
+    N = (len(x) - SHARED) // 6
+    poses = x[: 6 * N].reshape(N, 6)
+    shared = x[6 * N :]
+    gradient[:] = 0.0
+    clear(A)
+    value = 0.0
+    for n in range(min(last + 1, N)):
+        fill_rotation_derivatives(
+            poses[n, 3], poses[n, 4], poses[n, 5], scratch.R[n], scratch.dR[n]
         )
-        if last >= N:
-            value[i] += add_shared_prior(
-                shared, terms.expected[b], terms.W_shared[b], gradient[i], 6 * N, own_corner,
-                curved,
-            )  # fmt: skip
+    for n in range(min(last, N)):
+        value += add_faces(n, poses[n], shared, terms, scratch, gradient, A)
+        if terms.W_input[n, 0] != 0.0:
+            value += add_input(n, poses[n], shared, terms, scratch.r, gradient, A)
+        if n < len(terms.W_shape):
+            value += add_rigid_shape(n, poses[n], shared, terms, scratch.r, gradient, A)
+        if terms.W_acceleration[n, 0, 0] != 0.0:
+            value += add_acceleration(n, poses, terms, scratch.r, gradient, A)
+        if terms.W_slip[n, 0] != 0.0:
+            value += add_slip(n, poses, shared[PIVOT], terms, scratch, gradient, A)
+        if terms.W_zero_motion[n, 0] != 0.0:
+            value += add_zero_motion(n, poses, terms, gradient, A)
+    if terms.W_prior[0, 0] != 0.0:
+        value += add_marginal_prior(poses, shared, terms, gradient, A)
+    if last >= N:
+        value += add_shared_prior(shared, terms, gradient, A)
+    return value
 
 
 @kernel
-def factorise_windows(begin, end, free, band, border, corner):
-    """
-    Replace Gauss-Newton matrices by their Cholesky factors in the `free` variables (B, D).
-
-    Those of the windows `begin` to `end`.
-    Factors of a matrix that is not positive definite are NaN.
-
-    """
-    for b in range(begin, end):
-        fix_variables(band[b], border[b], corner[b], free[b])
-        if not factorise(band[b], border[b], corner[b]):
-            band[b] = np.nan
-            border[b] = np.nan
-            corner[b] = np.nan
-
-
-@kernel
-def marginalise(begin, end, x, gradient, band, border, corner, mean, step, information):
-    """
-    Write the quadratic form that stands for the oldest observation of the windows.
-
-    In the next two poses and the shared variables: where they are (B, 34), the step from there to
-    the minimum (B, 34), and the curvature (B, 34, 34). The sums of the residuals of the oldest
-    observation, from `accumulate`, are the input.
-
-    """
-    N = (x.shape[1] - SHARED) // 6
-    head = min(3, N)
-    size = 12 + SHARED
-    for b in range(begin, end):
-        poses = x[b, : 6 * N].reshape(N, 6)
-        shared = x[b, 6 * N :]
-        # Dense, in the order: oldest pose, two next poses, shared variables.
-        form = np.zeros((18 + SHARED, 18 + SHARED))
-        pull = np.zeros(18 + SHARED)
-        for i in range(6 * head):
-            pull[i] = gradient[b, i]
-            for k in range(min(BAND, 6 * head - i)):
-                form[i, i + k] = band[b, i, k]
-            for s in range(SHARED):
-                form[i, 18 + s] = border[b, i, s]
-        for s in range(SHARED):
-            pull[18 + s] = gradient[b, 6 * N + s]
-            for t in range(s, SHARED):
-                form[18 + s, 18 + t] = corner[b, s, t]
-        for i in range(6):
-            form[i, i] += RIDGE
-        is_definite = eliminate(form, pull, 6)
-        for i in range(size):
-            mean[b, i] = poses[1 + i // 6, i % 6] if i < 12 else shared[i - 12]
-            for j in range(size):
-                low, high = min(i, j), max(i, j)
-                information[b, i, j] = form[6 + low, 6 + high] if is_definite else np.nan
-        # The ridge is for directions that nothing is known about.
-        for i in range(6, 18 + SHARED):
-            form[i, i] += UNKNOWN_RIDGE
-        rest = form[6:, 6:].copy()
-        x_rest = -pull[6:]
-        is_definite = is_definite and eliminate(rest, x_rest, size)
-        back_substitute(rest, x_rest)
-        for i in range(size):
-            step[b, i] = x_rest[i] if is_definite else np.nan
+def fill_dense(A, dense):
+    """Write a matrix with a chain of two poses as a dense one, (34, 34)."""
+    for pose in range(2):
+        for a in range(POSE):
+            i = POSE * pose + a
+            for c in range(a, NEXT - POSE * pose):
+                dense[i, POSE * pose + c] = A.links[pose, a, c]
+            for s in range(BORDER):
+                dense[i, NEXT + s] = A.border[pose, a, s]
+    for s in range(BORDER):
+        for t in range(s, BORDER):
+            dense[NEXT + s, NEXT + t] = A.corner[s, t]
+    for i in range(len(dense)):
+        for j in range(i):
+            dense[i, j] = dense[j, i]
 
 
 @kernel
-def eliminate(form, pull, count):
-    """Eliminate the first `count` variables of an upper triangle and its right side (in place)."""
-    size = len(form)
-    for i in range(count):
-        if not form[i, i] > 0.0:
-            return False
-        root = sqrt(form[i, i])
-        for j in range(i, size):
-            form[i, j] /= root
-        pull[i] /= root
-        for j in range(i + 1, size):
-            factor = form[i, j]
-            if factor != 0.0:
-                for k in range(j, size):
-                    form[j, k] -= factor * form[i, k]
-                pull[j] -= factor * pull[i]
-    return True
+def marginalise(x, gradient, A, mean, step, information):
+    """
+    Write the quadratic form that stands for the oldest observation of one window (M13).
 
+    In the next two poses and the shared variables: where they are (34,), the step from there to
+    the minimum (34,), and the curvature (34, 34). The sums of the residuals of the oldest
+    observation, from `accumulate`, are the input; they are changed.
 
-@kernel
-def back_substitute(upper, x):
-    """Replace x by the solution of U x = x for an upper triangle U."""
-    for i in range(len(x) - 1, -1, -1):
-        for j in range(i + 1, len(x)):
-            x[i] -= upper[i, j] * x[j]
-        x[i] /= upper[i, i]
+    """
+    n = len(x) - SHARED
+    mean[:NEXT] = x[POSE : POSE + NEXT]
+    mean[NEXT:] = x[n:]
+    for a in range(POSE):
+        A.links[0, a, a] += RIDGE
+    is_definite = eliminate_pose(A, 0)
+    A.corner[:] -= np.dot(A.border[0].T, A.border[0])
+    rest = ArrowheadArrays(A.links[1:5], A.border[1:5], A.corner)
+    fill_dense(rest, information)
+    # The ridge is for directions that nothing is known about.
+    for pose in range(2):
+        for a in range(POSE):
+            rest.links[pose, a, a] += UNKNOWN_RIDGE
+    for s in range(SHARED):
+        rest.corner[s, s] += UNKNOWN_RIDGE
+    if not (is_definite and factorise(rest)):
+        step[:] = np.nan
+        information[:] = np.nan
+        return
+    substitute_forward(A, gradient, POSE)
+    step[:NEXT] = -gradient[POSE : POSE + NEXT]
+    step[NEXT:] = -gradient[n:]
+    solve(rest, step)

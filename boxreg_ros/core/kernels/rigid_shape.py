@@ -6,7 +6,7 @@ The torch twin is `boxreg_ros.core.rigid_shape.agreement_torch`, which has the f
 """
 
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.face_support import fill_velocity, returns_of, to_box_axes
+from boxreg_ros.core.kernels.face_support import fill_moved, fill_velocity, to_box_axes
 from boxreg_ros.core.kernels.rotation import fill_rotation
 import numpy as np
 
@@ -74,7 +74,7 @@ def agreement(
     margin, flatness, min_points, independent, ridge = limits
     N = poses.shape[1]
     M = max(1, windows.counts[begin:end].max()) if end > begin else 1
-    moved = np.empty((M, 3))
+    moved = np.empty((3, M))
     velocity = np.zeros(3)
     cell_count = cells[0] * cells[1] * cells[2]
     local = np.empty((N, 3, M))
@@ -95,11 +95,8 @@ def agreement(
                 shift[k] = poses[b, n, k] - windows.boxes[b, n, k]
             if is_moving:
                 fill_velocity(poses[b], windows.times[b], n, windows.lengths[b], velocity)
-            to_box_axes(
-                returns_of(windows, windows.points, b, n),
-                returns_of(windows, windows.delays, b, n), velocity, shift, R, moved[:m],
-                local[n, :, :m],
-            )  # fmt: skip
+            fill_moved(windows, b, n, velocity, is_moving, moved)
+            to_box_axes(m, moved, shift, R, local[n])
             for i in range(m):
                 x, y, z = local[n, 0, i], local[n, 1, i], local[n, 2, i]
                 if not is_near(x, y, z, half, margin):

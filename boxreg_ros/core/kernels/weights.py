@@ -5,10 +5,19 @@ The torch twins are the functions of `boxreg_ros.core.weights`; the formulas are
 
 """
 
-from math import hypot, inf
+from math import hypot, inf, sqrt
 
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.normal_equations import BIAS, EXTENT, GAP, PIVOT, SHARED, slip_of
+from boxreg_ros.core.kernels.normal_equations import (
+    BIAS,
+    EXTENT,
+    fill_acceleration,
+    fill_step,
+    GAP,
+    PIVOT,
+    SHARED,
+    slip_of,
+)
 from boxreg_ros.core.kernels.rotation import fill_rotation
 from boxreg_ros.core.kernels.sorting import lower_median
 import numpy as np
@@ -99,21 +108,31 @@ def fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked):
 
 
 @kernel
-def fill_input_weights(
-    boxes, poses, bias, length, axes, off_track, deviation, widened, numbers, W
-):
-    """Write the weights of the input poses (M21), (N, 6, 6)."""
+def fill_input_weights(poses, bias, length, off_track, deviation, widened, numbers, terms):
+    """Write the weights of the input poses (M21), (N, 6)."""
+    r = np.empty(6)
     for n in range(length):
-        box, R = boxes[n], axes[n]
+        fill_step(poses[n], terms.given[n], terms.axes[n], r)
         for k in range(6):
-            r = -bias[k]
-            if k < 3:
-                for j in range(3):
-                    r += R[j, k] * (poses[n, j] - box[j])
-            else:
-                r += poses[n, k] - box[3 + k]
-            off = (abs(r) + off_track[n, k]) / deviation[k]
-            W[n, k, k] = 1 / widened[k] ** 2 / (1 + (off / numbers.input_outlier) ** 2)
+            off = (abs(r[k] - bias[k]) + off_track[n, k]) / deviation[k]
+            terms.W_input[n, k] = 1 / widened[k] ** 2 / (1 + (off / numbers.input_outlier) ** 2)
+
+
+@kernel
+def weigh_pins(pinned, length, widened, unmodelled_bias, pin_deviations, W):
+    """
+    Change the weights (N, 6) of the input poses of a window with pinned boxes (M21a).
+
+    The bias of the other boxes is part of their noise.
+
+    """
+    if not pinned.any():
+        return
+    for k in range(6):
+        variance = widened[k] ** 2
+        factor = variance / (variance + sqrt(float(length)) * unmodelled_bias[k] ** 2)
+        for n in range(length):
+            W[n, k] = 1 / pin_deviations[k] ** 2 if pinned[n] else W[n, k] * factor
 
 
 @kernel
@@ -138,10 +157,10 @@ def scale_moments(moments, weight, W):
 
 
 @kernel
-def fill_shared_weights(shared, expected, deviation, distance, face_weight, length, numbers, W):
-    """Write the weights of the shared variables (M22), (22, 22)."""
+def fill_shared_weights(shared, deviation, distance, face_weight, length, numbers, terms):
+    """Write the weights of the shared variables (M22), (22,)."""
     for s in range(SHARED):
-        W[s, s] = 1 / deviation[s] ** 2
+        terms.W_shared[s] = 1 / deviation[s] ** 2
     for face in range(6):
         axis = face // 2
         total = 0.0
@@ -154,79 +173,88 @@ def fill_shared_weights(shared, expected, deviation, distance, face_weight, leng
         spread = deviation[GAP + face]
         variance = spread**2 + deviation[BIAS + axis] ** 2 + half_extent**2
         of_points = (pull / max(total, 1e-9)) ** 2 / variance
-        of_gap = (shared[GAP + face] - expected[GAP + face]) ** 2 / spread**2
+        of_gap = (shared[GAP + face] - terms.expected[GAP + face]) ** 2 / spread**2
         off = max(of_points, of_gap)
-        W[GAP + face, GAP + face] = 1 / (spread**2 * (1 + off / numbers.gap_outlier**2))
+        terms.W_shared[GAP + face] = 1 / (spread**2 * (1 + off / numbers.gap_outlier**2))
 
 
 @kernel
-def fill_acceleration_weights(axes, deviation, length, W):
-    """Write the weights of the accelerations (M23), (N - 2, 6, 6), in the fixed frame."""
+def fill_acceleration_weights(deviation, length, terms):
+    """Write the weights of the accelerations (M23), in the fixed frame."""
     for n in range(length - 2):
-        R = axes[n + 1]
+        R = terms.axes[n + 1]
         for j in range(3):
             for k in range(3):
                 total = 0.0
                 for axis in range(3):
                     total += R[j, axis] * R[k, axis] / deviation[axis] ** 2
-                W[n, j, k] = total
-            W[n, 3 + j, 3 + j] = 1 / deviation[3 + j] ** 2
+                terms.W_acceleration[n, j, k] = total
+            terms.W_turning[n, j] = 1 / deviation[3 + j] ** 2
 
 
 @kernel
-def mahalanobis(W, r):
-    """Return r' W r."""
-    total = 0.0
-    for j in range(len(r)):
-        for k in range(len(r)):
-            total += r[j] * W[j, k] * r[k]
-    return total
+def fill_motion_weights(length, parked, slip, zero_motion, terms):
+    """Write the weights of slip and, where the object is parked, of zero motion (M25)."""
+    for n in range(length - 1):
+        for k in range(2):
+            terms.W_slip[n, k] = 1 / slip[k] ** 2
+        for k in range(6):
+            if parked[n]:
+                terms.W_zero_motion[n, k] = 1 / zero_motion[k] ** 2
 
 
 @kernel
-def scale_by_neighbours(squared, count, outlier, W):
-    """Down-weight the first `count` matrices W (n, R, R) by Cauchy's weight, squared (M24)."""
-    for n in range(count):
-        least = squared[n]
-        if n >= 2:
-            least = min(squared[n], squared[n - 1], squared[n - 2])
-        scale = 1 / (1 + least / outlier**2) ** 2
-        for j in range(W.shape[1]):
-            for k in range(W.shape[2]):
-                W[n, j, k] *= scale
+def robust_scale(squared, n, outlier):
+    """Return the factor (M24) of residual n: of the least of its own and the two before."""
+    least = squared[n]
+    if n >= 2:
+        least = min(squared[n], squared[n - 1], squared[n - 2])
+    return 1 / (1 + least / outlier**2) ** 2
 
 
 @kernel
-def robustify_motion(poses, times, pivot, length, numbers, W_acceleration, W_slip):
+def robustify_motion(poses, pivot, length, outlier, terms):
     """Down-weight motion residuals that are far off at the start of the round (M24)."""
     squared = np.empty(len(poses))
     r = np.empty(6)
+    between = np.empty((3, 3))
     for n in range(length - 2):
-        first = times[n + 1] - times[n]
-        second = times[n + 2] - times[n + 1]
-        for k in range(6):
-            forward = (poses[n + 2, k] - poses[n + 1, k]) / second
-            r[k] = (forward - (poses[n + 1, k] - poses[n, k]) / first) * 2 / (first + second)
-        squared[n] = mahalanobis(W_acceleration[n], r)
-    scale_by_neighbours(squared, length - 2, numbers.motion_outlier, W_acceleration)
+        W, w = terms.W_acceleration[n], terms.W_turning[n]
+        fill_acceleration(n, poses, terms.times, r)
+        squared[n] = 0.0
+        for k in range(3):
+            squared[n] += r[k] * (W[k, 0] * r[0] + W[k, 1] * r[1] + W[k, 2] * r[2])
+            squared[n] += w[k] * r[3 + k] ** 2
+    for n in range(length - 2):
+        scale = robust_scale(squared, n, outlier)
+        for j in range(3):
+            terms.W_turning[n, j] *= scale
+            for k in range(3):
+                terms.W_acceleration[n, j, k] *= scale
     for n in range(length - 1):
-        slip_of(poses[n], poses[n + 1], times[n + 1] - times[n], pivot, r)
-        squared[n] = mahalanobis(W_slip[n], r[:2])
-    scale_by_neighbours(squared, length - 1, numbers.motion_outlier, W_slip)
+        dt = terms.times[n + 1] - terms.times[n]
+        slip_of(n, poses, terms.axes, dt, pivot, between, r)
+        squared[n] = terms.W_slip[n, 0] * r[0] ** 2 + terms.W_slip[n, 1] * r[1] ** 2
+    for n in range(length - 1):
+        scale = robust_scale(squared, n, outlier)
+        for k in range(2):
+            terms.W_slip[n, k] *= scale
 
 
 @kernel
-def weigh_windows(begin, end, windows, poses, shared, faces, expected, of_class, numbers, terms):
+def weigh(b, windows, start, faces, expected, of_class, numbers, terms):
     """
-    Write data and weights of the terms of the windows `begin` to `end`.
+    Write data and weights of the terms of window `b`, but those of rigid shape and prior.
+
+    The weights of padding are left as they are: zero.
 
     Parameters
     ----------
-    begin, end : int
-        First window, and the one after the last.
+    b : int
+        The window.
     windows : WindowArrays
         Input of the windows.
-    poses, shared : array, shapes (B, N, 6) and (B, 22)
+    start : StartArrays
         Boxes at the start of the round.
     faces : FaceArrays
         Face observations.
@@ -237,46 +265,45 @@ def weigh_windows(begin, end, windows, poses, shared, faces, expected, of_class,
     numbers : WeightNumbers
         Constants and settings.
     terms : TermArrays
-        `axes` and the weights of faces, input, motion and shared variables are written; the
-        weights have to be zero.
+        Written.
 
     """
-    N = poses.shape[1]
+    N = start.poses.shape[1]
     off_track = np.empty((N, 6))
     face_weight = np.empty((N, 6))
     parked = np.empty(N, np.bool_)
-    for b in range(begin, end):
-        length = windows.lengths[b]
-        boxes, times, axes = windows.boxes[b], windows.times[b], terms.axes[b]
-        for n in range(N):
-            fill_rotation(poses[b, n, 3], poses[b, n, 4], poses[b, n, 5], axes[n])
-        fill_neighbour_deviation(boxes, times, length, axes, numbers, off_track)
-        distance = faces.distance[b]
-        fill_face_weights(
-            distance, faces.weight[b], off_track, length, of_class.faces[b], numbers, face_weight
-        )
-        for n in range(length):
-            scale_moments(faces.moments[b, n], face_weight[n], terms.W_faces[b, n])
-        deviation = expected.pose_deviation[b]
-        fill_input_weights(
-            boxes, poses[b], shared[b, BIAS:GAP], length, axes, off_track, deviation,
-            expected.widened_deviation[b], numbers, terms.W_input[b],
-        )  # fmt: skip
-        fill_shared_weights(
-            shared[b], expected.shared[b], expected.deviation[b], distance, face_weight, length,
-            numbers, terms.W_shared[b],
-        )  # fmt: skip
-        fill_acceleration_weights(axes, of_class.acceleration[b], length, terms.W_acceleration[b])
-        yaw_deviation = max(deviation[5], of_class.heading[b])
-        fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked)
-        for n in range(length - 1):
-            for k in range(2):
-                terms.W_slip[b, n, k, k] = 1 / of_class.slip[b, k] ** 2
-            if parked[n]:
-                for k in range(6):
-                    terms.W_zero_motion[b, n, k, k] = 1 / of_class.zero_motion[b, k] ** 2
-        if numbers.is_robust:
-            robustify_motion(
-                poses[b], times, shared[b, PIVOT], length, numbers, terms.W_acceleration[b],
-                terms.W_slip[b],
-            )  # fmt: skip
+    length = windows.lengths[b]
+    boxes, times, poses, shared = (
+        windows.boxes[b], windows.times[b], start.poses[b], start.shared[b]
+    )  # fmt: skip
+    terms.times[:] = times
+    terms.inset[:] = faces.inset[b]
+    terms.expected[:] = expected.shared[b]
+    for n in range(N):
+        fill_rotation(poses[n, 3], poses[n, 4], poses[n, 5], terms.axes[n])
+        for k in range(6):
+            terms.given[n, k] = boxes[n, POSE[k]]
+    fill_neighbour_deviation(boxes, times, length, terms.axes, numbers, off_track)
+    distance = faces.distance[b]
+    fill_face_weights(
+        distance, faces.weight[b], off_track, length, of_class.faces[b], numbers, face_weight
+    )
+    for n in range(length):
+        scale_moments(faces.moments[b, n], face_weight[n], terms.W_faces[n])
+    deviation, widened = expected.pose_deviation[b], expected.widened_deviation[b]
+    fill_input_weights(
+        poses, shared[BIAS:GAP], length, off_track, deviation, widened, numbers, terms
+    )
+    weigh_pins(
+        windows.pinned[b], length, widened, expected.unmodelled_bias[b], numbers.pin_deviations,
+        terms.W_input,
+    )  # fmt: skip
+    fill_shared_weights(
+        shared, expected.deviation[b], distance, face_weight, length, numbers, terms
+    )
+    fill_acceleration_weights(of_class.acceleration[b], length, terms)
+    yaw_deviation = max(deviation[5], of_class.pose[b, 5])
+    fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked)
+    fill_motion_weights(length, parked, of_class.slip[b], of_class.zero_motion[b], terms)
+    if numbers.is_robust:
+        robustify_motion(poses, shared[PIVOT], length, numbers.motion_outlier, terms)

@@ -1,0 +1,96 @@
+"""
+`boxreg bench lidars`: accuracy on a truck with LiDARs at its corners.
+
+The same drives are recorded in four ways: a topic per LiDAR, a concatenated cloud with its info
+message, the concatenated cloud alone, and a single LiDAR on the roof. The input boxes and the
+truth are the same.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import tempfile
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
+from boxreg_ros.config import Config
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import Lidars
+from boxreg_ros.io.recording import input_boxes, Recording
+from boxreg_ros.offline.box_scores import match
+from boxreg_ros.offline.relabel import relabel
+from boxreg_ros.offline.request import Request
+from boxreg_ros.simulation.truck import CORNERS, LAYOUTS, truck_scene, write_truck
+import numpy as np
+
+CLASSES = ('car', 'van', 'truck')
+MIN_POINTS = 100
+"""True boxes with fewer points of all corners are left out, as in `boxreg bench real`."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `boxreg bench lidars`."""
+    parser.add_argument(
+        '--seeds', type=int, default=3, metavar='N', help='number of drives (default: 3)'
+    )
+    parser.add_argument('--sweeps', type=int, metavar='N', help='sweeps of a drive (default: 50)')
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the mean IoU of the input and of each way to record the LiDARs."""
+    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ('input', *LAYOUTS)}
+    with progress_bar(args.seeds * len(LAYOUTS), args) as bar:
+        for seed in range(args.seeds):
+            for name, ious in measured(seed, args.sweeps, bar.update).items():
+                rows[name].append(ious)
+    results = {
+        name: dict(zip(('bev', '3d'), np.mean(ious, axis=0).tolist(), strict=True))
+        for name, ious in rows.items()
+    }
+    if args.json:
+        print_json(results)
+        return 0
+    print(line('', ('BEV', '3D')))
+    for name, found in results.items():
+        print(line(name, list(found.values())))
+    return 0
+
+
+def measured(seed: int, sweeps: int | None, done: Any) -> dict[str, tuple[float, float]]:
+    """
+    Return mean BEV and 3D IoU of the input and of each layout for one drive.
+
+    Parameters
+    ----------
+    seed, sweeps
+        Of the drive.
+    done : callable
+        Called after each layout.
+
+    """
+    scene = truck_scene(seed, sweeps)
+    found: dict[str, tuple[float, float]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for layout in LAYOUTS:
+            path = Path(folder) / f'{layout}.mcap'
+            out = Path(folder) / layout
+            write_truck(path, scene, layout)
+            topics = tuple(f'/points/{name}' for name in CORNERS) if layout == 'corners' else ()
+            if not found:
+                arrays, _ = input_boxes(Recording([path], Lidars(topics)))
+                found['input'] = _ious(BoxTable.from_arrays(arrays, 'input'), scene.truth)
+            request = Request((path,), lidars=Lidars(topics), formats=('csv',), config=Config())
+            relabel(request, out)
+            found[layout] = _ious(BoxTable.read(out / 'boxes.csv'), scene.truth)
+            done()
+    return found
+
+
+def _ious(boxes: BoxTable, truth: BoxTable) -> tuple[float, float]:
+    """Return the mean BEV and 3D IoU of the boxes that there are."""
+    matches = match(boxes, truth, MIN_POINTS, CLASSES)
+    is_there = matches.is_matched
+    return float(matches.iou_bev[is_there].mean()), float(matches.iou_3d[is_there].mean())

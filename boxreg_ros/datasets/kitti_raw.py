@@ -1,0 +1,121 @@
+"""
+KITTI raw, synchronised and rectified, as its archives are unpacked: one folder per day.
+
+Sweeps have the stamp at which the LiDAR faces forward; poses are interpolated between those of
+the GPS/IMU unit. The LiDAR turns while the vehicle moves, which is not compensated.
+
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from boxreg_ros.datasets.files import require, require_lidar
+from boxreg_ros.datasets.kitti import (
+    calibration_lines,
+    exported_poses,
+    oxts_poses,
+    oxts_rows,
+    rigid_transform,
+    sweep_files,
+)
+from boxreg_ros.datasets.protocol import Dataset, Scene
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.labels import frames_of, SceneFrames
+from boxreg_ros.labels.files import frame_names
+from boxreg_ros.labels.sidecar import read_stamps, STAMPS_FILE
+from boxreg_ros.labels.tracklets import FILE
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+
+DATASET = Dataset(
+    name='kitti-raw',
+    title='KITTI raw',
+    folder='DATE/DATE_drive_0001_sync/velodyne_points/, DATE/calib_imu_to_velo.txt',
+    scene='2011_09_26_drive_0001',
+    labels='tracklets',
+    remedy='unpack its archives into one folder',
+    lidar='velodyne_points',
+)
+SUFFIX = '_sync'
+RAW_DIGITS = 10
+IMU_CALIBRATION_FILE = 'calib_imu_to_velo.txt'
+
+
+def scene_names(root: Path) -> list[str]:
+    """Return the names of the synchronised drives."""
+    return sorted(_drives(root))
+
+
+def inputs(root: Path, name: str) -> tuple[Path, ...]:
+    """Return the files and folders of a drive."""
+    drive = _drives(root)[name]
+    paths = (drive / FILE, drive / 'oxts', drive.parent / IMU_CALIBRATION_FILE)
+    return (drive / DATASET.lidar, *(path for path in paths if path.exists()))
+
+
+def open_scene(root: Path, name: str, points: str | None) -> Scene:
+    """Return a drive; see `protocol.DatasetModule`."""
+    require_lidar(points, [DATASET.lidar], DATASET.lidar)
+    drive = _drives(root)[name]
+    exported = exported_poses(drive, 1)
+    if exported is None:
+        stamps_ns = _stamps(drive / DATASET.lidar / STAMPS_FILE, f'{name}{SUFFIX}.zip')
+        pose_stamps_ns, poses = _oxts(drive, name)
+    else:
+        pose_stamps_ns, poses = exported
+        stamps_ns = _stamps(drive / STAMPS_FILE, 'the export')
+    names = {str(number): stamp_ns for number, stamp_ns in enumerate(stamps_ns)}
+    frames = SceneFrames(name, names, *frame_names(drive, 'map', DATASET.lidar))
+    labels = drive / FILE
+    return Scene(
+        frames,
+        DATASET.lidar,
+        np.array(stamps_ns, np.int64),
+        partial(sweep_files, drive / DATASET.lidar / 'data', RAW_DIGITS, stamps_ns),
+        pose_stamps_ns,
+        poses,
+        partial(frames_of, 'tracklets', labels, frames) if labels.is_file() else None,
+        without_boxes=f'{labels} (from {name}_tracklets.zip)',
+    )
+
+
+def _oxts(drive: Path, name: str) -> tuple[Ints, Floats]:
+    """Return stamps (n,) and poses (n, 7) of the LiDAR at the stamps of the GPS/IMU unit."""
+    archive = f'{name}{SUFFIX}.zip'
+    stamps_ns = np.array(_stamps(drive / 'oxts' / STAMPS_FILE, archive), np.int64)
+    folder = require(drive / 'oxts' / 'data', 'the poses', f'unpack {archive}')
+    rows = [oxts_rows(path) for path in sorted(folder.glob('*.txt'))]
+    if len(rows) != len(stamps_ns):
+        raise RecordingError(
+            f'{folder}: expected {len(stamps_ns)} poses, one per stamp, got {len(rows)}; unpack '
+            f'{archive} again'
+        )
+    calibration = drive.parent / IMU_CALIBRATION_FILE
+    values = calibration_lines(calibration, f'{drive.parent.name}_calib.zip')
+    R, t = values.get('R', []), values.get('T', [])
+    if (len(R), len(t)) != (9, 3):
+        raise RecordingError(
+            f'{calibration}: expected lines R and T of 9 and 3 numbers, got {len(R)} and '
+            f'{len(t)}; unpack it again'
+        )
+    T_velo_imu = rigid_transform([*R[:3], t[0], *R[3:6], t[1], *R[6:], t[2]], calibration)
+    # Some drives have stamps of the unit that go back for a moment.
+    stamps_ns, order = np.unique(stamps_ns, return_index=True)
+    return stamps_ns, oxts_poses(np.concatenate(rows), T_velo_imu)[order]
+
+
+def _stamps(path: Path, archive: str) -> list[int]:
+    """Return the stamps of a file [ns]."""
+    stamps_ns = read_stamps(require(path, 'the stamps', f'unpack {archive}'))
+    if not stamps_ns:
+        raise RecordingError(f'{path}: expected stamps, got none; unpack {archive} again')
+    return stamps_ns
+
+
+def _drives(root: Path) -> dict[str, Path]:
+    """Return the folders of all drives by name: of all days, of one day, or one export."""
+    found = [*root.glob(f'*{SUFFIX}'), *root.glob(f'*/*{SUFFIX}')]
+    found += [root.absolute()] if (root / DATASET.lidar).is_dir() else []
+    return {path.name.removesuffix(SUFFIX): path for path in found}

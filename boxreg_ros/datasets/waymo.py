@@ -1,0 +1,278 @@
+"""
+Waymo (perception data set, version 2), as it is downloaded: one folder per component.
+
+Clouds are those of the LiDAR on the roof, both returns. Its range images become points by the
+inclination of each row, the azimuth of each column and the pose of the vehicle at each pixel; they
+are in the frame of the vehicle at the stamp. Rows are streamed: one range image is in memory.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from boxreg_ros.datasets.files import finite_cloud, require, require_lidar
+from boxreg_ros.datasets.poses import pose_rows
+from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
+from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.transforms import inverse
+from boxreg_ros.labels import frames_of, SceneFrames
+from boxreg_ros.labels.arrow import read_rows
+from boxreg_ros.labels.files import frame_names
+from boxreg_ros.labels.waymo import MICROSECONDS, VEHICLE_POSE
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import Floats
+import numpy as np
+
+DATASET = Dataset(
+    name='waymo',
+    title='Waymo (version 2)',
+    folder='lidar/SEGMENT.parquet, lidar_pose/, lidar_calibration/, vehicle_pose/, lidar_box/ '
+    '(of training/, unless the folder is named)',
+    scene='SEGMENT',
+    labels='waymo',
+    remedy='download it again',
+    lidar='TOP',
+    packages=('pyarrow',),
+)
+TOP_LASER = 1
+"""Value of the column `LASER` for the LiDAR on the roof."""
+LASER = 'key.laser_name'
+RETURNS = [f'[LiDARComponent].range_image_return{i}' for i in (1, 2)]
+PIXEL_POSE = '[LiDARPoseComponent].range_image_return1'
+CALIBRATION = '[LiDARCalibrationComponent].'
+RANGE, INTENSITY = 0, 1
+"""Channels of a range image [m, without unit]."""
+READ_AHEAD_BYTES = 1 << 20
+"""Bytes of a column that are read at once; a whole column of a segment has some 100 MB."""
+MAX_POSE_GAP_NS = 1000
+"""A pose belongs to a sweep of the same microsecond [ns]."""
+
+
+def scene_names(root: Path) -> list[str]:
+    """Return the names of the segments with clouds."""
+    return sorted(path.stem for path in (_split(root) / 'lidar').glob('*.parquet'))
+
+
+def inputs(root: Path, name: str) -> tuple[Path, ...]:
+    """Return the files of a segment."""
+    parts = ('lidar', 'lidar_pose', 'lidar_calibration', 'vehicle_pose', 'lidar_box')
+    paths = (_file(root, part, name) for part in parts)
+    return tuple(path for path in paths if path.is_file())
+
+
+def open_scene(root: Path, name: str, points: str | None) -> Scene:
+    """Return a segment; see `protocol.DatasetModule`."""
+    require_lidar(points, [DATASET.lidar], DATASET.lidar)
+    clouds = _component(root, 'lidar', name)
+    pixel_poses = _component(root, 'lidar_pose', name)
+    calibration = _Calibration.read(_component(root, 'lidar_calibration', name))
+    rows = read_rows(_component(root, 'vehicle_pose', name))
+    T_world_vehicle = {
+        row[MICROSECONDS] * 1000: np.reshape(row[VEHICLE_POSE], (4, 4)) for row in rows
+    }
+    stamps_ns = [
+        row[MICROSECONDS] * 1000
+        for row in _streamed(clouds, [MICROSECONDS, LASER])
+        if row[LASER] == TOP_LASER
+    ]
+    if stamps_ns != sorted(stamps_ns) or not stamps_ns:
+        raise RecordingError(
+            f'{clouds}: expected sweeps of the LiDAR {DATASET.lidar} in order of time, got '
+            f'{len(stamps_ns)}; {DATASET.remedy}'
+        )
+    missing = set(stamps_ns) - T_world_vehicle.keys()
+    if missing:
+        raise RecordingError(
+            f'{_file(root, "vehicle_pose", name)}: expected a pose at each of {len(stamps_ns)} '
+            f'sweeps, got none at {min(missing)} ns; {DATASET.remedy}'
+        )
+    frames = SceneFrames(
+        name,
+        {str(stamp_ns // 1000): stamp_ns for stamp_ns in stamps_ns},
+        *frame_names(_split(root), 'world', 'vehicle'),
+    )
+    boxes = _file(root, 'lidar_box', name)
+    pose_stamps_ns = sorted(T_world_vehicle)
+    return Scene(
+        frames,
+        DATASET.lidar,
+        np.array(stamps_ns, np.int64),
+        partial(_sweeps, clouds, pixel_poses, calibration, T_world_vehicle),
+        np.array(pose_stamps_ns, np.int64),
+        pose_rows([T_world_vehicle[stamp_ns] for stamp_ns in pose_stamps_ns]),
+        partial(frames_of, 'waymo', boxes, frames) if boxes.is_file() else None,
+        without_boxes=str(boxes),
+    )
+
+
+class _Calibration(NamedTuple):
+    """Pose (4, 4) in the vehicle, and inclinations [rad], of the LiDAR on the roof."""
+
+    T_vehicle_lidar: Floats
+    inclinations: Floats | None
+    min_inclination: float
+    max_inclination: float
+
+    @classmethod
+    def read(cls, path: Path) -> _Calibration:
+        """Read the calibration of a segment."""
+        for row in read_rows(path):
+            if row[LASER] == TOP_LASER:
+                values = row[f'{CALIBRATION}beam_inclination.values']
+                return cls(
+                    np.reshape(row[f'{CALIBRATION}extrinsic.transform'], (4, 4)),
+                    np.array(values) if values else None,
+                    row[f'{CALIBRATION}beam_inclination.min'],
+                    row[f'{CALIBRATION}beam_inclination.max'],
+                )
+        raise RecordingError(
+            f'{path}: expected the LiDAR {DATASET.lidar}, got others; {DATASET.remedy}'
+        )
+
+    def rows(self, height: int) -> Floats:
+        """Return the inclination of each row of a range image, the highest first."""
+        if self.inclinations is not None:
+            return self.inclinations[::-1]
+        shares = (np.arange(height) + 0.5) / height
+        return (self.min_inclination + shares * (self.max_inclination - self.min_inclination))[
+            ::-1
+        ]
+
+
+def _sweeps(
+    clouds: Path,
+    pixel_poses: Path,
+    calibration: _Calibration,
+    T_world_vehicle: dict[int, Floats],
+) -> Iterator[SweepFile]:
+    """Yield the sweeps in the order of the file, with the poses of the same stamps."""
+    columns = [f'{image}.{part}' for image in RETURNS for part in ('values', 'shape')]
+    pose_columns = [f'{PIXEL_POSE}.values', f'{PIXEL_POSE}.shape']
+    poses = _streamed(pixel_poses, [MICROSECONDS, LASER, *pose_columns])
+    pose: dict[str, Any] = {MICROSECONDS: -1, LASER: TOP_LASER}
+    for row in _streamed(clouds, [MICROSECONDS, LASER, *columns]):
+        if row[LASER] != TOP_LASER:
+            continue
+        while pose[MICROSECONDS] < row[MICROSECONDS] or pose[LASER] != TOP_LASER:
+            pose = next(poses, {MICROSECONDS: 1 << 62, LASER: TOP_LASER})
+        stamp_ns = row[MICROSECONDS] * 1000
+        read = partial(_cloud, row, pose, calibration, T_world_vehicle[stamp_ns], pixel_poses)
+        yield SweepFile(stamp_ns, read)
+
+
+def _cloud(
+    row: dict[str, Any],
+    pose: dict[str, Any],
+    calibration: _Calibration,
+    T_world_vehicle: Floats,
+    pixel_poses: Path,
+) -> Cloud:
+    """Return the points of both returns in the frame of the vehicle at the stamp."""
+    if pose[MICROSECONDS] != row[MICROSECONDS]:
+        raise UnsupportedMessage(
+            f'{pixel_poses}: expected the poses of the sweep at {row[MICROSECONDS]} us, got none; '
+            f'{DATASET.remedy}'
+        )
+    T_world_pixel = _image(pose, PIXEL_POSE)
+    points = []
+    intensities = []
+    for name in RETURNS:
+        image = _image(row, name)
+        if image is None:
+            continue
+        rows, columns = np.nonzero(image[..., RANGE] > 0)
+        found = image[rows, columns]
+        local = _rays(calibration, image.shape, rows, columns) * found[:, RANGE, None]
+        T = calibration.T_vehicle_lidar
+        vehicle = local @ T[:3, :3].T + T[:3, 3]
+        assert T_world_pixel is not None
+        points.append(_at_stamp(vehicle, T_world_pixel[rows, columns], T_world_vehicle))
+        intensities.append(found[:, INTENSITY])
+    return finite_cloud(
+        np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32),
+        np.concatenate([np.zeros(0), *intensities]),
+        origin=calibration.T_vehicle_lidar[:3, 3],
+    )
+
+
+def _rays(calibration: _Calibration, shape: tuple[int, ...], rows: Any, columns: Any) -> Floats:
+    """Return the unit vectors (M, 3) of pixels in the frame of the LiDAR."""
+    height, width = shape[:2]
+    T = calibration.T_vehicle_lidar
+    inclination = calibration.rows(height)[rows]
+    # The first column looks backward in the vehicle; the azimuth descends over the columns.
+    correction = np.arctan2(T[1, 0], T[0, 0])
+    azimuth = (2 * (width - columns - 0.5) / width - 1) * np.pi - correction
+    across = np.cos(inclination)
+    return np.stack(
+        [np.cos(azimuth) * across, np.sin(azimuth) * across, np.sin(inclination)], axis=1
+    )
+
+
+def _at_stamp(points: Floats, pixel_poses: Floats, T_world_vehicle: Floats) -> Floats:
+    """
+    Return points of the vehicle frame at their own times in that at the stamp.
+
+    Parameters
+    ----------
+    points : array, shape (M, 3)
+        In the frame of the vehicle when each was measured [m].
+    pixel_poses : array, shape (M, 6)
+        Pose of this frame in the world: roll pitch yaw x y z [rad, m].
+    T_world_vehicle : array, shape (4, 4)
+        Pose of the vehicle at the stamp.
+
+    """
+    R = matrix_from_rpy(pixel_poses[:, :3])
+    world = np.einsum('mij,mj->mi', R, points) + pixel_poses[:, 3:]
+    T = inverse(T_world_vehicle)
+    return np.asarray(world @ T[:3, :3].T + T[:3, 3])
+
+
+def _image(row: dict[str, Any], name: str) -> Floats | None:
+    """Return an image (height, width, channel) of a row; None if it has none."""
+    values, shape = row[f'{name}.values'], row[f'{name}.shape']
+    if values is None or not len(values):
+        return None
+    return np.reshape(np.asarray(values, np.float64), shape)
+
+
+def _streamed(path: Path, columns: list[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a Parquet file one by one, lists as arrays."""
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        with parquet.ParquetFile(path, buffer_size=READ_AHEAD_BYTES, pre_buffer=False) as file:
+            for batch in file.iter_batches(1, columns=columns, use_threads=False):
+                yield {name: _value(batch.column(name)) for name in columns}
+    except (OSError, KeyError, pyarrow.ArrowException) as error:
+        text = ' '.join(str(error).split())
+        raise RecordingError(f'{path}: cannot be read: {text}; {DATASET.remedy}') from None
+
+
+def _value(column: Any) -> Any:
+    """Return the only value of a column of a batch; a list as an array, without copying."""
+    value = column[0]
+    if not value.is_valid:
+        return None
+    return value.values.to_numpy() if hasattr(value, 'values') else value.as_py()
+
+
+def _component(root: Path, part: str, name: str) -> Path:
+    return require(
+        _file(root, part, name), f'the component {part}', f'download {part}/ of this split'
+    )
+
+
+def _file(root: Path, part: str, name: str) -> Path:
+    return _split(root) / part / f'{name}.parquet'
+
+
+def _split(root: Path) -> Path:
+    """Return the folder of a split: the root itself, or ``training`` in it."""
+    return root if (root / 'lidar').is_dir() else root / 'training'

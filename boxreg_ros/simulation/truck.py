@@ -1,0 +1,236 @@
+"""
+A truck in the traffic of the street, with four LiDARs at its corners or one on its roof.
+
+The LiDARs turn one after the other, a quarter of a period apart. The body of the truck blocks
+their view. All boxes and the truth are the same, whichever LiDARs are recorded; boxes are in the
+frame ``base``, at the stamp of the first LiDAR.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.lidars import merged
+from boxreg_ros.io.transforms import inverse, sweep_to_frame
+from boxreg_ros.simulation.noise import detector_noise
+from boxreg_ros.simulation.raycast import (
+    Actor,
+    body,
+    Motion,
+    revolution,
+    ROAD,
+    Sensor,
+    SWEEP_PERIOD,
+    to_matrix,
+)
+from boxreg_ros.simulation.recorder import LidarMessages, write_messages
+from boxreg_ros.simulation.scenarios import (
+    constant,
+    drive,
+    EXTENTS,
+    MISS_PROBABILITY,
+    PITCH_AMPLITUDE,
+    ROAD_MARGIN,
+    street_actors,
+    STREET_SWEEPS,
+    zero,
+)
+from boxreg_ros.simulation.scene import (
+    boxes_of,
+    FIXED_FRAME,
+    is_near,
+    make_scene,
+    make_sweep,
+    START_NS,
+)
+from boxreg_ros.structures import BoxArray, Floats, Ints, Sweep
+import numpy as np
+
+BASE_FRAME = 'base'
+CORNERS = {
+    'lidar_front_left': (4.0, 1.35, 1.2), 'lidar_front_right': (4.0, -1.35, 1.2),
+    'lidar_rear_left': (-4.0, 1.35, 1.2), 'lidar_rear_right': (-4.0, -1.35, 1.2),
+}  # fmt: skip
+"""Frame and position of each LiDAR from the middle of the truck, on the ground [m]."""
+ROOF = {'lidar_roof': (3.0, 0.0, 3.5)}
+ROOF_STREAM = 2
+"""Random stream of the LiDAR on the roof, so that the others do not depend on it."""
+LAYOUTS = ('corners', 'concatenated', 'concatenated-alone', 'roof')
+"""
+What is recorded: a topic per corner, one concatenated cloud with or without info, or the roof.
+"""
+
+
+class TruckScene(NamedTuple):
+    """
+    A drive of the truck.
+
+    Attributes
+    ----------
+    clouds : dict of str and tuple of n Sweep
+        Of each LiDAR, in its frame and at its stamps.
+    detections : tuple of n BoxArray
+        Noisy boxes in frame ``base``.
+    truth : BoxTable
+        True boxes in frame ``odom``.
+    ego : Motion
+        Of the frame ``base`` in ``odom``.
+
+    """
+
+    clouds: dict[str, tuple[Sweep, ...]]
+    detections: tuple[BoxArray, ...]
+    truth: BoxTable
+    ego: Motion
+
+
+def truck_scene(seed: int, sweeps: int | None = None) -> TruckScene:
+    """Return the drive of a seed, by default of as many sweeps as the street."""
+    count = sweeps or STREET_SWEEPS
+    rng = np.random.default_rng(seed)
+    actors = street_actors(rng, count)
+    ego = drive(count * SWEEP_PERIOD, (0, -1.75, 0), constant(6), zero)
+    ego.poses[:, 4] = PITCH_AMPLITUDE * np.sin(2 * ego.times)
+    stamps = np.arange(count) * SWEEP_PERIOD
+    # (actors, sweeps, 9)
+    true_boxes = np.stack([boxes_of(actor, actor.motion.at(stamps)) for actor in actors])
+    clouds, owners = _scanned(CORNERS, actors, ego, true_boxes, rng)
+    roof_rng = np.random.default_rng([seed, ROOF_STREAM])
+    roof, _ = _scanned(ROOF, actors, ego, true_boxes, roof_rng)
+    whole = [merged(_in_base(parts, ego)) for parts in zip(*clouds.values(), strict=True)]
+    scene = make_scene(
+        actors, true_boxes, whole, owners, to_matrix(ego.at(stamps)), detector_noise,
+        MISS_PROBABILITY, rng,
+    )  # fmt: skip
+    return TruckScene(clouds | roof, scene.detections, scene.truth, ego)
+
+
+def write_truck(path: Path, scene: TruckScene, layout: str) -> None:
+    """
+    Write a recording of some LiDARs of the truck.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in ``.mcap``.
+    scene : TruckScene
+        The drive.
+    layout : str
+        One of `LAYOUTS`.
+
+    Raises
+    ------
+    RecordingError
+        If `path` does not end in ``.mcap`` or cannot be written.
+
+    """
+    write_messages(path, _messages(scene, layout), is_compressed=True)
+
+
+def _messages(scene: TruckScene, layout: str) -> Iterator[tuple[str, Any, int]]:
+    """Yield topic, message and receive time [ns]."""
+    make = LidarMessages()
+    mounts = ROOF if layout == 'roof' else CORNERS
+    clouds = {name: scene.clouds[name] for name in mounts}
+    first_ns = scene.detections[0].stamp_ns
+    T_base_lidar = {name: _translation(at) for name, at in mounts.items()}
+    yield '/tf_static', make.static_transforms(first_ns, BASE_FRAME, T_base_lidar), first_ns
+    for boxes, *parts in zip(scene.detections, *clouds.values(), strict=True):
+        received_ns = max(part.stamp_ns for part in parts)
+        for part in parts:
+            T = _base_at(scene.ego, part.stamp_ns)
+            yield '/tf', make.transform(part.stamp_ns, FIXED_FRAME, BASE_FRAME, T), part.stamp_ns
+        if layout in ('corners', 'roof'):
+            for part in parts:
+                yield f'/points/{part.frame_id}', make.cloud(part, _dark(part)), received_ns
+        else:
+            whole = _concatenated(parts, scene.ego)
+            yield '/points', make.cloud(whole, _dark(whole)), received_ns
+        if layout == 'concatenated':
+            yield '/points_info', make.info(whole, parts), received_ns
+        yield '/detections', make.detections(boxes), received_ns
+
+
+def _scanned(
+    mounts: dict[str, tuple[float, float, float]],
+    actors: Sequence[Actor],
+    ego: Motion,
+    true_boxes: Floats,
+    rng: np.random.Generator,
+) -> tuple[dict[str, tuple[Sweep, ...]], list[Ints]]:
+    """Return the clouds of each LiDAR, and the owners of the points of all, per sweep."""
+    truck = _truck(ego)
+    parts = [body(actor.shape, actor.extent) for actor in (*actors, truck)]
+    sensor = Sensor(np.radians(np.linspace(-22, 8, 34)), columns=640)
+    clouds: dict[str, list[Sweep]] = {name: [] for name in mounts}
+    owners = []
+    for i in range(true_boxes.shape[1]):
+        found = []
+        for k, (name, at) in enumerate(mounts.items()):
+            stamp = i * SWEEP_PERIOD + k * SWEEP_PERIOD / len(CORNERS)
+            motion = _mounted(ego, at)
+            points, times, owner = revolution([*actors, truck], parts, motion, sensor, stamp, rng)
+            kept = owner != ROAD
+            for box in true_boxes[:, i]:
+                kept |= is_near(points, box, ROAD_MARGIN)
+            kept &= owner != len(actors)  # the truck itself
+            T = to_matrix(motion.at(np.array([stamp])))[0]
+            sweep = make_sweep(stamp, points[kept], times[kept], T)
+            clouds[name].append(replace(sweep, frame_id=name))
+            found.append(owner[kept])
+        owners.append(np.concatenate(found))
+    return {name: tuple(sweeps) for name, sweeps in clouds.items()}, owners
+
+
+def _truck(ego: Motion) -> Actor:
+    """Return the body of the truck, which blocks the view of its LiDARs."""
+    extent = np.array(EXTENTS['truck'])
+    poses = ego.poses + np.eye(6)[2] * extent[2] / 2
+    return Actor('', 'truck', 'truck', extent, Motion(ego.times, poses))
+
+
+def _mounted(ego: Motion, at: tuple[float, float, float]) -> Motion:
+    """Return the motion of a LiDAR at a place on the truck."""
+    T = to_matrix(ego.poses) @ _translation(at)
+    return Motion(ego.times, np.hstack([T[:, :3, 3], ego.poses[:, 3:]]))
+
+
+def _translation(at: tuple[float, float, float]) -> Floats:
+    T = np.eye(4)
+    T[:3, 3] = at
+    return T
+
+
+def _base_at(ego: Motion, stamp_ns: int) -> Floats:
+    """Return T_odom_base (4, 4) at a stamp."""
+    T: Floats = to_matrix(ego.at(np.array([(stamp_ns - START_NS) * 1e-9])))[0]
+    return T
+
+
+def _in_base(clouds: Sequence[Sweep], ego: Motion) -> list[Sweep]:
+    """Return clouds in the frame base at the stamp of the first, each with its own stamp."""
+    T_base_fixed = inverse(_base_at(ego, clouds[0].stamp_ns))
+    every = CORNERS | ROOF
+    moved = []
+    for cloud in clouds:
+        T_fixed_base = _base_at(ego, cloud.stamp_ns)
+        T = T_base_fixed @ T_fixed_base @ _translation(every[cloud.frame_id])
+        moved.append(sweep_to_frame(cloud, T, BASE_FRAME))
+    return moved
+
+
+def _concatenated(clouds: Sequence[Sweep], ego: Motion) -> Sweep:
+    """Return one cloud in the frame base; its times are relative to the stamp of each LiDAR."""
+    parts = _in_base(clouds, ego)
+    times = [np.zeros(0) if part.times is None else part.times for part in parts]
+    return replace(merged(parts), times=np.concatenate(times))
+
+
+def _dark(sweep: Sweep) -> Ints:
+    """Return an intensity of 0 for each point."""
+    return np.zeros(len(sweep.points), np.int64)

@@ -1,0 +1,173 @@
+"""
+Layouts of point clouds by LiDAR drivers, told apart by their fields, and the times of points.
+
+A layout states field and unit of the times. Without a known layout both are derived from type and
+magnitude.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+from boxreg_ros.errors import UnsupportedMessage
+from boxreg_ros.structures import Floats
+import numpy as np
+from numpy.typing import NDArray
+
+TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
+"""Possible units of point times [s], coarsest first."""
+AUTO = 'auto'
+TIME_UNIT_CHOICES = (AUTO, *TIME_UNITS)
+POINT_TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time', 'time_stamp')
+MAX_TIME_OFFSET = 1.0
+"""Largest difference between the time of a point and the stamp [s]; one revolution is shorter."""
+MIN_DURATION = 1e-3
+"""A whole cloud takes longer [s]; chosen: a hundredth of a revolution at 10 Hz."""
+WHOLE_CLOUD = 5000
+"""A cloud of as many points is not a small part of a revolution; chosen: 3 ms of 128 channels."""
+
+
+class PointLayout(NamedTuple):
+    """
+    The layout of the clouds of a driver.
+
+    Attributes
+    ----------
+    name : str
+        Of the sensor or the point type.
+    kinds : dict of str and str
+        Fields that tell the layout from others, with the kind of their numbers; any if empty.
+    time_field, unit : str
+        Field of the times and their unit; empty if there are none.
+
+    """
+
+    name: str
+    kinds: Mapping[str, str]
+    time_field: str = ''
+    unit: str = ''
+
+
+LAYOUTS = (
+    PointLayout(
+        'Autoware PointXYZIRCAEDT',
+        {'return_type': 'u1', 'channel': 'u2', 'azimuth': 'f4', 'time_stamp': 'u4'},
+        'time_stamp', 'ns',
+    ),
+    PointLayout(
+        'Autoware PointXYZIRADT', {'return_type': 'u1', 'azimuth': 'f4', 'time_stamp': 'f8'},
+        'time_stamp', 's',
+    ),
+    PointLayout('Autoware PointXYZIRC', {'return_type': 'u1', 'channel': 'u2'}),
+    PointLayout('Ouster', {'t': 'u4', 'ring': '', 'reflectivity': ''}, 't', 'ns'),
+    PointLayout('Livox PointCloud2', {'line': 'u1', 'timestamp': 'f8'}, 'timestamp', 'ns'),
+    PointLayout(
+        'Livox CustomMsg', {'reflectivity': 'u1', 'offset_time': 'u4'}, 'offset_time', 'ns'
+    ),
+    PointLayout('Hesai or RoboSense', {'ring': 'u2', 'timestamp': 'f8'}, 'timestamp', 's'),
+    PointLayout('Velodyne', {'ring': 'u2', 'time': 'f4'}, 'time', 's'),
+)  # fmt: skip
+"""The first one that fits counts."""
+
+
+class TimeReading(NamedTuple):
+    """Unit of the times of points, and whether they are absolute or relative to the stamp."""
+
+    unit: str
+    is_absolute: bool
+
+
+def layout_of(kinds: Mapping[str, str]) -> PointLayout | None:
+    """Return the layout of a cloud with fields of these kinds (as in ``u4``); None if unknown."""
+    return next((layout for layout in LAYOUTS if _fits(kinds, layout)), None)
+
+
+def _fits(kinds: Mapping[str, str], layout: PointLayout) -> bool:
+    return all(name in kinds and kind in ('', kinds[name]) for name, kind in layout.kinds.items())
+
+
+def time_field_of(kinds: Mapping[str, str]) -> str:
+    """Return the field with the times of the points; empty if there is none."""
+    layout = layout_of(kinds)
+    if layout is not None:
+        return layout.time_field
+    return next((name for name in POINT_TIME_FIELDS if name in kinds), '')
+
+
+def reading_of(
+    raw: NDArray[Any], stamp_ns: int, layout: PointLayout | None, unit: str
+) -> TimeReading | None:
+    """
+    Return how finite times (M,), M > 0, of points are read; None if they are of no unit.
+
+    Parameters
+    ----------
+    raw : array, shape (M,)
+        As the message has them.
+    stamp_ns : int
+        Stamp of the cloud [ns].
+    layout : PointLayout or None
+        Known layout of the cloud.
+    unit : str
+        One of `TIME_UNIT_CHOICES`.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the times of a known layout are in another unit than that of its driver.
+
+    """
+    ends = float(raw.min()), float(raw.max())
+    may_be_absolute = raw.dtype.kind == 'f' and raw.dtype.itemsize == 8
+    fitting = partial(_fitting, ends, stamp_ns, may_be_absolute)
+    if unit != AUTO:
+        return fitting((unit,))
+    # Integers are no seconds: a second has too few of them.
+    possible = [name for name in TIME_UNITS if name != 's' or raw.dtype.kind == 'f']
+    likely = fitting(possible)
+    if layout is None or likely is None:
+        return likely
+    stated = fitting((layout.unit,))
+    if stated is None or (stated.unit != likely.unit and _is_too_short(len(raw), ends, stated)):
+        raise UnsupportedMessage(
+            f'PointCloud2: field {layout.time_field!r} of {layout.name}: expected times in '
+            f'{layout.unit}, got values from {ends[0]:g} to {ends[1]:g}, which are times of a '
+            f'sweep in {likely.unit} only; correct the driver, or set the time unit: '
+            f'--time-unit {likely.unit}, time_unit of the node'
+        )
+    return stated
+
+
+def seconds_of(raw: NDArray[Any], stamp_ns: int, reading: TimeReading) -> Floats:
+    """Return times (M,) relative to the stamp [s]."""
+    scale = TIME_UNITS[reading.unit]
+    if reading.is_absolute:
+        return np.asarray((raw.astype(np.float64) - stamp_ns * 1e-9 / scale) * scale)
+    return np.asarray(np.multiply(raw, scale, dtype=np.float64))
+
+
+def _fitting(
+    ends: tuple[float, float], stamp_ns: int, may_be_absolute: bool, units: Collection[str]
+) -> TimeReading | None:
+    """Return the first of the units, coarsest first, in which all times are near the stamp."""
+    low, high = ends
+    for unit in units if may_be_absolute else ():
+        scale = TIME_UNITS[unit]
+        stamp = stamp_ns * 1e-9 / scale
+        offset = max(abs(low - stamp), abs(high - stamp)) * scale
+        # A stamp near 0 does not separate absolute from relative times.
+        if stamp * scale > MAX_TIME_OFFSET and offset <= MAX_TIME_OFFSET:
+            return TimeReading(unit, True)
+    for unit in units:
+        if max(abs(low), abs(high)) * TIME_UNITS[unit] <= MAX_TIME_OFFSET:
+            return TimeReading(unit, False)
+    return None
+
+
+def _is_too_short(count: int, ends: tuple[float, float], reading: TimeReading) -> bool:
+    """Return whether a whole cloud would take less than `MIN_DURATION`."""
+    duration = (ends[1] - ends[0]) * TIME_UNITS[reading.unit]
+    return count >= WHOLE_CLOUD and duration < MIN_DURATION

@@ -1,0 +1,83 @@
+"""The lifecycle node as a process, over DDS."""
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+import pytest
+from ros_graph import (
+    ended_cleanly,
+    graph_in,
+    play,
+    publishers_for,
+    QUICK,
+    records_of,
+    RELIABLE,
+    stamp_of,
+)
+from ros_messages import DETECTIONS, Drive
+
+COMMAND = ('-c', 'import sys; from boxreg_ros.live.main import lifecycle; sys.exit(lifecycle())')
+NODE = '/boxreg_node'
+
+
+@pytest.fixture
+def graph(tmp_path):
+    with graph_in(tmp_path) as made:
+        yield made
+
+
+class Manager:
+    """Calls the services of a lifecycle node, as `ros2 lifecycle` does."""
+
+    def __init__(self, graph):
+        self._graph = graph
+        self._change = graph.node.create_client(ChangeState, f'{NODE}/change_state')
+        self._state = graph.node.create_client(GetState, f'{NODE}/get_state')
+        graph.wait(self._change.service_is_ready, 'the services of the node')
+
+    def change(self, transition):
+        """Request a transition; return whether it succeeded, and the state after it."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        succeeded = self._answer(self._change, request).success
+        return succeeded, self._answer(self._state, GetState.Request()).current_state.label
+
+    def _answer(self, client, request):
+        future = client.call_async(request)
+        self._graph.wait(future.done, 'an answer')
+        return future.result()
+
+
+def test_boxes_are_refined_while_the_node_is_active(graph, tmp_path):
+    drive = Drive(sweeps=10)
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    node = graph.start(*RELIABLE, *QUICK, command=COMMAND)
+    manager = Manager(graph)
+    assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
+    assert not any(p.get_subscription_count() for p in graph.publishers.values())
+    for _ in range(2):  # the second time all is forgotten: the same stamps are no time jump
+        assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
+        graph.wait_until_connected()
+        play(graph, records, early)
+        assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
+        graph.wait(lambda: len(final) == 10, 'the final boxes that the node held')
+        assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+        assert not any(p.get_subscription_count() for p in graph.publishers.values())
+        assert manager.change(Transition.TRANSITION_CLEANUP) == (True, 'unconfigured')
+        assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
+        early.clear()
+        final.clear()
+    assert manager.change(Transition.TRANSITION_INACTIVE_SHUTDOWN) == (True, 'finalized')
+    assert 'time_jump' not in node.output()
+    assert ended_cleanly(node)
+
+
+def test_an_activation_that_fails_leaves_the_node_inactive(graph):
+    node = graph.start('-p', 'boxes_type:=std_msgs/msg/String', command=COMMAND)
+    manager = Manager(graph)
+    assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
+    assert manager.change(Transition.TRANSITION_ACTIVATE) == (False, 'inactive')
+    assert 'std_msgs/msg/String' in node.output()
+    assert 'Traceback' not in node.output()
+    assert ended_cleanly(node)
