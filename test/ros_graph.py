@@ -10,11 +10,15 @@ import time
 from typing import NamedTuple
 
 from boxreg_ros.live.topics import import_message
+from msg_adapters import vision
+import numpy as np
 from paths import ROOT
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from ros_domain import next_domain
+from ros_messages import DETECTIONS
 from rosbags.highlevel import AnyReader
 
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
@@ -233,6 +237,15 @@ def play(graph, records, early=None):
             graph.wait(
                 lambda s=stamp_ns: any(stamp_of(m) == s for m in early), f'boxes of {stamp_ns} ns'
             )
+
+
+def numbers_changed(messages, records):
+    """Return how many boxes of each message differ from those of the record with its number."""
+    kind = import_message(DETECTIONS)
+    given = [deserialize_message(r.data, kind) for r in records if r.type_name == DETECTIONS]
+    pairs = zip(messages, given, strict=True)
+    changes = [vision.from_msg(a).boxes - vision.from_msg(b).boxes for a, b in pairs]
+    return [int((np.abs(change).max(1) > 1e-6).sum()) for change in changes]
 
 
 if __name__ == '__main__':

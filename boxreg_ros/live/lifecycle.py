@@ -8,6 +8,7 @@ from threading import Event
 
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.live.node import BoxregNode
+from boxreg_ros.live.recording import RECORDING_TIME
 from boxreg_ros.live.worker import Worker
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
@@ -49,6 +50,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         self._is_active = False
         self.worker.stop()
         self._drained.wait()
+        self.recording.wait(RECORDING_TIME)
         self.close()
         return TransitionCallbackReturn.SUCCESS
 

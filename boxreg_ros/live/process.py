@@ -13,6 +13,7 @@ import time
 
 from boxreg_ros.live.lifecycle import BoxregLifecycleNode
 from boxreg_ros.live.node import BoxregNode
+from boxreg_ros.live.recording import RECORDING_TIME
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
@@ -20,14 +21,6 @@ from rclpy.utilities import remove_ros_args
 
 ENDING_TIME = 0.9
 """Time the threads have to end after a signal: 0.5 s to solve, 0.4 s for acknowledgements [s]."""
-
-RECORDING_TIME = 3.0
-"""
-Wait for the last segment of recorded labels [s].
-
-The recorder completes it in any case; launch files send SIGTERM after 5 s.
-
-"""
 
 
 def make_node(program: str, arguments: list[str], is_managed: bool = False) -> BoxregNode:

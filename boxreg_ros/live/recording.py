@@ -24,6 +24,14 @@ from std_srvs.srv import Trigger
 MIN_SECONDS_LEFT = 600.0
 """A disk that is full sooner is a WARN in /diagnostics [s]; chosen: time to drive to a stop."""
 
+RECORDING_TIME = 3.0
+"""
+Wait for the last segment of recorded labels [s].
+
+The recorder completes it in any case; launch files send SIGTERM after 5 s.
+
+"""
+
 
 class Recording:
     """

@@ -21,6 +21,7 @@ from ros_graph import (
     DIAGNOSTICS,
     ended_cleanly,
     graph_in,
+    numbers_changed,
     play,
     publishers_for,
     QUICK,
@@ -216,6 +217,50 @@ def test_boxes_wait_half_a_second_for_clouds_after_the_lidar_stops(graph, tmp_pa
     slowest = [values_of([d]).get('latency most [ms]', 0) for d in diagnostics]
     assert max(map(float, slowest)) >= 500.0
     assert ended_cleanly(node)
+
+
+def stepped(seconds):
+    """Return a drive of 16 sweeps whose clock is stepped before the ninth."""
+    drive = Drive(sweeps=16)
+    whole = drive.items
+    drive.items = [item for item in whole if item[1] >= drive.stamps[8]]
+    shifted(drive, seconds)
+    drive.items = whole
+    return drive
+
+
+def without(topic, first, last, sweeps):
+    """Return a drive without the messages of a topic from one sweep to another, both included."""
+    drive = Drive(sweeps=sweeps)
+    gap = drive.stamps[first], drive.stamps[last]
+    drive.items = [i for i in drive.items if i[0] != topic or not gap[0] <= i[1] <= gap[1]]
+    return drive
+
+
+@pytest.mark.parametrize(
+    ('drive', 'refined'),
+    [
+        pytest.param(stepped(2), [0, 0, *[2] * 6] * 2, id='clock steps forward by 2 s'),
+        pytest.param(stepped(-2), [0, 0, *[2] * 6] * 2, id='clock steps back by 2 s'),
+        pytest.param(
+            without('/points', 6, 9, 16), [0, 0, *[2] * 4, *[0] * 4, *[2] * 6], id='LiDAR restarts'
+        ),
+        # The first transform is extrapolated by 0.1 s.
+        pytest.param(
+            without('/tf', 4, 13, 20), [0, 0, *[2] * 3, *[0] * 9, *[2] * 6], id='TF stops for 1 s'
+        ),
+    ],
+)
+def test_boxes_are_refined_again_after_a_disturbance(graph, tmp_path, drive, refined):
+    """With two tracks: the number of early boxes refined at each sweep."""
+    records = records_of(drive.write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'transform_timeout:=0.1')
+    graph.wait_until_connected()
+    play(graph, records, early)
+    assert ended_cleanly(node)
+    assert numbers_changed(early, records) == refined
 
 
 def malformed_messages():
