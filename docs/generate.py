@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+import json
 from pathlib import Path
 import re
 
@@ -59,7 +60,40 @@ def counters() -> str:
     return table(('counter', 'counts', 'meaning', 'remedy'), rows)
 
 
+def scale() -> str:
+    """Return the figures of the stored run of `boxreg bench scale`."""
+    stored = json.loads((DOCS / 'results' / 'scale.json').read_text(encoding='utf-8'))
+    found = stored['results']
+    large, fleet = found['large'], found['fleet']
+    rows = [
+        ('hours_per_core_hour', f'{found["hours_per_core_hour"]:.2f}', 'hours of recording'),
+        ('peak_mb', f'{found["peak_mb"]:,.0f} MB', 'memory of a job, its reader and its solver'),
+        (
+            'speedup_2_workers',
+            f'{found["speedup_2_workers"]:.2f}',
+            f'two workers on two cores, at a load of {found["load"]:.1f} by others',
+        ),
+        (
+            'large.peak_mb',
+            f'{large["peak_mb"]:,.0f} MB',
+            f'memory for {large["gb"]:.1f} GB: {large["sweeps"]:,} sweeps of 150,000 points',
+        ),
+        ('large.seconds', f'{large["seconds"]:,.0f} s', 'its time, on one core'),
+        ('fleet.core_hours', f'{fleet["core_hours"]:,.0f}', '10,000 hours of recording'),
+        ('fleet.price_usd', f'{fleet["price_usd"]:,.0f} USD', 'the same, at 0.04 USD a core-hour'),
+        (
+            'fleet.hours',
+            f'{fleet["hours"]:.2f} h',
+            f'10,000 jobs on 500 cores; {fleet["least_hours"]:.2f} h without losses or idle cores',
+        ),
+        ('fleet.used', f'{fleet["used"]:.0%}', 'part of the time that the cores have jobs'),
+        ('fleet.lost', f'{fleet["lost"]:.2%}', 'part of the work that is done twice'),
+    ]
+    return table(('figure', 'value', 'of'), rows)
+
+
 TABLES = {
+    'scale.md': scale,
     'parameters.md': parameters,
     'formats.md': label_formats,
     'datasets.md': datasets,

@@ -22,7 +22,7 @@ from boxreg_ros.io.recording import input_boxes, Recording
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
-from boxreg_ros.simulation.truck import CORNERS, LAYOUTS, truck_scene, write_truck
+from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, TRUCK_SENSORS, write_truck
 import numpy as np
 
 CLASSES = ('car', 'van', 'truck')
@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the mean IoU of the input and of each way to record the LiDARs."""
-    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ('input', *LAYOUTS)}
-    with progress_bar(args.seeds * len(LAYOUTS), args) as bar:
+    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ('input', *TRUCK_SENSORS)}
+    with progress_bar(args.seeds * len(TRUCK_SENSORS), args) as bar:
         for seed in range(args.seeds):
             for name, ious in measured(seed, args.sweeps, bar.update).items():
                 rows[name].append(ious)
@@ -74,11 +74,13 @@ def measured(seed: int, sweeps: int | None, done: Any) -> dict[str, tuple[float,
     scene = truck_scene(seed, sweeps)
     found: dict[str, tuple[float, float]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for layout in LAYOUTS:
+        for layout in TRUCK_SENSORS:
             path = Path(folder) / f'{layout}.mcap'
             out = Path(folder) / layout
             write_truck(path, scene, layout)
-            topics = tuple(f'/points/{name}' for name in CORNERS) if layout == 'corners' else ()
+            topics = (
+                tuple(f'/points/{name}' for name in CORNER_LIDARS) if layout == 'corners' else ()
+            )
             if not found:
                 arrays, _ = input_boxes(Recording([path], Lidars(topics)))
                 found['input'] = _ious(BoxTable.from_arrays(arrays, 'input'), scene.truth)

@@ -24,6 +24,7 @@ MEASUREMENTS = {
     'covariance': Measurement('covariance', 'covariances against errors, by estimate and class'),
     'review': Measurement('review', 'how early the review list shows the bad tracks'),
     'speed': Measurement('speed.command', 'time per tick, per box and per window'),
+    'scale': Measurement('scale', 'core hours and memory per hour, and a simulated fleet'),
     'load': Measurement('load', 'latency and accuracy of the live node by number of tracks'),
     'node': Measurement('node', 'latency and memory of the live node, over DDS'),
 }

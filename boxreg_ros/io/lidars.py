@@ -34,7 +34,7 @@ Sweeps that wait for clouds at once; chosen.
 A cloud may arrive after the first cloud of the next period, but not after two periods.
 
 """
-MERGED, LATE, MISSING = 'merged', 'cloud_late', 'cloud_missing'
+CLOUD_MERGED, CLOUD_LATE, CLOUD_MISSING = 'merged', 'cloud_late', 'cloud_missing'
 """Counters of a LiDAR; the last two are reasons of `boxreg_ros.reasons`."""
 
 Report = Callable[[str, str, int], None]
@@ -337,7 +337,7 @@ class SweepMerger:
         if group is None:
             self._note(
                 sweep.topic,
-                LATE,
+                CLOUD_LATE,
                 f'a cloud of {sweep.stamp_ns} ns arrived after the others of its time were merged',
             )
             return []
@@ -384,9 +384,9 @@ class SweepMerger:
     def _merged(self, group: _Group) -> MergedSweep:
         lacking = [topic for topic in self._topics if topic not in group.clouds]
         for topic in lacking:
-            self._note(topic, MISSING, f'no cloud at {group.first_ns} ns')
+            self._note(topic, CLOUD_MISSING, f'no cloud at {group.first_ns} ns')
         for topic in group.clouds:
-            self.counts[topic][MERGED] += 1
+            self.counts[topic][CLOUD_MERGED] += 1
         self._returned_ns = group.last_ns
         clouds = [group.clouds[topic] for topic in self._topics if topic in group.clouds]
         there = [(sweep, extra) for sweep, extra in clouds if not sweep.is_dropped]

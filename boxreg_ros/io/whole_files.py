@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 import errno
+from io import StringIO
 import os
 from pathlib import Path
 from typing import TextIO
 from uuid import uuid4
+
+from boxreg_ros.io.storage.urls import url_of, write_text
 
 DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 """Disk full, file larger than the limit of the process, quota used up."""
@@ -16,7 +19,12 @@ DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[TextIO]:
-    """Yield a file that replaces `path` on success and is deleted on failure."""
+    """Yield a file that replaces `path`, also a URL, on success and is deleted on failure."""
+    if url_of(path) is not None:
+        text = StringIO()
+        yield text
+        write_text(path, text.getvalue())
+        return
     partial = path.with_name(f'.{path.name}.{uuid4().hex[:8]}.partial')
     try:
         with partial.open('w', encoding='utf-8', newline='') as file:

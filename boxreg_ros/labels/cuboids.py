@@ -10,7 +10,7 @@ sensor frame; the extents are along x (forward), y (left) and z of the box.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import require_single
 from boxreg_ros.labels.protocol import absolute, INPUT_STATUS, LabelFrame
 from boxreg_ros.labels.records import finite_or_none, refined_boxes
-from boxreg_ros.labels.sidecar import read_sidecar, STAMPS_FILE
+from boxreg_ros.labels.sidecar import read_sidecar, Sidecar, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, ROLL, X, Z
 import numpy as np
@@ -200,22 +200,32 @@ def read_frames(
             )
         order = names
     for index, name in enumerate(order):
-        cuboids = cuboids_by_name(name)
-        evidence = [cuboid.evidence for cuboid in cuboids]
-        refined = refined_boxes(
-            sidecar.stamps_ns[index],
-            sidecar.sensor_frame,
-            [cuboid.track_id for cuboid in cuboids],
-            [cuboid.class_name for cuboid in cuboids],
-            [cuboid.box for cuboid in cuboids],
-            [item.get('score', 1.0) for item in evidence],
-            [str(item.get('status', INPUT_STATUS)) for item in evidence],
-            [int(item.get('num_points', 0)) for item in evidence],
-            [_covariance(item.get('covariance')) for item in evidence],
-            [str(item.get('reason', '')) for item in evidence],
-            [item.get('extent_covariance') for item in evidence],
-        )
+        try:
+            refined = _refined(cuboids_by_name(name), sidecar, index)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f'{folder}: frame {name!r}: expected attributes as boxreg writes them, got '
+                f'others: {error}; remove the attributes that were changed'
+            ) from None
         yield sidecar.frame(index, refined).moved('fixed')
+
+
+def _refined(cuboids: Sequence[ReadCuboid], sidecar: Sidecar, index: int) -> RefinedBoxes:
+    """Return the boxes of one frame with the evidence in their attributes."""
+    evidence = [cuboid.evidence for cuboid in cuboids]
+    return refined_boxes(
+        sidecar.stamps_ns[index],
+        sidecar.sensor_frame,
+        [cuboid.track_id for cuboid in cuboids],
+        [cuboid.class_name for cuboid in cuboids],
+        [cuboid.box for cuboid in cuboids],
+        [item.get('score', 1.0) for item in evidence],
+        [str(item.get('status', INPUT_STATUS)) for item in evidence],
+        [int(item.get('num_points', 0)) for item in evidence],
+        [_covariance(item.get('covariance')) for item in evidence],
+        [str(item.get('reason', '')) for item in evidence],
+        [item.get('extent_covariance') for item in evidence],
+    )
 
 
 def _covariance(upper: ArrayLike | None) -> Floats | None:

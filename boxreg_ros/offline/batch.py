@@ -18,6 +18,7 @@ import sys
 from typing import Any
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.arguments import add_recording_arguments, config_from, lidar_options
 from boxreg_ros.offline.batch_results import row_of, rows_of_shards, write_results
 from boxreg_ros.offline.job import Job, JOB_FAILED, jobs_of, UP_TO_DATE
@@ -86,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
     index, count = args.shard
     jobs = jobs_of(args.recordings)[index - 1 :: count]
     with writing(args.out):
-        args.out.mkdir(parents=True, exist_ok=True)
+        if url_of(args.out) is None:
+            args.out.mkdir(parents=True, exist_ok=True)
         _run_all(jobs, args)
         rows = [row_of(job) for job in jobs]
         write_results(args.out, rows, '' if count == 1 else f'.{index}-of-{count}')
@@ -112,6 +114,7 @@ def _run_all(jobs: list[Job], args: argparse.Namespace) -> None:
     """Run all jobs, and show the progress and the jobs that fail."""
     from tqdm import tqdm
 
+    jobs = sorted(jobs, key=_begins)
     options = tuple(_options(args))
     runner = JobRunner(args.out, options, str(config_from(args)), args.retries, args.timeout)
     total = sum(job.size() for job in jobs if job.status != JOB_FAILED)
@@ -125,6 +128,11 @@ def _run_all(jobs: list[Job], args: argparse.Namespace) -> None:
             else:
                 bar.update(job.size())
             bar.set_postfix_str(f'{failed} failed')
+
+
+def _begins(job: Job) -> int:
+    """Return a key that sorts the largest drives first: none of them is left to the end."""
+    return 0 if job.status == JOB_FAILED else -job.size()
 
 
 def _ended_jobs(jobs: list[Job], runner: JobRunner, args: argparse.Namespace) -> Iterator[Job]:

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, TextIO
 from urllib.parse import quote
 
+from boxreg_ros.io.storage.urls import read_text
+
 REVIEW = 'review.csv'
 RISK = 'risk_m'
 MAX_LISTED_TRACKS = 100
@@ -52,15 +54,15 @@ def _riskiest(out: Path, drives: Iterable[str]) -> list[dict[str, Any]]:
     """Return the rows of all reviews with the largest risk, those first."""
     found: list[tuple[float, dict[str, Any]]] = []
     for drive in drives:
-        path = out / drive / REVIEW
-        if not path.is_file():
+        try:
+            text = read_text(out / drive / REVIEW)
+        except OSError:  # the drive has failed
             continue
-        with path.open(newline='', encoding='utf-8') as file:
-            for row in csv.DictReader(file):
-                try:
-                    found.append((float(row[RISK]), {'drive': drive, **row}))
-                except (KeyError, TypeError, ValueError):
-                    continue  # a review without this column has no order
+        for row in csv.DictReader(text.splitlines()):
+            try:
+                found.append((float(row[RISK]), {'drive': drive, **row}))
+            except (KeyError, TypeError, ValueError):
+                continue  # a review without this column has no order
     found.sort(key=lambda item: -item[0])
     return [row for _, row in found[:MAX_LISTED_TRACKS]]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import csv
+from io import StringIO
 import json
 from pathlib import Path
 import re
@@ -11,13 +12,14 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.storage.urls import names_of, read_text, url_of
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.batch_report import write_batch_report
 from boxreg_ros.offline.job import Job, JOB_FAILED
 from boxreg_ros.offline.result_folder import SUMMARY
 
 COUNTS = ('sweeps', 'boxes_in', 'refined', 'kept', 'damages')
-COLUMNS = (
+INDEX_COLUMNS = (
     'drive', 'status', 'exit_status', 'attempts', 'seconds', 'peak_mb', *COUNTS, 'last_line',
     'key',
 )  # fmt: skip
@@ -59,7 +61,7 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
 
     """
     with written_whole(out / f'index{shard}.csv') as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator='\n')
+        writer = csv.DictWriter(file, INDEX_COLUMNS, lineterminator='\n')
         writer.writeheader()
         writer.writerows(rows)
     merged = {
@@ -90,11 +92,10 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
     """
     found = {}
     counts = set()
-    for path in out.glob('index.*-of-*.csv'):
-        match = SHARD_INDEX.fullmatch(path.name)
-        if match:
-            found[int(match[1])] = path
-            counts.add(int(match[2]))
+    names = names_of(out) if url_of(out) else [path.name for path in out.glob('index.*')]
+    for match in filter(None, map(SHARD_INDEX.fullmatch, names)):
+        found[int(match[1])] = out / match[0]
+        counts.add(int(match[2]))
     if len(counts) != 1:
         raise RecordingError(
             f'{out}: expected the indexes of all shards of one --shard I/N, got those of '
@@ -109,8 +110,7 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
         )
     rows: list[dict[str, Any]] = []
     for path in found.values():
-        with path.open(newline='', encoding='utf-8') as file:
-            rows += csv.DictReader(file)
+        rows += csv.DictReader(StringIO(read_text(path)))
     return sorted(rows, key=lambda row: str(row['drive']))
 
 

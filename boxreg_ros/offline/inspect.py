@@ -112,7 +112,7 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
 
 def _contents(paths: list[Path]) -> dict[str, Any]:
     """Return files, times, topics and damages: what the index has."""
-    from boxreg_ros.io.storage.files import part_of
+    from boxreg_ros.io.storage.files import part_of, size_of
     from boxreg_ros.io.storage.reader import Reader
 
     parts = [part_of(path) for path in paths]
@@ -128,7 +128,7 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
         damages = [damage._asdict() for damage in reader.damages]
     return {
         'files': [str(file) for part in parts for file in part.files],
-        'bytes': sum(file.stat().st_size for part in parts for file in part.files),
+        'bytes': sum(size_of(file) for part in parts for file in part.files),
         'begin_ns': begin_ns,
         'seconds': seconds,
         'topics': [

@@ -14,7 +14,8 @@ from typing import Any
 
 from boxreg_ros import __version__
 from boxreg_ros.datasets import address_of, all_scenes, resolved, scene_files
-from boxreg_ros.errors import BoxregError
+from boxreg_ros.errors import BoxregError, RecordingError
+from boxreg_ros.io.storage.urls import entries_of, Entry, url_of
 
 MANIFESTS = ('.txt', '.lst')
 COMMENT = re.compile(r'(^|\s)#.*')
@@ -66,8 +67,10 @@ class Job:
     summary: dict[str, Any] = field(default_factory=dict)
 
     def files(self) -> Iterator[Path]:
-        """Yield all files of the recordings."""
+        """Yield all files of the recordings on this machine."""
         for path in self.recordings:
+            if url_of(path) is not None:
+                continue
             address = address_of(path)
             if address is not None:
                 yield from scene_files(address)
@@ -76,8 +79,18 @@ class Job:
             yield from (file for file in inner if file.is_file())
 
     def size(self) -> int:
-        """Return the size of all files [bytes]."""
-        return sum(file.stat().st_size for file in self.files())
+        """Return the size of all files [bytes]; 0 where it is unknown, which the job reports."""
+        try:
+            local = sum(file.stat().st_size for file in self.files())
+            return local + sum(entry.size for entry in self.entries())
+        except (OSError, RecordingError):
+            return 0
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield all files of the recordings behind URLs."""
+        for path in self.recordings:
+            if url_of(path) is not None:
+                yield from entries_of(path)
 
     def fail(self, reason: str) -> None:
         """Note why the job cannot be done."""
@@ -86,7 +99,7 @@ class Job:
 
     def hashes(self, earlier: Sequence[Sequence[Any]]) -> list[list[Any]]:
         """
-        Return path, size, time and hash of each file, and set the status of a missing one.
+        Return path, size, time and hash of each file; of a URL the tag or time of its server.
 
         Parameters
         ----------
@@ -100,6 +113,7 @@ class Job:
             about = file.stat()
             place = str(file.resolve()), about.st_size, about.st_mtime_ns
             hashes.append([*place, known.get(place) or _hash(file)])
+        hashes += [[str(one.path), one.size, 0, one.version] for one in self.entries()]
         return hashes
 
     def set_key(self, hashes: Sequence[Sequence[Any]], settings: Sequence[str]) -> None:
@@ -124,7 +138,7 @@ def jobs_of(arguments: Sequence[Path]) -> list[Job]:
             drives += _manifest(argument)
         elif (address := address_of(argument)) is not None:
             drives += [(Path(str(scene)),) for scene in all_scenes(address)]
-        elif not argument.exists() and glob(str(argument)):
+        elif url_of(argument) is None and not argument.exists() and glob(str(argument)):
             drives += [(Path(path),) for path in sorted(glob(str(argument)))]
         else:
             drives.append((argument,))
@@ -148,8 +162,10 @@ def _manifest(path: Path) -> Iterator[tuple[Path, ...]]:
 
 
 def _listed(folder: Path, word: str) -> Path:
-    """Return a path of a manifest in `folder`; the address of a scene is returned unchanged."""
-    return Path(word) if address_of(Path(word)) is not None else folder / word
+    """Return a path of a manifest in `folder`; a URL or the address of a scene unchanged."""
+    path = Path(word)
+    is_address = url_of(path) is not None or address_of(path) is not None
+    return path if is_address else folder / word
 
 
 def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
@@ -161,7 +177,7 @@ def _problem(drive: tuple[Path, ...], seen: set[Path]) -> str:
                 resolved(address)
             except BoxregError as error:
                 return str(error)
-        elif not path.exists():
+        elif url_of(path) is None and not path.exists():
             return 'expected a recording, got no such file; correct its path, or leave it out'
         if path.resolve() in seen:
             return 'expected each recording once, got it a second time; leave one out'

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import ctypes
 from dataclasses import dataclass, field
 from functools import partial
 import json
+import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+from tempfile import TemporaryFile
 import time
-from typing import Any
+from typing import Any, BinaryIO
 
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.storage.urls import names_of, read_text, url_of, write_text
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.job import Job, JOB_DONE, JOB_FAILED, UP_TO_DATE
 from boxreg_ros.offline.result_folder import delete_remains, earlier_summary
@@ -22,7 +27,7 @@ JOBS = 'jobs'
 """Folder with the key and the log of each job."""
 END_SECONDS = 10.0
 """Time that a job has to remove its files after SIGTERM [s]; then it is killed."""
-SAMPLE_SECONDS = 0.5
+MEMORY_PERIOD = 0.5
 """Time between two measurements of the memory [s]; a run of a drive takes some seconds."""
 PR_SET_PDEATHSIG = 1
 """Of Linux: option of prctl for the signal at the end of the parent."""
@@ -68,7 +73,8 @@ class JobRunner:
         earlier = _read_state(state)
         try:
             hashes = job.hashes(earlier.get('files', []))
-            folder.mkdir(parents=True, exist_ok=True)
+            if url_of(folder) is None:
+                folder.mkdir(parents=True, exist_ok=True)
             job.set_key(hashes, [*self.options, self.config])
             self._relabel(job, earlier)
             job.summary = earlier_summary(self.out / job.name) or {}
@@ -76,6 +82,8 @@ class JobRunner:
                 with written_whole(state) as file:
                     known = {'key': job.key, 'files': hashes, 'peak_bytes': job.peak_bytes}
                     file.write(json.dumps(known, indent=2))
+        except RecordingError as error:
+            job.fail(str(error))
         except OSError as error:
             job.fail(f'{error}; free some space, or make the file accessible, and run it again')
         return job
@@ -87,7 +95,13 @@ class JobRunner:
 
     def measured_bytes(self) -> int:
         """Return the largest memory of the jobs that are done; 0 before the first."""
-        states = map(_read_state, (self.out / JOBS).glob('*.json'))
+        folder = self.out / JOBS
+        names: list[str] = []
+        if url_of(folder) is not None:
+            names = names_of(folder)
+        elif folder.is_dir():
+            names = os.listdir(folder)
+        states = [_read_state(folder / name) for name in names if name.endswith('.json')]
         return max((int(state.get('peak_bytes', 0)) for state in states), default=0)
 
     def _relabel(self, job: Job, earlier: dict[str, Any]) -> None:
@@ -108,15 +122,17 @@ class JobRunner:
         delete_remains(self.out / job.name)
         job.attempts += 1
         log = self.out / JOBS / f'{job.name}.log'
-        with log.open('wb') as file:
+        with _log_file(log) as file:
             process = subprocess.Popen(
                 command, stdout=file, stderr=subprocess.STDOUT, preexec_fn=_end_with_parent()
             )
             self.running.add(process)
             is_late = self._wait(process, job)
             self.running.discard(process)
+            file.seek(0)
+            last_line = _last_line(file.read())
         job.exit_status = process.returncode
-        job.last_line = _last_line(log) or f'ended with status {process.returncode}'
+        job.last_line = last_line or f'ended with status {process.returncode}'
         if is_late:
             job.last_line = f'not done after {self.timeout:g} s: raise --timeout'
         elif process.returncode < 0:
@@ -133,7 +149,7 @@ class JobRunner:
         while process.poll() is None and time.monotonic() < deadline:
             job.peak_bytes = max(job.peak_bytes, memory_bytes(process.pid))
             left = deadline - time.monotonic()
-            _wait_for(process, max(min(SAMPLE_SECONDS, left), 0.0))
+            _wait_for(process, max(min(MEMORY_PERIOD, left), 0.0))
         if process.poll() is not None:
             return False
         process.terminate()
@@ -169,14 +185,27 @@ def _end_with_parent() -> Callable[[], None]:
     return partial(prctl, PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _last_line(log: Path) -> str:
-    lines = log.read_text(encoding='utf-8', errors='replace').strip().splitlines()
+@contextmanager
+def _log_file(path: Path) -> Iterator[BinaryIO]:
+    """Yield the file of a log; one behind a URL is written at the end."""
+    if url_of(path) is None:
+        with path.open('w+b') as file:
+            yield file
+        return
+    with TemporaryFile() as temporary:
+        yield temporary
+        temporary.seek(0)
+        write_text(path, temporary.read().decode(errors='replace'))
+
+
+def _last_line(log: bytes) -> str:
+    lines = log.decode(errors='replace').strip().splitlines()
     return lines[-1].removeprefix('boxreg: ') if lines else ''
 
 
 def _read_state(path: Path) -> dict[str, Any]:
     try:
-        state = json.loads(path.read_text(encoding='utf-8'))
+        state = json.loads(read_text(path))
     except (OSError, ValueError):
         return {}
     return state if isinstance(state, dict) else {}

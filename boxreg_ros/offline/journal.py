@@ -11,15 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 import fcntl
+import hashlib
 from io import BytesIO
 from pathlib import Path
 import pickle
 import struct
+from tempfile import gettempdir
 from types import TracebackType
 from typing import Any, BinaryIO, cast, Self, TYPE_CHECKING
 import zlib
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.storage.urls import url_of
 import numpy as np
 
 if TYPE_CHECKING:  # these import torch
@@ -166,7 +169,15 @@ class _TrustedUnpickler(pickle.Unpickler):
 
 
 def journal_path(out: Path) -> Path:
-    """Return the file of the journal of a result folder: beside it, hidden."""
+    """
+    Return the file of the journal of a result folder: beside it, hidden.
+
+    That of a URL is among the temporary files of this machine.
+
+    """
+    url = url_of(out)
+    if url is not None:
+        return Path(gettempdir(), f'boxreg-{hashlib.sha256(url.encode()).hexdigest()}.journal')
     whole = out.resolve()
     return whole.with_name(f'.{whole.name}.journal')
 

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+import logging
+from pathlib import Path
+import signal
+import socket
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.job import Job
 from boxreg_ros.offline.job_process import JobRunner
 
@@ -21,6 +26,8 @@ MEMORY_RESERVE = 1.2
 """Declared by measured memory; chosen: drives of one fleet differ by their number of objects."""
 JOBS_AHEAD = 2
 """Jobs that are submitted per core of the cluster: one runs, one waits."""
+ANSWER_SECONDS = 5.0
+"""Longest time for the cluster to accept a connection [s]; within a site it takes milliseconds."""
 NODE_LOSSES = 10
 """How often Ray starts a job again whose node or worker was lost; spot nodes are lost hourly."""
 
@@ -80,16 +87,26 @@ def _connected(address: str | None) -> Any:
         import ray
     except ImportError as error:
         raise ConfigError(f"--engine ray needs Ray: pip install 'ray>=2.9' ({error})") from None
-    options: dict[str, Any] = {'log_to_driver': False, 'logging_level': 'ERROR'}
+    handler = signal.getsignal(signal.SIGTERM)
     try:
-        ray.init(address=address, **options)
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+        _check_answers(address)
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (OSError, ValueError, RuntimeError, TimeoutError) as error:
         reason = ' '.join(str(error).split())[:200]
         raise RecordingError(
             f'--address {address}: expected a Ray cluster that answers, got: {reason}; check '
             f'`ray status --address {address}`, or leave --address out to run on this machine'
         ) from None
+    finally:
+        signal.signal(signal.SIGTERM, handler)  # that of Ray exits without the clean-up
     return ray
+
+
+def _check_answers(address: str | None) -> None:
+    """Raise OSError if nothing listens at an address: Ray itself tries for minutes."""
+    host, _, port = (address or '').removeprefix('ray://').rpartition(':')
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), ANSWER_SECONDS).close()
 
 
 def _run_job(runner: JobRunner, job: Job) -> Job:
@@ -113,8 +130,12 @@ def _take_result(ray: Any, reference: Any, job: Job) -> None:
 
 def _absolute(runner: JobRunner) -> JobRunner:
     """Return a runner with paths that do not depend on the current folder."""
-    return replace(runner, out=runner.out.resolve(), running=set())
+    return replace(runner, out=_absolute_path(runner.out), running=set())
 
 
 def _absolute_job(job: Job) -> Job:
-    return replace(job, recordings=tuple(path.resolve() for path in job.recordings))
+    return replace(job, recordings=tuple(map(_absolute_path, job.recordings)))
+
+
+def _absolute_path(path: Path) -> Path:
+    return path if url_of(path) else path.resolve()

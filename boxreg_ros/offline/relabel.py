@@ -23,7 +23,7 @@ from typing import Any, TYPE_CHECKING
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.lidars import LATE, MERGED, MISSING
+from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MERGED, CLOUD_MISSING
 from boxreg_ros.io.session import register
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.output import Sink
@@ -366,7 +366,7 @@ def _dropped(registered: Counter[str], findings: Findings) -> dict[str, int]:
     for name in ('sweep_without_transform', 'sensor_without_transform', 'cloud_without_info'):
         counts[name] = findings.counts[name]
     for lidar in findings.lidars.values():
-        for name in (LATE, MISSING):
+        for name in (CLOUD_LATE, CLOUD_MISSING):
             counts[name] = counts.get(name, 0) + lidar[name]
     counts['unreadable'] = findings.unreadable
     return {name: count for name, count in sorted(counts.items()) if count}
@@ -417,10 +417,11 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
     """Yield warnings about the input and the results, one line each."""
     yield from _input_notes(summary)
     for topic, counts in summary['lidars'].items():
-        if counts.get(LATE) or counts.get(MISSING):
+        if counts.get(CLOUD_LATE) or counts.get(CLOUD_MISSING):
             yield (
-                f'LiDAR {topic}: {counts.get(MERGED, 0):,} clouds merged, {counts.get(LATE, 0):,} '
-                f'late, {counts.get(MISSING, 0):,} missing; the others were used'
+                f'LiDAR {topic}: {counts.get(CLOUD_MERGED, 0):,} clouds merged, '
+                f'{counts.get(CLOUD_LATE, 0):,} late, {counts.get(CLOUD_MISSING, 0):,} missing; '
+                f'the others were used'
             )
     if summary['first_unplaced']:
         clouds = sum(

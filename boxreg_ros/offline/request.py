@@ -14,6 +14,7 @@ from boxreg_ros.datasets import address_of, scene_inputs, SceneRecording
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage.urls import entries_of, url_of
 from boxreg_ros.labels import check_options, module_of, Options
 from boxreg_ros.offline.sources import source_of
 from msg_adapters.convention import Convention, STANDARD
@@ -166,9 +167,12 @@ class Request:
     def fingerprint(self) -> str:
         """Return a hash of the request and of its input files, by size and modification time."""
         files = []
+        for path in self.inputs():
+            if url_of(path) is not None:
+                files += [(str(one.path), one.size, one.version) for one in entries_of(path)]
         for file in self._input_files():
             status = file.stat()
-            files.append((str(file.resolve()), status.st_size, status.st_mtime_ns))
+            files.append((str(file.resolve()), status.st_size, str(status.st_mtime_ns)))
         return hashlib.sha256(repr((__version__, self, files)).encode()).hexdigest()
 
     def _input_files(self) -> Iterator[Path]:

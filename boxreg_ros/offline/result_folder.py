@@ -10,10 +10,12 @@ import json
 import os
 from pathlib import Path
 import shutil
+from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.storage.urls import names_of, read_text, upload, url_of
 from boxreg_ros.io.whole_files import DISK_ERRORS
 
 REFUSED_ERRORS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
@@ -25,7 +27,7 @@ CONFIG = 'config.yaml'
 def earlier_summary(out: Path) -> dict[str, Any] | None:
     """Return the summary of an earlier run in `out`; None if there is none."""
     try:
-        summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
+        summary = json.loads(read_text(out / SUMMARY))
     except (OSError, ValueError):
         return None
     return summary if isinstance(summary, dict) and 'fingerprint' in summary else None
@@ -82,6 +84,10 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
         If `out` exists and is not the unchanged result of an earlier run, or cannot be written.
 
     """
+    if url_of(out) is not None:
+        with _uploaded_folder(out) as folder:
+            yield folder
+        return
     spare(out, inputs)
     _check_replaceable(out)
     out = out.resolve()
@@ -100,6 +106,16 @@ def whole_folder(out: Path, inputs: Iterable[Path | None] = ()) -> Iterator[Path
             os.replace(earlier, out)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(earlier, ignore_errors=True)
+
+
+@contextmanager
+def _uploaded_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder of this machine that is uploaded to the URL `out` on success."""
+    if earlier_summary(out) is None and names_of(out):
+        raise _other_files(out)
+    with TemporaryDirectory() as folder:
+        yield Path(folder)
+        upload(Path(folder), out, SUMMARY)
 
 
 @contextmanager
@@ -133,6 +149,8 @@ def writing(out: Path) -> Iterator[None]:
 
 def delete_remains(out: Path) -> None:
     """Delete the partial results of runs that were killed; none may be running."""
+    if url_of(out) is not None:
+        return
     whole = out.resolve()
     for remains in whole.parent.glob(f'.{escape(whole.name)}.*.partial'):
         shutil.rmtree(remains, ignore_errors=True)
@@ -141,10 +159,7 @@ def delete_remains(out: Path) -> None:
 def _check_replaceable(out: Path) -> None:
     """Refuse a folder that is not the unchanged result of an earlier run."""
     if out.exists() and earlier_summary(out) is None and not _is_empty(out):
-        raise RecordingError(
-            f'output {str(out)!r}: expected a new folder or an earlier result, got other files; '
-            f'choose another with -o'
-        )
+        raise _other_files(out)
     changed = _changed_since(out)
     if changed is not None:
         raise RecordingError(
@@ -152,6 +167,13 @@ def _check_replaceable(out: Path) -> None:
             f'{str(changed)!r} changed or added since, which would be lost; choose another with '
             f'-o, or delete this one'
         )
+
+
+def _other_files(out: Path) -> RecordingError:
+    return RecordingError(
+        f'output {str(out)!r}: expected a new folder or an earlier result, got other files; '
+        f'choose another with -o'
+    )
 
 
 def _changed_since(out: Path) -> Path | None:

@@ -13,8 +13,10 @@ from boxreg_ros.io.whole_files import written_whole
 MAX_PARTS = 500
 """Parts of a line that a picture of 1,000 pixels can show."""
 ROW_PIXELS = 26
-PRESENT, MISSING, DAMAGED = '#2a6fbb', '#e0912f', '#c0392b'
-"""Colours of messages, gaps and damages; distinct for people with any colour vision."""
+MESSAGE_COLOUR = '#2a6fbb'
+GAP_COLOUR = '#e0912f'
+DAMAGE_COLOUR = '#c0392b'
+"""Distinct for people with any colour vision."""
 
 
 def check_plotly() -> None:
@@ -44,11 +46,11 @@ def write_timeline(path: Path, facts: Mapping[str, Any], lines: Sequence[str]) -
     rows = {entry['topic']: entry for entry in facts['topics']}
     figure = go.Figure(layout=_layout(len(rows)))
     present = [(topic, part) for topic in rows for part in rows[topic]['presence_s']]
-    _add_lines(figure, 'messages', PRESENT, 12, present)
+    _add_lines(figure, 'messages', MESSAGE_COLOUR, 12, present)
     gaps = [(topic, part) for topic in rows for part in rows[topic]['gaps_s']]
-    _add_lines(figure, 'gap', MISSING, 4, gaps)
+    _add_lines(figure, 'gap', GAP_COLOUR, 4, gaps)
     damaged = [(rows_name, part) for part in _damaged(facts) for rows_name in rows]
-    _add_lines(figure, 'damage', DAMAGED, 3, damaged)
+    _add_lines(figure, 'damage', DAMAGE_COLOUR, 3, damaged)
     text = '\n'.join(escape(line) for line in lines)
     drawing = figure.to_html(full_html=False, include_plotlyjs=True)
     with written_whole(path) as file:

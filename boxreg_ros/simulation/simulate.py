@@ -20,7 +20,7 @@ from boxreg_ros.simulation.raycast import ROAD
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.scenarios import SCENARIOS
 from boxreg_ros.simulation.scene import FIXED_FRAME, Scene, SENSOR_FRAME
-from boxreg_ros.simulation.truck import LAYOUTS, truck_scene, write_truck
+from boxreg_ros.simulation.truck import truck_scene, TRUCK_SENSORS, write_truck
 from boxreg_ros.structures import Ints
 import numpy as np
 
@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--sweeps', type=int, metavar='N', help='number of sweeps (default: that of the scenario)'
     )
     parser.add_argument(
-        '--sensors', choices=LAYOUTS,
+        '--sensors', choices=TRUCK_SENSORS,
         help='a truck drives through the street, with LiDARs at its corners: a topic each, '
         'concatenated with info, or concatenated alone; or with one on its roof',
     )  # fmt: skip

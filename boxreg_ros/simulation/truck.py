@@ -52,15 +52,15 @@ from boxreg_ros.structures import BoxArray, Floats, Ints, Sweep
 import numpy as np
 
 BASE_FRAME = 'base'
-CORNERS = {
+CORNER_LIDARS = {
     'lidar_front_left': (4.0, 1.35, 1.2), 'lidar_front_right': (4.0, -1.35, 1.2),
     'lidar_rear_left': (-4.0, 1.35, 1.2), 'lidar_rear_right': (-4.0, -1.35, 1.2),
 }  # fmt: skip
 """Frame and position of each LiDAR from the middle of the truck, on the ground [m]."""
-ROOF = {'lidar_roof': (3.0, 0.0, 3.5)}
+ROOF_LIDAR = {'lidar_roof': (3.0, 0.0, 3.5)}
 ROOF_STREAM = 2
 """Random stream of the LiDAR on the roof, so that the others do not depend on it."""
-LAYOUTS = ('corners', 'concatenated', 'concatenated-alone', 'roof')
+TRUCK_SENSORS = ('corners', 'concatenated', 'concatenated-alone', 'roof')
 """
 What is recorded: a topic per corner, one concatenated cloud with or without info, or the roof.
 """
@@ -99,9 +99,9 @@ def truck_scene(seed: int, sweeps: int | None = None) -> TruckScene:
     stamps = np.arange(count) * SWEEP_PERIOD
     # (actors, sweeps, 9)
     true_boxes = np.stack([boxes_of(actor, actor.motion.at(stamps)) for actor in actors])
-    clouds, owners = _scanned(CORNERS, actors, ego, true_boxes, rng)
+    clouds, owners = _scanned(CORNER_LIDARS, actors, ego, true_boxes, rng)
     roof_rng = np.random.default_rng([seed, ROOF_STREAM])
-    roof, _ = _scanned(ROOF, actors, ego, true_boxes, roof_rng)
+    roof, _ = _scanned(ROOF_LIDAR, actors, ego, true_boxes, roof_rng)
     whole = [merged(_in_base(parts, ego)) for parts in zip(*clouds.values(), strict=True)]
     scene = make_scene(
         actors, true_boxes, whole, owners, to_matrix(ego.at(stamps)), detector_noise,
@@ -121,7 +121,7 @@ def write_truck(path: Path, scene: TruckScene, layout: str) -> None:
     scene : TruckScene
         The drive.
     layout : str
-        One of `LAYOUTS`.
+        One of `TRUCK_SENSORS`.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def write_truck(path: Path, scene: TruckScene, layout: str) -> None:
 def _messages(scene: TruckScene, layout: str) -> Iterator[tuple[str, Any, int]]:
     """Yield topic, message and receive time [ns]."""
     make = LidarMessages()
-    mounts = ROOF if layout == 'roof' else CORNERS
+    mounts = ROOF_LIDAR if layout == 'roof' else CORNER_LIDARS
     clouds = {name: scene.clouds[name] for name in mounts}
     first_ns = scene.detections[0].stamp_ns
     T_base_lidar = {name: _translation(at) for name, at in mounts.items()}
@@ -172,7 +172,7 @@ def _scanned(
     for i in range(true_boxes.shape[1]):
         found = []
         for k, (name, at) in enumerate(mounts.items()):
-            stamp = i * SWEEP_PERIOD + k * SWEEP_PERIOD / len(CORNERS)
+            stamp = i * SWEEP_PERIOD + k * SWEEP_PERIOD / len(CORNER_LIDARS)
             motion = _mounted(ego, at)
             points, times, owner = revolution([*actors, truck], parts, motion, sensor, stamp, rng)
             kept = owner != ROAD
@@ -215,7 +215,7 @@ def _base_at(ego: Motion, stamp_ns: int) -> Floats:
 def _in_base(clouds: Sequence[Sweep], ego: Motion) -> list[Sweep]:
     """Return clouds in the frame base at the stamp of the first, each with its own stamp."""
     T_base_fixed = inverse(_base_at(ego, clouds[0].stamp_ns))
-    every = CORNERS | ROOF
+    every = CORNER_LIDARS | ROOF_LIDAR
     moved = []
     for cloud in clouds:
         T_fixed_base = _base_at(ego, cloud.stamp_ns)

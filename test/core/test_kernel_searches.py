@@ -1,6 +1,8 @@
 """The compiled searches against their torch twins, fallbacks, and independence of windows."""
 
 from dataclasses import fields
+import os
+import shutil
 import subprocess
 import sys
 
@@ -409,18 +411,20 @@ class Absent:
             raise ModuleNotFoundError('No module named numba')
 sys.meta_path.insert(0, Absent())
 """
-WITHOUT_CACHE = """
-import numba.core.caching
-# As where neither the package, nor NUMBA_CACHE_DIR, nor the home folder can be written.
-numba.core.caching.CacheImpl._locator_classes = []
+UNSUPPORTED_PROCESSOR = """
+class Unsupported:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] == 'llvmlite':
+            raise OSError('libllvmlite.so: cannot open shared object file')
+sys.meta_path.insert(0, Unsupported())
 """
 
 
-def refined(prepare=''):
+def refined(prepare='', folder=ROOT, **environment):
     """Return the warnings about numba, and the boxes, of a small refinement in a process."""
     done = subprocess.run(
         [sys.executable, '-c', REFINE.replace('PREPARE', prepare)],
-        cwd=ROOT, capture_output=True, text=True, timeout=300,
+        cwd=folder, env={**os.environ, **environment}, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     count, *texts, boxes = done.stdout.splitlines()
@@ -428,13 +432,46 @@ def refined(prepare=''):
     return texts, np.array(boxes.split(), float)
 
 
-@pytest.mark.parametrize(
-    ('prepare', 'remedy'), [(WITHOUT_NUMBA, 'pip install'), (WITHOUT_CACHE, 'NUMBA_CACHE_DIR')]
-)
-def test_without_numba_or_its_cache_results_are_the_same_with_one_warning(prepare, remedy):
-    texts, known = refined()
+@pytest.fixture(scope='module')
+def known_boxes():
+    """Return the boxes of the small refinement, by the kernels."""
+    texts, boxes = refined()
     assert texts == []
-    texts, found = refined(prepare)
-    assert len(texts) == 1
-    assert remedy in texts[0]
-    np.testing.assert_allclose(found, known, atol=1e-6)
+    return boxes
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """Return a folder with a copy of the package and its compiled kernels."""
+    shutil.copytree(ROOT / 'boxreg_ros', tmp_path / 'boxreg_ros')
+    return tmp_path
+
+
+@pytest.mark.parametrize('prepare', [WITHOUT_NUMBA, UNSUPPORTED_PROCESSOR])
+def test_without_numba_results_are_the_same_with_one_warning(prepare, known_boxes):
+    (text,), found = refined(prepare)
+    assert 'pip install' in text
+    np.testing.assert_allclose(found, known_boxes, atol=1e-6)
+
+
+def test_a_read_only_home_gives_one_warning(copy, known_boxes):
+    # Neither the package, nor NUMBA_CACHE_DIR, nor the home folder can be written: files are in
+    # the place of folders, which holds for the superuser as well.
+    cache = copy / 'boxreg_ros' / 'core' / 'kernels' / '__pycache__'
+    shutil.rmtree(cache)
+    cache.touch()
+    places = {'HOME': str(cache), 'XDG_CACHE_HOME': str(cache), 'NUMBA_CACHE_DIR': str(cache)}
+    (text,), found = refined(folder=copy, **places)
+    assert 'set NUMBA_CACHE_DIR' in text
+    np.testing.assert_array_equal(found, known_boxes)
+
+
+def test_a_damaged_cache_is_written_again_with_one_warning(copy, known_boxes):
+    cache = copy / 'boxreg_ros' / 'core' / 'kernels' / '__pycache__'
+    for file in cache.glob('face_support.count_held*.nbi'):
+        file.write_bytes(b'damaged')
+    (text,), found = refined(folder=copy)
+    assert 'delete the folder' in text
+    np.testing.assert_array_equal(found, known_boxes)
+    texts, _ = refined(folder=copy)
+    assert texts == []

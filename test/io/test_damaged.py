@@ -16,7 +16,7 @@ from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
+from mcap_files import rewritten
 import pytest
 from ros_messages import Drive, SECOND, START, write_recording
 from rosbags.rosbag2 import CompressionMode
@@ -34,26 +34,6 @@ def read(path, **options):
         damages = recording.damages
     sweeps = [item.stamp_ns for item in items if isinstance(item, Sweep)]
     return sweeps, [item.stamp_ns for item in items if isinstance(item, BoxArray)], damages
-
-
-def rewritten(path, target, order=None, chunk_size=4096, **options):
-    """Write an MCAP file again with the mcap library; `order` sorts the messages."""
-    with path.open('rb') as source, target.open('wb') as file:
-        found = list(make_reader(source).iter_messages())
-        writer = McapWriter(file, chunk_size=chunk_size, **options)
-        writer.start('ros2')
-        channels = {}
-        for schema, channel, message in sorted(found, key=order) if order else found:
-            if channel.topic not in channels:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number, channel.metadata
-                )
-            writer.add_message(
-                channels[channel.topic], message.log_time, message.data, message.log_time
-            )
-        writer.finish()
-    return target
 
 
 @pytest.fixture

@@ -5,8 +5,10 @@ import csv
 from boxreg_ros.cli import main
 from boxreg_ros.labels import FORMATS
 from diagnostic_msgs.msg import DiagnosticStatus
+from lidar_drives import LidarDrive
 import numpy as np
 import orjson
+import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_graph import (
@@ -138,22 +140,30 @@ def assert_equal(live, offline, where):
         assert live == offline, where
 
 
-def test_labels_in_every_format_equal_those_of_relabel(tmp_path):
+@pytest.mark.parametrize('lidars', ['one', 'two'])
+def test_labels_equal_those_of_relabel(tmp_path, lidars):
+    """In every format; with the merged clouds of two LiDARs in one with a file for each."""
+    drive = Drive(sweeps=10) if lidars == 'one' else LidarDrive(sweeps=10)
     # Label files state the name of their recording; a segment has this one.
-    path = Drive(sweeps=10).write(tmp_path / 'live_segment_000001', 'mcap-folder')
+    path = drive.write(tmp_path / 'live_segment_000001', 'mcap-folder')
     camera = tmp_path / 'calibration.txt'
     camera.write_text(CALIBRATION)
+    names = LIVE_FORMATS if lidars == 'one' else ['sustechpoints']
+    formats = ','.join(names)
     options = [f'--set={key}={value}' for key, value in SETTINGS.items()]
-    options += ['--set=estimate=final', '--with-points', f'--camera={camera}']
-    formats = ','.join(LIVE_FORMATS)
+    options += ['--set=estimate=final', f'--formats={formats}', '--with-points']
+    parameters = {'record_formats': f'[{formats}]', 'record_points': True}
+    if lidars == 'one':
+        options.append(f'--camera={camera}')
+        parameters['record_camera'] = camera
+    else:
+        options += ['--points=/front', '--points=/rear']
+        parameters['points'] = '[/front, /rear]'
     out = tmp_path / 'out'
-    assert main(['relabel', str(path), '-o', str(out), f'--formats={formats}', *options]) == 0
+    assert main(['relabel', str(path), '-o', str(out), *options]) == 0
     folder = tmp_path / 'live'
     with graph_in(tmp_path) as graph:
-        robot = Robot(
-            graph, path, record_to=folder, record_formats=f'[{formats}]', record_points=True,
-            record_camera=camera, record_segment='1 h',
-        )  # fmt: skip
+        robot = Robot(graph, path, record_to=folder, record_segment='1 h', **parameters)
         robot.play()
         robot.stop()
     (row,) = index_of(folder)
@@ -163,7 +173,7 @@ def test_labels_in_every_format_equal_those_of_relabel(tmp_path):
     live = files_of(folder / 'segment_000001')
     offline = files_of(out)
     assert live.keys() == offline.keys()
-    assert {path.parts[0] for path in live} >= {*LIVE_FORMATS} - {'csv'}
+    assert {path.parts[0] for path in live} >= {*names} - {'csv'}
     for name, file in live.items():
         assert_equal_files(file, offline[name])
 

@@ -280,3 +280,24 @@ def test_formats_command_lists_all_formats(capsys):
         assert f'\n{name}: ' in f'\n{text}'
     assert 'pip install pyarrow' in text
     assert {len(row) for row in rows()} == {len(FORMAT_COLUMNS)}
+
+
+def test_attributes_of_another_shape_are_refused(tmp_path, capsys):
+    """A covariance of 20 numbers in place of 21, found by mutated files."""
+    recording = Drive(sweeps=6).write(tmp_path / 'drive')
+    out = tmp_path / 'out'
+    quick = ['--set=min_observations=3', '--formats=datumaro']
+    assert cli.main(['relabel', str(recording), '-o', str(out), *quick]) == 0
+    (file,) = (out / 'datumaro' / 'annotations').glob('*.json')
+    content = json.loads(file.read_text())
+    for item in content['items']:
+        for annotation in item['annotations']:
+            covariance = annotation['attributes'].get('covariance')
+            if covariance:
+                covariance.pop()
+    file.write_text(json.dumps(content))
+    capsys.readouterr()
+    command = ['convert', str(out / 'datumaro'), '-o', str(tmp_path / 'csv'), '--from', 'datumaro']
+    assert cli.main([*command, '--to', 'csv']) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'expected attributes as boxreg writes them' in line

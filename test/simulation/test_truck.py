@@ -6,13 +6,13 @@ from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.session import Session
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.simulation.truck import CORNERS, LAYOUTS, truck_scene, write_truck
+from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, TRUCK_SENSORS, write_truck
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import STANDARD
 import numpy as np
 import pytest
 
-TOPICS = tuple(f'/points/{name}' for name in CORNERS)
+TOPICS = tuple(f'/points/{name}' for name in CORNER_LIDARS)
 
 
 @pytest.fixture(scope='module')
@@ -50,7 +50,7 @@ def test_topics_and_concatenated_clouds_with_info_are_the_same_sweep(scene, tmp_
 
 
 def test_each_lidar_sees_its_side_only(scene):
-    for name, at in CORNERS.items():
+    for name, at in CORNER_LIDARS.items():
         points = np.concatenate([sweep.points for sweep in scene.clouds[name]]) + at
         is_below_top = points[:, 2] < 1.2  # of the body, which blocks them
         behind = np.sign(at[1]) * points[:, 1] < -1.5
@@ -58,7 +58,7 @@ def test_each_lidar_sees_its_side_only(scene):
         assert not blocked.any()
 
 
-@pytest.mark.parametrize('layout', LAYOUTS)
+@pytest.mark.parametrize('layout', TRUCK_SENSORS)
 def test_the_command_writes_a_recording(layout, tmp_path, capsys):
     path = tmp_path / 'truck.mcap'
     assert main(['simulate', '-o', str(path), '--sensors', layout, '--sweeps', '1']) == 0

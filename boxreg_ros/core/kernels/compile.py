@@ -38,7 +38,7 @@ def kernel(function: _F) -> _F:
     function.__qualname__ += f'_{sources_digest(folder)}'
     options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'fastmath': REORDER}
     try:
-        return cast(_F, numba.njit(function, cache=True, **options))
+        dispatcher = numba.njit(function, cache=True, **options)
     except RuntimeError as error:  # no folder for the cache can be written
         if function.__name__ == FIRST_KERNEL:
             warn(
@@ -48,6 +48,29 @@ def kernel(function: _F) -> _F:
                 stacklevel=2,
             )
         return cast(_F, numba.njit(function, **options))
+    _recover_from_damage(dispatcher._cache)
+    return cast(_F, dispatcher)
+
+
+def _recover_from_damage(cache: Any) -> None:
+    """Let a damaged cache file be written again, with a warning; numba itself would raise."""
+    load = cache.load_overload
+
+    def load_or_compile(*arguments: Any) -> Any:
+        try:
+            return load(*arguments)
+        except Exception as error:  # whatever pickle raises for other bytes
+            warn(
+                f'numba cache: expected compiled kernels in {cache.cache_path}, got a damaged '
+                f'file ({type(error).__name__}); it is written again: if that comes back, delete '
+                f'the folder',
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            cache.flush()
+            return None
+
+    cache.load_overload = load_or_compile
 
 
 FIRST_KERNEL = 'fill_rotation'

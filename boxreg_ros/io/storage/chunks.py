@@ -12,11 +12,11 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from heapq import heapify, heappop, heappush
-import os
 from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.io.storage.record import Damage, note, one_line, Record, shown, span_ns
+from boxreg_ros.io.storage.urls import ByteSource, source_of
 from rosbags.interfaces import Connection
 
 BUFFER_BYTES = 256 * 2**20
@@ -25,6 +25,14 @@ Messages of chunks that are held at a time [bytes].
 
 Two seconds of a recording of 100 MB/s. Recordings whose chunks all cover the whole time exceed
 it; their chunks are then dropped and read again.
+
+"""
+AHEAD_BYTES = 16 * 2**20
+AHEAD_CHUNKS = 16
+"""
+Chunks that are requested ahead of a stream of a remote file, the first limit that is reached.
+
+Chosen: at 50 MB/s they last for the latency of an object store, 0.1 s, three times.
 
 """
 MAX_CHUNK_BYTES = 2**30
@@ -81,8 +89,9 @@ class ChunkedFile(ABC):
 
     def __init__(self, path: Path, origin: Path | None = None) -> None:
         self.name = shown(path, origin)
-        self._file = path.open('rb')
-        self.size = os.fstat(self._file.fileno()).st_size
+        self._path = path
+        self._file = source_of(path)
+        self.size = self._file.size
         self.connections: list[Connection] = []
         self.damages: list[Damage] = []
         self._chunks: list[Chunk] = []
@@ -105,6 +114,7 @@ class ChunkedFile(ABC):
         wanted = {connection.id: connection for connection in connections}
 
         def load(chunk: Chunk) -> list[Record]:
+            read_ahead(chunk)
             return [
                 Record(
                     wanted[message.connection_id], message.received_ns, message.data,
@@ -121,6 +131,7 @@ class ChunkedFile(ABC):
             and (start is None or start <= chunk.last_ns)
             and (stop is None or chunk.start_ns < stop)
         ]
+        read_ahead = _ReadAhead(chunks, self._file)
         return _merged(chunks, load, BUFFER_BYTES)
 
     def spans(self) -> Iterator[tuple[int, int, int]]:
@@ -158,7 +169,7 @@ class ChunkedFile(ABC):
 
     def _bytes(self, first_byte: int, end_byte: int) -> bytes:
         """Return a part of the file; fewer bytes at its end."""
-        return os.pread(self._file.fileno(), end_byte - first_byte, first_byte)
+        return self._file.read(first_byte, end_byte)
 
     def _count_messages(self) -> Counter[int]:
         """Return the number of messages in all chunks by connection id."""
@@ -179,6 +190,34 @@ class ChunkedFile(ABC):
             start_ns = max(before, default=None)
             end_ns = min(behind, default=start_ns)
             self.damages[i] = damage._replace(start_ns=start_ns, end_ns=end_ns)
+
+
+class _ReadAhead:
+    """
+    Ask for the chunks that are needed next, once a stream has come to its third chunk.
+
+    Streams that are begun for one message end before.
+
+    """
+
+    def __init__(self, chunks: Sequence[Chunk], file: ByteSource) -> None:
+        self._following = sorted(chunks, key=lambda chunk: chunk.start_ns)
+        self._place = {chunk.first_byte: i for i, chunk in enumerate(self._following)}
+        self._file = file
+
+    def __call__(self, chunk: Chunk) -> None:
+        """Ask for the chunks behind one, up to `AHEAD_BYTES`."""
+        begin = self._place[chunk.first_byte]
+        if begin < 2:
+            return
+        ranges = []
+        size = 0
+        for later in self._following[begin : begin + AHEAD_CHUNKS]:
+            size += later.end_byte - later.first_byte
+            ranges.append((later.first_byte, later.end_byte))
+            if size > AHEAD_BYTES:
+                break
+        self._file.prefetch(ranges)
 
 
 def _merged(

@@ -14,6 +14,7 @@ from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, StorageFile
 from boxreg_ros.io.storage.rosbag1 import Rosbag1File
 from boxreg_ros.io.storage.sqlite import SqliteFile
+from boxreg_ros.io.storage.urls import download, entries_of, entry_of, url_of
 from mcap.records import Schema
 from rosbags.interfaces import Connection
 import yaml
@@ -49,6 +50,9 @@ def part_of(path: Path) -> Part:
         If it does not exist, or is a folder without files of recordings.
 
     """
+    if url_of(path) is not None:
+        files = [entry.path for entry in entries_of(path) if _kind(entry.path) in OPENERS]
+        return Part(path, tuple(_some(path, files)))
     if not path.exists():
         raise RecordingError(f'no such recording: {str(path)!r}')
     if not path.is_dir():
@@ -56,11 +60,22 @@ def part_of(path: Path) -> Part:
     listed = _listed(path)
     there = sorted(file for file in path.iterdir() if file.is_file() and _kind(file) in OPENERS)
     files = [file for file in listed if file.is_file()] or there
+    missing = tuple(file for file in listed if not file.is_file())
+    return Part(path, tuple(_some(path, files)), missing)
+
+
+def _some(path: Path, files: list[Path]) -> list[Path]:
+    """Return the files of a folder; RecordingError if there are none."""
     if not files:
         raise RecordingError(
             f'{str(path)!r} is no recording: expected {METADATA}, .mcap, .db3 or .bag files in it'
         )
-    return Part(path, tuple(files), tuple(file for file in listed if not file.is_file()))
+    return files
+
+
+def size_of(path: Path) -> int:
+    """Return the size of a file of this machine or behind a URL [bytes]."""
+    return path.stat().st_size if url_of(path) is None else entry_of(path).size
 
 
 def is_ros1(path: Path) -> bool:
@@ -83,6 +98,8 @@ def opened(path: Path) -> StorageFile:
         raise RecordingError(
             f'{str(path)!r}: expected an .mcap, .db3 or .bag file, or a rosbag2 folder'
         )
+    if url_of(path) is not None:
+        return _opened_remote(path, opener)
     try:
         path.open('rb').close()
     except PermissionError as error:
@@ -99,6 +116,16 @@ def opened(path: Path) -> StorageFile:
     if damage is not None:
         file.damages.insert(0, damage)
     return file
+
+
+def _opened_remote(path: Path, opener: Callable[[Path, Path | None], StorageFile]) -> StorageFile:
+    """Open a file behind a URL: MCAP by ranges, a copy of other formats."""
+    if opener is McapFile and path.suffix not in COMPRESSED:
+        return opener(path, None)
+    with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
+        copy = Path(folder, path.name)
+        download(path, copy)
+        return opened(copy)
 
 
 class Files:
@@ -124,7 +151,7 @@ class Files:
                     self._files.append(stack.enter_context(closing(opened(path))))
                 except RecordingError as error:
                     first_error = first_error or error
-                    size = path.stat().st_size
+                    size = size_of(path)
                     self._damages.append(Damage(str(path), str(error), 0, size))
             if first_error is not None and not self._files:
                 raise first_error

@@ -49,7 +49,7 @@ class Rosbag1File(ChunkedFile):
 
     def _read_index(self) -> bool:
         """Read the index; return False if it is missing or damaged."""
-        reader = Reader(self._file.name)
+        reader = Reader(self._path)
         try:
             reader.open()
         except Exception:  # of the library, for any malformed content; the scan reports it

@@ -1,0 +1,264 @@
+"""
+Files behind URLs: ``s3://``, ``gs://``, ``https://`` and whatever fsspec opens.
+
+A URL is carried as a `Path`, which has one slash in place of two behind the scheme. Files are read
+by ranges: what the index of a recording asks for, and some chunks ahead.
+
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import re
+from typing import Any, NamedTuple, Protocol
+
+from boxreg_ros.errors import RecordingError
+
+URL = re.compile(r'([a-z][a-z0-9+.-]+):/+(.+)')
+"""A scheme has two letters or more."""
+CACHE_BYTES = 64 * 2**20
+"""Ranges that are kept: the first chunks are read for topics and transforms, then again."""
+REQUEST_BYTES = 2**16
+"""Smaller reads fetch a block of this size: a request takes as long as 1 MB of data."""
+READERS = 4
+"""Requests at a time; chosen: object stores send some 50 MB/s each."""
+CAUSES = 'check the address, the network and the credentials'
+
+
+class Entry(NamedTuple):
+    """Name, size [bytes] and version (tag or time) of a file behind a URL."""
+
+    path: Path
+    size: int
+    version: str
+
+
+class ByteSource(Protocol):
+    """A file that is read by ranges; `size` in bytes."""
+
+    size: int
+
+    def read(self, first: int, end: int) -> bytes:
+        """Return a part of the file; fewer bytes at its end."""
+
+    def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """Begin to read ranges that are needed next."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+class LocalFile:
+    """A file of this machine; see `ByteSource`."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open('rb')
+        self.size = os.fstat(self._file.fileno()).st_size
+
+    def read(self, first: int, end: int) -> bytes:
+        """Return a part of the file; fewer bytes at its end."""
+        return os.pread(self._file.fileno(), end - first, first)
+
+    def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """Leave it to the system, which reads ahead itself."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class RemoteFile:
+    """
+    A file behind a URL; see `ByteSource`.
+
+    Attributes
+    ----------
+    bytes_read : int
+        Number of bytes that were requested so far.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._system, self._name = _system_of(path)
+        self._path = path
+        self.size = entry_of(path).size
+        self.bytes_read = 0
+        self._pool = ThreadPoolExecutor(READERS)
+        self._ranges: OrderedDict[tuple[int, int], Future[bytes]] = OrderedDict()
+
+    def read(self, first: int, end: int) -> bytes:
+        """Return a part of the file; fewer bytes at its end."""
+        end = min(end, self.size)
+        if end <= first:
+            return b''
+        for (start, stop), future in self._ranges.items():
+            if start <= first and end <= stop:
+                self._ranges.move_to_end((start, stop))
+                return future.result()[first - start : end - start]
+        stop = end
+        if end - first < REQUEST_BYTES:
+            first_of_block = min(first, max(self.size - REQUEST_BYTES, 0))
+            stop = min(first_of_block + REQUEST_BYTES, self.size)
+            return self._fetch(first_of_block, stop).result()[
+                first - first_of_block : end - first_of_block
+            ]
+        return self._fetch(first, stop).result()
+
+    def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """Begin to read ranges that are needed next."""
+        for first, end in ranges:
+            if (first, end) not in self._ranges:
+                self._fetch(first, end)
+
+    def close(self) -> None:
+        """Cancel what is requested."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _fetch(self, first: int, end: int) -> Future[bytes]:
+        """Request a range; forget the oldest ones beyond `CACHE_BYTES`."""
+        future = self._pool.submit(self._request, first, end)
+        self._ranges[first, end] = future
+        self.bytes_read += end - first
+        held = sum(stop - start for start, stop in self._ranges)
+        while held > CACHE_BYTES and len(self._ranges) > 1:
+            (start, stop), _ = self._ranges.popitem(last=False)
+            held -= stop - start
+        return future
+
+    def _request(self, first: int, end: int) -> bytes:
+        with _answers(self._path):
+            return bytes(self._system.cat_file(self._name, start=first, end=end))
+
+
+def url_of(path: Path) -> str | None:
+    """Return the URL that a path carries; None for a path of this machine."""
+    match = URL.fullmatch(str(path))
+    return f'{match[1]}://{match[2]}' if match else None
+
+
+def source_of(path: Path) -> LocalFile | RemoteFile:
+    """Return an open file."""
+    return LocalFile(path) if url_of(path) is None else RemoteFile(path)
+
+
+def entry_of(path: Path) -> Entry:
+    """
+    Return size and version of a file behind a URL.
+
+    Raises
+    ------
+    RecordingError
+        If it does not exist, or its server does not answer.
+
+    """
+    system, name = _system_of(path)
+    with _answers(path):
+        return _entry(path, system.info(name))
+
+
+def entries_of(path: Path) -> list[Entry]:
+    """Return a file behind a URL, or the files in the folder that it is, sorted by name."""
+    system, name = _system_of(path)
+    with _answers(path):
+        about = system.info(name)
+        if about['type'] != 'directory':
+            return [_entry(path, about)]
+        inner = sorted(system.ls(name, detail=True), key=lambda one: str(one['name']))
+        files = [one for one in inner if one['type'] == 'file']
+    return [_entry(path / Path(one['name']).name, one) for one in files]
+
+
+def download(path: Path, target: Path) -> None:
+    """Copy a file behind a URL to this machine."""
+    system, name = _system_of(path)
+    with _answers(path):
+        system.get_file(name, str(target))
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file of this machine or behind a URL; OSError if there is none."""
+    if url_of(path) is None:
+        return path.read_text(encoding='utf-8')
+    system, name = _system_of(path)
+    with _answers(path, missing_is_error=False):
+        return bytes(system.cat_file(name)).decode()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file behind a URL; it appears whole."""
+    system, name = _system_of(path)
+    with _answers(path):
+        system.pipe_file(name, text.encode())
+
+
+def names_of(path: Path) -> list[str]:
+    """Return the names of all files below a folder behind a URL; none if it does not exist."""
+    system, name = _system_of(path)
+    with _answers(path):
+        found = system.find(name)
+    return [str(one).removeprefix(name).lstrip('/') for one in found]
+
+
+def upload(folder: Path, target: Path, last: str) -> None:
+    """
+    Replace a folder behind a URL by one of this machine.
+
+    Parameters
+    ----------
+    folder, target : Path
+        Source and URL.
+    last : str
+        File that marks a whole result: it is deleted first, and written when all others are.
+
+    """
+    system, name = _system_of(target)
+    files = {str(file.relative_to(folder)) for file in folder.rglob('*') if file.is_file()}
+    old = names_of(target)
+    with _answers(target):
+        if last in old:
+            system.rm_file(f'{name}/{last}')
+        for file in sorted(set(old) - files - {last}):
+            system.rm_file(f'{name}/{file}')
+        for file in sorted(files, key=lambda file: (file == last, file)):
+            system.put_file(str(folder / file), f'{name}/{file}')
+
+
+def _entry(path: Path, about: dict[str, Any]) -> Entry:
+    tags = ('ETag', 'etag', 'LastModified', 'updated', 'mtime', 'last-modified')
+    version = next((str(about[tag]) for tag in tags if about.get(tag)), '')
+    return Entry(path, int(about.get('size') or 0), version)
+
+
+def _system_of(path: Path) -> tuple[Any, str]:
+    """Return the file system of fsspec for a URL, and the name of the file in it."""
+    import fsspec
+
+    url = str(url_of(path))
+    try:
+        system, name = fsspec.core.url_to_fs(url)
+    except ImportError as error:
+        raise RecordingError(
+            f"{url}: needs another package: pip install 'boxreg_ros[remote]' ({error})"
+        ) from None
+    except ValueError as error:  # an unknown scheme
+        raise RecordingError(f'{url}: expected a scheme of fsspec, got: {error}') from None
+    return system, str(name)
+
+
+@contextmanager
+def _answers(path: Path, missing_is_error: bool = True) -> Iterator[None]:
+    """Turn the errors of file systems, which are of any class, into RecordingError."""
+    try:
+        yield
+    except FileNotFoundError:
+        if not missing_is_error:
+            raise
+        raise RecordingError(f'{url_of(path)}: expected a file, got none; {CAUSES}') from None
+    except Exception as error:
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise RecordingError(f'{url_of(path)}: got no answer: {reason}; {CAUSES}') from None

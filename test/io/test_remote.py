@@ -1,0 +1,215 @@
+"""Recordings and results behind URLs: an object store and a plain HTTP server on loopback."""
+
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+import json
+from pathlib import Path
+from threading import Thread
+
+from boxreg_ros.cli import main
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage.files import part_of
+from boxreg_ros.io.storage.urls import RemoteFile, url_of
+from boxreg_ros.io.transforms import TransformTree
+from mcap.reader import make_reader
+from mcap_files import rewritten
+import numpy as np
+import pytest
+from ros_messages import Drive, SECOND, START
+
+QUICK = ['--set=min_observations=3', '--formats=csv']
+
+
+class Files(BaseHTTPRequestHandler):
+    """Serve the files of a folder, whole or a range, and count the bytes."""
+
+    def do_HEAD(self):
+        self.respond(with_content=False)
+
+    def do_GET(self):
+        self.respond(with_content=True)
+
+    def respond(self, with_content):
+        path = Path(self.server.folder, self.path.lstrip('/'))
+        if not path.is_file():
+            self.send_error(404)
+            return
+        data = path.read_bytes()
+        first, last = 0, len(data) - 1
+        asked = self.headers.get('Range')
+        if asked:
+            begin, _, end = asked.removeprefix('bytes=').partition('-')
+            first, last = int(begin), min(int(end or last), last)
+        self.send_response(206 if asked else 200)
+        self.send_header('Accept-Ranges', 'bytes')
+        self.send_header('Content-Length', str(last + 1 - first))
+        if asked:
+            self.send_header('Content-Range', f'bytes {first}-{last}/{len(data)}')
+        self.end_headers()
+        if with_content:
+            self.server.sent.append(last + 1 - first)
+            self.wfile.write(data[first : last + 1])
+
+    def log_message(self, *_):
+        """Be silent."""
+
+
+@contextmanager
+def http_server(folder):
+    server = ThreadingHTTPServer(('127.0.0.1', 0), Files)
+    server.folder, server.sent = folder, []
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield server, f'http://127.0.0.1:{server.server_port}'
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture
+def store(monkeypatch):
+    """Yield a file system of an object store with the bucket ``drives``."""
+    s3fs = pytest.importorskip('s3fs')
+    moto = pytest.importorskip('moto.server')
+    server = moto.ThreadedMotoServer(ip_address='127.0.0.1', port=0, verbose=False)
+    server.start()
+    port = server.get_host_and_port()[1]
+    monkeypatch.setenv('AWS_ENDPOINT_URL', f'http://127.0.0.1:{port}')
+    monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'key')
+    monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', 'secret')
+    monkeypatch.setenv('AWS_DEFAULT_REGION', 'us-east-1')
+    s3fs.S3FileSystem.clear_instance_cache()  # one of an earlier test has another endpoint
+    system = s3fs.S3FileSystem()
+    system.makedirs('drives', exist_ok=True)
+    yield system
+    server.stop()
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """Return an MCAP file of 60 sweeps and many chunks, 0.4 MB."""
+    return rewritten(Drive(sweeps=60).write(tmp_path / 'drive'), tmp_path / 'whole.mcap')
+
+
+def boxes(out):
+    return (out / 'boxes.csv').read_bytes()
+
+
+def test_a_path_carries_a_url():
+    assert url_of(Path('s3://bucket/a/b.mcap')) == 's3://bucket/a/b.mcap'
+    assert url_of(Path('https://host:80/b.mcap')) == 'https://host:80/b.mcap'
+    assert url_of(Path('/s3:/bucket')) is None
+    assert url_of(Path('c:/drive')) is None
+
+
+def test_recordings_over_http_give_the_same_boxes(tmp_path, whole):
+    local, remote = tmp_path / 'local', tmp_path / 'remote'
+    assert main(['relabel', str(whole), '-o', str(local), *QUICK]) == 0
+    with http_server(tmp_path) as (_, url):
+        assert main(['relabel', f'{url}/whole.mcap', '-o', str(remote), *QUICK]) == 0
+    assert boxes(remote) == boxes(local)
+
+
+def test_bytes_of_a_slice(tmp_path, monkeypatch):
+    """Sweeps of 0.3 MB in chunks of one: the bytes that a slice needs are those of its chunks."""
+    drive = Drive(sweeps=60)
+    padded = [
+        (topic, received, message)
+        for topic, received, message in drive.items
+        if topic != '/points'
+    ]
+    rng = np.random.default_rng(0)
+    for stamp in drive.stamps:
+        xyz = rng.normal(size=(25_000, 3))
+        padded.append(('/points', stamp, drive.messages.points(stamp, 'lidar', xyz)))
+    drive.items = sorted(padded, key=lambda item: item[1])
+    path = rewritten(drive.write(tmp_path / 'drive'), tmp_path / 'large.mcap', chunk_size=300_000)
+    begin, end = START + 3 * SECOND, START + 4 * SECOND
+    with path.open('rb') as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    # A slice needs its chunks, those of the transforms 2 s around it, and the first of all.
+    needed = (
+        sum(
+            chunk.chunk_length
+            for chunk in chunks
+            if chunk.message_end_time >= begin - 2 * SECOND
+            and chunk.message_start_time < end + 2 * SECOND
+        )
+        + chunks[0].chunk_length
+    )
+    with http_server(tmp_path) as (server, url):
+        with Recording([Path(f'{url}/large.mcap')], start=3.0, end=4.0) as recording:
+            tree = TransformTree()
+            recording.choose_fixed_frame(tree)
+            stamps = [item.content.stamp_ns for item in recording.items(tree)]
+        sent = sum(server.sent)
+    assert len(stamps) == 20
+    assert 0.5 * needed < sent < 1.2 * needed
+    assert sent < 0.95 * path.stat().st_size
+
+
+@pytest.mark.parametrize('storage', ['sqlite3', 'rosbag1'])
+def test_other_storages_over_http(tmp_path, storage):
+    drive = Drive(sweeps=6, boxes='markers', ros1=storage == 'rosbag1')
+    path = drive.write(tmp_path / 'other', storage)
+    file = path if path.is_file() else next(path.glob('*.db3'))
+    with http_server(tmp_path) as (_, url):
+        remote = Path(f'{url}/{file.relative_to(tmp_path)}')
+        with Recording([remote]) as recording:
+            tree = TransformTree()
+            recording.choose_fixed_frame(tree)
+            assert len(list(recording.items(tree))) == 12
+
+
+def test_an_object_store_in_and_out(tmp_path, whole, store, capsys):
+    store.put(str(whole), 'drives/one/whole.mcap')
+    local = tmp_path / 'local'
+    command = ['relabel', str(whole), '-o', str(local), *QUICK]
+    assert main(command) == 0
+    out = 's3://drives/results/one'
+    command = ['relabel', 's3://drives/one', '-o', out, *QUICK, '--resume']
+    assert main(command) == 0
+    capsys.readouterr()
+    assert store.cat('drives/results/one/boxes.csv') == boxes(local)
+    summary = json.loads(store.cat('drives/results/one/summary.json'))
+    assert summary['boxes_in'] == 120
+    assert main(command) == 0
+    assert 'up to date' in capsys.readouterr().out
+    store.pipe('drives/other/file', b'x')
+    assert main(['relabel', str(whole), '-o', 's3://drives/other', *QUICK]) == 1
+    assert 'expected a new folder or an earlier result' in capsys.readouterr().err
+
+
+def test_batch_with_an_object_store(tmp_path, whole, store, capsys):
+    store.put(str(whole), 'drives/one/whole.mcap')
+    command = ['batch', 's3://drives/one/whole.mcap', '-o', 's3://drives/all']
+    assert main([*command, '--set=min_observations=3']) == 0
+    assert store.exists('drives/all/whole/boxes.csv')
+    assert b'whole,done' in store.cat('drives/all/index.csv')
+    assert main([*command, '--set=min_observations=3']) == 0
+    assert '1 of them earlier' in capsys.readouterr().out
+
+
+def test_errors_name_url_and_remedy(tmp_path, capsys):
+    with http_server(tmp_path) as (_, url):
+        missing = f'{url}/missing.mcap'
+        assert main(['relabel', missing, '-o', str(tmp_path / 'out')]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f'boxreg: {missing}: expected a file, got none')
+        assert 'credentials' in line
+    with pytest.raises(RecordingError, match='expected a scheme of fsspec'):
+        part_of(Path('nonsense://host/file.mcap'))
+
+
+def test_ranges_are_read_once(tmp_path):
+    (tmp_path / 'file.mcap').write_bytes(bytes(range(256)) * 4096)
+    with http_server(tmp_path) as (server, url):
+        file = RemoteFile(Path(f'{url}/file.mcap'))
+        assert file.read(0, 8) == bytes(range(8))
+        assert file.read(256, 260) == bytes(range(4))
+        assert len(server.sent) == 1
+        file.prefetch([(2**18, 2**19)])
+        assert file.read(2**18, 2**18 + 2) == b'\0\1'
+        assert file.read(file.size - 1, file.size + 5) == b'\xff'
+        assert len(server.sent) == 3
+        assert file.bytes_read == sum(server.sent)
+        file.close()
