@@ -371,6 +371,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'has no time for are kept; with a deadline of an hour, clouds are dropped.',
         _load,
     ),
+    'scale': ('A fleet of drives', '[Scale](scale.md) says what the figures mean.', _figures),
     'node': ('The live node', 'Publisher, node and observer each a process, over DDS.', _figures),
 }
 

@@ -19,7 +19,7 @@ import numpy as np
 
 POLICIES = {'deadline': [], 'dropping clouds': ['deadline:=3600.0']}
 """Parameters of the node for each way to treat overload."""
-COLUMNS = ('latency p50 [ms]', 'latency p99 [ms]', 'early IoU', 'final IoU', 'clouds dropped')
+SHOWN = ('latency p50 [ms]', 'latency p99 [ms]', 'early IoU', 'final IoU', 'clouds dropped')
 """Values that are printed for each number of tracks."""
 
 
@@ -56,15 +56,15 @@ def run(args: argparse.Namespace) -> int:
         print_json(report)
         return 0
     for policy, rows in report.items():
-        print(f'{policy:16} {"".join(f"{name:>18}" for name in ("input IoU", *COLUMNS))}')
+        print(f'{policy:16} {"".join(f"{name:>18}" for name in ("input IoU", *SHOWN))}')
         for tracks, row in rows.items():
-            cells = [row[name] for name in ('input IoU', *COLUMNS)]
+            cells = [row[name] for name in ('input IoU', *SHOWN)]
             print(f'{tracks:>16} {"".join(f"{value:18.3f}" for value in cells)}')
     return 0
 
 
 def _measured(args: argparse.Namespace, tracks: int, settings: list[str]) -> dict[str, float]:
-    """Return the values of `COLUMNS` for a number of tracks and parameters of the node."""
+    """Return the values of `SHOWN` for a number of tracks and parameters of the node."""
     scope = argparse.Namespace(
         tracks=tracks, points=args.points, rate=10.0, seconds=args.seconds, delay=0.05,
         transport='large', set=settings, record=None,
@@ -74,7 +74,7 @@ def _measured(args: argparse.Namespace, tracks: int, settings: list[str]) -> dic
     overlap = {f'{name} IoU': _mean_iou(scope, messages[name]) for name in ('early', 'final')}
     dropped = float(report['counters'].get('points_queue_full', 0))
     nan = float('nan')  # no message was published
-    latencies = {name: report.get(name, nan) for name in COLUMNS if 'latency' in name}
+    latencies = {name: report.get(name, nan) for name in SHOWN if 'latency' in name}
     return {**latencies, 'input IoU': _input_iou(scope), **overlap, 'clouds dropped': dropped}
 
 

@@ -31,14 +31,14 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 PATIENCE = 10.0
 """A topic without publishers or messages is reported this long after its subscription [s]."""
-MAX_DEPTH = 2**31 - 1
+MAX_QOS_DEPTH = 2**31 - 1
 """Longest queue; derived: DDS counts its samples by a signed integer of 32 bits."""
 
 
 def _depth_result(qos: QoSProfile) -> SetParametersResult:
     """Return whether DDS can have a queue of the depth of a profile."""
-    is_possible = qos.history == HistoryPolicy.KEEP_ALL or 1 <= qos.depth <= MAX_DEPTH
-    reason = f'depth: expected 1 to {MAX_DEPTH}, got {qos.depth}'
+    is_possible = qos.history == HistoryPolicy.KEEP_ALL or 1 <= qos.depth <= MAX_QOS_DEPTH
+    reason = f'depth: expected 1 to {MAX_QOS_DEPTH}, got {qos.depth}'
     return SetParametersResult(successful=is_possible, reason='' if is_possible else reason)
 
 

@@ -191,9 +191,9 @@ def _explained(counts: Mapping[str, int]) -> list[tuple[str, int, Reason]]:
     return sorted(found, key=lambda item: -item[1])
 
 
-def _violated(counts: Mapping[str, Mapping[str, int]]) -> list[tuple[Rule, int, int]]:
+def _violated(sums: Mapping[str, Mapping[str, int]]) -> list[tuple[Rule, int, int]]:
     """Return rules with their violations before and after the run; those never violated not."""
-    found = [(rule, counts['before'][name], counts['after'][name]) for name, rule in RULES.items()]
+    found = [(rule, sums['before'][name], sums['after'][name]) for name, rule in RULES.items()]
     return [row for row in found if row[1] or row[2]]
 
 

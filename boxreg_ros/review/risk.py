@@ -37,7 +37,7 @@ SWITCH_SPEED = 10.0
 """Deviation from constant velocity that is an id switch [m/s], as in `core.registrar`."""
 SWITCH_LOSS = 0.5
 """Loss to expect where the id of a track has switched: half its boxes are of another object."""
-MIN_TRACKS = 8
+MIN_COMPARED = 8
 """Fewest tracks of a class, and fewest of a recording, that show what is usual. Chosen: quartiles
 of fewer are the values of single tracks."""
 MAX_DEVIATIONS = 2.0
@@ -90,9 +90,9 @@ class Usual(NamedTuple):
 
     @classmethod
     def of(cls, tracks: Sequence[TrackChanges]) -> Usual:
-        """Return what is usual; classes of fewer than `MIN_TRACKS` tracks have no sizes."""
+        """Return what is usual; classes of fewer than `MIN_COMPARED` tracks have no sizes."""
         outside = [track.outside.mean() for track in tracks if track.is_refined.any()]
-        usual = float(np.median(outside)) if len(outside) >= MIN_TRACKS else USUAL_OUTSIDE
+        usual = float(np.median(outside)) if len(outside) >= MIN_COMPARED else USUAL_OUTSIDE
         by_class: dict[str, list[Floats]] = {}
         for track in tracks:
             size = np.log(_extents(track)).mean(axis=0)
@@ -100,7 +100,7 @@ class Usual(NamedTuple):
         sizes = {
             name: _median_and_deviation(np.array(of_class))
             for name, of_class in by_class.items()
-            if len(of_class) >= MIN_TRACKS
+            if len(of_class) >= MIN_COMPARED
         }
         return cls(usual, sizes)
 

@@ -3,7 +3,7 @@
 import csv
 
 from boxreg_ros.review.changes import Changes
-from boxreg_ros.review.risk import assess, MIN_TRACKS, Usual
+from boxreg_ros.review.risk import assess, MIN_COMPARED, Usual
 from boxreg_ros.review.tables import assessed, REVIEW_COLUMNS, write_tables
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
@@ -60,7 +60,7 @@ def test_a_face_far_off_its_points_costs_its_distance():
 
 
 def test_extents_unlike_those_of_the_class_raise_the_risk():
-    cars = [track_with(boxes=boxes_of(size)) for size in np.linspace(0.95, 1.05, MIN_TRACKS)]
+    cars = [track_with(boxes=boxes_of(size)) for size in np.linspace(0.95, 1.05, MIN_COMPARED)]
     usual = Usual.of(cars)
     reason = 'size unlike its class'
     assert assess(cars[0], usual).parts[reason].sum() == 0
