@@ -23,8 +23,6 @@ import sys
 from tempfile import TemporaryDirectory
 import time
 
-sys.path.insert(0, str(Path(__file__).parent))
-
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.io.recording import Record, Recording

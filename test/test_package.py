@@ -210,7 +210,7 @@ def test_node_starts_and_ends_from_the_workspace(prefix):
     rclpy.init(context=context)
     observer = rclpy.create_node('observer', context=context)
     try:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 180  # kernels are compiled first
         while '/refined_markers' not in dict(observer.get_topic_names_and_types()):
             assert process.poll() is None, process.communicate()[0]
             assert time.monotonic() < deadline, observer.get_topic_names_and_types()

@@ -404,7 +404,7 @@ def recording(folder: Path, memory: list[float]) -> dict[str, float]:
         'recorded box arrays': float(sum(row.frames for row in rows)),
         'recorded clouds': float(sum(row.clouds for row in rows)),
         'recorded segments': float(len(rows)),
-        'recorded [MB]': 1e-6 * sum(row.bytes for row in rows),
+        'recorded [MB]': 1e-6 * sum(row.size for row in rows),
         'recorder memory in the middle [MB]': memory[len(memory) // 2],
         'recorder memory at the end [MB]': memory[-1],
     }

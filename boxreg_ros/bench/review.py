@@ -132,7 +132,7 @@ def with_pins(drive: Drive, pins: Mapping[str, int]) -> Drive:
     """Return a drive with one pinned box of some tracks, at the true box: stamps by track id."""
     truth = drive.truth
     keys = zip(truth.stamps_ns.tolist(), truth.track_ids, strict=True)
-    true_boxes = {key: box for key, box in zip(keys, truth.boxes, strict=True)}
+    true_boxes = dict(zip(keys, truth.boxes, strict=True))
     arrays = []
     for array in drive.boxes:
         boxes = array.boxes.copy()

@@ -7,7 +7,7 @@ docs/method.md, section Input model, has the formulas (M14) to (M18).
 
 from collections.abc import Sequence
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import FaceConfig, KINDS
 from boxreg_ros.core.batch import EXTENT, GAP, PIVOT, POSE_ERRORS, Problem, SHARED, State
@@ -586,6 +586,10 @@ class InputModel:
         self._known_offsets: FaceOffsets | None = None  # of the present sums
         self._residuals = [dict[str, Floats]() for _ in KINDS]
         self._evidence = [dict[str, Floats]() for _ in KINDS]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what was observed; margins that follow from it are computed again."""
+        return {**vars(self), '_known_offsets': None}
 
     def add_face_observations(
         self,

@@ -103,7 +103,7 @@ class Status:
         Segments completed since the start.
     frames, boxes, clouds : int
         Written since the start.
-    bytes : int
+    size : int
         Size of the label files written since the start.
     rate : float
         Growth of these files over the last seconds [bytes/s].
@@ -125,7 +125,7 @@ class Status:
     frames: int = 0
     boxes: int = 0
     clouds: int = 0
-    bytes: int = 0
+    size: int = 0
     rate: float = 0.0
     free: int = 0
     recovered: int = 0

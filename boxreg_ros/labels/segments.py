@@ -33,7 +33,7 @@ class IndexRow(NamedTuple):
         Stamps, boxes and clouds written.
     left_out : int
         Boxes that a format cannot represent, summed over formats.
-    bytes : int
+    size : int
         Size of its files.
     recovered : int
         1 if it was made from the journal of a recording that was cut off, else
@@ -48,7 +48,7 @@ class IndexRow(NamedTuple):
     boxes: int
     clouds: int
     left_out: int
-    bytes: int
+    size: int
     recovered: int
 
 

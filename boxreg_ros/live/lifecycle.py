@@ -36,13 +36,13 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe and publish."""
-        result = self._tried(self.open)
+        result = self._tried(self.open_topics)
         self._is_active = result == TransitionCallbackReturn.SUCCESS
         if self._is_active:
             self._drained.clear()
             self._activated.put(self.worker)
         else:
-            self.close()
+            self.close_topics()
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -51,7 +51,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         self.worker.stop()
         self._drained.wait()
         self.recording.wait(RECORDING_TIME)
-        self.close()
+        self.close_topics()
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:

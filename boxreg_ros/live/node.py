@@ -49,8 +49,8 @@ class BoxregNode(Node):
     """
     Subscribes to clouds, boxes, TF and odometry; publishes refined boxes.
 
-    Its life has three steps: the constructor declares the parameters, `configure` warms up, `open`
-    creates topics and services. `close` destroys these again.
+    Its life has three steps: the constructor declares the parameters, `configure` warms up,
+    `open_topics` creates topics and services. `close_topics` destroys these again.
 
     Callbacks run in the thread of the executor. They put messages and events into the inbox and
     return at once. `worker` runs in another thread and does the rest.
@@ -58,7 +58,7 @@ class BoxregNode(Node):
     Attributes
     ----------
     worker : Worker
-        Registers boxes and publishes them in the thread of `run_worker`; made by `open`.
+        Registers boxes and publishes them in the thread of `run_worker`; made by `open_topics`.
     recording : Recording
         Writes the final boxes as label files, where that is asked for.
 
@@ -107,7 +107,7 @@ class BoxregNode(Node):
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
 
-    def open(self) -> None:
+    def open_topics(self) -> None:
         """
         Create topics, services and timers.
 
@@ -132,8 +132,8 @@ class BoxregNode(Node):
             self._live, self._inbox, self._health, self.get_logger(), self._budget,
             options.backlog, self._markers,
         )  # fmt: skip
-        self.recording.open()
-        self._opened.callback(self.recording.close)
+        self.recording.offer_services()
+        self._opened.callback(self.recording.withdraw_services)
         if options.record_to:
             self.recording.start()
         self._subscribe_to_points(options.points_type, options.lidars)
@@ -157,8 +157,8 @@ class BoxregNode(Node):
             self._opened.callback(self.destroy_timer, self._search_timer)
             self.get_logger().info(f'waiting for the type of {name}; {self._topics.description()}')
 
-    def close(self) -> None:
-        """Destroy what `open` has created; the worker has ended before."""
+    def close_topics(self) -> None:
+        """Destroy what `open_topics` has created; the worker has ended before."""
         self._opened.close()
 
     def run_worker(self) -> None:

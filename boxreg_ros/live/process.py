@@ -51,7 +51,7 @@ def make_node(program: str, arguments: list[str], is_managed: bool = False) -> B
         return BoxregLifecycleNode()
     node = BoxregNode()
     node.configure()
-    node.open()
+    node.open_topics()
     return node
 
 

@@ -70,7 +70,7 @@ class Recording:
         self._is_shown = False
         self._services: list[Service] = []
 
-    def open(self) -> None:
+    def offer_services(self) -> None:
         """Create the services."""
         # Their callbacks wait: in the group of the others, these would wait with them.
         group = ReentrantCallbackGroup()
@@ -81,7 +81,7 @@ class Recording:
             for name, callback in callbacks.items()
         ]
 
-    def close(self) -> None:
+    def withdraw_services(self) -> None:
         """Destroy the services."""
         for service in self._services:
             self._node.destroy_service(service)
@@ -212,7 +212,7 @@ def _values_of(recorder: RecorderProcess) -> dict[str, object]:
         'clouds': status.clouds,
         'frames without cloud': status.without_cloud,
         'boxes left out of formats': status.left_out,
-        'written [MB]': f'{1e-6 * status.bytes:.1f}',
+        'written [MB]': f'{1e-6 * status.size:.1f}',
         'rate [MB/s]': f'{1e-6 * status.rate:.2f}',
         'disk free [GB]': f'{1e-9 * status.free:.1f}',
         'disk full in [h]': 'unknown' if left is None else f'{left / 3600:.2f}',

@@ -117,7 +117,9 @@ class Journal:
 
             def await_and_store() -> list[Estimate | None]:
                 found = get_estimates()
-                self._append(pickle.dumps((checksum, found, vars(model)), pickle.HIGHEST_PROTOCOL))
+                self._append(
+                    pickle.dumps((checksum, found, model.__getstate__()), pickle.HIGHEST_PROTOCOL)
+                )
                 self._num_records += 1
                 return found
 

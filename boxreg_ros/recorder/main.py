@@ -130,14 +130,14 @@ class Recorder:
                 f'let nothing delete it meanwhile'
             )
         open_bytes = 0 if segment is None else self._growth.measure(segment.files)
-        size = self._written['bytes'] + open_bytes
+        size = self._written['size'] + open_bytes
         if segment is not None and self._limits_bytes and open_bytes >= self._limit:
             self._end_segment()
         left_out = 0 if segment is None else segment.files.left_out
         return replace(
             self._counted(),
             segment='' if segment is None else segment.name,
-            bytes=size,
+            size=size,
             rate=self._growth.rate(size),
             free=shutil.disk_usage(self._folder).free,
             left_out=self._written['left_out'] + left_out,
@@ -196,7 +196,7 @@ class Recorder:
             completion.result()
             self._completions.popleft()
             self._written['segments'] += 1
-            self._written['bytes'] += segment.files.size
+            self._written['size'] += segment.files.size
             self._written['left_out'] += segment.files.left_out
 
 

@@ -62,7 +62,7 @@ def face_in_ego(i):
 
 
 def face_in_map(i):
-    """The same points in the map."""
+    """Return the points of `face_in_ego` in the map."""
     x, y, z = face_in_ego(i).T
     return ego_position(i) + np.stack([-y, x, z], axis=1)
 

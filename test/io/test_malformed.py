@@ -93,7 +93,7 @@ def test_json_of_wrong_types_is_unreadable_or_decoded(tmp_path, topic):
 def own_fault(kind):
     """Return an adapter function that raises an exception."""
 
-    def from_msg(message):
+    def from_msg(message, *_):
         if kind is AttributeError:
             return np.a_function_that_old_versions_lack(message)
         if kind is TypeError:

@@ -134,12 +134,12 @@ def test_segments_end_after_their_time(tmp_path, segment, expected):
     rows = read_index(tmp_path)
     assert [row.frames for row in rows] == expected
     assert (status.frames, status.boxes, status.segments) == (25, 50, len(expected))
-    assert status.bytes == sum(row.bytes for row in rows)
+    assert status.size == sum(row.size for row in rows)
     for row, part in zip(rows, np.split(np.arange(25), np.cumsum(expected))[:-1], strict=True):
         assert row.first_stamp_ns == START + part[0] * SECOND // 10
         assert row.last_stamp_ns == START + part[-1] * SECOND // 10
         files = {path for path in (tmp_path / row.segment).rglob('*') if path.is_file()}
-        assert row.bytes == sum(path.stat().st_size for path in files)
+        assert row.size == sum(path.stat().st_size for path in files)
     for name in ('csv', 'openlabel'):
         assert stamps_in(tmp_path, name) == list(range(25))
 
@@ -167,7 +167,7 @@ def test_segments_end_at_their_size(tmp_path):
     output, _ = recorder.communicate(timeout=30)
     rows = read_index(tmp_path)
     assert len(rows) > 1
-    assert all(row.bytes >= 0.2e6 for row in rows[:-1])
+    assert all(row.size >= 0.2e6 for row in rows[:-1])
     status = last_status(output)
     assert (status.clouds, status.without_cloud, status.error) == (28, 0, '')
     assert status.free > 0

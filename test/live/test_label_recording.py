@@ -56,7 +56,7 @@ class Robot:
         """Call a service of the node and return its response."""
         return self._request(Trigger, name, Trigger.Request())
 
-    def set(self, name, value):
+    def set_parameter(self, name, value):
         """Set a parameter of the node."""
         parameters = [Parameter(name, value=value).to_parameter_msg()]
         request = SetParameters.Request(parameters=parameters)
@@ -194,12 +194,12 @@ def test_services_start_split_and_stop_a_recording(tmp_path):
             assert not answer.success
             assert error in answer.message
         (tmp_path / 'file').write_text('')
-        robot.set('record_to', str(tmp_path / 'file'))
+        robot.set_parameter('record_to', str(tmp_path / 'file'))
         answer = robot.call('start_recording')
         assert not answer.success
         assert 'file' in answer.message
         graph.wait(lambda: robot.state()[0] == DiagnosticStatus.ERROR, 'an ERROR')
-        robot.set('record_to', str(folder))
+        robot.set_parameter('record_to', str(folder))
         answer = robot.call('start_recording')
         assert answer.success, answer.message
         assert 'call ~/stop_recording first' in robot.call('start_recording').message
