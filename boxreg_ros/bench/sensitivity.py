@@ -18,7 +18,7 @@ import ast
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from fnmatch import fnmatch
 from functools import partial
 from importlib import import_module
@@ -417,9 +417,10 @@ def measure(drive: Drive, measurement: Measurement, variation: Variation | None)
             predicted = drive.registered(config)[estimate]
         else:
             with changed_constant(variation.place, variation.value):
-                # The class that the changed core is imported by; it reads attributes only.
+                # The class that the changed core is imported by, with the same content.
                 changed: Any = import_module(Drive.__module__).Drive
-                predicted = changed.registered(drive, config)[estimate]
+                content = {item.name: getattr(drive, item.name) for item in fields(drive)}
+                predicted = changed(**content).registered(config)[estimate]
         scope = (measurement.min_points, measurement.classes)
         scores = summarise(match(predicted, drive.truth, *scope))
     except Exception as error:  # a number out of its range may fail anywhere in the core
