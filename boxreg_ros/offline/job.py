@@ -69,11 +69,11 @@ class Job:
     def files(self) -> Iterator[Path]:
         """Yield all files of the recordings on this machine."""
         for path in self.recordings:
-            if url_of(path) is not None:
-                continue
             address = address_of(path)
-            if address is not None:
+            if address is not None:  # before `url_of`: it looks like a URL
                 yield from scene_files(address)
+                continue
+            if url_of(path) is not None:
                 continue
             inner = sorted(path.iterdir()) if path.is_dir() else [path]
             yield from (file for file in inner if file.is_file())
@@ -89,7 +89,7 @@ class Job:
     def entries(self) -> Iterator[Entry]:
         """Yield all files of the recordings behind URLs."""
         for path in self.recordings:
-            if url_of(path) is not None:
+            if url_of(path) is not None and address_of(path) is None:
                 yield from entries_of(path)
 
     def fail(self, reason: str) -> None:

@@ -52,14 +52,11 @@ from scenes import (
 import torch
 
 D = torch.float64
-pytest.importorskip('numba')
-from boxreg_ros.core.kernels import (  # noqa: E402 (after the skip)
-    arrowhead,
-    face_support,
-    normal_equations,
-    rounds,
-    weights,
-)
+arrowhead = pytest.importorskip('boxreg_ros.core.kernels.arrowhead')
+face_support = pytest.importorskip('boxreg_ros.core.kernels.face_support')
+normal_equations = pytest.importorskip('boxreg_ros.core.kernels.normal_equations')
+rounds = pytest.importorskip('boxreg_ros.core.kernels.rounds')
+weights = pytest.importorskip('boxreg_ros.core.kernels.weights')
 from test_kernels import term_arrays  # noqa: E402
 
 
