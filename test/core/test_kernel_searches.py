@@ -49,6 +49,7 @@ from scenes import (
     track_of,
     window_of,
 )
+from test_kernels import term_arrays
 import torch
 
 D = torch.float64
@@ -57,7 +58,6 @@ face_support = pytest.importorskip('boxreg_ros.core.kernels.face_support')
 normal_equations = pytest.importorskip('boxreg_ros.core.kernels.normal_equations')
 rounds = pytest.importorskip('boxreg_ros.core.kernels.rounds')
 weights = pytest.importorskip('boxreg_ros.core.kernels.weights')
-from test_kernels import term_arrays  # noqa: E402
 
 
 def assert_equal(found, known, tolerance=1e-9):

@@ -1,6 +1,7 @@
 """The node writes labels while it drives: equal to those of `relabel`, in whole segments."""
 
 import csv
+import time
 
 from boxreg_ros.cli import main
 from boxreg_ros.labels import FORMATS
@@ -83,6 +84,11 @@ class Robot:
 
 
 def index_of(folder):
+    """Return the index, once the recorder has completed the last segment after its node."""
+    deadline = time.monotonic() + 60
+    while not (folder / 'index.csv').is_file() or list(folder.glob('.segment_*')):
+        assert time.monotonic() < deadline, 'the recorder did not complete the last segment'
+        time.sleep(0.05)
     with (folder / 'index.csv').open() as file:
         return list(csv.DictReader(file))
 
