@@ -1,5 +1,5 @@
 """
-Layouts of point clouds by LiDAR drivers, told apart by their fields, and the times of points.
+Layouts of point clouds by LiDAR drivers, recognised by their fields, and the times of points.
 
 A layout states field and unit of the times. Without a known layout both are derived from type and
 magnitude.
@@ -39,7 +39,7 @@ class PointLayout(NamedTuple):
     name : str
         Of the sensor or the point type.
     kinds : dict of str and str
-        Fields that tell the layout from others, with the kind of their numbers; any if empty.
+        Fields that identify the layout, with the kind of their numbers; any if empty.
     time_field, unit : str
         Field of the times and their unit; empty if there are none.
 
