@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 from ros_messages import Drive, SECOND, START
 
+pytest.importorskip('aiohttp', reason='the extra "remote" is not installed')
+
 QUICK = ['--set=min_observations=3', '--formats=csv']
 
 

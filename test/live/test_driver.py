@@ -341,7 +341,8 @@ def test_a_pause_of_playback_does_not_change_later_boxes():
         out += live.feed(second) + live.flush()
         finals.append([item.refined.boxes.boxes for item in out if item.is_final][8:])
     assert len(finals[0]) == 8
-    np.testing.assert_array_equal(*finals)
+    # To rounding: a kernel compiled in this process adds in another order than one from the cache.
+    np.testing.assert_allclose(*finals, rtol=0, atol=1e-9)
 
 
 def test_held_boxes_are_published_after_silence():
