@@ -158,10 +158,9 @@ def _classes(measured: Any) -> str:
     header = [f'{name} ({row["boxes"]})' for name, row in names.items()]
     rows = []
     for method, scores in measured.items():
-        pairs = [
-            (scores['by_class'][name][key] for key in ('iou_bev', 'iou_3d')) for name in names
-        ]
-        rows.append([method, *(' / '.join(map(_number, pair)) for pair in pairs)])
+        found = [scores['by_class'][name] for name in names]
+        pairs = [f'{_number(row["iou_bev"])} / {_number(row["iou_3d"])}' for row in found]
+        rows.append([method, *pairs])
     return _table(['BEV / 3D IoU by class (boxes)', *header], rows)
 
 
