@@ -27,8 +27,7 @@ def tensor(values):
 
 # --- derivatives --------------------------------------------------------------------------------
 
-NAMES = ['faces', 'input_pose', 'rigid_shape', 'acceleration', 'zero_motion', 'slip']
-NAMES += ['shared_prior', 'marginalisation_prior']
+NAMES = list(terms_of(random_problem()))
 
 
 def test_state_packs_and_unpacks():

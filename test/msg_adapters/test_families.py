@@ -55,14 +55,18 @@ def moved_boxes(given, frame_id='lidar', boxes=None):
     return replace(given, frame_id=frame_id, boxes=given.boxes + step if boxes is None else boxes)
 
 
+def posed_of(message, type_name):
+    """Return the ``PoseWithCovariance`` of each box of a message."""
+    if type_name == DETECTIONS:
+        return [detection.results[0].pose for detection in message.detections]
+    if type_name == OBJECTS_WITH_COVARIANCE:
+        return [item.pose for item in message.objects]
+    return [item.kinematics.pose_with_covariance for item in message.objects]
+
+
 def covariances_of(message, type_name):
     """Return the covariances (n, 6, 6) of a message."""
-    if type_name == DETECTIONS:
-        found = [d.results[0].pose.covariance for d in message.detections]
-    elif type_name == OBJECTS_WITH_COVARIANCE:
-        found = [o.pose.covariance for o in message.objects]
-    else:
-        found = [o.kinematics.pose_with_covariance.covariance for o in message.objects]
+    found = [posed.covariance for posed in posed_of(message, type_name)]
     return np.array(found).reshape(-1, 6, 6)
 
 
@@ -120,10 +124,7 @@ def test_kept_boxes_keep_the_covariance_of_the_detector(type_name):
 @pytest.mark.parametrize('type_name', WITH_COVARIANCE)
 def test_covariances_are_rotated_to_the_output_frame(type_name):
     message, adapter = message_of(type_name), adapter_for(type_name)
-    items = message.objects if hasattr(message, 'objects') else message.detections
-    for item in items:
-        posed = item.results[0].pose if hasattr(item, 'results') else getattr(item, 'pose', None)
-        posed = posed or item.kinematics.pose_with_covariance
+    for posed in posed_of(message, type_name):
         posed.covariance = np.diag([4.0, 1.0, 0, 0, 0, 0]).reshape(36)
     T = np.eye(4)
     T[:2, :2] = [[0, -1], [1, 0]]  # yaw of 90 degrees: x becomes y
