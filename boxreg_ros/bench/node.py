@@ -437,8 +437,9 @@ def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
 
 
 def children_of(pid: int) -> list[int]:
-    """Return the processes that a process has started."""
-    return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+    """Return the processes that a process has started, in any of its threads."""
+    lists = Path(f'/proc/{pid}/task').glob('*/children')
+    return [int(word) for children in lists for word in children.read_text().split()]
 
 
 def vitals(pid: int) -> tuple[float, int, int, float]:
