@@ -22,7 +22,7 @@ HEADER = 4
 """Bytes before the first field; alignment counts from there."""
 LITTLE_ENDIAN = 1
 """Second byte of the header, of the only encoding that is walked."""
-NUMBERS, TEXT, SEQUENCE, ITEMS, END = range(5)
+STEP_NUMBERS, STEP_TEXT, STEP_SEQUENCE, STEP_ITEMS, STEP_END = range(5)
 """Steps of a walk: numbers, a string, a sequence of numbers; begin and end of repeated steps."""
 SIZES = {
     **dict.fromkeys(('boolean', 'octet', 'char', 'int8', 'uint8'), 1),
@@ -97,10 +97,10 @@ class Layout:
         element = match['of'] or match['one']
         count = -1 if match['of'] else int(match['n'] or 1)  # -1: the message has the length
         if element in SIZES:
-            yield (SEQUENCE if count < 0 else NUMBERS), SIZES[element], count, path
+            yield (STEP_SEQUENCE if count < 0 else STEP_NUMBERS), SIZES[element], count, path
             return
         if element == 'string':
-            inner = [(TEXT, 1, 1, path)]
+            inner = [(STEP_TEXT, 1, 1, path)]
         elif '/' in element:
             package, _, name = element.partition('/')
             inner = list(
@@ -111,9 +111,9 @@ class Layout:
         if count == 1:
             yield from inner
             return
-        yield ITEMS, len(inner), count, path
+        yield STEP_ITEMS, len(inner), count, path
         yield from inner
-        yield END, 0, 0, ''
+        yield STEP_END, 0, 0, ''
 
 
 class Fields:
@@ -139,11 +139,11 @@ class Fields:
         self._places = places
 
     def counts(self, path: str) -> NDArray[np.int64]:
-        """Return the counts (k,) of a sequence or array, for each item that it is in."""
+        """Return how many elements (k,) a sequence or array has, for each item that it is in."""
         return self._places[path][:, 1]
 
     def numbers(self, path: str, dtype: str, width: int = 1) -> NDArray[Any]:
-        """Return numbers (k, width): a field and those that follow it without a gap."""
+        """Return a field and the numbers that follow it without a gap, as an array (k, width)."""
         values: NDArray[Any] = self._body.view(dtype)[self._index(path, dtype, width)]
         return values
 
@@ -231,14 +231,14 @@ def _walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
     while i < len(steps):
         step, width, count, column = steps[i]
         i += 1
-        if step == END:
+        if step == STEP_END:
             lefts[depth] -= 1
             if lefts[depth] > 0:
                 i = firsts[depth]
             else:
                 depth -= 1
             continue
-        if step == TEXT or count < 0:
+        if step == STEP_TEXT or count < 0:
             position = (position + 3) // 4 * 4
             if position + 4 > size:
                 return False
@@ -247,11 +247,11 @@ def _walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
             count = low | high << 16
             position += 4
         begin = position
-        if step == ITEMS and count > 0:
+        if step == STEP_ITEMS and count > 0:
             depth += 1
             firsts[depth] = i
             lefts[depth] = count
-        elif step == ITEMS:
+        elif step == STEP_ITEMS:
             i += width + 1
         elif count > 0:
             begin = (position + width - 1) // width * width

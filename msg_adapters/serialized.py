@@ -22,7 +22,7 @@ from msg_adapters.registry import adapter_for, ConvertingAdapter
 import numpy as np
 from numpy.typing import NDArray
 
-POSE, SIZE, COVARIANCE = 7, 3, 36
+POSE_WIDTH, SIZE_WIDTH, COVARIANCE_WIDTH = 7, 3, 36
 """Numbers of a pose (position, quaternion), of a size and of a covariance."""
 HALF_TURN_SIGNS = np.tile([-1.0, -1.0, 1.0], 2)
 """Signs of the numbers of a twist or acceleration that is rotated by 180 degrees about z."""
@@ -138,7 +138,8 @@ class SerializedAdapter:
         at = self._at
         rows = self._rows(fields)
         boxes = poses.boxes_from(
-            fields.numbers(at.pose, '<f8', POSE)[rows], fields.numbers(at.size, '<f8', SIZE)[rows]
+            fields.numbers(at.pose, '<f8', POSE_WIDTH)[rows],
+            fields.numbers(at.size, '<f8', SIZE_WIDTH)[rows],
         )
         if at.has_angles is not None:
             boxes[~at.has_angles(fields), ROLL : YAW + 1] = np.nan
@@ -161,8 +162,8 @@ class SerializedAdapter:
             given = self._deserialize(msg, self._kind)
             return self._inner.to_msg(given, boxes, covariances, T_out_in)
         rows = self._rows(fields)
-        pose = fields.numbers(at.pose, '<f8', POSE)
-        size = fields.numbers(at.size, '<f8', SIZE)
+        pose = fields.numbers(at.pose, '<f8', POSE_WIDTH)
+        size = fields.numbers(at.size, '<f8', SIZE_WIDTH)
         old_pose, old_size = pose[rows].copy(), size[rows].copy()
         quaternions_xyzw = poses.quaternions_of(boxes.boxes)
         pose[rows, :3] = _finite_or(boxes.boxes[:, :3], old_pose[:, :3])
@@ -170,11 +171,11 @@ class SerializedAdapter:
         size[rows] = _finite_or(boxes.boxes[:, LENGTH:ROLL], old_size)
         fields.put(at.pose, pose)
         fields.put(at.size, size)
-        covariance = np.full((len(boxes.boxes), COVARIANCE), np.nan)
+        covariance = np.full((len(boxes.boxes), COVARIANCE_WIDTH), np.nan)
         if covariances is not None:
-            covariance[:] = covariances.reshape(-1, COVARIANCE)
+            covariance[:] = covariances.reshape(-1, COVARIANCE_WIDTH)
         if at.covariance:
-            own = fields.numbers(at.covariance, '<f8', COVARIANCE)
+            own = fields.numbers(at.covariance, '<f8', COVARIANCE_WIDTH)
             fields.put(at.covariance, _finite_or(covariance, own))
         at.write(fields, Rewrite(boxes, old_pose, pose[rows], old_size, covariance))
         return fields.message()
@@ -252,7 +253,7 @@ def _write_hypotheses(fields: Fields, rewrite: Rewrite) -> None:
     """Write pose and covariance of each box into its hypotheses."""
     counts = fields.counts('detections.results')
     fields.put(RESULT_POSE, np.repeat(rewrite.new_pose, counts, axis=0))
-    own = fields.numbers(RESULT_COVARIANCE, '<f8', COVARIANCE)
+    own = fields.numbers(RESULT_COVARIANCE, '<f8', COVARIANCE_WIDTH)
     fields.put(RESULT_COVARIANCE, _finite_or(np.repeat(rewrite.covariance, counts, axis=0), own))
 
 
@@ -277,14 +278,14 @@ def _marker_labels(fields: Fields) -> Labels:
 # ---------------------------------------------------------------- autoware_perception_msgs
 
 KINEMATICS = 'objects.kinematics.'
-CORNERS = 'objects.shape.footprint.points'
-TWIST = KINEMATICS + 'twist_with_covariance.twist.linear.x'
-ACCELERATION = KINEMATICS + 'acceleration_with_covariance.accel.linear.x'
+FOOTPRINT = 'objects.shape.footprint.points'
+TWIST_FIELD = KINEMATICS + 'twist_with_covariance.twist.linear.x'
+ACCELERATION_FIELD = KINEMATICS + 'acceleration_with_covariance.accel.linear.x'
 HAS_COVARIANCE = KINEMATICS + 'has_position_covariance'
 AUTOWARE_FIELDS = (
     'objects.existence_probability', 'objects.classification', 'objects.classification.label',
-    'objects.classification.probability', KINEMATICS + 'orientation_availability', TWIST,
-    'objects.shape.type', CORNERS, CORNERS + '.x',
+    'objects.classification.probability', KINEMATICS + 'orientation_availability', TWIST_FIELD,
+    'objects.shape.type', FOOTPRINT, FOOTPRINT + '.x',
 )  # fmt: skip
 
 
@@ -328,9 +329,9 @@ def _write_footprints_and_motion(fields: Fields, rewrite: Rewrite, *motions: str
     is_scaled = (old_size > 0).all(1) & np.isfinite(new_size).all(1)
     scale = np.ones((len(new_size), 3))
     scale[is_scaled, :2] = new_size[is_scaled] / old_size[is_scaled]
-    corners = fields.numbers(CORNERS + '.x', '<f4', 3)
-    scaled = corners * np.repeat(scale, fields.counts(CORNERS), axis=0)
-    fields.put(CORNERS + '.x', scaled.astype('<f4'))
+    corners = fields.numbers(FOOTPRINT + '.x', '<f4', 3)
+    scaled = corners * np.repeat(scale, fields.counts(FOOTPRINT), axis=0)
+    fields.put(FOOTPRINT + '.x', scaled.astype('<f4'))
     is_flipped = (_forward(rewrite.old_pose) * _forward(rewrite.new_pose)).sum(1) < 0
     signs = np.concatenate([HALF_TURN_SIGNS, np.outer(HALF_TURN_SIGNS, HALF_TURN_SIGNS).ravel()])
     for path in motions:
@@ -340,11 +341,11 @@ def _write_footprints_and_motion(fields: Fields, rewrite: Rewrite, *motions: str
 
 
 def _write_tracked(fields: Fields, rewrite: Rewrite) -> None:
-    _write_footprints_and_motion(fields, rewrite, TWIST, ACCELERATION)
+    _write_footprints_and_motion(fields, rewrite, TWIST_FIELD, ACCELERATION_FIELD)
 
 
 def _write_detected(fields: Fields, rewrite: Rewrite) -> None:
-    _write_footprints_and_motion(fields, rewrite, TWIST)
+    _write_footprints_and_motion(fields, rewrite, TWIST_FIELD)
     own = fields.numbers(HAS_COVARIANCE, '|u1')
     is_estimated = np.isfinite(rewrite.covariance).all(1, keepdims=True)
     fields.put(HAS_COVARIANCE, own | is_estimated.astype('|u1'))
@@ -366,7 +367,7 @@ OBJECT_FIELDS = (
 
 def _has_boxes_only(fields: Fields) -> bool:
     is_box = fields.numbers('objects.shape.type', '|u1') == derived.BOX
-    return bool(is_box.all() and (fields.counts(DIMENSIONS) == SIZE).all())
+    return bool(is_box.all() and (fields.counts(DIMENSIONS) == SIZE_WIDTH).all())
 
 
 def _object_labels(fields: Fields) -> Labels:
@@ -437,7 +438,7 @@ BOX_FIELDS = {
         KINEMATICS + 'pose_with_covariance.pose.position.x',
         'objects.shape.dimensions.x',
         _tracked_labels,
-        others=(*AUTOWARE_FIELDS, ACCELERATION, 'objects.object_id.uuid'),
+        others=(*AUTOWARE_FIELDS, ACCELERATION_FIELD, 'objects.object_id.uuid'),
         covariance=KINEMATICS + 'pose_with_covariance.covariance',
         is_ordinary=_has_no_cylinder,
         has_angles=_is_oriented,
