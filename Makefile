@@ -24,9 +24,14 @@ tests := $(VENV)/.tests-$(version)
 consumers := .venv-consumers/.done-$(version)
 jazzy := $(VENV_JAZZY)/.done
 
-# Rooms without nodes, processes and pictures: the tests that depend on numpy, SciPy and pytest.
-JAZZY_TESTS := --ignore test/core/test_refine.py test/test_config.py test/core test/io test/msg_adapters \
-    test/labels/test_labels.py test/offline/test_evaluate.py test/offline/test_relabel.py test/live/test_driver.py
+# Rooms without nodes, processes and pictures: the tests that depend on numpy, SciPy and numba, and
+# two that take a recording all the way.
+JAZZY_TESTS := $(addprefix --ignore test/core/,test_refine.py test_kernel_cache.py test_kernel_searches.py) \
+    $(addprefix --ignore test/io/,test_damaged.py test_malformed.py test_remote.py) \
+    test/test_config.py test/core test/io test/msg_adapters test/labels/test_labels.py \
+    test/offline/test_evaluate.py test/live/test_driver.py \
+    test/offline/test_relabel.py::test_every_box_is_written_once_in_order \
+    test/offline/test_relabel.py::test_refined_boxes_match_the_truth_in_the_fixed_frame
 
 # Each worker begins with one end of the suite and takes tests of the other when it is done.
 SHARED := -n $(WORKERS) --dist worksteal

@@ -25,7 +25,8 @@ import time
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
-from boxreg_ros.io.recording import Record, Recording
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage.record import Record
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.relabel import relabel
@@ -122,12 +123,12 @@ def messages(folder):
     recording = Recording([Drive(sweeps=1).write(folder / 'messages')])
     recording.__enter__()
     for topic in ('/points', '/boxes', '/tf'):
-        record = next(recording._read(recording._connections({topic})))
+        record = next(recording._read({topic}))
 
         def read(data, record=record):
             tampered = Record(record.connection, record.received_ns, data)
             if record.connection.topic == '/tf':
-                recording._add_motion(TransformTree(), tampered)
+                recording._follow(TransformTree(), tampered)
             else:
                 recording._item(tampered, with_intensities=True)
 

@@ -13,6 +13,7 @@ from boxreg_ros.live.topics import import_message
 from msg_adapters import vision
 import numpy as np
 from paths import ROOT
+from preloaded import NODE, PreloadedProcess
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -48,15 +49,15 @@ class Graph:
         self.processes = []
         self.publishers = {}
 
-    def start(self, *ros_args, command=('-m', 'boxreg_ros.live.main')):
+    def start(self, *ros_args, command=('-m', NODE)):
         """Start the node with arguments after --ros-args."""
-        process = NodeProcess(self, [sys.executable, *command, '--ros-args', *ros_args])
+        process = NodeProcess(self, [*command, '--ros-args', *ros_args])
         self.processes.append(process)
         return process
 
     def start_player(self, path, boxes_topic='/boxes'):
         """Start a process that plays a recording when a line arrives on its standard input."""
-        command = [sys.executable, __file__, str(path), boxes_topic, str(self.domain)]
+        command = [__file__, str(path), boxes_topic, str(self.domain)]
         process = NodeProcess(self, command)
         process.is_ending = True
         self.processes.append(process)
@@ -122,25 +123,26 @@ class Graph:
 
 
 class NodeProcess:
-    """A started process; its output is written to a file."""
+    """A process of Python with some arguments; its output is written to a file."""
 
     def __init__(self, graph, command):
         self._graph = graph
         self._log = graph.folder / f'node{len(graph.processes)}.log'
         self.is_ending = False
-        environment = {
-            **os.environ,
-            'ROS_DOMAIN_ID': str(graph.domain),
-            'ROS_LOG_DIR': str(graph.folder),
-        }
+        environment = {'ROS_DOMAIN_ID': str(graph.domain), 'ROS_LOG_DIR': str(graph.folder)}
+        option, *words = command
+        if option == '-m':
+            module, *arguments = words
+            self.popen = PreloadedProcess(module, arguments, environment, self._log)
+            return
         with self._log.open('w') as log:
             self.popen = subprocess.Popen(
-                command, cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=log,
-                stderr=subprocess.STDOUT,
+                [sys.executable, *command], cwd=ROOT, env={**os.environ, **environment},
+                stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT,
             )  # fmt: skip
 
     def output(self):
-        return self._log.read_text()
+        return self._log.read_text() if self._log.exists() else ''
 
     def stop(self, number=signal.SIGINT):
         """Send a signal, spin until the process has ended, and return the time it took [s]."""

@@ -10,8 +10,8 @@ from typing import Self
 from boxreg_ros.datasets.protocol import Scene, SweepFile
 from boxreg_ros.datasets.registry import Address, module_of, open_scene, resolved, scene_files
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
+from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, Stage
 from boxreg_ros.io.lidars import SensorPlacement
-from boxreg_ros.io.recording import Item, LOOKAHEAD_NS, not_measured, Stage
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of, LabelFrame

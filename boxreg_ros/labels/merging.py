@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from boxreg_ros.io.recording import Item
+from boxreg_ros.io.items import Item
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels.protocol import LabelFrame
 

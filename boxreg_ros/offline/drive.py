@@ -12,7 +12,8 @@ from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.datasets import SceneRecording
 from boxreg_ros.errors import RecordingError, TransformUnavailable
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.recording import left_out, Recording
+from boxreg_ros.io.items import left_out
+from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.session import register
 from boxreg_ros.io.transforms import sweep_to_frame, to_fixed_frame, TransformTree
 from boxreg_ros.rotations import matrix_from_rpy

@@ -32,7 +32,7 @@ from boxreg_ros.offline.result_folder import spare_file
 from boxreg_ros.offline.timeline import check_plotly, merged_spans, write_timeline
 
 if TYPE_CHECKING:
-    from boxreg_ros.io.recording import Item, ItemSource
+    from boxreg_ros.io.items import Item, ItemSource
     from boxreg_ros.io.transforms import Link
 
 DONE = 0

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, TransformUnavailable
-from boxreg_ros.io.recording import Item, ItemSource, not_measured, Recording, Stage
+from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage
+from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of
 from boxreg_ros.labels.merging import LabelMerger

@@ -14,8 +14,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, cast, NamedTuple
 
+from boxreg_ros.io.items import Item, ItemSource
 from boxreg_ros.io.lidars import MergedSweep
-from boxreg_ros.io.recording import Item, ItemSource
 from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.transforms import inverse, sweep_to_frame

@@ -8,7 +8,7 @@ import tempfile
 from typing import Any
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.recording import VISION_DEFINITIONS
+from boxreg_ros.io.message_decoder import VISION_DEFINITIONS
 from boxreg_ros.rotations import matrix_from_rpy, quaternion_from_matrix
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, Sweep
 from msg_adapters.concatenation import INFO_TYPE

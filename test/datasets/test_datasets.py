@@ -8,7 +8,7 @@ from typing import NamedTuple
 from boxreg_ros.cli import main
 from boxreg_ros.datasets import address_of, SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
-from boxreg_ros.io.recording import ItemSource
+from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.structures import Sweep

@@ -70,7 +70,7 @@ def test_other_fields_are_copied_in_the_encoding_of_the_input(tmp_path, encoding
         ((_, _, raw),) = make_reader(file).iter_messages('/boxes')
     with Recording([path]) as recording:
         (record,) = recording._records(TransformTree(), {'/boxes'})
-        message = recording._message(record)
+        message = recording._decoder.message(record)
         adapter = adapter_for(SCENE)
         boxes = adapter.from_msg(message)
         longer = replace(boxes, boxes=boxes.boxes + np.array([0, 0, 0, 1, 0, 0, 0, 0, 0]))

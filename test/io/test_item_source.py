@@ -1,7 +1,8 @@
 """Bags, MCAP files of Foxglove and label files are read through one protocol."""
 
 from boxreg_ros.cli import main
-from boxreg_ros.io.recording import ItemSource, Recording
+from boxreg_ros.io.items import ItemSource
+from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
 from boxreg_ros.offline.labelled_recording import LabelledRecording
 from boxreg_ros.structures import Sweep

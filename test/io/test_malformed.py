@@ -5,7 +5,8 @@ import json
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import UnsupportedMessage
-from boxreg_ros.io.recording import Record, Recording
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage.record import Record
 from boxreg_ros.io.transforms import TransformTree
 from foxglove_recordings import write_foxglove_mcap
 from mcap.reader import make_reader
@@ -38,7 +39,7 @@ def outcomes(recording, record, changed):
         tampered = Record(record.connection, record.received_ns, data)
         if record.connection.topic == '/tf':
             before = recording.unreadable.total()
-            recording._add_motion(TransformTree(), tampered)
+            recording._follow(TransformTree(), tampered)
             decoded += recording.unreadable.total() == before
         else:
             decoded += recording._item(tampered, with_intensities=True) is not None
@@ -52,7 +53,7 @@ def test_corrupted_bytes_are_unreadable_or_decoded(tmp_path, topic):
     topic = '/boxes' if topic in ADAPTERS else topic
     rng = np.random.default_rng(0)
     with Recording([path], convention=Convention(associate=True)) as recording:
-        record = next(recording._read(recording._connections({topic})))
+        record = next(recording._read({topic}))
         changed = [corrupted(bytes(record.data), rng) for _ in range(300)]
         assert 0 < outcomes(recording, record, changed) < 300
 
@@ -84,7 +85,7 @@ def test_json_of_wrong_types_is_unreadable_or_decoded(tmp_path, topic):
         raw = json.loads(next(make_reader(file).iter_messages(topic))[2].data)
     rng = np.random.default_rng(0)
     with Recording([path]) as recording:
-        record = next(recording._read(recording._connections({topic})))
+        record = next(recording._read({topic}))
         changed = [json.dumps(tampered_json(raw, rng)).encode() for _ in range(300)]
         changed += [b'{', b'{"entities": [' * 10_000, b'{"a": "\xff"}', b'{}']
         assert 0 < outcomes(recording, record, changed) < len(changed) - 2
@@ -126,8 +127,8 @@ def test_an_error_in_an_adapter_is_raised_and_not_counted_as_unreadable(
 def test_a_field_that_the_definition_lacks_is_unreadable(tmp_path):
     path = Drive(sweeps=1).write(tmp_path / 'drive')
     with Recording([path]) as recording:
-        record = next(recording._read(recording._connections({'/boxes'})))
-        message = recording._message(record)
+        record = next(recording._read({'/boxes'}))
+        message = recording._decoder.message(record)
         del message.detections[0].bbox.__dict__['size']
         with pytest.raises(UnsupportedMessage, match=r"topic '/boxes'.*field 'size'"):
             recording._content('/boxes', message)

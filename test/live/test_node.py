@@ -16,6 +16,7 @@ from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import markers, vision
 import numpy as np
+from preloaded import NODE, PreloadedProcess
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
@@ -321,11 +322,11 @@ def wait_for_thirty_early_boxes(graph, early):
 
 
 def test_boxes_that_wait_too_long_are_published_unchanged(graph, tmp_path):
-    # Boxes wait ten times the backlog, 1 s. With 60 multiplier updates a window of the paper's
-    # objective takes about 2 s to solve, while the boxes after it wait.
+    # Boxes wait ten times the backlog, 0.3 s. Each stamp takes some tenths of a second to solve by
+    # the paper's objective, while the boxes after it wait.
     drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
-    slow = ['objective:=paper', 'paper.multiplier_rounds:=60', 'paper.iterations:=10000']
-    options = [part for text in (*slow, 'backlog:=0.1') for part in ('-p', text)]
+    slow = ['objective:=paper', 'paper.multiplier_rounds:=20', 'paper.iterations:=200']
+    options = [part for text in (*slow, 'backlog:=0.03') for part in ('-p', text)]
     node = graph.start(*RELIABLE, *options)
     graph.wait_until_connected()
     first = 1 + [record.boxes_stamp_ns for record in records].index(drive.stamps[3])
@@ -399,7 +400,7 @@ def test_busy_solver_delays_neither_diagnostics_nor_shutdown(graph, tmp_path):
     early = graph.collect(DETECTIONS, '/refined_boxes')
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     # The paper's objective is minimised by torch: some tenths of a second for each box array.
-    slow = ['objective:=paper', 'paper.iterations:=1000', 'window:=30']
+    slow = ['objective:=paper', 'paper.iterations:=300', 'window:=30']
     options = [part for text in (*slow, 'backlog:=60.0', 'queue:=100') for part in ('-p', text)]
     node = graph.start(*RELIABLE, *options)
     graph.wait_until_connected()
@@ -453,17 +454,13 @@ def refused(tmp_path_factory):
         'deadline': ['--ros-args', '-p', 'deadline:=0'],
         'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
     }
+    folder = tmp_path_factory.mktemp('refused')
     started = {
-        name: subprocess.Popen(
-            [sys.executable, '-m', 'boxreg_ros.live.main', *arguments], cwd=ROOT,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )
+        name: PreloadedProcess(NODE, arguments, {}, folder / name)
         for name, arguments in cases.items()
-    }  # fmt: skip
-    return {
-        name: (process.communicate(timeout=60)[0], process.returncode)
-        for name, process in started.items()
     }
+    statuses = {name: process.wait(60) for name, process in started.items()}
+    return {name: ((folder / name).read_text(), status) for name, status in statuses.items()}
 
 
 @pytest.mark.parametrize(
