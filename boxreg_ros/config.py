@@ -196,6 +196,10 @@ class ClassConfig:
     slip: float = setting(
         0.15, 'standard deviation of the sideways velocity of the pivot', 'm/s', 1e-3, 1e3
     )
+    sideslip: float = setting(
+        0.01, 'standard deviation of the constant angle from the heading of a track to its path',
+        'rad', 1e-4, 1.0,
+    )  # fmt: skip
     climb: float = setting(
         0.25, 'standard deviation of the velocity along the z axis of the box', 'm/s', 1e-3, 1e3
     )
@@ -371,13 +375,13 @@ class Config:
     )
     cyclist: ClassConfig = ClassConfig(
         names=('cyclist', 'bicycle', 'bike', 'motorcycle', 'motorcyclist', 'rider', 'scooter'),
-        acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4, pivot=0.2, shape=0.15,
-        heading=0.15, extent=0.07, gap_spread=0.2,
+        acceleration=1.5, cornering=1.5, turning=1.0, slip=0.4, sideslip=1e-3, pivot=0.2,
+        shape=0.15, heading=0.15, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
     pedestrian: ClassConfig = ClassConfig(
         names=('pedestrian', 'person', 'walker', 'people', 'child'),
-        acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5, pivot=0.0, shape=0.2,
-        heading=0.5, extent=0.07, gap_spread=0.2,
+        acceleration=0.8, cornering=0.8, turning=1.0, slip=0.5, sideslip=1e-3, pivot=0.0,
+        shape=0.2, heading=0.5, extent=0.07, gap_spread=0.2,
     )  # fmt: skip
 
     def __post_init__(self) -> None:

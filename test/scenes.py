@@ -160,7 +160,7 @@ def returns_of(points, mask, delays=None):
 
 
 def shared_of(extent=(4.0, 2.0, 2.0), B=1, **parts):
-    """Return shared parameters (B, 22): `extent`, and parts by the names of their slices."""
+    """Return shared parameters (B, 23): `extent`, and parts by the names of their slices."""
     shared = torch.zeros(B, SHARED, dtype=torch.float64)
     shared[:, :3] = torch.tensor(extent)
     for name, value in parts.items():

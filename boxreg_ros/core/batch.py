@@ -25,13 +25,18 @@ numbers_of = attrgetter(*CLASS_NUMBERS)
 POSE_ERRORS = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
 """The settings of `ClassConfig` that are the deviations of an input pose: x y z roll pitch yaw."""
 
-SHARED = 22
-"""Shared variables: extent (3), input bias (6), labelling margins (6), pivot, shape anchor (6)."""
+SHARED = 23
+"""
+Shared variables: extent (3), input bias (6), labelling margins (6), pivot, shape anchor (6),
+sideslip.
+
+"""
 EXTENT = slice(0, 3)
 BIAS = slice(3, 9)
 GAP = slice(9, 15)
 PIVOT = 15
 ANCHOR = slice(16, 22)
+SIDESLIP = 22
 
 PADDING_POSITION = 1e6
 """Coordinate of padding points [m]; derived: near no box, and finite in float32."""
@@ -106,7 +111,7 @@ class Problem(NamedTuple):
         Each sensor that sees the object minus the centre of the input box [m]; NaN if unknown.
     ground : Tensor, shape (B, N)
         Height of the road minus that of the input centre [m]; NaN if unknown.
-    prior_mean, prior_information : Tensor, shapes (B, 34) and (B, 34, 34)
+    prior_mean, prior_information : Tensor, shapes (B, 35) and (B, 35, 35)
         Marginalisation prior on the two oldest poses and the shared variables: the minimum of its
         quadratic form, and its information matrix. The information is 0 without a prior.
     marginalised_extents : Tensor, shape (B, 4)
@@ -198,11 +203,11 @@ class State(NamedTuple):
     ----------
     pose : Tensor, shape (B, N, 6)
         x y z roll pitch yaw [m, rad].
-    shared : Tensor, shape (B, 22)
+    shared : Tensor, shape (B, 23)
         Extent of the object [m]; bias of the input poses, along their axes [m, rad]; labelling
         margin of each face, from its outermost points out to the face [m]; distance of the pivot
         behind the centre, where the object has no sideways velocity [m]; anchor of the rigid
-        shape, a step of all poses in box axes [m, rad].
+        shape, a step of all poses in box axes [m, rad]; angle from the heading to the path [rad].
 
     """
 
@@ -211,11 +216,11 @@ class State(NamedTuple):
 
     @classmethod
     def unpack(cls, x: Tensor, length: int) -> 'State':
-        """Return views into variables `x` (B, 6 N + 22)."""
+        """Return views into variables `x` (B, 6 N + 23)."""
         return cls(x[:, : LINK * length].unflatten(1, (length, LINK)), x[:, LINK * length :])
 
     def pack(self) -> Tensor:
-        """Return the variables as one row per window, shape (B, 6 N + 22)."""
+        """Return the variables as one row per window, shape (B, 6 N + 23)."""
         return torch.cat([self.pose.flatten(1), self.shared], 1)
 
 
@@ -225,9 +230,9 @@ class MarginalPrior(NamedTuple):
 
     Attributes
     ----------
-    state, step : Tensor, shape (B, 34)
+    state, step : Tensor, shape (B, 35)
         The linearisation point, and the step from there to the minimum.
-    information : Tensor, shape (B, 34, 34)
+    information : Tensor, shape (B, 35, 35)
         The information matrix.
 
     """
@@ -291,7 +296,7 @@ class Solution(NamedTuple):
 
 
 def free_variables(problem: Problem, config: Config) -> Tensor:
-    """Return 1 for every variable (B, 6 N + 22) that is estimated, 0 for those held fixed."""
+    """Return 1 for every variable (B, 6 N + 23) that is estimated, 0 for those held fixed."""
     pose = problem.valid[..., None].to(problem.boxes).expand(-1, -1, LINK).clone()
     shared = pose.new_ones((len(pose), SHARED))
     if config.mode == 'bev':

@@ -44,7 +44,7 @@ def posterior(
         Of the `FaceObservations` of the last round.
     expected : Expectation
         Means and deviations of the last round.
-    free : Tensor, shape (B, 6 N + 22)
+    free : Tensor, shape (B, 6 N + 23)
         1 for variables that are estimated, 0 for those held fixed.
     inverse : InverseBlocks
         Of the Gauss-Newton curvature of the last round.

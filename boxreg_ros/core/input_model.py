@@ -336,9 +336,9 @@ class Expectation(NamedTuple):
 
     Attributes
     ----------
-    shared : Tensor, shape (B, 22)
+    shared : Tensor, shape (B, 23)
         Mean of the shared variables, see `State`.
-    deviation : Tensor, shape (B, 22)
+    deviation : Tensor, shape (B, 23)
         Their deviations.
     pose_deviation : Tensor, shape (B, 6)
         Deviation of the input poses along the axes of their boxes, without their bias [m, rad].
@@ -426,7 +426,8 @@ def expect(
     shared[:, EXTENT] = torch.where(has_pin, mean, extent)
     input_deviation = torch.cat([extent_deviation, bias], 1)
     input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
-    deviations = [input_deviation, spread, mean[:, :1] * PIVOT_DEVIATION, one]
+    sideslip = problem.of_class('sideslip')
+    deviations = [input_deviation, spread, mean[:, :1] * PIVOT_DEVIATION, one, sideslip]
     return Expectation(
         shared,
         torch.cat(deviations, 1),
@@ -458,7 +459,7 @@ def _input_error(problem: Problem, noise: InputNoise, widening: Tensor, slow: Te
 
 def expected_shared(problem: Problem, offsets: FaceOffsets, extent: Tensor) -> Tensor:
     """
-    Return the means of the shared variables, (B, 22), see `State`, without a population.
+    Return the means of the shared variables, (B, 23), see `State`, without a population.
 
     Given the margins of the input, and the mean extents (B, 3) of `mean_input_extents`.
 
@@ -541,7 +542,7 @@ def evidence_of_extents(
         Prior of the fit: its part in that is removed.
     state : State
         The fit.
-    covariance : Tensor, shape (B, 22, 22)
+    covariance : Tensor, shape (B, 23, 23)
         Of its shared variables.
 
     """

@@ -45,7 +45,7 @@ def marginalise(terms: Sequence[Term], state: State) -> MarginalPrior:
         J = pad(J, (0, STENCIL * LINK - J.shape[-1]))
         S = pad(S, (0, SHARED - S.shape[-1])).expand(*J.shape[:-1], -1)
         # With the residual as a last column, one product gives information and gradient.
-        A = torch.cat([J, S, r[..., None]], -1)[:, 0]  # (B, F, R, 18 + 22 + 1)
+        A = torch.cat([J, S, r[..., None]], -1)[:, 0]  # (B, F, R, 18 + 23 + 1)
         jacobians.append(A.flatten(1, 2))
         weighted.append((term.weight[:, 0] @ A).flatten(1, 2))
     form = torch.cat(jacobians, 1).mT @ torch.cat(weighted, 1)

@@ -21,13 +21,13 @@ from boxreg_ros.core.batch import (
     PRIOR_POSES,
     PRIOR_SIZE,
     SHARED,
+    SIDESLIP,
     State,
 )
 from boxreg_ros.core.geometry import rotation_derivatives, rotation_from_rpy
 from boxreg_ros.core.lbfgs import select
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 
 class Linearised(NamedTuple):
@@ -81,7 +81,7 @@ def value_and_gradient(
     terms: Sequence[Term], x: Tensor, length: int, curvature: Chain | None = None
 ) -> tuple[Tensor, Tensor]:
     """
-    Return the sum of r' W r / 2 over all terms, shape (B,), and its gradient (B, 6 N + 22) (M1).
+    Return the sum of r' W r / 2 over all terms, shape (B,), and its gradient (B, 6 N + 23) (M1).
 
     The Gauss-Newton matrices J' W J are added to `curvature`, if that is given.
 
@@ -249,7 +249,7 @@ def zero_motion(state: State) -> Linearised:
 
 
 def slip(state: State, times: Tensor) -> Linearised:
-    """Return the velocity of the pivot along the body's y and z axes (M7) [m/s] [for Eq. 7]."""
+    """Return the velocity of the pivot across the path and upward (M7) [m/s] [for Eq. 7]."""
     N = state.pose.shape[1]
     dt = times.diff(dim=1)[..., None, None]
     position, angles = state.pose[..., :3], state.pose[..., 3:]
@@ -259,20 +259,27 @@ def slip(state: State, times: Tensor) -> Linearised:
     R, dR = rotation_derivatives(torch.cat([angles, mid_angles], 1))
     heading = R[:, :N, :, 0]
     arm_by_angle = arm * dR[:, :N, ..., 0].mT
-    across = R[:, N:, :, 1:].mT / dt  # (B, N - 1, 2, 3): y and z axes at the midpoints
-    across_by_angle = dR[:, N:, ..., 1:] / dt[..., None]
+    sideslip = state.shared[:, SIDESLIP, None, None, None]
+    to_path = torch.eye(3).to(R)[:, 1:].repeat(len(R), 1, 1, 1)  # (B, 1, 3, 2) in body axes
+    to_path[:, :, :1, :1] = -sideslip
+    # (B, N - 1, 2, 3): left of the path, and up, at the midpoints
+    across = (R[:, N:] @ to_path).mT / dt
+    across_by_angle = dR[:, N:] @ to_path[:, None] / dt[..., None]
     step = (position - arm[..., 0] * heading).diff(dim=1)
     residual = (across @ step[..., None]).mT
     tilt = (step[:, :, None, None] @ across_by_angle)[..., 0, :].mT / 2
     by_angle_before = tilt + across @ arm_by_angle[:, :-1]
     by_angle_after = tilt - across @ arm_by_angle[:, 1:]
     by_pose = torch.cat([-across, by_angle_before, across, by_angle_after], -1)[:, :, None]
-    by_arm = -(across @ heading.diff(dim=1)[..., None]).mT
-    return Linearised(residual, by_pose, pad(by_arm[..., None], (PIVOT, 0)))
+    by_shared = residual.new_zeros((*residual.shape, SHARED))
+    by_shared[..., PIVOT] = -(across @ heading.diff(dim=1)[..., None]).mT
+    forward = R[:, N:, :, :1].mT / dt
+    by_shared[..., 0, SIDESLIP] = -(forward @ step[..., None])[..., 0]
+    return Linearised(residual, by_pose, by_shared)
 
 
 def shared_prior(state: State, expected: Tensor) -> Linearised:
-    """Return the deviation of the shared variables from those `expected` (B, 22) (M8)."""
+    """Return the deviation of the shared variables from those `expected` (B, 23) (M8)."""
     residual = (state.shared - expected)[:, None, None]
     by_pose = residual.new_zeros((len(expected), 1, 1, SHARED, LINK))
     return Linearised(residual, by_pose, torch.eye(SHARED).to(residual)[None])
@@ -282,7 +289,7 @@ def marginalisation_prior(state: State, mean: Tensor) -> Linearised:
     """
     Return the deviation of the oldest two poses and the shared variables from a mean (M9).
 
-    `mean` (B, 1, 34) is the minimum of the marginalisation prior.
+    `mean` (B, 1, 35) is the minimum of the marginalisation prior.
 
     """
     known = torch.cat([state.pose[:, :PRIOR_POSES].flatten(1), state.shared], 1)

@@ -119,7 +119,7 @@ def weigh(
 
 
 def prior_information(problem: Problem, config: Config) -> Tensor:
-    """Return the information of the marginalisation prior (B, 34, 34), 0 where it is off."""
+    """Return the information of the marginalisation prior (B, 35, 35), 0 where it is off."""
     if config.ingredients.marginalisation:
         return problem.prior_information
     return torch.zeros_like(problem.prior_information)
@@ -299,7 +299,7 @@ def _shared_weights(
     config: Config,
 ) -> Tensor:
     """
-    Return the weights of the shared variables (M22), shape (B, 22).
+    Return the weights of the shared variables (M22), shape (B, 23).
 
     The deviation of a labelling margin is widened where the margin is far off the expected one, or
     the points of a face are far off where they are expected: points of a load, or of a branch

@@ -56,17 +56,17 @@ class MarginalisationPrior(NamedTuple):
     Quadratic prior on a window from observations that have been marginalised.
 
     Its variables are the poses of the two oldest observations and the parameters that all
-    observations of a track share (34 in all).
+    observations of a track share (35 in all).
 
     Attributes
     ----------
     base : array, shape (3,)
         Fixed origin of all positions of the track, in the fixed frame [m].
-    state : array, shape (34,)
+    state : array, shape (35,)
         Linearisation point: the variables when the last observation was marginalised.
-    step : array, shape (34,)
+    step : array, shape (35,)
         Minimum of the quadratic form minus `state`.
-    information : array, shape (34, 34)
+    information : array, shape (35, 35)
         Hessian of the quadratic form.
     marginalised_extents : array, shape (4,)
         Sum of the input extents of marginalised observations [m], and their number.
@@ -329,7 +329,7 @@ def _starting_boxes(windows: Sequence[Window], boxes: Floats) -> Floats:
 
 def _prior_minimum(start: Floats, state: Floats, step: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """
-    Return the minimum of each prior (B, 34), and which priors fit the present headings (B,).
+    Return the minimum of each prior (B, 35), and which priors fit the present headings (B,).
 
     Angles are moved by half turns to those of `start` (B, N, 9). A prior that an odd number of
     them is needed for holds for the other heading sign.

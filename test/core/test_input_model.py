@@ -264,7 +264,7 @@ def fitted(given, measured, own, part=0.05):
 
     """
     given, measured, own = (torch.tensor([row], dtype=D) for row in (given, measured, own))
-    error, precision = part * given, torch.ones(1, 22, dtype=D)
+    error, precision = part * given, torch.ones(1, 23, dtype=D)
     precision[:, :3] = error**-2 + own**-2
     spread = torch.cat([error, torch.ones(1, 19, dtype=D)], 1)
     expected = Expectation(

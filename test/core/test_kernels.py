@@ -59,7 +59,7 @@ def term_arrays(terms, problem, b):
     acceleration = weight('acceleration', N, 6, 6)
     start, wanted = data('rigid_shape', (N, 6), (N, 6))
     _, axes = data('input_pose', (N, 6), (N, 3, 3))
-    (prior_mean,) = data('marginalisation_prior', (34,))
+    (prior_mean,) = data('marginalisation_prior', (35,))
     (expected,) = data('shared_prior', (SHARED,))
     return TermArrays(
         given=problem.pose[b].numpy().copy(),
@@ -76,7 +76,7 @@ def term_arrays(terms, problem, b):
         W_slip=diagonal('slip', N, 2),
         W_zero_motion=diagonal('zero_motion', N, 6),
         prior_mean=prior_mean,
-        W_prior=weight('marginalisation_prior', 1, 34, 34)[0],
+        W_prior=weight('marginalisation_prior', 1, 35, 35)[0],
         expected=expected,
         W_shared=diagonal('shared_prior', 1, SHARED)[0],
     )
@@ -204,7 +204,7 @@ def test_marginalisation_prior_equals_that_of_torch():
     x, terms = random_variables(problem), regular_terms(problem)
     known = marginalise(terms, State.unpack(x, problem.length))
     for b in range(len(x)):
-        mean, step, information = np.empty(34), np.empty(34), np.empty((34, 34))
+        mean, step, information = np.empty(35), np.empty(35), np.empty((35, 35))
         A = arrowhead.empty_arrowhead(problem.length)
         scratch = normal_equations.empty_scratch(problem.length)
         gradient, arrays = np.empty(x.shape[1]), term_arrays(terms, problem, b)

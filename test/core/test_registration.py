@@ -407,7 +407,7 @@ def test_robust_prior_of_labelling_margins_by_hand():
     )
     part, height = (0.385 - 0.15) / 0.3, drive(1)[0, 5]
     z, half = part * ALONE.vehicle.height, part * ALONE.vehicle.extent * height / 2
-    known = np.full(22, ALONE.vehicle.gap_spread)
+    known = np.full(23, ALONE.vehicle.gap_spread)
     known[left] *= 2**0.5
     known[top] *= (1 + 0.3**2 / (ALONE.vehicle.gap_spread**2 + z**2 + half**2) / 4) ** 0.5
     np.testing.assert_allclose(weight[batch.GAP] ** -0.5, known[batch.GAP], rtol=1e-9)

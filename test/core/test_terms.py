@@ -228,6 +228,17 @@ def test_a_vehicle_on_a_circle_does_not_slip():
     np.testing.assert_allclose(terms.slip(state, problem.times).residual[0, :, 0, 0], known)
 
 
+def test_a_track_with_its_sideslip_does_not_slip():
+    # Its heading is off its path by a constant angle, forward as in reverse.
+    angle = 0.05
+    for way in (1.0, -1.0):
+        distance = way * np.array([0.0, 1.0, 3.0])
+        pose = np.c_[distance, np.zeros((3, 4)), np.full(3, -angle)]
+        problem = problem_at(pose, [0.0, 0.1, 0.3])
+        state = State(problem.pose, shared_of(PIVOT=1.0, SIDESLIP=np.tan(angle)))
+        np.testing.assert_allclose(terms.slip(state, problem.times).residual, 0, atol=1e-12)
+
+
 @pytest.mark.parametrize('yaw', [0.0, np.pi / 2, 3.0])
 def test_slip_by_hand(yaw):
     # 0.1 m to its left and 0.02 m up in 0.1 s, beside 1 m ahead: 1 m/s and 0.2 m/s; reversing

@@ -123,7 +123,7 @@ def _minimum(terms: Sequence[Term], start: Tensor, scale: Tensor, length: int) -
 
 
 def _deviations(problem: Problem, config: Config) -> Tensor:
-    """Return the expected error of every variable, 1 where none is known; (1, 6 N + 22)."""
+    """Return the expected error of every variable, 1 where none is known; (1, 6 N + 23)."""
     expected = expect(problem, InputModel(config.faces).offsets())
     pose = problem.of_class(*POSE_ERRORS).repeat(1, problem.length)
     deviations = torch.cat([pose, expected.deviation], 1)

@@ -101,11 +101,11 @@ class StartArrays(NamedTuple):
 
     Attributes
     ----------
-    poses, shared : array, shapes (B, N, 6) and (B, 22)
+    poses, shared : array, shapes (B, N, 6) and (B, 23)
         Boxes, and the variables that all observations of a window share.
-    free : array, shape (B, 6 N + 22)
+    free : array, shape (B, 6 N + 23)
         1 for variables that are estimated, 0 for those held fixed.
-    prior_mean, W_prior : array, shapes (B, 34) and (B, 34, 34)
+    prior_mean, W_prior : array, shapes (B, 35) and (B, 35, 35)
         Marginalisation prior (M9).
 
     """
@@ -153,9 +153,9 @@ class TermArrays(NamedTuple):
         (M5): of the position, and of roll, pitch and yaw.
     W_slip, W_zero_motion : array, shapes (N, 2) and (N, 6)
         (M7) and (M6).
-    prior_mean, W_prior : array, shapes (34,) and (34, 34)
+    prior_mean, W_prior : array, shapes (35,) and (35, 35)
         Marginalisation prior (M9).
-    expected, W_shared : array, shape (22,)
+    expected, W_shared : array, shape (23,)
         Shared variables (M8).
 
     """
@@ -188,9 +188,9 @@ class ArrowheadArrays(NamedTuple):
     links : array, shape (N + 2, 6, 18)
         Blocks of each pose: upper triangle of its own, and those with the two poses after it. Two
         poses of padding, zero, end the chain.
-    border : array, shape (N + 2, 6, 22)
+    border : array, shape (N + 2, 6, 23)
         Blocks of each pose with the shared variables.
-    corner : array, shape (22, 22)
+    corner : array, shape (23, 23)
         Upper triangle of the block of the shared variables.
 
     """
@@ -206,16 +206,16 @@ class RoundResults(NamedTuple):
 
     Attributes
     ----------
-    x : array, shape (B, 6 N + 22)
+    x : array, shape (B, 6 N + 23)
         Poses and shared variables at the end of the round.
     is_done : array, shape (B,)
         Whether a window is settled, or this was the last round.
-    pose_blocks, border_blocks : array, shapes (B, N, 6, 6) and (B, N, 6, 22)
+    pose_blocks, border_blocks : array, shapes (B, N, 6, 6) and (B, N, 6, 23)
         Blocks of the poses in the inverse curvature, of windows that are done: their own, and
         those with the shared variables.
-    corner : array, shape (B, 22, 22)
+    corner : array, shape (B, 23, 23)
         Block of the shared variables in the inverse curvature.
-    prior_mean, prior_step, prior_information : array, shapes (B, 34), (B, 34), (B, 34, 34)
+    prior_mean, prior_step, prior_information : array, shapes (B, 35), (B, 35), (B, 35, 35)
         What full windows that are done leave to the next ones, NaN for others; B = 0 if it is not
         wanted.
 

@@ -17,7 +17,7 @@ POSE = 6
 NEXT = 2 * POSE
 """Variables of the two poses after one."""
 SPAN = POSE + NEXT
-BORDER = 22
+BORDER = 23
 """Shared variables."""
 REST = NEXT + BORDER
 """Variables that a pose is coupled to."""
@@ -43,7 +43,7 @@ def clear(A):
 
 @kernel
 def fix_variables(A, free):
-    """Make rows and columns of variables that are not `free` (6 N + 22,) those of the identity."""
+    """Make rows and columns of variables that are not `free` (6 N + 23,) those of the identity."""
     n = len(free) - BORDER
     for i in range(n):
         pose, a = i // POSE, i % POSE
@@ -135,7 +135,7 @@ def factorise(A):
 
 @kernel
 def substitute_forward(U, x, count):
-    """Eliminate the first `count` variables of the chain from a right side (6 N + 22,)."""
+    """Eliminate the first `count` variables of the chain from a right side (6 N + 23,)."""
     n = len(x) - BORDER
     for i in range(count):
         pose, a = i // POSE, i % POSE
@@ -149,7 +149,7 @@ def substitute_forward(U, x, count):
 
 @kernel
 def solve(U, x):
-    """Replace a right side `x` (6 N + 22,) by the solution of U' U x = b."""
+    """Replace a right side `x` (6 N + 23,) by the solution of U' U x = b."""
     links, border, corner = U
     n = len(x) - BORDER
     substitute_forward(U, x, n)
@@ -190,7 +190,7 @@ def fill_inverse_root(U, inverse):
 
 @kernel
 def invert_corner(corner, inverse):
-    """Write the inverse (22, 22) of U' U of a corner's factor."""
+    """Write the inverse (23, 23) of U' U of a corner's factor."""
     root = np.empty((BORDER, BORDER))
     fill_inverse_root(corner, root)
     np.dot(root, root.T, inverse)
@@ -199,9 +199,9 @@ def invert_corner(corner, inverse):
 @kernel
 def shift_known(known, own, across):
     """
-    Move the known part of the inverse (34, 34) to the pose before.
+    Move the known part of the inverse (35, 35) to the pose before.
 
-    `own` (6, 6) is the block of this pose, `across` (6, 34) the negative of those beside it.
+    `own` (6, 6) is the block of this pose, `across` (6, 35) the negative of those beside it.
 
     """
     for a in range(POSE):
@@ -223,10 +223,10 @@ def shift_known(known, own, across):
 @kernel
 def invert_poses(U, corner_inverse, blocks, border_blocks):
     """
-    Write the blocks of the poses in the inverse: own, (N, 6, 6), and with the border, (N, 6, 22).
+    Write the blocks of the poses in the inverse: own, (N, 6, 6), and with the border, (N, 6, 23).
 
     The blocks of the inverse Z within the pattern of U follow from the last pose backward
-    (Takahashi), beginning with that of the border, `corner_inverse` (22, 22). With r the two poses
+    (Takahashi), beginning with that of the border, `corner_inverse` (23, 23). With r the two poses
     after p and the border, and W = inv(U_pp) U_pr: Z_pr = -W Z_rr, and
     Z_pp = inv(U_pp) inv(U_pp)' - Z_pr W'.
 

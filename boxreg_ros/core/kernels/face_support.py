@@ -308,7 +308,7 @@ def observe_window(b, windows, poses, shared, occlusion_inset, range_inset, numb
         The window.
     windows : WindowArrays
         Input of the windows.
-    poses, shared : array, shapes (N, 6) and (22,)
+    poses, shared : array, shapes (N, 6) and (23,)
         Its boxes of this round.
     occlusion_inset, range_inset : array, shape (6,)
         As in `boxreg_ros.core.face_support.FaceOffsets` [m].
@@ -371,7 +371,7 @@ def observe_faces(
     """
     Write the face observations of the windows `begin` to `end`.
 
-    `poses`, `shared` and insets are (B, N, 6), (B, 22) and (B, 6), else as in `observe_window`.
+    `poses`, `shared` and insets are (B, N, 6), (B, 23) and (B, 6), else as in `observe_window`.
 
     """
     work = empty_face_work(begin, end, windows, numbers)

@@ -116,13 +116,13 @@ def minimise(x, value, terms, free, U, search, scratch, numbers):
 
     Parameters
     ----------
-    x : array, shape (6 N + 22,)
+    x : array, shape (6 N + 23,)
         Start, then the best point.
     value : float
         Value at the start; `search.gradient` is the gradient there.
     terms : TermArrays
         Data and weights.
-    free : array, shape (6 N + 22,)
+    free : array, shape (6 N + 23,)
         1 for variables that are estimated, 0 for those held fixed.
     U : ArrowheadArrays
         Factor of the curvature at the start.

@@ -26,7 +26,7 @@ from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.rotation import fill_rotation, fill_rotation_derivatives
 import numpy as np
 
-EXTENT, BIAS, GAP, PIVOT, ANCHOR, SHARED = 0, 3, 9, 15, 16, 22
+EXTENT, BIAS, GAP, PIVOT, ANCHOR, SIDESLIP, SHARED = 0, 3, 9, 15, 16, 22, 23
 """First of the shared variables of each kind, and their number."""
 UNKNOWN_RIDGE = 1e-6
 """Information that is assumed in directions which no residual constrains."""
@@ -248,27 +248,31 @@ def add_acceleration(n, poses, terms, r, gradient, A):
 
 
 @kernel
-def slip_of(n, poses, R, dt, pivot, Rm, r):
+def slip_of(n, poses, R, dt, shared, Rm, r):
     """
-    Write the velocity of the pivot to the left and upward from pose n to n + 1, (2,) [m/s].
+    Write the velocity of the pivot across the path from pose n to n + 1, (2,) [m/s].
 
-    `R` (N, 3, 3) are the axes of the poses; those between the two poses are written to `Rm`.
+    To the left of the path and upward. `R` (N, 3, 3) are the axes of the poses; those between the
+    two poses are written to `Rm`.
 
     """
+    pivot, sideslip = shared[PIVOT], shared[SIDESLIP]
     before, after = poses[n], poses[n + 1]
     fill_rotation(
         (before[3] + after[3]) / 2, (before[4] + after[4]) / 2, (before[5] + after[5]) / 2, Rm
     )
-    for side in range(2):
-        r[side] = 0.0
-        for j in range(3):
-            step = after[j] - before[j] - pivot * (R[n + 1, j, 0] - R[n, j, 0])
-            r[side] += Rm[j, 1 + side] * step / dt
+    r[0] = 0.0
+    r[1] = 0.0
+    for j in range(3):
+        step = after[j] - before[j] - pivot * (R[n + 1, j, 0] - R[n, j, 0])
+        r[0] += (Rm[j, 1] - sideslip * Rm[j, 0]) * step / dt
+        r[1] += Rm[j, 2] * step / dt
 
 
 @kernel
-def add_slip(n, poses, pivot, terms, scratch, gradient, A):
-    """Add the velocity of the pivot to the left and upward from pose n to n + 1 (M7)."""
+def add_slip(n, poses, shared, terms, scratch, gradient, A):
+    """Add the velocity of the pivot across the path and upward from pose n to n + 1 (M7)."""
+    pivot = shared[PIVOT]
     R0, dR0, R1, dR1 = scratch.R[n], scratch.dR[n], scratch.R[n + 1], scratch.dR[n + 1]
     Rm, dRm, J = scratch.mean_R, scratch.mean_dR, scratch.J
     before, after = poses[n], poses[n + 1]
@@ -281,14 +285,19 @@ def add_slip(n, poses, pivot, terms, scratch, gradient, A):
     value = 0.0
     for side in range(2):
         axis = 1 + side
+        sideslip = shared[SIDESLIP] if side == 0 else 0.0
         w = terms.W_slip[n, side]
         r = 0.0
         by_pivot = 0.0
+        by_sideslip = 0.0
         for j in range(3):
-            across = Rm[j, axis] * rate
+            across = (Rm[j, axis] - sideslip * Rm[j, 0]) * rate
             turned = R1[j, 0] - R0[j, 0]
-            r += across * (after[j] - before[j] - pivot * turned)
+            step = after[j] - before[j] - pivot * turned
+            r += across * step
             by_pivot -= across * turned
+            if side == 0:
+                by_sideslip -= Rm[j, 0] * rate * step
             J[j] = -across
             J[6 + j] = across
         for k in range(3):
@@ -297,7 +306,7 @@ def add_slip(n, poses, pivot, terms, scratch, gradient, A):
             swing1 = 0.0
             for j in range(3):
                 step = after[j] - before[j] - pivot * (R1[j, 0] - R0[j, 0])
-                tilt += step * dRm[k, j, axis] * rate / 2
+                tilt += step * (dRm[k, j, axis] - sideslip * dRm[k, j, 0]) * rate / 2
                 swing0 += J[6 + j] * dR0[k, j, 0]
                 swing1 += J[6 + j] * dR1[k, j, 0]
             J[3 + k] = tilt + pivot * swing0
@@ -306,13 +315,17 @@ def add_slip(n, poses, pivot, terms, scratch, gradient, A):
         for k in range(12):
             gradient[row + k] += J[k] * w * r
         gradient[first + PIVOT] += by_pivot * w * r
+        gradient[first + SIDESLIP] += by_sideslip * w * r
         if is_wanted(A):
             for k in range(12):
                 links, border = A.links[n + k // 6, k % 6], A.border[n + k // 6, k % 6]
                 for m in range(k, 12):
                     links[m - 6 * (k // 6)] += w * J[k] * J[m]
                 border[PIVOT] += w * J[k] * by_pivot
+                border[SIDESLIP] += w * J[k] * by_sideslip
             A.corner[PIVOT, PIVOT] += w * by_pivot**2
+            A.corner[PIVOT, SIDESLIP] += w * by_pivot * by_sideslip
+            A.corner[SIDESLIP, SIDESLIP] += w * by_sideslip**2
     return value
 
 
@@ -424,7 +437,7 @@ def accumulate(x, last, terms, scratch, gradient, A):
 
     Parameters
     ----------
-    x : array, shape (6 N + 22,)
+    x : array, shape (6 N + 23,)
         Poses and shared variables.
     last : int
         Only residuals that begin at the first `last` observations; less than N leaves out the
@@ -433,7 +446,7 @@ def accumulate(x, last, terms, scratch, gradient, A):
         Data and weights.
     scratch : Scratch
         Arrays to work in.
-    gradient : array, shape (6 N + 22,)
+    gradient : array, shape (6 N + 23,)
         Written.
     A : ArrowheadArrays
         Gauss-Newton matrix, written; of `no_matrix` where it is not wanted.
@@ -458,7 +471,7 @@ def accumulate(x, last, terms, scratch, gradient, A):
         if terms.W_acceleration[n, 0, 0] != 0.0:
             value += add_acceleration(n, poses, terms, scratch.r, gradient, A)
         if terms.W_slip[n, 0] != 0.0:
-            value += add_slip(n, poses, shared[PIVOT], terms, scratch, gradient, A)
+            value += add_slip(n, poses, shared, terms, scratch, gradient, A)
         if terms.W_zero_motion[n, 0] != 0.0:
             value += add_zero_motion(n, poses, terms, gradient, A)
     if terms.W_prior[0, 0] != 0.0:
@@ -470,7 +483,7 @@ def accumulate(x, last, terms, scratch, gradient, A):
 
 @kernel
 def fill_dense(A, dense):
-    """Write a matrix with a chain of two poses as a dense one, (34, 34)."""
+    """Write a matrix with a chain of two poses as a dense one, (35, 35)."""
     for pose in range(2):
         for a in range(POSE):
             i = POSE * pose + a
@@ -491,8 +504,8 @@ def marginalise(x, gradient, A, mean, step, information):
     """
     Write the quadratic form that stands for the oldest observation of one window (M13).
 
-    In the next two poses and the shared variables: where they are (34,), the step from there to
-    the minimum (34,), and the curvature (34, 34). The sums of the residuals of the oldest
+    In the next two poses and the shared variables: where they are (35,), the step from there to
+    the minimum (35,), and the curvature (35, 35). The sums of the residuals of the oldest
     observation, from `accumulate`, are the input; they are changed.
 
     """

@@ -14,7 +14,6 @@ from boxreg_ros.core.kernels.normal_equations import (
     fill_acceleration,
     fill_step,
     GAP,
-    PIVOT,
     SHARED,
     slip_of,
 )
@@ -158,7 +157,7 @@ def scale_moments(moments, weight, W):
 
 @kernel
 def fill_shared_weights(shared, deviation, distance, face_weight, length, numbers, terms):
-    """Write the weights of the shared variables (M22), (22,)."""
+    """Write the weights of the shared variables (M22), (23,)."""
     for s in range(SHARED):
         terms.W_shared[s] = 1 / deviation[s] ** 2
     for face in range(6):
@@ -213,7 +212,7 @@ def robust_scale(squared, n, outlier):
 
 
 @kernel
-def robustify_motion(poses, pivot, length, outlier, terms):
+def robustify_motion(poses, shared, length, outlier, terms):
     """Down-weight motion residuals that are far off at the start of the round (M24)."""
     squared = np.empty(len(poses))
     r = np.empty(6)
@@ -233,7 +232,7 @@ def robustify_motion(poses, pivot, length, outlier, terms):
                 terms.W_acceleration[n, j, k] *= scale
     for n in range(length - 1):
         dt = terms.times[n + 1] - terms.times[n]
-        slip_of(n, poses, terms.axes, dt, pivot, between, r)
+        slip_of(n, poses, terms.axes, dt, shared, between, r)
         squared[n] = terms.W_slip[n, 0] * r[0] ** 2 + terms.W_slip[n, 1] * r[1] ** 2
     for n in range(length - 1):
         scale = robust_scale(squared, n, outlier)
@@ -306,4 +305,4 @@ def weigh(b, windows, start, faces, expected, of_class, numbers, terms):
     fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked)
     fill_motion_weights(length, parked, of_class.slip[b], of_class.zero_motion[b], terms)
     if numbers.is_robust:
-        robustify_motion(poses, shared[PIVOT], length, numbers.motion_outlier, terms)
+        robustify_motion(poses, shared, length, numbers.motion_outlier, terms)
