@@ -204,7 +204,7 @@ def parked_steps(problem: Problem, yaw_deviation: Tensor) -> Tensor:
     Return 1 for the steps (B, N - 1) of parked objects, else 0 (M25).
 
     `yaw_deviation` (B,) is the estimated error of the input yaw [rad]: noise alone is no turn. An
-    object that is parked over most of its window may brake or drive off at an end of it: those steps,
+    object that is parked over most of its window may brake or drive off at an end: those steps,
     and `DRIVING_REACH` more around them, are 0.
 
     """
