@@ -9,6 +9,7 @@ and needs Chromium; where there is none, that picture alone stays as it is.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import csv
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -31,6 +32,7 @@ from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, RefinedBoxes, RO
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 STREET = ROOT / 'bags' / 'street.mcap'
@@ -75,7 +77,7 @@ def draw_car(runs: Path, target: Path) -> None:
 
 
 def draw_report(runs: Path, target: Path) -> None:
-    """Take a screenshot of the first track of the report, if there is a browser."""
+    """Take a screenshot of one track of the report, if there is a browser."""
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         print(
@@ -89,10 +91,23 @@ def draw_report(runs: Path, target: Path) -> None:
     command = [
         browser, *BROWSER_OPTIONS, f'--user-data-dir={runs / "profile"}',
         f'--window-size={width},{height}', f'--force-device-scale-factor={SCALE}',
-        f'--screenshot={screenshot}', (runs / RESULT / REPORT).as_uri() + '#tracks',
+        f'--screenshot={screenshot}',
+        f'{(runs / RESULT / REPORT).as_uri()}#track={densest_vehicle(runs / RESULT)}',
     ]  # fmt: skip
     subprocess.run(command, check=True, capture_output=True, timeout=TIMEOUT)
-    shutil.copyfile(screenshot, target)
+    with Image.open(screenshot) as picture:  # a palette holds the colours in a third of the size
+        picture.convert('RGB').quantize(256).save(target, optimize=True)
+
+
+def densest_vehicle(result: Path) -> str:
+    """Return the id of the vehicle with the most points, of those with `MIN_BOXES` or more."""
+    names = Config().vehicle.names
+    with (result / 'tracks.csv').open(encoding='utf-8', newline='') as file:
+        rows = list(csv.DictReader(file))
+    vehicles = [
+        row for row in rows if row['class_name'] in names and int(row['boxes']) >= MIN_BOXES
+    ]
+    return max(vehicles, key=lambda row: float(row['median_points']))['track_id']
 
 
 def draw_paper(runs: Path, target: Path) -> None:
@@ -182,6 +197,8 @@ def points_picture(track: TrackChanges, points: Sequence[Floats]) -> bytes:
     panels[0, 1].set_title('points in the refined boxes', fontweight='bold')
     panels[0, 0].set_ylabel('top view [m]')
     panels[1, 0].set_ylabel('side view [m]')
+    for panel in panels[1]:
+        panel.set_xlabel('along the box [m]')
     buffer = BytesIO()
     figure.savefig(buffer, format='png', dpi=150)
     return buffer.getvalue()

@@ -19,13 +19,15 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
+
 DOCS = Path(__file__).resolve().parent
 STORE = DOCS / 'results'
 PAGE = DOCS / 'results.md'
 
 DATA = {
     'resim_3bffdcff': 'Real surfaces on a real drive, exact truth, detector noise',
-    'resim_7fab2350': 'The same on a busier street',
+    'resim_7fab2350': 'Real surfaces on a busier street, exact truth, detector noise',
     'pandaset_002_a': 'PandaSet 002, human labels, detector noise',
     'kitti_raw_0001': 'KITTI raw 0001, human labels, detector noise',
     'street': 'The sample recording, simulated',
@@ -45,14 +47,18 @@ Accuracy is measured against true boxes of vehicles with at least 100 points:
 - **flips**: part of the boxes whose heading is off by more than a right angle.
 - **jitter**: mean second difference of the centre over time [m/s^2].
 
-- **by class**: BEV and 3D IoU of all true boxes of a class with points, for classes with at least
-  20 of them.
+Tables by class are of all true boxes with points, for classes with at least 20 of them.
 
-Rows of every table: *input* is the noisy input. *smoothing* is a robust constant-velocity
-smoother that does not use the points: *early* at the newest box, *final* with the lag of the live
-node, *only* on the whole track. *paper* is the objective of the paper (Eq. 4 to 8). *ours* is the
-default: *early* is the newest box of its window, *final* the box `lag` observations later, *track*
-uses the whole track.
+The rows are methods. *early* is the estimate of the newest box of a sliding window, *final* that
+of the box `lag` observations before it, *track* that from the whole track:
+
+- **input**: the noisy boxes that every method starts from.
+- **smoothing**: a robust constant-velocity smoother that does not use the points; *smoothing only*
+  is that of whole tracks.
+- **L-shape per sweep**: a rectangle fitted to the points of each box, in each sweep alone.
+- **ICP on box points**: the points of each box aligned to points sampled on its visible faces.
+- **paper**: the objective of the paper (Eq. 4 to 8).
+- **ours**: the default objective.
 
 *Detector noise* has the error sizes measured for a published detector: a part that is constant
 over a track, a part that changes slowly, wrong extents, and 2.4 % flipped headings.
@@ -82,8 +88,9 @@ def page(store: Path) -> str:
         if stored:
             parts += [f'## {title}\n', f'{meaning}\n']
         for data, document in stored:
-            if data in DATA:
-                parts.append(f'### {DATA[data]}\n')
+            title = _title(data)
+            if title:
+                parts.append(f'### {title}\n')
             parts.append(_origin(document))
             parts += [f'{part}\n' for part in render(document['results'])]
         verdict = store / f'{kind}.md'
@@ -102,6 +109,15 @@ def _measurements(store: Path, kind: str) -> list[tuple[str, Any]]:
     names = [name for name in DATA if name in found]
     names += [name for name in found if name not in DATA]
     return [(name, json.loads(found[name].read_text(encoding='utf-8'))) for name in names]
+
+
+def _title(data: str) -> str:
+    """Return the title of the measurements of some data, '' if they have none."""
+    for name, title in DATA.items():
+        if data.startswith(name):
+            with_suffix = data.removeprefix(name).replace('_', ', with ')
+            return f'{title}{with_suffix}'
+    return ''
 
 
 def _origin(document: Any) -> str:
@@ -146,6 +162,8 @@ def _groups(measured: Any, iou: str) -> Iterable[str]:
     for key, title in (('by_range', 'by range [m]'), ('by_points', 'by number of points')):
         grouped = {name: row[key] for name, row in measured.items() if key in row}
         labels = list(dict.fromkeys(label for row in grouped.values() for label in row))
+        if len(labels) < 2:  # the same as the mean of all boxes
+            continue
         rows = [
             [name, *(_number(row.get(label)) for label in labels)] for name, row in grouped.items()
         ]
@@ -168,14 +186,14 @@ def _paper(results: Any) -> Iterable[str]:
     """Yield Table I of each mode."""
     for mode, methods in results.items():
         measured = {name: row for name, row in methods.items() if not isinstance(row, str)}
-        columns = ('x', 'y', 'z', 'roll', 'pitch', 'yaw', 'iou', 'iou_first', 'iou_last')
+        pose = ['x', 'y', 'z', 'roll', 'pitch', 'yaw'] if mode == '3d' else ['x', 'y', 'yaw']
+        columns = (*pose, 'iou', 'iou_first', 'iou_last')
         rows = [
             [name, *(_number(row.get(column)) for column in columns)]
             for name, row in measured.items()
         ]
         iou = '3D IoU' if mode == '3d' else 'BEV IoU'
-        header = [f'mode: {mode}', 'x', 'y', 'z', 'roll', 'pitch', 'yaw', iou, 'first', 'last']
-        yield _table(header, rows)
+        yield _table([f'mode: {mode}', *pose, iou, f'{iou}, first', f'{iou}, last'], rows)
         yield from _groups(measured, iou)
 
 
@@ -202,12 +220,13 @@ def _sensitivity(results: Any) -> Iterable[str]:
     yield _table([f'estimate: {results["estimate"]}', 'BEV', '3D'], rows)
     largest: dict[str, float] = {}
     rows = []
+    failures = []
     for loss in results['losses']:
         name = f'`{loss["name"]}`'
         start = [name, f'{loss["factor"]:g}', f'{loss["value"]:.3g}']
         if loss['failure']:
             largest[name] = float('inf')
-            rows.append([*start, 'failed', loss['failure']])
+            failures.append(f'{name} = {loss["value"]:.3g}')
             continue
         size = max(abs(loss['bev']), abs(loss['volume']))
         largest[name] = max(largest.get(name, 0.0), size)
@@ -216,6 +235,8 @@ def _sensitivity(results: Any) -> Iterable[str]:
     yield _table(['setting or constant', 'factor', 'value', 'BEV loss', '3D loss'], rows)
     without = sorted(name for name, size in largest.items() if size < SHOWN_LOSS)
     yield f'Less than {SHOWN_LOSS} either way: {", ".join(without)}.'
+    if failures:
+        yield f'Not possible, since the value is an index or a quantile: {", ".join(failures)}.'
 
 
 def _tracks(results: Any) -> Iterable[str]:
@@ -259,8 +280,9 @@ def _review(results: Any) -> Iterable[str]:
             yield _table([head, '1 %', '5 %', '10 %', '20 %'], rows)
             pins = found['pins']
             yield (
-                f'One box of each pinned at the truth: {pins["before"]:.3f} -> '
-                f'{pins["after"]:.3f}, {pins["gained"]:.0%} of what is missing.'
+                f'With one box of each of these tracks pinned, the mean 3D IoU of their other '
+                f'boxes rises from {pins["before"]:.3f} to {pins["after"]:.3f}: '
+                f'{pins["gained"]:.0%} of 1 - IoU are removed.'
             )
 
 
@@ -271,6 +293,7 @@ def _covariance(results: Any) -> Iterable[str]:
             [f'{estimate}, {name}', str(group['boxes']), *_consistent(group)]
             for estimate, groups in estimates.items()
             for name, group in groups.items()
+            if name == 'all' or len(groups) > 2  # a single class is the same as all
         ]
         variables = next(iter(next(iter(estimates.values())).values()))['nees']
         yield _table([recording, 'boxes', *variables], rows)
@@ -294,7 +317,7 @@ def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
         if isinstance(value, dict):
             yield from _flat(value, f'{prefix}{name}: ')
         elif isinstance(value, float):
-            yield [f'{prefix}{name}', f'{value:.4g}']
+            yield [f'{prefix}{name}', f'{value:,.0f}' if value >= 1e4 else f'{value:.4g}']
         else:
             yield [f'{prefix}{name}', str(value)]
 
@@ -312,7 +335,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'All classes and all true boxes, whatever their number of points. 8 % of the boxes are\n'
         'removed, and gaps of 3 to 8 sweeps; after half of the gaps the id is another one. Each\n'
         'row has one step more. Recall and precision at a 3D IoU of 0.5, matched by overlap;\n'
-        'HOTA and IDF1 by TrackEval. With `--ghosts` there are boxes without an object.',
+        'HOTA and IDF1 by TrackEval. *added* is the number of added boxes. With `--ghosts` there\n'
+        'are boxes without an object; *ghosts rejected* is the part of them that is rejected,\n'
+        '*others rejected* the part of the boxes of objects.',
         _tracks,
     ),
     'paper': (
@@ -323,13 +348,17 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     ),
     'ablation': (
         'Ablation',
-        'The method with one ingredient off. A positive loss means that the ingredient helps.',
+        'The method with one ingredient off. A positive loss means that the ingredient helps.\n\n'
+        + _table(
+            ['without', 'the change'],
+            [[name, item.meaning] for name, item in INGREDIENTS.items() if name != WHOLE],
+        ),
         _ablation,
     ),
     'sensitivity': (
         'Sensitivity',
         'One setting or constant halved or doubled. A positive loss means that the default is '
-        'better.',
+        'better.\nThe run is of an earlier build: some names have changed since.',
         _sensitivity,
     ),
     'lidars': (
@@ -343,18 +372,21 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     ),
     'covariance': (
         'Covariances',
-        'Part of the errors within two standard deviations (0.95 is consistent) / mean squared\n'
-        'error over variance (1 is consistent), along the axes of the true boxes; no heading\n'
-        'flips. All boxes of a track share its constant errors: classes of one or two tracks say\n'
-        'little. "Without input errors" are the inverse curvature and the model error alone.',
+        'Two numbers per cell: the part of the errors within two standard deviations (0.95 is\n'
+        'consistent) and the mean squared error over variance (1 is consistent). Errors are\n'
+        'along the axes of the true boxes, without heading flips. All boxes of a track share its\n'
+        'constant errors: numbers of classes with one or two tracks have little significance.\n'
+        'The second run, "without input errors", has the inverse curvature and the model error\n'
+        'alone.',
         _covariance,
     ),
     'review': (
         'Review list',
-        'Share of the tracks with the worst 3D IoU within the first part of the list, by risk,\n'
-        'by points, by deviation, and by chance. Inputs: noisy boxes, and true boxes with errors\n'
-        'planted in a fifth of the tracks. Then one box of each of the worst tracks is pinned at\n'
-        'the truth, the one that the list names: mean 3D IoU of the other boxes of these tracks.',
+        'Share of the tracks with the worst 3D IoU that are in the first 1 %, 5 %, 10 % and 20 %\n'
+        'of a list, at least one track: the list by risk, by number of points, by standard\n'
+        'deviation, and a random one. Inputs: noisy boxes (*own boxes*), and true boxes with\n'
+        'errors planted in a fifth of the tracks. Then, in each of the worst tracks, the box\n'
+        'that the list names is pinned at the truth.',
         _review,
     ),
     'speed': (
@@ -370,7 +402,12 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'has no time for are kept; with a deadline of an hour, clouds are dropped.',
         _load,
     ),
-    'scale': ('A fleet of drives', '[Scale](scale.md) says what the figures mean.', _figures),
+    'scale': (
+        'A fleet of drives',
+        '[Scale](scale.md) explains the figures. The speedup of two workers was measured on a\n'
+        'loaded machine: more than 2 is chance.',
+        _figures,
+    ),
     'node': ('The live node', 'Publisher, node and observer each a process, over DDS.', _figures),
 }
 

@@ -1,4 +1,4 @@
-"""What an adapter of box messages offers."""
+"""The protocol of the adapters of box messages."""
 
 from __future__ import annotations
 

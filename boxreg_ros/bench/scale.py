@@ -142,7 +142,7 @@ def simulated(
 
 
 def _measured(recording: Path, folder: Path) -> dict[str, float]:
-    """Return what one job takes, the second time: the first one compiles."""
+    """Return time and memory of one job, the second time: the first one compiles."""
     runner = JobRunner(folder / 'one', OPTIONS, '')
     for _ in range(2):
         shutil.rmtree(runner.out, ignore_errors=True)

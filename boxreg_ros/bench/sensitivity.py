@@ -470,7 +470,7 @@ def losses(
     baseline: Mapping[str, Outcome],
     outcomes: Sequence[Sequence[Outcome]],
 ) -> list[Loss]:
-    """Return what each variation loses on the mean of the drives, the largest loss first."""
+    """Return the loss of each variation on the mean of the drives, the largest one first."""
     bev = np.mean([outcome.iou_bev for outcome in baseline.values()])
     volume = np.mean([outcome.iou_3d for outcome in baseline.values()])
     found = []

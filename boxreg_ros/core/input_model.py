@@ -506,8 +506,8 @@ def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
     evidence about their extents show which, and by how much: a ridge regression of their
     corrections on the distance of all three extents from the medians, in logarithms and in
     proportion to the square of the error, so that low-noise input is left as it is. Objects
-    unlike the majority, trucks among cars, get little of it, and the medians none: those are up to
-    the labelling margin.
+    unlike the majority, trucks among cars, are corrected little, and the medians not at all: the
+    labelling margin accounts for a common error.
 
     """
     log, correction, weight = evidence.to(given).unbind(1)
@@ -755,7 +755,7 @@ def _posterior_mean(means: Floats, prior: float, deviation: float) -> float:
 
 
 def _of_track(known: dict[str, Floats], track_id: str, fresh: Floats) -> Floats:
-    """Return the array of a track, `fresh` for a new one; forget the one seen longest ago."""
+    """Return the array of a track, `fresh` for a new one; delete the one seen longest ago."""
     found = known.pop(track_id, fresh)
     known[track_id] = found
     if len(known) > MAX_TRACKS:

@@ -112,7 +112,7 @@ def alignment(boxes: Tensor, valid: Tensor, rounding: float = EPSILON) -> Tensor
     Notes
     -----
     The direction of a step of length zero is undefined: the weight of a step grows linearly up
-    to `FULL_STEP`. A window that moves against its headings on the whole is taken for a reversing
+    to `FULL_STEP`. A window whose mean motion is against its headings is taken for a reversing
     object: its direction of motion is reversed. The paper also wraps its alpha, the roll, into
     [-pi/2, pi/2]; this term does not depend on it.
 

@@ -446,7 +446,7 @@ class _Track:
     variance : float
         Of the position of the newest estimate, the sum over its axes [m^2].
     num_carried : int
-        Newest observations that have been in no window for want of a budget.
+        Newest observations that were in no window yet, because the budget was used up.
 
     """
 

@@ -350,7 +350,7 @@ def _weighted_terms(
 
 
 def _prior_of_full(weighted: list[Term], found: State, problem: Problem) -> MarginalPrior:
-    """Return what full windows leave to the next ones, NaN for those that are padded."""
+    """Return the prior of the windows after full ones, NaN for those that are padded."""
     prior = marginalise(weighted, found)
     is_padded = ~problem.valid.all(1)
     prior.state[is_padded] = torch.nan

@@ -204,7 +204,7 @@ def parked_steps(problem: Problem, yaw_deviation: Tensor) -> Tensor:
     Return 1 for the steps (B, N - 1) of parked objects, else 0 (M25).
 
     `yaw_deviation` (B,) is the estimated error of the input yaw [rad]: noise alone is no turn. An
-    object that is parked on the whole may brake or drive off at an end of its window: those steps,
+    object that is parked over most of its window may brake or drive off at an end: those steps,
     and `DRIVING_REACH` more around them, are 0.
 
     """
@@ -303,7 +303,7 @@ def _shared_weights(
 
     The deviation of a labelling margin is widened where the margin is far off the expected one, or
     the points of a face are far off where they are expected: points of a load, or of a branch
-    above, must not lift the roof.
+    above, must not raise the estimated roof.
 
     """
     outlier = GAP_OUTLIER if config.ingredients.robust_weights else inf

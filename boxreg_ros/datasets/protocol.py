@@ -1,4 +1,4 @@
-"""What the module of a data set reads, and states about it."""
+"""The protocol of the modules of data sets: description and reader of a data set."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class DatasetModule(Protocol):
 
     @property
     def DATASET(self) -> Dataset:
-        """Return what the data set is."""
+        """Return the description of the data set."""
 
     def scene_names(self, root: Path) -> list[str]:
         """Return the names of all scenes in a folder; empty if it is not of this data set."""

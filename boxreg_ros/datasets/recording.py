@@ -80,7 +80,7 @@ class SceneRecording:
         self._readable = 0
 
     def __enter__(self) -> Self:
-        """Read what is known about the scene, but no cloud."""
+        """Read stamps, poses and boxes of the scene, but no cloud."""
         self._address = resolved(self._address)
         self._scene: Scene = open_scene(self._address, self._points)
         self.points_topic = self._scene.points_topic

@@ -1,4 +1,4 @@
-"""Tables of boxes: what ``boxes.csv`` and truth files hold."""
+"""Tables of boxes: the content of ``boxes.csv`` and of truth files."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ class MarkerBoard:
         return m.MarkerArray(markers=markers)
 
     def clear(self) -> Any:
-        """Return what removes all markers."""
+        """Return the markers that remove all others."""
         self._shown = {}
         m = self._messages
         return m.MarkerArray(markers=[m.Marker(action=DELETEALL)])

@@ -348,7 +348,7 @@ class Recording:
         read_to = end and end + LOOKAHEAD_NS
         waiting: deque[Record] = deque()
         for record in self._read(topics | ahead_topics, read_from, read_to):
-            # Those complete first: after a pause, this record makes the tree forget.
+            # Those complete first: after a pause, this record resets the tree.
             while waiting and waiting[0].received_ns <= record.received_ns - LOOKAHEAD_NS:
                 yield waiting.popleft()
             if record.connection.topic in ahead_topics:

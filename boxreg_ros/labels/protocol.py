@@ -1,4 +1,4 @@
-"""What a label format reads, writes and states about itself."""
+"""The protocol of the modules of label formats: description, reader and writer."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ class Health:
 
 
 def _awaited(counts: Mapping[str, int], fixed_frame: str) -> str:
-    """Return what the first refined box still needs, the most basic thing first."""
+    """Return the inputs that the first refined box still needs, the most basic one first."""
     missing = [name for name in ('points', 'boxes') if not counts.get(f'{name}_received')]
     if missing:
         return f'messages on {" and ".join(missing)}'

@@ -1,4 +1,4 @@
-"""What the label files get of the live registration: final boxes in order, and clouds."""
+"""The output of the live registration for label files: final boxes in order, and clouds."""
 
 from __future__ import annotations
 

@@ -234,7 +234,7 @@ class Topics:
         return {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)}
 
     def problems(self) -> list[Problem]:
-        """Return what keeps messages from arriving now, on any topic of the node."""
+        """Return the reasons why messages do not arrive now, on any topic of the node."""
         found: list[Problem] = []
         for endpoint in self._endpoints:
             if endpoint.is_input:

@@ -111,7 +111,7 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _contents(paths: list[Path]) -> dict[str, Any]:
-    """Return files, times, topics and damages: what the index has."""
+    """Return files, times, topics and damages, from the index."""
     from boxreg_ros.io.storage.files import part_of, size_of
     from boxreg_ros.io.storage.reader import Reader
 
@@ -278,7 +278,7 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
 
 
 def _transform(link: Link) -> dict[str, Any]:
-    """Return what is known of the transform between two frames."""
+    """Return rate and gaps of the transform between two frames."""
     stamps = list(link.stamps_ns)
     return {
         'parent': link.parent,
@@ -314,7 +314,7 @@ def _summary(sample: _Sample) -> dict[str, Any]:
 
 
 def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[str]:
-    """Yield what makes results worse, one line each."""
+    """Yield the conditions that make results worse, one line each."""
     if finding:
         yield finding
     if sample.without_id:

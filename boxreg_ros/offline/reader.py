@@ -270,7 +270,7 @@ class RecordingReader:
             return self._trimmed(whole, Admitted(sweep, T_fixed_sensor))
 
     def _trimmed(self, item: Item, admitted: Admitted) -> ReadItem:
-        """Return an item without what nobody reads: it is copied."""
+        """Return an item without the parts that are not read: it is copied to a process."""
         restarts = self._restarts
         self._restarts = False
         given = item.content

@@ -221,7 +221,7 @@ def _take(ready: list[RefinedBoxes], completion: Completion | None, sink: Sink) 
 
 
 def _completed(plan: Plan | None) -> dict[str, int]:
-    """Return what each step did to how many tracks and boxes; empty without steps."""
+    """Return the numbers of tracks and boxes that each step changed; empty without steps."""
     if plan is None:
         return {}
     tracks = plan.tracks
@@ -465,7 +465,7 @@ def is_complete(summary: dict[str, Any]) -> bool:
 
 
 def _input_notes(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield what of the recording cannot be used, one line each."""
+    """Yield the parts of the recording that cannot be used, one line each."""
     if summary['damage']:
         yield _damage_line(summary['damage'])
     if summary['without_stamp']:

@@ -46,7 +46,7 @@ class Stopwatch:
             yield item  # type: ignore[misc]
 
     def begun(self, stage: str) -> None:
-        """Add the time since construction to a stage: what was done before work began."""
+        """Add the time since construction to a stage: the preparation before the work."""
         self.add(stage, time.perf_counter() - self._begun)
 
     def stages(self) -> dict[str, float]:

@@ -163,7 +163,7 @@ class Segment:
 
 
 def journal_settings(settings: RecorderSettings) -> dict[str, str]:
-    """Return what a journal states beside its frames: all that the label writers need."""
+    """Return the metadata of a journal: all that the label writers need beside the frames."""
     return {
         'formats': ','.join(with_csv(settings.formats)),
         'with_points': str(settings.with_points).lower(),

@@ -1,4 +1,4 @@
-"""What ``report.html`` holds of each track: one row for the list, and one compressed part."""
+"""The data of each track in ``report.html``: one row for the list, and one compressed part."""
 
 from __future__ import annotations
 

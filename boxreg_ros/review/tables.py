@@ -17,7 +17,7 @@ REVIEW = 'review.csv'
 
 
 class TrackRow(NamedTuple):
-    """What a row of ``tracks.csv`` is made of: the track, and its risk."""
+    """The source of a row of ``tracks.csv``: the track, and its risk."""
 
     track: TrackChanges
     risk: Risk

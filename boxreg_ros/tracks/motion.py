@@ -175,5 +175,5 @@ def between(before: EndMotion, after: EndMotion, stamps_ns: Ints) -> Floats:
 
 
 def _velocity_or(motion: EndMotion, chord: Floats) -> Floats:
-    """Return the velocity at an end; that of the chord where one box says nothing about it."""
+    """Return the velocity at an end; that of the chord where only one box is known."""
     return chord if motion.speed_variance >= UNKNOWN_SPEED_DEVIATION**2 else motion.velocity

@@ -1,4 +1,4 @@
-"""What the completing steps did to one track."""
+"""The effects of the completing steps on one track."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a rule is, and the labels that it reads."""
+"""The protocol of the rules, and the labels that they read."""
 
 from __future__ import annotations
 
