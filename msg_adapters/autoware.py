@@ -92,6 +92,11 @@ def to_msg(
     return poses.replaced(msg, header=header, objects=objects)
 
 
+def class_name_of(label: int) -> str:
+    """Return the class of a label."""
+    return LABELS[label] if label < len(LABELS) else f'label_{label}'
+
+
 def _with_pose(
     kinematics: Any,
     pose: Any,
@@ -123,8 +128,7 @@ def _track_id(o: Any) -> str:
 def _class_name(o: Any) -> str:
     if not o.classification:
         return ''
-    label = max(o.classification, key=lambda item: item.probability).label
-    return LABELS[label] if label < len(LABELS) else f'label_{label}'
+    return class_name_of(max(o.classification, key=lambda item: item.probability).label)
 
 
 def _scaled_footprint(shape: Any, box: Floats) -> Any:

@@ -90,6 +90,11 @@ def to_msg(
     )
 
 
+def class_name_of(number: int) -> str:
+    """Return the class of a classification."""
+    return CLASS_NAMES[number] if number < len(CLASS_NAMES) else f'class_{number}'
+
+
 def _is_box(o: Any) -> bool:
     return o.shape.type == BOX and len(o.shape.dimensions) == 3
 
@@ -97,8 +102,7 @@ def _is_box(o: Any) -> bool:
 def _class_name(o: Any) -> str:
     if not o.object_classified:
         return ''
-    number = o.classification
-    return CLASS_NAMES[number] if number < len(CLASS_NAMES) else f'class_{number}'
+    return class_name_of(o.classification)
 
 
 def _score(o: Any) -> float:

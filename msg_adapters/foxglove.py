@@ -62,8 +62,9 @@ def from_msg(msg: Any) -> BoxArray:
         metadata = _metadata(entity)
         for k, cube in enumerate(own_cubes):
             track_ids.append(str(entity.id) if len(own_cubes) == 1 else f'{entity.id}/{k}')
-            class_names.append(_first_value(metadata, CLASS_KEYS, ''))
-            scores.append(_score(_first_value(metadata, SCORE_KEYS, '1')))
+            class_name, score = class_and_score(metadata)
+            class_names.append(class_name)
+            scores.append(score)
             cubes.append(cube)
     return BoxArray(
         stamp_ns,
@@ -92,6 +93,12 @@ def to_msg(
             entity = _with_cubes(entity, cubes, boxes.frame_id, T_out_in)
         entities.append(entity)
     return poses.replaced(msg, entities=entities)
+
+
+def class_and_score(metadata: dict[str, str]) -> tuple[str, float]:
+    """Return class and score of an entity by its metadata, with keys in lower case."""
+    class_name = _first_value(metadata, CLASS_KEYS, '')
+    return class_name, _score(_first_value(metadata, SCORE_KEYS, '1'))
 
 
 def _with_cubes(entity: Any, cubes: list[Any], frame_id: str, T_out_in: Floats | None) -> Any:

@@ -113,17 +113,31 @@ def boxes_of(poses: Sequence[Any], sizes: Sequence[Any]) -> Floats:
         If a value is not a number, or a size does not have three.
 
     """
-    boxes = np.full((len(poses), 9), np.nan)
     if not len(poses):
-        return boxes
+        return np.zeros((0, 9))
+    numbers = np.empty((len(poses), 10))
     try:
-        boxes[:, X : Z + 1] = [(p.position.x, p.position.y, p.position.z) for p in poses]
-        boxes[:, LENGTH : HEIGHT + 1] = [(s.x, s.y, s.z) if hasattr(s, 'x') else s for s in sizes]
-        quaternions_xyzw = np.array([quaternion_of(pose) for pose in poses], dtype=np.float64)
+        numbers[:, :3] = [(p.position.x, p.position.y, p.position.z) for p in poses]
+        numbers[:, 3:7] = [quaternion_of(pose) for pose in poses]
+        numbers[:, 7:] = [(s.x, s.y, s.z) if hasattr(s, 'x') else s for s in sizes]
     except (OverflowError, TypeError, ValueError) as error:
         raise UnsupportedMessage(
             f'boxes: expected numbers as position, orientation and size: {error}'
         ) from None
+    return boxes_from(numbers[:, :7], numbers[:, 7:])
+
+
+def boxes_from(poses: Floats, sizes: Floats) -> Floats:
+    """
+    Return boxes (n, 9) from poses (n, 7), position and quaternion, and extents (n, 3).
+
+    A box whose quaternion is not of unit length gets NaN angles.
+
+    """
+    boxes = np.full((len(poses), 9), np.nan)
+    boxes[:, X : Z + 1] = poses[:, :3]
+    boxes[:, LENGTH : HEIGHT + 1] = sizes
+    quaternions_xyzw = poses[:, 3:]
     is_unit = _is_unit(quaternions_xyzw)
     boxes[is_unit, ROLL:] = rpy_from_quaternion(quaternions_xyzw[is_unit])
     return boxes

@@ -103,13 +103,14 @@ def rows() -> list[tuple[str, ...]]:
 
 
 @dataclass(frozen=True, slots=True)
-class _ConvertingAdapter:
+class ConvertingAdapter:
     """An adapter whose messages follow another convention than their type defines."""
 
     inner: Adapter
     convention: Convention
 
     def from_msg(self, msg: Any) -> BoxArray:
+        """Return the boxes, see `Adapter`."""
         return self.convention.to_centers(self.inner.from_msg(msg))
 
     def to_msg(
@@ -119,6 +120,7 @@ class _ConvertingAdapter:
         covariances: Floats | None = None,
         T_out_in: Floats | None = None,
     ) -> Any:
+        """Return a copy with its boxes replaced, see `Adapter`."""
         if covariances is not None:
             covariances = self.convention.covariances_from_centers(boxes, covariances)
         return self.inner.to_msg(msg, self.convention.from_centers(boxes), covariances, T_out_in)
@@ -163,4 +165,4 @@ def adapter_for(type_name: str, convention: Convention | None = None) -> Adapter
     adapter = cast(Adapter, import_module(ADAPTERS[name]))
     if convention is None or convention.is_standard:
         return adapter
-    return _ConvertingAdapter(adapter, convention)
+    return ConvertingAdapter(adapter, convention)

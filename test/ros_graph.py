@@ -203,6 +203,7 @@ class Record(NamedTuple):
     topic: str
     type_name: str
     data: bytes
+    received_ns: int
     boxes_stamp_ns: int | None
 
 
@@ -210,11 +211,11 @@ def records_of(path, boxes_topic='/boxes'):
     """Return all records of a recording in the order they were received."""
     records = []
     with AnyReader([path]) as reader:
-        for connection, _, data in reader.messages():
+        for connection, received_ns, data in reader.messages():
             topic, type_name, stamp_ns = connection.topic, connection.msgtype, None
             if topic == boxes_topic:
                 stamp_ns = stamp_of(reader.deserialize(data, type_name))
-            records.append(Record(topic, type_name, bytes(data), stamp_ns))
+            records.append(Record(topic, type_name, bytes(data), received_ns, stamp_ns))
     return records
 
 
@@ -239,6 +240,25 @@ def play(graph, records, early=None):
             graph.wait(
                 lambda s=stamp_ns: any(stamp_of(m) == s for m in early), f'boxes of {stamp_ns} ns'
             )
+
+
+def play_in_time(graph, records, rate):
+    """Publish records at a rate of their times, and /clock, as ``ros2 bag play --clock 100``."""
+    kind = import_message('rosgraph_msgs/msg/Clock')
+    first_ns = records[0].received_ns
+    begun = time.monotonic()
+    for record in records:
+        due = begun + (record.received_ns - first_ns) * 1e-9 / rate
+        while True:
+            now = time.monotonic()
+            message = kind()
+            now_ns = first_ns + round((min(now, due) - begun) * rate * 1e9)
+            message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
+            graph.publishers['/clock'].publish(message)
+            if now >= due:
+                break
+            graph.executor.spin_once(timeout_sec=min(0.01, due - now))
+        graph.publishers[record.topic].publish(record.data)
 
 
 def numbers_changed(messages, records):

@@ -44,6 +44,7 @@ CDR_HEADER = 4  # bytes before the first member of a serialised message
 FIRST_MARKER = 8  # bytes before the first marker: the header and the length of the list
 COMPLETION_TIME = 60.0  # for the last segment of recorded labels [s]
 RECORDING_TURNS = 2  # runs without and with recording
+SETTLED_AFTER = 60.0  # queues, pools of memory and the heap have their size by then [s]
 SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
 
 
@@ -414,7 +415,8 @@ def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
     """
     Return memory, handles, threads and cores used by the node.
 
-    A value that grows from the start to the middle and on to the end is a leak.
+    A value that grows from the start, after `SETTLED_AFTER` or a third of the run, to the middle
+    and on to the end is a leak.
 
     Parameters
     ----------
@@ -423,7 +425,7 @@ def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
 
     """
     end = len(samples) - 1
-    begin = min(round(STARTUP_TIME / SAMPLE_PERIOD), end // 3)
+    begin = min(round(SETTLED_AFTER / SAMPLE_PERIOD), end // 3)
     rows = {'at the start': begin, 'in the middle': (begin + end) // 2, 'at the end': end}
     cpu_time = samples[end][3] - samples[begin][3]
     return {
@@ -435,8 +437,9 @@ def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
 
 
 def children_of(pid: int) -> list[int]:
-    """Return the processes that a process has started."""
-    return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+    """Return the processes that a process has started, in any of its threads."""
+    lists = Path(f'/proc/{pid}/task').glob('*/children')
+    return [int(word) for children in lists for word in children.read_text().split()]
 
 
 def vitals(pid: int) -> tuple[float, int, int, float]:

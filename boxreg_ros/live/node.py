@@ -20,18 +20,20 @@ from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
 from boxreg_ros.live.recording import Recording
-from boxreg_ros.live.topics import Topics
+from boxreg_ros.live.topics import import_message, Topics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
-from msg_adapters import adapter_for, canonical
+from msg_adapters import adapter_for, canonical, cdr
 from msg_adapters.clouds import header_of
 from msg_adapters.concatenation import INFO_TYPE
+from msg_adapters.serialized import serialized_adapter_for
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 NAME = 'boxreg_node'
@@ -98,6 +100,7 @@ class BoxregNode(Node):
         """
         config, options = self._settings
         warm_up(config)
+        cdr.warm_up()
         self._budget = TickBudget(options.deadline)
         warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
         self._live = LiveRegistrar(
@@ -222,13 +225,19 @@ class BoxregNode(Node):
         """Publish refined boxes and subscribe to boxes of a type."""
         config, options = self._settings
         adapter = adapter_for(type_name, options.convention)
+        serialized = serialized_adapter_for(
+            type_name, options.convention, import_message(type_name), deserialize_message
+        )
         capacity = self._inbox.capacity['boxes']
         at_end = FINALS_MARGIN + config.lag + capacity  # published at once at the end
         early = self._topics.publish(type_name, 'refined_boxes', at_end)
         final = self._topics.publish(type_name, 'refined_boxes_final', at_end)
-        self.worker.open_boxes(adapter, early, final)
+        self.worker.open_boxes(serialized or adapter, early, final)
         qos = QoSProfile(depth=2 * capacity, reliability=ReliabilityPolicy.BEST_AVAILABLE)
-        self._topics.subscribe(type_name, 'boxes', self._on_boxes, qos, is_required=True)
+        self._topics.subscribe(
+            type_name, 'boxes', self._on_boxes, qos, is_required=True,
+            is_raw=serialized is not None,
+        )  # fmt: skip
         self.get_logger().info(f'boxes are {type_name}; {self._topics.description()}')
 
     def _on_transforms(self, topic: str, msg: Any) -> None:

@@ -72,6 +72,8 @@ class RecorderProcess:
     on_end : callable
         Called once, from another thread, when the recorder has ended, with the error that ended
         it early; '' for none.
+    predecessor : RecorderProcess, optional
+        The recorder is started when this one has ended, which may write to the same folder.
 
     Attributes
     ----------
@@ -90,6 +92,7 @@ class RecorderProcess:
         health: Health,
         on_begin: Callable[[], None],
         on_end: Callable[[str], None],
+        predecessor: RecorderProcess | None = None,
     ) -> None:
         self.settings = settings
         self.status = Status()
@@ -101,16 +104,7 @@ class RecorderProcess:
         self._changed = Condition()
         self._waiting: deque[Any] = deque([settings])
         self._sizes = dict.fromkeys(CAPACITY, 0)
-        self._process = subprocess.Popen(
-            [sys.executable, '-m', PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._threads = [
-            Thread(target=self._send_all, args=(self._process.stdin,), daemon=True),
-            Thread(target=self._read_all, args=(self._process.stdout,), daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
+        Thread(target=self._run, args=(predecessor,), daemon=True).start()
 
     def put(self, item: RawCloud | FinalBoxes | Split) -> None:
         """Queue an item; where the queue is full, it is dropped and counted."""
@@ -143,6 +137,17 @@ class RecorderProcess:
         """Return the number of waiting items."""
         return {f'{kind} waiting': self._sizes[kind] for kind in CAPACITY}
 
+    def _run(self, predecessor: RecorderProcess | None) -> None:
+        """Start the recorder and send it what is put."""
+        if predecessor is not None:
+            predecessor.has_ended.wait()
+        process = subprocess.Popen(
+            [sys.executable, '-m', PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert process.stdin is not None
+        Thread(target=self._read_all, args=(process,), daemon=True).start()
+        self._send_all(process.stdin)
+
     def _send_all(self, target: IO[bytes]) -> None:
         """Send what is put, until `finish` or the end of the recorder."""
         try:
@@ -169,14 +174,15 @@ class RecorderProcess:
                 self._sizes[kind] -= 1
             return item
 
-    def _read_all(self, source: IO[bytes]) -> None:
+    def _read_all(self, process: subprocess.Popen[bytes]) -> None:
         """Read the status of the recorder until it ends."""
-        lines = iter(source)
+        assert process.stdout is not None
+        lines = iter(process.stdout)
         self._take_status(next(lines, b''))
         self._on_begin()
         for line in lines:
             self._take_status(line)
-        exit_status = self._process.wait()
+        exit_status = process.wait()
         error = self.status.error
         if not error and (exit_status or not self._is_finishing):
             error = (

@@ -97,7 +97,7 @@ class Recording:
         self._begun = begun = Future()
         self._ended = Future()
         self._recorder = RecorderProcess(
-            settings, self._health, lambda: begun.set_result(None), self._note_end
+            settings, self._health, lambda: begun.set_result(None), self._note_end, self._recorder
         )
         self._inbox.put_event('record', self._recorder)
         self._logger.info(f'recording labels to {settings.folder}')

@@ -91,6 +91,8 @@ class Endpoint:
         True if the node refines nothing without messages on it.
     has_overrides : bool
         True if parameters may override the QoS profile.
+    is_raw : bool
+        True if the callback takes bytes.
     entity : Subscription or Publisher
         The entity of rclpy, once made.
     since : float
@@ -107,6 +109,7 @@ class Endpoint:
     callback: Callable[[Any], None] | None = None
     is_required: bool = False
     has_overrides: bool = True
+    is_raw: bool = False
     entity: Any = None
     since: float = field(default_factory=time.monotonic)
     received: int = 0
@@ -146,6 +149,7 @@ class Topics:
         qos: QoSProfile,
         is_required: bool = False,
         has_overrides: bool = True,
+        is_raw: bool = False,
     ) -> None:
         """
         Create a subscription.
@@ -167,6 +171,8 @@ class Topics:
             True to report that nothing is published or received on it.
         has_overrides : bool
             True to let parameters override the QoS profile.
+        is_raw : bool
+            True to receive messages as bytes.
 
         Raises
         ------
@@ -177,7 +183,9 @@ class Topics:
 
         """
         name = self._node.resolve_topic_name(topic)
-        endpoint = Endpoint(topic, name, type_name, qos, callback, is_required, has_overrides)
+        endpoint = Endpoint(
+            topic, name, type_name, qos, callback, is_required, has_overrides, is_raw
+        )
         self._create_subscription(endpoint)
         self._endpoints.append(endpoint)
 
@@ -292,7 +300,7 @@ class Topics:
         with _checked_overrides(f'{endpoint.name}.subscription'):
             endpoint.entity = self._node.create_subscription(
                 kind, endpoint.topic, partial(self._on_message, endpoint), endpoint.qos,
-                event_callbacks=events,
+                event_callbacks=events, raw=endpoint.is_raw,
                 qos_overriding_options=QOS_OVERRIDES if endpoint.has_overrides else None,
             )  # fmt: skip
 

@@ -23,6 +23,7 @@ from ros_graph import (
     graph_in,
     numbers_changed,
     play,
+    play_in_time,
     publishers_for,
     QUICK,
     records_of,
@@ -217,6 +218,26 @@ def test_boxes_wait_half_a_second_for_clouds_after_the_lidar_stops(graph, tmp_pa
     slowest = [values_of([d]).get('latency most [ms]', 0) for d in diagnostics]
     assert max(map(float, slowest)) >= 500.0
     assert ended_cleanly(node)
+
+
+def test_a_recording_is_refined_at_every_rate_and_in_each_loop(graph, tmp_path):
+    records = records_of(Drive(sweeps=14).write(tmp_path / 'drive'))  # stamps go back by > 1 s
+    publishers_for(graph, records)
+    graph.publisher('rosgraph_msgs/msg/Clock', '/clock')
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    final = graph.collect(DETECTIONS, '/refined_boxes_final')
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start(*RELIABLE, *QUICK, '-p', 'use_sim_time:=true')
+    graph.wait_until_connected()
+    for loop, rate in enumerate((0.5, 1, 2, 2)):
+        play_in_time(graph, records, rate)
+        graph.wait(lambda n=loop: len(early) == 14 * (n + 1), 'early boxes')
+    graph.wait(lambda: values_of(diagnostics).get('time_jump') == '3', 'counters')
+    assert ended_cleanly(node)
+    for loop in range(4):
+        part = slice(14 * loop, 14 * loop + 14)
+        assert numbers_changed(early[part], records) == [0, 0, *[2] * 12]
+        assert numbers_changed(final[part], records) == [2] * 14
 
 
 def stepped(seconds):

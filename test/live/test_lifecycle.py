@@ -1,5 +1,6 @@
 """The lifecycle node as a process, over DDS."""
 
+from boxreg_ros.labels.segments import read_index
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
@@ -71,6 +72,25 @@ def test_boxes_are_refined_while_the_node_is_active(graph, tmp_path):
     assert manager.change(Transition.TRANSITION_INACTIVE_SHUTDOWN) == (True, 'finalized')
     assert 'time_jump' not in node.output()
     assert ended_cleanly(node)
+
+
+def test_each_activation_records_its_own_segments(graph, tmp_path):
+    records = records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
+    publishers_for(graph, records)
+    early = graph.collect(DETECTIONS, '/refined_boxes')
+    folder = tmp_path / 'labels'
+    node = graph.start(*RELIABLE, *QUICK, '-p', f'record_to:={folder}', command=COMMAND)
+    manager = Manager(graph)
+    assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
+    for _ in range(2):  # without a pause between them
+        assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
+        graph.wait_until_connected()
+        play(graph, records, early)
+        assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
+        early.clear()
+    assert ended_cleanly(node)
+    assert 'ERROR' not in node.output()
+    assert [row.frames for row in read_index(folder)] == [6, 6]
 
 
 def test_an_activation_that_fails_leaves_the_node_inactive(graph):

@@ -84,10 +84,14 @@ def test_launch_file_starts_the_node_with_its_arguments():
     assert node.get('exec') == arguments['name'].get('default') == 'boxreg_node'
     for argument in ('name', 'namespace', 'respawn'):
         assert node.get(argument) == f'$(var {argument})'
-    assert node.get('ros_args') == '--log-level $(var log_level)'
+    # As a parameter of launch, a file that does not exist would be a mere warning.
+    assert node.get('ros_args') == '--log-level $(var log_level) --params-file $(var params)'
     assert {item.get('from') for item in node.iter('remap')} == {'points', 'boxes', 'odom'}
     given = [item.get('from') or item.get('name') for item in node.iter('param')]
-    assert given == ['$(var params)', 'boxes_type', 'use_sim_time']  # later ones win
+    assert given == ['boxes_type', 'use_sim_time']  # they override the file
+    for name in ('use_sim_time', 'respawn', 'rviz'):
+        choices = [item.get('value') for item in arguments[name].iter('choice')]
+        assert choices == ['true', 'false']
     text = (SHARE / 'boxreg.launch.xml').read_text(encoding='utf-8')
     assert set(re.findall(r'\$\(var (\w+)\)', text)) == set(arguments)
     for file in re.findall(r'find-pkg-share boxreg_ros\)/([\w.]+)', text):

@@ -166,10 +166,10 @@ def test_start_up_line_names_resolved_topics_with_type_and_qos(graph):
 
 ADAPTER_WITH_A_BUG = """
 import sys
-from msg_adapters import vision
-def from_msg(message):
+from msg_adapters.serialized import SerializedAdapter
+def from_msg(self, message):
     return {}['a bug']
-vision.from_msg = from_msg
+SerializedAdapter.from_msg = from_msg
 from boxreg_ros.live.main import main
 sys.exit(main())
 """

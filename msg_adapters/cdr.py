@@ -1,0 +1,265 @@
+"""
+Serialised messages: where their fields are, read and written as arrays.
+
+A message of 1,000 boxes becomes 10,000 Python objects, which takes ROS 50 to 100 ms. Here its
+bytes are walked once by a compiled loop; numbers are then copied to and from arrays.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+import re
+from typing import Any
+
+from boxreg_ros.errors import UnsupportedMessage
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+HEADER = 4
+"""Bytes before the first field; alignment counts from there."""
+LITTLE_ENDIAN = 1
+"""Second byte of the header, of the only encoding that is walked."""
+STEP_NUMBERS, STEP_TEXT, STEP_SEQUENCE, STEP_ITEMS, STEP_END = range(5)
+"""Steps of a walk: numbers, a string, a sequence of numbers; begin and end of repeated steps."""
+SIZES = {
+    **dict.fromkeys(('boolean', 'octet', 'char', 'int8', 'uint8'), 1),
+    **dict.fromkeys(('int16', 'uint16'), 2),
+    **dict.fromkeys(('int32', 'uint32', 'float'), 4),
+    **dict.fromkeys(('int64', 'uint64', 'double'), 8),
+}
+"""Size of each type of numbers, which is its alignment as well [bytes]."""
+FIELD_TYPE = re.compile(
+    r'(?:sequence<(?P<of>[^,>]+).*>|(?P<one>[^\[<]+)(?:<=\d+)?(\[(?P<n>\d+)\])?)'
+)
+"""A field type of rclpy: ``double``, ``double[36]``, ``sequence<std_msgs/Header>``, ..."""
+
+
+class Layout:
+    """
+    Steps through the fields of a message type, and where to note the places of some of them.
+
+    Parameters
+    ----------
+    kind : type
+        Class of the messages, of rclpy.
+    paths : sequence of str
+        Fields to find, as ``items.pose.position.x``.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the type lacks one of the fields, or has one of a type that is not walked.
+
+    """
+
+    def __init__(self, kind: Any, paths: Sequence[str]) -> None:
+        self._paths = tuple(paths)
+        steps = list(self._steps_of(kind, ''))
+        missing = set(paths) - {path for *_, path in steps}
+        if missing:
+            raise UnsupportedMessage(
+                f'{kind.__name__}: expected the fields {", ".join(sorted(missing))}, got a '
+                f'definition without; install the current definition'
+            )
+        columns = {path: number for number, path in enumerate(paths)}
+        rows = [(step, size, count, columns.get(path, -1)) for step, size, count, path in steps]
+        self._steps = np.array(rows, np.int64)  # (steps, [step, size, count, column])
+
+    def fields_of(self, data: bytes) -> Fields | None:
+        """Return the fields of a message; None if it is not one of this type."""
+        if len(data) < HEADER or data[1] != LITTLE_ENDIAN:
+            return None
+        size = len(data) - HEADER
+        body = np.zeros(-(-size // 8) * 8, np.uint8)  # whole numbers of 8 bytes
+        body[:size] = np.frombuffer(data, np.uint8, size, HEADER)
+        counts = np.zeros(len(self._paths), np.int64)
+        places = np.zeros((len(self._paths), 0, 2), np.int64)
+        if not _walk(body, size, self._steps, counts, places):
+            return None
+        places = np.zeros((len(self._paths), int(counts.max(initial=0)), 2), np.int64)
+        counts[:] = 0
+        _walk(body, size, self._steps, counts, places)
+        found = {path: places[i, : counts[i]] for i, path in enumerate(self._paths)}
+        return Fields(data, body, found)
+
+    def _steps_of(self, kind: Any, prefix: str) -> Iterator[tuple[int, int, int, str]]:
+        """Yield step, size [bytes], count and path for all fields of a class."""
+        for name, text in kind.get_fields_and_field_types().items():
+            yield from self._steps_of_field(text, prefix + name)
+
+    def _steps_of_field(self, text: str, path: str) -> Iterator[tuple[int, int, int, str]]:
+        match = FIELD_TYPE.fullmatch(text)
+        if match is None:
+            raise UnsupportedMessage(f'{path}: expected a field type of ROS, got {text}')
+        element = match['of'] or match['one']
+        count = -1 if match['of'] else int(match['n'] or 1)  # -1: the message has the length
+        if element in SIZES:
+            yield (STEP_SEQUENCE if count < 0 else STEP_NUMBERS), SIZES[element], count, path
+            return
+        if element == 'string':
+            inner = [(STEP_TEXT, 1, 1, path)]
+        elif '/' in element:
+            package, _, name = element.partition('/')
+            inner = list(
+                self._steps_of(getattr(import_module(f'{package}.msg'), name), f'{path}.')
+            )
+        else:
+            raise UnsupportedMessage(f'{path}: expected numbers, strings or messages, got {text}')
+        if count == 1:
+            yield from inner
+            return
+        yield STEP_ITEMS, len(inner), count, path
+        yield from inner
+        yield STEP_END, 0, 0, ''
+
+
+class Fields:
+    """
+    The fields that a `Layout` has found in a message.
+
+    Parameters
+    ----------
+    data : bytes
+        The message.
+    body : array
+        What follows its header, as bytes, in whole numbers of 8 bytes.
+    places : dict of str to array, shape (k, 2)
+        Offset in `body` and count (numbers, letters, items) of each field, by path.
+
+    """
+
+    def __init__(
+        self, data: bytes, body: NDArray[np.uint8], places: dict[str, NDArray[np.int64]]
+    ) -> None:
+        self._data = data
+        self._body = body
+        self._places = places
+
+    def counts(self, path: str) -> NDArray[np.int64]:
+        """Return how many elements (k,) a sequence or array has, for each item that it is in."""
+        return self._places[path][:, 1]
+
+    def numbers(self, path: str, dtype: str, width: int = 1) -> NDArray[Any]:
+        """Return a field and the numbers that follow it without a gap, as an array (k, width)."""
+        values: NDArray[Any] = self._body.view(dtype)[self._index(path, dtype, width)]
+        return values
+
+    def put(self, path: str, values: NDArray[Any]) -> None:
+        """Replace what `numbers` returns."""
+        dtype = values.dtype.str
+        self._body.view(dtype)[self._index(path, dtype, values.shape[1])] = values
+
+    def texts(self, path: str) -> list[str]:
+        """Return strings; what is not of UTF-8 is replaced."""
+        encoded = list(self._encoded(path))
+        decoded = {text: text.decode(errors='replace') for text in set(encoded)}
+        return [decoded[text] for text in encoded]
+
+    def distinct(self, path: str) -> set[str]:
+        """Return the different strings among those of `texts`."""
+        return {text.decode(errors='replace') for text in set(self._encoded(path))}
+
+    def message(self) -> bytes:
+        """Return the message with the numbers that were put."""
+        return self._data[:HEADER] + self._body[: len(self._data) - HEADER].tobytes()
+
+    def _encoded(self, path: str) -> Iterator[bytes]:
+        data = self._data
+        for offset, length in self._places[path].tolist():
+            begin = HEADER + offset
+            yield data[begin : begin + max(length - 1, 0)]  # a zero ends each string
+
+    def _index(self, path: str, dtype: str, width: int) -> NDArray[np.int64]:
+        first = self._places[path][:, :1] // np.dtype(dtype).itemsize
+        index: NDArray[np.int64] = first + np.arange(width)
+        return index
+
+
+def warm_up() -> None:
+    """Load the compiled loop, or compile it at the very first start."""
+    nothing = np.zeros(0, np.int64)
+    _walk(
+        np.zeros(0, np.uint8),
+        0,
+        np.zeros((0, 4), np.int64),
+        nothing,
+        np.zeros((0, 0, 2), np.int64),
+    )
+
+
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function at its first call; kept on disk where a folder can be written."""
+    try:
+        compiled: Callable[..., Any] = numba.njit(function, cache=True, nogil=True)
+    except RuntimeError:
+        compiled = numba.njit(function, nogil=True)
+    return compiled
+
+
+@_compiled
+def _walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
+    """
+    Walk through a message and note the places of fields.
+
+    Parameters
+    ----------
+    body : array of uint8
+        Bytes of the message.
+    size : int
+        How many of them are of the message.
+    steps : array, shape (steps, 4)
+        Step, size, count and column.
+    counts : array, shape (columns,)
+        Set to the number of fields found; begins with zeros.
+    places : array, shape (columns, capacity, 2)
+        Set to offset and count of each field, as far as there is room.
+
+    Returns
+    -------
+    bool
+        Whether the message has all fields.
+
+    """
+    firsts = np.zeros(len(steps), np.int64)  # first repeated step, by depth
+    lefts = np.zeros(len(steps), np.int64)  # repetitions left, by depth
+    depth = 0
+    position = 0
+    i = 0
+    while i < len(steps):
+        step, width, count, column = steps[i]
+        i += 1
+        if step == STEP_END:
+            lefts[depth] -= 1
+            if lefts[depth] > 0:
+                i = firsts[depth]
+            else:
+                depth -= 1
+            continue
+        if step == STEP_TEXT or count < 0:
+            position = (position + 3) // 4 * 4
+            if position + 4 > size:
+                return False
+            low = np.int64(body[position]) | np.int64(body[position + 1]) << 8
+            high = np.int64(body[position + 2]) | np.int64(body[position + 3]) << 8
+            count = low | high << 16
+            position += 4
+        begin = position
+        if step == STEP_ITEMS and count > 0:
+            depth += 1
+            firsts[depth] = i
+            lefts[depth] = count
+        elif step == STEP_ITEMS:
+            i += width + 1
+        elif count > 0:
+            begin = (position + width - 1) // width * width
+            position = begin + width * count
+            if position > size:
+                return False
+        if column >= 0:
+            if counts[column] < places.shape[1]:
+                places[column, counts[column]] = begin, count
+            counts[column] += 1
+    return True

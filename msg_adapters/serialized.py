@@ -1,0 +1,504 @@
+"""
+Boxes of serialised messages, read and rewritten as arrays: the way of the live node.
+
+`BOX_FIELDS` states where each type has pose, size, id, class and score. What is out of the
+ordinary (several frames in one message, another output frame, shapes that are no boxes) is left
+to the adapter of the family, which reads the deserialised message.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, WIDTH, YAW
+from msg_adapters import autoware, derived, foxglove, markers, poses
+from msg_adapters.cdr import Fields, Layout
+from msg_adapters.convention import Convention, STANDARD
+from msg_adapters.protocol import Adapter
+from msg_adapters.registry import adapter_for, ConvertingAdapter
+import numpy as np
+from numpy.typing import NDArray
+
+POSE_WIDTH, SIZE_WIDTH, COVARIANCE_WIDTH = 7, 3, 36
+"""Numbers of a pose (position, quaternion), of a size and of a covariance."""
+HALF_TURN_SIGNS = np.tile([-1.0, -1.0, 1.0], 2)
+"""Signs of the numbers of a twist or acceleration that is rotated by 180 degrees about z."""
+
+Labels = tuple[list[str], list[str], Floats]
+"""Ids, classes and scores of all boxes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rewrite:
+    """
+    What replaces the boxes of a message.
+
+    Attributes
+    ----------
+    boxes : BoxArray
+        The new boxes.
+    old_pose, new_pose : array, shape (n, 7)
+        Position and quaternion.
+    old_size : array, shape (n, 3)
+        Extents [m].
+    covariance : array, shape (n, 36)
+        NaN where that of the message remains.
+
+    """
+
+    boxes: BoxArray
+    old_pose: Floats
+    new_pose: Floats
+    old_size: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class BoxFields:
+    """
+    Where the messages of a type have their boxes.
+
+    Attributes
+    ----------
+    frames : tuple of str
+        Frames of the array and of the boxes.
+    pose, size : str
+        First number of pose and of size.
+    labels : callable
+        Reads ids, classes and scores.
+    others : tuple of str
+        Further fields that the functions here use.
+    stamp : str
+        Seconds of the stamp, before its nanoseconds.
+    covariance : str
+        First number of the covariance of the pose; '' if there is none.
+    is_ordinary : callable
+        Whether the message can be treated as arrays.
+    rows : callable
+        Which of the poses are those of boxes.
+    write : callable
+        Writes what depends on the box beside pose, size and covariance.
+
+    """
+
+    frames: tuple[str, ...]
+    pose: str
+    size: str
+    labels: Callable[[Fields], Labels]
+    others: tuple[str, ...] = ()
+    stamp: str = 'header.stamp.sec'
+    covariance: str = ''
+    is_ordinary: Callable[[Fields], bool] = lambda fields: True
+    rows: Callable[[Fields], NDArray[np.bool_]] | None = None
+    has_angles: Callable[[Fields], NDArray[np.bool_]] | None = None
+    write: Callable[[Fields, Rewrite], None] = lambda fields, rewrite: None
+
+
+class SerializedAdapter:
+    """
+    An `Adapter` whose messages are bytes, as they arrive and as they are published.
+
+    Parameters
+    ----------
+    type_name : str
+        Message type, one of `BOX_FIELDS`.
+    kind : type
+        Its class, of rclpy.
+    inner : Adapter
+        Adapter of its messages.
+    deserialize : callable
+        Returns the message of bytes.
+
+    Raises
+    ------
+    UnsupportedMessage
+        If the type is an older one that lacks a field.
+
+    """
+
+    def __init__(
+        self, type_name: str, kind: Any, inner: Adapter, deserialize: Callable[[bytes, Any], Any]
+    ) -> None:
+        self._at = BOX_FIELDS[type_name]
+        self._kind = kind
+        self._inner = inner
+        self._deserialize = deserialize
+        at = self._at
+        paths = (at.stamp, *at.frames, at.pose, at.size, at.covariance, *at.others)
+        self._layout = Layout(kind, [path for path in dict.fromkeys(paths) if path])
+
+    def from_msg(self, msg: bytes) -> BoxArray:
+        """Return the boxes of a message, see `Adapter`."""
+        fields = self._ordinary(msg)
+        if fields is None:
+            return self._inner.from_msg(self._deserialize(msg, self._kind))
+        at = self._at
+        rows = self._rows(fields)
+        boxes = poses.boxes_from(
+            fields.numbers(at.pose, '<f8', POSE_WIDTH)[rows],
+            fields.numbers(at.size, '<f8', SIZE_WIDTH)[rows],
+        )
+        if at.has_angles is not None:
+            boxes[~at.has_angles(fields), ROLL : YAW + 1] = np.nan
+        ids, classes, scores = at.labels(fields)
+        sec, nanosec = fields.numbers(at.stamp, '<i4', 2)[0].tolist()
+        frame_id = fields.texts(at.frames[0])[0]
+        return BoxArray(sec * 10**9 + nanosec, frame_id, tuple(ids), tuple(classes), scores, boxes)
+
+    def to_msg(
+        self,
+        msg: bytes,
+        boxes: BoxArray,
+        covariances: Floats | None = None,
+        T_out_in: Floats | None = None,
+    ) -> Any:
+        """Return a copy with its boxes replaced, see `Adapter`: bytes, or a message."""
+        fields = self._ordinary(msg) if T_out_in is None else None
+        at = self._at
+        if fields is None or fields.texts(at.frames[0])[0] != boxes.frame_id:
+            given = self._deserialize(msg, self._kind)
+            return self._inner.to_msg(given, boxes, covariances, T_out_in)
+        rows = self._rows(fields)
+        pose = fields.numbers(at.pose, '<f8', POSE_WIDTH)
+        size = fields.numbers(at.size, '<f8', SIZE_WIDTH)
+        old_pose, old_size = pose[rows].copy(), size[rows].copy()
+        quaternions_xyzw = poses.quaternions_of(boxes.boxes)
+        pose[rows, :3] = _finite_or(boxes.boxes[:, :3], old_pose[:, :3])
+        pose[rows, 3:] = _finite_or(quaternions_xyzw, old_pose[:, 3:])
+        size[rows] = _finite_or(boxes.boxes[:, LENGTH:ROLL], old_size)
+        fields.put(at.pose, pose)
+        fields.put(at.size, size)
+        covariance = np.full((len(boxes.boxes), COVARIANCE_WIDTH), np.nan)
+        if covariances is not None:
+            covariance[:] = covariances.reshape(-1, COVARIANCE_WIDTH)
+        if at.covariance:
+            own = fields.numbers(at.covariance, '<f8', COVARIANCE_WIDTH)
+            fields.put(at.covariance, _finite_or(covariance, own))
+        at.write(fields, Rewrite(boxes, old_pose, pose[rows], old_size, covariance))
+        return fields.message()
+
+    def _ordinary(self, msg: bytes) -> Fields | None:
+        """Return the fields of a message with one frame and one stamp that has boxes."""
+        fields = self._layout.fields_of(msg)
+        if fields is None:
+            return None
+        at = self._at
+        frames = {text for path in at.frames for text in fields.distinct(path)}
+        stamps = fields.numbers(at.stamp, '<i4', 2)
+        is_one = len(frames) == 1 and '' not in frames and bool((stamps == stamps[:1]).all())
+        has_boxes = len(fields.counts(at.pose)) > 0
+        return fields if is_one and has_boxes and at.is_ordinary(fields) else None
+
+    def _rows(self, fields: Fields) -> Any:
+        """Return which of the poses are those of boxes, as an index."""
+        return slice(None) if self._at.rows is None else self._at.rows(fields)
+
+
+def serialized_adapter_for(
+    type_name: str, convention: Convention, kind: Any, deserialize: Callable[[bytes, Any], Any]
+) -> Adapter | None:
+    """
+    Return the adapter of serialised messages of a type; None if there is none.
+
+    Parameters
+    ----------
+    type_name, convention
+        As for `adapter_for`, which raises the same errors.
+    kind, deserialize
+        As for `SerializedAdapter`.
+
+    """
+    inner = adapter_for(type_name, replace(STANDARD, associate=convention.associate))
+    if type_name not in BOX_FIELDS:
+        return None
+    adapter = SerializedAdapter(type_name, kind, inner, deserialize)
+    return adapter if convention.is_standard else ConvertingAdapter(adapter, convention)
+
+
+def _finite_or(new: Floats, old: Floats) -> Floats:
+    """Return the rows of `new`, and those of `old` where they are not finite."""
+    return np.where(np.isfinite(new).all(1, keepdims=True), new, old)
+
+
+def _without_labels(fields: Fields) -> Labels:
+    """Return empty ids and classes, and the score 1."""
+    n = len(fields.counts('boxes.center.position.x'))
+    return [''] * n, [''] * n, np.ones(n)
+
+
+# ---------------------------------------------------------------- vision_msgs/Detection3DArray
+
+RESULT_POSE = 'detections.results.pose.pose.position.x'
+RESULT_COVARIANCE = 'detections.results.pose.covariance'
+
+
+def _detection_labels(fields: Fields) -> Labels:
+    """Return ids, and classes and scores of the hypotheses with the highest score."""
+    classes = fields.texts('detections.results.hypothesis.class_id')
+    scores = fields.numbers('detections.results.hypothesis.score', '<f8')[:, 0].tolist()
+    best = []
+    end = 0
+    for count in fields.counts('detections.results').tolist():
+        begin, end = end, end + count
+        hypotheses = zip(classes[begin:end], scores[begin:end], strict=True)
+        best.append(max(hypotheses, key=lambda item: item[1], default=('', 1.0)))
+    found_scores = np.array([score for _, score in best])
+    return fields.texts('detections.id'), [name for name, _ in best], found_scores
+
+
+def _write_hypotheses(fields: Fields, rewrite: Rewrite) -> None:
+    """Write pose and covariance of each box into its hypotheses."""
+    counts = fields.counts('detections.results')
+    fields.put(RESULT_POSE, np.repeat(rewrite.new_pose, counts, axis=0))
+    own = fields.numbers(RESULT_COVARIANCE, '<f8', COVARIANCE_WIDTH)
+    fields.put(RESULT_COVARIANCE, _finite_or(np.repeat(rewrite.covariance, counts, axis=0), own))
+
+
+# ---------------------------------------------------------------- visualization_msgs/MarkerArray
+
+
+def _cubes(fields: Fields) -> NDArray[np.bool_]:
+    """Return which markers are boxes."""
+    _, kinds, actions = fields.numbers('markers.id', '<i4', 3).T
+    is_box: NDArray[np.bool_] = (kinds == markers.CUBE) & (actions == markers.ADD)
+    return is_box
+
+
+def _marker_labels(fields: Fields) -> Labels:
+    """Return ids and namespaces of the boxes."""
+    rows = _cubes(fields)
+    ids = [str(number) for number in fields.numbers('markers.id', '<i4')[rows, 0].tolist()]
+    names = np.array(fields.texts('markers.ns'), object)[rows].tolist()
+    return ids, names, np.ones(len(ids))
+
+
+# ---------------------------------------------------------------- autoware_perception_msgs
+
+KINEMATICS = 'objects.kinematics.'
+FOOTPRINT = 'objects.shape.footprint.points'
+TWIST_FIELD = KINEMATICS + 'twist_with_covariance.twist.linear.x'
+ACCELERATION_FIELD = KINEMATICS + 'acceleration_with_covariance.accel.linear.x'
+HAS_COVARIANCE = KINEMATICS + 'has_position_covariance'
+AUTOWARE_FIELDS = (
+    'objects.existence_probability', 'objects.classification', 'objects.classification.label',
+    'objects.classification.probability', KINEMATICS + 'orientation_availability', TWIST_FIELD,
+    'objects.shape.type', FOOTPRINT, FOOTPRINT + '.x',
+)  # fmt: skip
+
+
+def _autoware_labels(fields: Fields) -> Labels:
+    """Return the most probable classes and the probabilities of existence; no ids."""
+    labels = fields.numbers('objects.classification.label', '|u1')[:, 0].tolist()
+    probabilities = fields.numbers('objects.classification.probability', '<f4')[:, 0].tolist()
+    classes = []
+    end = 0
+    for count in fields.counts('objects.classification').tolist():
+        begin, end = end, end + count
+        best = max(range(begin, end), key=probabilities.__getitem__, default=None)
+        classes.append('' if best is None else autoware.class_name_of(labels[best]))
+    scores = fields.numbers('objects.existence_probability', '<f4')[:, 0].astype(np.float64)
+    return [''] * len(scores), classes, scores
+
+
+def _tracked_labels(fields: Fields) -> Labels:
+    """Return the same with the UUIDs in hexadecimal."""
+    _, classes, scores = _autoware_labels(fields)
+    uuids = fields.numbers('objects.object_id.uuid', '|u1', 16)
+    ids = [row.tobytes().hex() if row.any() else '' for row in uuids]
+    return ids, classes, scores
+
+
+def _has_no_cylinder(fields: Fields) -> bool:
+    return not (fields.numbers('objects.shape.type', '|u1') == autoware.CYLINDER).any()
+
+
+def _is_oriented(fields: Fields) -> NDArray[np.bool_]:
+    """Return which objects have an orientation."""
+    availability = fields.numbers(KINEMATICS + 'orientation_availability', '|u1')[:, 0]
+    is_oriented: NDArray[np.bool_] = availability != autoware.ORIENTATION_UNAVAILABLE
+    return is_oriented
+
+
+def _write_footprints_and_motion(fields: Fields, rewrite: Rewrite, *motions: str) -> None:
+    """Scale footprints with their boxes, and rotate the motion where the heading flips."""
+    new_size = rewrite.boxes.boxes[:, LENGTH : WIDTH + 1]
+    old_size = rewrite.old_size[:, :2]
+    is_scaled = (old_size > 0).all(1) & np.isfinite(new_size).all(1)
+    scale = np.ones((len(new_size), 3))
+    scale[is_scaled, :2] = new_size[is_scaled] / old_size[is_scaled]
+    corners = fields.numbers(FOOTPRINT + '.x', '<f4', 3)
+    scaled = corners * np.repeat(scale, fields.counts(FOOTPRINT), axis=0)
+    fields.put(FOOTPRINT + '.x', scaled.astype('<f4'))
+    is_flipped = (_forward(rewrite.old_pose) * _forward(rewrite.new_pose)).sum(1) < 0
+    signs = np.concatenate([HALF_TURN_SIGNS, np.outer(HALF_TURN_SIGNS, HALF_TURN_SIGNS).ravel()])
+    for path in motions:
+        motion = fields.numbers(path, '<f8', len(signs))
+        motion[is_flipped] *= signs
+        fields.put(path, motion)
+
+
+def _write_tracked(fields: Fields, rewrite: Rewrite) -> None:
+    _write_footprints_and_motion(fields, rewrite, TWIST_FIELD, ACCELERATION_FIELD)
+
+
+def _write_detected(fields: Fields, rewrite: Rewrite) -> None:
+    _write_footprints_and_motion(fields, rewrite, TWIST_FIELD)
+    own = fields.numbers(HAS_COVARIANCE, '|u1')
+    is_estimated = np.isfinite(rewrite.covariance).all(1, keepdims=True)
+    fields.put(HAS_COVARIANCE, own | is_estimated.astype('|u1'))
+
+
+def _forward(pose: Floats) -> Floats:
+    """Return the x axes (n, 3) of poses (n, 7)."""
+    x, y, z, w = pose[:, 3:].T
+    return np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+
+
+# ---------------------------------------------------------------- derived_object_msgs
+
+DIMENSIONS = 'objects.shape.dimensions'
+OBJECT_FIELDS = (
+    'objects.id', 'objects.object_classified', 'objects.shape.type', 'objects.classification',
+)  # fmt: skip
+
+
+def _has_boxes_only(fields: Fields) -> bool:
+    is_box = fields.numbers('objects.shape.type', '|u1') == derived.BOX
+    return bool(is_box.all() and (fields.counts(DIMENSIONS) == SIZE_WIDTH).all())
+
+
+def _object_labels(fields: Fields) -> Labels:
+    """Return ids, and classes and certainties where an object is classified."""
+    ids = [str(number) for number in fields.numbers('objects.id', '<u4')[:, 0].tolist()]
+    is_known = fields.numbers('objects.object_classified', '|u1')[:, 0] != 0
+    numbers, certainties = fields.numbers('objects.classification', '|u1', 2).T
+    classes = [
+        derived.class_name_of(number) if known else ''
+        for number, known in zip(numbers.tolist(), is_known.tolist(), strict=True)
+    ]
+    return ids, classes, np.where(is_known, certainties / derived.CERTAIN, 1.0)
+
+
+# ---------------------------------------------------------------- foxglove_msgs/SceneUpdate
+
+
+def _has_one_cube_each(fields: Fields) -> bool:
+    return bool((fields.counts('entities.cubes') == 1).all())
+
+
+def _entity_labels(fields: Fields) -> Labels:
+    """Return ids, and classes and scores by the metadata."""
+    keys = fields.texts('entities.metadata.key')
+    lower = {key: key.lower() for key in set(keys)}
+    keys = [lower[key] for key in keys]
+    values = fields.texts('entities.metadata.value')
+    classes = []
+    scores = []
+    end = 0
+    for count in fields.counts('entities.metadata').tolist():
+        begin, end = end, end + count
+        metadata = dict(zip(keys[begin:end], values[begin:end], strict=True))
+        class_name, score = foxglove.class_and_score(metadata)
+        classes.append(class_name)
+        scores.append(score)
+    return fields.texts('entities.id'), classes, np.array(scores)
+
+
+# ---------------------------------------------------------------- jsk_recognition_msgs
+
+
+def _jsk_labels(fields: Fields) -> Labels:
+    """Return labels as classes, and values as scores; no ids."""
+    classes = [str(label) for label in fields.numbers('boxes.label', '<u4')[:, 0].tolist()]
+    scores = fields.numbers('boxes.value', '<f4')[:, 0].astype(np.float64)
+    return [''] * len(classes), classes, scores
+
+
+BOX_FIELDS = {
+    'vision_msgs/msg/Detection3DArray': BoxFields(
+        ('header.frame_id', 'detections.header.frame_id'),
+        'detections.bbox.center.position.x',
+        'detections.bbox.size.x',
+        _detection_labels,
+        others=(
+            'detections.id', 'detections.results', 'detections.results.hypothesis.class_id',
+            'detections.results.hypothesis.score', RESULT_POSE, RESULT_COVARIANCE,
+        ),
+        is_ordinary=lambda fields: bool((fields.counts('detections.id') > 1).all()),
+        write=_write_hypotheses,
+    ),
+    'vision_msgs/msg/BoundingBox3DArray': BoxFields(
+        ('header.frame_id',), 'boxes.center.position.x', 'boxes.size.x', _without_labels
+    ),
+    'autoware_perception_msgs/msg/TrackedObjects': BoxFields(
+        ('header.frame_id',),
+        KINEMATICS + 'pose_with_covariance.pose.position.x',
+        'objects.shape.dimensions.x',
+        _tracked_labels,
+        others=(*AUTOWARE_FIELDS, ACCELERATION_FIELD, 'objects.object_id.uuid'),
+        covariance=KINEMATICS + 'pose_with_covariance.covariance',
+        is_ordinary=_has_no_cylinder,
+        has_angles=_is_oriented,
+        write=_write_tracked,
+    ),
+    'autoware_perception_msgs/msg/DetectedObjects': BoxFields(
+        ('header.frame_id',),
+        KINEMATICS + 'pose_with_covariance.pose.position.x',
+        'objects.shape.dimensions.x',
+        _autoware_labels,
+        others=(*AUTOWARE_FIELDS, HAS_COVARIANCE),
+        covariance=KINEMATICS + 'pose_with_covariance.covariance',
+        is_ordinary=_has_no_cylinder,
+        has_angles=_is_oriented,
+        write=_write_detected,
+    ),
+    'derived_object_msgs/msg/ObjectArray': BoxFields(
+        ('header.frame_id', 'objects.header.frame_id'),
+        'objects.pose.position.x',
+        DIMENSIONS,
+        _object_labels,
+        others=OBJECT_FIELDS,
+        is_ordinary=_has_boxes_only,
+    ),
+    'derived_object_msgs/msg/ObjectWithCovarianceArray': BoxFields(
+        ('header.frame_id', 'objects.header.frame_id'),
+        'objects.pose.pose.position.x',
+        DIMENSIONS,
+        _object_labels,
+        others=OBJECT_FIELDS,
+        covariance='objects.pose.covariance',
+        is_ordinary=_has_boxes_only,
+    ),
+    'foxglove_msgs/msg/SceneUpdate': BoxFields(
+        ('entities.frame_id',),
+        'entities.cubes.pose.position.x',
+        'entities.cubes.size.x',
+        _entity_labels,
+        others=(
+            'entities.id', 'entities.cubes', 'entities.metadata', 'entities.metadata.key',
+            'entities.metadata.value',
+        ),
+        stamp='entities.timestamp.sec',
+        is_ordinary=_has_one_cube_each,
+    ),
+    'jsk_recognition_msgs/msg/BoundingBoxArray': BoxFields(
+        ('header.frame_id', 'boxes.header.frame_id'),
+        'boxes.pose.position.x',
+        'boxes.dimensions.x',
+        _jsk_labels,
+        others=('boxes.value', 'boxes.label'),
+    ),
+    'visualization_msgs/msg/MarkerArray': BoxFields(
+        ('markers.header.frame_id',),
+        'markers.pose.position.x',
+        'markers.scale.x',
+        _marker_labels,
+        others=('markers.id', 'markers.ns'),
+        stamp='markers.header.stamp.sec',
+        rows=_cubes,
+    ),
+}  # fmt: skip
+"""Message type -> where its messages have their boxes."""

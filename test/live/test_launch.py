@@ -1,0 +1,122 @@
+"""The launch file, started as `ros2 launch` starts it."""
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+from paths import ROOT, SHARE
+import pytest
+from ros_domain import next_domain
+from ros_graph import graph_in, numbers_changed, play, publishers_for, records_of
+from ros_messages import DETECTIONS, Drive
+import yaml
+
+pytest.importorskip('launch_ros', reason='launch_ros is not installed')
+pytest.importorskip('launch_xml', reason='launch_xml is not installed')
+
+ROS2_LAUNCH = """
+import sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+file, *arguments = sys.argv[1:]
+pairs = [argument.split(':=', 1) for argument in arguments]
+source = AnyLaunchDescriptionSource(file)
+service = LaunchService(argv=arguments)
+service.include_launch_description(
+    LaunchDescription([IncludeLaunchDescription(source, launch_arguments=pairs)])
+)
+sys.exit(service.run())
+"""
+"""What `ros2 launch` does; ros2cli is in no registry."""
+
+
+@pytest.fixture
+def environment(tmp_path):
+    """Return the environment of a workspace that has these sources as an installed package."""
+    prefix = tmp_path / 'install'
+    index = prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    (index / 'boxreg_ros').touch()
+    (prefix / 'share' / 'boxreg_ros').symlink_to(SHARE)
+    programs = prefix / 'lib' / 'boxreg_ros'
+    programs.mkdir(parents=True)
+    program = (
+        f'#!{sys.executable}\nfrom boxreg_ros.live.main import main\nraise SystemExit(main())\n'
+    )
+    (programs / 'boxreg_node').write_text(program)
+    (programs / 'boxreg_node').chmod(0o755)
+    paths = [str(prefix), os.environ['AMENT_PREFIX_PATH']]
+    return {
+        **os.environ, 'AMENT_PREFIX_PATH': os.pathsep.join(paths),
+        'PYTHONPATH': os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')]),
+        'ROS_DOMAIN_ID': str(next_domain()), 'ROS_LOG_DIR': str(tmp_path),
+    }  # fmt: skip
+
+
+def started(environment, log, *arguments):
+    """Start the launch file with arguments; return the process."""
+    command = [sys.executable, '-c', ROS2_LAUNCH, str(SHARE / 'boxreg.launch.xml'), *arguments]
+    with log.open('w') as file:
+        return subprocess.Popen(
+            command, env=environment, cwd=log.parent, stdout=file, stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )  # fmt: skip
+
+
+def test_boxes_are_refined_and_sigint_ends_everything(environment, tmp_path):
+    records = [
+        record._replace(topic=record.topic.replace('/points', '/lidar/points'))
+        for record in records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
+    ]
+    settings = yaml.safe_load((SHARE / 'params.yaml').read_text(encoding='utf-8'))
+    settings['/**']['ros__parameters'] |= {
+        'window': 4, 'lag': 2, 'backlog': 60.0,
+        'deadline': 3600.0,  # all windows are solved on a busy machine
+        'qos_overrides./lidar/points.subscription.reliability': 'reliable',
+    }  # fmt: skip
+    (tmp_path / 'robot.yaml').write_text(yaml.safe_dump(settings))
+    log = tmp_path / 'launch.log'
+    with graph_in(tmp_path) as graph:
+        publishers_for(graph, records)
+        early = graph.collect(DETECTIONS, '/front/refined_boxes')
+        environment['ROS_DOMAIN_ID'] = str(graph.domain)
+        launched = started(
+            environment, log, 'points:=/lidar/points', 'boxes:=/boxes', 'namespace:=front',
+            'name:=refiner', 'params:=robot.yaml', f'boxes_type:={DETECTIONS}',
+        )  # fmt: skip
+        try:
+            graph.wait_until_connected()
+            play(graph, records, early)
+            assert numbers_changed(early, records) == [0, 0, *[2] * 4]
+            os.killpg(launched.pid, signal.SIGINT)  # as a terminal does
+            assert launched.wait(10.0) == 0
+        finally:
+            launched.kill()
+            launched.wait()
+    output = log.read_text()
+    assert 'finished cleanly' in output, output
+    assert 'front.refiner' in output
+    assert 'ERROR' not in output
+
+
+@pytest.mark.parametrize(
+    ('argument', 'words'),
+    [
+        ('use_sim_time:=maybe', ('use_sim_time', 'maybe', 'true', 'false')),
+        ('log_level:=loud', ('log_level', 'loud', 'debug', 'fatal')),
+        ('respawn:=yes', ('respawn', 'yes', 'true')),
+        ('rviz:=1', ('rviz', "'true', 'false'")),
+        ('params:=missing.yaml', ('params file', 'missing.yaml', 'Error opening')),
+        ('boxes_type:=vision_msgs/Foo', ('vision_msgs/msg/Foo', 'Detection3DArray')),
+    ],
+)
+def test_wrong_arguments_are_named(environment, tmp_path, argument, words):
+    log = Path(tmp_path, 'launch.log')
+    launched = started(environment, log, argument)
+    launched.wait(60.0)
+    lines = [line for line in log.read_text().splitlines() if all(w in line for w in words)]
+    assert lines, log.read_text()
+    assert 'Traceback' not in log.read_text()
