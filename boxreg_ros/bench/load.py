@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--points', type=int, default=130_000, metavar='N', help='per sweep (default: 130000)'
     )
     parser.add_argument(
-        '--seconds', type=float, default=15.0, metavar='S', help='of data (default: 15)'
+        '--seconds', type=float, default=15.0, metavar='S', help='seconds of data (default: 15)'
     )
     add_json_argument(parser)
 

@@ -55,14 +55,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--points', type=int, default=130_000, metavar='N', help='per sweep (default: 130000)'
     )
     parser.add_argument(
-        '--rate', type=float, default=10.0, metavar='HZ', help='of the sensor (default: 10)'
+        '--rate', type=float, default=10.0, metavar='HZ', help='rate of the sensor (default: 10)'
     )
     parser.add_argument(
-        '--seconds', type=float, default=60.0, metavar='S', help='of data (default: 60)'
+        '--seconds', type=float, default=60.0, metavar='S', help='seconds of data (default: 60)'
     )
     parser.add_argument(
         '--delay', type=float, default=0.05, metavar='S',
-        help='of the boxes after their cloud (default: 0.05)',
+        help='delay of the boxes after their cloud (default: 0.05)',
     )  # fmt: skip
     parser.add_argument(
         '--transport', choices=('large', 'default'), default='large',

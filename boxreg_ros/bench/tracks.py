@@ -60,7 +60,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='mean number of boxes per sweep that belong to no object (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument(
-        '--seed', type=int, default=0, metavar='N', help='of the breaks (default: %(default)s)'
+        '--seed',
+        type=int,
+        default=0,
+        metavar='N',
+        help='seed of the breaks (default: 0)',
     )
     add_json_argument(parser)
 

@@ -107,7 +107,8 @@ class BoxTable:
                 missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
                 if missing:
                     raise RecordingError(
-                        f'{path}: not a table of boxes, columns missing: {", ".join(missing)}'
+                        f'{path}: not a table of boxes, columns missing: {", ".join(missing)}; '
+                        f'expected those of boxes.csv'
                     )
                 rows = [(reader.line_num, row) for row in reader]
         except OSError as error:

@@ -178,7 +178,9 @@ def _refined(path: Path, table: Any, frame_id: str) -> Iterator[RefinedBoxes]:
     needed = ANNOTATION_COLUMNS.keys() - OPTIONAL_COLUMNS
     missing = sorted(needed.difference(table.column_names))
     if missing:
-        raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
+        raise RecordingError(
+            f'{path}: columns missing: {", ".join(missing)}; expected annotations of Argoverse 2'
+        )
     rows = table.to_pylist()
     rows.sort(key=lambda row: row['timestamp_ns'])
     for stamp_ns, group in groupby(rows, lambda row: row['timestamp_ns']):

@@ -142,7 +142,9 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     table = read_table(path)
     missing = [name for name in COLUMNS if name not in table.column_names]
     if missing:
-        raise RecordingError(f'{path}: columns missing: {", ".join(missing)}')
+        raise RecordingError(
+            f'{path}: columns missing: {", ".join(missing)}; expected those of boxes.parquet'
+        )
     for i, name in enumerate(table.column_names):
         kind = COLUMN_TYPES.get(name)
         if kind not in NULL_VALUES:

@@ -229,40 +229,20 @@ def revolution(
 
     """
     columns = sensor.columns
-    beams = len(sensor.elevations)
     phase = (np.arange(columns) + 0.5) / columns - 0.5
     azimuth = 2 * np.pi * phase
     times = SWEEP_PERIOD * (phase + 0.5 - sensor.stamp_at)
     poses = ego.at(stamp + times)
-    flat = np.cos(sensor.elevations)
-    rise = np.sin(sensor.elevations)
-    rays = np.stack(  # (columns, beams, xyz)
-        [
-            np.cos(azimuth)[:, None] * flat,
-            np.sin(azimuth)[:, None] * flat,
-            np.broadcast_to(rise, (columns, beams)),
-        ],
-        axis=2,
-    )
-    rays = np.einsum('cij,cbj->cbi', to_matrix(poses)[:, :3, :3], rays)
+    rays = _rays(sensor, azimuth, poses)
     origins = poses[:, :3]
     with np.errstate(divide='ignore'):
         ranges = np.where(rays[..., 2] < 0, -origins[:, None, 2] / rays[..., 2], np.inf)
-    owner = np.full((columns, beams), ROAD)
+    owner = np.full(ranges.shape, ROAD)
     for index, actor in enumerate(actors):
-        # Only rays that can meet the sphere around the body, wider for its motion.
-        first, center, last = actor.motion.at(stamp + times[[0, columns // 2, -1]])[:, :3]
-        offset = center - poses[columns // 2, :3]
-        distance = np.hypot(*offset[:2])
-        moved = (np.linalg.norm(last - first) + np.linalg.norm(poses[-1] - poses[0])) / 2
-        radius = np.linalg.norm(actor.extent) / 2 + np.maximum(1.0, moved)
-        if distance - radius > sensor.reach:
+        near = _near(actor, sensor, azimuth, poses, stamp + times)
+        if near is None:
             continue
-        half = np.arcsin(radius / distance) if distance > radius else np.pi
-        bearing = np.arctan2(offset[1], offset[0]) - poses[columns // 2, 5]
-        cols = np.flatnonzero(np.abs(wrap_angle(azimuth - bearing)) <= half)
-        height = np.arctan2(offset[2], distance)
-        rows = np.flatnonzero(np.abs(sensor.elevations - height) <= half + 0.02)
+        cols, rows = near
         T_body_fixed = np.linalg.inv(to_matrix(actor.motion.at(stamp + times[cols])))
         R = T_body_fixed[:, :3, :3]
         start = np.einsum('cij,cj->ci', R, origins[cols]) + T_body_fixed[:, :3, 3]
@@ -281,6 +261,46 @@ def revolution(
     column = np.nonzero(kept)[0]
     points = origins[column] + ranges[kept][:, None] * rays[kept]
     return points, times[column], owner[kept]
+
+
+def _rays(sensor: Sensor, azimuth: Floats, poses: Floats) -> Floats:
+    """Return unit vectors of the rays in the fixed frame, (columns, beams, xyz)."""
+    flat = np.cos(sensor.elevations)
+    rise = np.sin(sensor.elevations)
+    rays = np.stack(
+        [
+            np.cos(azimuth)[:, None] * flat,
+            np.sin(azimuth)[:, None] * flat,
+            np.broadcast_to(rise, (len(azimuth), len(rise))),
+        ],
+        axis=2,
+    )
+    return np.asarray(np.einsum('cij,cbj->cbi', to_matrix(poses)[:, :3, :3], rays))
+
+
+def _near(
+    actor: Actor, sensor: Sensor, azimuth: Floats, poses: Floats, times: Floats
+) -> tuple[Ints, Ints] | None:
+    """
+    Return columns and beams whose rays can meet an actor; None if it is out of reach.
+
+    They meet the sphere around its body, which is wider for the motion of actor and sensor.
+
+    """
+    middle = len(azimuth) // 2
+    first, center, last = actor.motion.at(times[[0, middle, -1]])[:, :3]
+    offset = center - poses[middle, :3]
+    distance = np.hypot(*offset[:2])
+    moved = (np.linalg.norm(last - first) + np.linalg.norm(poses[-1] - poses[0])) / 2
+    radius = np.linalg.norm(actor.extent) / 2 + np.maximum(1.0, moved)
+    if distance - radius > sensor.reach:
+        return None
+    half = np.arcsin(radius / distance) if distance > radius else np.pi
+    bearing = np.arctan2(offset[1], offset[0]) - poses[middle, 5]
+    height = np.arctan2(offset[2], distance)
+    columns = np.flatnonzero(np.abs(wrap_angle(azimuth - bearing)) <= half)
+    beams = np.flatnonzero(np.abs(sensor.elevations - height) <= half + 0.02)
+    return columns, beams
 
 
 def to_matrix(poses: Floats) -> Floats:

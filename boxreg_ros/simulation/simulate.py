@@ -92,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--scenario', choices=list(SCENARIOS), default='street', help='default: street'
     )
     parser.add_argument(
-        '--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)'
+        '--seed', type=int, default=0, metavar='N', help='seed of every random choice (default: 0)'
     )
     parser.add_argument(
         '--sweeps', type=int, metavar='N', help='number of sweeps (default: that of the scenario)'

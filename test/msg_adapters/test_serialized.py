@@ -93,14 +93,14 @@ class Adapters:
         return not self.deserialized
 
 
-@pytest.mark.parametrize('type_name', ADAPTERS)
+@pytest.mark.parametrize('type_name', BOX_FIELDS)
 def test_boxes_are_read_and_written_without_objects(type_name):
-    assert BOX_FIELDS.keys() == ADAPTERS.keys()
+    assert type_name in ADAPTERS
     assert Adapters(type_name).check(message_of(type_name))
     assert not Adapters(type_name).check(message_of(type_name, n=0))  # no stamp, no frame
 
 
-@pytest.mark.parametrize('type_name', ADAPTERS)
+@pytest.mark.parametrize('type_name', BOX_FIELDS)
 def test_another_output_frame_is_left_to_the_objects(type_name):
     T = np.eye(4)
     T[:2, :3] = [[0, -1, 0], [1, 0, 0]]

@@ -195,12 +195,10 @@ class SqliteFile:
         raised.
 
         """
-        left = QUERY_STEPS + STEPS_PER_BYTE * self._size
+        calls = iter(range(1 + STEPS_PER_BYTE * self._size // QUERY_STEPS))
 
         def has_ended() -> bool:
-            nonlocal left
-            left -= QUERY_STEPS
-            return left < 0
+            return next(calls, None) is None
 
         self._database.set_progress_handler(has_ended, QUERY_STEPS)
         try:
