@@ -41,7 +41,7 @@ def no_matrix():
 
 
 @kernel
-def is_wanted(A):
+def is_wanted(A: Any) -> bool:
     """Return whether the curvature is wanted."""
     return len(A.links) > 0
 
