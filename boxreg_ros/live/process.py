@@ -88,8 +88,11 @@ def run(node: BoxregNode) -> list[Exception]:
         node.destroy_node()
         shut_down()
     if not node.recording.wait(RECORDING_TIME):
+        lost = node.recording.lost
         print(
-            f'the recorder completes the last segment in {node.recording.folder}', file=sys.stderr
+            f'the recorder completes the last segment in {node.recording.folder}'
+            f'{lost and f"; lost: {lost}"}',
+            file=sys.stderr,
         )
     return failures
 

@@ -112,6 +112,12 @@ class Recording:
         return '' if self._recorder is None else self._recorder.settings.folder
 
     @property
+    def lost(self) -> str:
+        """Return the number of items that are lost if the process ends now; '' for none."""
+        sizes = {} if self._recorder is None else self._recorder.sizes()
+        return ', '.join(f'{size} {name}' for name, size in sizes.items() if size)
+
+    @property
     def text(self) -> str:
         """Return the state in one line; empty while nothing is recorded."""
         if self._error:

@@ -48,6 +48,12 @@ class Robot:
         given = [part for item in parameters.items() for part in ('-p', '{}:={}'.format(*item))]
         self.node = graph.start(*RELIABLE, *given)
         graph.wait_until_connected()
+        if 'record_to' in parameters:
+            # A drive of a second may end before the recorder has started, and then lacks its end.
+            graph.wait(self._is_recording, 'the recorder')
+
+    def _is_recording(self):
+        return self.diagnostics and float(self.state()[2].get('disk free [GB]', 0)) > 0
 
     def play(self, records=None):
         """Publish messages, and wait after each box array until it is refined."""
