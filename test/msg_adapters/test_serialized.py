@@ -26,6 +26,14 @@ ASSOCIATE = replace(STANDARD, associate=True)
 M = Messages()
 
 
+def class_of(type_name):
+    """Return a message class of rclpy; skip the test where its package is not installed."""
+    try:
+        return import_message(type_name)
+    except UnsupportedMessage as error:
+        pytest.skip(str(error))
+
+
 def message_of(type_name, n=5):
     """Return a message of n boxes, of rclpy."""
     rng = np.random.default_rng(1)
@@ -37,7 +45,7 @@ def message_of(type_name, n=5):
     ]
     message = M.boxes(type_name, STAMP, 'lidar', found)
     data = bytes(M.store.serialize_cdr(message, type_name))
-    return deserialize_message(data, import_message(type_name))
+    return deserialize_message(data, class_of(type_name))
 
 
 def items_of(message):
@@ -52,7 +60,7 @@ class Adapters:
     """The adapter of serialised messages of a type, and that of objects."""
 
     def __init__(self, type_name, convention=ASSOCIATE):
-        self.kind = import_message(type_name)
+        self.kind = class_of(type_name)
         self.deserialized = []
         self.fast = serialized_adapter_for(type_name, convention, self.kind, self._deserialize)
         self.slow = adapter_for(type_name, convention)
@@ -169,7 +177,7 @@ def test_objects_without_orientation_or_class_are_ordinary():
 
 @pytest.mark.parametrize('type_name', [DETECTIONS, MARKERS])
 def test_bytes_that_were_cut_off_or_changed_are_no_fields(type_name):
-    kind = import_message(type_name)
+    kind = class_of(type_name)
     at = BOX_FIELDS[type_name]
     layout = Layout(kind, [at.pose, *at.frames])
     data = serialize_message(message_of(type_name))
@@ -186,10 +194,11 @@ def test_bytes_that_were_cut_off_or_changed_are_no_fields(type_name):
 
 
 def test_a_definition_without_a_field_is_refused_by_name():
+    kind = class_of(JSK)
     with pytest.raises(UnsupportedMessage, match=r'BoundingBoxArray.*boxes\.colour'):
-        Layout(import_message(JSK), ['boxes.colour', 'boxes.value'])
+        Layout(kind, ['boxes.colour', 'boxes.value'])
     with pytest.raises(UnsupportedMessage, match='have no ids'):
-        serialized_adapter_for(BOXES, STANDARD, import_message(BOXES), deserialize_message)
+        serialized_adapter_for(BOXES, STANDARD, class_of(BOXES), deserialize_message)
 
 
 def milliseconds(task, repetitions=9):
