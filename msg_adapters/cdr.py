@@ -1,20 +1,21 @@
 """
-Serialised messages: where their fields are, read and written as arrays.
+Serialised messages: the places of their fields, read and written as arrays.
 
-A message of 1,000 boxes becomes 10,000 Python objects, which takes ROS 50 to 100 ms. Here its
-bytes are walked once by a compiled loop; numbers are then copied to and from arrays.
+A message of 1,000 boxes becomes 10,000 Python objects, which takes ROS 50 to 100 ms. Here a
+compiled loop walks once through its bytes; numbers are then copied to and from arrays.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from importlib import import_module
 import re
 from typing import Any
+from warnings import warn
 
 from boxreg_ros.errors import UnsupportedMessage
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,19 +70,20 @@ class Layout:
         self._steps = np.array(rows, np.int64)  # (steps, [step, size, count, column])
 
     def fields_of(self, data: bytes) -> Fields | None:
-        """Return the fields of a message; None if it is not one of this type."""
-        if len(data) < HEADER or data[1] != LITTLE_ENDIAN:
+        """Return the fields of a message; None if it is not one of this type, or without numba."""
+        walk_compiled = walker()
+        if walk_compiled is None or len(data) < HEADER or data[1] != LITTLE_ENDIAN:
             return None
         size = len(data) - HEADER
         body = np.zeros(-(-size // 8) * 8, np.uint8)  # whole numbers of 8 bytes
         body[:size] = np.frombuffer(data, np.uint8, size, HEADER)
         counts = np.zeros(len(self._paths), np.int64)
         places = np.zeros((len(self._paths), 0, 2), np.int64)
-        if not _walk(body, size, self._steps, counts, places):
+        if not walk_compiled(body, size, self._steps, counts, places):
             return None
         places = np.zeros((len(self._paths), int(counts.max(initial=0)), 2), np.int64)
         counts[:] = 0
-        _walk(body, size, self._steps, counts, places)
+        walk_compiled(body, size, self._steps, counts, places)
         found = {path: places[i, : counts[i]] for i, path in enumerate(self._paths)}
         return Fields(data, body, found)
 
@@ -125,7 +127,7 @@ class Fields:
     data : bytes
         The message.
     body : array
-        What follows its header, as bytes, in whole numbers of 8 bytes.
+        The bytes after its header, filled up to a multiple of 8 with zeros.
     places : dict of str to array, shape (k, 2)
         Offset in `body` and count (numbers, letters, items) of each field, by path.
 
@@ -148,12 +150,12 @@ class Fields:
         return values
 
     def put(self, path: str, values: NDArray[Any]) -> None:
-        """Replace what `numbers` returns."""
+        """Replace the numbers that `numbers` returns for `path` by an array (k, width)."""
         dtype = values.dtype.str
         self._body.view(dtype)[self._index(path, dtype, values.shape[1])] = values
 
     def texts(self, path: str) -> list[str]:
-        """Return strings; what is not of UTF-8 is replaced."""
+        """Return strings; bytes that are no UTF-8 are replaced."""
         encoded = list(self._encoded(path))
         decoded = {text: text.decode(errors='replace') for text in set(encoded)}
         return [decoded[text] for text in encoded]
@@ -178,29 +180,45 @@ class Fields:
         return index
 
 
-def warm_up() -> None:
-    """Load the compiled loop, or compile it at the very first start."""
-    nothing = np.zeros(0, np.int64)
-    _walk(
-        np.zeros(0, np.uint8),
-        0,
-        np.zeros((0, 4), np.int64),
-        nothing,
-        np.zeros((0, 0, 2), np.int64),
-    )
+@cache
+def walker() -> Callable[..., bool] | None:
+    """
+    Return `walk` compiled, or loaded from disk; None where numba does not work.
 
+    A warning names the reason, unless numba is missing: the solver warns of that.
 
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function at its first call; kept on disk where a folder can be written."""
+    """
     try:
-        compiled: Callable[..., Any] = numba.njit(function, cache=True, nogil=True)
-    except RuntimeError:
-        compiled = numba.njit(function, nogil=True)
+        import numba
+
+        compiled = _compiled(numba)
+        nothing = np.zeros(0, np.int64)
+        bytes_, steps = np.zeros(0, np.uint8), np.zeros((0, 4), np.int64)
+        compiled(bytes_, 0, steps, nothing, np.zeros((0, 0, 2), np.int64))
+    except ImportError:
+        return None
+    except Exception as error:  # whatever a damaged cache or an unsupported processor raises
+        reason = ' '.join(f'{type(error).__name__}: {error}'.split())
+        warn(
+            f'numba: expected to compile the reader of box messages, got {reason}; they are read '
+            f'by rclpy, several times slower: delete __pycache__ beside {__file__}',
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return None
     return compiled
 
 
-@_compiled
-def _walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
+def _compiled(numba: Any) -> Callable[..., bool]:
+    """Compile `walk` at its first call; kept on disk where a folder can be written."""
+    try:
+        compiled: Callable[..., bool] = numba.njit(walk, cache=True, nogil=True)
+    except RuntimeError:
+        compiled = numba.njit(walk, nogil=True)
+    return compiled
+
+
+def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
     """
     Walk through a message and note the places of fields.
 

@@ -1,9 +1,9 @@
 """
 Boxes of serialised messages, read and rewritten as arrays: the way of the live node.
 
-`BOX_FIELDS` states where each type has pose, size, id, class and score. What is out of the
-ordinary (several frames in one message, another output frame, shapes that are no boxes) is left
-to the adapter of the family, which reads the deserialised message.
+`BOX_FIELDS` states where each type has pose, size, id, class and score. The adapter of the family
+reads unusual messages (several frames in one message, another output frame, shapes that are no
+boxes) after they have been deserialised.
 
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, WIDTH, YAW
 from msg_adapters import autoware, derived, foxglove, markers, poses
-from msg_adapters.cdr import Fields, Layout
+from msg_adapters.cdr import Fields, Layout, walker
 from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.protocol import Adapter
 from msg_adapters.registry import adapter_for, ConvertingAdapter
@@ -34,7 +34,7 @@ Labels = tuple[list[str], list[str], Floats]
 @dataclass(frozen=True, slots=True)
 class Rewrite:
     """
-    What replaces the boxes of a message.
+    The new boxes of a message, beside the old ones.
 
     Attributes
     ----------
@@ -76,9 +76,11 @@ class BoxFields:
     covariance : str
         First number of the covariance of the pose; '' if there is none.
     is_ordinary : callable
-        Whether the message can be treated as arrays.
-    rows : callable
-        Which of the poses are those of boxes.
+        Whether all its objects are boxes that arrays can represent.
+    rows : callable, optional
+        Which of the poses are those of boxes; by default all.
+    has_angles : callable, optional
+        Which boxes have an orientation; by default all.
     write : callable
         Writes what depends on the box beside pose, size and covariance.
 
@@ -201,7 +203,7 @@ def serialized_adapter_for(
     type_name: str, convention: Convention, kind: Any, deserialize: Callable[[bytes, Any], Any]
 ) -> Adapter | None:
     """
-    Return the adapter of serialised messages of a type; None if there is none.
+    Return the adapter of serialised messages of a type; None if there is none, or no numba.
 
     Parameters
     ----------
@@ -212,7 +214,7 @@ def serialized_adapter_for(
 
     """
     inner = adapter_for(type_name, replace(STANDARD, associate=convention.associate))
-    if type_name not in BOX_FIELDS:
+    if type_name not in BOX_FIELDS or walker() is None:
         return None
     adapter = SerializedAdapter(type_name, kind, inner, deserialize)
     return adapter if convention.is_standard else ConvertingAdapter(adapter, convention)

@@ -100,7 +100,7 @@ class BoxregNode(Node):
         """
         config, options = self._settings
         warm_up(config)
-        cdr.warm_up()
+        cdr.walker()
         self._budget = TickBudget(options.deadline)
         warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
         self._live = LiveRegistrar(

@@ -12,7 +12,7 @@ import time
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.live.topics import import_message
-from msg_adapters import adapter_for, ADAPTERS
+from msg_adapters import adapter_for, ADAPTERS, cdr
 from msg_adapters.cdr import Layout
 from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.serialized import BOX_FIELDS, serialized_adapter_for
@@ -199,6 +199,20 @@ def test_a_definition_without_a_field_is_refused_by_name():
         Layout(kind, ['boxes.colour', 'boxes.value'])
     with pytest.raises(UnsupportedMessage, match='have no ids'):
         serialized_adapter_for(BOXES, STANDARD, class_of(BOXES), deserialize_message)
+
+
+def test_a_compiler_that_fails_leaves_messages_to_rclpy_with_one_warning(monkeypatch):
+    def fail(*_, **__):
+        raise ValueError('no such processor')
+
+    kind = class_of(DETECTIONS)
+    cdr.walker.cache_clear()
+    with monkeypatch.context() as patched:
+        patched.setattr('numba.njit', fail)
+        with pytest.warns(RuntimeWarning, match=r'no such processor.*delete __pycache__'):
+            assert serialized_adapter_for(DETECTIONS, ASSOCIATE, kind, deserialize_message) is None
+    cdr.walker.cache_clear()
+    assert serialized_adapter_for(DETECTIONS, ASSOCIATE, kind, deserialize_message) is not None
 
 
 def milliseconds(task, repetitions=9):
