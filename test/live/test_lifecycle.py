@@ -47,6 +47,14 @@ class Manager:
         return future.result()
 
 
+def wait_until_unsubscribed(graph):
+    """Wait until DDS has reported the end of all subscriptions of the node."""
+    graph.wait(
+        lambda: not any(p.get_subscription_count() for p in graph.publishers.values()),
+        'the end of the subscriptions',
+    )
+
+
 def test_boxes_are_refined_while_the_node_is_active(graph, tmp_path):
     drive = Drive(sweeps=10)
     records = records_of(drive.write(tmp_path / 'drive'))
@@ -64,7 +72,7 @@ def test_boxes_are_refined_while_the_node_is_active(graph, tmp_path):
         assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
         graph.wait(lambda: len(final) == 10, 'the final boxes that the node held')
         assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
-        assert not any(p.get_subscription_count() for p in graph.publishers.values())
+        wait_until_unsubscribed(graph)
         assert manager.change(Transition.TRANSITION_CLEANUP) == (True, 'unconfigured')
         assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
         early.clear()
@@ -82,11 +90,12 @@ def test_each_activation_records_its_own_segments(graph, tmp_path):
     node = graph.start(*RELIABLE, *QUICK, '-p', f'record_to:={folder}', command=COMMAND)
     manager = Manager(graph)
     assert manager.change(Transition.TRANSITION_CONFIGURE) == (True, 'inactive')
-    for _ in range(2):  # without a pause between them
+    for _ in range(2):  # the second begins while the recorder completes the first segment
         assert manager.change(Transition.TRANSITION_ACTIVATE) == (True, 'active')
         graph.wait_until_connected()
         play(graph, records, early)
         assert manager.change(Transition.TRANSITION_DEACTIVATE) == (True, 'inactive')
+        wait_until_unsubscribed(graph)  # else it counts as connected before it is again
         early.clear()
     assert ended_cleanly(node)
     assert 'ERROR' not in node.output()
