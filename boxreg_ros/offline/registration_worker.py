@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 import gc
-from itertools import islice
+from itertools import accumulate, islice, pairwise
 import time
 from typing import Any, cast
 
@@ -135,9 +135,15 @@ def _unpacked(heads: list[Any], *columns: Any) -> list[Window]:
     """Return the windows that `_packed` was given."""
     stamps, boxes, points, delays, *others = columns
     counts = [count for head in heads for count in head.observations]
-    ends = np.cumsum(counts)[:-1]
+    ends = accumulate(counts, initial=0)
+    parts = [slice(begin, end) for begin, end in pairwise(ends)]
     observations = map(
-        Observation, stamps, boxes, np.split(points, ends), np.split(delays, ends), *others
+        Observation,
+        stamps,
+        boxes,
+        [points[part] for part in parts],
+        [delays[part] for part in parts],
+        *others,
     )
     return [
         head._replace(observations=list(islice(observations, len(head.observations))))
