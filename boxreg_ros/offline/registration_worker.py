@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-import gc
 from itertools import accumulate, islice, pairwise
 import time
 from typing import Any, cast
@@ -95,9 +94,6 @@ def _serve(config: Config, receive: Receive, send: Send) -> None:
     torch.set_num_threads(1)  # the solver divides the windows among threads of its own
     with announced_compilation(send):
         warm_up(config)  # while the recording is read up to the first full window
-    # Later collections skip the imported and compiled objects: going through them takes 67 ms.
-    gc.collect()
-    gc.freeze()
     send(WARM)
     while True:
         packed, config, model = receive()

@@ -44,7 +44,8 @@ def _medians(values: Floats, is_in: NDArray[np.bool_]) -> Floats:
     ordered = np.sort(np.where(is_in, values, np.inf), axis=1)
     counts = is_in.sum(axis=1)
     rows = np.arange(len(values))
-    return (ordered[rows, (counts - 1) // 2] + ordered[rows, counts // 2]) / 2
+    medians: Floats = (ordered[rows, (counts - 1) // 2] + ordered[rows, counts // 2]) / 2
+    return medians
 
 
 RULE = Rule(
