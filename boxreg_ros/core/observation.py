@@ -191,7 +191,7 @@ class OwnPoints(NamedTuple):
     Attributes
     ----------
     row, owner : array, shape (P,)
-        Row of the point in its sweep, and of the box.
+        Row of the point in its sweep, ascending, and of the box.
     x : array, shape (P,)
         Its x coordinate from the centre of the box [m].
     road : array, shape (n,)
@@ -246,6 +246,7 @@ def own_points_numpy(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
         is_own &= depth <= _least_depth(near, depth, len(sweep.points)) + OWNERSHIP_TOLERANCE
     is_own &= height > (np.nan_to_num(road) + GROUND_CLEARANCE).take(near.owner)
     own = np.flatnonzero(is_own)
+    own = own[np.argsort(near.row[own], kind='stable')]  # ascending by point, as the kernel has it
     num_inside = np.bincount(near.owner.take(np.flatnonzero(depth <= 0)), minlength=n)
     return OwnPoints(near.row[own], near.owner[own], near.offset[0, own], road, num_inside)
 
@@ -400,15 +401,17 @@ def _flat_heights(heights: Floats, owner: Ints, n: int) -> Floats:
 
 def _sorted_by_x(rows: Ints, owner: Ints, x: Floats, n: int) -> Ints:
     """
-    Return `rows` of the sweep sorted by `owner` (one of `n`), then `x` (-1 to 1), then row.
+    Return `rows` of the sweep, ascending for each box, sorted by `owner` (one of `n`), then `x`.
 
-    All three are packed into one integer: sorting integers is several times faster than finding
-    their order, and no two are equal, so that every machine sorts them alike.
+    Both are packed into 32 bits. Two stable sorts by 16 bits each, which numpy does by radix, take
+    half the time of one by comparisons. `x` is -1 to 1. Values closer than 2^-23, with 64 boxes,
+    may count as equal and are in the order of their rows: every machine sorts them alike.
 
     """
-    bits = int(rows.max(initial=0)).bit_length()
-    place = (owner + 0.5 + x / 4) * 2.0 ** (62 - bits - n.bit_length())
-    return np.sort(place.astype(np.int64) << bits | rows) & ((1 << bits) - 1)
+    place = ((owner + 0.5 + x / 4) * 2.0 ** (32 - n.bit_length())).astype(np.uint32)
+    order = np.argsort(place.astype(np.uint16), kind='stable')
+    order = order[np.argsort((place >> 16).astype(np.uint16)[order], kind='stable')]
+    return rows[order]
 
 
 def _thinned(rows: Ints, points: NDArray[np.floating], config: Config) -> Ints:
