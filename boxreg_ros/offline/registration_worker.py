@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from itertools import accumulate, islice, pairwise
 import time
 from typing import Any, cast
@@ -21,9 +20,6 @@ from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
 import numpy as np
 import torch
-
-WARM = ''
-"""Activity of a worker that is ready for windows."""
 
 
 @contextmanager
@@ -50,26 +46,23 @@ def registration_worker(
         with announced_compilation(announce):
             yield None
         return
-    with run_in_worker(partial(_serve, config), 'registers windows') as process:
-        yield _Dispatcher(process, clock, announce)
+    with announced_compilation(announce):
+        warm_up(config)  # this process and the worker then share what is imported and compiled
+    with run_in_worker(_serve, 'registers windows') as process:
+        yield _Dispatcher(process, clock)
 
 
 class _Dispatcher:
     """Send windows to the worker and receive their estimates."""
 
-    def __init__(
-        self, process: WorkerProcess, clock: Stopwatch, announce: Callable[[str], None]
-    ) -> None:
+    def __init__(self, process: WorkerProcess, clock: Stopwatch) -> None:
         self._process = process
         self._clock = clock
-        self._announce = announce
-        self._is_warm = False
 
     def __call__(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
         """Send windows; return a function that waits for their estimates."""
         if not windows:
             return list
-        self._wait_until_warm()
         self._process.send((_packed(windows), config, model))
 
         def awaited() -> list[Estimate | None]:
@@ -80,21 +73,10 @@ class _Dispatcher:
 
         return awaited
 
-    def _wait_until_warm(self) -> None:
-        """Announce what the worker does before it takes its first windows."""
-        while not self._is_warm:
-            activity = self._process.receive()
-            if activity:
-                self._announce(activity)
-            self._is_warm = activity == WARM
 
-
-def _serve(config: Config, receive: Receive, send: Send) -> None:
+def _serve(receive: Receive, send: Send) -> None:
     """Register windows in the worker until the connection is closed."""
     torch.set_num_threads(1)  # the solver divides the windows among threads of its own
-    with announced_compilation(send):
-        warm_up(config)  # while the recording is read up to the first full window
-    send(WARM)
     while True:
         packed, config, model = receive()
         begun = time.perf_counter()

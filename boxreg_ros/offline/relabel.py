@@ -101,12 +101,12 @@ def relabel(
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
 
-        submit = workers.enter_context(
-            registration_worker(request.config, clock, progress.announce)
-        )
         recording = ReadAhead(process)
         if plan is None:
             clock.begun('start')
+        submit = workers.enter_context(
+            registration_worker(request.config, clock, progress.announce)
+        )
         registrar = BoxRegistrar(request.config, _journaled(submit, journal))
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
@@ -177,11 +177,11 @@ def _survey(
         from boxreg_ros.offline.completion import Completion, survey
         from boxreg_ros.offline.registration_worker import registration_worker
 
+        recording = ReadAhead(process)
+        clock.begun('start')
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.progress.announce)
         )
-        recording = ReadAhead(process)
-        clock.begun('start')
         items = ((item.moved, item.restarts) for item in progress.each(recording))
         submit = _journaled(submit, journal)
         plan = survey(items, recording.source.fixed_frame, request.config, submit)

@@ -232,15 +232,11 @@ def test_the_first_compilation_is_announced():
     assert texts == [COMPILING]
 
 
-def test_compilation_in_the_worker_is_announced_while_it_is_waited_for(stream, monkeypatch):
+def test_compilation_is_announced_before_the_worker_begins(monkeypatch):
     texts = []
-    monkeypatch.setattr(registration, 'warm_up', compile_something)  # the fork copies it
-    with registration_worker(SHORT, Stopwatch(), texts.append) as begin:
-        registrar = BoxRegistrar(SHORT, begin)
-        fed(registrar, stream[:3])
-        assert texts == []
-        registrar.flush()
-    assert texts == [COMPILING]
+    monkeypatch.setattr(registration, 'warm_up', compile_something)
+    with registration_worker(SHORT, Stopwatch(), texts.append):
+        assert texts == [COMPILING]
 
 
 def test_the_reader_imports_no_solver():
@@ -283,11 +279,11 @@ def test_killed_worker_is_an_error_with_a_remedy(tmp_path, monkeypatch, which):
     others = set(children_of(parent))  # of earlier tests
 
     def killing(self, boxes):
-        # The worker adds boxes too, when it warms up. Killed as by the kernel without memory.
-        if not added and os.getpid() == parent:
-            pids = sorted({*children_of(parent)} - others)
-            os.kill(pids[which == 'registers windows'], signal.SIGKILL)
-        added.append(boxes)
+        # Boxes of the warm-up are added before there are two workers.
+        pids = sorted({*children_of(parent)} - others)
+        if not added and len(pids) == 2:
+            os.kill(pids[which == 'registers windows'], signal.SIGKILL)  # as without memory
+            added.append(boxes)
         return add(self, boxes)
 
     add = BoxRegistrar.add_boxes
