@@ -453,6 +453,7 @@ def test_without_numba_results_are_the_same_with_one_warning(prepare, known_boxe
 
 
 ROTATE = """
+import resource
 import warnings
 import numpy as np
 with warnings.catch_warnings(record=True) as caught:
@@ -461,11 +462,24 @@ with warnings.catch_warnings(record=True) as caught:
     from boxreg_ros.core.kernels.rotation import fill_rotation
     assert load() is not None
     R = np.empty((3, 3))
+    PREPARE
     fill_rotation(0.1, 0.2, 0.3, R)
 (text,) = [str(w.message) for w in caught]
 print(text)
 print(*R.ravel().tolist())
 """
+KNOWN_ROTATION = rotation_from_rpy(torch.tensor([0.1, 0.2, 0.3], dtype=D)).ravel().numpy()
+
+
+def rotated(folder, places, prepare='pass'):
+    """Return the warning and the numbers of a rotation by a kernel, compiled in a process."""
+    # One kernel stands for all, which take half a minute.
+    done = subprocess.run(
+        [sys.executable, '-c', ROTATE.replace('PREPARE', prepare)],
+        cwd=folder, env={**os.environ, **places}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    text, values = done.stdout.splitlines()
+    return text, np.array(values.split(), float)
 
 
 def test_a_read_only_home_gives_one_warning(copy):
@@ -475,15 +489,18 @@ def test_a_read_only_home_gives_one_warning(copy):
     shutil.rmtree(cache)
     cache.touch()
     places = {'HOME': str(cache), 'XDG_CACHE_HOME': str(cache), 'NUMBA_CACHE_DIR': str(cache)}
-    # One kernel stands for all: without a cache they are compiled, for a minute.
-    done = subprocess.run(
-        [sys.executable, '-c', ROTATE],
-        cwd=copy, env={**os.environ, **places}, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    text, values = done.stdout.splitlines()
+    text, values = rotated(copy, places)
     assert 'set NUMBA_CACHE_DIR' in text
-    R = rotation_from_rpy(torch.tensor([0.1, 0.2, 0.3], dtype=D))
-    np.testing.assert_allclose(np.array(values.split(), float), R.ravel().numpy(), atol=1e-15)
+    np.testing.assert_allclose(values, KNOWN_ROTATION, atol=1e-15)
+
+
+def test_a_full_disk_gives_one_warning(copy):
+    # A limit of the size of files stands for the full disk: it holds for the superuser as well.
+    places = {'NUMBA_CACHE_DIR': str(copy / 'cache')}
+    limit = 'resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))'
+    text, values = rotated(copy, places, limit)
+    assert 'make room' in text and str(copy / 'cache') in text
+    np.testing.assert_allclose(values, KNOWN_ROTATION, atol=1e-15)
 
 
 def test_a_damaged_cache_is_written_again_with_one_warning(copy, known_boxes):

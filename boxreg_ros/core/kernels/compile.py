@@ -49,6 +49,7 @@ def kernel(function: _F) -> _F:
             )
         return cast(_F, numba.njit(function, **options))
     _recover_from_damage(dispatcher._cache)
+    _go_on_without_room(dispatcher._cache)
     return cast(_F, dispatcher)
 
 
@@ -71,6 +72,29 @@ def _recover_from_damage(cache: Any) -> None:
             return None
 
     cache.load_overload = load_or_compile
+
+
+def _go_on_without_room(cache: Any) -> None:
+    """Let a kernel that cannot be written to disk be used, with a warning; numba would raise."""
+    save = cache.save_overload
+
+    def save_or_warn(*arguments: Any) -> None:
+        try:
+            save(*arguments)
+        except OSError as error:
+            _warn_once(
+                f'numba cache: expected room for compiled kernels in {cache.cache_path}, got '
+                f'"{error.strerror}"; every process compiles the solver again: make room, or set '
+                f'NUMBA_CACHE_DIR to another folder'
+            )
+
+    cache.save_overload = save_or_warn
+
+
+@cache
+def _warn_once(text: str) -> None:
+    """Warn unless the same text has been given for another kernel."""
+    warn(text, RuntimeWarning, stacklevel=2)
 
 
 FIRST_KERNEL = 'fill_rotation'
