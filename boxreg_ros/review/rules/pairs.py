@@ -8,6 +8,7 @@ from typing import NamedTuple
 from boxreg_ros.review.rules.protocol import LabelTrack
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, X, Z
 import numpy as np
+from scipy.spatial.distance import cdist
 
 
 class Pairs(NamedTuple):
@@ -41,8 +42,7 @@ def near_pairs(tracks: Sequence[LabelTrack]) -> Pairs:
     found = [np.zeros((0, 2), np.int64)]
     for rows in np.split(order, np.flatnonzero(np.diff(stamps_ns[order])) + 1):
         centres = boxes[rows, X : Z + 1]
-        distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-        is_near = distance < radius[rows][:, None] + radius[rows]
+        is_near = cdist(centres, centres) < radius[rows][:, None] + radius[rows]
         i, j = np.nonzero(is_near & (owner[rows][:, None] < owner[rows]))
         found.append(np.column_stack([rows[i], rows[j]]))
     a, b = np.concatenate(found).T
