@@ -9,6 +9,7 @@ points, those of the other are ahead of or behind them. docs/method.md (M12).
 from collections import Counter
 from dataclasses import replace
 from functools import lru_cache
+from math import hypot
 from typing import Any
 
 from boxreg_ros.config import Config
@@ -82,7 +83,7 @@ class BoxTimeEvidence:
         object: near the faces of a box of their own time.
 
         """
-        if np.linalg.norm(motion) < MIN_MOTION or len(points) < MIN_VOTE_POINTS:
+        if hypot(*motion.tolist()) < MIN_MOTION or len(points) < MIN_VOTE_POINTS:
             return
         at_sight = _distance_from_faces(box, points)
         at_stamp = _distance_from_faces(box, points - motion)

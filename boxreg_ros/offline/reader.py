@@ -238,14 +238,13 @@ class RecordingReader:
         """Yield an item in the fixed frame, or the sweeps that are complete with its cloud."""
         with self._clock('transform'):
             admitted = self._session.admit(item.content)
-            self._count(item.content, admitted)
-            if not self._is_merging or not isinstance(item.content, Sweep):
-                yield self._trimmed(item, admitted)
-                return
-            if not isinstance(admitted.moved, Sweep):
-                return  # the other LiDARs go on
-            complete = self._session.merged(admitted.moved, item)
-        yield from map(self._merged_item, complete)
+        self._count(item.content, admitted)
+        if not self._is_merging or not isinstance(item.content, Sweep):
+            yield self._trimmed(item, admitted)
+        elif isinstance(admitted.moved, Sweep):  # otherwise the other LiDARs go on
+            with self._clock('transform'):
+                complete = self._session.merged(admitted.moved, item)
+            yield from map(self._merged_item, complete)
 
     def _merged_item(self, merged: MergedSweep) -> ReadItem:
         """Return a sweep of several LiDARs; files get it in their sensor frame."""
