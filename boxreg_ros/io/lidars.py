@@ -161,9 +161,15 @@ class SensorPlacement:
         """Return whether the info message of a cloud may still arrive."""
         return self.lidars.info != '' and self._is_awaited and sweep.stamp_ns not in self._infos
 
+    def last_stamp_ns(self, sweep: Sweep) -> int:
+        """Return the newest stamp that the transforms of a cloud are needed for [ns]."""
+        info = self._infos.get(sweep.stamp_ns)
+        stamps_ns = [] if info is None else [part.stamp_ns for part in info.sources]
+        return max([sweep.stamp_ns, *stamps_ns])
+
     def placed(self, sweep: Sweep, tree: TransformTree) -> tuple[Sweep, str, str]:
         """
-        Return a cloud with the positions of its LiDARs, in its own frame.
+        Return a cloud with the positions of its LiDARs, each at the stamp of its own part.
 
         Points of a concatenated cloud without an info message are attributed to the nearest of
         the LiDARs that are named: the one with the densest points, and rarely blocked by the
@@ -172,7 +178,7 @@ class SensorPlacement:
         Parameters
         ----------
         sweep : Sweep
-            As its message has it.
+            In the fixed frame.
         tree : TransformTree
             Transforms to the frames of the LiDARs.
 
@@ -194,7 +200,7 @@ class SensorPlacement:
         if not frames or sweep.is_dropped:
             return sweep, '', ''
         try:
-            origins = _positions(frames, sweep, tree)
+            origins = _positions([(frame, sweep.stamp_ns) for frame in frames], sweep, tree)
         except TransformUnavailable as error:
             return sweep, 'sensor_without_transform', str(error)
         if len(frames) == 1:
@@ -202,10 +208,10 @@ class SensorPlacement:
         return _with_sensors(sweep, origins, _nearest(sweep.points, origins)), '', ''
 
 
-def _positions(frames: Sequence[str], sweep: Sweep, tree: TransformTree) -> Floats:
-    """Return the origins (K, 3) of frames in the frame of a cloud [m]."""
+def _positions(sensors: Sequence[tuple[str, int]], sweep: Sweep, tree: TransformTree) -> Floats:
+    """Return the origins (K, 3) of frames at stamps [ns], in the frame of a cloud [m]."""
     return np.array(
-        [tree.lookup(sweep.frame_id, frame, sweep.stamp_ns)[:3, 3] for frame in frames]
+        [tree.lookup(sweep.frame_id, frame, stamp_ns)[:3, 3] for frame, stamp_ns in sensors]
     )
 
 
@@ -224,9 +230,9 @@ def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tupl
     """
     Return a concatenated cloud with the positions and times of its LiDARs; as of `placed`.
 
-    Its points are in its frame at its stamp: the concatenation has compensated the motion of the
-    vehicle. Their times, if any, are relative to the stamps of the LiDARs, and so are the points
-    of other moving objects.
+    The concatenation has compensated the motion of the vehicle: the points are where the LiDARs
+    measured them, each at its own stamp and position. Their times, if any, are relative to the
+    stamps of the LiDARs.
 
     """
     rows = np.arange(len(sweep.points)) if sweep.rows is None else sweep.rows
@@ -240,7 +246,7 @@ def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tupl
     if not parts:
         return sweep, '', ''
     try:
-        origins = _positions([part.frame_id for part in parts], sweep, tree)
+        origins = _positions([(part.frame_id, part.stamp_ns) for part in parts], sweep, tree)
     except TransformUnavailable as error:
         return sweep, 'sensor_without_transform', str(error)
     owner = np.zeros(max(ends), np.uint8)

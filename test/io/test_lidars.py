@@ -2,11 +2,12 @@
 
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import ignore, Lidars, merged, SensorPlacement, SweepMerger
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transforms import sweep_to_frame, TransformTree
 from boxreg_ros.structures import Sweep
-from lidar_drives import LidarDrive, LIDARS
+from lidar_drives import DELAY_NS, LidarDrive, LIDARS, SPEED
 import numpy as np
 import pytest
+from ros_messages import SECOND
 
 MS = 10**6
 PERIOD = 100 * MS
@@ -146,8 +147,8 @@ def test_settings_that_contradict_each_other_are_refused(fields, text):
         Lidars(**fields)
 
 
-def placement_of(drive, lidars):
-    """Return the sweep of the first cloud of a drive in its frame, placed, and what is missing."""
+def placement_of(drive, lidars, frame_id='base'):
+    """Return the sweep of the first cloud of a drive in a frame, placed, and what is missing."""
     tree = TransformTree()
     placement = SensorPlacement(lidars)
     cloud = None
@@ -158,7 +159,8 @@ def placement_of(drive, lidars):
             placement.add_info(message)
         elif topic == '/points':
             cloud = cloud or placement.sweep_of(message, topic)
-    return placement.placed(cloud, tree)
+    T_frame_base = tree.lookup(frame_id, 'base', cloud.stamp_ns)
+    return placement.placed(sweep_to_frame(cloud, T_frame_base, frame_id), tree)
 
 
 def test_the_info_names_the_lidar_and_the_time_of_every_point():
@@ -168,6 +170,13 @@ def test_the_info_names_the_lidar_and_the_time_of_every_point():
     assert sweep.sensors.tolist() == [0] * half + [1] * half
     np.testing.assert_allclose(sweep.origins, list(LIDARS.values()))
     np.testing.assert_allclose(sweep.times, [0.0] * half + [0.03] * half)
+
+
+def test_each_lidar_is_where_it_was_at_its_own_stamp():
+    sweep, _, _ = placement_of(LidarDrive(2, 'info'), Lidars(info='/points_info'), 'odom')
+    front, rear = LIDARS.values()
+    moved = SPEED * DELAY_NS / SECOND  # of the vehicle, until the rear LiDAR measures
+    np.testing.assert_allclose(sweep.origins, [front, np.add(rear, [moved, 0, 0])])
 
 
 def test_rows_of_the_info_count_points_that_are_not_finite():
