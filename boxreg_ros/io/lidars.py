@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, concatenation, pointcloud
@@ -137,9 +137,15 @@ class SensorPlacement:
         Raises
         ------
         UnsupportedMessage
-            If the cloud cannot be read.
+            If the cloud cannot be read, or its points are not in the order of the info messages.
 
         """
+        if self.lidars.info and clouds.is_reordered(msg):
+            raise UnsupportedMessage(
+                f'expected points in the order that {self.lidars.info!r} counts them, got a cloud '
+                f'that Draco has sorted; publish it by zstd, or by Draco with encode_method 2 and '
+                f'force_quantization false'
+            )
         cloud = clouds.plain(msg)
         unit = self.lidars.time_unit
         if topic not in self.layouts:

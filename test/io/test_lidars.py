@@ -1,6 +1,8 @@
 """Several LiDARs: which clouds are merged, and which LiDAR measured which point."""
 
-from boxreg_ros.errors import ConfigError
+from types import SimpleNamespace
+
+from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.lidars import ignore, Lidars, merged, SensorPlacement, SweepMerger
 from boxreg_ros.io.transforms import sweep_to_frame, TransformTree
 from boxreg_ros.structures import Sweep
@@ -177,6 +179,12 @@ def test_each_lidar_is_where_it_was_at_its_own_stamp():
     front, rear = LIDARS.values()
     moved = SPEED * DELAY_NS / SECOND  # of the vehicle, until the rear LiDAR measures
     np.testing.assert_allclose(sweep.origins, [front, np.add(rear, [moved, 0, 0])])
+
+
+def test_an_info_of_points_that_draco_has_sorted_is_refused():
+    message = SimpleNamespace(format='draco', compressed_data=b'DRACO\2\3\0\1')
+    with pytest.raises(UnsupportedMessage, match=r"order that '/i' counts them.*encode_method 2"):
+        SensorPlacement(Lidars(info='/i')).sweep_of(message, '/points')
 
 
 def test_rows_of_the_info_count_points_that_are_not_finite():
