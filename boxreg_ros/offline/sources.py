@@ -50,8 +50,7 @@ def source_of(
     address = scene_address(paths)
     if address is not None:
         _check_scene(address, lidars, boxes, odometry, convention)
-        sensor = lidars.topics[0] if lidars.topics else None
-        return SceneRecording(address, sensor, start, end, labels)
+        return SceneRecording(address, lidars.topics, start, end, labels)
     if labels is not None:
         return LabelledRecording(
             labels, paths, lidars=lidars, odometry=odometry, start=start, end=end
@@ -88,10 +87,10 @@ def _check_scene(
     convention: Convention,
 ) -> None:
     """Refuse options of topics."""
-    if len(lidars.topics) > 1 or lidars.frames or lidars.info:
+    if lidars.frames or lidars.info:
         raise ConfigError(
-            f'points, sensor_frames, points_info: expected at most one sensor for a scene of a '
-            f'data set, got {lidars} with {address}; leave out all but one --points'
+            f'sensor_frames, points_info: expected for recordings with topics only, got {lidars} '
+            f'with {address}; leave them out: a data set has the positions of its LiDARs'
         )
     for name, topic in (('boxes', boxes), ('odometry', odometry)):
         if topic is not None:
