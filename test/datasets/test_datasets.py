@@ -169,7 +169,7 @@ def test_points_of_waymo_are_of_the_lidars_that_are_asked_for(tmp_path):
     (alone, *_), _ = read(source_of('waymo', tmp_path, lidars=['FRONT']))
     np.testing.assert_allclose(alone.points, sweep.points[-1:], atol=1e-6)
     assert alone.sensors is None
-    with pytest.raises(RecordingError, match="TOP, FRONT, .*, REAR, got 'BACK'"):
+    with pytest.raises(RecordingError, match=r"TOP, FRONT, .*, REAR, got 'BACK'"):
         source_of('waymo', tmp_path, lidars=['TOP', 'BACK']).__enter__()
     with pytest.raises(RecordingError, match='expected the LiDAR REAR, got others'):
         source_of('waymo', tmp_path, lidars=['REAR']).__enter__()
