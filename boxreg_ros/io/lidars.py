@@ -287,11 +287,24 @@ class _Group:
     def last_ns(self) -> int:
         return max(sweep.stamp_ns for sweep, _ in self.clouds.values())
 
-    def takes(self, sweep: Sweep, span_ns: int) -> bool:
-        """Return whether a cloud belongs here: the first of its topic, within the span."""
+    def takes(self, sweep: Sweep, span_ns: int, offsets_ns: Mapping[str, int]) -> bool:
+        """
+        Return whether a cloud belongs here: the first of its topic, within the span.
+
+        With `offsets_ns` of the LiDARs from the begin of a period, as in the last sweep, it is of
+        the same period too: without the cloud before, one of the next would be within the span.
+
+        """
         first_ns = min(self.first_ns, sweep.stamp_ns)
         last_ns = max(self.last_ns, sweep.stamp_ns)
-        return sweep.topic not in self.clouds and last_ns - first_ns <= span_ns
+        if sweep.topic in self.clouds or last_ns - first_ns > span_ns:
+            return False
+        begins_ns = [
+            cloud.stamp_ns - offsets_ns[cloud.topic]
+            for cloud in (self.clouds[next(iter(self.clouds))][0], sweep)
+            if cloud.topic in offsets_ns
+        ]
+        return max(begins_ns, default=0) - min(begins_ns, default=0) <= span_ns // 2
 
 
 class SweepMerger:
@@ -300,9 +313,10 @@ class SweepMerger:
 
     A sweep has at most one cloud of each topic, and their stamps are within `merge_span`. It is
     complete with a cloud of every LiDAR that was heard in the last second; without one of them it
-    is returned once a later sweep is complete, or two later ones have begun. The rule reads
-    stamps and the order of arrival only, no clock. A sweep has the stamp of the first topic in it,
-    in the order of `topics`; the times of its points are relative to that.
+    is returned once a later sweep is complete, or two later ones have begun. After a complete
+    sweep the LiDARs keep their order within a period, so that a lost cloud shifts no pairs. The
+    rule reads stamps and the order of arrival only, no clock. A sweep has the stamp of the first
+    topic in it, in the order of `topics`; the times of its points are relative to that.
 
     Parameters
     ----------
@@ -331,6 +345,7 @@ class SweepMerger:
         """Forget all clouds; keep the counts."""
         self._groups: list[_Group] = []  # ascending by stamp
         self._heard_ns: dict[str, int] = {}
+        self._offsets_ns: dict[str, int] = {}  # of the LiDARs in the last sweep, if complete
         self._returned_ns: int | None = None
 
     def add(self, sweep: Sweep, extra: Any = None) -> list[MergedSweep]:
@@ -366,7 +381,7 @@ class SweepMerger:
     def _group_for(self, sweep: Sweep) -> _Group | None:
         """Return the oldest group that takes a cloud, a new one, or None for a late cloud."""
         for group in self._groups:
-            if group.takes(sweep, self._span_ns):
+            if group.takes(sweep, self._span_ns, self._offsets_ns):
                 return group
         newest_ns = self._groups[-1].first_ns if self._groups else self._returned_ns
         if newest_ns is not None and sweep.stamp_ns <= newest_ns:
@@ -400,6 +415,12 @@ class SweepMerger:
         for topic in group.clouds:
             self.counts[topic][CLOUD_MERGED] += 1
         self._returned_ns = group.last_ns
+        self._offsets_ns = {}
+        if not self._awaited(group):
+            self._offsets_ns = {
+                topic: sweep.stamp_ns - group.first_ns
+                for topic, (sweep, _) in group.clouds.items()
+            }
         clouds = [group.clouds[topic] for topic in self._topics if topic in group.clouds]
         there = [(sweep, extra) for sweep, extra in clouds if not sweep.is_dropped]
         if not there:

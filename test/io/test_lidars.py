@@ -125,6 +125,28 @@ def test_the_stamp_is_that_of_the_first_topic_that_is_there():
     np.testing.assert_allclose(part.sweep.times, [0, 0, -0.02, -0.02], atol=1e-12)
 
 
+@pytest.mark.parametrize('lost', [('a', 2), ('b', 2), ('c', 2)])
+def test_a_lost_cloud_does_not_shift_the_pairs_after_it(lost):
+    # Without the first cloud of its period, the others are near the first of the next one.
+    offsets = {'a': 0, 'b': 40, 'c': 70}
+    complete, rest = groups(periods(6, offsets, skip={lost}))
+    expected = [
+        [1000 + 100 * k + offset for name, offset in offsets.items() if (name, k) != lost]
+        for k in range(6)
+    ]
+    assert complete + rest == expected
+
+
+def test_lidars_of_different_rates_are_paired_again_after_they_pass_each_other():
+    order = [('a', 1000 + 100 * k) for k in range(60)] + [('b', 1051 + 103 * k) for k in range(58)]
+    complete, rest = groups(sorted(order, key=lambda item: item[1]), topics=('a', 'b'))
+    sweeps = complete + rest
+    pairs = [sweep for sweep in sweeps if len(sweep) == 2]
+    assert len(pairs) >= 54
+    assert all(abs(first - second) <= 100 for first, second in pairs)
+    assert sum(len(sweep) for sweep in sweeps) == len(order)
+
+
 def test_a_dropped_cloud_is_not_waited_for():
     merger = SweepMerger(('a', 'b'), 0.1, ignore)
     merger.add(cloud('a', 1000, is_dropped=True))

@@ -12,6 +12,7 @@ from boxreg_ros.offline.drive import Drive
 from lidar_drives import LidarDrive, LIDARS, SPEED
 import numpy as np
 import pytest
+from ros_messages import SECOND
 
 TOPICS = ['--points', '/front', '--points', '/rear']
 MERGED = Lidars(('/front', '/rear'))
@@ -77,6 +78,38 @@ def test_a_silent_lidar_is_counted(tmp_path, capsys):
         '/rear': {'merged': 1, 'cloud_missing': 5},
     }
     assert 'LiDAR /rear: 1 clouds merged, 0 late, 5 missing' in capsys.readouterr().err
+
+
+def test_a_lidar_that_is_a_second_late_is_counted_and_the_other_goes_on(tmp_path, capsys):
+    drive = LidarDrive(30)
+    late = [
+        (topic, received + SECOND * (topic == '/rear'), message)
+        for topic, received, message in drive.items
+    ]
+    drive.items = sorted(late, key=lambda item: item[1])
+    table, summary = relabelled(drive.write(tmp_path / 'drive'), tmp_path / 'out', *TOPICS)
+    assert len(table.status) == 60
+    assert set(table.status) == {'refined'}
+    assert summary['lidars']['/front']['merged'] == 30
+    assert summary['lidars']['/rear']['cloud_late'] == 29  # the last one is a sweep of its own
+    assert 'LiDAR /rear: 1 clouds merged, 29 late' in capsys.readouterr().err
+
+
+def test_a_draco_stream_that_is_cut_short_is_counted_and_the_others_go_on(tmp_path, capsys):
+    pytest.importorskip('DracoPy')
+    drive = LidarDrive(6, 'compressed')
+    clouds = [message for topic, _, message in drive.items if topic in ('/front', '/rear')]
+    clouds[4].compressed_data = clouds[4].compressed_data[:20]  # of the front LiDAR
+    clouds[7].compressed_data = clouds[7].compressed_data[:20]
+    table, summary = relabelled(drive.write(tmp_path / 'drive'), tmp_path / 'out', *TOPICS)
+    assert set(table.status) == {'refined'}
+    assert summary['dropped']['unreadable'] == 2
+    assert summary['lidars'] == {
+        '/front': {'merged': 5, 'cloud_missing': 1}, '/rear': {'merged': 5, 'cloud_missing': 1}
+    }  # fmt: skip
+    error = capsys.readouterr().err
+    assert 'by draco: expected a whole stream, got 20 bytes' in error
+    assert 'by zstd: expected a whole stream, got 20 bytes' in error
 
 
 def test_label_files_get_the_points_of_all_lidars_in_one_frame(tmp_path):
