@@ -241,8 +241,8 @@ class BoxRegistrar:
             seen.relative_to(box, shift)
             for seen, box, shift in zip(found, given, motion / 2, strict=True)
         ]
-        for row, track, moved, seen in zip(rows, tracks, motion, observations, strict=True):
-            self.box_time.add(seen.box, seen.points, moved)
+        for row, track, velocity, seen in zip(rows, tracks, velocities, observations, strict=True):
+            self.box_time.add(seen, velocity)
             array.num_points[row] = seen.num_points
             array.reasons[row] = 'short_track'  # until there is an estimate
             array.num_unsettled += 1
