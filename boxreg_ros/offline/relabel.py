@@ -135,9 +135,7 @@ def _journal(out: Path, fingerprint: str) -> Iterator[Journal]:
     """Yield the journal of a run; while it is locked, other partial results are remains."""
     from boxreg_ros.offline.journal import Journal, journal_path
 
-    path = journal_path(out)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with Journal(path, fingerprint) as journal:
+    with Journal(journal_path(out), fingerprint) as journal:
         delete_remains(out)
         yield journal
 

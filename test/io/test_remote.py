@@ -12,6 +12,7 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.urls import RemoteFile, url_of
 from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.offline.journal import Journal
 from mcap.reader import make_reader
 from mcap_files import rewritten
 import numpy as np
@@ -179,6 +180,40 @@ def test_an_object_store_in_and_out(tmp_path, whole, store, capsys):
     store.pipe('drives/other/file', b'x')
     assert main(['relabel', str(whole), '-o', 's3://drives/other', *QUICK]) == 1
     assert 'expected a new folder or an earlier result' in capsys.readouterr().err
+
+
+def test_an_interrupted_run_goes_on_from_the_journal_in_the_store(tmp_path, store, monkeypatch):
+    recording = Drive(sweeps=60).write(tmp_path / 'drive')
+    command = ['relabel', str(recording), '--set=track_window=16', *QUICK, '--resume', '-o']
+    local = tmp_path / 'local'
+    append = Journal._append
+    appended = []
+
+    def append_until(limit):
+        def limited(journal, content):
+            append(journal, content)
+            appended.append(content)
+            if len(appended) == limit:
+                raise KeyboardInterrupt
+
+        appended.clear()
+        monkeypatch.setattr(Journal, '_append', limited)
+
+    append_until(None)
+    assert main([*command, str(local)]) == 0
+    records = len(appended)
+    assert records > 3
+    append_until(3)
+    out = 's3://drives/interrupted/one'
+    assert main([*command, out]) != 0
+    names = [f'drives/interrupted/.one.journal/00000{i}' for i in range(3)]
+    assert store.find('drives/interrupted') == names
+    # Another machine has only the store: what was solved before is not solved again.
+    append_until(None)
+    assert main([*command, out]) == 0
+    assert len(appended) == records - 3
+    assert store.cat('drives/interrupted/one/boxes.csv') == boxes(local)
+    assert not any('.journal' in name for name in store.find('drives/interrupted'))
 
 
 def test_batch_with_an_object_store(tmp_path, whole, store, capsys):

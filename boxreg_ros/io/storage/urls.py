@@ -184,16 +184,35 @@ def read_text(path: Path) -> str:
     """Return the text of a file of this machine or behind a URL; OSError if there is none."""
     if url_of(path) is None:
         return path.read_text(encoding='utf-8')
+    return read_bytes(path).decode()
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the content of a file behind a URL; OSError if there is none."""
     system, name = _system_of(path)
     with _answers(path, missing_is_error=False):
-        return bytes(system.cat_file(name)).decode()
+        return bytes(system.cat_file(name))
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a file behind a URL; it appears whole."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file behind a URL; it appears whole."""
     system, name = _system_of(path)
     with _answers(path):
-        system.pipe_file(name, text.encode())
+        system.pipe_file(name, content)
+
+
+def delete_files(path: Path) -> None:
+    """Delete all files below a folder behind a URL."""
+    system, name = _system_of(path)
+    names = names_of(path)
+    with _answers(path):
+        for one in names:
+            system.rm_file(f'{name}/{one}')
 
 
 def names_of(path: Path) -> list[str]:
