@@ -20,6 +20,7 @@ import pytest
 from ros_messages import Drive, SECOND, START
 
 pytest.importorskip('aiohttp', reason='the extra "remote" is not installed')
+fsspec = pytest.importorskip('fsspec')
 
 QUICK = ['--set=min_observations=3', '--formats=csv']
 
@@ -84,6 +85,22 @@ def store(monkeypatch):
     system = s3fs.S3FileSystem()
     system.makedirs('drives', exist_ok=True)
     yield system
+    server.stop()
+
+
+@pytest.fixture
+def google_store(monkeypatch):
+    """Yield a file system of Google's object store with the bucket ``drives``."""
+    monkeypatch.setenv('GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT', 'false')  # gRPC, not in the emulator
+    gcsfs = pytest.importorskip('gcsfs')
+    emulator = pytest.importorskip('gcp_storage_emulator.server')
+    server = emulator.create_server('127.0.0.1', 0, in_memory=True, default_bucket='drives')
+    server.start()
+    address = f'http://127.0.0.1:{server._api._httpd.server_port}'
+    monkeypatch.setenv('STORAGE_EMULATOR_HOST', address)
+    monkeypatch.setitem(fsspec.config.conf, 'gs', {'token': 'anon'})
+    gcsfs.GCSFileSystem.clear_instance_cache()
+    yield gcsfs.GCSFileSystem(token='anon')
     server.stop()
 
 
@@ -163,13 +180,14 @@ def test_other_storages_over_http(tmp_path, storage):
             assert len(list(recording.items(tree))) == 12
 
 
-def test_an_object_store_in_and_out(tmp_path, whole, store, capsys):
+@pytest.mark.parametrize(('scheme', 'fixture'), [('s3', 'store'), ('gs', 'google_store')])
+def test_an_object_store_in_and_out(tmp_path, whole, scheme, fixture, request, capsys):
+    store = request.getfixturevalue(fixture)
     store.put(str(whole), 'drives/one/whole.mcap')
     local = tmp_path / 'local'
-    command = ['relabel', str(whole), '-o', str(local), *QUICK]
-    assert main(command) == 0
-    out = 's3://drives/results/one'
-    command = ['relabel', 's3://drives/one', '-o', out, *QUICK, '--resume']
+    assert main(['relabel', str(whole), '-o', str(local), *QUICK]) == 0
+    out = f'{scheme}://drives/results/one'
+    command = ['relabel', f'{scheme}://drives/one', '-o', out, *QUICK, '--resume']
     assert main(command) == 0
     capsys.readouterr()
     assert store.cat('drives/results/one/boxes.csv') == boxes(local)
@@ -178,7 +196,7 @@ def test_an_object_store_in_and_out(tmp_path, whole, store, capsys):
     assert main(command) == 0
     assert 'up to date' in capsys.readouterr().out
     store.pipe('drives/other/file', b'x')
-    assert main(['relabel', str(whole), '-o', 's3://drives/other', *QUICK]) == 1
+    assert main(['relabel', str(whole), '-o', f'{scheme}://drives/other', *QUICK]) == 1
     assert 'expected a new folder or an earlier result' in capsys.readouterr().err
 
 
