@@ -4,11 +4,13 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import json
 from pathlib import Path
+import socket
 from threading import Thread
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage import urls
 from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.urls import RemoteFile, url_of
 from boxreg_ros.io.transforms import TransformTree
@@ -253,6 +255,61 @@ def test_errors_name_url_and_remedy(tmp_path, capsys):
         assert 'credentials' in line
     with pytest.raises(RecordingError, match='expected a scheme of fsspec'):
         part_of(Path('nonsense://host/file.mcap'))
+
+
+class Refusing(BaseHTTPRequestHandler):
+    """Refuse every request."""
+
+    def do_GET(self):
+        self.send_error(403)
+
+    do_HEAD = do_GET
+
+    def log_message(self, *_):
+        """Be silent."""
+
+
+def test_refused_credentials_are_named(tmp_path, capsys):
+    server = ThreadingHTTPServer(('127.0.0.1', 0), Refusing)
+    Thread(target=server.serve_forever, daemon=True).start()
+    url = f'http://127.0.0.1:{server.server_port}/one.mcap'
+    assert main(['relabel', url, '-o', str(tmp_path / 'out')]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f'boxreg: {url}: expected credentials that give access, got: ')
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize('out', ['results', 's3://missing-bucket/results'])
+def test_refused_credentials_of_an_object_store(tmp_path, whole, store, out, monkeypatch, capsys):
+    """No credentials at all, where drives are read or results are written."""
+    for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv('AWS_EC2_METADATA_DISABLED', 'true')
+    monkeypatch.setenv('HOME', str(tmp_path))
+    type(store).clear_instance_cache()
+    drives = ['s3://drives/one/whole.mcap'] if out == 'results' else []
+    target = out if '://' in out else str(tmp_path / out)
+    command = ['batch', str(whole), *drives, '-o', target, '--set=min_observations=3']
+    assert main(command) == 1
+    streams = capsys.readouterr()
+    (line,) = streams.err.splitlines()
+    assert 'expected credentials that give access, got: ' in line
+    if drives:
+        assert '1 of 2 drives done' in streams.out
+
+
+def test_a_server_that_does_not_answer_fails_its_drive_only(tmp_path, monkeypatch, capsys):
+    path = Drive(sweeps=6).write(tmp_path / 'drive')
+    monkeypatch.setattr(urls, 'ANSWER_SECONDS', 1.0)
+    with socket.create_server(('127.0.0.1', 0)) as silent:
+        url = f'http://127.0.0.1:{silent.getsockname()[1]}/silent.mcap'
+        command = ['batch', url, str(path), '-o', str(tmp_path / 'out')]
+        assert main([*command, '--set=min_observations=3']) == 1
+    streams = capsys.readouterr()
+    (line,) = streams.err.splitlines()
+    assert line.startswith(f'boxreg: silent: {url}: got no answer')
+    assert '1 of 2 drives done' in streams.out
 
 
 def test_ranges_are_read_once(tmp_path):
