@@ -112,8 +112,9 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         help='exit with 1, the results kept, if a smaller part of the boxes is refined, as in 0.9',
     )  # fmt: skip
     parser.add_argument(
-        '--workers', type=int, metavar='N', help='CPU cores of the solver (sets solver.threads)'
-    )
+        '--workers', type=int, metavar='N',
+        help='CPU cores of the solver (sets solver.threads); with 1 the run is one process',
+    )  # fmt: skip
 
 
 class _Removed(argparse.Action):
