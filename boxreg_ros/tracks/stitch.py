@@ -10,10 +10,11 @@ as good, none is made.
 from __future__ import annotations
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.motion import EndMotion
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import HEIGHT, LENGTH, X, Y, YAW, Z
 from boxreg_ros.tracks.links import best_links, join_links
-from boxreg_ros.tracks.motion import end_motion, EndMotion
+from boxreg_ros.tracks.motion import end_motion
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np
 

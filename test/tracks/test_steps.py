@@ -1,10 +1,11 @@
 """Each step from tracks to whole tracks, on tables of boxes with a known answer."""
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.motion import motion_at
 from boxreg_ros.tracks.extend import extend, num_free, num_supported
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.links import best_links
-from boxreg_ros.tracks.motion import between, is_parked, motion_at
+from boxreg_ros.tracks.motion import between, is_parked
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import stitch
