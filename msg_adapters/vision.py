@@ -86,12 +86,13 @@ def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
 
 
 def _unseen(detection: Any, header: Any) -> Any:
-    """Return a detection with the score 0 under another header."""
-    results = [
+    """Return a detection with its best hypothesis only, at the score 0, under another header."""
+    results = sorted(detection.results, key=lambda result: -result.hypothesis.score)[:1]
+    unseen = [
         poses.replaced(result, hypothesis=poses.replaced(result.hypothesis, score=0.0))
-        for result in detection.results
+        for result in results
     ]
-    return poses.replaced(detection, header=header, results=results)
+    return poses.replaced(detection, header=header, results=unseen)
 
 
 def _from_detections(msg: Any) -> BoxArray:

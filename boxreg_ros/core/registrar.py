@@ -260,9 +260,11 @@ class BoxRegistrar:
             if track.track_id in boxes.track_ids or not track.coasts(boxes.stamp_ns, self.config):
                 continue
             box = track.predicted(boxes.stamp_ns, self.config)
-            if not is_owned(box, others):
-                others = np.vstack([others, box])
-                found.append(_Sighting(track, box))
+            if is_owned(box, others):
+                self.counts['coast_unconfirmed'] += 1
+                continue
+            others = np.vstack([others, box])
+            found.append(_Sighting(track, box))
         return found
 
     def _seen(

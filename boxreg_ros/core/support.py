@@ -7,7 +7,6 @@ from boxreg_ros.core.observation import Observation
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, ROLL
 import numpy as np
-from numpy.typing import ArrayLike
 
 MIN_HITS = 3
 """Detections that confirm a track; literature: SORT."""
@@ -30,7 +29,7 @@ FACE_TOLERANCE = 0.2
 """Points up to so far outside of a face count [m]; chosen: the error of a prediction."""
 
 
-def least_support(at_end: ArrayLike) -> float:
+def least_support(at_end: Ints) -> float:
     """Return the points that a supported box has, by those of boxes at the end of its track."""
     return max(SUPPORT_POINTS, SUPPORT_PART * float(np.median(at_end)))
 
