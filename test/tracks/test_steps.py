@@ -119,6 +119,15 @@ def test_fragments_that_disagree_are_not_stitched(change):
     assert ids(found) == ['a', 'b']
 
 
+def test_a_gap_longer_than_both_fragments_is_left():
+    """Two short ghosts would fit each other anywhere."""
+    boxes = path((0, 0), (5, 0), 40)
+    ghosts = [tracklet('a', boxes[:3]), tracklet('b', boxes[12:15], 12)]
+    assert len(stitch(ghosts, CONFIG)[0]) == 2
+    longer = [tracklet('a', boxes[:12]), tracklet('b', boxes[21:24], 21)]
+    assert len(stitch(longer, CONFIG)[0]) == 1
+
+
 def test_tracks_that_cross_are_not_exchanged():
     east = path((-10, 0), (10, 0), 40)
     north = path((0, -10), (0, 10), 40)
