@@ -91,7 +91,7 @@ def test_detector_at_2_hz_that_misses_a_box():
     assert steps_of(rows, '7') == list(range(0, 31, 5))
     (added,) = [row for row in rows if row[3] == 'interpolated']
     assert added[0] == 15
-    assert iou_3d(added[4][None], boxes[[30]]) > 0.9
+    assert iou_3d(added[4][None], boxes[[30]]) > 0.85
 
 
 def test_class_that_changes_along_a_track_becomes_the_majority():
