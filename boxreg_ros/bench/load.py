@@ -72,7 +72,7 @@ def _measured(args: argparse.Namespace, tracks: int, settings: list[str]) -> dic
     """Return the values of `SHOWN` for a number of tracks and parameters of the node."""
     scope = argparse.Namespace(
         tracks=tracks, points=args.points, rate=10.0, seconds=args.seconds, delay=0.05,
-        transport='large', set=settings, record=None,
+        transport='large', set=settings, record=None, keep_gigabytes=0.0,
     )  # fmt: skip
     report = measure(scope, keeps_messages=True)
     messages = report.pop('messages')
