@@ -118,7 +118,8 @@ def _origins(path: Path) -> Floats:
     found = [positions[name] for name in LIDAR_NAMES if name in positions]
     if not found:
         raise RecordingError(
-            f'{path}: expected the poses of {" and ".join(LIDAR_NAMES)}, got none; {DATASET.remedy}'
+            f'{path}: expected the poses of {" and ".join(LIDAR_NAMES)}, got none; '
+            f'{DATASET.remedy}'
         )
     return np.array(found)
 
