@@ -16,6 +16,7 @@ from boxreg_ros.core.registration import Estimate, register
 from boxreg_ros.core.window import stack_origins, Window
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.offline.compilation import announced_compilation
+from boxreg_ros.offline.reader import uses_one_core
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
 import numpy as np
@@ -30,7 +31,8 @@ def registration_worker(
     Yield a function that starts `register` in a worker process, for `BoxRegistrar`.
 
     Yield None where a worker is no gain or cannot work: a sliding window is awaited before the
-    next sweep is taken, and only the CPU can be used after a fork.
+    next sweep is taken, a run on one core is one process, and only the CPU can be used after a
+    fork.
 
     Parameters
     ----------
@@ -42,7 +44,7 @@ def registration_worker(
         Called with what is waited for where that takes long.
 
     """
-    if config.estimate != 'track' or config.device != 'cpu':
+    if config.estimate != 'track' or config.device != 'cpu' or uses_one_core(config):
         with announced_compilation(announce):
             yield None
         return
