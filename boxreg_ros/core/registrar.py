@@ -71,8 +71,8 @@ class BoxRegistrar:
 
     Each box array added is returned exactly once with ``is_final=True``, with all its boxes in
     the order of the input; `coasted` boxes follow. Stamps of returned arrays ascend, except for
-    late arrays. With `estimate` 'early' or 'final' an array is returned once more before that, with
-    ``is_final=False``, as soon as its sweep is known.
+    late arrays. With `estimate` 'early' or 'final' an array is returned once more before that,
+    with ``is_final=False``, as soon as its sweep is known.
 
     Parameters
     ----------
