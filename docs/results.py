@@ -413,8 +413,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     'load': (
         'The live node under load',
         'Latency from the later of cloud and boxes to the refined boxes, and mean 3D IoU of all\n'
-        'published boxes, kept ones included. With the default deadline, tracks that the solver\n'
-        'has no time for are kept; with a deadline of an hour, clouds are dropped.',
+        'published boxes, kept ones included. With the default deadline (80 ms), tracks that the\n'
+        'solver has no time for are kept. *one window* solves one track per stamp: the latency\n'
+        'that no deadline can avoid. With a deadline of an hour, clouds are dropped.',
         _load,
     ),
     'scale': (

@@ -23,8 +23,8 @@ SPEEDS = (5.0, 30.0)
 """Of the vehicle with the sensor [m/s]; the others drive 0.83 to 1.33 times as fast."""
 CONVENTIONS = ('stamp', 'sight')
 """Times that the boxes are of."""
-METHODS = ('smoothing', 'ours')
-MIN_POINTS = 10
+COMPARED = ('smoothing', 'ours')
+MIN_SEEN_POINTS = 10
 """True boxes with fewer points are left out; chosen: there is little to register to."""
 
 
@@ -81,7 +81,7 @@ def measured(seed: int, sweeps: int, convention: str, speed: float) -> Iterator[
     """
     rng = np.random.default_rng(seed)
     drive = Drive.from_scene(highway(rng, sweeps, convention == 'sight', speed))
-    for name, boxes in run_methods(drive, wanted=METHODS).items():
+    for name, boxes in run_methods(drive, wanted=COMPARED).items():
         if not isinstance(boxes, str):
-            matches = match(boxes, drive.truth, MIN_POINTS)
+            matches = match(boxes, drive.truth, MIN_SEEN_POINTS)
             yield name, float(matches.iou_3d[matches.is_matched].mean())

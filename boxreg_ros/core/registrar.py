@@ -235,8 +235,8 @@ class BoxRegistrar:
             # A box that is not confirmed owns no points.
             self.counts['coast_unconfirmed'] += len(coasting) - len(confirmed)
             seen = self._seen([*given, *confirmed], boxes.stamp_ns, sweep)
-        for sighting, (observation, motion) in zip(given, seen, strict=False):
-            self.box_time.add(observation.box, observation.points, motion)
+        for sighting, (observation, velocity) in zip(given, seen, strict=False):
+            self.box_time.add(observation, velocity)
             is_pinned = boxes.pinned is not None and bool(boxes.pinned[sighting.row])
             track = sighting.track
             track.add(observation._replace(is_pinned=is_pinned), array, sighting.row)
@@ -270,7 +270,7 @@ class BoxRegistrar:
     def _seen(
         self, sightings: list['_Sighting'], stamp_ns: int, sweep: Sweep
     ) -> list[tuple[Observation, Floats]]:
-        """Return for each box its observation, and how far it moves until the sweep sees it."""
+        """Return for each box its observation, and the velocity of its input."""
         if not sightings:
             return []
         boxes = np.array([sighting.box for sighting in sightings])
@@ -284,8 +284,8 @@ class BoxRegistrar:
             motion = motion_to_sight(sweep, at_sweep, velocities)
         found = observe(sweep, swept(at_sweep, motion), stamp_ns, self.config)
         return [
-            (seen.relative_to(box, moved / 2), moved)
-            for seen, box, moved in zip(found, boxes, motion, strict=True)
+            (seen.relative_to(box, moved / 2), velocity)
+            for seen, box, moved, velocity in zip(found, boxes, motion, velocities, strict=True)
         ]
 
     def _end_silent_tracks(self, now_ns: int) -> None:

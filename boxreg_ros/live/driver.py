@@ -282,7 +282,10 @@ class LiveRegistrar:
             fixed_frame = self._session.require_fixed_frame(content)
         except TransformUnavailable:
             return False
-        is_covered = self.tree.covers(fixed_frame, content.frame_id, content.stamp_ns)
+        stamp_ns = content.stamp_ns
+        if isinstance(content, Sweep):
+            stamp_ns = self.placement.last_stamp_ns(content)
+        is_covered = self.tree.covers(fixed_frame, content.frame_id, stamp_ns)
         if is_covered and self._changes_frame(content):
             return self.tree.covers(self.output_frame, fixed_frame, content.stamp_ns)
         return is_covered

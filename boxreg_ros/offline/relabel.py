@@ -104,7 +104,7 @@ def relabel(
     with writing(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         plan, completion = _survey(request, clock, shown, journal)
-        process = workers.enter_context(reader(request))
+        receive = workers.enter_context(reader(request))
         # The recording is opened while this process imports torch, which takes a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
@@ -112,7 +112,7 @@ def relabel(
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.announce)
         )
-        recording = ReadAhead(process)
+        recording = ReadAhead(receive)
         if plan is None:
             clock.begun('start')
         registrar = BoxRegistrar(request.config, _journaled(submit, journal))
@@ -143,9 +143,7 @@ def _journal(out: Path, fingerprint: str) -> Iterator[Journal]:
     """Yield the journal of a run; while it is locked, other partial results are remains."""
     from boxreg_ros.offline.journal import Journal, journal_path
 
-    path = journal_path(out)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with Journal(path, fingerprint) as journal:
+    with Journal(journal_path(out), fingerprint) as journal:
         delete_remains(out)
         yield journal
 
@@ -181,14 +179,14 @@ def _survey(
     if not request.config.complete.steps:
         return None, None
     with ExitStack() as workers:
-        process = workers.enter_context(reader(request))
+        receive = workers.enter_context(reader(request))
         from boxreg_ros.offline.completion import Completion, first_pass
         from boxreg_ros.offline.registration_worker import registration_worker
 
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.progress.announce)
         )
-        recording = ReadAhead(process)
+        recording = ReadAhead(receive)
         clock.begun('start')
         items = ((item.moved, item.restarts) for item in progress.each(recording))
         submit = _journaled(submit, journal)
