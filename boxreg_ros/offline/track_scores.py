@@ -82,12 +82,12 @@ def track_scores(predicted: BoxTable, truth: BoxTable, scope: Ints | None = None
     last: dict[str, str] = {}  # the newest of them
     added: list[float] = []
     for stamp in stamps:
+        found += len(best_pairs(stamp.iou, LEAST_IOU)[0])
         objects = [truth.track_ids[row] for row in stamp.true]
         names = [predicted.track_ids[row] for row in stamp.predicted]
         goes_on = np.array([[last.get(one) == name for name in names] for one in objects], bool)
-        rows, columns = best_pairs(stamp.iou, LEAST_IOU, goes_on.reshape(stamp.iou.shape))
-        found += len(rows)
-        for row, column in zip(rows, columns, strict=True):
+        pairs = best_pairs(stamp.iou, LEAST_IOU, goes_on.reshape(stamp.iou.shape))
+        for row, column in zip(*pairs, strict=True):
             last[objects[row]] = names[column]
             ids.setdefault(objects[row], set()).add(names[column])
         added += _iou_of_added(stamp, predicted)
