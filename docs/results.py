@@ -345,7 +345,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'row has one step more. Recall and precision at a 3D IoU of 0.5, matched by overlap;\n'
         'HOTA and IDF1 by TrackEval. *added* is the number of added boxes. With `--ghosts` there\n'
         'are boxes without an object; *ghosts rejected* is the part of them that is rejected,\n'
-        '*others rejected* the part of the boxes of objects.',
+        '*others rejected* the part of the boxes of objects. With `--far-misses` the boxes are\n'
+        'removed in runs, as often as the square of the distance, like those of a detector that\n'
+        'has too few points. `--coast` is the node: its final boxes without and with `coast`.',
         _tracks,
     ),
     'paper': (

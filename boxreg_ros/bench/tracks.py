@@ -20,7 +20,7 @@ from boxreg_ros.config import COMPLETE_STEPS, Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
-from boxreg_ros.offline.completion import completed
+from boxreg_ros.offline.completion import completed, first_pass
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.track_scores import track_scores, TrackScores
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
@@ -117,10 +117,11 @@ def after_each_step(drive: Drive) -> Iterator[tuple[str, Row]]:
     items = _items(drive)
     yield 'input', _input_row(drive)
     config = Config()
-    yield 'refined', _row(_registered(items, config), drive)
+    first = first_pass(((item, False) for item in items), config)
+    yield 'refined', _row(first.results[0], drive)
     for step in COMPLETE_STEPS:
         config = config.updated({f'complete.{step}': True})
-        results, _ = completed(items, drive.truth.frame_id, config)
+        results, _ = completed(items, drive.truth.frame_id, config, first)
         yield f'+ {step}', _row(results, drive)
 
 

@@ -71,9 +71,8 @@ class BoxRegistrar:
 
     Each box array added is returned exactly once with ``is_final=True``, with all its boxes in
     the order of the input; `coasted` boxes follow. Stamps of returned arrays ascend, except for
-    late arrays.
-    With `estimate` 'early' or 'final' an array is returned once more before that, with
-    ``is_final=False``, as soon as its sweep is known.
+    late arrays. With `estimate` 'early' or 'final' an array is returned once more before that,
+    with ``is_final=False``, as soon as its sweep is known.
 
     Parameters
     ----------
@@ -254,10 +253,11 @@ class BoxRegistrar:
         if not (self.config.coasts and array.is_observed):
             return []
         boxes = array.input
+        present = set(boxes.track_ids)
         others = boxes.boxes[is_valid_box(boxes.boxes)]
         found = []
         for track in self._tracks.values():
-            if track.track_id in boxes.track_ids or not track.coasts(boxes.stamp_ns, self.config):
+            if track.track_id in present or not track.coasts(boxes.stamp_ns, self.config):
                 continue
             box = track.predicted(boxes.stamp_ns, self.config)
             if is_owned(box, others):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import Pair, StampMatcher
@@ -91,31 +92,44 @@ def points_above_road(sweep: Sweep, boxes: Floats) -> Ints:
     return counts
 
 
-def survey(
-    items: Iterable[tuple[Moved, bool]],
-    fixed_frame: str,
-    config: Config,
-    submit: Submit | None = None,
-) -> Plan:
+class FirstPass(NamedTuple):
     """
-    Register a recording and plan its completed tracks: the first pass.
+    A registered recording, before its tracks are completed.
+
+    Attributes
+    ----------
+    given, results, num_points : list of lists
+        Box arrays, their registration, and the points above the road in each box: one list for
+        each part of the recording between two time jumps.
+
+    """
+
+    given: list[list[BoxArray]]
+    results: list[list[RefinedBoxes]]
+    num_points: list[list[Ints]]
+
+    def plan(self, fixed_frame: str, config: Config) -> Plan:
+        """Return what completes the tracks in the fixed frame; each part on its own."""
+        whole = Plan([], [])
+        for part in zip(self.given, self.results, self.num_points, strict=True):
+            whole.append(complete(*part, fixed_frame, config))
+        return whole
+
+
+def first_pass(
+    items: Iterable[tuple[Moved, bool]], config: Config, submit: Submit | None = None
+) -> FirstPass:
+    """
+    Register a recording, and count the points in its boxes.
 
     Parameters
     ----------
     items : iterable of (item, restarts)
         Sweeps and boxes in the fixed frame, and whether time went back before them.
-    fixed_frame : str
-        Frame of the tracks.
     config : Config
         Settings.
     submit : callable, optional
         As of `BoxRegistrar`.
-
-    Returns
-    -------
-    plan : Plan
-        Its arrays are in the order of the box arrays among the items. Parts of a recording
-        between two time jumps are completed on their own.
 
     """
     registrar = BoxRegistrar(config, submit)
@@ -142,12 +156,11 @@ def survey(
         keep(register(registrar, moved, restarts))
     keep(registrar.flush())
     counter.finish()
-    whole = Plan([], [])
-    for given in parts:
-        found = [results[array.ticket] for array in given]
-        points = [counter.of(array) for array in given]
-        whole.append(complete(given, found, points, fixed_frame, config))
-    return whole
+    return FirstPass(
+        parts,
+        [[results[array.ticket] for array in given] for given in parts],
+        [[counter.of(array) for array in given] for given in parts],
+    )
 
 
 class Completion:
@@ -201,7 +214,10 @@ class Completion:
 
 
 def completed(
-    items: Sequence[Sweep | BoxArray], fixed_frame: str, config: Config
+    items: Sequence[Sweep | BoxArray],
+    fixed_frame: str,
+    config: Config,
+    first: FirstPass | None = None,
 ) -> tuple[list[RefinedBoxes], list[TrackSteps]]:
     """
     Return the completed tracks of a drive in memory, and what was done per track.
@@ -214,9 +230,13 @@ def completed(
         That frame.
     config : Config
         Settings; see `Config.complete`.
+    first : FirstPass, optional
+        That of the same items, with any of the steps.
 
     """
-    plan = survey(((item, False) for item in items), fixed_frame, config)
+    if first is None:
+        first = first_pass(((item, False) for item in items), config)
+    plan = first.plan(fixed_frame, config)
     completion = Completion(plan, config)
     registrar = BoxRegistrar(config)
     for ticket, item in enumerate(items):

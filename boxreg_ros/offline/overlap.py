@@ -9,6 +9,7 @@ from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, is_valid_box
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 
@@ -51,7 +52,9 @@ def pairwise_iou(first: Floats, second: Floats) -> Floats:
     return iou
 
 
-def best_pairs(iou: Floats, least: float = 0.0) -> tuple[Ints, Ints]:
+def best_pairs(
+    iou: Floats, least: float = 0.0, is_preferred: NDArray[np.bool_] | None = None
+) -> tuple[Ints, Ints]:
     """
     Return the rows and columns of the one-to-one pairs with the greatest sum of IoU.
 
@@ -61,9 +64,14 @@ def best_pairs(iou: Floats, least: float = 0.0) -> tuple[Ints, Ints]:
         Overlap of each pair.
     least : float
         Pairs need more than 0 and at least this.
+    is_preferred : array, shape (t, p), optional
+        Pairs that count as one more IoU of 1: more than any other pair of one of the boxes.
 
     """
-    rows, columns = linear_sum_assignment(np.where(iou >= least, iou, 0.0), maximize=True)
+    gains = np.where(iou >= least, iou, 0.0)
+    if is_preferred is not None:
+        gains += is_preferred & (gains > 0)
+    rows, columns = linear_sum_assignment(gains, maximize=True)
     is_pair = (iou[rows, columns] > 0) & (iou[rows, columns] >= least)
     return rows[is_pair], columns[is_pair]
 

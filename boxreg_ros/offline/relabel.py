@@ -180,7 +180,7 @@ def _survey(
         return None, None
     with ExitStack() as workers:
         receive = workers.enter_context(reader(request))
-        from boxreg_ros.offline.completion import Completion, survey
+        from boxreg_ros.offline.completion import Completion, first_pass
         from boxreg_ros.offline.registration_worker import registration_worker
 
         recording = ReadAhead(receive)
@@ -190,7 +190,8 @@ def _survey(
         )
         items = ((item.moved, item.restarts) for item in progress.each(recording))
         submit = _journaled(submit, journal)
-        plan = survey(items, recording.source.fixed_frame, request.config, submit)
+        first = first_pass(items, request.config, submit)
+        plan = first.plan(recording.source.fixed_frame, request.config)
         return plan, Completion(plan, request.config)
 
 

@@ -29,7 +29,9 @@ class TrackScores:
     misses, ghosts : int
         True boxes that are not found, and predicted boxes that find none.
     ids_per_object : float
-        Mean number of predicted ids that find a true object, over the objects found.
+        Mean number of predicted ids that find a true object, over the objects found. As in
+        CLEAR MOT, a pair of ids goes on while its boxes overlap: where the truth has two boxes
+        of one object, the ids do not change places.
     added, added_iou : int and float
         Boxes that the input did not have, and their mean 3D IoU; 0 for a ghost.
     hota, det_a, ass_a, idf1 : float
@@ -77,13 +79,17 @@ def track_scores(predicted: BoxTable, truth: BoxTable, scope: Ints | None = None
     num_predicted = sum(len(stamp.predicted) for stamp in stamps)
     found = 0
     ids: dict[str, set[str]] = {}  # predicted ids that find each object
+    last: dict[str, str] = {}  # the newest of them
     added: list[float] = []
     for stamp in stamps:
-        rows, columns = best_pairs(stamp.iou, LEAST_IOU)
-        found += len(rows)
-        pairs = zip(stamp.true[rows], stamp.predicted[columns], strict=True)
-        for true, box in pairs:
-            ids.setdefault(truth.track_ids[true], set()).add(predicted.track_ids[box])
+        found += len(best_pairs(stamp.iou, LEAST_IOU)[0])
+        objects = [truth.track_ids[row] for row in stamp.true]
+        names = [predicted.track_ids[row] for row in stamp.predicted]
+        goes_on = np.array([[last.get(one) == name for name in names] for one in objects], bool)
+        pairs = best_pairs(stamp.iou, LEAST_IOU, goes_on.reshape(stamp.iou.shape))
+        for row, column in zip(*pairs, strict=True):
+            last[objects[row]] = names[column]
+            ids.setdefault(objects[row], set()).add(names[column])
         added += _iou_of_added(stamp, predicted)
     return TrackScores(
         recall=_part(found, num_true),

@@ -62,6 +62,15 @@ def test_ids_per_object():
     assert track_scores(predicted, TRUTH).ids_per_object == 1.5
 
 
+def test_ids_of_two_boxes_of_one_object_do_not_change_places():
+    # The truth has the object twice, 0.4 m apart; the nearer prediction alternates.
+    truth = table([[('a', 0), ('b', 0.4)]] * 4)
+    predicted = table([[('1', 0), ('2', 0.4)], [('1', 0.4), ('2', 0)]] * 2)
+    assert track_scores(predicted, truth).ids_per_object == 1
+    gone = table([[('1', 0), ('2', 0.4)], [('2', 0)], [('2', 0)], [('2', 0)]])
+    assert track_scores(gone, truth).ids_per_object == 1
+
+
 def test_hota_and_idf1_of_an_id_switch():
     pytest.importorskip('trackeval')
     predicted = table([
