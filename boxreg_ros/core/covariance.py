@@ -81,7 +81,7 @@ def posterior(
     """
     R = rotation_from_rpy(state.pose[..., 3:])
     estimated = free[:, -SHARED:][:, INPUT_ERRORS]
-    distances = _face_distances(problem, state, R, moments[..., 3, :3], inset)
+    distances = _face_distances(problem, state, expected, R, moments[..., 3, :3], inset)
     distances = torch.where(weight > 0, distances, 0.0)
     of_faces = _correlated_information(problem, weight, distances, expected, config)
     underrated = torch.cat([_underrated_information(expected, estimated), of_faces], 1)
@@ -191,18 +191,24 @@ def _extent_covariance(
 
 
 def _face_distances(
-    problem: Problem, state: State, R: Tensor, centroid: Tensor, inset: Tensor
+    problem: Problem,
+    state: State,
+    expected: Expectation,
+    R: Tensor,
+    centroid: Tensor,
+    inset: Tensor,
 ) -> Tensor:
     """
     Return the mean of (M2) over the outermost points of each face, shape (B, N, 6) [m].
 
-    `R` (B, N, 3, 3) are the axes of the boxes, `centroid` (B, N, 6, 3) is that of the points, from
-    the centre of the input box [m].
+    With the labelling margins `expected` by other tracks: those of the estimate would take up the
+    error of extents that are held. `R` (B, N, 3, 3) are the axes of the boxes, `centroid`
+    (B, N, 6, 3) is that of the points, from the centre of the input box [m].
 
     """
     normals = R.mT[..., FACE_AXIS, :] * FACE_SIGN.to(R)[:, None]  # (B, N, 6, 3)
     shift = (state.pose - problem.pose)[..., None, :3]
     outward = ((centroid - shift) * normals).sum(-1)
     half = state.shared[:, EXTENT][:, FACE_AXIS] / 2
-    surface = (half - state.shared[:, GAP])[:, None] - inset
+    surface = (half - expected.shared[:, GAP])[:, None] - inset
     return outward - surface
