@@ -23,7 +23,7 @@ setup(
     package_data={NAME: ['py.typed', 'share/*'], 'msg_adapters': ['py.typed']},
     entry_points={
         'console_scripts': [
-            f'boxreg = {NAME}.cli:main',
+            f'boxreg = {NAME}.cli:command',
             f'boxreg_node = {NAME}.live.main:main',
             f'boxreg_lifecycle_node = {NAME}.live.main:lifecycle',
         ]

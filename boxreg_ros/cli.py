@@ -14,7 +14,7 @@ import signal
 import sys
 from threading import current_thread, main_thread
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from boxreg_ros import __version__
 from boxreg_ros.allocation import collect_rarely, keep_freed_memory
@@ -57,6 +57,20 @@ WRONG_USAGE = 2
 SIGNALLED = 128
 """Added to the number of the signal that ended a run, as shells do."""
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
+
+
+def command() -> NoReturn:
+    """
+    Run a subcommand and end the process with its exit status.
+
+    After a signal the process ends at once: `main` has removed the files, and to take down an
+    interpreter with the sweeps of a recording takes up to a second.
+
+    """
+    status = main()
+    if status > SIGNALLED:
+        os._exit(status)  # stderr is not buffered beyond a line
+    sys.exit(status)
 
 
 class _EndedBySignal(BaseException):
@@ -200,4 +214,4 @@ def _fail(message: str, status: int) -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    command()

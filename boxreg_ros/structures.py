@@ -213,7 +213,8 @@ class RefinedBoxes:
         Covariance of length, width and height [m]; always finite, identity for kept boxes.
     face_distances : array, shape (n, 6)
         Signed distance of the outermost points of each face (front, rear, left, right, top,
-        bottom) from where the estimate expects them, positive outside [m]; 0 without points.
+        bottom) from where they are expected, by the extents of the box and the labelling margins
+        of other tracks, positive outside [m]; 0 without points.
     outside : array, shape (n,)
         Part of the points in and near the box, the road left out, that are outside of it.
 

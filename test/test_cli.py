@@ -19,6 +19,10 @@ import pytest
 from ros_messages import Drive
 
 QUICK = ['--set', 'solver.rounds=1', '--set', 'solver.iterations=3']
+SLOW = [
+    '--set', 'solver.rounds=100', '--set', 'solver.iterations=10000',
+    '--set', 'solver.tolerance=0', '--set', 'estimate=early',
+]  # fmt: skip
 
 
 def boxreg(capsys, *arguments):
@@ -275,9 +279,7 @@ def test_an_interrupted_run_leaves_no_files(tmp_path, number):
     recording = Drive(sweeps=60).write(tmp_path / 'drive')
     before = signal.signal(number, signal.SIG_DFL)  # under nohup it is ignored
     process = start(
-        'relabel', recording, '-o', tmp_path / 'results' / 'out',
-        '--set', 'solver.rounds=100', '--set', 'solver.iterations=10000',
-        '--set', 'solver.tolerance=0', '--set', 'estimate=early',
+        'relabel', recording, '-o', tmp_path / 'results' / 'out', *SLOW,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     signal.signal(number, before)
@@ -292,6 +294,21 @@ def test_an_interrupted_run_leaves_no_files(tmp_path, number):
     cause = 'interrupted' if number == signal.SIGINT else f'ended by {number.name}'
     assert (out, err) == ('', f'boxreg: {cause}; nothing was written\n')
     assert list((tmp_path / 'results').iterdir()) == []
+
+
+def test_an_interrupted_run_does_not_wait_for_the_interpreter(tmp_path):
+    # To take down the interpreter takes up to a second: the process ends without that.
+    recording = Drive(sweeps=60).write(tmp_path / 'drive')
+    program = 'import atexit, boxreg_ros.cli as c; atexit.register(print, "late"); c.command()'
+    command = [sys.executable, '-c', program, 'relabel', recording, '-o', tmp_path / 'r' / 'out']
+    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'text': True}
+    process = subprocess.Popen([*map(str, command), *SLOW], cwd=ROOT, **pipes)
+    deadline = time.monotonic() + 60
+    while not any((tmp_path / 'r').glob('.out.*')) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60) == ('', 'boxreg: interrupted; nothing was written\n')
+    assert process.returncode == 130
 
 
 def test_a_run_under_nohup_ignores_sighup(tmp_path):

@@ -253,8 +253,8 @@ class Posterior(NamedTuple):
     extents : Tensor, shape (B, 3, 3)
         Covariances of length, width and height [m].
     face_distances : Tensor, shape (B, N, 6)
-        Signed distance of the outermost points of each face from where the estimate expects
-        them, positive outside [m]; 0 without points.
+        Signed distance of the outermost points of each face from where they are expected, by the
+        estimated extents and the margins of other tracks, positive outside [m]; 0 without points.
 
     """
 

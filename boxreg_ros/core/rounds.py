@@ -188,7 +188,9 @@ def run_round(
         (part.problem, fit.state, *faces, part.expected, part.free, fit.inverse), done
     )
     evidence = evidence_of_extents(part.log_extent, part.expected, fit.state, fit.inverse.corner)
-    return RoundResult(rows, fit.state, fit.is_done, evidence, posterior(*settled), fit.prior)
+    return RoundResult(
+        rows, fit.state, fit.is_done, evidence, posterior(*settled, config), fit.prior
+    )
 
 
 class Fit(NamedTuple):

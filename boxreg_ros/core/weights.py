@@ -154,7 +154,7 @@ def class_deviations(problem: Problem, config: Config) -> ClassDeviations:
     """Return the deviations of the class of each window for the kernel."""
     drift = problem.of_class('drift')
     return ClassDeviations(
-        faces=contiguous(_face_deviations(problem, config)),
+        faces=contiguous(face_deviations(problem, config)),
         acceleration=contiguous(problem.of_class(*ACCELERATIONS)),
         slip=contiguous(problem.of_class('slip', 'climb')),
         zero_motion=contiguous(drift * drift.new_tensor(DRIFT_RATIOS)),
@@ -249,7 +249,7 @@ def _face_weights(
 
     """
     settings = config.faces
-    deviation = _face_deviations(problem, config)
+    deviation = face_deviations(problem, config)
     robust = 1 / (1 + (observations.distance / settings.outlier) ** 2) ** 2
     same_object = valid / (1 + off_track[..., :2].square().sum(2) ** 2) ** 2
     return observations.weight * robust * same_object[..., None] / deviation[:, None] ** 2
@@ -340,7 +340,7 @@ def _zero_motion_weights(problem: Problem, expected: Expectation) -> Tensor:
     return deviation[:, None] ** -2 * parked_steps(problem, yaw_deviation)[..., None]
 
 
-def _face_deviations(problem: Problem, config: Config) -> Tensor:
+def face_deviations(problem: Problem, config: Config) -> Tensor:
     """
     Return the deviation of one observation of each face, shape (B, 6) [m].
 

@@ -22,6 +22,9 @@ REFERENCE_LENGTH = 4.5
 """Length of the car whose shift a risk is [m]. Chosen: a mid-size car."""
 MEAN_OF_NORMAL = np.sqrt(2 / np.pi)
 """Mean magnitude of a normal variable over its deviation. Derived."""
+ONE_OF_PAIR = np.sqrt(0.5)
+"""Expected error of two opposite faces if only one of them errs, over that of two that err alike.
+Derived: of the same sum of variances, one has twice the variance, so sqrt(2) / 2 the magnitude."""
 MAX_LOSS = 1.0
 """Largest loss of 3D IoU."""
 KEPT_LOSS = 0.25
@@ -117,9 +120,10 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
 
     A face that is off by d costs d / L of 3D IoU, L the extent across it; a turn by a costs
     a l / (2 w). The error of a face is normal. Its deviation is that of the centre and half the
-    extent. Its mean is how far the face is off its points, beyond what surfaces of its kind are
-    off a rigid box. Its mean magnitude is that of a folded normal variable. What its mean adds to
-    its deviation is a reason of its own.
+    extent, nearly all of it at the unseen face of a pair. Its mean is how far the face is off its
+    points, beyond what surfaces of its kind are off a rigid box; they are expected by the
+    labelling margins of other tracks. Its mean magnitude is that of a folded normal variable. What
+    its mean adds to its deviation is a reason of its own.
 
     """
     extents = _extents(track)
@@ -135,7 +139,7 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     turn = deviations[:, 3] * length / (2 * width)
     is_refined = track.is_refined
     losses = {
-        'uncertain position and size': uncertain.sum(axis=1),
+        'uncertain position and size': ONE_OF_PAIR * uncertain.sum(axis=1),
         'uncertain heading': MEAN_OF_NORMAL * turn,
         'faces off their points': (misfit - uncertain).sum(axis=1),
         'points left outside': _left_outside(track, extents, usual.outside),

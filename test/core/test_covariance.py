@@ -1,14 +1,18 @@
-"""Covariances: the inverse curvature, and the model error."""
+"""Covariances: the inverse curvature, errors of input and faces, and the model error."""
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import covariance
 from boxreg_ros.core.batch import SHARED
 from boxreg_ros.core.input_model import Expectation
 from boxreg_ros.core.refine import refine
-from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
+import pytest
+from scenes import drive, problem_of, track_of
 import torch
+from torch.nn.functional import pad
+
+D = torch.float64
 
 
 def refined_tracks():
@@ -16,22 +20,23 @@ def refined_tracks():
     return refine(simulate('street', 0).tracks()[:3], Config())
 
 
-def test_model_errors_are_added_along_the_axes_of_the_box(monkeypatch):
-    with_model = refined_tracks()
-    pose_deviation = np.array(covariance.POSE_MODEL_DEVIATION)
-    extent_deviation = np.array(covariance.EXTENT_MODEL_DEVIATION)
-    monkeypatch.setattr(covariance, 'POSE_MODEL_DEVIATION', (0.0,) * 6)
-    monkeypatch.setattr(covariance, 'EXTENT_MODEL_DEVIATION', (0.0,) * 3)
-    for ours, bare in zip(with_model, refined_tracks(), strict=True):
-        is_refined = np.array(ours.status) == 'refined'
-        axes = np.tile(np.eye(6), (len(ours.boxes), 1, 1))
-        axes[:, :3, :3] = matrix_from_rpy(ours.boxes[:, 6:])
-        expected = axes * pose_deviation**2 @ axes.swapaxes(1, 2)
+def test_the_model_errors_are_those_of_time_and_heading(monkeypatch):
+    tracks = [drive_of(12, speed) for speed in (0.0, 10.0)]
+    with_model = refine(tracks, Config())
+    time, heading = covariance.TIME_DEVIATION, covariance.HEADING_MODEL_DEVIATION
+    monkeypatch.setattr(covariance, 'TIME_DEVIATION', 0.0)
+    monkeypatch.setattr(covariance, 'HEADING_MODEL_DEVIATION', 0.0)
+    for ours, bare in zip(with_model, refine(tracks, Config()), strict=True):
         difference = ours.covariances - bare.covariances
-        np.testing.assert_allclose(difference[is_refined], expected[is_refined], atol=1e-9)
-        difference = ours.extent_covariances - bare.extent_covariances
-        expected = np.tile(np.diag(extent_deviation**2), (len(ours.boxes), 1, 1))
-        np.testing.assert_allclose(difference[is_refined], expected[is_refined], atol=1e-9)
+        step = np.gradient(ours.boxes[:, :3], 0.1, axis=0)
+        expected = time**2 * step[:, :, None] * step[:, None]
+        np.testing.assert_allclose(difference[:, :3, :3], expected, atol=1e-9)
+        np.testing.assert_allclose(difference[:, 5, 5], heading**2, atol=1e-9)
+
+
+def drive_of(count, speed):
+    """Return a track that drives straight on, with points."""
+    return track_of(drive(count, speed=speed, turn=0.0), np.random.default_rng(0), str(speed))
 
 
 def test_extent_covariances_are_symmetric_and_positive():
@@ -43,8 +48,8 @@ def test_extent_covariances_are_symmetric_and_positive():
 
 def expectation(deviation, error):
     """Return an expectation of one window, its priors with `deviation`, off by `error` (9,)."""
-    deviations = torch.full((1, SHARED), deviation, dtype=torch.float64)
-    errors = torch.tensor(error, dtype=torch.float64).expand(1, 9)
+    deviations = torch.full((1, SHARED), deviation, dtype=D)
+    errors = torch.tensor(error, dtype=D).expand(1, 9)
     return Expectation(torch.zeros(1, SHARED), deviations, *torch.ones(3, 1, 6), errors)
 
 
@@ -52,11 +57,11 @@ def extent_variances(expected, is_free=1.0, measured=0.1):
     """Return the variances of extents that are each `measured` once with this deviation [m]."""
     information = expected.deviation**-2 + measured**-2
     inverse = torch.diag_embed(1 / information)
-    free = torch.full((1, 9), is_free, dtype=torch.float64)
+    free = torch.full((1, 9), is_free, dtype=D)
     underrated = covariance._underrated_information(expected, free)
+    underrated = pad(underrated, (0, 6))  # none of the margins
     found = covariance._extent_covariance(expected, free, inverse, underrated)
-    model = np.array(covariance.EXTENT_MODEL_DEVIATION) ** 2
-    return found[0].diagonal().numpy() - model
+    return found[0].diagonal().numpy()
 
 
 def test_a_prior_that_is_too_tight_is_no_evidence():
@@ -79,3 +84,37 @@ def test_fixed_extents_have_the_errors_of_the_input():
         deviations = np.sqrt(np.diagonal(track.extent_covariances, axis1=1, axis2=2))
         assert (deviations > 0.01 * track.boxes[:, 3:6]).all()
         assert (deviations < 0.2 * track.boxes[:, 3:6]).all()
+
+
+def test_scattered_residuals_of_faces_by_hand():
+    # Of a face that is visible in 40 observations, whose residuals alternate about 0.03 m: they
+    # are not correlated. Their scatter has the weight 40, the one of the settings 14.
+    problem = problem_of(drive(40, turn=0.0)[None], class_numbers={'shape': 0.03})
+    weight = torch.zeros(1, 40, 6, dtype=D)
+    weight[..., 0] = 1.0
+    distances = 0.03 + 0.06 * torch.tensor([1.0, -1.0], dtype=D).repeat(20)[None, :, None]
+    found = covariance._correlated_information(
+        problem, weight, distances * weight, expectation(0.05, [0.0] * 9), Config()
+    )
+    claimed = Config().faces.ends ** 2
+    measured = 0.06**2 / (1 - 1 / 40)  # the mean of the window removes part of it
+    known = ((40 * measured + 14 * claimed) / 54 - claimed) / 40 / 0.05**4
+    np.testing.assert_allclose(found[0], [known, *[0] * 5], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('correlation', 'count'), [(0.0, 3000), (0.5, 3000), (0.8, 3000), (0.8, 2)]
+)
+def test_variance_of_the_mean_of_correlated_residuals(correlation, count):
+    rng = np.random.default_rng(0)
+    residuals = torch.zeros(1, count, 6, dtype=D)
+    noise = torch.from_numpy(rng.normal(size=(count, 6)))
+    for i in range(1, count):
+        residuals[0, i] = correlation * residuals[0, i - 1] + noise[i]
+    residuals -= residuals.mean(1, keepdim=True)
+    found = covariance._variance_of_mean(residuals, torch.ones(1, count, 6, dtype=torch.bool))
+    known = (1 + correlation) / (1 - correlation)
+    if count < 10:  # nearly the usual correlation
+        assert 1.5 < found < 5
+    else:
+        np.testing.assert_allclose(found, known, rtol=0.1)

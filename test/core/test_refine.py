@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from boxreg_ros import Config, refine, Track
-from boxreg_ros.core import rounds, window
+from boxreg_ros.core import covariance, rounds, window
 from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.rotations import wrap_angle
@@ -579,11 +579,14 @@ def normalised_errors(scenario, seeds):
 
 
 @pytest.mark.parametrize(('scenario', 'seeds'), [('street', range(2)), ('paper', range(5))])
-def test_covariances_are_consistent_with_the_errors(scenario, seeds):
-    # 1 for a consistent covariance. Here it is too large: simulated objects are boxes, without
-    # the model error of real ones, and the one track of the paper's experiment does not show how
-    # large the constant errors of its input are, so that typical ones are assumed.
-    assert 0.5 <= normalised_errors(scenario, seeds) <= 1.5
+def test_covariances_are_consistent_with_the_errors(scenario, seeds, monkeypatch):
+    # 1 for a consistent covariance. Simulated labels have no errors of time and heading. Here it
+    # is still too large: the margins of simulated objects vary less than those of labels, and the
+    # one track of the paper's experiment does not show how large the constant errors of its input
+    # are, so that typical ones are assumed.
+    monkeypatch.setattr(covariance, 'TIME_DEVIATION', 0.0)
+    monkeypatch.setattr(covariance, 'HEADING_MODEL_DEVIATION', 0.0)
+    assert 0.55 <= normalised_errors(scenario, seeds) <= 1.5
 
 
 def test_track_estimates_beat_final_ones_at_half_the_rate():

@@ -41,10 +41,11 @@ def track_with(deviation=0.05, n=4, status='refined', boxes=None, **columns):
 
 def test_risk_is_the_expected_loss_of_overlap():
     # A face that is off by d costs d / L, and 4.5 / 2 turns a loss into a shift of a car. Errors
-    # of a face are those of the centre and half the extent: .05 m and .025 m.
+    # of a face are those of the centre and half the extent: .05 m and .025 m. Of a pair of faces
+    # one has them all: twice the variance of one.
     track = track_with(0.05)
     mean = np.hypot(0.05, 0.025) * np.sqrt(2 / np.pi)
-    expected = 2 * mean * (1 / 4.5 + 1 / 1.8 + 1 / 1.5) * 4.5 / 2
+    expected = np.sqrt(2) * mean * (1 / 4.5 + 1 / 1.8 + 1 / 1.5) * 4.5 / 2
     np.testing.assert_allclose(assess(track).parts['uncertain position and size'], expected)
 
 
