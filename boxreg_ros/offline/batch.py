@@ -54,16 +54,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--strict', action='store_true', help='a drive that cannot be read completely has failed'
     )
+    _add_machine_arguments(parser)
+
+
+def _add_machine_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add which machines do which drives, and what happens to those that hang or are killed."""
     parser.add_argument(
         '--shard', type=_shard, default=(1, 1), metavar='I/N',
         help='do only every N-th drive, beginning with the I-th: one part per machine',
-    )  # fmt: skip
-    parser.add_argument(
-        '--timeout', type=float, metavar='S', help='longest time for one drive [s] (default: none)'
-    )
-    parser.add_argument(
-        '--retries', type=int, default=1, metavar='N',
-        help='how often a drive whose process was killed is tried again (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument(
         '--merge', action='store_true',
@@ -76,6 +74,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--address', metavar='HOST:PORT',
         help='Ray cluster (default: the one that this machine belongs to, else a new local one)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--timeout', type=float, metavar='S', help='longest time for one drive [s] (default: none)'
+    )
+    parser.add_argument(
+        '--retries', type=int, default=1, metavar='N',
+        help='how often a drive whose process was killed is tried again (default: %(default)s)',
     )  # fmt: skip
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-import gc
-from itertools import islice
+from itertools import accumulate, islice, pairwise
 import time
 from typing import Any, cast
 
@@ -97,9 +96,6 @@ def _serve(config: Config, receive: Receive, send: Send) -> None:
     torch.set_num_threads(1)  # the solver divides the windows among threads of its own
     with announced_compilation(send):
         warm_up(config)  # while the recording is read up to the first full window
-    # Later collections skip the imported and compiled objects: going through them takes 67 ms.
-    gc.collect()
-    gc.freeze()
     send(WARM)
     while True:
         packed, config, model = receive()
@@ -137,9 +133,15 @@ def _unpacked(heads: list[Any], *columns: Any) -> list[Window]:
     """Return the windows that `_packed` was given."""
     stamps, boxes, points, delays, *others = columns
     counts = [count for head in heads for count in head.observations]
-    ends = np.cumsum(counts)[:-1]
+    ends = accumulate(counts, initial=0)
+    parts = [slice(begin, end) for begin, end in pairwise(ends)]
     observations = map(
-        Observation, stamps, boxes, np.split(points, ends), np.split(delays, ends), *others
+        Observation,
+        stamps,
+        boxes,
+        [points[part] for part in parts],
+        [delays[part] for part in parts],
+        *others,
     )
     return [
         head._replace(observations=list(islice(observations, len(head.observations))))

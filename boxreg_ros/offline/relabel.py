@@ -36,7 +36,15 @@ from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.review.decisions import DECISIONS
-from boxreg_ros.structures import EXTENDED, INTERPOLATED, KEPT, REFINED, RefinedBoxes, REJECTED
+from boxreg_ros.structures import (
+    COASTED,
+    EXTENDED,
+    INTERPOLATED,
+    KEPT,
+    REFINED,
+    RefinedBoxes,
+    REJECTED,
+)
 import numpy as np
 import yaml
 
@@ -396,7 +404,7 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
         parts[-1] += f' ({_counts(summary["reasons"])})'
     if summary['heading_flips']:
         parts.append(f'{summary["heading_flips"]:,} heading flips corrected')
-    for word in (REJECTED, INTERPOLATED, EXTENDED):
+    for word in (REJECTED, INTERPOLATED, EXTENDED, COASTED):
         if word in status:
             parts.append(f'{status[word]:,} {word}')
     line = (
