@@ -27,6 +27,8 @@ RENAMED = {
     'faces.spread': 'vehicle.gap_spread',
 }
 """Settings of earlier versions by their old names: the error names the new one."""
+YAML_ERRORS = (yaml.YAMLError, ValueError, RecursionError)
+"""Of `yaml.safe_load`: malformed text, dates that do not exist, and nesting that is too deep."""
 REMOVED = {'solver.history': 'no result depends on it'}
 """Settings of earlier versions that are gone, and why."""
 
@@ -492,7 +494,7 @@ class Config:
                             if str(key).partition('.')[0] not in NODE_OPTIONS
                         }
             return cls.from_dict(values)
-        except (OSError, UnicodeDecodeError, yaml.YAMLError, ConfigError) as error:
+        except (OSError, ConfigError, *YAML_ERRORS) as error:
             reason = ' '.join(str(error).split())
             raise ConfigError(f'config file {str(path)!r}: {reason}') from None
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 import json
 from pathlib import Path
 import re
+from typing import Any
 
 from boxreg_ros.config import settings
 from boxreg_ros.offline import formats
@@ -64,23 +65,37 @@ def scale() -> str:
     """Return the figures of the stored run of `boxreg bench scale`."""
     stored = json.loads((DOCS / 'results' / 'scale.json').read_text(encoding='utf-8'))
     found = stored['results']
-    large, fleet = found['large'], found['fleet']
+    job, large, workers, fleet = (found[name] for name in ('job', 'large', 'workers', 'fleet'))
+    used = [workers[name]['cores_used'] for name in ('one', 'two')]
     rows = [
-        ('hours_per_core_hour', f'{found["hours_per_core_hour"]:.2f}', 'hours of recording'),
-        ('peak_mb', f'{found["peak_mb"]:,.0f} MB', 'memory of a job, its reader and its solver'),
         (
-            'speedup_2_workers',
-            f'{found["speedup_2_workers"]:.2f}',
-            f'two workers on two cores, at a load of {found["load"]:.1f} by others',
+            'job.hours_per_core_hour',
+            f'{job["hours_per_core_hour"]:.2f}',
+            f'hours of recording; {_about(job)}',
+        ),
+        ('job.peak_mb', f'{job["peak_mb"]:,.0f} MB', 'memory of the job'),
+        (
+            'workers.speedup',
+            f'{workers["speedup"]:.2f}',
+            f'two workers by one; they used {used[1]:.2f} cores and {used[0]:.2f}',
         ),
         (
-            'large.peak_mb',
-            f'{large["peak_mb"]:,.0f} MB',
-            f'memory for {large["gb"]:.1f} GB: {large["sweeps"]:,} sweeps of 150,000 points',
+            'large.hours_per_core_hour',
+            f'{large["hours_per_core_hour"]:.2f}',
+            f'hours of recording; {_about(large)}',
         ),
-        ('large.seconds', f'{large["seconds"]:,.0f} s', 'its time, on one core'),
-        ('fleet.core_hours', f'{fleet["core_hours"]:,.0f}', '10,000 hours of recording'),
-        ('fleet.price_usd', f'{fleet["price_usd"]:,.0f} USD', 'the same, at 0.04 USD a core-hour'),
+        ('large.peak_mb', f'{large["peak_mb"]:,.0f} MB', f'memory for {large["gb"]:.1f} GB'),
+        ('large.inspect_s', f'{large["inspect_s"]:.1f} s', '`boxreg inspect` of it'),
+        (
+            'fleet.core_hours',
+            f'{fleet["core_hours"]:,.0f}',
+            f'10,000 hours of recording as `{fleet["basis"]}`',
+        ),
+        (
+            'fleet.usd',
+            f'{fleet["usd"]:,.0f} USD',
+            f'the same, at {fleet["usd_per_core_hour"]:.2f} USD a core-hour',
+        ),
         (
             'fleet.hours',
             f'{fleet["hours"]:.2f} h',
@@ -89,7 +104,16 @@ def scale() -> str:
         ('fleet.used', f'{fleet["used"]:.0%}', 'part of the time that the cores have jobs'),
         ('fleet.lost', f'{fleet["lost"]:.2%}', 'part of the work that is done twice'),
     ]
-    return table(('figure', 'value', 'of'), rows)
+    made = f'    {stored["command"]}'
+    return f'{made}\n\n{table(("figure", "value", "of"), rows)}'
+
+
+def _about(measured: Any) -> str:
+    """Return the size of a recording."""
+    return (
+        f'{measured["recording_s"]:,.0f} s, {measured["sweeps"]:,} sweeps of '
+        f'{measured["points_per_sweep"]:,} points, {measured["boxes"]:,} boxes'
+    )
 
 
 TABLES = {

@@ -422,8 +422,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     ),
     'scale': (
         'A fleet of drives',
-        '[Scale](scale.md) explains the figures. The speedup of two workers was measured on a\n'
-        'loaded machine: more than 2 is chance.',
+        '[Scale](scale.md) explains the figures. Where two workers used far less than two cores,\n'
+        'other programs had the rest, and their speedup is no measurement.',
         _figures,
     ),
     'node': ('The live node', 'Publisher, node and observer each a process, over DDS.', _figures),

@@ -46,7 +46,9 @@ MAX_BYTES = 4 * 2**30
 """Address space of the process; the libraries alone map 2 GB."""
 VALUES = (b'\0', b'\x01', b'\x7f', b'\x80', b'\xff', b'\xff' * 4, b'\0' * 8, b'\xff' * 8, b'%n')
 EDIT = strategies.tuples(
-    strategies.sampled_from(('set', 'set', 'flip', 'flip', 'insert', 'delete', 'cut', 'copy')),
+    strategies.sampled_from(
+        ('set', 'set', 'flip', 'flip', 'insert', 'delete', 'cut', 'copy', 'nest')
+    ),
     strategies.floats(0, 1),
     strategies.integers(0, 255),
 )
@@ -71,6 +73,8 @@ def mutated(data, edits):
             del changed[at:]
         elif kind == 'copy':
             changed[at:at] = changed[: 16 * number]
+        elif kind == 'nest':  # deeper than parsers can go
+            changed[at:at] = b'[{'[number % 2 :][:1] * 5000
     return bytes(changed)
 
 

@@ -64,6 +64,15 @@ def test_exponents_without_a_decimal_point_are_numbers(tmp_path):
     assert Config.from_yaml(path).solver.tolerance == 1e-6
 
 
+@pytest.mark.parametrize('text', ['[' * 5000, 'lag: 2026-13-45', 'lag: !!python/name:os.system'])
+def test_malformed_yaml_is_an_error_in_one_line(tmp_path, text):
+    path = tmp_path / 'config.yaml'
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r'config\.yaml') as raised:
+        Config.from_yaml(path)
+    assert '\n' not in str(raised.value)
+
+
 def test_dotted_names_update_a_copy():
     config = Config()
     changed = config.updated({'solver.rounds': 2, 'mode': 'bev', 'vehicle.names': ['Auto']})

@@ -171,7 +171,7 @@ def _workers(recording: Path, drives: int, rounds: int, folder: Path) -> dict[st
     Returns
     -------
     found : dict
-        ``seconds`` and ``cores_used`` of one and of two workers, medians over the rounds, and
+        Of ``one`` and ``two`` workers ``seconds`` and ``cores_used``, medians over the rounds, and
         ``speedup``, the median of the ratios of each round.
 
     """
@@ -184,11 +184,15 @@ def _workers(recording: Path, drives: int, rounds: int, folder: Path) -> dict[st
         for turn in range(rounds)
     ]
     seconds, used = np.moveaxis(np.array(runs), 2, 0)  # (round, workers) each
-    return {
-        'seconds': np.median(seconds, axis=0).tolist(),
-        'cores_used': np.median(used / seconds, axis=0).tolist(),
-        'speedup': float(np.median(seconds[:, 0] / seconds[:, 1])),
+    found: dict[str, Any] = {
+        name: {
+            'seconds': float(np.median(seconds[:, i])),
+            'cores_used': float(np.median(used[:, i] / seconds[:, i])),
+        }
+        for i, name in enumerate(('one', 'two'))
     }
+    found['speedup'] = float(np.median(seconds[:, 0] / seconds[:, 1]))
+    return found
 
 
 def _run_batch(drives: Sequence[Path], workers: int, out: Path) -> tuple[float, float]:

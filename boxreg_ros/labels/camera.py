@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from boxreg_ros.config import YAML_ERRORS
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
@@ -80,7 +81,7 @@ class Camera:
             values = _from_yaml(text) if is_yaml else _from_lines(text)
         except OSError as error:
             raise ConfigError(f'{path}: cannot be read: {error.strerror}') from None
-        except (ValueError, TypeError, AttributeError, yaml.YAMLError) as error:
+        except (TypeError, AttributeError, *YAML_ERRORS) as error:
             raise ConfigError(f'{path}: not a camera calibration: {error}') from None
         T_camera_sensor = np.eye(4)
         T_camera_sensor[:3] = _part(path, values, 'pose', (12, 16))[:12].reshape(3, 4)

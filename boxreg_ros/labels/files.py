@@ -49,7 +49,7 @@ def from_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding='utf-8'))
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RecordingError(f'{path}: not JSON: {error}') from None
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, YAML_ERRORS
 from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
 from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
 import yaml
@@ -159,7 +159,7 @@ def setting(text: str) -> tuple[str, Any]:
         raise argparse.ArgumentTypeError(f'expected KEY=VALUE, got {text!r}')
     try:
         return name, yaml.safe_load(value)
-    except yaml.YAMLError:
+    except YAML_ERRORS:
         raise argparse.ArgumentTypeError(f'{name}: expected a YAML value, got {value!r}') from None
 
 

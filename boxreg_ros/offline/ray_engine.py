@@ -19,7 +19,7 @@ DEFAULT_JOB_BYTES = 10**9
 """
 Memory that a job declares before one was measured [bytes].
 
-Measured: 0.67 GB for a recording of 130,000 points a sweep (docs/scale.md).
+Twice the memory that was measured for a recording of 150,000 points a sweep (docs/scale.md).
 
 """
 MEMORY_RESERVE = 1.2

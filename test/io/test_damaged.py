@@ -143,6 +143,12 @@ def test_static_transforms_before_the_part_are_read_without_an_index(tmp_path, d
     assert sweeps == boxes == drive.stamps[6:]
 
 
+def test_metadata_that_cannot_be_parsed_is_not_used(tmp_path, drive):
+    folder = drive.write(tmp_path / 'drive', 'mcap-folder')
+    (folder / 'metadata.yaml').write_text('[' * 5000)
+    assert read(folder) == (drive.stamps, drive.stamps, [])
+
+
 def test_a_missing_file_of_a_folder_is_listed(tmp_path, drive):
     folder = drive.write(tmp_path / 'drive', 'mcap-folder')
     metadata = folder / 'metadata.yaml'

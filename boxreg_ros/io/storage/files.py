@@ -9,6 +9,7 @@ from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+from boxreg_ros.config import YAML_ERRORS
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, StorageFile
@@ -246,7 +247,7 @@ def _listed(folder: Path) -> list[Path]:
         names = metadata['rosbag2_bagfile_information']['relative_file_paths']
         # The name alone: a recording must not refer to files elsewhere.
         return [folder / PurePath(name).name for name in names]
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+    except (OSError, KeyError, TypeError, *YAML_ERRORS):
         return []
 
 
