@@ -112,6 +112,20 @@ def assert_equal_boxes(found, expected):
     assert difference.max() < 1e-6
 
 
+def test_missed_detections_are_added_live_and_offline(tmp_path):
+    drive = Drive(sweeps=12)
+    missed = [message for topic, _, message in drive.items if topic == '/boxes'][6:8]
+    for message in missed:
+        del message.detections[0]
+    path = drive.write(tmp_path / 'drive')
+    expected = relabelled(path, tmp_path / 'out', '--set=coast=0.5')
+    assert len(expected) == 24
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    assert (summary['boxes_in'], summary['status']['coasted']) == (22, 2)
+    found, _ = final_of_node(tmp_path, records_of(path), 'coast:=0.5')
+    assert_equal_boxes(found, expected)
+
+
 @pytest.mark.parametrize('clouds', ['topics', 'compressed', 'info'])
 def test_two_lidars_give_the_same_boxes_live_and_offline(tmp_path, clouds):
     path = LidarDrive(8, clouds).write(tmp_path / 'drive')

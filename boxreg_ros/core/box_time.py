@@ -9,6 +9,7 @@ points, those of the other are ahead of or behind them. docs/method.md (M12).
 from collections import Counter
 from dataclasses import replace
 from functools import lru_cache
+from math import hypot
 from typing import Any
 
 from boxreg_ros.config import Config
@@ -96,7 +97,7 @@ class BoxTimeEvidence:
 
         """
         motion = velocity * seen.sight
-        if np.linalg.norm(motion) < MIN_MOTION or len(seen.points) < MIN_VOTE_POINTS:
+        if hypot(*motion.tolist()) < MIN_MOTION or len(seen.points) < MIN_VOTE_POINTS:
             return
         points = seen.points - np.outer(seen.delays, velocity)  # at the stamp
         at_stamp = _distance_from_faces(seen.box, points)

@@ -40,7 +40,7 @@ DATASET = Dataset(
     packages=('pyarrow',),
 )
 SENSOR_POSES_FILE = 'calibration/egovehicle_SE3_sensor.feather'
-LIDARS = ('up_lidar', 'down_lidar')
+LIDAR_NAMES = ('up_lidar', 'down_lidar')
 """Names in the calibration; `laser_number` counts the lasers of the first one, then the second."""
 LASERS_EACH = 32
 
@@ -115,10 +115,11 @@ def _cloud(path: Path, origins: Floats) -> Cloud:
 def _origins(path: Path) -> Floats:
     """Return the positions of both LiDARs in the ego frame (2, 3); of our exports one (1, 3)."""
     positions = {row['sensor_name']: xyz_xyzw(row)[:3] for row in read_rows(path)}
-    found = [positions[name] for name in LIDARS if name in positions]
+    found = [positions[name] for name in LIDAR_NAMES if name in positions]
     if not found:
         raise RecordingError(
-            f'{path}: expected the poses of {" and ".join(LIDARS)}, got none; {DATASET.remedy}'
+            f'{path}: expected the poses of {" and ".join(LIDAR_NAMES)}, got none; '
+            f'{DATASET.remedy}'
         )
     return np.array(found)
 

@@ -39,7 +39,7 @@ DATASET = Dataset(
     lidar='pandar64',
     packages=('pandas',),
 )
-LIDARS = {'pandar64': 0, 'pandarGT': 1}
+SENSOR_IDS = {'pandar64': 0, 'pandarGT': 1}
 """LiDAR -> value of ``d`` of points and of ``cuboids.sensor_id``, which may be -1: for both."""
 POSITIONS = {'pandar64': (0.0, 0.80, 1.85), 'pandarGT': (-0.02, 1.41, 1.55)}
 """
@@ -73,7 +73,7 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
 
 def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a sequence; see `protocol.DatasetModule`."""
-    lidar_names = require_lidars(lidars, list(LIDARS), DATASET.lidar)
+    lidar_names = require_lidars(lidars, list(SENSOR_IDS), DATASET.lidar)
     folder = root / name / 'lidar'
     path = require(folder / 'timestamps.json', 'the stamps', DATASET.remedy)
     try:
@@ -119,7 +119,7 @@ def _sweep_files(
 
 def _cloud(path: Path, stamp_ns: int, T_world_vehicle: Floats, lidars: Sequence[str]) -> Cloud:
     """Return the points of some LiDARs in the frame of the vehicle."""
-    numbers = [LIDARS[name] for name in lidars]
+    numbers = [SENSOR_IDS[name] for name in lidars]
     try:
         table = _table(path)
         table = table[table['d'].isin(numbers)]
@@ -142,7 +142,7 @@ def _cloud(path: Path, stamp_ns: int, T_world_vehicle: Floats, lidars: Sequence[
 
 def _boxes(folder: Path, scene: SceneFrames, lidars: Sequence[str]) -> Iterator[LabelFrame]:
     """Yield the cuboids of each frame, but for those that were drawn for another LiDAR."""
-    others = [number for name, number in LIDARS.items() if name != lidars[0]]
+    others = [number for name, number in SENSOR_IDS.items() if name != lidars[0]]
     for number, stamp_ns in scene.stamps_ns.items():
         path = folder / f'{int(number):02d}.pkl.gz'
         try:

@@ -1,26 +1,28 @@
 """
 Items of a recording on their way to the registrar: read, decoded, in the fixed frame.
 
-This runs in a process of its own, a few items ahead of the registrar; see `ReadAhead`.
+This runs in a process of its own, a few items ahead of the registrar, or in that of a run on one
+core; see `reader`.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from boxreg_ros.config import Config
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
-from boxreg_ros.offline.worker_process import run_in_worker, WorkerProcess
+from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 
 
@@ -211,19 +213,35 @@ class RecordingReader:
         )
 
 
-def reader(request: Request) -> AbstractContextManager[WorkerProcess]:
-    """Return, for a block, the process that reads a recording for `ReadAhead`."""
-    return run_in_worker(partial(_read, request), 'reads the recording')
+@contextmanager
+def reader(request: Request) -> Iterator[Receive]:
+    """
+    Yield, for a block, a function that returns the next message for `ReadAhead`.
+
+    The recording is read in a process of its own, or in this one where it may use one core only.
+
+    """
+    if uses_one_core(request.config):
+        with closing(_messages(request)) as messages:
+            yield messages.__next__
+        return
+    with run_in_worker(partial(_read, request), 'reads the recording') as process:
+        yield process.receive
+
+
+def uses_one_core(config: Config) -> bool:
+    """Return whether a run is one process: more would use more cores, and copy every sweep."""
+    return config.solver.threads == 1
 
 
 class ReadAhead:
     """
-    Iterate over the items that a `RecordingReader` yields in another process, a few ahead.
+    Iterate over the items that a `RecordingReader` yields, in another process a few ahead.
 
     Parameters
     ----------
-    process : WorkerProcess
-        The process, from `reader`.
+    receive : callable
+        From `reader`.
 
     Attributes
     ----------
@@ -234,25 +252,30 @@ class ReadAhead:
 
     """
 
-    def __init__(self, process: WorkerProcess) -> None:
-        self._process = process
-        self.source: Source = process.receive()
+    def __init__(self, receive: Receive) -> None:
+        self._receive = receive
+        self.source: Source = receive()
         self.findings: Findings
 
     def __iter__(self) -> Iterator[ReadItem]:
         """Yield clouds and boxes; an error of the process is raised at its place."""
         while True:
-            received = self._process.receive()
+            received = self._receive()
             if isinstance(received, Findings):
                 self.findings = received
                 return
             yield received
 
 
-def _read(request: Request, _: Callable[[], Any], send: Callable[[Any], None]) -> None:
+def _read(request: Request, _: Receive, send: Send) -> None:
+    for message in _messages(request):
+        send(message)
+
+
+def _messages(request: Request) -> Generator[Source | ReadItem | Findings]:
+    """Yield the source of a recording, all its items, and the findings."""
     with request.recording() as recording:
         reading = RecordingReader(recording, request, Stopwatch())
-        send(reading.source)
-        for read_item in reading:
-            send(read_item)
-        send(reading.findings())
+        yield reading.source
+        yield from reading
+        yield reading.findings()
