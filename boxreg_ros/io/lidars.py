@@ -291,20 +291,20 @@ class _Group:
         """
         Return whether a cloud belongs here: the first of its topic, within the span.
 
-        With `offsets_ns` of the LiDARs from the begin of a period, as in the last sweep, it is of
-        the same period too: without the cloud before, one of the next would be within the span.
+        `offsets_ns` are those of the LiDARs from the begin of a period, where known. By these it
+        has to be of the same period: where the cloud before it is lost, one of the next period
+        may be within the span, too.
 
         """
         first_ns = min(self.first_ns, sweep.stamp_ns)
         last_ns = max(self.last_ns, sweep.stamp_ns)
         if sweep.topic in self.clouds or last_ns - first_ns > span_ns:
             return False
-        begins_ns = [
-            cloud.stamp_ns - offsets_ns[cloud.topic]
-            for cloud in (self.clouds[next(iter(self.clouds))][0], sweep)
-            if cloud.topic in offsets_ns
-        ]
-        return max(begins_ns, default=0) - min(begins_ns, default=0) <= span_ns // 2
+        topic, (other, _) = next(iter(self.clouds.items()))
+        if topic not in offsets_ns or sweep.topic not in offsets_ns:
+            return True
+        begin_ns = other.stamp_ns - offsets_ns[topic]
+        return abs(sweep.stamp_ns - offsets_ns[sweep.topic] - begin_ns) <= span_ns // 2
 
 
 class SweepMerger:

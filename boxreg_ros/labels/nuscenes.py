@@ -16,7 +16,7 @@ from dataclasses import asdict
 import hashlib
 from pathlib import Path
 import struct
-from typing import Any
+from typing import Any, TypeVar
 import zlib
 
 from boxreg_ros.errors import RecordingError
@@ -44,6 +44,8 @@ from boxreg_ros.rotations import quaternion_from_matrix
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
+
+_T = TypeVar('_T')
 
 FORMAT = Format(
     name='nuscenes',
@@ -427,12 +429,12 @@ def _annotated(
     names: Mapping[str, str],
 ) -> RefinedBoxes:
     """Return the boxes of the annotations of a sample."""
-    tracks = [instances[item['instance_token']] for item in items]
+    tracks = [_row_of(instances, item['instance_token'], 'instance') for item in items]
     return refined_boxes(
         stamp_ns,
         frame_id,
         [track.get('instance_name') or track['token'] for track in tracks],
-        [names[track['category_token']] for track in tracks],
+        [_row_of(names, track['category_token'], 'category') for track in tracks],
         _boxes_of(items),
         [item.get('score') for item in items],
         [item.get('status') for item in items],
@@ -441,6 +443,16 @@ def _annotated(
         [item.get('reason') for item in items],
         [item.get('extent_covariance') for item in items],
     )
+
+
+def _row_of(rows: Mapping[str, _T], token: str, table: str) -> _T:
+    """Return the row of a token; RecordingError if the table lacks it."""
+    if token not in rows:
+        raise RecordingError(
+            f'{table}.json of nuScenes: expected a row with the token {token!r}, got none among '
+            f'{len(rows)}; unpack the archive of its metadata again'
+        )
+    return rows[token]
 
 
 def _boxes_of(items: list[dict[str, Any]]) -> Floats:
@@ -473,7 +485,7 @@ def _poses(tables: Path) -> dict[str, Floats]:
     for item in from_json(tables / 'sample_data.json'):
         calibration = item['calibrated_sensor_token']
         if item['is_key_frame'] and calibration in T_ego_lidar:
-            T_global_ego = pose_matrix(ego_poses[item['ego_pose_token']])
+            T_global_ego = pose_matrix(_row_of(ego_poses, item['ego_pose_token'], 'ego_pose'))
             poses[item['sample_token']] = T_global_ego @ T_ego_lidar[calibration]
     return poses
 

@@ -354,6 +354,16 @@ def test_a_pose_that_is_missing_is_named(tmp_path):
         source_of('nuscenes', f'{tmp_path}#scene-0061').__enter__()
 
 
+@pytest.mark.parametrize(('table', 'lost'), [('instance', 'car'), ('category', 'vehicle.car')])
+def test_a_token_that_is_missing_is_named(tmp_path, table, lost):
+    layouts.nuscenes(tmp_path)
+    path = tmp_path / 'v1.0-mini' / f'{table}.json'
+    path.write_text(path.read_text().replace(f'"token": "{lost}"', '"token": "lost"'))
+    expected = f"{table}.json of nuScenes: expected a row with the token '{lost}', got none"
+    with pytest.raises(RecordingError, match=expected):
+        read(source_of('nuscenes', f'{tmp_path}#scene-0061'))
+
+
 CLOUDS = {
     'nuscenes': 'samples/**/*.bin',
     'kitti-tracking': '**/*.bin',
