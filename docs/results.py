@@ -409,6 +409,12 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'loaded machine: more than 2 is chance.',
         _figures,
     ),
+    'kills': (
+        'Labels while driving, killed',
+        'Box arrays that were published, and are in no segment after `boxreg recover`. Early\n'
+        'boxes become final 0.9 s later.',
+        _figures,
+    ),
     'node': ('The live node', 'Publisher, node and observer each a process, over DDS.', _figures),
 }
 

@@ -10,7 +10,7 @@ import shutil
 from boxreg_ros.labels.clouds import SUFFIXES
 from boxreg_ros.labels.segments import IndexRow, read_index
 
-BYTES_PER_POINT = 12
+XYZ_BYTES = 12
 """Least size of a point in a file: x, y and z as float32."""
 
 
@@ -47,7 +47,7 @@ class RecordedLabels:
         self.rows: list[IndexRow] = []
         self._folder = folder
         self._kept = kept
-        self._cloud_bytes = BYTES_PER_POINT * points
+        self._cloud_bytes = XYZ_BYTES * points
         self._on_disk = deque[IndexRow]()
 
     def update(self) -> None:
