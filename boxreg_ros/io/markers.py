@@ -9,6 +9,7 @@ from typing import Any
 
 from boxreg_ros.structures import (
     BoxArray,
+    COASTED,
     Floats,
     HEIGHT,
     is_valid_box,
@@ -25,11 +26,14 @@ Colour = tuple[float, float, float, float]
 TRANSLUCENT_GREY: Colour = (0.7, 0.7, 0.7, 0.25)
 GREEN = (0.1, 0.8, 0.3, 0.45)
 ORANGE = (1.0, 0.6, 0.1, 0.45)
-VIOLET = (0.6, 0.3, 1.0, 0.45)
+YELLOW = (1.0, 0.95, 0.2, 0.45)
 CYAN = (0.1, 0.8, 1.0, 0.3)
 BLUE = (0.2, 0.5, 1.0, 0.6)
+VIOLET = (0.6, 0.3, 0.9, 0.45)
 WHITE = (1.0, 1.0, 1.0, 1.0)
 RED = (0.9, 0.1, 0.1, 1.0)
+COLOURS = {REFINED: GREEN, COASTED: VIOLET}
+"""By status; kept boxes are orange, or yellow where there was no time for them."""
 BOX_NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
 FINAL = 'final'
 RECORDING = 'recording'
@@ -120,10 +124,11 @@ class MarkerBoard:
         Parameters
         ----------
         given, refined : BoxArray, RefinedBoxes
-            The same boxes before and after, in one frame. Boxes that are not finite, or have
-            no volume, are not shown. Green is refined, orange is kept, violet is kept because
-            there was no time; grey is the input. The blue ellipse is the covariance of x and y of
-            a refined box, 2 standard deviations.
+            The same boxes before and after, in one frame; coasted boxes stand behind those of
+            the input. Boxes that are not finite, or have no volume, are not shown. Green is
+            refined, violet coasted, orange is kept, yellow is kept because there was no time;
+            grey is the input. The blue ellipse is the covariance of x and y of a refined box, 2
+            standard deviations.
 
         """
         m = self._messages
@@ -132,18 +137,25 @@ class MarkerBoard:
         after = quaternions_of(refined.boxes.boxes)
         markers: list[Any] = list(self.clear().markers) if self._is_new else []
         self._is_new = False
-        is_shown = is_valid_box(refined.boxes.boxes) & is_valid_box(given.boxes)
+        is_shown = is_valid_box(refined.boxes.boxes)
+        is_shown[: len(before)] &= is_valid_box(given.boxes)
         rows = np.flatnonzero(is_shown).tolist()
-        for i, number in self._shown.replace(given.track_ids, rows):
+        for i, number in self._shown.replace(refined.boxes.track_ids, rows):
             box = refined.boxes.boxes[i]
-            is_refined = refined.status[i] == REFINED
-            colour = GREEN if is_refined else VIOLET if refined.reasons[i] == BUDGET else ORANGE
+            is_given = i < len(before)
+            is_refined = refined.status[i] in COLOURS
+            colour = _colour_of(refined.status[i], refined.reasons[i])
             spread = refined.covariances[i, :2, :2] if is_refined else np.zeros((2, 2))
+            grey = m.Marker(header=header, ns='input', id=number, action=DELETE)
+            if is_given:
+                grey = _cube(
+                    m, header, 'input', number, given.boxes[i], before[i], TRANSLUCENT_GREY
+                )
             markers += [
-                _cube(m, header, 'input', number, given.boxes[i], before[i], TRANSLUCENT_GREY),
+                grey,
                 _cube(m, header, 'refined', number, box, after[i], colour),
                 _arrow(m, header, number, box, after[i]),
-                _text(m, header, number, box, given.track_ids[i]),
+                _text(m, header, number, box, refined.boxes.track_ids[i]),
                 _ellipse(m, header, number, box, spread),
             ]
         markers += [
@@ -181,6 +193,11 @@ class MarkerBoard:
         sec, nanosec = divmod(boxes.stamp_ns, 10**9)
         m = self._messages
         return m.Header(stamp=m.Time(sec=sec, nanosec=nanosec), frame_id=boxes.frame_id)
+
+
+def _colour_of(status: str, reason: str) -> Colour:
+    """Return the colour of a box by what was done with it."""
+    return YELLOW if reason == BUDGET else COLOURS.get(status, ORANGE)
 
 
 def _cube(

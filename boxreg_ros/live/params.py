@@ -105,7 +105,7 @@ NODE_SETTINGS = (
 
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
-    *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
+    *('max_gap', 'coast', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
     *('config_file', 'record_'),
 )
 """Prefixes of the parameters that may change while the node runs."""
