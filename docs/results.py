@@ -426,6 +426,12 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'other programs had the rest, and their speedup is no measurement.',
         _figures,
     ),
+    'kills': (
+        'Labels while driving, killed',
+        'Box arrays that were published, and are in no segment after `boxreg recover`. Early\n'
+        'boxes become final 0.9 s later.',
+        _figures,
+    ),
     'node': ('The live node', 'Publisher, node and observer each a process, over DDS.', _figures),
 }
 

@@ -28,6 +28,7 @@ MEASUREMENTS = {
     'scale': Measurement('scale', 'core hours and memory per hour, and a simulated fleet'),
     'load': Measurement('load', 'latency and accuracy of the live node by number of tracks'),
     'node': Measurement('node', 'latency and memory of the live node, over DDS'),
+    'kills': Measurement('kills', 'what recorded labels lose when a process is killed'),
 }
 
 

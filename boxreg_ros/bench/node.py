@@ -10,7 +10,7 @@ publishing the later of cloud and boxes until the refined boxes arrive at the ob
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from functools import partial
 import os
@@ -31,6 +31,7 @@ from boxreg_ros.labels import module_of
 from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
 import numpy as np
 
+BOXREG = (sys.executable, '-m', 'boxreg_ros.cli')
 PROFILE = Path(__file__).parents[1] / 'share' / 'fastdds.xml'
 CIRCLE_PERIOD = 5.0  # time until a car is back where it began [s]
 TRACK_LIFETIME = 200  # sweeps until a track gets a new id
@@ -280,29 +281,17 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
         message by its sweep, after `STARTUP_TIME`.
 
     """
-    if args.transport == 'large':
-        os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
-    else:
-        os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    os.environ.setdefault('ROS_DOMAIN_ID', '231')  # apart from other nodes of this machine
-    command = [sys.executable, '-m', 'boxreg_ros.cli']
+    set_environment(args.transport)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         arrivals = stack.enter_context(observer(keeps_messages))
         labels = RecordedLabels(folder / 'labels', 1e9 * args.keep_gigabytes, args.points)
-        given = [*args.set, *recording_parameters(args.record, folder / 'labels')]
-        parameters = [part for text in given for part in ('-p', text)]
-        node = stack.enter_context(
-            process([*command, 'node', '--ros-args', *parameters], folder / 'node.log')
-        )
-        options = [
-            f'--{name}={getattr(args, name)}'
-            for name in ('tracks', 'points', 'rate', 'seconds', 'delay')
-        ]
-        role = ['bench', 'node', '--role=publish', f'--log={folder / "sent"}']
+        parameters = [*args.set, *recording_parameters(args.record, folder / 'labels')]
+        node = stack.enter_context(process(node_command(parameters), folder / 'node.log'))
         load = os.getloadavg()[0]
-        publisher = stack.enter_context(process([*command, *role, *options], folder / 'sent.log'))
+        publisher = stack.enter_context(
+            process(publisher_command(args, folder / 'sent'), folder / 'sent.log')
+        )
         samples = []
         recorder_samples = []
         while publisher.poll() is None:
@@ -337,6 +326,29 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
         'counters': arrivals['counters'],
         **({'messages': _by_sweep(sent, arrivals, args.rate)} if keeps_messages else {}),
     }
+
+
+def set_environment(transport: str) -> None:
+    """Set the transport of DDS, and a domain apart from other nodes of this machine."""
+    if transport == 'large':
+        os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
+    else:
+        os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    os.environ.setdefault('ROS_DOMAIN_ID', '231')
+
+
+def node_command(parameters: Sequence[str]) -> list[str]:
+    """Return the command of a node with parameters as ``KEY:=VALUE``."""
+    options = [part for text in parameters for part in ('-p', text)]
+    return [*BOXREG, 'node', '--ros-args', *options]
+
+
+def publisher_command(args: argparse.Namespace, log: Path) -> list[str]:
+    """Return the command of the publisher, which logs what it has sent."""
+    names = ('tracks', 'points', 'rate', 'seconds', 'delay')
+    options = [f'--{name}={getattr(args, name)}' for name in names]
+    return [*BOXREG, 'bench', 'node', '--role=publish', f'--log={log}', *options]
 
 
 def _by_sweep(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, dict[int, bytes]]:
@@ -507,6 +519,7 @@ def observer(keeps_messages: bool = False) -> Iterator[dict[str, Any]]:
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import QoSProfile
+    from rclpy.signals import SignalHandlerOptions
     from visualization_msgs.msg import MarkerArray
 
     arrivals: dict[str, Any] = {'early': {}, 'final': {}, 'counters': {}}
@@ -524,7 +537,7 @@ def observer(keeps_messages: bool = False) -> Iterator[dict[str, Any]]:
             if item.value.isdigit():
                 arrivals['counters'][item.key] = int(item.value)
 
-    rclpy.init(args=[])
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C ends the run
     node = rclpy.create_node('bench_observer')
     for name, topic in (('early', 'refined_boxes'), ('final', 'refined_boxes_final')):
         node.create_subscription(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import count
 from types import SimpleNamespace
 from typing import Any
@@ -26,20 +26,68 @@ Colour = tuple[float, float, float, float]
 TRANSLUCENT_GREY: Colour = (0.7, 0.7, 0.7, 0.25)
 GREEN = (0.1, 0.8, 0.3, 0.45)
 ORANGE = (1.0, 0.6, 0.1, 0.45)
+YELLOW = (1.0, 0.95, 0.2, 0.45)
+CYAN = (0.1, 0.8, 1.0, 0.3)
 BLUE = (0.2, 0.5, 1.0, 0.6)
 VIOLET = (0.6, 0.3, 0.9, 0.45)
 WHITE = (1.0, 1.0, 1.0, 1.0)
 RED = (0.9, 0.1, 0.1, 1.0)
 COLOURS = {REFINED: GREEN, COASTED: VIOLET}
-"""By status; kept boxes are orange."""
+"""By status; kept boxes are orange, or yellow where there was no time for them."""
 BOX_NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
+FINAL = 'final'
 RECORDING = 'recording'
-NAMESPACES = (*BOX_NAMESPACES, RECORDING)
+NAMESPACES = (*BOX_NAMESPACES, FINAL, RECORDING)
 DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
 TEXT_HEIGHT = 3.0
 """Height of the state of the recording above the sensor [m]; chosen."""
 ARROW, CUBE, SPHERE, TEXT = 0, 1, 2, 9
 ADD, DELETE, DELETEALL = 0, 2, 3
+BUDGET = 'budget'
+"""Reason of boxes that there was no time for, see `reasons`."""
+
+
+class _Shown:
+    """
+    Tracks that are shown in some namespaces, each with the number of its markers.
+
+    Parameters
+    ----------
+    numbers : iterator of int
+        Numbers for further tracks.
+
+    Attributes
+    ----------
+    gone : list of int
+        Numbers of the tracks that the last call of `replace` has removed.
+
+    """
+
+    def __init__(self, numbers: Iterator[int]) -> None:
+        self.gone: list[int] = []
+        self._new_numbers = numbers
+        self._numbers: dict[str, int] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._numbers)
+
+    def replace(self, track_ids: Sequence[str], rows: Sequence[int]) -> list[tuple[int, int]]:
+        """Show `rows` of boxes with track ids instead; return each row with its number."""
+        before, self._numbers = self._numbers, {}
+        numbered = []
+        for row in rows:
+            key = track_ids[row]
+            if not key or key in self._numbers:
+                key = f'{key}#{row}'
+            number = before[key] if key in before else next(self._new_numbers) % 2**31
+            self._numbers[key] = number
+            numbered.append((row, number))
+        self.gone = [number for key, number in before.items() if key not in self._numbers]
+        return numbered
+
+    def clear(self) -> None:
+        """Show nothing."""
+        self._numbers = {}
 
 
 class MarkerBoard:
@@ -60,44 +108,43 @@ class MarkerBoard:
     def __init__(self, messages: Any = None) -> None:
         self._messages = messages or ros_messages()
         self._is_new = True
-        self._shown: dict[str, int] = {}
-        self._numbers = count()
+        numbers = count()
+        self._shown = _Shown(numbers)
+        self._shown_finals = _Shown(numbers)
 
     @property
     def is_showing(self) -> bool:
         """Return whether boxes are shown."""
-        return bool(self._shown)
+        return bool(self._shown) or bool(self._shown_finals)
 
     def update(self, given: BoxArray, refined: RefinedBoxes) -> Any:
         """
-        Return the markers that bring what is shown up to date.
+        Return the markers that bring what is shown of early boxes up to date.
 
         Parameters
         ----------
         given, refined : BoxArray, RefinedBoxes
             The same boxes before and after, in one frame; coasted boxes stand behind those of
             the input. Boxes that are not finite, or have no volume, are not shown. Green is
-            refined, violet coasted, orange is kept; grey is the input. The blue ellipse is the
-            covariance of x and y of a refined box, 2 standard deviations.
+            refined, violet coasted, orange is kept, yellow is kept because there was no time;
+            grey is the input. The blue ellipse is the covariance of x and y of a refined box, 2
+            standard deviations.
 
         """
         m = self._messages
-        sec, nanosec = divmod(given.stamp_ns, 10**9)
-        header = m.Header(stamp=m.Time(sec=sec, nanosec=nanosec), frame_id=given.frame_id)
+        header = self._header_of(given)
         before = quaternions_of(given.boxes)
         after = quaternions_of(refined.boxes.boxes)
         markers: list[Any] = list(self.clear().markers) if self._is_new else []
         self._is_new = False
-        was_shown, self._shown = self._shown, {}
-        for i, track_id in enumerate(refined.boxes.track_ids):
-            key = track_id if track_id and track_id not in self._shown else f'{track_id}#{i}'
+        is_shown = is_valid_box(refined.boxes.boxes)
+        is_shown[: len(before)] &= is_valid_box(given.boxes)
+        rows = np.flatnonzero(is_shown).tolist()
+        for i, number in self._shown.replace(refined.boxes.track_ids, rows):
             box = refined.boxes.boxes[i]
-            is_given = i < len(given.track_ids)
-            if not (is_valid_box(box) and (not is_given or is_valid_box(given.boxes[i]))):
-                continue
-            self._shown[key] = number = was_shown[key] if key in was_shown else self._number()
-            colour = COLOURS.get(refined.status[i], ORANGE)
-            is_refined = colour is not ORANGE
+            is_given = i < len(before)
+            is_refined = refined.status[i] in COLOURS
+            colour = _colour_of(refined.status[i], refined.reasons[i])
             spread = refined.covariances[i, :2, :2] if is_refined else np.zeros((2, 2))
             grey = m.Marker(header=header, ns='input', id=number, action=DELETE)
             if is_given:
@@ -108,25 +155,49 @@ class MarkerBoard:
                 grey,
                 _cube(m, header, 'refined', number, box, after[i], colour),
                 _arrow(m, header, number, box, after[i]),
-                _text(m, header, number, box, track_id),
+                _text(m, header, number, box, refined.boxes.track_ids[i]),
                 _ellipse(m, header, number, box, spread),
             ]
-        gone = [number for key, number in was_shown.items() if key not in self._shown]
         markers += [
             m.Marker(header=header, ns=ns, id=number, action=DELETE)
-            for number in gone
+            for number in self._shown.gone
             for ns in BOX_NAMESPACES
+        ]
+        return m.MarkerArray(markers=markers)
+
+    def update_finals(self, refined: RefinedBoxes) -> Any:
+        """Return the markers that bring what is shown of final boxes up to date: cyan boxes."""
+        m = self._messages
+        boxes = refined.boxes
+        header = self._header_of(boxes)
+        quaternions_xyzw = quaternions_of(boxes.boxes)
+        rows = np.flatnonzero(is_valid_box(boxes.boxes)).tolist()
+        markers = [
+            _cube(m, header, FINAL, number, boxes.boxes[i], quaternions_xyzw[i], CYAN)
+            for i, number in self._shown_finals.replace(boxes.track_ids, rows)
+        ]
+        markers += [
+            m.Marker(header=header, ns=FINAL, id=number, action=DELETE)
+            for number in self._shown_finals.gone
         ]
         return m.MarkerArray(markers=markers)
 
     def clear(self) -> Any:
         """Return the markers that remove all others."""
-        self._shown = {}
+        self._shown.clear()
+        self._shown_finals.clear()
         m = self._messages
         return m.MarkerArray(markers=[m.Marker(action=DELETEALL)])
 
-    def _number(self) -> int:
-        return next(self._numbers) % 2**31
+    def _header_of(self, boxes: BoxArray) -> Any:
+        sec, nanosec = divmod(boxes.stamp_ns, 10**9)
+        m = self._messages
+        return m.Header(stamp=m.Time(sec=sec, nanosec=nanosec), frame_id=boxes.frame_id)
+
+
+def _colour_of(status: str, reason: str) -> Colour:
+    """Return the colour of a box by what was done with it."""
+    return YELLOW if reason == BUDGET else COLOURS.get(status, ORANGE)
 
 
 def _cube(

@@ -314,7 +314,11 @@ class Worker:
         if not self._markers.get_subscription_count():
             return
         for out in ready:  # after all boxes: making markers takes longer than publishing boxes
-            if not out.is_final and out.given is not None and out.refined is not None:
+            if out.given is None or out.refined is None:
+                continue
+            if out.is_final:
+                self._markers.publish(self._board.update_finals(out.refined))
+            else:
                 self._markers.publish(self._board.update(out.given, out.refined))
 
     def _finish(self, item: ReceivedMessage | None) -> None:

@@ -1,6 +1,7 @@
 """The node as a process, over DDS."""
 
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib.util import find_spec
 import signal
 import subprocess
@@ -74,7 +75,7 @@ def test_odometry_replaces_tf(graph, tmp_path):
     play(graph, records[:3], early)
     assert time.monotonic() - begun < 2.0
     play(graph, records[3:], early)
-    graph.wait(lambda: len(shown) == 6, 'markers')
+    graph.wait(lambda: len(shown) == 6 + 4, 'markers of early and final boxes')
     graph.wait(lambda: values_of(diagnostics).get('early_published') == '6', 'diagnostics')
     assert values_of(diagnostics)['fixed_frame'] == 'odom'
     assert int(values_of(diagnostics)['refined']) > 0
@@ -88,15 +89,17 @@ def test_odometry_replaces_tf(graph, tmp_path):
 
     array = markers.from_msg(early[-1])
     assert array.frame_id == 'lidar' and array.track_ids == ('1',)
-    added = [{m.ns for m in message.markers if m.action == 0} for message in shown[:6]]
-    assert added == [set(BOX_NAMESPACES)] * 6
+    assert shown[-1].markers[0].action == 3  # all are deleted when the node ends
+    added = [{m.ns for m in message.markers if m.action == 0} for message in shown[:10]]
+    assert added.count({'final'}) == 4
+    shown = [message for message, ns in zip(shown, added, strict=False) if ns != {'final'}]
+    assert [ns for ns in added if ns != {'final'}] == [set(BOX_NAMESPACES)] * 6
     colours = {(m.ns, m.color.g) for m in shown[3].markers if m.ns in ('input', 'refined')}
     assert len({green for _, green in colours}) == 2
     numbers = {m.text: m.id for m in shown[3].markers if m.ns == 'id'}
     assert numbers.keys() == {'1', '2'}
-    deleted = [{m.id for m in message.markers if m.action == 2} for message in shown[:6]]
+    deleted = [{m.id for m in message.markers if m.action == 2} for message in shown]
     assert deleted == [set(), set(), set(), set(), {numbers['2']}, set()]
-    assert shown[-1].markers[0].action == 3  # all are deleted when the node ends
 
 
 def test_late_transforms_are_awaited_and_invalid_boxes_are_unchanged(graph, tmp_path):
@@ -297,9 +300,9 @@ def test_empty_box_array_deletes_the_markers(graph, tmp_path):
     node = graph.start(*RELIABLE, *QUICK, '-p', 'max_gap:=1000.0')  # else silence deletes them
     graph.wait_until_connected()
     play(graph, records, early)
-    graph.wait(lambda: len(shown) == 4, 'markers')
+    graph.wait(lambda: len(shown) == 4 + 2, 'markers of early and final boxes')
     graph.publishers['/boxes'].publish(import_message(MARKERS)())
-    graph.wait(lambda: len(shown) == 5, 'no markers')
+    graph.wait(lambda: len(shown) == 7, 'no markers')
     assert [m.action for m in shown[-1].markers] == [3]
     assert ended_cleanly(node)
 
@@ -362,6 +365,21 @@ def test_boxes_beyond_the_deadline_are_kept_and_no_cloud_is_dropped(graph, tmp_p
     assert ended_cleanly(node)
     assert numbers_changed(early, records)[2:] == [1] * 28
     assert numbers_changed(final, records)[1:29] == [2] * 28  # by a window of the next stamp
+
+
+def test_a_node_without_any_parameter_refines_a_track_at_every_stamp(graph, tmp_path):
+    """The default deadline leaves at least one window a stamp, on the slowest machine."""
+    drive, records, early, final = publish_thirty_stamps(graph, tmp_path)
+    node = graph.start()
+    graph.wait_until_connected()
+    play(graph, records, early)
+    counts = wait_for_thirty_early_boxes(graph, early)
+    assert 0.0 < float(counts['deadline [ms]']) <= 1000.0
+    assert not {'points_queue_full', 'boxes_queue_full'} & counts.keys()
+    assert ended_cleanly(node)
+    assert [stamp_of(m) for m in early] == [stamp_of(m) for m in final] == drive.stamps
+    assert set(numbers_changed(early, records)[2:]) <= {1, 2}
+    assert numbers_changed(final, records)[1:29] == [2] * 28
 
 
 def test_messages_are_queued_while_the_process_is_suspended(graph, tmp_path):
@@ -529,6 +547,25 @@ def test_markers_keep_one_id_per_track():
     assert board.is_showing and board.clear() and not board.is_showing
     given.boxes[1, 4] = 0.0  # no width: viewers reject it
     assert not board.update(given, refined_of(given, KEPT, KEPT)).markers
+
+
+def test_markers_of_final_boxes_and_of_boxes_without_time_have_their_own_colours():
+    board = MarkerBoard()
+    given = boxes_of('a', 'b', 'c')
+    refined = refined_of(given, REFINED, KEPT, KEPT)
+    refined = replace(refined, reasons=('', 'budget', 'no_points'))
+    early = board.update(given, refined).markers
+    colours = [(m.color.r, m.color.g, m.color.b) for m in early if m.ns == 'refined']
+    assert len(set(colours)) == 3
+    numbers = [m.id for m in board.update_finals(refined).markers]
+    assert len(set(numbers)) == 3
+    left = boxes_of('c')
+    finals = board.update_finals(refined_of(left, REFINED)).markers
+    assert [(m.ns, m.id, m.action) for m in finals] == [
+        ('final', numbers[2], 0), ('final', numbers[0], 2), ('final', numbers[1], 2)
+    ]  # fmt: skip
+    assert not set(colours) & {(m.color.r, m.color.g, m.color.b) for m in finals}
+    assert board.clear() and not board.is_showing
 
 
 def test_a_coasted_box_has_a_colour_of_its_own_and_no_box_of_the_input():
