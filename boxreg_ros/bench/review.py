@@ -23,6 +23,7 @@ from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, median, TrackChanges
+from boxreg_ros.review.decisions import Corrections, Decision
 from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
@@ -131,19 +132,14 @@ def _gain(drive: Drive, bad: Sequence[TrackChanges], pins: Mapping[str, int]) ->
 def with_pins(drive: Drive, pins: Mapping[str, int]) -> Drive:
     """Return a drive with one pinned box of some tracks, at the true box: stamps by track id."""
     truth = drive.truth
-    keys = zip(truth.stamps_ns.tolist(), truth.track_ids, strict=True)
+    keys = zip(truth.track_ids, truth.stamps_ns.tolist(), strict=True)
     true_boxes = dict(zip(keys, truth.boxes, strict=True))
-    arrays = []
-    for array in drive.boxes:
-        boxes = array.boxes.copy()
-        pinned = np.zeros(len(boxes), bool)
-        for row, track_id in enumerate(array.track_ids):
-            true = true_boxes.get((array.stamp_ns, track_id))
-            if pins.get(track_id) == array.stamp_ns and true is not None:
-                boxes[row] = true
-                pinned[row] = True
-        arrays.append(replace(array, boxes=boxes, pinned=pinned))
-    return replace(drive, boxes=tuple(arrays))
+    corrections = Corrections(
+        Decision(*key, 'pin', '', truth.frame_id, true_boxes[key])
+        for key in pins.items()
+        if key in true_boxes
+    )
+    return replace(drive, boxes=tuple(map(corrections.pinned, drive.boxes)))
 
 
 def planted(drive: Drive) -> Drive:

@@ -205,6 +205,7 @@ class Corrections:
         made = {key: one for key, one in last.items() if one.kind in ('reject', 'pin')}
         self._made = made
         self._unused = set(made)
+        self._extents = _extents_of_pins(made.values())
 
     def unused(self) -> list[str]:
         """Return the tracks and boxes with a decision that the recording does not have."""
@@ -217,6 +218,9 @@ class Corrections:
         """
         Return input boxes with pinned boxes in the place of theirs.
 
+        A pin shows the extents of the object: the other boxes of its track have them too, in
+        windows without a pin as well.
+
         Raises
         ------
         RecordingError
@@ -228,6 +232,7 @@ class Corrections:
         is_pinned = np.zeros(len(given.track_ids), bool)
         boxes = given.boxes.copy()
         for row, track_id in enumerate(given.track_ids):
+            boxes[row, BOX_EXTENT] = self._extents.get(track_id, boxes[row, BOX_EXTENT])
             found = self._of(track_id, given.stamp_ns)
             if found is None or found.kind != 'pin' or found.box is None:
                 continue
@@ -250,6 +255,8 @@ class Corrections:
         reasons = list(refined.reasons)
         covariances = refined.covariances.copy()
         for row, track_id in enumerate(given.track_ids):
+            if status[row] == KEPT:
+                boxes[row] = given.boxes[row]  # without the extents of a pin
             found = self._of(track_id, given.stamp_ns)
             if found is None:
                 continue
@@ -276,6 +283,15 @@ class Corrections:
                 self._unused.discard(key)
                 found = found or self._made[key]
         return found
+
+
+def _extents_of_pins(decisions: Iterable[Decision]) -> dict[str, Floats]:
+    """Return the mean extents (3,) of the pinned boxes of each track that has any."""
+    by_track: dict[str, list[Floats]] = {}
+    for decision in decisions:
+        if decision.kind == 'pin' and decision.box is not None:
+            by_track.setdefault(decision.track_id, []).append(decision.box[BOX_EXTENT])
+    return {track_id: np.mean(extents, axis=0) for track_id, extents in by_track.items()}
 
 
 def _parsed(row: dict[str, str]) -> Decision:

@@ -131,6 +131,22 @@ def test_last_decision_holds_and_box_goes_before_track():
     assert corrections.unused() == ["'2' at 6", "'4'"]
 
 
+def test_a_pin_holds_its_extents_along_the_whole_track():
+    pin = BOX + 0.5
+    corrections = Corrections([Decision('1', 5, 'pin', '', 'odom', pin)])
+    later = BoxArray(10**12, 'odom', ('1', '2'), ('car',) * 2, np.ones(2), np.tile(BOX, (2, 1)))
+    found = corrections.pinned(later)
+    assert not found.pinned.any()
+    np.testing.assert_array_equal(found.boxes[0, 3:6], pin[3:6])
+    np.testing.assert_array_equal(found.boxes[0, :3], BOX[:3])
+    np.testing.assert_array_equal(found.boxes[1], BOX)
+    # A box that is kept is returned as in the input.
+    kept = RefinedBoxes(
+        found, ('kept',) * 2, ('no_gain',) * 2, np.ones(2, int), np.ones((2, 6, 6))
+    )
+    np.testing.assert_array_equal(corrections.apply(later, kept).boxes.boxes, later.boxes)
+
+
 def test_pin_in_another_frame_is_refused():
     given = BoxArray(5, 'odom', ('1',), ('car',), np.ones(1), BOX[None])
     with pytest.raises(RecordingError, match="expected frame 'odom', got 'map'"):
