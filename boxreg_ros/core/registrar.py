@@ -225,29 +225,32 @@ class BoxRegistrar:
         given = boxes.boxes[rows]
         at_sweep = given.copy()
         offset = (sweep.stamp_ns - boxes.stamp_ns) * 1e-9  # [s]
-        velocities = np.array(
-            [
-                track.input_velocity(box, boxes.stamp_ns)
-                for track, box in zip(tracks, given, strict=True)
+        motion = np.zeros((len(rows), 3))
+        if offset or sweep.times is not None:
+            velocities = np.array(
+                [
+                    track.input_velocity(box, boxes.stamp_ns)
+                    for track, box in zip(tracks, given, strict=True)
+                ]
+            )
+            # The points are relative to the box: motion-compensated to the stamp of the box.
+            at_sweep[:, X : Z + 1] += offset * velocities
+            if self.config.sampling.deskew:
+                motion = motion_to_sight(sweep, at_sweep, velocities)
+        observations = observe(sweep, swept(at_sweep, motion), boxes.stamp_ns, self.config)
+        if offset or motion.any():
+            observations = [
+                seen.relative_to(box, shift)
+                for seen, box, shift in zip(observations, given, motion / 2, strict=True)
             ]
-        )
-        # The points are relative to the box: motion-compensated to the stamp of the box.
-        at_sweep[:, X : Z + 1] += offset * velocities
-        motion = np.zeros_like(velocities)
-        if self.config.sampling.deskew:
-            motion = motion_to_sight(sweep, at_sweep, velocities)
-        found = observe(sweep, swept(at_sweep, motion), boxes.stamp_ns, self.config)
-        observations = [
-            seen.relative_to(box, shift)
-            for seen, box, shift in zip(found, given, motion / 2, strict=True)
-        ]
-        for row, track, moved, seen in zip(rows, tracks, motion, observations, strict=True):
-            self.box_time.add(seen.box, seen.points, moved)
+            for seen, moved in zip(observations, motion, strict=True):
+                self.box_time.add(seen.box, seen.points, moved)
+        pinned = [False] * len(rows) if boxes.pinned is None else boxes.pinned[rows].tolist()
+        for row, track, seen, is_pinned in zip(rows, tracks, observations, pinned, strict=True):
             array.num_points[row] = seen.num_points
             array.reasons[row] = 'short_track'  # until there is an estimate
             array.num_unsettled += 1
-            is_pinned = boxes.pinned is not None and bool(boxes.pinned[row])
-            observation = seen._replace(is_pinned=is_pinned)
+            observation = seen._replace(is_pinned=True) if is_pinned else seen
             track.entries.append(_Entry(observation, array, row))
             successor = track.split_at_id_switch()
             if successor is not None:
@@ -443,8 +446,8 @@ class _Track:
 
     Attributes
     ----------
-    variance : float
-        Of the position of the newest estimate, the sum over its axes [m^2].
+    covariance : array, shape (6, 6), or None
+        Of the newest estimate.
     num_carried : int
         Newest observations that were in no window yet, because the budget was used up.
 
@@ -454,7 +457,7 @@ class _Track:
     class_name: str
     entries: list[_Entry] = field(default_factory=list)
     prior: MarginalisationPrior | None = None
-    variance: float = inf
+    covariance: Floats | None = None
     num_carried: int = 0
 
     @property
@@ -476,9 +479,12 @@ class _Track:
 
     def urgency(self) -> tuple[int, float, float]:
         """Return the key that sorts tracks by the gain of solving them, highest gain first."""
+        variance = inf
+        if self.covariance is not None:
+            variance = float(np.trace(self.covariance[:3, :3]))  # of the position [m^2]
         sensors = self.entries[-1].observation.origins
         distance = float(np.linalg.norm(sensors, axis=1).min())  # NaN if unknown
-        return -self.num_carried, -self.variance, distance if distance >= 0 else inf
+        return -self.num_carried, -variance, distance if distance >= 0 else inf
 
     def carry(self, length: int) -> None:
         """
@@ -532,7 +538,7 @@ class _Track:
     def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
         """Pass the estimate of the window of `entries` to the box arrays that are not settled."""
         self.prior = estimate.prior
-        self.variance = float(np.trace(estimate.covariances[-1, :3, :3]))
+        self.covariance = estimate.covariances[-1]
         self.num_carried = 0
         for i, (entry, box) in enumerate(zip(entries, estimate.boxes, strict=True)):
             entry.estimate = box

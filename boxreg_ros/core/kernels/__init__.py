@@ -13,11 +13,13 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
 from itertools import pairwise
+import os
 from types import ModuleType
 from typing import Any, NamedTuple
 from warnings import warn
 
 import numpy as np
+import torch
 from torch import Tensor
 
 
@@ -25,7 +27,9 @@ class Kernels(NamedTuple):
     """The modules with compiled functions."""
 
     crop: ModuleType
+    expectation: ModuleType
     face_support: ModuleType
+    noise: ModuleType
     rigid_shape: ModuleType
     rounds: ModuleType
 
@@ -34,22 +38,26 @@ MIN_WINDOWS_PER_THREAD = 8
 """Fewest windows that a thread gets. Chosen: they take longer than handing them over, 0.1 ms."""
 
 
-class _Threads(NamedTuple):
-    pool: ThreadPoolExecutor
-    workers: int
+_workers: ContextVar[int] = ContextVar('workers', default=1)
 
 
-_threads: ContextVar[_Threads | None] = ContextVar('threads', default=None)
+@cache
+def pool_of(workers: int) -> ThreadPoolExecutor:
+    """Return threads that run torch in one thread each; they wait for the next work."""
+    return ThreadPoolExecutor(workers, 'solver', torch.set_num_threads, (1,))
+
+
+os.register_at_fork(after_in_child=pool_of.cache_clear)  # no thread survives a fork
 
 
 @contextmanager
-def shared_by(pool: ThreadPoolExecutor, workers: int) -> Iterator[None]:
+def shared_by(workers: int) -> Iterator[None]:
     """Let `run` share the windows of each kernel between the caller and `workers` - 1 threads."""
-    token = _threads.set(_Threads(pool, workers))
+    token = _workers.set(workers)
     try:
         yield
     finally:
-        _threads.reset(token)
+        _workers.reset(token)
 
 
 def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
@@ -68,15 +76,14 @@ def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
         The other arguments.
 
     """
-    threads = _threads.get()
-    parts = 1 if threads is None else min(threads.workers, windows // MIN_WINDOWS_PER_THREAD)
-    if threads is None or parts < 2:
+    workers = _workers.get()
+    parts = min(workers, windows // MIN_WINDOWS_PER_THREAD)
+    if parts < 2:
         kernel(0, windows, *arguments)
         return
     ends = [windows * part // parts for part in range(parts + 1)]
-    others = [
-        threads.pool.submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])
-    ]
+    submit = pool_of(workers).submit
+    others = [submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])]
     kernel(0, ends[1], *arguments)
     for other in others:
         other.result()
@@ -96,7 +103,14 @@ def compiled(like: Tensor) -> Kernels | None:
 def load() -> Kernels | None:
     """Return the kernels; None where numba does not work, with one warning."""
     try:
-        from boxreg_ros.core.kernels import crop, face_support, rigid_shape, rounds
+        from boxreg_ros.core.kernels import (
+            crop,
+            expectation,
+            face_support,
+            noise,
+            rigid_shape,
+            rounds,
+        )
     except Exception as error:  # whatever an incomplete or unsupported installation raises
         reason = ' '.join(f'{type(error).__name__}: {error}'.split())
         warn(
@@ -106,4 +120,4 @@ def load() -> Kernels | None:
             stacklevel=2,
         )
         return None
-    return Kernels(crop, face_support, rigid_shape, rounds)
+    return Kernels(crop, expectation, face_support, noise, rigid_shape, rounds)
