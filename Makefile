@@ -10,7 +10,8 @@ PYTHON_JAZZY ?= $(firstword $(foreach python,python3.12 $(wildcard $(HOME)/.pyen
 VENV_JAZZY ?= .venv-jazzy
 
 BIN := $(VENV)/bin
-QUIET := --disable-pip-version-check install -qq
+# Modules are compiled when they are first imported: most of the 38,000 files never are.
+QUIET := --disable-pip-version-check install -qq --no-compile
 # A compat install puts a plain path into site-packages, which type checkers can follow.
 BUILD := --use-pep517 --no-build-isolation --config-settings editable_mode=compat
 INSTALL := $(BIN)/python -m pip $(QUIET) $(BUILD) -c constraints.txt
@@ -36,7 +37,7 @@ JAZZY_TESTS := $(addprefix --ignore test/core/,test_refine.py test_kernel_cache.
 # Each worker begins with one end of the suite and takes tests of the other when it is done.
 SHARED := -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo test test-main test-jazzy lint format docs figures clean
+.PHONY: help demo test environments test-main test-jazzy lint format docs figures clean
 
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -49,7 +50,12 @@ demo: $(runtime) ## set up, refine the sample recording and complete its tracks,
 	$(BIN)/boxreg evaluate out/demo/boxes.csv bags/street_truth.csv
 	@echo; echo 'Refined boxes: out/demo/boxes.csv    What was done, to look at: out/demo/report.html'
 
-test: test-main test-jazzy ## set up, run the whole suite, and a part of it as on Ubuntu 24.04
+test: ## set up, run the whole suite, and a part of it as on Ubuntu 24.04
+	@$(MAKE) --no-print-directory --jobs environments
+	@$(MAKE) --no-print-directory test-main test-jazzy
+
+# They do not depend on each other, and most of their time is download and unpacking.
+environments: $(tests) $(consumers) $(if $(PYTHON_JAZZY),$(jazzy))
 
 test-main: $(tests) $(consumers)
 	$(BIN)/python -m pytest $(SHARED) --cov --cov-report=term:skip-covered

@@ -66,7 +66,7 @@ setup(
         # The engine `--engine ray` of `boxreg batch`.
         'fleet': ['ray>=2.9'],
         # Recordings and results behind URLs: s3, gs, https.
-        'remote': ['aiohttp', 'fsspec>=2023.1', 's3fs'],
+        'remote': ['aiohttp', 'fsspec>=2023.1', 'gcsfs', 's3fs'],
         # Where ROS 2 Jazzy itself is not installed.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
@@ -87,6 +87,8 @@ setup(
             'flask',
             'flask-cors',
             'foxglove-schemas-protobuf',
+            'gcp-storage-emulator',
+            'gcsfs',
             'hypothesis',
             'ijson>=3.2',
             'jinja2',

@@ -17,7 +17,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from boxreg_ros import __version__
-from boxreg_ros.allocation import keep_freed_memory
+from boxreg_ros.allocation import collect_rarely, keep_freed_memory
 from boxreg_ros.errors import BoxregError, ConfigError
 
 
@@ -156,6 +156,7 @@ def _run(arguments: list[str]) -> int:
         proposal = _proposal(unknown, options)
         args.subparser.error(f'unrecognized arguments: {" ".join(unknown)}{proposal}')
     keep_freed_memory()
+    collect_rarely()
     return int(_module(args.command).run(args))
 
 

@@ -342,6 +342,14 @@ class Config:
     )
     min_observations: int = setting(3, 'boxes of shorter windows are kept', '', 2, 1000)
     max_gap: float = setting(1.6, 'time without observation that ends a track', 's', 0.01, 1e4)
+    coast: float = setting(
+        0.0,
+        'time after its last detection that a track goes on with predicted boxes, as long as its '
+        "points confirm them; 0: off; only with estimate 'early' or 'final', and without complete",
+        's',
+        0.0,
+        10.0,
+    )
     tolerance: float = setting(
         0.02, 'time offset up to which boxes and sweep are paired at once', 's', 0.0, 10.0
     )
@@ -393,6 +401,11 @@ class Config:
                 f'lag: expected less than window ({self.window}), got {self.lag}: a final box '
                 f'waits within its window; lower lag or raise window'
             )
+
+    @property
+    def coasts(self) -> bool:
+        """Return whether boxes are added online; whole tracks are filled from both sides."""
+        return self.coast > 0 and self.estimate != 'track' and not self.complete.steps
 
     def items(self) -> Iterator[tuple[Setting, Any]]:
         """Yield every setting with its value; names of groups are dotted."""

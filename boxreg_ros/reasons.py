@@ -172,6 +172,11 @@ REASONS = {
         'not solved before `deadline`: other tracks came first; its track is solved at a later '
         'stamp, which refines the final box too if that is within `lag`',
     ),
+    'coast_unconfirmed': Reason(
+        'predicted box',
+        'a track has no box in a message, and with `coast` none was added: too few points in the '
+        'predicted box, or another box has its place',
+    ),
     'sweep_without_boxes': Reason('cloud', 'no boxes arrived for it, or too late'),
     'no_points': Reason('box', 'no points near any box of its window: occluded or too far away'),
     'no_gain': Reason(

@@ -28,7 +28,8 @@ BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
 
 REFINED, KEPT = 'refined', 'kept'
 INTERPOLATED, EXTENDED, REJECTED = 'interpolated', 'extended', 'rejected'
-ADDED = (INTERPOLATED, EXTENDED)
+COASTED = 'coasted'
+ADDED = (INTERPOLATED, EXTENDED, COASTED)
 """Status of boxes that the input does not have."""
 HUMAN = 'human'
 """Status of a box that a person has corrected and pinned."""
@@ -198,8 +199,8 @@ class RefinedBoxes:
         Refined boxes, otherwise as in the input: stamp, frame, ids, scores and ticket.
     status : tuple of n str
         ``refined``, ``kept`` (the input box is returned unchanged), ``rejected`` (likewise, and
-        no object), ``interpolated`` or ``extended`` (the input has no such box), or ``human`` (a
-        pinned box).
+        no object), ``interpolated``, ``extended`` or ``coasted`` (the input has no such box), or
+        ``human`` (a pinned box).
     reasons : tuple of n str
         Why a box was kept or rejected; empty for the others.
     num_points : array, shape (n,)

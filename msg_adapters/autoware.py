@@ -8,6 +8,7 @@ The track id is the UUID in hexadecimal, the class the most probable label, the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, WIDTH, YAW
@@ -90,6 +91,14 @@ def to_msg(
         objects.append(poses.replaced(o, kinematics=kinematics, shape=shape))
     header = poses.with_frame(msg.header, boxes.frame_id)
     return poses.replaced(msg, header=header, objects=objects)
+
+
+def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+    """Return a copy with objects of earlier messages added; see `Adapter.with_added`."""
+    added = [
+        poses.replaced(source.objects[row], existence_probability=0.0) for source, row in sources
+    ]
+    return poses.replaced(msg, objects=[*msg.objects, *added])
 
 
 def class_name_of(label: int) -> str:

@@ -29,6 +29,10 @@ GZIP_OR_ZLIB = 32 + zlib.MAX_WBITS
 """``wbits`` of zlib that accept either header."""
 DRACO_POSITION = 0
 """``attribute_type`` of coordinates in Draco."""
+DRACO_METHOD, DRACO_KD_TREE = 8, 1
+"""Byte of a Draco point cloud with its encoding method, and the method that sorts points."""
+COLOR_FIELDS = ('rgb', 'rgba')
+"""Fields that the publisher of draco_point_cloud_transport splits into four numbers."""
 NUMBERS = {kind: number for number, kind in DTYPES.items()}
 """Kind of dtype -> ``PointField.datatype``."""
 LIVOX_FIELDS = {'x': 'f4', 'y': 'f4', 'z': 'f4', 'reflectivity': 'u1', 'offset_time': 'u4'}
@@ -52,7 +56,7 @@ def plain(msg: Any) -> Any:
         header = SimpleNamespace(stamp=msg.timestamp, frame_id=msg.frame_id)
         if msg.format != 'draco':
             raise _unknown_format('CompressedPointCloud', msg.format, ('draco',))
-        return _cloud_of_columns(header, _draco_columns(bytes(msg.data), ()))
+        return _cloud_of_columns(header, _draco_columns(bytes(msg.data)))
     if hasattr(msg, 'point_num'):
         columns = [
             (name, np.array([getattr(point, name) for point in msg.points], kind))
@@ -71,10 +75,9 @@ def header_of(msg: Any) -> Any:
 
 def _decompressed(msg: Any) -> Any:
     """Return a CompressedPointCloud2 as a cloud."""
-    data = bytes(msg.compressed_data)
     if msg.format == 'draco':
-        names = [name for field in msg.fields for name in _names(field)]
-        return _cloud_of_columns(msg.header, _draco_columns(data, names))
+        return _draco_cloud(msg)
+    data = bytes(msg.compressed_data)
     if msg.format not in DECOMPRESSORS:
         raise _unknown_format('CompressedPointCloud2', msg.format, ('draco', *DECOMPRESSORS))
     size = msg.height * max(msg.row_step, msg.width * msg.point_step)
@@ -106,19 +109,102 @@ DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {'zlib': _inflated, 'z
 """``format`` -> function of the compressed data and the size of the cloud in bytes."""
 
 
-def _draco_columns(data: bytes, names: Sequence[str]) -> list[tuple[str, NDArray[Any]]]:
-    """
-    Return name and values (M,) of all components of the attributes of a Draco point cloud.
+def is_reordered(msg: Any) -> bool:
+    """Return whether the compression of a cloud has changed the order of its points."""
+    data = getattr(msg, 'compressed_data', b'')
+    has_method = getattr(msg, 'format', '') == 'draco' and len(data) > DRACO_METHOD
+    return has_method and int(data[DRACO_METHOD]) == DRACO_KD_TREE
 
-    Parameters
-    ----------
-    data : bytes
-        The stream.
-    names : sequence of str
-        Names of the components, in their order; empty to take x, y, z for the coordinates and
-        the names in the stream for the others.
+
+def _draco_cloud(msg: Any) -> Any:
+    """
+    Return a CompressedPointCloud2 of Draco as a cloud.
+
+    Its publisher writes one attribute per field, in their order, without names. The four bytes of
+    a colour are four components. Some encoders put several fields into one attribute.
 
     """
+    columns = [
+        column
+        for attribute in _draco_attributes(bytes(msg.compressed_data))
+        for column in _columns(attribute)
+    ]
+    names = [field.name for field in msg.fields]
+    lengths = [max(1, field.count) for field in msg.fields]
+    if sum(lengths) != len(columns):
+        lengths = [
+            4 if field.name in COLOR_FIELDS else max(1, field.count) for field in msg.fields
+        ]
+    if sum(lengths) != len(columns):
+        raise UnsupportedMessage(
+            f'point cloud compressed by Draco: expected a component for each of the fields '
+            f'{", ".join(names)}, got {len(columns)}; publisher and recording have different '
+            f'fields'
+        )
+    table = np.zeros(len(columns[0]) if columns else 0, _layout(msg, names, lengths))
+    ends = np.cumsum(lengths).tolist()
+    for name, length, end in zip(names, lengths, ends, strict=True):
+        values = np.stack(columns[end - length : end], axis=1)
+        table[name] = values.reshape(table[name].shape)
+    return SimpleNamespace(
+        header=msg.header, height=1, width=len(table), fields=msg.fields, is_bigendian=False,
+        point_step=msg.point_step, row_step=table.nbytes, data=table.view(np.uint8),
+        is_dense=msg.is_dense,
+    )  # fmt: skip
+
+
+def _layout(msg: Any, names: Sequence[str], lengths: Sequence[int]) -> np.dtype[Any]:
+    """Return the layout of a point; UnsupportedMessage if its fields contradict each other."""
+    try:
+        return np.dtype(
+            {
+                'names': names,
+                'formats': [_format(*pair) for pair in zip(msg.fields, lengths, strict=True)],
+                'offsets': [field.offset for field in msg.fields],
+                'itemsize': msg.point_step,
+            }
+        )
+    except (KeyError, ValueError) as error:
+        raise UnsupportedMessage(
+            f'point cloud compressed by Draco: expected different fields within a point_step of '
+            f'{msg.point_step} bytes, got {", ".join(names)} ({error}); correct its publisher'
+        ) from None
+
+
+def _format(field: Any, length: int) -> tuple[str, tuple[int, ...]]:
+    """Return dtype and shape of a field that a stream has as `length` components."""
+    kind = DTYPES[field.datatype]
+    count = max(1, field.count)
+    if length != count:  # the bytes of a colour
+        return f'<u{np.dtype(kind).itemsize * count // length}', (length,)
+    return f'<{kind}', (length,) if length > 1 else ()
+
+
+def _columns(attribute: Any) -> list[NDArray[Any]]:
+    """Return the components (M,) of an attribute of Draco."""
+    return list(np.atleast_2d(np.asarray(attribute['data'])).T)
+
+
+def _draco_columns(data: bytes) -> list[tuple[str, NDArray[Any]]]:
+    """
+    Return name and values (M,) of all components of a Draco point cloud that states its names.
+
+    These are x, y, z for the coordinates, and the names in the stream for the others.
+
+    """
+    found = []
+    for attribute in _draco_attributes(data):
+        columns = _columns(attribute)
+        prefix = attribute['name'] or f'attribute_{attribute["unique_id"]}'
+        own = [f'{prefix}_{k}' if k else prefix for k in range(len(columns))]
+        if attribute['attribute_type'] == DRACO_POSITION and len(columns) == 3:
+            own = ['x', 'y', 'z']
+        found += list(zip(own, columns, strict=True))
+    return found
+
+
+def _draco_attributes(data: bytes) -> list[Any]:
+    """Return the attributes of a Draco point cloud: mappings with ``data`` (M, components)."""
     try:
         import DracoPy
     except ImportError:
@@ -127,30 +213,10 @@ def _draco_columns(data: bytes, names: Sequence[str]) -> list[tuple[str, NDArray
             'installed: pip install DracoPy'
         ) from None
     try:
-        attributes = DracoPy.decode(data).attributes
+        attributes: list[Any] = DracoPy.decode(data).attributes
     except (DracoPy.FileTypeException, ValueError) as error:
         raise _damaged('draco', len(data), str(error)) from None
-    found = []
-    for attribute in attributes:
-        values = np.atleast_2d(np.asarray(attribute['data']))
-        prefix = attribute['name'] or f'attribute_{attribute["unique_id"]}'
-        own = [f'{prefix}_{k}' if k else prefix for k in range(values.shape[1])]
-        if attribute['attribute_type'] == DRACO_POSITION and values.shape[1] == 3:
-            own = ['x', 'y', 'z']
-        found += list(zip(own, values.T, strict=True))
-    if not names:
-        return found
-    if len(found) != len(names):
-        raise UnsupportedMessage(
-            f'point cloud compressed by Draco: expected a component for each of the fields '
-            f'{", ".join(names)}, got {len(found)}; publisher and recording have different fields'
-        )
-    return [(name, values) for name, (_, values) in zip(names, found, strict=True)]
-
-
-def _names(field: Any) -> list[str]:
-    """Return the names of the components of a field."""
-    return [f'{field.name}_{k}' if k else field.name for k in range(max(1, field.count))]
+    return attributes
 
 
 def _cloud_of_columns(header: Any, columns: Sequence[tuple[str, NDArray[Any]]]) -> Any:

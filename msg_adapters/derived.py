@@ -9,6 +9,7 @@ dimensions are skipped when reading; when writing, they only change their frame.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats
@@ -88,6 +89,16 @@ def to_msg(
     return poses.replaced(
         msg, header=poses.with_frame(msg.header, boxes.frame_id), objects=objects
     )
+
+
+def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+    """Return a copy with objects of earlier messages added; see `Adapter.with_added`."""
+    header = poses.common_header('ObjectArray', msg.header, [*filter(_is_box, msg.objects)])
+    added = []
+    for source, row in sources:
+        o = [*filter(_is_box, source.objects)][row]
+        added.append(poses.replaced(o, header=header, classification_certainty=0))
+    return poses.replaced(msg, objects=[*msg.objects, *added])
 
 
 def class_name_of(number: int) -> str:

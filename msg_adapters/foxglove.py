@@ -95,6 +95,38 @@ def to_msg(
     return poses.replaced(msg, entities=entities)
 
 
+def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+    """Return a copy with an entity per added cube; see `Adapter.with_added`."""
+    entities = [*_items(msg, 'entities')]
+    timestamp = next((e for e in entities if _items(e, 'cubes')), entities[0]).timestamp
+    added = []
+    for source, row in sources:
+        cubes = [
+            (e, k) for e in _items(source, 'entities') for k in range(len(_items(e, 'cubes')))
+        ]
+        entity, k = cubes[row]
+        own_cubes = _items(entity, 'cubes')
+        name = str(entity.id) if len(own_cubes) == 1 else f'{entity.id}/{k}'
+        added.append(
+            poses.replaced(
+                entity,
+                id=name,
+                timestamp=timestamp,
+                cubes=[own_cubes[k]],
+                metadata=_without_score(_items(entity, 'metadata')),
+                **{kind: [] for kind in OTHER_PRIMITIVES},
+            )
+        )
+    return poses.replaced(msg, entities=[*entities, *added])
+
+
+def _without_score(metadata: Sequence[Any]) -> list[Any]:
+    """Return metadata with the score 0."""
+    others = [item for item in metadata if str(item.key).lower() not in SCORE_KEYS]
+    scores = [poses.replaced(item, key=SCORE_KEYS[0], value='0') for item in metadata[:1]]
+    return [*others, *scores]
+
+
 def class_and_score(metadata: dict[str, str]) -> tuple[str, float]:
     """Return class and score of an entity by its metadata, with keys in lower case."""
     class_name = _first_value(metadata, CLASS_KEYS, '')

@@ -8,6 +8,7 @@ a recording contains its message definitions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats
@@ -51,3 +52,10 @@ def to_msg(
         replaced.append(poses.replaced(own, header=header, pose=pose, dimensions=size))
     header = poses.with_frame(msg.header, boxes.frame_id)
     return poses.replaced(msg, header=header, boxes=replaced)
+
+
+def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+    """Return a copy with boxes of earlier messages added, value 0; see `Adapter.with_added`."""
+    header = poses.common_header('BoundingBoxArray', msg.header, msg.boxes)
+    added = [poses.replaced(m.boxes[row], header=header, value=0.0) for m, row in sources]
+    return poses.replaced(msg, boxes=[*msg.boxes, *added])

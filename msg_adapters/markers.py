@@ -7,6 +7,7 @@ Markers of other types and deletions are skipped when reading, and copied when w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats
@@ -64,6 +65,21 @@ def to_msg(
             i += 1
         markers.append(marker)
     return poses.replaced(msg, markers=markers)
+
+
+def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+    """
+    Return a copy with cubes of earlier messages added; see `Adapter.with_added`.
+
+    A marker has no score. The added ones have the text ``coasted``, which is not displayed.
+
+    """
+    header = msg.markers[0].header
+    added = []
+    for source, row in sources:
+        cube = [*filter(_is_box, source.markers)][row]
+        added.append(poses.replaced(cube, header=header, text='coasted'))
+    return poses.replaced(msg, markers=[*msg.markers, *added])
 
 
 def _is_box(marker: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 from boxreg_ros.structures import BoxArray, Floats
@@ -11,7 +12,7 @@ class Adapter(Protocol):
     """
     Reads boxes from messages of one family, and writes refined boxes into copies of them.
 
-    An adapter is a module with these two functions. It reads messages by attribute and imports
+    An adapter is a module with these three functions. It reads messages by attribute and imports
     no message package.
 
     """
@@ -54,5 +55,22 @@ class Adapter(Protocol):
         T_out_in : array, shape (4, 4), optional
             Transform from the frame of the message to that of `boxes`, if they differ. It is
             applied to the copied fields.
+
+        """
+
+    def with_added(self, msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+        """
+        Return a copy of an input message with boxes of earlier messages added behind its own.
+
+        The result is an argument of `to_msg`, which sets the boxes.
+
+        Parameters
+        ----------
+        msg : message
+            The message that `from_msg` has read. It is not modified; it has a stamp.
+        sources : sequence of (message, row)
+            For each added box an earlier message of the same type, and its row in the
+            `BoxArray` of that. All fields are copied but stamp, frame and score: the score is 0,
+            because the detector has not found the object.
 
         """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, cast
@@ -124,6 +125,10 @@ class ConvertingAdapter:
         if covariances is not None:
             covariances = self.convention.covariances_from_centers(boxes, covariances)
         return self.inner.to_msg(msg, self.convention.from_centers(boxes), covariances, T_out_in)
+
+    def with_added(self, msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+        """Return a copy with boxes of earlier messages added, see `Adapter`."""
+        return self.inner.with_added(msg, sources)
 
 
 def canonical(type_name: str) -> str:

@@ -9,7 +9,7 @@ boxes) after they have been deserialised.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -152,12 +152,14 @@ class SerializedAdapter:
 
     def to_msg(
         self,
-        msg: bytes,
+        msg: Any,
         boxes: BoxArray,
         covariances: Floats | None = None,
         T_out_in: Floats | None = None,
     ) -> Any:
         """Return a copy with its boxes replaced, see `Adapter`: bytes, or a message."""
+        if not isinstance(msg, bytes):
+            return self._inner.to_msg(msg, boxes, covariances, T_out_in)
         fields = self._ordinary(msg) if T_out_in is None else None
         at = self._at
         if fields is None or fields.texts(at.frames[0])[0] != boxes.frame_id:
@@ -181,6 +183,11 @@ class SerializedAdapter:
             fields.put(at.covariance, _finite_or(covariance, own))
         at.write(fields, Rewrite(boxes, old_pose, pose[rows], old_size, covariance))
         return fields.message()
+
+    def with_added(self, msg: bytes, sources: Sequence[tuple[bytes, int]]) -> Any:
+        """Return a message with boxes of earlier ones added, see `Adapter`."""
+        earlier = [(self._deserialize(source, self._kind), row) for source, row in sources]
+        return self._inner.with_added(self._deserialize(msg, self._kind), earlier)
 
     def _ordinary(self, msg: bytes) -> Fields | None:
         """Return the fields of a message with one frame and one stamp that has boxes."""

@@ -8,6 +8,7 @@ highest score. ``center`` is the pose of the box, ``size`` its extents along x, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
@@ -73,6 +74,25 @@ def to_msg(
             )
         )
     return poses.replaced(msg, header=header, detections=detections)
+
+
+def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+    """Return a copy with boxes of earlier messages added, score 0; see `Adapter.with_added`."""
+    if not hasattr(msg, 'detections'):
+        return poses.replaced(msg, boxes=[*msg.boxes, *(m.boxes[row] for m, row in sources)])
+    header = poses.common_header('Detection3DArray', msg.header, msg.detections)
+    added = [_unseen(source.detections[row], header) for source, row in sources]
+    return poses.replaced(msg, detections=[*msg.detections, *added])
+
+
+def _unseen(detection: Any, header: Any) -> Any:
+    """Return a detection with its best hypothesis only, at the score 0, under another header."""
+    results = sorted(detection.results, key=lambda result: -result.hypothesis.score)[:1]
+    unseen = [
+        poses.replaced(result, hypothesis=poses.replaced(result.hypothesis, score=0.0))
+        for result in results
+    ]
+    return poses.replaced(detection, header=header, results=unseen)
 
 
 def _from_detections(msg: Any) -> BoxArray:

@@ -128,19 +128,25 @@ def av2(path):
 
 
 def av2_log(folder, stamp_ns):
-    """Return a sweep, the pose of the vehicle and the pose of the LiDAR."""
+    """Return a sweep, the pose of the vehicle and the poses of the LiDARs."""
     from av2.utils.io import (
         read_city_SE3_ego,
         read_ego_SE3_sensor,
         read_lidar_sweep,
     )
 
+    mounts = read_ego_SE3_sensor(Path(folder))
     return {
         'points': read_lidar_sweep(
             Path(folder, 'sensors', 'lidar', f'{stamp_ns}.feather')
         ).tolist(),
         'city_SE3_ego': read_city_SE3_ego(Path(folder))[int(stamp_ns)].transform_matrix.tolist(),
-        'ego_SE3_lidar': read_ego_SE3_sensor(Path(folder))['up_lidar'].transform_matrix.tolist(),
+        'ego_SE3_lidar': mounts['up_lidar'].transform_matrix.tolist(),
+        'positions': [
+            mounts[name].translation.tolist()
+            for name in ('up_lidar', 'down_lidar')
+            if name in mounts
+        ],
     }
 
 

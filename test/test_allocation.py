@@ -1,4 +1,4 @@
-"""Freed memory is reused for the next arrays."""
+"""Freed memory is reused for the next arrays; the garbage collector runs rarely."""
 
 import platform
 import subprocess
@@ -51,3 +51,16 @@ def test_arrays_of_one_step_reuse_the_memory_of_the_step_before():
         faults[case] = [int(number) for number in found.split()]
     assert min(faults['returned']) > 20 * 2343 / 2
     assert max(faults['kept']) < 2343 / 2
+
+
+def test_imported_libraries_start_no_collection():
+    count = """
+import gc
+from boxreg_ros.allocation import collect_rarely
+collect_rarely()
+before = gc.get_stats()[2]['collections']
+import torch
+print(gc.get_stats()[2]['collections'] - before)
+"""
+    found = subprocess.run([sys.executable, '-c', count], capture_output=True, text=True)
+    assert found.stdout.split() == ['0'], found.stderr

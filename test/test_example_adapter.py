@@ -1,5 +1,6 @@
 """The adapter of docs/tasks/write-an-adapter.md reads, writes and runs in `boxreg relabel`."""
 
+from copy import copy
 from dataclasses import replace
 from importlib import import_module
 from types import SimpleNamespace
@@ -86,6 +87,20 @@ def test_boxes_are_read_and_written(adapter, drive):
     T[:2, :2] = [[0, -1], [1, 0]]  # yaw of 90 degrees: x becomes y
     rotated = adapter.to_msg(message, boxes, None, T).obstacles[0].velocity
     assert (rotated.x, rotated.y) == (0.0, 1.0)
+
+
+def test_boxes_of_an_earlier_message_are_added(adapter, drive):
+    message = first_array(drive)
+    added = adapter.with_added(replaced_obstacles(message, message.obstacles[:1]), [(message, 1)])
+    boxes = adapter.from_msg(added)
+    assert boxes.track_ids == ('1', '2')
+    assert boxes.scores.tolist() == [0.75, 0.0]
+
+
+def replaced_obstacles(message, obstacles):
+    changed = copy(message)
+    changed.obstacles = obstacles
+    return changed
 
 
 def test_definition_without_a_field_is_refused(adapter, drive):

@@ -5,7 +5,7 @@ from importlib import import_module
 from boxreg_ros import cli
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.items import input_boxes
+from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.labels import can_read, FORMATS, frames_of, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.offline.sources import source_of

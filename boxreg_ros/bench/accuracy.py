@@ -25,6 +25,7 @@ from boxreg_ros.bench.common import (
 )
 from boxreg_ros.bench.methods import add_method_argument, run_methods
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.arguments import add_lidar_arguments, lidars_from
 from boxreg_ros.offline.box_scores import groups, match, Matches, RECALLS, Scores, summarise
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import Floats
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `boxreg bench real`."""
     add_scope_arguments(parser)
     add_method_argument(parser)
+    add_lidar_arguments(parser)
     add_json_argument(parser)
 
 
@@ -52,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     report: dict[str, Any] = {}
     with progress_bar(len(args.data) * len(args.methods), args) as bar:
         for folder in args.data:
-            drive = Drive.read(folder)
+            drive = Drive.read(folder, lidars_from(args))
             methods = run_methods(drive, '3d', args.methods, bar.update)
             found = {
                 name: boxes if isinstance(boxes, str) else in_scope(boxes, drive.truth, args)

@@ -17,7 +17,7 @@ from typing import Any
 from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.items import input_boxes
+from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.box_scores import match

@@ -20,6 +20,7 @@ MEASUREMENTS = {
     'tracks': Measurement('tracks', 'broken tracks before and after each completing step'),
     'ablation': Measurement('ablation', 'accuracy without each ingredient of the method'),
     'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),
+    'highway': Measurement('highway', 'accuracy at 5 and at 30 m/s, with boxes of either time'),
     'lidars': Measurement('lidars', 'accuracy on a truck with LiDARs at its corners'),
     'covariance': Measurement('covariance', 'covariances against errors, by estimate and class'),
     'review': Measurement('review', 'how early the review list shows the bad tracks'),

@@ -25,8 +25,9 @@ import time
 from typing import Any
 
 from boxreg_ros.bench.common import add_json_argument, print_json
-from boxreg_ros.errors import BoxregError
-from boxreg_ros.labels.segments import read_index
+from boxreg_ros.bench.recorded import RecordedLabels
+from boxreg_ros.errors import BoxregError, ConfigError
+from boxreg_ros.labels import module_of
 from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
 import numpy as np
 
@@ -73,8 +74,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--record', metavar='FORMAT,...',
-        help='also record labels in these formats, with their clouds: runs without and with it '
-        'alternate',
+        help='also record labels in these formats, with their clouds',
+    )  # fmt: skip
+    parser.add_argument(
+        '--compare', action='store_true',
+        help='alternate runs without and with --record, and divide their latencies',
+    )  # fmt: skip
+    parser.add_argument(
+        '--keep-gigabytes', type=float, default=float('inf'), metavar='N',
+        help='delete the oldest recorded segments beyond N GB, after they were counted (default: '
+        'none)',
     )  # fmt: skip
     add_json_argument(parser)
     parser.add_argument('--role', choices=('publish',), help=argparse.SUPPRESS)
@@ -98,7 +107,9 @@ def run(args: argparse.Namespace) -> int:
     if args.role:
         publish(args)
         return 0
-    report = measure(args) if args.record is None else compare(args)
+    if args.compare and args.record is None:
+        raise ConfigError('--compare: expected --record with formats, got none; add it')
+    report = compare(args) if args.compare else measure(args)
     if args.json:
         print_json(report)
         return 0
@@ -279,8 +290,8 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         arrivals = stack.enter_context(observer(keeps_messages))
-        labels = folder / 'labels'
-        given = [*args.set, *recording_parameters(args.record, labels)]
+        labels = RecordedLabels(folder / 'labels', 1e9 * args.keep_gigabytes, args.points)
+        given = [*args.set, *recording_parameters(args.record, folder / 'labels')]
         parameters = [part for text in given for part in ('-p', text)]
         node = stack.enter_context(
             process([*command, 'node', '--ros-args', *parameters], folder / 'node.log')
@@ -299,7 +310,8 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
                 raise BoxregError(f'the node ended: {(folder / "node.log").read_text()}')
             if arrivals['early']:
                 samples.append(vitals(node.pid))
-                recorder_samples += [vitals(child)[0] for child in children_of(node.pid)]
+                recorder_samples += [vitals(child) for child in children_of(node.pid)]
+            labels.update()
             time.sleep(SAMPLE_PERIOD)
         if publisher.returncode:
             raise BoxregError(f'the publisher failed: {(folder / "sent.log").read_text()}')
@@ -311,7 +323,9 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
         shutdown_time = time.monotonic() - begin
         time.sleep(0.5)
         log = (folder / 'node.log').read_text()
-        recorded = {} if args.record is None else recording(labels, recorder_samples)
+        recorded = recording(labels, args.record, sent) if args.record else {}
+        if recorder_samples:
+            recorded |= {f'recorder: {k}': v for k, v in growth(recorder_samples).items()}
     return {
         'load before, during': f'{load:.2f}, {os.getloadavg()[0]:.2f}',
         **results(sent, arrivals, args.rate),
@@ -384,30 +398,34 @@ def recording_parameters(formats: str | None, folder: Path) -> list[str]:
     return [f'record_to:={folder}', f'record_formats:=[{formats}]', 'record_points:=true']
 
 
-def recording(folder: Path, memory: list[float]) -> dict[str, float]:
+def recording(labels: RecordedLabels, formats: str, sent: Any) -> dict[str, float]:
     """
-    Return what was recorded, and the memory of the recorder.
+    Wait for the last segment; return what was recorded of the box arrays sent and their clouds.
 
     Parameters
     ----------
-    folder : Path
-        Folder of the segments.
-    memory : list of float
-        Resident memory of the recorder every `SAMPLE_PERIOD` [MB].
+    labels : RecordedLabels
+        What was recorded so far.
+    formats : str
+        As given to the recorder.
+    sent : array, shape (n, 2)
+        Stamp and time of publishing of each box array [ns].
 
     """
     deadline = time.monotonic() + COMPLETION_TIME
-    while list(folder.glob('.segment_*')) and time.monotonic() < deadline:
+    while labels.has_open_segment and time.monotonic() < deadline:
         time.sleep(0.1)  # the recorder completes the last segment after the node has ended
-    rows = read_index(folder)
-    memory = memory or [0.0]
+    labels.update()
+    with_clouds = sum(
+        'with_points' in module_of(name).FORMAT.options for name in formats.split(',')
+    )
     return {
-        'recorded box arrays': float(sum(row.frames for row in rows)),
-        'recorded clouds': float(sum(row.clouds for row in rows)),
-        'recorded segments': float(len(rows)),
-        'recorded [MB]': 1e-6 * sum(row.size for row in rows),
-        'recorder memory in the middle [MB]': memory[len(memory) // 2],
-        'recorder memory at the end [MB]': memory[-1],
+        'recorded box arrays': float(len(labels.stamps)),
+        'recorded cloud files': float(labels.cloud_files),
+        'box arrays not recorded': float(len(set(sent[:, 0].tolist()) - labels.stamps)),
+        'cloud files not recorded': float(with_clouds * len(sent) - labels.cloud_files),
+        'recorded segments': float(len(labels.rows)),
+        'recorded [MB]': 1e-6 * sum(row.size for row in labels.rows),
     }
 
 

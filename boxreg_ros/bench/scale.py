@@ -1,16 +1,19 @@
 """
 `boxreg bench scale`: core hours and memory per hour of recording, and a fleet of jobs.
 
-The drives are copies of one recording, and run by `boxreg batch` itself. The fleet is simulated
-with the measured time: jobs of random length, stragglers, and workers that are lost.
+The drives are copies of one recording, and run by `boxreg batch` itself. A large recording is its
+repetition. The fleet is simulated with the measured time: jobs of random length, stragglers, and
+workers that are lost.
 
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import heapify, heapreplace
+import json
 import os
 from pathlib import Path
 import resource
@@ -22,9 +25,7 @@ import time
 from typing import Any
 
 from boxreg_ros.bench.common import add_json_argument, print_json
-from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.job import JOB_FAILED, jobs_of
 from boxreg_ros.offline.job_process import JobRunner
 from boxreg_ros.structures import Floats
@@ -34,6 +35,7 @@ import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
 OPTIONS = ('--formats=csv', '--workers=1')
+BOXREG = (sys.executable, '-m', 'boxreg_ros.cli')
 FLEET_JOBS = 10_000
 FLEET_CORES = 500
 FLEET_HOURS = 10_000
@@ -47,7 +49,7 @@ LOSS_PART = 0.05
 UNIT_PART = 0.02
 """Part of a job that a loss costs: a job of an hour has some 50 batches of windows."""
 PRICE = 0.04
-"""Price of a core for an hour [USD]; stated, of the order of a list price on demand."""
+"""Price of a core for an hour [USD]; of the order of a list price on demand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +84,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='copies that are relabelled by one and by two workers (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument(
+        '--rounds', type=int, default=3, metavar='N',
+        help='how often one and two workers take turns (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
         '--large', type=float, metavar='GB',
-        help='also measure the memory of a recording of this size, made by repetition',
+        help='also measure a recording of this size, made by repetition; the fleet is of such '
+        'drives then',
+    )  # fmt: skip
+    parser.add_argument(
+        '--price', type=float, default=PRICE, metavar='USD',
+        help='of a core for an hour (default: %(default)s)',
     )  # fmt: skip
     add_json_argument(parser)
 
@@ -91,15 +102,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, simulate and print."""
     report: dict[str, Any] = {'recording': args.recording.name, 'load': os.getloadavg()[0]}
-    with TemporaryDirectory() as folder:
-        report |= _measured(args.recording, Path(folder))
-        report['speedup_2_workers'] = _speedup(args.recording, args.drives, Path(folder))
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        report['workers'] = _workers(args.recording, args.drives, args.rounds, folder)
+        report['job'] = _measured(args.recording, folder)
         if args.large:
-            report['large'] = _large(args.recording, args.large, Path(folder))
-    core_hours = FLEET_HOURS / report['hours_per_core_hour']
-    report['fleet'] = {'core_hours': core_hours, 'price_usd': core_hours * PRICE}
+            path = folder / 'large.mcap'
+            repeated(args.recording, path, args.large)
+            report['large'] = _measured(path, folder)
+    basis = 'large' if args.large else 'job'
+    core_hours = FLEET_HOURS / report[basis]['hours_per_core_hour']
     fleet = simulated(core_hours * 3600 / FLEET_JOBS, np.random.default_rng(0))
-    report['fleet'] |= {name: getattr(fleet, name) for name in Fleet.__slots__}
+    report['fleet'] = {
+        'basis': basis,
+        'core_hours': core_hours,
+        'usd_per_core_hour': args.price,
+        'usd': core_hours * args.price,
+        **{name: getattr(fleet, name) for name in Fleet.__slots__},
+    }
     if args.json:
         print_json(report)
     else:
@@ -141,57 +161,75 @@ def simulated(
     )  # fmt: skip
 
 
-def _measured(recording: Path, folder: Path) -> dict[str, float]:
-    """Return time and memory of one job, the second time: the first one compiles."""
-    runner = JobRunner(folder / 'one', OPTIONS, '')
-    for _ in range(2):
-        shutil.rmtree(runner.out, ignore_errors=True)
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        (job,) = jobs_of([recording])
-        runner(job)
-        if job.status == JOB_FAILED:
-            raise RecordingError(f'{recording}: {job.last_line}')
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with Recording([recording]) as opened:
-        seconds = (opened.end_ns - opened.start_ns) * 1e-9
-    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {
-        'recording_s': seconds,
-        'cpu_s': used,
-        'hours_per_core_hour': seconds / used,
-        'peak_mb': job.peak_bytes / 1e6,
-    }
+def _workers(recording: Path, drives: int, rounds: int, folder: Path) -> dict[str, Any]:
+    """
+    Return how much faster two workers are than one.
 
+    They take turns, so that other programs slow down both. Where others use the cores, two
+    workers get less than two of them, which ``cores_used`` shows.
 
-def _speedup(recording: Path, drives: int, folder: Path) -> float:
-    """Return the time of one worker by that of two, for copies of a recording."""
+    Returns
+    -------
+    found : dict
+        ``seconds`` and ``cores_used`` of one and of two workers, medians over the rounds, and
+        ``speedup``, the median of the ratios of each round.
+
+    """
     copies = [folder / f'{i}{recording.suffix}' for i in range(drives)]
     for copy in copies:
         shutil.copyfile(recording, copy)
-    times = []
-    for workers in (1, 2):
-        out = folder / f'workers{workers}'
-        command = [sys.executable, '-m', 'boxreg_ros.cli', 'batch', *map(str, copies)]
-        command += ['-o', str(out), f'--workers={workers}']
-        begun = time.perf_counter()
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        times.append(time.perf_counter() - begun)
-    return times[0] / times[1]
-
-
-def _large(recording: Path, gigabytes: float, folder: Path) -> dict[str, float]:
-    """Return size, time and memory of a large recording."""
-    path = folder / 'large.mcap'
-    repeated(recording, path, gigabytes)
-    (job,) = jobs_of([path])
-    JobRunner(folder / 'large', OPTIONS, str(Config()))(job)
-    if job.status == JOB_FAILED:
-        raise RecordingError(f'{path}: {job.last_line}')
+    _run_batch(copies, 1, folder / 'compiled')
+    runs = [
+        [_run_batch(copies, workers, folder / f'{turn}-{workers}') for workers in (1, 2)]
+        for turn in range(rounds)
+    ]
+    seconds, used = np.moveaxis(np.array(runs), 2, 0)  # (round, workers) each
     return {
-        'gb': path.stat().st_size / 1e9,
-        'seconds': job.seconds,
+        'seconds': np.median(seconds, axis=0).tolist(),
+        'cores_used': np.median(used / seconds, axis=0).tolist(),
+        'speedup': float(np.median(seconds[:, 0] / seconds[:, 1])),
+    }
+
+
+def _run_batch(drives: Sequence[Path], workers: int, out: Path) -> tuple[float, float]:
+    """Run `boxreg batch`; return its duration and its CPU time [s]."""
+    command = [*BOXREG, 'batch', *map(str, drives), '-o', str(out), f'--workers={workers}']
+    begun = time.perf_counter()
+    before = _children_seconds()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - begun, _children_seconds() - before
+
+
+def _children_seconds() -> float:
+    """Return the CPU time of all processes that were started here and have ended [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _measured(recording: Path, folder: Path) -> dict[str, float]:
+    """Return size, time and memory of one job, and the time to inspect its recording."""
+    begun = time.perf_counter()
+    shown = subprocess.run(
+        [*BOXREG, 'inspect', str(recording), '--json'], check=True, stdout=subprocess.PIPE
+    )
+    inspect_s = time.perf_counter() - begun
+    facts = json.loads(shown.stdout)
+    (job,) = jobs_of([recording])
+    before = _children_seconds()
+    JobRunner(folder / 'jobs', OPTIONS, '')(job)
+    cpu_s = _children_seconds() - before
+    if job.status == JOB_FAILED:
+        raise RecordingError(f'{recording}: {job.last_line}')
+    return {
+        'gb': recording.stat().st_size / 1e9,
+        'recording_s': facts['seconds'],
         'sweeps': job.summary['sweeps'],
+        'points_per_sweep': facts['sample']['points_per_sweep'],
         'boxes': job.summary['boxes_in'],
+        'inspect_s': inspect_s,
+        'seconds': job.seconds,
+        'cpu_s': cpu_s,
+        'hours_per_core_hour': facts['seconds'] / cpu_s,
         'peak_mb': job.peak_bytes / 1e6,
     }
 

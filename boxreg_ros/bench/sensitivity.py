@@ -17,6 +17,7 @@ import argparse
 import ast
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from fnmatch import fnmatch
@@ -440,11 +441,11 @@ def run_all(
     initial = (dict(drives), measurement)
     # Fresh processes: each has the memory of one run, and no threads are copied into it.
     with (
-        get_context('spawn').Pool(args.workers, _start_worker, initial) as pool,
+        ProcessPoolExecutor(args.workers, get_context('spawn'), _start_worker, initial) as pool,
         progress_bar(len(jobs), args) as bar,
     ):
         outcomes = []
-        for outcome in pool.imap(_work, jobs):
+        for outcome in pool.map(_work, jobs):
             outcomes.append(outcome)
             bar.update()
     rows = [outcomes[i : i + len(drives)] for i in range(0, len(jobs), len(drives))]

@@ -60,6 +60,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='mean number of boxes per sweep that belong to no object (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument(
+        '--far-misses',
+        action='store_true',
+        help='misses in runs, as likely as the square of the distance, like those of a detector '
+        'that has too few points; default: independent ones',
+    )
+    parser.add_argument(
+        '--coast', type=float, default=0.0, metavar='S',
+        help='rows of the live estimates, without and with this `coast`, instead of the steps',
+    )  # fmt: skip
+    parser.add_argument(
         '--seed',
         type=int,
         default=0,
@@ -72,15 +82,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the scores after each step, one table per recording."""
     report: dict[str, Any] = {}
-    with progress_bar(len(args.data) * (2 + len(COMPLETE_STEPS)), args) as bar:
+    rows_per_drive = 3 if args.coast else 2 + len(COMPLETE_STEPS)
+    with progress_bar(len(args.data) * rows_per_drive, args) as bar:
         for folder in args.data:
-            drive = broken(Drive.read(folder), args.seed, args.ghosts)
+            drive = broken(Drive.read(folder), args.seed, args.ghosts, args.far_misses)
             if not args.json:
                 bar.clear()
                 print(f'{folder}: {len(drive.truth.boxes)} true boxes')
                 print(line('', TITLES))
             rows = {}
-            for name, row in after_each_step(drive):
+            found = with_coast(drive, args.coast) if args.coast else after_each_step(drive)
+            for name, row in found:
                 rows[name] = asdict(row.scores) | {'ghosts_rejected': row.ghosts, 'lost': row.lost}
                 bar.update()
                 if not args.json:
@@ -91,30 +103,55 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def broken(drive: Drive, seed: int, ghosts: float) -> Drive:
+def broken(drive: Drive, seed: int, ghosts: float, far_misses: bool = False) -> Drive:
     """Return a drive with broken tracks."""
     stamps = np.array([array.stamp_ns for array in drive.boxes])
     origins = np.array([sweep.origin for sweep in drive.sweeps_at(stamps)])
-    arrays = break_tracks(drive.boxes, np.random.default_rng(seed), ghosts, origins)
+    rng = np.random.default_rng(seed)
+    arrays = break_tracks(drive.boxes, rng, ghosts, origins, far_misses)
     return replace(drive, boxes=tuple(arrays))
 
 
 def after_each_step(drive: Drive) -> Iterator[tuple[str, Row]]:
     """Yield the scores of the input, of registration alone, and with one more step each."""
-    items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
-    items.sort(key=lambda item: item.stamp_ns)
-    scores = track_scores(BoxTable.from_arrays(drive.boxes), drive.truth)
-    yield 'input', Row(scores, math.nan, math.nan)
+    items = _items(drive)
+    yield 'input', _input_row(drive)
     config = Config()
-    registrar = BoxRegistrar(config)
-    refined: list[RefinedBoxes] = []
-    for item in items:
-        refined += register(registrar, item, restarts=False)
-    yield 'refined', _row([*refined, *registrar.flush()], drive)
+    yield 'refined', _row(_registered(items, config), drive)
     for step in COMPLETE_STEPS:
         config = config.updated({f'complete.{step}': True})
         results, _ = completed(items, drive.truth.frame_id, config)
         yield f'+ {step}', _row(results, drive)
+
+
+def with_coast(drive: Drive, seconds: float) -> Iterator[tuple[str, Row]]:
+    """Yield the scores of the input, and of final boxes without and with `coast` [s]."""
+    items = _items(drive)
+    yield 'input', _input_row(drive)
+    for name, coast in (('final', 0.0), (f'coast {seconds:g} s', seconds)):
+        config = Config(estimate='final', coast=coast)
+        yield name, _row(_registered(items, config), drive)
+
+
+def _items(drive: Drive) -> list[Sweep | BoxArray]:
+    """Return sweeps and boxes in the order of their stamps, each sweep before its boxes."""
+    items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
+    return sorted(items, key=lambda item: item.stamp_ns)
+
+
+def _registered(items: Sequence[Sweep | BoxArray], config: Config) -> list[RefinedBoxes]:
+    """Return the last estimates of all box arrays."""
+    registrar = BoxRegistrar(config)
+    results: list[RefinedBoxes] = []
+    for item in items:
+        results += register(registrar, item, restarts=False)
+    results += registrar.flush()
+    return [result for result in results if result.is_final]
+
+
+def _input_row(drive: Drive) -> Row:
+    scores = track_scores(BoxTable.from_arrays(drive.boxes), drive.truth)
+    return Row(scores, math.nan, math.nan)
 
 
 def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:

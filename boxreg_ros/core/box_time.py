@@ -9,10 +9,11 @@ points, those of the other are ahead of or behind them. docs/method.md (M12).
 from collections import Counter
 from dataclasses import replace
 from functools import lru_cache
+from math import hypot
 from typing import Any
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.observation import crop
+from boxreg_ros.core.observation import crop, Observation
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, LENGTH, ROLL, Sweep, X, Z
 import numpy as np
@@ -21,8 +22,14 @@ from numpy.typing import NDArray
 # All of these are chosen.
 SIGHT_MARGIN = 1.0
 """Points up to this far outside a box give the time at which the sweep saw it [m]."""
-MIN_MOTION = 0.3
-"""Least motion between stamp and sight that is evidence [m]: twice the error of an input box."""
+MIN_MOTION = 0.2
+"""
+Least motion between stamp and sight that is evidence [m].
+
+About the error of an input box. Of simulated boxes of known time with 0.2 to 0.3 m, 84 to 100 %
+vote for it; with 0.1 to 0.2 m some sets vote for the other.
+
+"""
 MIN_VOTE_POINTS = 10
 """Fewest points of a box that is evidence."""
 MAX_FACE_DISTANCE = 0.5
@@ -74,18 +81,29 @@ class BoxTimeEvidence:
     def __init__(self) -> None:
         self.votes = Counter[str]()
 
-    def add(self, box: Floats, points: NDArray[np.floating], motion: Floats) -> None:
+    def add(self, seen: Observation, velocity: Floats) -> None:
         """
-        Compare a box (9,) with its points, as measured and moved back to the stamp.
+        Compare a box with its points, moved to the time of sight and to the stamp.
 
-        The points (M, 3) are relative to the centre of the box [m]; they are on the surface of the
-        object: near the faces of a box of their own time.
+        The points are on the surface of the object: near the faces of a box of their own time.
+        Each is moved by its own delay, since two LiDARs may see an object at different times.
+
+        Parameters
+        ----------
+        seen : Observation
+            Of the box.
+        velocity : array, shape (3,)
+            Of the object [m/s].
 
         """
-        if np.linalg.norm(motion) < MIN_MOTION or len(points) < MIN_VOTE_POINTS:
+        if not seen.sight:
             return
-        at_sight = _distance_from_faces(box, points)
-        at_stamp = _distance_from_faces(box, points - motion)
+        motion = velocity * seen.sight
+        if hypot(*motion.tolist()) < MIN_MOTION or len(seen.points) < MIN_VOTE_POINTS:
+            return
+        points = seen.points - np.outer(seen.delays, velocity)  # at the stamp
+        at_stamp = _distance_from_faces(seen.box, points)
+        at_sight = _distance_from_faces(seen.box, points + motion)
         if abs(at_sight - at_stamp) > MIN_DIFFERENCE:
             self.votes['sight' if at_sight < at_stamp else 'stamp'] += 1
 

@@ -3,8 +3,7 @@
 from boxreg_ros.core.arrowhead import InverseBlocks, product
 from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Posterior, Problem, SHARED, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
-from boxreg_ros.core.input_model import Expectation, MIN_EXTENT_GAIN
-from boxreg_ros.core.kernels.arrays import PosteriorNumbers
+from boxreg_ros.core.input_model import Expectation
 import torch
 from torch import Tensor
 
@@ -20,11 +19,6 @@ EXTENT_MODEL_DEVIATION = (0.03, 0.012, 0.012)
 """The same of length, width and height [m]."""
 INPUT_ERRORS = slice(EXTENT.start, BIAS.stop)
 """Shared variables whose prior is the input: the extents and the bias of the poses."""
-
-
-def posterior_numbers() -> PosteriorNumbers:
-    """Return the constants for the kernel."""
-    return PosteriorNumbers(POSE_MODEL_DEVIATION, EXTENT_MODEL_DEVIATION, MIN_EXTENT_GAIN)
 
 
 def posterior(

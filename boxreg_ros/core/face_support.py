@@ -325,7 +325,7 @@ def outermost_points(problem: Problem, state: State, search: Search) -> Found:
 
     strips = search.strips
     strip = ((local[..., :2, :] / half[..., :2, :] + 1) * (strips / 2)).clamp(0, strips - 1)
-    own_strip = strip.floor()[..., list(STRIP_AXIS), :]  # (B, N, 5, M)
+    own_strip = strip.floor()[..., STRIP_AXIS, :]  # (B, N, 5, M)
     most = min(points.shape[2], max(MIN_FACE_POINTS, int(search.share * points.shape[2]) + 1))
     in_strip = [torch.where(own_strip == k, depth, FAR) for k in range(strips)]
     depth, index = torch.stack(in_strip, 3).topk(most, -1, largest=False)  # (B, N, 5, strips, K)

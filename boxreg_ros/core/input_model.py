@@ -5,7 +5,7 @@ docs/method.md, section Input model, has the formulas (M14) to (M18).
 
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from boxreg_ros.core.batch import (
     State,
 )
 from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
-from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
+from boxreg_ros.core.geometry import FACE_AXIS
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.kernels.arrays import (
     ExpectationNumbers,
@@ -29,8 +29,10 @@ from boxreg_ros.core.kernels.arrays import (
     InputArrays,
     NoiseNumbers,
 )
-from boxreg_ros.structures import Floats, ROLL
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, POSE, ROLL
 import numpy as np
+from numpy.typing import NDArray
 import torch
 from torch import Tensor
 
@@ -127,6 +129,10 @@ PINNED_MARGINS = 4.0
 them. Chosen; 4 and 10 give the same."""
 REPEATED_BOX_TOLERANCE = 1e-3
 """A box that differs from the one before by less repeats it [m, rad]."""
+
+
+RESIDUAL_ERRORS = (*POSE_ERRORS, 'extent', 'extent', 'extent')
+"""Settings of `ClassConfig` that are the expected deviations of `input_residuals`."""
 
 
 class InputNoise(NamedTuple):
@@ -322,21 +328,45 @@ def input_residuals(problem: Problem, state: State) -> Tensor:
     and for those without points, since their fit follows the input.
 
     """
-    difference = problem.pose - state.pose
-    axes = rotation_from_rpy(state.pose[..., 3:])
-    along = (axes.mT @ difference[..., :3, None])[..., 0]
-    extent = problem.boxes[..., 3:6] / state.shared[:, None, EXTENT] - 1
-    residuals = torch.cat([along, difference[..., 3:], extent], -1)
+    boxes, pose, extent, counts = _boxes_and_fit(problem, state)
     # The first box is compared with the last one: a track that is held throughout is left out.
-    change = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1)
-    is_new = (problem.counts > 0) & ~(change < REPEATED_BOX_TOLERANCE)
-    return torch.where(is_new[..., None], residuals, torch.nan)
+    before = np.roll(boxes, 1, axis=1)
+    residuals = _residuals(boxes, before, pose, extent[:, None], counts > 0)
+    return torch.from_numpy(residuals).to(problem.boxes)
+
+
+def residuals_at(problem: Problem, state: State, columns: Ints) -> Floats:
+    """Return `normalised_residuals` (B, 9) of one observation of each window, in `columns`."""
+    boxes, pose, extent, counts = _boxes_and_fit(problem, state)
+    rows = np.arange(len(boxes))
+    before, has_points = boxes[rows, columns - 1], counts[rows, columns] > 0
+    residuals = _residuals(boxes[rows, columns], before, pose[rows, columns], extent, has_points)
+    return residuals / problem.of_class(*RESIDUAL_ERRORS).cpu().numpy()
+
+
+def _boxes_and_fit(problem: Problem, state: State) -> Iterator[Floats]:
+    parts = problem.boxes, state.pose, state.shared[:, EXTENT], problem.counts
+    return (part.cpu().numpy() for part in parts)
+
+
+def _residuals(
+    boxes: Floats, before: Floats, pose: Floats, extent: Floats, has_points: NDArray[np.bool_]
+) -> Floats:
+    """Return input minus fit (..., 9), NaN for boxes without points or as the one `before`."""
+    difference = boxes[..., POSE] - pose
+    to_box = np.swapaxes(matrix_from_rpy(pose[..., 3:]), -1, -2)
+    along = (to_box @ difference[..., :3, None])[..., 0]
+    residuals = np.concatenate(
+        [along, difference[..., 3:], boxes[..., BOX_EXTENT] / extent - 1], axis=-1
+    )
+    is_repeated = np.abs(boxes - before).max(-1) < REPEATED_BOX_TOLERANCE
+    residuals[~has_points | is_repeated] = np.nan
+    return residuals
 
 
 def normalised_residuals(problem: Problem, state: State) -> Tensor:
     """Return `input_residuals` over the expected deviations of the class, (B, N, 9)."""
-    expected = problem.of_class(*POSE_ERRORS, *['extent'] * 3)
-    return input_residuals(problem, state) / expected[:, None]
+    return input_residuals(problem, state) / problem.of_class(*RESIDUAL_ERRORS)[:, None]
 
 
 def smoothed_angles(problem: Problem) -> Tensor:
@@ -434,15 +464,27 @@ def expect_compiled(
     problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
 ) -> Expectation:
     """Return the same as `expect`, by the kernel."""
+    arrays, widening, slow = _expected_arrays(problem, offsets, noise, population)
+    parts = [torch.from_numpy(part) for part in arrays]
+    spread = torch.from_numpy(widening), torch.from_numpy(slow)
+    error = _input_error(problem, noise.of(problem), *spread)
+    return Expectation(*parts, _at_least_prior(problem, error, parts[1]))
+
+
+def _expected_arrays(
+    problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
+) -> tuple[ExpectedArrays, Floats, Floats]:
+    """Return what the kernel writes."""
     kernels = compiled(problem.boxes)
     assert kernels is not None
     B = len(problem.boxes)
-    expected = ExpectedArrays(*(np.empty((B, size)) for size in (SHARED, SHARED, 6, 6, 6, 9)))
+    expected = ExpectedArrays(*(np.empty((B, size)) for size in (SHARED, SHARED, 6, 6, 6)))
+    widening, slow = np.empty((B, 3)), np.empty((B, 1))
     run(
         kernels.expectation.expect, B, problem.arrays(), problem.class_arrays(),
-        input_arrays(offsets, noise, population), _expectation_numbers(), expected,
+        input_arrays(offsets, noise, population), _expectation_numbers(), expected, widening, slow,
     )  # fmt: skip
-    return Expectation(*map(torch.from_numpy, expected))
+    return expected, widening, slow
 
 
 def input_arrays(
@@ -478,7 +520,6 @@ def _expectation_numbers() -> ExpectationNumbers:
         pinned_extent=PINNED_EXTENT,
         pinned_margins=PINNED_MARGINS,
         pivot_deviation=PIVOT_DEVIATION,
-        constant_extent_errors=CONSTANT_EXTENT_ERRORS,
     )
 
 
@@ -528,18 +569,24 @@ def expect_torch(
     bias = torch.where(has_pin, PINNED_EXTENT, bias)
     shared = expected_shared(problem, offsets, mean)
     shared[:, EXTENT] = torch.where(has_pin, mean, extent)
-    input_deviation = torch.cat([extent_deviation, bias], 1)
-    input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
     sideslip = problem.of_class('sideslip')
-    deviations = [input_deviation, spread, mean[:, :1] * PIVOT_DEVIATION, one, sideslip]
+    pivot = mean[:, :1] * PIVOT_DEVIATION
+    deviations = torch.cat([extent_deviation, bias, spread, pivot, one, sideslip], 1)
+    input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
     return Expectation(
         shared,
-        torch.cat(deviations, 1),
+        deviations,
         deviation,
         deviation * widening[:, :6],
         unmodelled,
-        torch.where(has_pin, input_deviation, input_error.maximum(input_deviation)),
+        _at_least_prior(problem, input_error, deviations),
     )
+
+
+def _at_least_prior(problem: Problem, error: Tensor, deviation: Tensor) -> Tensor:
+    """Return errors of the input (B, 9), no less than its prior; that of pinned boxes is right."""
+    prior = deviation[:, : GAP.start]
+    return torch.where(problem.pinned.any(1)[:, None], prior, error.maximum(prior))
 
 
 def _input_error(problem: Problem, noise: InputNoise, widening: Tensor, slow: Tensor) -> Tensor:
@@ -559,6 +606,14 @@ def _input_error(problem: Problem, noise: InputNoise, widening: Tensor, slow: Te
     bias_ratio = slow * slow.new_tensor([1, 1, 1, 1, 1, YAW_BIAS])
     bias = problem.of_class(*POSE_ERRORS) * ratio[:, :6] * bias_ratio
     return torch.cat([extent, bias], 1)
+
+
+def expect_shared(problem: Problem, offsets: FaceOffsets) -> Tensor:
+    """Return the means of the shared variables as `expect` does without a population, (B, 23)."""
+    if compiled(problem.boxes) is None:
+        return expected_shared(problem, offsets, mean_input_extents(problem))
+    arrays, _, _ = _expected_arrays(problem, offsets, UNKNOWN_NOISE, UNKNOWN_POPULATION)
+    return torch.from_numpy(arrays.shared)
 
 
 def expected_shared(problem: Problem, offsets: FaceOffsets, extent: Tensor) -> Tensor:

@@ -91,6 +91,8 @@ class Observation(NamedTuple):
 
     def relative_to(self, box: Floats, shift: Floats) -> 'Observation':
         """Return this as the observation of another `box` (9,), whose centre is `-shift` away."""
+        if not shift.any():
+            return self._replace(box=box)  # of objects that did not move: no copy of the points
         return self._replace(
             box=box,
             points=self.points + shift.astype(np.float32),
@@ -137,7 +139,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     parts = _slices(owner, n)
     if config.sampling.deskew and sweep.times is not None:
         delays = sweep.times[rows].astype(np.float32)
-        sights = np.array([np.median(delays[part]) if delays[part].size else 0 for part in parts])
+        sights = _medians(delays, np.bincount(owner, minlength=n))
     up = matrix_from_rpy(boxes[:, ROLL:])[:, 2, 2]
     ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
     columns = zip(
@@ -169,6 +171,17 @@ def _origins(sweep: Sweep, rows: Ints, parts: list[slice], centers: Floats) -> l
         sees = counts >= MIN_SENSOR_PART * counts.sum()
         origins.append(sweep.origins[sees] - center)
     return origins
+
+
+def _medians(values: NDArray[np.float32], counts: Ints) -> Floats:
+    """Return the median of each of n successive parts of values (P,); 0 for an empty part."""
+    is_value = np.arange(counts.max(initial=1)) < counts[:, None]
+    ordered = np.full(is_value.shape, np.inf, values.dtype)  # (n, most values of a part)
+    ordered[is_value] = values
+    ordered.sort(axis=1)
+    rows = np.arange(len(counts))
+    medians = (ordered[rows, (counts - 1) // 2] + ordered[rows, counts // 2]) / 2
+    return np.where(counts > 0, medians, 0.0)
 
 
 class OwnPoints(NamedTuple):

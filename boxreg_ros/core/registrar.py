@@ -13,16 +13,20 @@ from boxreg_ros.core.batch import PRIOR_POSES
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
+from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.registration import Estimate, register
+from boxreg_ros.core.support import is_owned, MIN_HITS, points_inside, points_to_confirm
 from boxreg_ros.core.window import MarginalisationPrior, Window
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.structures import (
     BoxArray,
+    COASTED,
     Floats,
     is_valid_box,
     KEPT,
     LENGTH,
+    REFINED,
     RefinedBoxes,
     Sweep,
     X,
@@ -66,7 +70,8 @@ class BoxRegistrar:
     thread-safe.
 
     Each box array added is returned exactly once with ``is_final=True``, with all its boxes in
-    the order of the input. Stamps of returned arrays ascend, except for late arrays.
+    the order of the input; `coasted` boxes follow. Stamps of returned arrays ascend, except for
+    late arrays.
     With `estimate` 'early' or 'final' an array is returned once more before that, with
     ``is_final=False``, as soon as its sweep is known.
 
@@ -85,7 +90,7 @@ class BoxRegistrar:
     Attributes
     ----------
     config : Config
-        May be replaced between calls. `sampling`, `solver`, `paper`, `max_gap`,
+        May be replaced between calls. `sampling`, `solver`, `paper`, `max_gap`, `coast`,
         `min_observations` and the groups of object classes take effect at once, other settings
         after `reset`.
     counts : Counter
@@ -118,6 +123,10 @@ class BoxRegistrar:
     than half as many. A track ends after `max_gap` without an observation, when its id is given
     to another object, or, with 'track', at `flush`. It is then estimated a last time with the next
     windows, which settles all its observations.
+
+    With `coast`, a track that misses a detection gets an observation at its predicted box where
+    the points confirm it. Such a box is in the results while it is refined, with the status
+    ``coasted`` and the score 0.
 
     With a **budget**, the tracks that have waited longest are solved first, then those whose
     newest estimate is least certain, then the nearest. The boxes of the others are kept for now,
@@ -214,48 +223,75 @@ class BoxRegistrar:
     def _observe(self, array: '_PendingArray', sweep: Sweep) -> None:
         """Add an observation to the track of each box that has no reason not to be refined."""
         boxes = array.input
-        rows = [row for row, reason in enumerate(array.reasons) if not reason]
-        if not rows:
-            return
-        for row in rows:
-            track_id = boxes.track_ids[row]
-            if track_id not in self._tracks:
-                self._tracks[track_id] = _Track(track_id, boxes.class_names[row])
-        tracks = [self._tracks[boxes.track_ids[row]] for row in rows]
-        given = boxes.boxes[rows]
-        at_sweep = given.copy()
-        offset = (sweep.stamp_ns - boxes.stamp_ns) * 1e-9  # [s]
-        motion = np.zeros((len(rows), 3))
-        if offset or sweep.times is not None:
-            velocities = np.array(
-                [
-                    track.input_velocity(box, boxes.stamp_ns)
-                    for track, box in zip(tracks, given, strict=True)
-                ]
-            )
-            # The points are relative to the box: motion-compensated to the stamp of the box.
-            at_sweep[:, X : Z + 1] += offset * velocities
-            if self.config.sampling.deskew:
-                motion = motion_to_sight(sweep, at_sweep, velocities)
-        observations = observe(sweep, swept(at_sweep, motion), boxes.stamp_ns, self.config)
-        if offset or motion.any():
-            observations = [
-                seen.relative_to(box, shift)
-                for seen, box, shift in zip(observations, given, motion / 2, strict=True)
-            ]
-            for seen, moved in zip(observations, motion, strict=True):
-                self.box_time.add(seen.box, seen.points, moved)
-        pinned = [False] * len(rows) if boxes.pinned is None else boxes.pinned[rows].tolist()
-        for row, track, seen, is_pinned in zip(rows, tracks, observations, pinned, strict=True):
-            array.num_points[row] = seen.num_points
-            array.reasons[row] = 'short_track'  # until there is an estimate
-            array.num_unsettled += 1
-            observation = seen._replace(is_pinned=True) if is_pinned else seen
-            track.entries.append(_Entry(observation, array, row))
+        given = []
+        for row, track_id in enumerate(boxes.track_ids):
+            if not array.reasons[row]:
+                if track_id not in self._tracks:
+                    self._tracks[track_id] = _Track(track_id, boxes.class_names[row])
+                given.append(_Sighting(self._tracks[track_id], boxes.boxes[row], row))
+        coasting = self._coasting(array)
+        seen = self._seen([*given, *coasting], boxes.stamp_ns, sweep)
+        confirmed = _confirmed(coasting, seen[len(given) :])
+        if len(confirmed) < len(coasting):
+            # A box that is not confirmed owns no points.
+            self.counts['coast_unconfirmed'] += len(coasting) - len(confirmed)
+            seen = self._seen([*given, *confirmed], boxes.stamp_ns, sweep)
+        for sighting, (observation, velocity) in zip(given, seen, strict=False):
+            self.box_time.add(observation, velocity)
+            if boxes.pinned is not None and boxes.pinned[sighting.row]:
+                observation = observation._replace(is_pinned=True)
+            track = sighting.track
+            track.add(observation, array, sighting.row)
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
                 self._tracks[track.track_id] = successor
+        for sighting, (observation, _) in zip(confirmed, seen[len(given) :], strict=True):
+            row = array.add_predicted(sighting)
+            sighting.track.add(observation, array, row, is_predicted=True)
+
+    def _coasting(self, array: '_PendingArray') -> list['_Sighting']:
+        """Return the predicted boxes of the tracks that have no box in `array`."""
+        if not (self.config.coasts and array.is_observed):
+            return []
+        boxes = array.input
+        others = boxes.boxes[is_valid_box(boxes.boxes)]
+        found = []
+        for track in self._tracks.values():
+            if track.track_id in boxes.track_ids or not track.coasts(boxes.stamp_ns, self.config):
+                continue
+            box = track.predicted(boxes.stamp_ns, self.config)
+            if is_owned(box, others):
+                self.counts['coast_unconfirmed'] += 1
+                continue
+            others = np.vstack([others, box])
+            found.append(_Sighting(track, box))
+        return found
+
+    def _seen(
+        self, sightings: list['_Sighting'], stamp_ns: int, sweep: Sweep
+    ) -> list[tuple[Observation, Floats]]:
+        """Return for each box its observation, and the velocity of its input."""
+        if not sightings:
+            return []
+        boxes = np.array([sighting.box for sighting in sightings])
+        at_sweep = boxes.copy()
+        offset = (sweep.stamp_ns - stamp_ns) * 1e-9  # [s]
+        velocities = np.zeros((len(boxes), 3))
+        motion = velocities
+        if offset or sweep.times is not None:
+            velocities = np.array([s.track.input_velocity(s.box, stamp_ns) for s in sightings])
+            # The points are relative to the box: motion-compensated to the stamp of the box.
+            at_sweep[:, X : Z + 1] += offset * velocities
+            if self.config.sampling.deskew:
+                motion = motion_to_sight(sweep, at_sweep, velocities)
+        found = observe(sweep, swept(at_sweep, motion), stamp_ns, self.config)
+        if offset or motion.any():
+            found = [
+                seen.relative_to(box, moved / 2)
+                for seen, box, moved in zip(found, boxes, motion, strict=True)
+            ]
+        return list(zip(found, velocities, strict=True))
 
     def _end_silent_tracks(self, now_ns: int) -> None:
         oldest_ns = now_ns - round(self.config.max_gap * 1e9)
@@ -350,7 +386,9 @@ class _PendingArray:
     Attributes
     ----------
     input : BoxArray
-        As added.
+        As added, followed by the predicted boxes of tracks that have none here.
+    num_given : int
+        Boxes that were added.
     reasons : list of str
         Why each box is kept as long as it has no estimate.
     num_points : array, shape (n,)
@@ -370,6 +408,7 @@ class _PendingArray:
         self.reasons = [''] * n
         self.num_points = np.zeros(n, int)
         self.estimates: list[tuple[Estimate, int] | None] = [None] * n
+        self.num_given = n
         self.num_unsettled = 0
         self.is_observed = False
 
@@ -389,8 +428,29 @@ class _PendingArray:
             if is_valid[row]:
                 known.add(track_id)
 
+    def add_predicted(self, sighting: '_Sighting') -> int:
+        """Add the predicted box of a track; return its row."""
+        given = self.input
+        self.input = replace(
+            given,
+            track_ids=(*given.track_ids, sighting.track.track_id),
+            class_names=(*given.class_names, sighting.track.class_name),
+            scores=np.append(given.scores, 0.0),
+            boxes=np.vstack([given.boxes, sighting.box]),
+            pinned=None if given.pinned is None else np.append(given.pinned, False),
+        )
+        self.reasons.append('')
+        self.num_points = np.append(self.num_points, 0)
+        self.estimates.append(None)
+        return len(self.estimates) - 1
+
     def result(self, is_final: bool) -> RefinedBoxes:
-        """Return the present estimates as copies; without an estimate, the input box."""
+        """
+        Return the present estimates as copies; without an estimate, the input box.
+
+        Of the predicted boxes, those that are refined.
+
+        """
         n = len(self.estimates)
         boxes = self.input.boxes.copy()
         status = [KEPT] * n
@@ -409,7 +469,9 @@ class _PendingArray:
                 extent_covariances[row] = estimate.extent_covariances[i]
                 face_distances[row] = estimate.face_distances[i]
                 outside[row] = estimate.outside[i]
-        return RefinedBoxes(
+        rows = [row for row in range(n) if row < self.num_given or status[row] == REFINED]
+        status[self.num_given :] = [COASTED] * (n - self.num_given)
+        whole = RefinedBoxes(
             replace(self.input, boxes=boxes),
             tuple(status),
             tuple(reasons),
@@ -420,6 +482,7 @@ class _PendingArray:
             face_distances,
             outside,
         )
+        return whole if len(rows) == n else whole.take(rows)
 
 
 @dataclass(slots=True)
@@ -429,6 +492,7 @@ class _Entry:
     observation: Observation
     array: _PendingArray
     row: int
+    is_predicted: bool = False
     estimate: Floats | None = None
     is_settled: bool = False
 
@@ -450,6 +514,10 @@ class _Track:
         Of the newest estimate.
     num_carried : int
         Newest observations that were in no window yet, because the budget was used up.
+    detected_ns : int
+        Stamp of the last detection [ns].
+    least_points : float
+        Points inside a predicted box that confirm it, known after the first missed detection.
 
     """
 
@@ -459,6 +527,8 @@ class _Track:
     prior: MarginalisationPrior | None = None
     covariance: Floats | None = None
     num_carried: int = 0
+    detected_ns: int = 0
+    least_points: float = inf
 
     @property
     def newest_ns(self) -> int:
@@ -502,6 +572,36 @@ class _Track:
         excess = max(0, len(self.entries) - length)
         del self.entries[PRIOR_POSES : PRIOR_POSES + excess]
 
+    def add(
+        self, seen: Observation, array: _PendingArray, row: int, is_predicted: bool = False
+    ) -> None:
+        """Add an observation of a box in a row of `array`, which then waits for its estimate."""
+        array.num_points[row] = seen.num_points
+        array.reasons[row] = 'short_track'  # until there is an estimate
+        array.num_unsettled += 1
+        self.entries.append(_Entry(seen, array, row, is_predicted))
+        if not is_predicted:
+            self.detected_ns = seen.stamp_ns
+
+    def coasts(self, stamp_ns: int, config: Config) -> bool:
+        """Return whether a box may be predicted at a stamp without a detection."""
+        if stamp_ns > self.detected_ns + round(config.coast * 1e9):
+            return False
+        detected = [entry.observation for entry in self.entries if not entry.is_predicted]
+        if not self.entries[-1].is_predicted and len(detected) >= MIN_HITS:
+            self.least_points = points_to_confirm(detected)
+        return self.least_points < inf
+
+    def predicted(self, stamp_ns: int, config: Config) -> Floats:
+        """Return the box (9,) at a stamp by the motion of the newest estimates."""
+        stamps_ns = np.array([entry.observation.stamp_ns for entry in self.entries])
+        boxes = [
+            entry.observation.box if entry.estimate is None else entry.estimate
+            for entry in self.entries
+        ]
+        motion = motion_at(stamps_ns, np.array(boxes), -1, config.class_config(self.class_name))
+        return motion.predict(stamp_ns)
+
     def split_at_id_switch(self) -> '_Track | None':
         """
         Move the last two observations to a new track if they are of another object.
@@ -526,7 +626,7 @@ class _Track:
                 return None
         moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
         del self.entries[-2:]
-        return _Track(self.track_id, self.class_name, moved)
+        return _Track(self.track_id, self.class_name, moved, detected_ns=self.detected_ns)
 
     def input_velocity(self, box: Floats, stamp_ns: int) -> Floats:
         """Return the mean velocity (3,) of the input centre up to the newest `box` [m/s]."""
@@ -544,6 +644,26 @@ class _Track:
             entry.estimate = box
             if not entry.is_settled:
                 entry.array.estimates[entry.row] = estimate, i
+
+
+class _Sighting(NamedTuple):
+    """A box that is to be observed: in a row of its array, or predicted."""
+
+    track: _Track
+    box: Floats
+    row: int = -1
+
+
+def _confirmed(
+    coasting: list[_Sighting], seen: list[tuple[Observation, Floats]]
+) -> list[_Sighting]:
+    """Return those of the predicted boxes that have enough points."""
+    inside = points_inside([observation for observation, _ in seen])
+    return [
+        sighting
+        for sighting, count in zip(coasting, inside.tolist(), strict=True)
+        if count >= sighting.track.least_points
+    ]
 
 
 class _SubmittedTrack(NamedTuple):

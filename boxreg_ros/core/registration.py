@@ -20,9 +20,9 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
 from boxreg_ros.core.face_support import motion_compensated, observe_faces, to_box_frame
 from boxreg_ros.core.input_model import (
-    expect,
+    expect_shared,
     InputModel,
-    normalised_residuals,
+    residuals_at,
     smoothed_angles,
 )
 from boxreg_ros.core.kernels import compiled, contiguous, run
@@ -132,7 +132,7 @@ def _update_offsets(model: InputModel, windows: Sequence[Window], config: Config
     problem = problem.thinned(COARSE_POINTS)
     offsets = model.offsets()
     pose = torch.cat([problem.boxes[..., :3], smoothed_angles(problem)], -1)
-    state = State(pose, expect(problem, offsets).shared)
+    state = State(pose, expect_shared(problem, offsets))
     observations = observe_faces(problem, state, offsets, config)
     track_ids = [window.track_id for window in new_parts]
     model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)
@@ -148,11 +148,10 @@ def _update_noise(
 ) -> None:
     """Update the noise with the best fit of each window, `lag` from its end, and its extents."""
     best = [max(0, len(window.observations) - 1 - config.lag) for window in windows]
-    residuals = normalised_residuals(problem, solution.state)
-    residuals = residuals[range(len(windows)), best]
+    residuals = residuals_at(problem, solution.state, np.array(best))
     track_ids = [window.track_id for window in windows]
-    evidence = solution.extent_evidence
-    model.add_fits(track_ids, problem.kind, residuals.cpu().numpy(), evidence.cpu().numpy())
+    evidence = solution.extent_evidence.cpu().numpy()
+    model.add_fits(track_ids, problem.kind, residuals, evidence)
 
 
 @torch.inference_mode()

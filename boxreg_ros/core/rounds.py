@@ -8,30 +8,38 @@ By a kernel, one call for all windows, or by its torch twin, which is the refere
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import lbfgs, terms
-from boxreg_ros.core.arrowhead import InverseBlocks
+from boxreg_ros.core.arrowhead import InverseBlocks, LINK
 from boxreg_ros.core.batch import (
     ANCHOR,
     MarginalPrior,
     POSE_ERRORS,
     PRIOR_SIZE,
     Problem,
+    SHARED,
     Solution,
     State,
 )
-from boxreg_ros.core.covariance import posterior, posterior_numbers
+from boxreg_ros.core.covariance import posterior
 from boxreg_ros.core.face_support import (
+    empty_faces,
     face_numbers,
     FaceObservations,
     FaceOffsets,
     observe_faces,
 )
-from boxreg_ros.core.input_model import evidence_of_extents, Expectation, input_arrays
+from boxreg_ros.core.input_model import (
+    evidence_of_extents,
+    Expectation,
+    input_arrays,
+    MIN_EXTENT_GAIN,
+)
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.kernels.arrays import (
+    EndArrays,
     ExpectedArrays,
     PriorArrays,
     RoundNumbers,
@@ -51,6 +59,8 @@ from boxreg_ros.core.weights import (
 import numpy as np
 import torch
 from torch import Tensor
+
+_T = TypeVar('_T', bound=tuple[Any, ...])
 
 # Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
 # each of them.
@@ -167,29 +177,71 @@ def run_round_compiled(
         weight_numbers(config, _is_smooth(plan, turn)),
         shape_numbers(problem),
         _search_numbers(plan, turn, config),
-        posterior_numbers(),
+        MIN_EXTENT_GAIN,
     )
     prior = PriorArrays(
         contiguous(problem.prior_mean), contiguous(prior_information(problem, config))
     )
-    is_done = np.empty(len(rows), bool)
-    run(
-        kernels.rounds.run_windows, len(rows), rows.numpy(), problem.arrays(),
-        problem.thinned(SHAPE_POINTS).arrays(), input_arrays(offsets), prior, contiguous(free),
-        ExpectedArrays(*map(contiguous, expected)), problem.class_arrays(), numbers,
-        _solution_arrays(solution, plan.marginalises and config.window == problem.length), is_done,
+    b, N = len(rows), problem.length
+    faces = empty_faces(b, N)
+    ends = EndArrays(
+        np.empty(b, bool), np.empty((b, N, LINK, LINK)), np.empty((b, N, LINK, SHARED)),
+        np.empty((b, SHARED, SHARED)),
     )  # fmt: skip
-    return torch.from_numpy(is_done)
+    run(
+        kernels.rounds.run_windows, b, rows.numpy(), problem.arrays(),
+        problem.thinned(SHAPE_POINTS).arrays(), input_arrays(offsets), prior, contiguous(free),
+        ExpectedArrays(*map(contiguous, expected[:5])),
+        problem.class_arrays(), numbers, faces,
+        _solution_arrays(solution, plan.marginalises and config.window == N), ends,
+    )  # fmt: skip
+    is_done, *inverse = map(torch.from_numpy, ends)
+    observations = FaceObservations(*map(torch.from_numpy, faces))
+    done = is_done.nonzero()[:, 0]
+    _write_posterior(batch, rows, done, observations, _part(InverseBlocks(*inverse), done))
+    return is_done
+
+
+def _part(values: _T, rows: Tensor) -> _T:
+    """Return the rows of a tuple of tensors; `values` as they are for all rows."""
+    first = values[0]
+    return values if len(rows) == len(first) else select(values, rows)
+
+
+def _write_posterior(
+    batch: Round,
+    rows: Tensor,
+    done: Tensor,
+    observations: FaceObservations,
+    inverse: InverseBlocks,
+) -> None:
+    """
+    Write the covariances of windows that are done.
+
+    `observations` are of all `rows`, `inverse` is of the `done` ones among them.
+
+    """
+    if not len(done):
+        return
+    faces = _part((observations.moments, observations.inset, observations.weight), done)
+    ended = rows[done]
+    problem, state, expected, free = (
+        _part(part, ended) for part in (batch.problem, batch.state, batch.expected, (batch.free,))
+    )
+    _write(
+        posterior(problem, state, *faces, expected, *free, inverse),
+        batch.solution.posterior,
+        ended,
+    )
 
 
 def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
     """Return the memory of a solution for the kernel, without prior if none is left."""
-    parts = [*solution.state, *solution.posterior, solution.extent_evidence]
     prior = [np.empty((0, PRIOR_SIZE))] * 2 + [np.empty((0, PRIOR_SIZE, PRIOR_SIZE))]
     if leaves_prior and solution.prior is not None:
         prior = [part.numpy() for part in solution.prior]
-    poses, shared, pose_covariances, extents, distances, evidence = (p.numpy() for p in parts)
-    return SolutionArrays(poses, shared, pose_covariances, extents, distances, evidence, *prior)
+    parts = *solution.state, solution.extent_evidence
+    return SolutionArrays(*(part.numpy() for part in parts), *prior)
 
 
 def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
@@ -235,10 +287,8 @@ def run_round_torch(
     solution.extent_evidence[rows, 1:] = evidence
     done = is_done.nonzero()[:, 0]
     if len(done):
-        inverse = select(objective.factor, done).inverse_blocks(problem.length)
-        faces = observations.moments, observations.inset, observations.weight
-        ended = select((problem, found, *faces, expected, free), done)
-        _write(posterior(*ended, InverseBlocks(*inverse)), solution.posterior, rows[done])
+        inverse = InverseBlocks(*select(objective.factor, done).inverse_blocks(problem.length))
+        _write_posterior(batch, rows, done, observations, inverse)
         if plan.marginalises and problem.length == config.window and solution.prior is not None:
             prior = select(_prior_of_full(weighted, found, problem), done)
             _write(prior, solution.prior, rows[done])

@@ -24,6 +24,7 @@ from boxreg_ros.core.batch import (
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.input_model import (
     expect,
+    expect_shared,
     InputModel,
     InputNoise,
     normalised_residuals,
@@ -120,7 +121,7 @@ def _take_round(
 def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: Plan) -> Solution:
     """Return the state that the first round starts from, without covariances and prior."""
     pose = problem.start[..., POSE].contiguous()  # a copy
-    shared = expect(problem, offsets).shared
+    shared = expect_shared(problem, offsets)
     log_extent = shared[:, EXTENT].log()
     if plan.starts_from_fit:
         shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], free[:, -SHARED:][:, EXTENT])

@@ -382,6 +382,8 @@ def resolve_headings(
     """
     input_yaw = boxes[..., YAW]
     chain = input_yaw.copy()
+    if chain.shape[1] == 1:
+        return chain  # nothing contradicts a single heading
     trend = boxes[:, 0, YAW]
     for column in range(1, chain.shape[1]):
         change = (chain[:, column] - trend + np.pi / 2) % np.pi - np.pi / 2

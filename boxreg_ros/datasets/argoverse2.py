@@ -1,14 +1,15 @@
 """
 Argoverse 2 (sensor data set), as it is downloaded: one folder per log.
 
-Clouds are those of both LiDARs on the roof, in the frame of the ego vehicle at the stamp of the
-sweep; the motion of the ego vehicle is compensated, that of other objects is not.
+Clouds are those of both LiDARs on the roof, one above the other, in the frame of the ego vehicle
+at the stamp of the sweep; the motion of the ego vehicle is compensated, that of other objects is
+not.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -39,6 +40,9 @@ DATASET = Dataset(
     packages=('pyarrow',),
 )
 SENSOR_POSES_FILE = 'calibration/egovehicle_SE3_sensor.feather'
+LIDAR_NAMES = ('up_lidar', 'down_lidar')
+"""Names in the calibration; `laser_number` counts the lasers of the first one, then the second."""
+LASERS_EACH = 32
 
 
 def scene_names(root: Path) -> list[str]:
@@ -53,9 +57,9 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
     return (log / 'sensors' / DATASET.lidar, *(path for path in paths if path.is_file()))
 
 
-def open_scene(root: Path, name: str, points: str | None) -> Scene:
+def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a log; see `protocol.DatasetModule`."""
-    require_lidar(points, [DATASET.lidar], DATASET.lidar)
+    require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     log = _logs(root)[name]
     clouds = require(log / 'sensors' / DATASET.lidar, 'the sweeps', DATASET.remedy)
     stamps_ns = sorted(int(path.stem) for path in clouds.glob('*.feather'))
@@ -63,7 +67,7 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
         raise RecordingError(
             f'{clouds}: expected sweeps STAMP.feather, got none; {DATASET.remedy}'
         )
-    origin = _origin(require(log / SENSOR_POSES_FILE, 'the calibration', DATASET.remedy))
+    origins = _origins(require(log / SENSOR_POSES_FILE, 'the calibration', DATASET.remedy))
     rows = sorted(read_rows(log / EGO_POSES_FILE), key=lambda row: row['timestamp_ns'])
     frames = SceneFrames(
         name,
@@ -75,7 +79,7 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
         frames,
         DATASET.lidar,
         np.array(stamps_ns, np.int64),
-        partial(_sweep_files, clouds, stamps_ns, origin),
+        partial(_sweep_files, clouds, stamps_ns, origins),
         np.array([row['timestamp_ns'] for row in rows], np.int64),
         np.array([xyz_xyzw(row) for row in rows]),
         partial(frames_of, 'argoverse2', annotations, frames) if annotations.is_file() else None,
@@ -83,34 +87,41 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
     )
 
 
-def _sweep_files(folder: Path, stamps_ns: list[int], origin: Floats) -> Iterator[SweepFile]:
+def _sweep_files(folder: Path, stamps_ns: list[int], origins: Floats) -> Iterator[SweepFile]:
     for stamp_ns in stamps_ns:
         path = folder / f'{stamp_ns}.feather'
-        yield SweepFile(stamp_ns, partial(_cloud, path, origin))
+        yield SweepFile(stamp_ns, partial(_cloud, path, origins))
 
 
-def _cloud(path: Path, origin: Floats) -> Cloud:
-    """Return the cloud of a table with x y z, intensity and the time since the stamp."""
+def _cloud(path: Path, origins: Floats) -> Cloud:
+    """Return the cloud of a table with x y z, intensity, laser and the time since the stamp."""
     if not path.is_file():
         raise missing_sweep(path, FileNotFoundError(2, 'No such file or directory'))
     try:
         table = read_table(path)
         columns = {name: table.column(name).to_numpy() for name in ('x', 'y', 'z', 'intensity')}
         delays_ns = table.column('offset_ns').to_numpy()
+        lasers = table.column('laser_number').to_numpy()
     except (RecordingError, KeyError) as error:
         raise UnsupportedMessage(f'{error}; download it again') from None
     points = np.stack([columns[axis] for axis in 'xyz'], axis=1).astype(np.float32)
     times = delays_ns * 1e-9 if delays_ns.any() else None  # exports without times have zeros
-    return finite_cloud(points, columns['intensity'].astype(np.float64), times, origin)
+    sensors = None
+    if len(origins) > 1:
+        sensors = (lasers >= LASERS_EACH).astype(np.uint8)
+    return finite_cloud(points, columns['intensity'].astype(np.float64), times, origins, sensors)
 
 
-def _origin(path: Path) -> Floats:
-    """Return the mean position of the LiDARs, which are on top of each other, in ego (3,)."""
-    rows = [row for row in read_rows(path) if 'lidar' in row['sensor_name']]
-    if not rows:
-        raise RecordingError(f'{path}: expected the pose of a LiDAR, got none; {DATASET.remedy}')
-    positions = np.array([xyz_xyzw(row)[:3] for row in rows])
-    return np.asarray(positions.mean(axis=0))
+def _origins(path: Path) -> Floats:
+    """Return the positions of both LiDARs in the ego frame (2, 3); of our exports one (1, 3)."""
+    positions = {row['sensor_name']: xyz_xyzw(row)[:3] for row in read_rows(path)}
+    found = [positions[name] for name in LIDAR_NAMES if name in positions]
+    if not found:
+        raise RecordingError(
+            f'{path}: expected the poses of {" and ".join(LIDAR_NAMES)}, got none; '
+            f'{DATASET.remedy}'
+        )
+    return np.array(found)
 
 
 def _logs(root: Path) -> dict[str, Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from boxreg_ros.datasets.protocol import Cloud
@@ -9,6 +10,7 @@ from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.labels.clouds import BIN_COLUMNS
 from boxreg_ros.structures import Floats
 import numpy as np
+from numpy.typing import NDArray
 
 
 def read_bin(path: Path, suffix: str) -> Cloud:
@@ -46,7 +48,8 @@ def finite_cloud(
     points: np.ndarray,
     intensities: Floats | None = None,
     times: Floats | None = None,
-    origin: Floats | None = None,
+    origins: Floats | None = None,
+    sensors: NDArray[np.uint8] | None = None,
 ) -> Cloud:
     """Return a cloud without the points that are not finite."""
     is_finite = np.isfinite(points).all(axis=1)
@@ -54,7 +57,10 @@ def finite_cloud(
         points = points[is_finite]
         intensities = None if intensities is None else intensities[is_finite]
         times = None if times is None else times[is_finite]
-    return Cloud(points, intensities, times, np.zeros(3) if origin is None else origin)
+        sensors = None if sensors is None else sensors[is_finite]
+    return Cloud(
+        points, intensities, times, np.zeros((1, 3)) if origins is None else origins, sensors
+    )
 
 
 def missing_sweep(path: Path, error: OSError) -> UnsupportedMessage:
@@ -79,9 +85,9 @@ def require(path: Path, what: str, remedy: str) -> Path:
     return path
 
 
-def require_lidar(asked: str | None, names: list[str], main: str | None = None) -> str:
+def require_lidars(asked: Sequence[str], names: Sequence[str], main: str = '') -> list[str]:
     """
-    Return the LiDAR that is asked for, else the main one, else the only one.
+    Return the LiDARs that are asked for, else the main one, else the only one.
 
     Raises
     ------
@@ -89,13 +95,23 @@ def require_lidar(asked: str | None, names: list[str], main: str | None = None) 
         If there is no such LiDAR, or several and none is the main one.
 
     """
-    if asked is None and main is None and len(names) == 1:
-        return names[0]
-    name = asked or main
-    if name in names:
-        return str(name)
-    got = 'none' if name is None else repr(name)
+    default = [main] if main else list(names)[: len(names) == 1]
+    found = list(asked) or default
+    unknown = [name for name in found if name not in names]
+    if found and not unknown:
+        return found
     raise RecordingError(
-        f'points: expected one of the LiDARs {", ".join(names) or "(none)"}, got {got}; choose '
-        f'one with --points'
+        f'points: expected one of the LiDARs {", ".join(names) or "(none)"}, got '
+        f'{", ".join(map(repr, unknown)) or "none"}; choose one with --points'
     )
+
+
+def require_lidar(asked: Sequence[str], names: Sequence[str], main: str = '') -> str:
+    """Return the only LiDAR as `require_lidars`; RecordingError if several are asked for."""
+    found = require_lidars(asked, names, main)
+    if len(found) > 1:
+        raise RecordingError(
+            f'points: expected one of the LiDARs {", ".join(names)}, got {", ".join(found)}; '
+            f'leave out all but one --points'
+        )
+    return found[0]

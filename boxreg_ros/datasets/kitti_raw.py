@@ -8,6 +8,7 @@ the GPS/IMU unit. The LiDAR turns while the vehicle moves, which is not compensa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -55,9 +56,9 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
     return (drive / DATASET.lidar, *(path for path in paths if path.exists()))
 
 
-def open_scene(root: Path, name: str, points: str | None) -> Scene:
+def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a drive; see `protocol.DatasetModule`."""
-    require_lidar(points, [DATASET.lidar], DATASET.lidar)
+    require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     drive = _drives(root)[name]
     exported = exported_poses(drive, 1)
     if exported is None:

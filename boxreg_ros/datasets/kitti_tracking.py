@@ -8,6 +8,7 @@ left colour camera's view, so vehicles outside of it have none.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -54,9 +55,9 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
     return (split / DATASET.lidar / name, *(path for path in paths if path.is_file()))
 
 
-def open_scene(root: Path, name: str, points: str | None) -> Scene:
+def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a sequence; see `protocol.DatasetModule`."""
-    require_lidar(points, [DATASET.lidar], DATASET.lidar)
+    require_lidar(lidars, [DATASET.lidar], DATASET.lidar)
     split = _split(root)
     clouds = split / DATASET.lidar / name
     numbers = [int(path.stem) for path in clouds.glob('*.bin') if path.stem.isdigit()]

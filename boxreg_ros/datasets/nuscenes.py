@@ -8,7 +8,7 @@ frames are read too: 20 Hz, where annotations have 2 Hz.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,18 +46,18 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
     return (_tables_of(root, name)[0],)
 
 
-def open_scene(root: Path, name: str, points: str | None) -> Scene:
+def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a scene; see `protocol.DatasetModule`."""
     tables, scene = _tables_of(root, name)
     try:
-        return _scene(root, tables, scene, points)
+        return _scene(root, tables, scene, lidars)
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(
             f'{tables}: expected the tables of nuScenes: {type(error).__name__} {error}'
         ) from None
 
 
-def _scene(root: Path, tables: Path, scene: dict[str, Any], points: str | None) -> Scene:
+def _scene(root: Path, tables: Path, scene: dict[str, Any], lidars: Sequence[str]) -> Scene:
     samples = {
         row['token']: row['timestamp'] * 1000
         for row in _rows(tables, 'sample')
@@ -68,7 +68,7 @@ def _scene(root: Path, tables: Path, scene: dict[str, Any], points: str | None) 
         for row in from_json(tables / 'sensor.json')
         if row['modality'] == 'lidar'
     }
-    channel = require_lidar(points, sorted(set(channels.values())))
+    channel = require_lidar(lidars, sorted(set(channels.values())))
     calibrations = {
         row['token']: pose_matrix(row)
         for row in from_json(tables / 'calibrated_sensor.json')

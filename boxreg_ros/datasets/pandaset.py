@@ -2,7 +2,8 @@
 PandaSet, as it is unpacked: one folder per sequence.
 
 Clouds and boxes are in the world frame. Of the two LiDARs the mechanical one, with 360 degrees, is
-read, and the boxes that were drawn for it: the other LiDAR sees moving objects at other times.
+read, and the boxes that were drawn for it: the other LiDAR sees moving objects at other times, and
+is read where it is asked for. The pose of a sweep is that of the vehicle: x is right, y is ahead.
 
 Tables are pickles of pandas, which can hold programs: read only those from the publisher.
 
@@ -10,14 +11,14 @@ Tables are pickles of pandas, which can hold programs: read only those from the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 import pickle
 from typing import Any
 import zlib
 
-from boxreg_ros.datasets.files import finite_cloud, missing_sweep, require, require_lidar
+from boxreg_ros.datasets.files import finite_cloud, missing_sweep, require, require_lidars
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.transforms import inverse, matrix
@@ -38,9 +39,17 @@ DATASET = Dataset(
     lidar='pandar64',
     packages=('pandas',),
 )
-MECHANICAL_LIDAR, FORWARD_LIDAR = 0, 1
-"""Values of the columns ``d`` of points and ``cuboids.sensor_id`` of boxes; the latter may be -1:
-boxes for both LiDARs."""
+SENSOR_IDS = {'pandar64': 0, 'pandarGT': 1}
+"""LiDAR -> value of ``d`` of points and of ``cuboids.sensor_id``, which may be -1: for both."""
+POSITIONS = {'pandar64': (0.0, 0.80, 1.85), 'pandarGT': (-0.02, 1.41, 1.55)}
+"""
+Positions in the frame of ``poses.json`` [m], which the data set does not state.
+
+Derived: that of the first is the pose of a camera times its static calibration by the publisher,
+equal within 2 cm for the front, left and back cameras of sequence 002. The second is 0.61 m ahead
+of it; the 0.30 m of the calibration are taken as below it, where it is under its field of view.
+
+"""
 CUBOID_CENTRE = [f'position.{axis}' for axis in 'xyz']
 CUBOID_EXTENT = [f'dimensions.{axis}' for axis in 'yxz']
 """Length, width and height: y of a cuboid is its forward axis."""
@@ -62,9 +71,9 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
     return tuple(path for path in paths if path.is_dir())
 
 
-def open_scene(root: Path, name: str, points: str | None) -> Scene:
+def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a sequence; see `protocol.DatasetModule`."""
-    require_lidar(points, [DATASET.lidar], DATASET.lidar)
+    lidar_names = require_lidars(lidars, list(SENSOR_IDS), DATASET.lidar)
     folder = root / name / 'lidar'
     path = require(folder / 'timestamps.json', 'the stamps', DATASET.remedy)
     try:
@@ -84,12 +93,12 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
     cuboids = root / name / 'annotations' / 'cuboids'
     return Scene(
         frames,
-        DATASET.lidar,
+        ', '.join(lidar_names),
         stamps_ns,
-        partial(_sweep_files, folder, stamps_ns.tolist(), poses),
+        partial(_sweep_files, folder, stamps_ns.tolist(), poses, lidar_names),
         stamps_ns,
         poses,
-        partial(_boxes, cuboids, frames) if cuboids.is_dir() else None,
+        partial(_boxes, cuboids, frames, lidar_names) if cuboids.is_dir() else None,
         without_boxes=str(cuboids),
     )
 
@@ -100,17 +109,21 @@ def _pose(item: dict[str, dict[str, float]]) -> list[float]:
     return [*(position[axis] for axis in 'xyz'), *(heading[axis] for axis in 'xyzw')]
 
 
-def _sweep_files(folder: Path, stamps_ns: list[int], poses: Floats) -> Iterator[SweepFile]:
+def _sweep_files(
+    folder: Path, stamps_ns: list[int], poses: Floats, lidars: Sequence[str]
+) -> Iterator[SweepFile]:
     for number, (stamp_ns, pose) in enumerate(zip(stamps_ns, poses, strict=True)):
         path = folder / f'{number:02d}.pkl.gz'
-        yield SweepFile(stamp_ns, partial(_cloud, path, stamp_ns, matrix(pose)))
+        yield SweepFile(stamp_ns, partial(_cloud, path, stamp_ns, matrix(pose), lidars))
 
 
-def _cloud(path: Path, stamp_ns: int, T_world_lidar: Floats) -> Cloud:
-    """Return the points of the mechanical LiDAR in its frame."""
+def _cloud(path: Path, stamp_ns: int, T_world_vehicle: Floats, lidars: Sequence[str]) -> Cloud:
+    """Return the points of some LiDARs in the frame of the vehicle."""
+    numbers = [SENSOR_IDS[name] for name in lidars]
     try:
         table = _table(path)
-        table = table[table['d'] == MECHANICAL_LIDAR]
+        table = table[table['d'].isin(numbers)]
+        measured_by = table['d'].to_numpy()
         world = table[['x', 'y', 'z']].to_numpy(np.float64)
         intensities = table['i'].to_numpy(np.float64)
         times = table['t'].to_numpy(np.float64) - stamp_ns * 1e-9
@@ -118,18 +131,23 @@ def _cloud(path: Path, stamp_ns: int, T_world_lidar: Floats) -> Cloud:
         raise missing_sweep(path, error) from None
     except (RecordingError, KeyError) as error:
         raise UnsupportedMessage(f'{error}; download it again') from None
-    T = inverse(T_world_lidar)
+    T = inverse(T_world_vehicle)
     points = world @ T[:3, :3].T + T[:3, 3]
-    return finite_cloud(points.astype(np.float32), intensities, times)
+    sensors = None
+    if len(lidars) > 1:
+        sensors = (measured_by == numbers[1]).astype(np.uint8)
+    origins = np.array([POSITIONS[name] for name in lidars])
+    return finite_cloud(points.astype(np.float32), intensities, times, origins, sensors)
 
 
-def _boxes(folder: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
-    """Yield the cuboids of each frame; those drawn for the forward LiDAR are left out."""
+def _boxes(folder: Path, scene: SceneFrames, lidars: Sequence[str]) -> Iterator[LabelFrame]:
+    """Yield the cuboids of each frame, but for those that were drawn for another LiDAR."""
+    others = [number for name, number in SENSOR_IDS.items() if name != lidars[0]]
     for number, stamp_ns in scene.stamps_ns.items():
         path = folder / f'{int(number):02d}.pkl.gz'
         try:
             table = _table(path)
-            table = table[table['cuboids.sensor_id'] != FORWARD_LIDAR]
+            table = table[~table['cuboids.sensor_id'].isin(others)]
             boxes = np.zeros((len(table), 9))
             boxes[:, :6] = table[CUBOID_CENTRE + CUBOID_EXTENT].to_numpy(np.float64)
             # A yaw of 0 points along y.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -60,15 +60,18 @@ class Cloud:
         In the unit of the data set.
     times : array, shape (M,), or None
         Time of measurement of each point relative to the stamp [s].
-    origin : array, shape (3,)
-        Position of the sensor [m].
+    origins : array, shape (K, 3)
+        Position of each sensor [m].
+    sensors : array, shape (M,), or None
+        Row of `origins` of the sensor that measured each point; None if there is one sensor.
 
     """
 
     points: NDArray[np.floating]
     intensities: Floats | None = None
     times: Floats | None = None
-    origin: Floats = field(default_factory=lambda: np.zeros(3))
+    origins: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+    sensors: NDArray[np.uint8] | None = None
 
 
 class SweepFile(NamedTuple):
@@ -98,7 +101,7 @@ class Scene:
     frames : SceneFrames
         Names and stamps of its frames, and the names of the coordinate frames.
     points_topic : str
-        Name of the LiDAR.
+        Name of the LiDAR, or of several, separated by commas.
     sweep_stamps_ns : array, shape (S,)
         Stamps of the sweeps [ns], ascending.
     sweeps : callable
@@ -137,9 +140,9 @@ class DatasetModule(Protocol):
     def inputs(self, root: Path, name: str) -> tuple[Path, ...]:
         """Return the files and folders that a scene is read from, for its fingerprint."""
 
-    def open_scene(self, root: Path, name: str, points: str | None) -> Scene:
+    def open_scene(self, root: Path, name: str, lidars: Sequence[str]) -> Scene:
         """
-        Return a scene; `points` is the name of a LiDAR, None for the main one.
+        Return a scene with these LiDARs, by their names; none for the main one.
 
         Raises
         ------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -33,8 +33,8 @@ class SceneRecording:
     ----------
     address : Address
         Data set, folder and scene.
-    points : str, optional
-        Name of the LiDAR; by default the main one of the data set.
+    lidars : sequence of str
+        Names of the LiDARs; by default the main one of the data set.
     start, end : float, optional
         Part to read, from the first sweep [s].
     labels : tuple of str and Path, optional
@@ -62,14 +62,14 @@ class SceneRecording:
     def __init__(
         self,
         address: Address,
-        points: str | None = None,
+        lidars: Sequence[str] = (),
         start: float | None = None,
         end: float | None = None,
         labels: tuple[str, Path] | None = None,
     ) -> None:
         self._address = address
         self._dataset = module_of(address.dataset).DATASET
-        self._points = points
+        self._lidars = lidars
         self._start, self._end = start, end
         self._labels = labels
         self.boxes_topic = '' if labels else ANNOTATIONS
@@ -82,7 +82,7 @@ class SceneRecording:
     def __enter__(self) -> Self:
         """Read stamps, poses and boxes of the scene, but no cloud."""
         self._address = resolved(self._address)
-        self._scene: Scene = open_scene(self._address, self._points)
+        self._scene: Scene = open_scene(self._address, self._lidars)
         self.points_topic = self._scene.points_topic
         first_ns, last_ns = self._scene.sweep_stamps_ns[[0, -1]].tolist()
         self.start_ns = first_ns + round((self._start or 0.0) * 1e9)
@@ -220,7 +220,11 @@ class SceneRecording:
             self.first_errors.setdefault(self.points_topic, error)
             return None
         self._readable += 1
-        content = Sweep(sweep.stamp_ns, frame_id, cloud.points, cloud.times, cloud.origin)
+        origins = None if cloud.sensors is None else cloud.origins
+        content = Sweep(
+            sweep.stamp_ns, frame_id, cloud.points, cloud.times, cloud.origins.mean(axis=0),
+            origins=origins, sensors=cloud.sensors,
+        )  # fmt: skip
         return Item(sweep.stamp_ns, content, cloud.intensities if with_intensities else None)
 
     def _add_poses(self, tree: TransformTree, first: int, until_ns: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -162,10 +163,10 @@ def all_scenes(address: Address) -> list[Address]:
     return [address._replace(scene=name) for name in scene_names(address)]
 
 
-def open_scene(address: Address, points: str | None = None) -> Scene:
-    """Return a scene, with the LiDAR `points`; raises as `resolved` and as its module."""
+def open_scene(address: Address, lidars: Sequence[str] = ()) -> Scene:
+    """Return a scene with these LiDARs; raises as `resolved` and as its module."""
     address = resolved(address)
-    return module_of(address.dataset).open_scene(address.root, address.scene, points)
+    return module_of(address.dataset).open_scene(address.root, address.scene, lidars)
 
 
 def _listed(names: list[str]) -> str:

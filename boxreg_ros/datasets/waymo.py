@@ -1,20 +1,23 @@
 """
 Waymo (perception data set, version 2), as it is downloaded: one folder per component.
 
-Clouds are those of the LiDAR on the roof, both returns. Its range images become points by the
-inclination of each row, the azimuth of each column and the pose of the vehicle at each pixel; they
-are in the frame of the vehicle at the stamp. Rows are streamed: one range image is in memory.
+Clouds are those of the LiDAR on the roof, both returns, or also of those at the front, the sides
+and the rear. Range images become points by the inclination of each row, the azimuth of each column
+and, for the LiDAR on the roof, the pose of the vehicle at each pixel, which the others lack; they
+are in the frame of the vehicle at the stamp. Rows are streamed: one sweep is in memory.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from boxreg_ros.datasets.files import finite_cloud, require, require_lidar
+from boxreg_ros.datasets.files import finite_cloud, require, require_lidars
 from boxreg_ros.datasets.poses import pose_rows
 from boxreg_ros.datasets.protocol import Cloud, Dataset, Scene, SweepFile
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
@@ -38,8 +41,9 @@ DATASET = Dataset(
     lidar='TOP',
     packages=('pyarrow',),
 )
-TOP_LASER = 1
-"""Value of the column `LASER` for the LiDAR on the roof."""
+LASERS = {'TOP': 1, 'FRONT': 2, 'SIDE_LEFT': 3, 'SIDE_RIGHT': 4, 'REAR': 5}
+"""LiDAR -> value of the column `LASER`."""
+TOP_LASER = LASERS['TOP']
 LASER = 'key.laser_name'
 RETURNS = [f'[LiDARComponent].range_image_return{i}' for i in (1, 2)]
 PIXEL_POSE = '[LiDARPoseComponent].range_image_return1'
@@ -64,24 +68,20 @@ def inputs(root: Path, name: str) -> tuple[Path, ...]:
     return tuple(path for path in paths if path.is_file())
 
 
-def open_scene(root: Path, name: str, points: str | None) -> Scene:
+def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
     """Return a segment; see `protocol.DatasetModule`."""
-    require_lidar(points, [DATASET.lidar], DATASET.lidar)
+    names = require_lidars(lidars, list(LASERS), DATASET.lidar)
     clouds = _component(root, 'lidar', name)
-    pixel_poses = _component(root, 'lidar_pose', name)
-    calibration = _Calibration.read(_component(root, 'lidar_calibration', name))
+    pixel_poses = _component(root, 'lidar_pose', name) if DATASET.lidar in names else None
+    calibrations = _calibrations(_component(root, 'lidar_calibration', name), names)
     rows = read_rows(_component(root, 'vehicle_pose', name))
     T_world_vehicle = {
         row[MICROSECONDS] * 1000: np.reshape(row[VEHICLE_POSE], (4, 4)) for row in rows
     }
-    stamps_ns = [
-        row[MICROSECONDS] * 1000
-        for row in _streamed(clouds, [MICROSECONDS, LASER])
-        if row[LASER] == TOP_LASER
-    ]
-    if stamps_ns != sorted(stamps_ns) or not stamps_ns:
+    stamps_ns = [micros * 1000 for micros, _ in _by_time(clouds, [], calibrations)]
+    if stamps_ns != sorted(set(stamps_ns)) or not stamps_ns:
         raise RecordingError(
-            f'{clouds}: expected sweeps of the LiDAR {DATASET.lidar} in order of time, got '
+            f'{clouds}: expected sweeps of {", ".join(names)} in order of time, got '
             f'{len(stamps_ns)}; {DATASET.remedy}'
         )
     missing = set(stamps_ns) - T_world_vehicle.keys()
@@ -99,9 +99,9 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
     pose_stamps_ns = sorted(T_world_vehicle)
     return Scene(
         frames,
-        DATASET.lidar,
+        ', '.join(names),
         np.array(stamps_ns, np.int64),
-        partial(_sweeps, clouds, pixel_poses, calibration, T_world_vehicle),
+        partial(_sweeps, clouds, pixel_poses, calibrations, T_world_vehicle),
         np.array(pose_stamps_ns, np.int64),
         pose_rows([T_world_vehicle[stamp_ns] for stamp_ns in pose_stamps_ns]),
         partial(frames_of, 'waymo', boxes, frames) if boxes.is_file() else None,
@@ -110,28 +110,14 @@ def open_scene(root: Path, name: str, points: str | None) -> Scene:
 
 
 class _Calibration(NamedTuple):
-    """Pose (4, 4) in the vehicle, and inclinations [rad], of the LiDAR on the roof."""
+    """Name of a LiDAR, its pose (4, 4) in the vehicle, and its inclinations [rad]."""
+
+    name: str
 
     T_vehicle_lidar: Floats
     inclinations: Floats | None
     min_inclination: float
     max_inclination: float
-
-    @classmethod
-    def read(cls, path: Path) -> _Calibration:
-        """Read the calibration of a segment."""
-        for row in read_rows(path):
-            if row[LASER] == TOP_LASER:
-                values = row[f'{CALIBRATION}beam_inclination.values']
-                return cls(
-                    np.reshape(row[f'{CALIBRATION}extrinsic.transform'], (4, 4)),
-                    np.array(values) if values else None,
-                    row[f'{CALIBRATION}beam_inclination.min'],
-                    row[f'{CALIBRATION}beam_inclination.max'],
-                )
-        raise RecordingError(
-            f'{path}: expected the LiDAR {DATASET.lidar}, got others; {DATASET.remedy}'
-        )
 
     def rows(self, height: int) -> Floats:
         """Return the inclination of each row of a range image, the highest first."""
@@ -143,60 +129,105 @@ class _Calibration(NamedTuple):
         ]
 
 
+def _calibrations(path: Path, names: Sequence[str]) -> dict[int, _Calibration]:
+    """Return the calibration of each LiDAR, by its value of the column `LASER`."""
+    rows = {row[LASER]: row for row in read_rows(path)}
+    found = {}
+    for name in names:
+        row = rows.get(LASERS[name])
+        if row is None:
+            raise RecordingError(
+                f'{path}: expected the LiDAR {name}, got others; {DATASET.remedy}'
+            )
+        values = row[f'{CALIBRATION}beam_inclination.values']
+        found[LASERS[name]] = _Calibration(
+            name,
+            np.reshape(row[f'{CALIBRATION}extrinsic.transform'], (4, 4)),
+            np.array(values) if values else None,
+            row[f'{CALIBRATION}beam_inclination.min'],
+            row[f'{CALIBRATION}beam_inclination.max'],
+        )
+    return found
+
+
+def _by_time(
+    path: Path, columns: Sequence[str], lasers: Collection[int]
+) -> Iterator[tuple[int, dict[int, dict[str, Any]]]]:
+    """Yield the time [us] of each sweep and its rows by LiDAR, in the order of the file."""
+    streamed = _streamed(path, [MICROSECONDS, LASER, *columns])
+    wanted = (row for row in streamed if row[LASER] in lasers)
+    for micros, rows in groupby(wanted, itemgetter(MICROSECONDS)):
+        yield micros, {row[LASER]: row for row in rows}
+
+
 def _sweeps(
     clouds: Path,
-    pixel_poses: Path,
-    calibration: _Calibration,
+    pixel_poses: Path | None,
+    calibrations: dict[int, _Calibration],
     T_world_vehicle: dict[int, Floats],
 ) -> Iterator[SweepFile]:
     """Yield the sweeps in the order of the file, with the poses of the same stamps."""
     columns = [f'{image}.{part}' for image in RETURNS for part in ('values', 'shape')]
-    pose_columns = [f'{PIXEL_POSE}.values', f'{PIXEL_POSE}.shape']
-    poses = _streamed(pixel_poses, [MICROSECONDS, LASER, *pose_columns])
-    pose: dict[str, Any] = {MICROSECONDS: -1, LASER: TOP_LASER}
-    for row in _streamed(clouds, [MICROSECONDS, LASER, *columns]):
-        if row[LASER] != TOP_LASER:
-            continue
-        while pose[MICROSECONDS] < row[MICROSECONDS] or pose[LASER] != TOP_LASER:
-            pose = next(poses, {MICROSECONDS: 1 << 62, LASER: TOP_LASER})
-        stamp_ns = row[MICROSECONDS] * 1000
-        read = partial(_cloud, row, pose, calibration, T_world_vehicle[stamp_ns], pixel_poses)
-        yield SweepFile(stamp_ns, read)
+    poses: Iterator[tuple[int, dict[int, dict[str, Any]]]] = iter(())
+    if pixel_poses is not None:
+        pose_columns = [f'{PIXEL_POSE}.values', f'{PIXEL_POSE}.shape']
+        poses = _by_time(pixel_poses, pose_columns, [TOP_LASER])
+    after_all: tuple[int, dict[int, dict[str, Any]]] = (1 << 62, {})
+    pose_micros, pose = -1, after_all[1]
+    for micros, rows in _by_time(clouds, columns, calibrations):
+        while pose_micros < micros:
+            pose_micros, pose = next(poses, after_all)
+        T_world_pixel = pose if pose_micros == micros else {}
+        stamp_ns = micros * 1000
+        T = T_world_vehicle[stamp_ns]
+        yield SweepFile(stamp_ns, partial(_cloud, rows, T_world_pixel, calibrations, T, clouds))
 
 
 def _cloud(
-    row: dict[str, Any],
-    pose: dict[str, Any],
-    calibration: _Calibration,
+    rows: dict[int, dict[str, Any]],
+    pixel_poses: dict[int, dict[str, Any]],
+    calibrations: dict[int, _Calibration],
     T_world_vehicle: Floats,
-    pixel_poses: Path,
+    clouds: Path,
 ) -> Cloud:
-    """Return the points of both returns in the frame of the vehicle at the stamp."""
-    if pose[MICROSECONDS] != row[MICROSECONDS]:
-        raise UnsupportedMessage(
-            f'{pixel_poses}: expected the poses of the sweep at {row[MICROSECONDS]} us, got none; '
-            f'{DATASET.remedy}'
-        )
-    T_world_pixel = _image(pose, PIXEL_POSE)
-    points = []
-    intensities = []
-    for name in RETURNS:
-        image = _image(row, name)
-        if image is None:
-            continue
-        rows, columns = np.nonzero(image[..., RANGE] > 0)
-        found = image[rows, columns]
-        local = _rays(calibration, image.shape, rows, columns) * found[:, RANGE, None]
-        T = calibration.T_vehicle_lidar
-        vehicle = local @ T[:3, :3].T + T[:3, 3]
-        assert T_world_pixel is not None
-        points.append(_at_stamp(vehicle, T_world_pixel[rows, columns], T_world_vehicle))
-        intensities.append(found[:, INTENSITY])
+    """Return the points of both returns of the LiDARs in the frame of the vehicle at the stamp."""
+    points = [np.zeros((0, 3))]
+    intensities = [np.zeros(0)]
+    sensors = [np.zeros(0, np.uint8)]
+    for number, (laser, calibration) in enumerate(calibrations.items()):
+        if laser not in rows or (laser == TOP_LASER and laser not in pixel_poses):
+            what = 'poses' if laser in rows else 'points'
+            raise UnsupportedMessage(
+                f'{clouds}: expected the {what} of the LiDAR {calibration.name} in a sweep, got '
+                f'none; {DATASET.remedy}'
+            )
+        T_world_pixel = None
+        if laser == TOP_LASER:
+            T_world_pixel = _image(pixel_poses[laser], PIXEL_POSE)
+        for name in RETURNS:
+            image = _image(rows[laser], name)
+            if image is None:
+                continue
+            at = np.nonzero(image[..., RANGE] > 0)
+            found = _in_vehicle(image, at, calibration)
+            if T_world_pixel is not None:
+                found = _at_stamp(found, T_world_pixel[at], T_world_vehicle)
+            points.append(found)
+            intensities.append(image[at][:, INTENSITY])
+            sensors.append(np.full(len(found), number, np.uint8))
     return finite_cloud(
-        np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32),
-        np.concatenate([np.zeros(0), *intensities]),
-        origin=calibration.T_vehicle_lidar[:3, 3],
+        np.concatenate(points).astype(np.float32),
+        np.concatenate(intensities),
+        origins=np.array([one.T_vehicle_lidar[:3, 3] for one in calibrations.values()]),
+        sensors=np.concatenate(sensors) if len(calibrations) > 1 else None,
     )
+
+
+def _in_vehicle(image: Floats, at: tuple[Any, ...], calibration: _Calibration) -> Floats:
+    """Return the points (M, 3) of the pixels `at` in the vehicle when each was measured [m]."""
+    local = _rays(calibration, image.shape, *at) * image[at][:, RANGE, None]
+    T = calibration.T_vehicle_lidar
+    return np.asarray(local @ T[:3, :3].T + T[:3, 3])
 
 
 def _rays(calibration: _Calibration, shape: tuple[int, ...], rows: Any, columns: Any) -> Floats:

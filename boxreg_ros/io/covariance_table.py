@@ -58,19 +58,21 @@ class CovarianceWriter:
     def write(self, refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> None:
         """Add a row for each box with an estimate: kept boxes have none."""
         boxes = refined.boxes
-        for i, status in enumerate(refined.status):
-            if status == KEPT:
-                continue
-            distance = ''
-            if T_fixed_sensor is not None:
-                offset = boxes.boxes[i, [X, Y]] - T_fixed_sensor[:2, 3]
-                distance = f'{np.hypot(*offset):.3f}'
-            numbers = (
-                *refined.covariances[i][POSE_TRIANGLE],
-                *refined.extent_covariances[i][EXTENT_TRIANGLE],
-            )
-            cells = (f'{number:.7g}' for number in numbers)
-            self._table.writerow((boxes.stamp_ns, boxes.track_ids[i], distance, *cells))
+        distances = [''] * len(refined.status)
+        if T_fixed_sensor is not None:
+            offset = boxes.boxes[:, [X, Y]] - T_fixed_sensor[:2, 3]
+            distances = [f'{distance:.3f}' for distance in np.hypot(*offset.T).tolist()]
+        numbers = np.hstack(
+            [
+                refined.covariances[:, *POSE_TRIANGLE],
+                refined.extent_covariances[:, *EXTENT_TRIANGLE],
+            ]
+        )
+        rows = zip(refined.status, boxes.track_ids, distances, numbers.tolist(), strict=True)
+        for status, track_id, distance, row in rows:
+            if status != KEPT:
+                cells = [f'{number:.7g}' for number in row]
+                self._table.writerow((boxes.stamp_ns, track_id, distance, *cells))
 
     def close(self) -> None:
         """Close the file."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
+from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.lidars import SensorPlacement
 from boxreg_ros.io.storage.record import Damage
-from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
+from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 
 LOOKAHEAD_NS = 2 * 10**9
@@ -110,64 +110,3 @@ class ItemSource(Protocol):
 
     def check_readable(self) -> None:
         """Raise UnsupportedMessage if none of the clouds, or of the boxes, was readable."""
-
-
-def left_out(source: ItemSource, missing_transforms: Sequence[str]) -> str:
-    """
-    Return how many messages of a source are not used, and why, in one line; empty if all are.
-
-    Parameters
-    ----------
-    source : ItemSource
-        After its last item.
-    missing_transforms : sequence of str
-        Errors of the messages without a transform.
-
-    """
-    parts = []
-    if source.unreadable.total():
-        first = next(iter(source.first_errors.values()))
-        parts.append(f'{source.unreadable.total()} messages could not be read, first: {first}')
-    if missing_transforms:
-        parts.append(
-            f'{len(missing_transforms)} messages had no transform, first: {missing_transforms[0]}'
-        )
-    return '; '.join(parts)
-
-
-def input_boxes(
-    source: AbstractContextManager[ItemSource], fixed_frame: str | None = None
-) -> tuple[list[BoxArray], str]:
-    """
-    Return the input boxes of a recording in the fixed frame that `relabel` would choose.
-
-    Parameters
-    ----------
-    source : context manager of ItemSource
-        Recording that is not open yet.
-    fixed_frame : str, optional
-        Fixed frame to use instead.
-
-    Returns
-    -------
-    arrays : list of BoxArray
-        All that could be decoded and transformed.
-    others : str
-        Number of the others, and why; empty if there are none.
-
-    """
-    tree = TransformTree()
-    arrays: list[BoxArray] = []
-    missing_transforms: list[str] = []
-    with source as recording:
-        fixed_frame = recording.choose_fixed_frame(tree, fixed_frame)
-        for item in recording.items(tree, with_clouds=False):
-            try:
-                moved = to_fixed_frame(item.content, tree, fixed_frame)
-            except TransformUnavailable as error:
-                missing_transforms.append(str(error))
-                continue
-            if isinstance(moved, BoxArray):
-                arrays.append(moved)
-        others = left_out(recording, missing_transforms)
-    return arrays, others

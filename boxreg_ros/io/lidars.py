@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from boxreg_ros.errors import ConfigError, TransformUnavailable
+from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, concatenation, pointcloud
@@ -137,9 +137,15 @@ class SensorPlacement:
         Raises
         ------
         UnsupportedMessage
-            If the cloud cannot be read.
+            If the cloud cannot be read, or its points are not in the order of the info messages.
 
         """
+        if self.lidars.info and clouds.is_reordered(msg):
+            raise UnsupportedMessage(
+                f'expected points in the order that {self.lidars.info!r} counts them, got a cloud '
+                f'that Draco has sorted; publish it by zstd, or by Draco with encode_method 2 and '
+                f'force_quantization false'
+            )
         cloud = clouds.plain(msg)
         unit = self.lidars.time_unit
         if topic not in self.layouts:
@@ -161,9 +167,15 @@ class SensorPlacement:
         """Return whether the info message of a cloud may still arrive."""
         return self.lidars.info != '' and self._is_awaited and sweep.stamp_ns not in self._infos
 
+    def last_stamp_ns(self, sweep: Sweep) -> int:
+        """Return the newest stamp that the transforms of a cloud are needed for [ns]."""
+        info = self._infos.get(sweep.stamp_ns)
+        stamps_ns = [] if info is None else [part.stamp_ns for part in info.sources]
+        return max([sweep.stamp_ns, *stamps_ns])
+
     def placed(self, sweep: Sweep, tree: TransformTree) -> tuple[Sweep, str, str]:
         """
-        Return a cloud with the positions of its LiDARs, in its own frame.
+        Return a cloud with the positions of its LiDARs, each at the stamp of its own part.
 
         Points of a concatenated cloud without an info message are attributed to the nearest of
         the LiDARs that are named: the one with the densest points, and rarely blocked by the
@@ -172,7 +184,7 @@ class SensorPlacement:
         Parameters
         ----------
         sweep : Sweep
-            As its message has it.
+            In the fixed frame.
         tree : TransformTree
             Transforms to the frames of the LiDARs.
 
@@ -194,7 +206,7 @@ class SensorPlacement:
         if not frames or sweep.is_dropped:
             return sweep, '', ''
         try:
-            origins = _positions(frames, sweep, tree)
+            origins = _positions([(frame, sweep.stamp_ns) for frame in frames], sweep, tree)
         except TransformUnavailable as error:
             return sweep, 'sensor_without_transform', str(error)
         if len(frames) == 1:
@@ -202,10 +214,10 @@ class SensorPlacement:
         return _with_sensors(sweep, origins, _nearest(sweep.points, origins)), '', ''
 
 
-def _positions(frames: Sequence[str], sweep: Sweep, tree: TransformTree) -> Floats:
-    """Return the origins (K, 3) of frames in the frame of a cloud [m]."""
+def _positions(sensors: Sequence[tuple[str, int]], sweep: Sweep, tree: TransformTree) -> Floats:
+    """Return the origins (K, 3) of frames at stamps [ns], in the frame of a cloud [m]."""
     return np.array(
-        [tree.lookup(sweep.frame_id, frame, sweep.stamp_ns)[:3, 3] for frame in frames]
+        [tree.lookup(sweep.frame_id, frame, stamp_ns)[:3, 3] for frame, stamp_ns in sensors]
     )
 
 
@@ -224,9 +236,9 @@ def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tupl
     """
     Return a concatenated cloud with the positions and times of its LiDARs; as of `placed`.
 
-    Its points are in its frame at its stamp: the concatenation has compensated the motion of the
-    vehicle. Their times, if any, are relative to the stamps of the LiDARs, and so are the points
-    of other moving objects.
+    The concatenation has compensated the motion of the vehicle: the points are where the LiDARs
+    measured them, each at its own stamp and position. Their times, if any, are relative to the
+    stamps of the LiDARs.
 
     """
     rows = np.arange(len(sweep.points)) if sweep.rows is None else sweep.rows
@@ -240,7 +252,7 @@ def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tupl
     if not parts:
         return sweep, '', ''
     try:
-        origins = _positions([part.frame_id for part in parts], sweep, tree)
+        origins = _positions([(part.frame_id, part.stamp_ns) for part in parts], sweep, tree)
     except TransformUnavailable as error:
         return sweep, 'sensor_without_transform', str(error)
     owner = np.zeros(max(ends), np.uint8)
@@ -275,11 +287,24 @@ class _Group:
     def last_ns(self) -> int:
         return max(sweep.stamp_ns for sweep, _ in self.clouds.values())
 
-    def takes(self, sweep: Sweep, span_ns: int) -> bool:
-        """Return whether a cloud belongs here: the first of its topic, within the span."""
+    def takes(self, sweep: Sweep, span_ns: int, offsets_ns: Mapping[str, int]) -> bool:
+        """
+        Return whether a cloud belongs here: the first of its topic, within the span.
+
+        With `offsets_ns` of the LiDARs from the begin of a period, as in the last sweep, it is of
+        the same period too: without the cloud before, one of the next would be within the span.
+
+        """
         first_ns = min(self.first_ns, sweep.stamp_ns)
         last_ns = max(self.last_ns, sweep.stamp_ns)
-        return sweep.topic not in self.clouds and last_ns - first_ns <= span_ns
+        if sweep.topic in self.clouds or last_ns - first_ns > span_ns:
+            return False
+        begins_ns = [
+            cloud.stamp_ns - offsets_ns[cloud.topic]
+            for cloud in (self.clouds[next(iter(self.clouds))][0], sweep)
+            if cloud.topic in offsets_ns
+        ]
+        return max(begins_ns, default=0) - min(begins_ns, default=0) <= span_ns // 2
 
 
 class SweepMerger:
@@ -288,9 +313,10 @@ class SweepMerger:
 
     A sweep has at most one cloud of each topic, and their stamps are within `merge_span`. It is
     complete with a cloud of every LiDAR that was heard in the last second; without one of them it
-    is returned once a later sweep is complete, or two later ones have begun. The rule reads
-    stamps and the order of arrival only, no clock. A sweep has the stamp of the first topic in it,
-    in the order of `topics`; the times of its points are relative to that.
+    is returned once a later sweep is complete, or two later ones have begun. After a complete
+    sweep the LiDARs keep their order within a period, so that a lost cloud shifts no pairs. The
+    rule reads stamps and the order of arrival only, no clock. A sweep has the stamp of the first
+    topic in it, in the order of `topics`; the times of its points are relative to that.
 
     Parameters
     ----------
@@ -319,6 +345,7 @@ class SweepMerger:
         """Forget all clouds; keep the counts."""
         self._groups: list[_Group] = []  # ascending by stamp
         self._heard_ns: dict[str, int] = {}
+        self._offsets_ns: dict[str, int] = {}  # of the LiDARs in the last sweep, if complete
         self._returned_ns: int | None = None
 
     def add(self, sweep: Sweep, extra: Any = None) -> list[MergedSweep]:
@@ -354,7 +381,7 @@ class SweepMerger:
     def _group_for(self, sweep: Sweep) -> _Group | None:
         """Return the oldest group that takes a cloud, a new one, or None for a late cloud."""
         for group in self._groups:
-            if group.takes(sweep, self._span_ns):
+            if group.takes(sweep, self._span_ns, self._offsets_ns):
                 return group
         newest_ns = self._groups[-1].first_ns if self._groups else self._returned_ns
         if newest_ns is not None and sweep.stamp_ns <= newest_ns:
@@ -388,6 +415,12 @@ class SweepMerger:
         for topic in group.clouds:
             self.counts[topic][CLOUD_MERGED] += 1
         self._returned_ns = group.last_ns
+        self._offsets_ns = {}
+        if not self._awaited(group):
+            self._offsets_ns = {
+                topic: sweep.stamp_ns - group.first_ns
+                for topic, (sweep, _) in group.clouds.items()
+            }
         clouds = [group.clouds[topic] for topic in self._topics if topic in group.clouds]
         there = [(sweep, extra) for sweep, extra in clouds if not sweep.is_dropped]
         if not there:

@@ -9,6 +9,7 @@ from typing import Any
 
 from boxreg_ros.structures import (
     BoxArray,
+    COASTED,
     Floats,
     HEIGHT,
     is_valid_box,
@@ -26,8 +27,11 @@ TRANSLUCENT_GREY: Colour = (0.7, 0.7, 0.7, 0.25)
 GREEN = (0.1, 0.8, 0.3, 0.45)
 ORANGE = (1.0, 0.6, 0.1, 0.45)
 BLUE = (0.2, 0.5, 1.0, 0.6)
+VIOLET = (0.6, 0.3, 0.9, 0.45)
 WHITE = (1.0, 1.0, 1.0, 1.0)
 RED = (0.9, 0.1, 0.1, 1.0)
+COLOURS = {REFINED: GREEN, COASTED: VIOLET}
+"""By status; kept boxes are orange."""
 BOX_NAMESPACES = ('input', 'refined', 'heading', 'id', 'covariance')
 RECORDING = 'recording'
 NAMESPACES = (*BOX_NAMESPACES, RECORDING)
@@ -71,9 +75,10 @@ class MarkerBoard:
         Parameters
         ----------
         given, refined : BoxArray, RefinedBoxes
-            The same boxes before and after, in one frame. Boxes that are not finite, or have
-            no volume, are not shown. Green is refined, orange is kept; grey is the input.
-            The blue ellipse is the covariance of x and y of a refined box, 2 standard deviations.
+            The same boxes before and after, in one frame; coasted boxes stand behind those of
+            the input. Boxes that are not finite, or have no volume, are not shown. Green is
+            refined, violet coasted, orange is kept; grey is the input. The blue ellipse is the
+            covariance of x and y of a refined box, 2 standard deviations.
 
         """
         m = self._messages
@@ -84,17 +89,23 @@ class MarkerBoard:
         markers: list[Any] = list(self.clear().markers) if self._is_new else []
         self._is_new = False
         was_shown, self._shown = self._shown, {}
-        for i, track_id in enumerate(given.track_ids):
+        for i, track_id in enumerate(refined.boxes.track_ids):
             key = track_id if track_id and track_id not in self._shown else f'{track_id}#{i}'
             box = refined.boxes.boxes[i]
-            if not (is_valid_box(box) and is_valid_box(given.boxes[i])):
+            is_given = i < len(given.track_ids)
+            if not (is_valid_box(box) and (not is_given or is_valid_box(given.boxes[i]))):
                 continue
             self._shown[key] = number = was_shown[key] if key in was_shown else self._number()
-            is_refined = refined.status[i] == REFINED
-            colour = GREEN if is_refined else ORANGE
+            colour = COLOURS.get(refined.status[i], ORANGE)
+            is_refined = colour is not ORANGE
             spread = refined.covariances[i, :2, :2] if is_refined else np.zeros((2, 2))
+            grey = m.Marker(header=header, ns='input', id=number, action=DELETE)
+            if is_given:
+                grey = _cube(
+                    m, header, 'input', number, given.boxes[i], before[i], TRANSLUCENT_GREY
+                )
             markers += [
-                _cube(m, header, 'input', number, given.boxes[i], before[i], TRANSLUCENT_GREY),
+                grey,
                 _cube(m, header, 'refined', number, box, after[i], colour),
                 _arrow(m, header, number, box, after[i]),
                 _text(m, header, number, box, track_id),

@@ -216,9 +216,9 @@ class Session:
             reason = 'sweep_without_transform' if is_sweep else 'no_transform'
             return Admitted(None, None, reason, str(error))
         reason, detail = '', ''
-        if isinstance(item, Sweep):
-            item, reason, detail = self._placement.placed(item, self.tree)
         moved = move_to_frame(item, T_fixed_item, self.fixed_frame)
+        if isinstance(moved, Sweep):
+            moved, reason, detail = self._placement.placed(moved, self.tree)
         self._pose_check.add(moved)
         if self._tracker is not None and isinstance(moved, BoxArray):
             moved = self._tracker.identify(moved)

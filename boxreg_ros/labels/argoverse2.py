@@ -27,7 +27,12 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     SceneFrames,
 )
-from boxreg_ros.labels.records import boxes_from_quaternions, finite_or_none, refined_boxes
+from boxreg_ros.labels.records import (
+    boxes_from_quaternions,
+    EVIDENCE_COLUMNS,
+    evidence_values,
+    refined_boxes,
+)
 from boxreg_ros.rotations import quaternion_from_matrix
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, Sweep, X, Z
 from msg_adapters.poses import quaternions_of
@@ -54,14 +59,6 @@ ANNOTATION_COLUMNS = {
     **POSE_COLUMNS,
     'num_interior_pts': 'int64',
 }
-STATUS_COLUMNS = {
-    'status': 'string',
-    'reason': 'string',
-    'score': 'double',
-    'covariance': 'double[]',
-    'extent_covariance': 'double[]',
-}
-"""Additional columns; the devkit ignores them."""
 POINT_COLUMNS = {'intensity': 'uint8', 'laser_number': 'uint8', 'offset_ns': 'int32'}
 OPTIONAL_COLUMNS = {'track_uuid', 'num_interior_pts'}
 """Detections that are submitted lack these."""
@@ -84,7 +81,7 @@ class Writer:
             self._clouds.mkdir(parents=True)
         self._annotations = Table(
             folder / ANNOTATIONS_FILE,
-            ANNOTATION_COLUMNS | STATUS_COLUMNS,
+            ANNOTATION_COLUMNS | EVIDENCE_COLUMNS,
             to_json(self._provenance),
         )
         self._poses = Table(folder / EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
@@ -109,11 +106,7 @@ class Writer:
                 *quaternion,
                 *box[X : Z + 1],
                 int(refined.num_points[row]),
-                refined.status[row],
-                refined.reasons[row],
-                finite_or_none(array.scores[row]),
-                refined.covariances[row].ravel().tolist(),
-                refined.extent_covariances[row].ravel().tolist(),
+                *evidence_values(refined, row),
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(array.stamp_ns, *_pose_values(frame.T_fixed_sensor))

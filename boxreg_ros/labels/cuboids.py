@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import require_single
-from boxreg_ros.labels.protocol import absolute, INPUT_STATUS, LabelFrame
+from boxreg_ros.labels.protocol import absolute, Format, INPUT_STATUS, LabelFrame
 from boxreg_ros.labels.records import finite_or_none, refined_boxes
 from boxreg_ros.labels.sidecar import read_sidecar, Sidecar, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
@@ -31,6 +31,20 @@ EVIDENCE_KEY = 'boxreg'
 UNKNOWN_CLASS = 'unknown'
 """Class name of boxes without one, for tools that require a name."""
 UPPER_TRIANGLE = np.triu_indices(6)
+
+
+def cuboid_format(name: str, title: str, files: str) -> Format:
+    """Return the format of a tool with these conventions."""
+    return Format(
+        name=name,
+        title=title,
+        frame='sensor',
+        reference='centre',
+        sizes='length width height (x y z)',
+        rotation='angles x y z, R = Rx Ry Rz',
+        files=files,
+        options=('with_points',),
+    )
 
 
 def xyz_angles(boxes: Floats) -> Floats:

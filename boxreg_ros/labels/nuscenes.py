@@ -241,14 +241,6 @@ class Writer:
 
     def _closing_tables(self) -> dict[str, list[dict[str, Any]]]:
         """Return the tables that are written when all samples are known."""
-        sensor = self._token('sensor')
-        log = self._token('log')
-        recordings = ', '.join(self._provenance['recordings'])
-        tool = f'{self._provenance["tool"]} {self._provenance["version"]}'
-        first_sample = last_sample = ''
-        if self._num_samples:
-            first_sample = self._token('sample', 0)
-            last_sample = self._token('sample', self._num_samples - 1)
         return {
             'category': [
                 {'token': token, 'name': name, 'description': ''}
@@ -257,46 +249,58 @@ class Writer:
             'attribute': [],
             'visibility': [{'token': 'unavailable', 'level': 'unavailable', 'description': ''}],
             'instance': list(self._instances.values()),
-            'sensor': [{'token': sensor, 'channel': self.channel, 'modality': 'lidar'}],
-            'calibrated_sensor': [
-                {
-                    'token': self._token('calibrated_sensor'),
-                    'sensor_token': sensor,
-                    'translation': [0.0, 0.0, 0.0],
-                    'rotation': [1.0, 0.0, 0.0, 0.0],
-                    'camera_intrinsic': [],
-                    'camera_distortion': [],
-                }
-            ],
-            'log': [
-                {
-                    'token': log,
-                    'logfile': recordings,
-                    'vehicle': '',
-                    self.date_key: '',
-                    'location': '',
-                }
-            ],
-            'scene': [
-                {
-                    'token': self._token('scene'),
-                    'log_token': log,
-                    'nbr_samples': self._num_samples,
-                    'first_sample_token': first_sample,
-                    'last_sample_token': last_sample,
-                    'name': 'scene-0001',
-                    'description': f'{tool}: {recordings}',
-                }
-            ],
-            'map': [
-                {
-                    'token': self._token('map'),
-                    'log_tokens': [log],
-                    'category': '',
-                    'filename': EMPTY_MAP,
-                }
-            ],
+            **self._sensor_tables(),
+            **self._drive_tables(),
         }
+
+    def _sensor_tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the tables of the LiDAR, whose frame is that of the vehicle here."""
+        sensor = self._token('sensor')
+        calibrated_sensor = {
+            'token': self._token('calibrated_sensor'),
+            'sensor_token': sensor,
+            'translation': [0.0, 0.0, 0.0],
+            'rotation': [1.0, 0.0, 0.0, 0.0],
+            'camera_intrinsic': [],
+            'camera_distortion': [],
+        }
+        return {
+            'sensor': [{'token': sensor, 'channel': self.channel, 'modality': 'lidar'}],
+            'calibrated_sensor': [calibrated_sensor],
+        }
+
+    def _drive_tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the tables of the drive: one log, one scene and an empty map."""
+        log = self._token('log')
+        recordings = ', '.join(self._provenance['recordings'])
+        tool = f'{self._provenance["tool"]} {self._provenance["version"]}'
+        first_sample = last_sample = ''
+        if self._num_samples:
+            first_sample = self._token('sample', 0)
+            last_sample = self._token('sample', self._num_samples - 1)
+        log_row = {
+            'token': log,
+            'logfile': recordings,
+            'vehicle': '',
+            self.date_key: '',
+            'location': '',
+        }
+        scene_row = {
+            'token': self._token('scene'),
+            'log_token': log,
+            'nbr_samples': self._num_samples,
+            'first_sample_token': first_sample,
+            'last_sample_token': last_sample,
+            'name': 'scene-0001',
+            'description': f'{tool}: {recordings}',
+        }
+        map_row = {
+            'token': self._token('map'),
+            'log_tokens': [log],
+            'category': '',
+            'filename': EMPTY_MAP,
+        }
+        return {'log': [log_row], 'scene': [scene_row], 'map': [map_row]}
 
     def _token(self, kind: str, key: object = '') -> str:
         """Return 32 digits that are the same in every run over the same recording."""

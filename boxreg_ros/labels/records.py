@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import count
+from typing import Any
 
 from boxreg_ros.labels.protocol import INPUT_STATUS
 from boxreg_ros.rotations import rpy_from_quaternion
@@ -74,6 +75,27 @@ def boxes_from_quaternions(
     if is_rotation.any():
         angles[is_rotation] = rpy_from_quaternion(quaternion[is_rotation])
     return np.hstack([centre, extent, angles])
+
+
+EVIDENCE_COLUMNS = {
+    'status': 'string',
+    'reason': 'string',
+    'score': 'double',
+    'covariance': 'double[]',
+    'extent_covariance': 'double[]',
+}
+"""Columns of `evidence_values` in tables of Arrow, which the kits of the data sets ignore."""
+
+
+def evidence_values(refined: RefinedBoxes, row: int) -> tuple[Any, ...]:
+    """Return the values of `EVIDENCE_COLUMNS` for a box."""
+    return (
+        refined.status[row],
+        refined.reasons[row],
+        finite_or_none(refined.boxes.scores[row]),
+        refined.covariances[row].ravel().tolist(),
+        refined.extent_covariances[row].ravel().tolist(),
+    )
 
 
 def finite_or_none(value: float) -> float | None:

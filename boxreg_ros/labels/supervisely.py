@@ -18,6 +18,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.cuboids import (
     box_from_cuboid,
     Cuboid,
+    cuboid_format,
     cuboids_of,
     EVIDENCE_KEY,
     FrameNames,
@@ -28,18 +29,13 @@ from boxreg_ros.labels.cuboids import (
     write_points,
 )
 from boxreg_ros.labels.files import from_json, to_json
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.sidecar import SidecarWriter
 
-FORMAT = Format(
+FORMAT = cuboid_format(
     name='supervisely',
     title='Supervisely episodes',
-    frame='sensor',
-    reference='centre',
-    sizes='length width height (x y z)',
-    rotation='angles x y z, R = Rx Ry Rz',
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
-    options=('with_points',),
 )
 EPISODE_FOLDER = 'episode'
 CUBOID = 'cuboid_3d'

@@ -20,7 +20,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.arrow import read_rows, Table
 from boxreg_ros.labels.files import frame_names, require_single, to_json, write_provenance
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import finite_or_none, refined_boxes
+from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_values, refined_boxes
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import HEIGHT, LENGTH, X, YAW, Z
 import numpy as np
@@ -57,11 +57,7 @@ UNUSED_COLUMNS = {
 BOXREG_COLUMNS = {
     'boxreg.stamp_ns': 'int64',
     'boxreg.class_name': 'string',
-    'boxreg.status': 'string',
-    'boxreg.reason': 'string',
-    'boxreg.score': 'double',
-    'boxreg.covariance': 'double[]',
-    'boxreg.extent_covariance': 'double[]',
+    **{f'boxreg.{name}': kind for name, kind in EVIDENCE_COLUMNS.items()},
 }
 KEY_COLUMNS = {SEGMENT: 'string', MICROSECONDS: 'int64'}
 BOX_COLUMNS = (
@@ -113,11 +109,7 @@ class Writer:
                 *[None] * len(UNUSED_COLUMNS),
                 array.stamp_ns,
                 array.class_names[row],
-                refined.status[row],
-                refined.reasons[row],
-                finite_or_none(array.scores[row]),
-                refined.covariances[row].ravel().tolist(),
-                refined.extent_covariances[row].ravel().tolist(),
+                *evidence_values(refined, row),
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(*key, frame.T_fixed_sensor.ravel().tolist())

@@ -18,6 +18,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.cuboids import (
     box_from_cuboid,
     Cuboid,
+    cuboid_format,
     cuboids_of,
     EVIDENCE_KEY,
     FrameNames,
@@ -28,18 +29,13 @@ from boxreg_ros.labels.cuboids import (
     write_points,
 )
 from boxreg_ros.labels.files import from_json, to_json
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.sidecar import SidecarWriter
 
-FORMAT = Format(
+FORMAT = cuboid_format(
     name='xtreme1',
     title='Xtreme1',
-    frame='sensor',
-    reference='centre',
-    sizes='length width height (x y z)',
-    rotation='angles x y z, R = Rx Ry Rz',
     files='scene_1/result/STAMP.json, scene_1/lidar_point_cloud_0/STAMP.pcd',
-    options=('with_points',),
 )
 SCENE_FOLDER = 'scene_1'
 CLOUDS_FOLDER = 'lidar_point_cloud_0'

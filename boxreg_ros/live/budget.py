@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from functools import partial
+from math import inf
 import time
 
 from boxreg_ros.config import Config
@@ -24,21 +26,34 @@ BATCH_OVERHEAD = 25
 `boxreg bench speed`: 10 ms beside 0.4 ms a window."""
 RECENT = 10
 """Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
+OVERRUNS = 100
+"""
+Ticks whose largest overrun is left as a reserve; derived: the next one exceeds it with a
+probability of 1 / 101, so that the deadline holds for 99 of 100 box arrays.
+
+"""
+LARGEST_RESERVE = 0.5
+"""Part of the deadline that the reserve may take; chosen: a longer interruption of the process
+would leave no time for solving in the `OVERRUNS` ticks after it."""
 
 
 class TickBudget:
     """
     How many windows may be solved for a box array, so that it is published by its deadline.
 
-    The registrar reads no clock; this object does for it. It times every batch, and returns a
-    number of windows by the second longest time of a window among the recent batches: a single
-    interruption of the process is ignored.
+    The registrar reads no clock; this object does for it. The time for windows is what is left of
+    the deadline after decoding and cropping, which have been done by then, less the time for
+    publishing in the tick before, less a reserve: the largest overrun of the recent ticks. The
+    time of a window is the second longest among the recent batches: a single interruption of the
+    process is ignored.
 
     Parameters
     ----------
     deadline : float
         Maximum time from complete data to published early boxes [s]; negative:
         `PART_OF_PERIOD` of the measured period of the boxes.
+    clock : callable
+        Returns a time that never jumps [s].
 
     Attributes
     ----------
@@ -47,11 +62,14 @@ class TickBudget:
 
     """
 
-    def __init__(self, deadline: float) -> None:
+    def __init__(self, deadline: float, clock: Callable[[], float] = time.monotonic) -> None:
         self.deadline = deadline
-        self._since = time.monotonic()
+        self._clock = clock
+        self._since = clock()
         self._solved_at = self._since
+        self._planned_end = inf
         self._publishing_time = 0.0
+        self._overruns = deque[float](maxlen=OVERRUNS)  # of the planned end [s]
         self._times = deque[float](maxlen=RECENT)  # per window [s]
         self._arrivals = deque[float](maxlen=RECENT)
 
@@ -62,22 +80,31 @@ class TickBudget:
         self._arrivals.append(received)
 
     def begin(self, since: float) -> None:
-        """Begin a tick whose data are complete and were not waited for after `since` [s]."""
+        """Begin a tick whose data are complete since a moment (monotonic) [s]."""
         self._since = since
         self._solved_at = 0.0
+        self._planned_end = inf
 
     def end(self) -> None:
-        """End a tick: its boxes are published."""
+        """End a tick, unless it has ended: its early boxes are published."""
         if self._solved_at:
-            self._publishing_time = time.monotonic() - self._solved_at
+            now = self._clock()
+            self._publishing_time = now - self._solved_at
+            self._overruns.append(now - self._planned_end)
+            self._solved_at = 0.0
 
     def windows(self) -> int:
         """Return how many windows may be solved; at least one, so that its time is measured."""
         if not self._times:
             return 1
-        time_left = self._since + self.seconds - self._publishing_time - time.monotonic()
+        reserve = max(0.0, min(LARGEST_RESERVE * self.seconds, max(self._overruns, default=0.0)))
+        planned_end = self._since + self.seconds - reserve
+        time_left = planned_end - self._publishing_time - self._clock()
         time_of_window = sorted(self._times)[-2:][0]
-        return max(1, int(time_left / time_of_window) - BATCH_OVERHEAD)
+        number = int(time_left / time_of_window) - BATCH_OVERHEAD
+        if number > 0:  # else the tick is late whatever is planned
+            self._planned_end = planned_end
+        return max(1, number)
 
     def submit(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
         """Return a function that calls `register` with these arguments, and times it."""
@@ -96,9 +123,9 @@ class TickBudget:
     def _timed(
         self, windows: list[Window], config: Config, model: InputModel
     ) -> list[Estimate | None]:
-        begin = time.monotonic()
+        begin = self._clock()
         estimates = register(windows, config, model)
-        self._solved_at = time.monotonic()
+        self._solved_at = self._clock()
         num_solved = sum(estimate is not None for estimate in estimates)
         if num_solved:
             self._times.append((self._solved_at - begin) / (num_solved + BATCH_OVERHEAD))

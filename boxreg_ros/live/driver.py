@@ -23,7 +23,7 @@ from boxreg_ros.io.session import (
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.label_tap import LabelTap, Part
-from boxreg_ros.structures import BoxArray, Floats, REFINED, RefinedBoxes, Sweep
+from boxreg_ros.structures import BoxArray, COASTED, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
 from msg_adapters.poses import turned_covariances
@@ -94,6 +94,14 @@ class Outgoing(NamedTuple):
     received: float | None = None
 
 
+class _Detection(NamedTuple):
+    """The last message with a box of a track, the row of the box, and its stamp [ns]."""
+
+    message: Any
+    row: int
+    stamp_ns: int
+
+
 @dataclass(eq=False, slots=True)
 class _Pending:
     """A message whose boxes are with the registrar; the ticket of these boxes."""
@@ -104,6 +112,8 @@ class _Pending:
     T_output_fixed: Floats
     T_output_item: Floats | None  # None: the output frame is that of the message
     has_new_ids: bool
+    earlier: dict[str, _Detection]
+    """By id, of the tracks that have no box in the message."""
     is_early_out: bool = False
 
 
@@ -176,6 +186,7 @@ class LiveRegistrar:
             self._registrar = BoxRegistrar(config, budget.submit, budget.windows)
         self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
+        self._detections: dict[str, _Detection] = {}  # by track id, while tracks may coast
         self._made: list[Outgoing] = []  # survives an error while further messages are made
         self._choose_at: float | None = None
         self._last_boxes = 0.0
@@ -271,7 +282,10 @@ class LiveRegistrar:
             fixed_frame = self._session.require_fixed_frame(content)
         except TransformUnavailable:
             return False
-        is_covered = self.tree.covers(fixed_frame, content.frame_id, content.stamp_ns)
+        stamp_ns = content.stamp_ns
+        if isinstance(content, Sweep):
+            stamp_ns = self.placement.last_stamp_ns(content)
+        is_covered = self.tree.covers(fixed_frame, content.frame_id, stamp_ns)
         if is_covered and self._changes_frame(content):
             return self.tree.covers(self.output_frame, fixed_frame, content.stamp_ns)
         return is_covered
@@ -378,6 +392,7 @@ class LiveRegistrar:
     def reset(self) -> list[Outgoing]:
         """Forget everything but the transforms; return everything that is held."""
         ready = self.flush()
+        self._detections = {}
         self._registrar.reset()
         self._session.restart()
         return ready
@@ -399,6 +414,7 @@ class LiveRegistrar:
         """
         self._registrar.reset()
         self._session.restart()
+        self._detections = {}
         held = list(self._held)
         self._held.clear()
         self.tap.keep_all('failed')
@@ -468,10 +484,27 @@ class LiveRegistrar:
         pending = _Pending(
             item.message, replace(given, track_ids=moved.track_ids), item.received,
             T_output_fixed, T_output_item, moved.track_ids != content.track_ids,
+            self._earlier_detections(item.message, moved),
         )  # fmt: skip
         self._held.append(pending)
         self.tap.expect(pending, moved, T_fixed_item)
         return replace(moved, ticket=pending)
+
+    def _earlier_detections(self, message: Any, boxes: BoxArray) -> dict[str, _Detection]:
+        """Return the last detections of tracks that miss one in `boxes`; note those of `boxes`."""
+        oldest_ns = boxes.stamp_ns - round(self.config.coast * 1e9)
+        own = set(boxes.track_ids)
+        earlier = {
+            track_id: detection
+            for track_id, detection in self._detections.items()
+            if detection.stamp_ns >= oldest_ns and track_id not in own
+        }
+        if self.config.coasts:
+            self._detections = earlier | {
+                track_id: _Detection(message, row, boxes.stamp_ns)
+                for row, track_id in enumerate(boxes.track_ids)
+            }
+        return earlier
 
     def _changes_frame(self, content: Sweep | BoxArray) -> bool:
         """Return whether boxes are published in another frame than that of their message."""
@@ -498,9 +531,14 @@ class LiveRegistrar:
         assert self.adapter is not None  # it has read the message
         moved = refined_to_frame(refined, pending.T_output_fixed, pending.given.frame_id)
         message = pending.message
+        coasted = refined.boxes.track_ids[len(pending.given.track_ids) :]
+        if coasted:
+            sources = [pending.earlier[track_id][:2] for track_id in coasted]
+            message = self.adapter.with_added(message, sources)
         T_output_item = pending.T_output_item
+        is_changed = REFINED in refined.status or COASTED in refined.status
         # Copying a message takes time; under load most boxes are kept.
-        if REFINED in refined.status or T_output_item is not None or pending.has_new_ids:
+        if is_changed or T_output_item is not None or pending.has_new_ids:
             covariances = covariances_to_write(moved)
             message = self.adapter.to_msg(message, moved.boxes, covariances, T_output_item)
         return Outgoing(message, refined.is_final, pending.given, moved, pending.received)

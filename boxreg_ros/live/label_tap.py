@@ -66,6 +66,7 @@ class LabelTap:
         sweep, T_fixed_sweep = whole, np.eye(4)
         if len(parts) == 1:  # not moved, files get the numbers of the message
             _, sweep, T_fixed_sweep = parts[0]
+            sweep = replace(sweep, times=whole.times)
         self._cloud_stamps.append(sweep.stamp_ns)
         needed_from_ns = min(self._cloud_stamps)
         if self._order.first_ns is not None:

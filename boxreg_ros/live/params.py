@@ -76,9 +76,9 @@ NODE_SETTINGS = (
         's', -1.0, 3600.0,
     ),
     Setting(
-        'backlog', 0.1,
-        'maximum wait of a cloud for the solver before it is dropped; of a box array ten times '
-        'that, before it passes through unrefined',
+        'backlog', 0.5,
+        'maximum wait of a cloud for those before it, after which it is dropped; of a box array '
+        'ten times that, before it passes through unrefined',
         's', 0.0, 3600.0,
     ),
     Setting(
@@ -105,7 +105,7 @@ NODE_SETTINGS = (
 
 DYNAMIC = (
     *('sampling.', 'solver.', 'paper.', 'vehicle.', 'cyclist.', 'pedestrian.'),
-    *('max_gap', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
+    *('max_gap', 'coast', 'min_observations', 'output_frame', 'transform_timeout', 'deadline'),
     *('config_file', 'record_'),
 )
 """Prefixes of the parameters that may change while the node runs."""

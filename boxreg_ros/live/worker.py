@@ -99,7 +99,7 @@ class Worker:
         self._logger = logger
         self._budget = budget
         self._backlog = backlog
-        self._idle_at = 0.0
+        self._complete_at = 0.0  # when a message got its transforms, and how long it had waited
         self._waited = 0.0
         self._board = MarkerBoard()
         self._markers = markers
@@ -143,8 +143,8 @@ class Worker:
                 item = None
             else:
                 self._inbox.wake_up.wait(TRANSFORM_PERIOD)
-                self._idle_at = time.monotonic()
-                self._waited = self._idle_at - item.received
+                self._complete_at = time.monotonic()
+                self._waited = self._complete_at - item.received
         self._finish(item)
 
     def drop(self, message: Message) -> None:
@@ -196,7 +196,7 @@ class Worker:
         if message.topic == 'boxes':
             patience *= BOXES_PATIENCE
         # What arrived while a transform was waited for may take as long again to be solved.
-        since = max(message.received, self._idle_at + self._waited)
+        since = max(message.received, self._complete_at + self._waited)
         return time.monotonic() > since + patience
 
     def _decoded(self, message: Message) -> ReceivedMessage | None:
@@ -237,7 +237,6 @@ class Worker:
             self._markers.publish(self._board.clear())
         is_holding = self._live.is_holding
         self._inbox.wake_up.wait(HELD_PERIOD if is_holding else IDLE_PERIOD)
-        self._idle_at = time.monotonic()
         self._waited = 0.0
 
     def _release_boxes_without_cloud(self, item: ReceivedMessage | None) -> None:
@@ -280,13 +279,12 @@ class Worker:
     def _process(self, item: ReceivedMessage) -> None:
         if isinstance(item.content, BoxArray):
             self._budget.add_arrival(item.received)
-        self._budget.begin(max(item.received, self._idle_at))
+        self._budget.begin(max(item.received, self._complete_at))
         ready = self._guarded(partial(self._live.process, item), item)
         if self.fixed_frame != self._live.fixed_frame:
             self.fixed_frame = self._live.fixed_frame
             self._logger.info(f'fixed frame is {self.fixed_frame!r}')
         self._publish(ready)
-        self._budget.end()
         if is_placeholder(item.content) and self._board.is_showing:
             self._markers.publish(self._board.clear())
 
@@ -309,6 +307,7 @@ class Worker:
             publisher.publish(out.message)
             self._health.count('final_published' if out.is_final else 'early_published')
             if not out.is_final and out.received is not None:
+                self._budget.end()
                 self._health.add_latency(time.monotonic() - out.received)
             if not out.is_final and out.given is not None:
                 self.tracks = len(set(out.given.track_ids) - {''})

@@ -51,8 +51,8 @@ def add_recording_arguments(
     )  # fmt: skip
 
 
-def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the topics to read, the LiDARs, and the convention of the boxes."""
+def add_lidar_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the topics of the clouds, and the frames and times of their LiDARs."""
     parser.add_argument(
         '--points', action='append', default=[], metavar='TOPIC',
         help='topic of the point clouds (default: found by type); repeat it to merge the clouds '
@@ -72,6 +72,11 @@ def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
         '--time-unit', choices=TIME_UNIT_CHOICES, default=AUTO,
         help='unit of the times of the points (default: that of the layout, else by magnitude)',
     )  # fmt: skip
+
+
+def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the topics to read, the LiDARs, and the convention of the boxes."""
+    add_lidar_arguments(parser)
     parser.add_argument(
         '--boxes', metavar='TOPIC', help='topic of the boxes (default: found by type)'
     )

@@ -294,7 +294,7 @@ def run(args: argparse.Namespace) -> int:
         convention=convention_from(args),
     )
     recording.has_boxes = not args.no_boxes
-    drive = Drive.of(recording, truth, config.tolerance)
+    drive = Drive.of(recording, truth, config.tolerance, config)
     if drive.left_out:
         print(f'boxreg: {drive.left_out}', file=sys.stderr)
     measured = labelling_margins(drive, config)

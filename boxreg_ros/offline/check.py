@@ -81,7 +81,7 @@ def _tracks(source: str, config: Config) -> list[LabelTrack]:
     """Read the tracks of label files or of a recording."""
     path = Path(source)
     if _is_recording(path):
-        from boxreg_ros.io.items import input_boxes  # slow to import: it reads bags
+        from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
         from boxreg_ros.offline.sources import source_of
 
         arrays, _ = input_boxes(source_of([path]))

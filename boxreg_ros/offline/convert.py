@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import hashlib
@@ -14,8 +14,8 @@ from typing import Any
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.lidars import Lidars
-from boxreg_ros.io.transforms import boxes_to_frame, TransformTree
+from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.labels import (
     check_options,
     frames_of,
@@ -26,11 +26,15 @@ from boxreg_ros.labels import (
     writer_for,
 )
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.offline.arguments import add_label_arguments
-from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
+from boxreg_ros.offline.arguments import (
+    add_label_arguments,
+    add_lidar_arguments,
+    lidars_from,
+)
+from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.result_folder import SUMMARY, whole_folder
 from boxreg_ros.offline.sources import source_of
-from boxreg_ros.structures import Sweep
+from boxreg_ros.structures import BoxArray, Sweep
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,9 @@ class Conversion:
     recordings : tuple of Path
         Recordings of the labels, from which sensor poses and clouds are read. Not needed if the
         label files contain the poses.
-    points, fixed_frame, label_frame, odometry : str or None
+    lidars : Lidars
+        Topics of the clouds, as for `boxreg relabel`.
+    fixed_frame, label_frame, odometry : str or None
         As for `boxreg relabel`.
 
     """
@@ -61,10 +67,18 @@ class Conversion:
     target_formats: tuple[str, ...]
     options: Options = field(default_factory=Options)
     recordings: tuple[Path, ...] = ()
-    points: str | None = None
+    lidars: Lidars = SINGLE_LIDAR
     fixed_frame: str | None = None
     label_frame: str | None = None
     odometry: str | None = None
+
+
+@dataclass(slots=True)
+class _Unused:
+    """What of a recording was not used: the number of unreadable messages, and all in a line."""
+
+    unreadable: int = 0
+    text: str = ''
 
 
 def convert(request: Conversion, out: Path) -> dict[str, Any]:
@@ -97,13 +111,14 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
     _check(request)
     provenance = Provenance.of(request.recordings or (request.source,))
     counts: Counter[str] = Counter()
+    unused = _Unused()
     inputs = (request.source, *request.recordings, request.options.camera)
     with whole_folder(out, inputs) as folder:
         writers = {
             name: writer_for(name, folder, provenance, request.options)
             for name in request.target_formats
         }
-        for frame in _read_frames(request, folder, counts):
+        for frame in _read_frames(request, folder, unused):
             counts['frames'] += 1
             counts['boxes'] += len(frame.refined.status)
             for writer in writers.values():
@@ -119,7 +134,8 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
             'to': list(request.target_formats),
             'frames': counts['frames'],
             'boxes': counts['boxes'],
-            'unreadable': counts['unreadable'],
+            'unreadable': unused.unreadable,
+            'unused': unused.text,
             'left_out_of_labels': {name: found for name, found in left_out.items() if found},
             'versions': {'boxreg_ros': __version__},
             'fingerprint': hashlib.sha256(repr((__version__, request)).encode()).hexdigest(),
@@ -133,15 +149,16 @@ def _check(request: Conversion) -> None:
     module_of(request.source_format)
     recording_settings = (
         request.options.with_points,
-        request.points,
+        request.lidars != SINGLE_LIDAR,
         request.odometry,
         request.fixed_frame,
         request.label_frame,
     )
     if not request.recordings and any(recording_settings):
         raise ConfigError(
-            '--with-points, --points, --odometry, --fixed-frame, --label-frame: expected a '
-            'recording to apply them to, got none; give it with --recording'
+            '--with-points, --points, --sensor-frame, --points-info, --time-unit, --odometry, '
+            '--fixed-frame, --label-frame: expected a recording to apply them to, got none; give '
+            'it with --recording'
         )
     check_options(request.target_formats, request.options)
 
@@ -159,50 +176,60 @@ def _require_boxes(
             )
 
 
-def _read_frames(request: Conversion, folder: Path, counts: Counter[str]) -> Iterator[LabelFrame]:
+def _read_frames(request: Conversion, folder: Path, unused: _Unused) -> Iterator[LabelFrame]:
     """Yield the labels, in the fixed frame where the transform is known."""
     if request.recordings:
-        yield from _read_with_recording(request, folder, counts)
+        yield from _read_with_recording(request, folder, unused)
         return
     for frame in frames_of(request.source_format, request.source):
         yield frame.moved('fixed')
 
 
 def _read_with_recording(
-    request: Conversion, folder: Path, counts: Counter[str]
+    request: Conversion, folder: Path, unused: _Unused
 ) -> Iterator[LabelFrame]:
-    """Yield the labels with poses and clouds of the recording; count unreadable messages."""
-    tree = TransformTree()
+    """Yield the labels with poses and clouds of the recording; note what could not be used."""
     labels = (request.source_format, request.source)
-    spool = Spool(folder, Config()) if request.options.with_points else None
-    lidars = Lidars((request.points,) if request.points else ())
-    source = source_of(request.recordings, lidars, odometry=request.odometry, labels=labels)
+    config = Config()
+    waiting = deque[LabelFrame]()  # merged clouds are complete later than the boxes of their time
+    spool = Spool(folder, config) if request.options.with_points else None
+    source = source_of(
+        request.recordings, request.lidars, odometry=request.odometry, labels=labels
+    )
     with source as recording:
-        fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
-        sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
-        for read in recording.items(tree, with_intensities=spool is not None):
-            item = read.content
-            if isinstance(item, Sweep):
-                T_fixed_sweep = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
-                if spool is not None and T_fixed_sweep is not None:
-                    spool.add(item, T_fixed_sweep, read.intensities)
+        items = FixedFrameItems(recording, config, fixed_frame=request.fixed_frame)
+        fixed_frame = items.fixed_frame
+        sensor_frame = label_frame_of(recording, items.tree, fixed_frame, request.label_frame)
+        for item in items.read(with_clouds=spool is not None, with_intensities=True):
+            if isinstance(item.given, Sweep):
+                if spool is not None:
+                    yield from _with_clouds(waiting, items.stored_cloud(item, sensor_frame), spool)
                 continue
-            T_fixed_boxes = pose_of(tree, fixed_frame, item.frame_id, item.stamp_ns)
-            boxes = item
-            if T_fixed_boxes is not None:
-                boxes = boxes_to_frame(item, T_fixed_boxes, fixed_frame)
-            T_fixed_sensor = pose_of(tree, fixed_frame, sensor_frame, item.stamp_ns)
-            sweep = intensities = None
-            if spool is not None and T_fixed_sensor is not None:
-                sweep, intensities = spool.take(item.stamp_ns, sensor_frame, T_fixed_sensor)
-            assert read.refined is not None  # boxes of label files have it
-            refined = replace(read.refined, boxes=boxes)
-            yield LabelFrame(
-                refined, fixed_frame, sensor_frame, T_fixed_sensor, sweep, intensities
-            )
-        counts['unreadable'] = recording.unreadable.total()
+            refined = item.items[0].refined
+            assert refined is not None  # boxes of label files have it
+            if isinstance(item.moved, BoxArray):
+                refined = replace(refined, boxes=item.moved)
+            T_fixed_sensor = items.pose_of(sensor_frame, item.given.stamp_ns)
+            frame = LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor)
+            if spool is None:
+                yield frame
+            else:
+                waiting.append(frame)
+        unused.unreadable = recording.unreadable.total()
+        unused.text = items.left_out()
     if spool is not None:
+        yield from map(spool.with_cloud, waiting)
         spool.remove()
+
+
+def _with_clouds(
+    waiting: deque[LabelFrame], cloud: StoredCloud, spool: Spool
+) -> Iterator[LabelFrame]:
+    """Store a cloud, and yield the frames up to its stamp with theirs."""
+    if cloud.T_fixed_sweep is not None:
+        spool.add(cloud.sweep, cloud.T_fixed_sweep, cloud.intensities)
+    while waiting and waiting[0].refined.boxes.stamp_ns <= cloud.sweep.stamp_ns:
+        yield spool.with_cloud(waiting.popleft())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -232,7 +259,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='recording of the labels, if the label files lack the sensor poses; repeatable',
     )  # fmt: skip
     add_label_arguments(parser)
-    parser.add_argument('--points', metavar='TOPIC', help='point clouds of the recording')
+    add_lidar_arguments(parser)
     parser.add_argument(
         '--odometry', metavar='TOPIC', help='odometry of the recording, if TF has no fixed frame'
     )
@@ -244,7 +271,7 @@ def run(args: argparse.Namespace) -> int:
     request = Conversion(
         args.source, args.source_format, args.target_formats,
         Options(args.with_points, args.camera, args.swap_axes), tuple(args.recording),
-        args.points, args.fixed_frame, args.label_frame, args.odometry,
+        lidars_from(args), args.fixed_frame, args.label_frame, args.odometry,
     )  # fmt: skip
     summary = convert(request, args.out)
     parts = [
@@ -254,7 +281,7 @@ def run(args: argparse.Namespace) -> int:
     for name, counts in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in counts.items())
         parts.append(f'{name} leaves out {reasons}')
-    if summary['unreadable']:
-        parts.append(f'{summary["unreadable"]:,} messages could not be read')
+    if summary['unused']:
+        parts.append(summary['unused'])
     print('; '.join(parts))
     return 0

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.datasets import SceneRecording
-from boxreg_ros.errors import RecordingError, TransformUnavailable
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.items import left_out
+from boxreg_ros.io.fixed_frame import FixedFrameItems
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.session import register
-from boxreg_ros.io.transforms import sweep_to_frame, to_fixed_frame, TransformTree
+from boxreg_ros.io.transforms import sweep_to_frame
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.scene import Scene
 from boxreg_ros.structures import (
@@ -30,8 +30,9 @@ from boxreg_ros.structures import (
     WIDTH,
 )
 import numpy as np
-from numpy.typing import NDArray
 
+DEFAULTS = Config()
+"""Settings by which clouds of several LiDARs are merged unless others are given."""
 NEARBY_MARGIN = 1.0
 """Points up to this distance outside of a box are passed to the baselines [m]."""
 
@@ -66,9 +67,9 @@ class Drive:
         return cls(moved, tuple(scene.fixed_detections()), scene.truth)
 
     @classmethod
-    def read(cls, folder: Path) -> Drive:
+    def read(cls, folder: Path, lidars: Lidars = SINGLE_LIDAR) -> Drive:
         """
-        Read the one recording in a folder and the ``truth.csv`` beside it.
+        Read the one recording in a folder, of these LiDARs, and the ``truth.csv`` beside it.
 
         Raises
         ------
@@ -83,7 +84,7 @@ class Drive:
         found = found or [p.parent for p in sorted(folder.glob('*/metadata.yaml'))]
         if len(found) != 1:
             raise RecordingError(f'{folder}: expected one recording in it, got {len(found)}')
-        return cls.of(Recording(found), truth)
+        return cls.of(Recording(found, lidars), truth)
 
     @classmethod
     def of(
@@ -91,12 +92,14 @@ class Drive:
         recording: Recording | SceneRecording,
         truth: BoxTable,
         within: float | None = None,
+        config: Config = DEFAULTS,
     ) -> Drive:
         """
         Read a recording that is not open yet, in the frame of its true boxes.
 
-        Messages that cannot be decoded or have no transform are left out. Sweeps are held in
-        memory: all of them, or those within `within` [s] of the stamp of a true box.
+        Messages that cannot be decoded or have no transform are left out; clouds of several
+        LiDARs are merged by `config`. Sweeps are held in memory: all of them, or those within
+        `within` [s] of the stamp of a true box.
 
         Raises
         ------
@@ -104,27 +107,22 @@ class Drive:
             If it has no sweeps, cannot be read, or no transforms connect it with that frame.
 
         """
-        tree = TransformTree()
         sweeps: list[Sweep] = []
         boxes: list[BoxArray] = []
-        missing_transforms: list[str] = []
         has_sweeps = False
         with recording:
-            fixed_frame = recording.choose_fixed_frame(tree, truth.frame_id)
-            for item in recording.items(tree):
-                try:
-                    moved = to_fixed_frame(item.content, tree, fixed_frame)
-                except TransformUnavailable as error:
-                    missing_transforms.append(str(error))
-                    continue
+            items = FixedFrameItems(recording, config, fixed_frame=truth.frame_id)
+            for item in items.read():
+                moved = item.moved
                 if isinstance(moved, BoxArray):
                     boxes.append(moved)
+                if not isinstance(moved, Sweep):
                     continue
                 has_sweeps = True
                 away_ns = np.abs(truth.stamps_ns - moved.stamp_ns)
                 if within is None or (away_ns <= within * 1e9).any():
                     sweeps.append(moved)
-        others = left_out(recording, missing_transforms)
+            others = items.left_out()
         if not has_sweeps:
             reason = f': {others}' if others else ''
             raise RecordingError(f'{recording}: expected sweeps, got none{reason}')
@@ -167,18 +165,24 @@ class Drive:
             boxes = np.array([array.boxes[i] for array, i in places])
             stamps = np.array([array.stamp_ns for array, _ in places])
             near = self.sweeps_at(stamps)
-            points = [_crop(sweep.points, box) for sweep, box in zip(near, boxes, strict=True)]
-            origins = np.array([sweep.origin for sweep in near])
+            rows_near = [_nearby(sweep, box) for sweep, box in zip(near, boxes, strict=True)]
+            pairs = list(zip(near, rows_near, strict=True))
+            points = [sweep.points[nearby] for sweep, nearby in pairs]
+            origins = np.array([_main_origin(sweep, nearby) for sweep, nearby in pairs])
             array, i = places[0]
             tracks.append(Track(track_id, array.class_names[i], stamps, boxes, points, origins))
         return tracks
 
     def ranges(self, rows: Ints) -> Floats:
-        """Return the horizontal distance (n,) of the true boxes in `rows` to the sensor [m]."""
+        """Return the horizontal distance (n,) of the true boxes in `rows` to a sensor [m]."""
         near = self.sweeps_at(self.truth.stamps_ns[rows])
-        origins = np.array([sweep.origin for sweep in near]).reshape(-1, 3)
-        ranges: Floats = np.linalg.norm((self.truth.boxes[rows, :3] - origins)[:, :2], axis=1)
-        return ranges
+        centers = self.truth.boxes[rows, :2]
+        return np.array(
+            [
+                np.linalg.norm(center - _origins(sweep)[:, :2], axis=1).min()
+                for sweep, center in zip(near, centers, strict=True)
+            ]
+        )
 
     def sweeps_at(self, stamps_ns: Ints) -> list[Sweep]:
         """Return the sweep nearest in time to each stamp."""
@@ -189,11 +193,22 @@ class Drive:
         return [self.sweeps[row] for row in rows]
 
 
-def _crop(points: NDArray[Any], box: Floats) -> NDArray[Any]:
-    """Return the points within `NEARBY_MARGIN` of a box."""
+def _nearby(sweep: Sweep, box: Floats) -> Ints:
+    """Return the rows of the points within `NEARBY_MARGIN` of a box."""
     reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + 2 * NEARBY_MARGIN
-    near = points[(np.abs(points[:, :2] - box[:2]) < reach).all(axis=1)]
-    R = matrix_from_rpy(box[ROLL:])
-    inside = (np.abs((near - box[:3]) @ R) < box[BOX_EXTENT] / 2 + NEARBY_MARGIN).all(axis=1)
-    cropped: NDArray[Any] = near[inside]
-    return cropped
+    near = np.flatnonzero((np.abs(sweep.points[:, :2] - box[:2]) < reach).all(axis=1))
+    local = (sweep.points[near] - box[:3]) @ matrix_from_rpy(box[ROLL:])
+    return near[(np.abs(local) < box[BOX_EXTENT] / 2 + NEARBY_MARGIN).all(axis=1)]
+
+
+def _origins(sweep: Sweep) -> Floats:
+    """Return the positions (K, 3) of the sensors of a sweep [m]."""
+    return sweep.origin[None] if sweep.origins is None else sweep.origins
+
+
+def _main_origin(sweep: Sweep, rows: Ints) -> Floats:
+    """Return the position (3,) of the sensor that measured most of some points [m]."""
+    if sweep.sensors is None or not len(rows):
+        return sweep.origin
+    row = int(np.bincount(sweep.sensors[rows]).argmax())
+    return np.asarray(_origins(sweep)[row])

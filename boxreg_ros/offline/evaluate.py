@@ -145,7 +145,7 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
             )
         found = _table_in_frame(BoxTable.read_frames(source), frame_id)
         return found.rows(np.array([status != REJECTED for status in found.status], bool))
-    from boxreg_ros.io.items import input_boxes  # slow to import: it reads bags
+    from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
     from boxreg_ros.offline.sources import source_of
 
     recording = source_of([source], lidars_from(args), convention=convention, **topics)

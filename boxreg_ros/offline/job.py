@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from glob import glob
 import hashlib
@@ -36,6 +37,8 @@ class Job:
         Name of its result folder.
     recordings : tuple of Path
         Files or folders, merged by time.
+    size : int
+        Size of all files [bytes]; 0 where it is unknown.
     key : str
         Hash of the content of its files, the options and the version.
     status : str
@@ -57,6 +60,7 @@ class Job:
 
     name: str
     recordings: tuple[Path, ...]
+    size: int = 0
     key: str = ''
     status: str = 'waiting'
     exit_status: int | None = None
@@ -78,13 +82,11 @@ class Job:
             inner = sorted(path.iterdir()) if path.is_dir() else [path]
             yield from (file for file in inner if file.is_file())
 
-    def size(self) -> int:
-        """Return the size of all files [bytes]; 0 where it is unknown, which the job reports."""
-        try:
+    def measure(self) -> None:
+        """Set `size`; a job whose files cannot be found reports it when it runs."""
+        with suppress(OSError, RecordingError):
             local = sum(file.stat().st_size for file in self.files())
-            return local + sum(entry.size for entry in self.entries())
-        except (OSError, RecordingError):
-            return 0
+            self.size = local + sum(entry.size for entry in self.entries())
 
     def entries(self) -> Iterator[Entry]:
         """Yield all files of the recordings behind URLs."""

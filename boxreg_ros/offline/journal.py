@@ -11,18 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 import fcntl
-import hashlib
 from io import BytesIO
 from pathlib import Path
 import pickle
 import struct
-from tempfile import gettempdir
 from types import TracebackType
-from typing import Any, BinaryIO, cast, Self, TYPE_CHECKING
+from typing import Any, BinaryIO, cast, Protocol, Self, TYPE_CHECKING
 import zlib
 
-from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.storage.urls import url_of
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.storage.urls import delete_files, names_of, read_bytes, url_of, write_bytes
 import numpy as np
 
 if TYPE_CHECKING:  # these import torch
@@ -42,6 +40,125 @@ TRUSTED_NAMES = (
 """What a record may refer to: a pickle of other names could run any code."""
 
 
+class Records(Protocol):
+    """The records of a journal, in their order."""
+
+    def next(self) -> bytes | None:
+        """Return the next record of an earlier run; None behind the last whole one."""
+
+    def append(self, content: bytes) -> None:
+        """Store a record behind all others."""
+
+    def clear(self) -> None:
+        """Delete all records; others may follow."""
+
+    def delete(self) -> None:
+        """Delete the journal itself."""
+
+    def close(self) -> None:
+        """Let another run use the journal."""
+
+
+class FileRecords:
+    """
+    Records in one locked file of this machine; see `Records`.
+
+    Raises
+    ------
+    RecordingError
+        If another run uses the file, or its folder cannot be written.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = cast(BinaryIO, path.open('a+b'))
+        try:
+            # Not flock: forked workers would hold that lock after this process is killed.
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):  # POSIX allows both
+            self._file.close()
+            raise RecordingError(
+                f'{path}: expected no other run with the same output, got one that goes on; '
+                f'wait until it has ended, or choose another output with -o'
+            ) from None
+        self._file.seek(0)
+
+    def next(self) -> bytes | None:
+        """Return the next record; None behind the last whole one, where the file is cut off."""
+        begin = self._file.tell()
+        head = self._file.read(HEAD.size)
+        if len(head) == HEAD.size:
+            size, crc = HEAD.unpack(head)
+            content = self._file.read(size)
+            if len(content) == size and zlib.crc32(content) == crc:
+                return content
+        self._file.truncate(begin)
+        return None
+
+    def append(self, content: bytes) -> None:
+        """Write a record at the end of the file."""
+        self._file.write(HEAD.pack(len(content), zlib.crc32(content)) + content)
+        self._file.flush()
+
+    def clear(self) -> None:
+        """Empty the file, which stays locked."""
+        self._file.truncate(0)
+
+    def delete(self) -> None:
+        """Delete the file."""
+        self._path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Close the file, which unlocks it."""
+        self._file.close()
+
+
+class ObjectRecords:
+    """
+    Records in a folder behind a URL, one file each; see `Records`.
+
+    Object stores cannot append to a file, and have no locks: a second run with the same output is
+    not noticed. It writes the same records, because the registrar is deterministic.
+
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._stored = set(names_of(folder))
+        self._count = 0
+
+    def next(self) -> bytes | None:
+        """Return the next record; None behind the last one."""
+        name = self._name()
+        if name not in self._stored:
+            return None
+        self._count += 1
+        return read_bytes(self._folder / name)
+
+    def append(self, content: bytes) -> None:
+        """Write the file of a record; it appears whole."""
+        write_bytes(self._folder / self._name(), content)
+        self._count += 1
+
+    def clear(self) -> None:
+        """Delete all files of the folder."""
+        self.delete()
+        self._stored.clear()
+        self._count = 0
+
+    def delete(self) -> None:
+        """Delete all files of the folder, which is gone then."""
+        delete_files(self._folder)
+
+    def close(self) -> None:
+        """Do nothing: nothing is open."""
+
+    def _name(self) -> str:
+        return f'{self._count:06d}'
+
+
 class Journal:
     """
     Store estimates in the order their windows are submitted; use as a context manager.
@@ -49,7 +166,8 @@ class Journal:
     Parameters
     ----------
     path : Path
-        File of the journal. It is deleted after success, and where it has no record.
+        File of the journal, or its folder behind a URL. It is deleted after success, and where it
+        has no record.
     fingerprint : str
         Of the request. A journal of another request is begun again.
 
@@ -66,22 +184,13 @@ class Journal:
         self._earlier: Iterator[Any] = iter(())
 
     def __enter__(self) -> Self:
-        """Open the journal, find the records of an earlier run, and lock it."""
-        self._file = cast(BinaryIO, self._path.open('a+b'))
-        try:
-            # Not flock: forked workers would hold that lock after this process is killed.
-            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError):  # POSIX allows both
-            self._file.close()
-            raise RecordingError(
-                f'{self._path}: expected no other run with the same output, got one that goes on; '
-                f'wait until it has ended, or choose another output with -o'
-            ) from None
-        self._file.seek(0)
-        if self._next() == self._fingerprint:
-            self._earlier = iter(self._next, None)
+        """Open the journal and find the records of an earlier run."""
+        kind = FileRecords if url_of(self._path) is None else ObjectRecords
+        self._records: Records = kind(self._path)
+        if self._records.next() == self._fingerprint:
+            self._earlier = iter(self._records.next, None)
         else:
-            self._file.truncate(0)
+            self._records.clear()
             self._append(self._fingerprint)
         self._num_records = 0
         return self
@@ -94,8 +203,8 @@ class Journal:
     ) -> None:
         """Close the journal; delete it if nothing is left to go on with."""
         if kind is None or not self._num_records:
-            self._path.unlink(missing_ok=True)
-        self._file.close()
+            self._records.delete()
+        self._records.close()
 
     def journaled(self, submit: Submit) -> Submit:
         """Return a function like `submit` that takes estimates from the journal where it can."""
@@ -141,21 +250,8 @@ class Journal:
         self._num_records += 1
         return estimates, state
 
-    def _next(self) -> bytes | None:
-        """Return the next record; None behind the last whole one, where the file is cut off."""
-        begin = self._file.tell()
-        head = self._file.read(HEAD.size)
-        if len(head) == HEAD.size:
-            size, crc = HEAD.unpack(head)
-            content = self._file.read(size)
-            if len(content) == size and zlib.crc32(content) == crc:
-                return content
-        self._file.truncate(begin)
-        return None
-
     def _append(self, content: bytes) -> None:
-        self._file.write(HEAD.pack(len(content), zlib.crc32(content)) + content)
-        self._file.flush()
+        self._records.append(content)
 
 
 class _TrustedUnpickler(pickle.Unpickler):
@@ -172,16 +268,22 @@ class _TrustedUnpickler(pickle.Unpickler):
 
 def journal_path(out: Path) -> Path:
     """
-    Return the file of the journal of a result folder: beside it, hidden.
+    Return the journal of a result folder: beside it, hidden; of a URL, too.
 
-    That of a URL is among the temporary files of this machine.
+    Raises
+    ------
+    ConfigError
+        If nothing can be beside it.
 
     """
-    url = url_of(out)
-    if url is not None:
-        return Path(gettempdir(), f'boxreg-{hashlib.sha256(url.encode()).hexdigest()}.journal')
-    whole = out.resolve()
-    return whole.with_name(f'.{whole.name}.journal')
+    if url_of(out) is None:
+        out = out.resolve()
+    elif len(out.parts) < 3:  # scheme and bucket
+        raise ConfigError(
+            f'--resume: expected an output in a bucket, got the bucket {url_of(out)} itself; add '
+            f'a folder to -o'
+        )
+    return out.with_name(f'.{out.name}.journal')
 
 
 def _checksum(windows: Sequence[Window]) -> int:

@@ -6,13 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.errors import RecordingError, TransformUnavailable
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels import frames_of
 from boxreg_ros.labels.merging import LabelMerger
-from boxreg_ros.structures import Floats
 
 
 class LabelledRecording(Recording):
@@ -61,14 +60,6 @@ class LabelledRecording(Recording):
             yield from merger.after(cloud.received_ns, cloud.content.stamp_ns)
         yield from merger.rest()
         self.outside = merger.outside
-
-
-def pose_of(tree: TransformTree, fixed_frame: str, frame: str, stamp_ns: int) -> Floats | None:
-    """Return the pose of `frame` in the fixed frame; None if unknown."""
-    try:
-        return tree.lookup(fixed_frame, frame, stamp_ns)
-    except TransformUnavailable:
-        return None
 
 
 def label_frame_of(

@@ -169,9 +169,9 @@ class Sink:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
-        for name in given.class_names:
+        for name, boxes in Counter(given.class_names).items():
             if not self._config.knows_class(name):
-                self.unknown_classes[name] += 1
+                self.unknown_classes[name] += boxes
         if isinstance(item.moved, BoxArray):
             slot = Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
             self._last_ticket += 1

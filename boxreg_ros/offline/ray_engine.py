@@ -26,7 +26,7 @@ MEMORY_RESERVE = 1.2
 """Declared by measured memory; chosen: drives of one fleet differ by their number of objects."""
 JOBS_AHEAD = 2
 """Jobs that are submitted per core of the cluster: one runs, one waits."""
-ANSWER_SECONDS = 5.0
+CLUSTER_SECONDS = 5.0
 """Longest time for the cluster to accept a connection [s]; within a site it takes milliseconds."""
 NODE_LOSSES = 10
 """How often Ray starts a job again whose node or worker was lost; spot nodes are lost hourly."""
@@ -106,7 +106,7 @@ def _check_answers(address: str | None) -> None:
     """Raise OSError if nothing listens at an address: Ray itself tries for minutes."""
     host, _, port = (address or '').removeprefix('ray://').rpartition(':')
     if host and port.isdecimal():
-        socket.create_connection((host, int(port)), ANSWER_SECONDS).close()
+        socket.create_connection((host, int(port)), CLUSTER_SECONDS).close()
 
 
 def _run_job(runner: JobRunner, job: Job) -> Job:

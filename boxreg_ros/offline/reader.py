@@ -1,30 +1,29 @@
 """
 Items of a recording on their way to the registrar: read, decoded, in the fixed frame.
 
-This runs in a process of its own, a few items ahead of the registrar; see `ReadAhead`.
+This runs in a process of its own, a few items ahead of the registrar, or in that of a run on one
+core; see `reader`.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast, NamedTuple
+from typing import NamedTuple
 
-from boxreg_ros.io.items import Item, ItemSource
-from boxreg_ros.io.lidars import MergedSweep
-from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.config import Config
+from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
+from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.storage.record import Damage
-from boxreg_ros.io.transforms import inverse, sweep_to_frame
-from boxreg_ros.offline.labelled_recording import label_frame_of, pose_of
+from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
-from boxreg_ros.offline.worker_process import run_in_worker, WorkerProcess
+from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send
 from boxreg_ros.structures import BoxArray, Floats, Sweep
-import numpy as np
 
 
 class ReadItem(NamedTuple):
@@ -84,13 +83,8 @@ class Findings(NamedTuple):
 
     Attributes
     ----------
-    counts : Counter
-        Sweeps, box arrays, time jumps, clouds without a transform or whose LiDARs are not all
-        known, and clouds and box arrays without a stamp.
-    first_missing_transform : str
-        Error of the first item without a transform; empty if there is none.
-    first_unplaced : str
-        Error of the first cloud whose LiDARs are not all known; empty if there is none.
+    counts, first_missing_transform, first_unplaced
+        As of `FixedFrameItems`.
     lidars : dict of str and Counter
         Of each of several topics of clouds: clouds that were merged, late and missing.
     point_layouts : dict of str
@@ -150,25 +144,20 @@ class RecordingReader:
         self._clock = clock
         self._with_points = request.options.with_points
         self._with_times = request.config.sampling.deskew
-        self._session = Session(request.convention, request.config, placement=recording.placement)
-        self._is_merging = len(recording.placement.lidars.topics) > 1
-        self._jumps = JumpConfirmation[Item]()
-        tree = self._session.tree
+        self._items = FixedFrameItems(
+            recording, request.config, request.convention, request.fixed_frame, clock
+        )
         with clock('read'):
-            fixed_frame = recording.choose_fixed_frame(tree, request.fixed_frame)
-            sensor_frame = label_frame_of(recording, tree, fixed_frame, request.label_frame)
-        self._session.fixed_frame = fixed_frame
+            sensor_frame = label_frame_of(
+                recording, self._items.tree, self._items.fixed_frame, request.label_frame
+            )
         topics = {
             'points': ', '.join(recording.placement.lidars.topics) or recording.points_topic,
             'boxes': recording.boxes_topic or None,
             'odometry': recording.odometry_topic,
         }
         seconds = (recording.end_ns - recording.start_ns) * 1e-9
-        self.source = Source(topics, fixed_frame, sensor_frame, seconds)
-        self._counts: Counter[str] = Counter()
-        self._first_missing_transform = ''
-        self._first_unplaced = ''
-        self._restarts = False
+        self.source = Source(topics, self._items.fixed_frame, sensor_frame, seconds)
 
     def __iter__(self) -> Iterator[ReadItem]:
         """
@@ -180,129 +169,79 @@ class RecordingReader:
             At the end, if no cloud, or no message of boxes, was readable.
 
         """
-        items = self._recording.items(
-            self._session.tree, with_intensities=self._with_points, stage=self._clock
-        )
-        for item in items:
-            confirmed, restarts = [item], False
-            if not is_placeholder(item.content):
-                confirmed, restarts = self._jumps.add(item, item.content)
-            if restarts:
-                yield from map(self._merged_item, self._session.unmerged())
-                # The tree, which is ahead of the items, has detected the jump itself.
-                self._session.restart()
-                self._counts['time_jump'] += 1
-                self._restarts = True
-            for ready in confirmed:
-                yield from self._read_items(ready)
-        for late in self._jumps.release():
-            yield from self._read_items(late)
-        yield from map(self._merged_item, self._session.unmerged())
+        for item in self._items.read(with_intensities=self._with_points):
+            with self._clock('transform'):
+                read_item = self._trimmed(item)
+            yield read_item
         self._recording.check_readable()
 
     def findings(self) -> Findings:
         """Return the properties that are known after the last item."""
         recording = self._recording
+        items = self._items
         return Findings(
-            self._counts,
-            self._first_missing_transform,
-            self._first_unplaced,
-            self._session.lidar_counts,
+            items.counts,
+            items.first_missing_transform,
+            items.first_unplaced,
+            items.session.lidar_counts,
             recording.placement.layouts,
             recording.unreadable.total(),
             '; '.join(map(str, recording.first_errors.values())),
             recording.apart,
             recording.damages,
             recording.outside,
-            self._session.finding,
-            self._session.facts,
+            items.session.finding,
+            items.session.facts,
             self._clock.stages(),
         )
 
-    def _count(self, given: Sweep | BoxArray, admitted: Admitted) -> None:
-        kind = 'sweeps' if isinstance(given, Sweep) else 'box_arrays'
-        if not (self._is_merging and isinstance(given, Sweep)):  # those are counted merged
-            self._counts[kind] += 1
-        if given.stamp_ns <= 0 and not is_placeholder(given):
-            self._counts[f'{kind}_without_stamp'] += 1
-        if not admitted.reason:
-            return
-        if isinstance(given, Sweep):
-            self._counts[admitted.reason] += 1
-        if admitted.moved is None:
-            self._first_missing_transform = self._first_missing_transform or admitted.detail
-        else:
-            self._first_unplaced = self._first_unplaced or admitted.detail
-
-    def _read_items(self, item: Item) -> Iterator[ReadItem]:
-        """Yield an item in the fixed frame, or the sweeps that are complete with its cloud."""
-        with self._clock('transform'):
-            admitted = self._session.admit(item.content)
-            self._count(item.content, admitted)
-            if not self._is_merging or not isinstance(item.content, Sweep):
-                yield self._trimmed(item, admitted)
-                return
-            if not isinstance(admitted.moved, Sweep):
-                return  # the other LiDARs go on
-            complete = self._session.merged(admitted.moved, item)
-        yield from map(self._merged_item, complete)
-
-    def _merged_item(self, merged: MergedSweep) -> ReadItem:
-        """Return a sweep of several LiDARs; files get it in their sensor frame."""
-        items = cast(tuple[Item, ...], merged.extras)
-        self._counts['sweeps'] += 1
-        with self._clock('transform'):
-            sweep = merged.sweep
-            sensor_frame = self.source.sensor_frame
-            T_fixed_sensor = pose_of(
-                self._session.tree, sweep.frame_id, sensor_frame, sweep.stamp_ns
-            )
-            given = sweep
-            if T_fixed_sensor is not None:
-                given = sweep_to_frame(sweep, inverse(T_fixed_sensor), sensor_frame)
-            intensities = [item.intensities for item in items]
-            known = [values for values in intensities if values is not None]
-            whole = Item(
-                items[-1].received_ns,
-                given,
-                np.concatenate(known) if len(known) == len(items) else None,
-            )
-            return self._trimmed(whole, Admitted(sweep, T_fixed_sensor))
-
-    def _trimmed(self, item: Item, admitted: Admitted) -> ReadItem:
+    def _trimmed(self, item: MovedItem) -> ReadItem:
         """Return an item without the parts that are not read: it is copied to a process."""
-        restarts = self._restarts
-        self._restarts = False
-        given = item.content
-        moved = admitted.moved
+        moved = item.moved
         if isinstance(moved, Sweep) and not self._with_times:
             moved = replace(moved, times=None)
         seconds = (item.received_ns - self._recording.start_ns) * 1e-9
-        if isinstance(given, Sweep) and not self._with_points:
-            return ReadItem(seconds, restarts, None, moved, None, None, None)
-        fixed_frame = self.source.fixed_frame
-        T_fixed_sensor = pose_of(
-            self._session.tree, fixed_frame, self.source.sensor_frame, given.stamp_ns
-        )
+        given, T_fixed_given, intensities = item.given, item.T_fixed_item, None
+        if isinstance(given, Sweep):
+            if not self._with_points:
+                return ReadItem(seconds, item.restarts, None, moved, None, None, None)
+            cloud = self._items.stored_cloud(item, self.source.sensor_frame)
+            given, T_fixed_given, intensities = cloud
+        T_fixed_sensor = self._items.pose_of(self.source.sensor_frame, given.stamp_ns)
         return ReadItem(
-            seconds, restarts, given, moved, admitted.T_fixed_item, T_fixed_sensor,
-            item.intensities,
-        )  # fmt: skip
+            seconds, item.restarts, given, moved, T_fixed_given, T_fixed_sensor, intensities
+        )
 
 
-def reader(request: Request) -> AbstractContextManager[WorkerProcess]:
-    """Return, for a block, the process that reads a recording for `ReadAhead`."""
-    return run_in_worker(partial(_read, request), 'reads the recording')
+@contextmanager
+def reader(request: Request) -> Iterator[Receive]:
+    """
+    Yield, for a block, a function that returns the next message for `ReadAhead`.
+
+    The recording is read in a process of its own, or in this one where it may use one core only.
+
+    """
+    if uses_one_core(request.config):
+        with closing(_messages(request)) as messages:
+            yield messages.__next__
+        return
+    with run_in_worker(partial(_read, request), 'reads the recording') as process:
+        yield process.receive
+
+
+def uses_one_core(config: Config) -> bool:
+    """Return whether a run is one process: more would use more cores, and copy every sweep."""
+    return config.solver.threads == 1
 
 
 class ReadAhead:
     """
-    Iterate over the items that a `RecordingReader` yields in another process, a few ahead.
+    Iterate over the items that a `RecordingReader` yields, in another process a few ahead.
 
     Parameters
     ----------
-    process : WorkerProcess
-        The process, from `reader`.
+    receive : callable
+        From `reader`.
 
     Attributes
     ----------
@@ -313,25 +252,30 @@ class ReadAhead:
 
     """
 
-    def __init__(self, process: WorkerProcess) -> None:
-        self._process = process
-        self.source: Source = process.receive()
+    def __init__(self, receive: Receive) -> None:
+        self._receive = receive
+        self.source: Source = receive()
         self.findings: Findings
 
     def __iter__(self) -> Iterator[ReadItem]:
         """Yield clouds and boxes; an error of the process is raised at its place."""
         while True:
-            received = self._process.receive()
+            received = self._receive()
             if isinstance(received, Findings):
                 self.findings = received
                 return
             yield received
 
 
-def _read(request: Request, _: Callable[[], Any], send: Callable[[Any], None]) -> None:
+def _read(request: Request, _: Receive, send: Send) -> None:
+    for message in _messages(request):
+        send(message)
+
+
+def _messages(request: Request) -> Generator[Source | ReadItem | Findings]:
+    """Yield the source of a recording, all its items, and the findings."""
     with request.recording() as recording:
         reading = RecordingReader(recording, request, Stopwatch())
-        send(reading.source)
-        for read_item in reading:
-            send(read_item)
-        send(reading.findings())
+        yield reading.source
+        yield from reading
+        yield reading.findings()

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-import gc
-from itertools import islice
+from itertools import accumulate, islice, pairwise
 import time
 from typing import Any, cast
 
@@ -18,6 +17,7 @@ from boxreg_ros.core.registration import Estimate, register
 from boxreg_ros.core.window import stack_origins, Window
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.offline.compilation import announced_compilation
+from boxreg_ros.offline.reader import uses_one_core
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
 import numpy as np
@@ -35,7 +35,8 @@ def registration_worker(
     Yield a function that starts `register` in a worker process, for `BoxRegistrar`.
 
     Yield None where a worker is no gain or cannot work: a sliding window is awaited before the
-    next sweep is taken, and only the CPU can be used after a fork.
+    next sweep is taken, a run on one core is one process, and only the CPU can be used after a
+    fork.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def registration_worker(
         Called with what is waited for where that takes long.
 
     """
-    if config.estimate != 'track' or config.device != 'cpu':
+    if config.estimate != 'track' or config.device != 'cpu' or uses_one_core(config):
         with announced_compilation(announce):
             yield None
         return
@@ -95,9 +96,6 @@ def _serve(config: Config, receive: Receive, send: Send) -> None:
     torch.set_num_threads(1)  # the solver divides the windows among threads of its own
     with announced_compilation(send):
         warm_up(config)  # while the recording is read up to the first full window
-    # Later collections skip the imported and compiled objects: going through them takes 67 ms.
-    gc.collect()
-    gc.freeze()
     send(WARM)
     while True:
         packed, config, model = receive()
@@ -135,9 +133,15 @@ def _unpacked(heads: list[Any], *columns: Any) -> list[Window]:
     """Return the windows that `_packed` was given."""
     stamps, boxes, points, delays, *others = columns
     counts = [count for head in heads for count in head.observations]
-    ends = np.cumsum(counts)[:-1]
+    ends = accumulate(counts, initial=0)
+    parts = [slice(begin, end) for begin, end in pairwise(ends)]
     observations = map(
-        Observation, stamps, boxes, np.split(points, ends), np.split(delays, ends), *others
+        Observation,
+        stamps,
+        boxes,
+        [points[part] for part in parts],
+        [delays[part] for part in parts],
+        *others,
     )
     return [
         head._replace(observations=list(islice(observations, len(head.observations))))

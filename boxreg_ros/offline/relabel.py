@@ -36,7 +36,15 @@ from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.review.decisions import DECISIONS
-from boxreg_ros.structures import EXTENDED, INTERPOLATED, KEPT, REFINED, RefinedBoxes, REJECTED
+from boxreg_ros.structures import (
+    COASTED,
+    EXTENDED,
+    INTERPOLATED,
+    KEPT,
+    REFINED,
+    RefinedBoxes,
+    REJECTED,
+)
 import numpy as np
 import yaml
 
@@ -96,7 +104,7 @@ def relabel(
     with writing(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         plan, completion = _survey(request, clock, shown, journal)
-        process = workers.enter_context(reader(request))
+        receive = workers.enter_context(reader(request))
         # The recording is opened while this process imports torch, which takes a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
@@ -104,7 +112,7 @@ def relabel(
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.announce)
         )
-        recording = ReadAhead(process)
+        recording = ReadAhead(receive)
         if plan is None:
             clock.begun('start')
         registrar = BoxRegistrar(request.config, _journaled(submit, journal))
@@ -135,9 +143,7 @@ def _journal(out: Path, fingerprint: str) -> Iterator[Journal]:
     """Yield the journal of a run; while it is locked, other partial results are remains."""
     from boxreg_ros.offline.journal import Journal, journal_path
 
-    path = journal_path(out)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with Journal(path, fingerprint) as journal:
+    with Journal(journal_path(out), fingerprint) as journal:
         delete_remains(out)
         yield journal
 
@@ -173,14 +179,14 @@ def _survey(
     if not request.config.complete.steps:
         return None, None
     with ExitStack() as workers:
-        process = workers.enter_context(reader(request))
+        receive = workers.enter_context(reader(request))
         from boxreg_ros.offline.completion import Completion, survey
         from boxreg_ros.offline.registration_worker import registration_worker
 
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.progress.announce)
         )
-        recording = ReadAhead(process)
+        recording = ReadAhead(receive)
         clock.begun('start')
         items = ((item.moved, item.restarts) for item in progress.each(recording))
         submit = _journaled(submit, journal)
@@ -398,7 +404,7 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
         parts[-1] += f' ({_counts(summary["reasons"])})'
     if summary['heading_flips']:
         parts.append(f'{summary["heading_flips"]:,} heading flips corrected')
-    for word in (REJECTED, INTERPOLATED, EXTENDED):
+    for word in (REJECTED, INTERPOLATED, EXTENDED, COASTED):
         if word in status:
             parts.append(f'{status[word]:,} {word}')
     line = (

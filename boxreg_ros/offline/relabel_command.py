@@ -29,28 +29,23 @@ BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaini
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg relabel`."""
     add_recording_arguments(parser)
-    parser.add_argument(
-        '-o', '--out', type=Path, required=True,
-        help='result folder; it is written completely or not at all',
-    )  # fmt: skip
-    parser.add_argument(
-        '--associate', action='store_true',
-        help='replace the track ids of the input: associate boxes over time',
-    )  # fmt: skip
-    parser.add_argument(
-        '--fixed-frame', metavar='FRAME',
-        help='frame to refine in (default: topmost frame that the frame of the clouds moves in)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--formats', default='csv,openlabel', metavar='NAME,...', type=_names,
-        help='label formats to write, see `boxreg formats`; csv is always written '
-        '(default: %(default)s)',
-    )  # fmt: skip
+    _add_input_arguments(parser)
+    _add_track_arguments(parser)
+    _add_result_arguments(parser)
+    _add_run_arguments(parser)
+
+
+def _add_input_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what is read besides the recording, and which part of it."""
     parser.add_argument(
         '--labels', type=_labels_argument, metavar='FORMAT:PATH',
         help='read the boxes from label files instead of a topic',
     )  # fmt: skip
     add_label_arguments(parser)
+    parser.add_argument(
+        '--fixed-frame', metavar='FRAME',
+        help='frame to refine in (default: topmost frame that the frame of the clouds moves in)',
+    )  # fmt: skip
     parser.add_argument(
         '--start', type=float, metavar='S',
         help='start of the part to refine, from the beginning of the recording [s]',
@@ -59,25 +54,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--end', type=float, metavar='S',
         help='end of the part to refine, from the beginning of the recording [s]',
     )  # fmt: skip
+
+
+def _add_track_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what is done to the tracks besides the refinement."""
+    parser.add_argument(
+        '--associate', action='store_true',
+        help='replace the track ids of the input: associate boxes over time',
+    )  # fmt: skip
     parser.add_argument(
         '--complete', action='store_true',
         help='complete the tracks: join fragments, reject ghosts, add missing boxes (sets '
-        ' complete.stitch, static, prune, fill and extend)',
+        'complete.stitch, static, prune, fill and extend)',
     )  # fmt: skip
     parser.add_argument('--bridge', nargs='?', action=_Removed, help=argparse.SUPPRESS)
     parser.add_argument(
-        '--report', action='store_true',
-        help='also write report.html: every track before and after, to look at in a browser',
-    )  # fmt: skip
-    parser.add_argument(
         '--decisions', type=Path, metavar='FILE',
         help='decisions.csv of boxreg review: keep rejected tracks as input, hold pinned boxes',
+    )  # fmt: skip
+
+
+def _add_result_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what is written."""
+    parser.add_argument(
+        '-o', '--out', type=Path, required=True,
+        help='result folder; it is written completely or not at all',
+    )  # fmt: skip
+    parser.add_argument(
+        '--formats', default='csv,openlabel', metavar='NAME,...', type=_names,
+        help='label formats to write, see `boxreg formats`; csv is always written '
+        '(default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--report', action='store_true',
+        help='also write report.html: every track before and after, to look at in a browser',
     )  # fmt: skip
     parser.add_argument(
         '--truth', type=Path, metavar='FILE',
         help='true boxes that the report shows: CSV with the columns of boxes.csv, or a scene of '
         'a data set',
     )  # fmt: skip
+
+
+def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add how the run goes on and ends, and what it may use."""
     parser.add_argument(
         '--resume', action='store_true',
         help='go on with an interrupted run of the same request, files and settings; do nothing '
@@ -92,8 +112,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='exit with 1, the results kept, if a smaller part of the boxes is refined, as in 0.9',
     )  # fmt: skip
     parser.add_argument(
-        '--workers', type=int, metavar='N', help='CPU cores of the solver (sets solver.threads)'
-    )
+        '--workers', type=int, metavar='N',
+        help='CPU cores of the solver (sets solver.threads); with 1 the run is one process',
+    )  # fmt: skip
 
 
 class _Removed(argparse.Action):

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from boxreg_ros.config import Config
 from boxreg_ros.datasets import Address, address_of, SceneRecording
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
 from boxreg_ros.offline.labelled_recording import LabelledRecording
 from boxreg_ros.structures import BoxArray
 from msg_adapters.convention import Convention, STANDARD
@@ -49,8 +50,7 @@ def source_of(
     address = scene_address(paths)
     if address is not None:
         _check_scene(address, lidars, boxes, odometry, convention)
-        sensor = lidars.topics[0] if lidars.topics else None
-        return SceneRecording(address, sensor, start, end, labels)
+        return SceneRecording(address, lidars.topics, start, end, labels)
     if labels is not None:
         return LabelledRecording(
             labels, paths, lidars=lidars, odometry=odometry, start=start, end=end
@@ -87,10 +87,10 @@ def _check_scene(
     convention: Convention,
 ) -> None:
     """Refuse options of topics."""
-    if len(lidars.topics) > 1 or lidars.frames or lidars.info:
+    if lidars.frames or lidars.info:
         raise ConfigError(
-            f'points, sensor_frames, points_info: expected at most one sensor for a scene of a '
-            f'data set, got {lidars} with {address}; leave out all but one --points'
+            f'sensor_frames, points_info: expected for recordings with topics only, got {lidars} '
+            f'with {address}; leave them out: a data set has the positions of its LiDARs'
         )
     for name, topic in (('boxes', boxes), ('odometry', odometry)):
         if topic is not None:
@@ -118,15 +118,14 @@ def true_boxes(path: Path) -> BoxTable:
     address = address_of(path)
     if address is None:
         return BoxTable.read(path)
-    tree = TransformTree()
     arrays: list[BoxArray] = []
     num_points = [np.zeros(0, np.int64)]
     with SceneRecording(address) as scene:
-        fixed_frame = scene.choose_fixed_frame(tree)
-        for item in scene.items(tree, with_clouds=False):
-            moved = to_fixed_frame(item.content, tree, fixed_frame)
-            assert isinstance(moved, BoxArray)
-            assert item.refined is not None  # annotations have it
-            arrays.append(moved)
-            num_points.append(item.refined.num_points)
+        for item in FixedFrameItems(scene, Config()).read(with_clouds=False):
+            if not isinstance(item.moved, BoxArray):
+                continue  # without a pose
+            annotations = item.items[0].refined
+            assert annotations is not None
+            arrays.append(item.moved)
+            num_points.append(annotations.num_points)
     return replace(BoxTable.from_arrays(arrays), num_points=np.concatenate(num_points))

@@ -12,6 +12,10 @@ import numpy as np
 
 BREAK_MISS_PROBABILITY = 0.08
 """Part of the boxes that are missing beside the gaps; literature: PointRCNN misses 6.8 %."""
+MISS_SWEEPS = 3.0
+"""Mean length of a run of misses that depend on the distance; chosen: such misses repeat."""
+MAX_MISS_PROBABILITY = 0.5
+"""Greatest part of missing boxes at any distance; chosen: a detector that misses more has none."""
 SWEEPS_PER_GAP = 60
 """A track has one gap in so many sweeps on average; chosen."""
 GAP_SWEEPS = (3, 8)
@@ -48,6 +52,7 @@ def break_tracks(
     rng: np.random.Generator,
     ghosts: float = 0.0,
     origins: Floats | None = None,
+    far_misses: bool = False,
 ) -> list[BoxArray]:
     """
     Return box arrays with missed boxes, gaps, changed ids and ghosts.
@@ -61,29 +66,36 @@ def break_tracks(
     ghosts : float
         Mean number of boxes per sweep that belong to no object.
     origins : array, shape (n, 3), optional
-        Positions of the sensor; needed for ghosts [m].
+        Positions of the sensor; needed for ghosts and far misses [m].
+    far_misses : bool
+        Misses come in runs, as likely as the square of the distance, like those of a detector
+        that has too few points. By default they are independent.
 
     Raises
     ------
     ConfigError
-        If `ghosts` is negative, or positive without `origins`.
+        If `ghosts` is negative, or something needs `origins` that are not given.
 
     Notes
     -----
     The boxes that are left have exactly the input poses and extents.
 
     """
-    if ghosts < 0 or (ghosts and origins is None):
+    if ghosts < 0 or ((ghosts or far_misses) and origins is None):
         raise ConfigError(f'ghosts: expected 0 or more, and origins, got {ghosts:g}')
-    sweeps_of: dict[str, list[int]] = {}
+    probabilities = _miss_probabilities(arrays, origins, far_misses)
+    sweeps_of: dict[str, list[tuple[int, float]]] = {}  # with the probability of a miss
     for sweep, array in enumerate(arrays):
-        for track_id in array.track_ids:
-            sweeps_of.setdefault(track_id, []).append(sweep)
+        for track_id, probability in zip(array.track_ids, probabilities[sweep], strict=True):
+            sweeps_of.setdefault(track_id, []).append((sweep, probability))
     new_id: dict[tuple[int, str], str] = {}  # of the boxes that are left, by sweep and old id
     for track_id, sweeps in sweeps_of.items():
         names = _broken_names(track_id, len(sweeps), rng)
-        for sweep, name in zip(sweeps, names, strict=True):
-            if name:
+        numbers = rng.random(len(sweeps))
+        if far_misses:
+            numbers = _repeated(numbers, rng)
+        for (sweep, probability), name, number in zip(sweeps, names, numbers, strict=True):
+            if name and number >= probability:
                 new_id[sweep, track_id] = name
     broken = [_renamed(array, sweep, new_id) for sweep, array in enumerate(arrays)]
     if ghosts and origins is not None:
@@ -92,7 +104,7 @@ def break_tracks(
 
 
 def _broken_names(track_id: str, count: int, rng: np.random.Generator) -> list[str]:
-    """Return the id of each of `count` boxes of a track after breaking it; '' if it is missing."""
+    """Return the id of each of `count` boxes of a track after breaking it; '' in a gap."""
     names = [track_id] * count
     part = 0
     box = 1 + round(rng.exponential(SWEEPS_PER_GAP))
@@ -105,8 +117,28 @@ def _broken_names(track_id: str, count: int, rng: np.random.Generator) -> list[s
         suffix = f'_{part}' if part else ''
         names[end:] = [track_id + suffix] * (count - end)
         box = end + 1 + round(rng.exponential(SWEEPS_PER_GAP))
-    is_missed = rng.random(count) < BREAK_MISS_PROBABILITY
-    return ['' if missed else name for name, missed in zip(names, is_missed, strict=True)]
+    return names
+
+
+def _miss_probabilities(
+    arrays: Sequence[BoxArray], origins: Floats | None, far_misses: bool
+) -> list[Floats]:
+    """Return the probability (b,) that each box is missed, of each array with b boxes."""
+    if not far_misses or origins is None:
+        return [np.full(len(array.track_ids), BREAK_MISS_PROBABILITY) for array in arrays]
+    squares = [
+        np.square(array.boxes[:, X : Y + 1] - origin[:2]).sum(1)
+        for array, origin in zip(arrays, origins, strict=True)
+    ]
+    part = BREAK_MISS_PROBABILITY / np.concatenate(squares).mean()
+    return [np.minimum(MAX_MISS_PROBABILITY, part * square) for square in squares]
+
+
+def _repeated(numbers: Floats, rng: np.random.Generator) -> Floats:
+    """Return random numbers (n,) that repeat in runs of `MISS_SWEEPS` on average."""
+    is_new = rng.random(len(numbers)) < 1 / MISS_SWEEPS
+    is_new[:1] = True
+    return np.asarray(numbers[is_new][np.cumsum(is_new) - 1])
 
 
 def _renamed(array: BoxArray, sweep: int, new_id: dict[tuple[int, str], str]) -> BoxArray:

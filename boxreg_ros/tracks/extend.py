@@ -10,7 +10,7 @@ ends the extension.
 from __future__ import annotations
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.support import is_owned, least_support, SUPPORT_BOXES
 from boxreg_ros.structures import EXTENDED, Floats, Ints
 from boxreg_ros.tracks.added import AddedBoxes
 from boxreg_ros.tracks.fill import accelerations
@@ -18,20 +18,6 @@ from boxreg_ros.tracks.motion import end_motion, is_parked
 from boxreg_ros.tracks.prune import CONFIRMED_BOXES
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np
-
-SUPPORT_POINTS = 3
-"""Least points above the road in a supported box; chosen: one or two may be of clutter."""
-SUPPORT_PART = 0.3
-"""
-Least part of the points that the end of the track has, in a supported box.
-
-Chosen: within the longest extension the range, and so the number, changes less.
-
-"""
-SUPPORT_BOXES = 5
-"""Boxes at the end of a track that give the number of points to expect; chosen."""
-OWNED = 0.1
-"""3D IoU with a box of another track that ends an extension; chosen: objects do not overlap."""
 
 
 def extend(tracklet: Tracklet, array_stamps_ns: Ints, config: Config) -> list[AddedBoxes]:
@@ -76,8 +62,7 @@ def num_supported(num_points: Ints, at_end: Ints) -> int:
         The same of the boxes at that end of the track.
 
     """
-    least = max(SUPPORT_POINTS, SUPPORT_PART * float(np.median(at_end)))
-    is_supported = num_points >= least
+    is_supported = num_points >= least_support(at_end)
     return len(num_points) if is_supported.all() else int(np.argmin(is_supported))
 
 
@@ -119,6 +104,6 @@ def num_free(candidates: AddedBoxes, owned: dict[int, list[Floats]]) -> int:
         zip(candidates.stamps_ns.tolist(), candidates.boxes, strict=True)
     ):
         others = owned.get(stamp_ns, [])
-        if others and iou_3d(np.tile(box, (len(others), 1)), np.array(others)).max() > OWNED:
+        if others and is_owned(box, np.array(others)):
             return count
     return len(candidates.boxes)

@@ -9,9 +9,10 @@ the box on the motion model stays, with a covariance that grows with the distanc
 from __future__ import annotations
 
 from boxreg_ros.config import ClassConfig, Config
+from boxreg_ros.core.motion import motion_at
 from boxreg_ros.structures import Floats, INTERPOLATED, Ints
 from boxreg_ros.tracks.added import AddedBoxes
-from boxreg_ros.tracks.motion import between, is_parked, motion_at
+from boxreg_ros.tracks.motion import between, is_parked
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.support import GOOD_POINTS, MIN_HITS
 from boxreg_ros.structures import BOX_EXTENT, Floats, X, Y
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np
@@ -19,10 +20,6 @@ GHOST, DUPLICATE = 'ghost', 'duplicate'
 
 CONFIRMED_BOXES = 6
 """A track with so many boxes is not rejected; chosen: twice the three that trackers ask for."""
-MIN_HITS = 3
-"""A track with fewer boxes is a ghost, points or not; literature: SORT confirms with three."""
-GOOD_POINTS = 5
-"""Points above the road that are evidence for an object; chosen: fewer are often of clutter."""
 CONTAINED = 0.5
 """Part of a box inside another one that makes it a duplicate; chosen: objects do not overlap."""
 DUPLICATE_PART = 0.5

@@ -10,10 +10,11 @@ as good, none is made.
 from __future__ import annotations
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.motion import EndMotion
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import HEIGHT, LENGTH, X, Y, YAW, Z
 from boxreg_ros.tracks.links import best_links, join_links
-from boxreg_ros.tracks.motion import end_motion, EndMotion
+from boxreg_ros.tracks.motion import end_motion
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np
 
@@ -52,6 +53,7 @@ def stitch(
     """
     n = len(tracklets)
     counts = [len(tracklet.stamps_ns) for tracklet in tracklets]
+    spans = [(tracklet.last_ns - tracklet.first_ns) * 1e-9 for tracklet in tracklets]
     firsts = [end_motion(tracklet, False, config) for tracklet in tracklets]
     lasts = [end_motion(tracklet, True, config) for tracklet in tracklets]
     kinds = [tracklet.model(config) for tracklet in tracklets]
@@ -60,7 +62,9 @@ def stitch(
         for j in range(n):
             gap = (firsts[j].stamp_ns - lasts[i].stamp_ns) * 1e-9
             is_known = max(counts[i], counts[j]) >= MIN_KNOWN_MOTION
-            if is_known and 0 < gap <= config.complete.stitch_gap and kinds[i] is kinds[j]:
+            # A motion is not predicted for longer than it was observed: two ghosts fit anything.
+            limit = min(config.complete.stitch_gap, spans[i] + spans[j])
+            if is_known and 0 < gap <= limit and kinds[i] is kinds[j]:
                 costs[i, j] = _cost(lasts[i], firsts[j])
     links = best_links(costs)
     ambiguous = [(tracklets[i].track_id, tracklets[j].track_id) for i, j in links.ambiguous]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.structures import BoxArray, Floats
@@ -38,3 +39,9 @@ def to_msg(
         obstacles.append(poses.replaced(item, pose=pose, size=size, velocity=velocity))
     header = poses.with_frame(msg.header, boxes.frame_id)
     return poses.replaced(msg, header=header, obstacles=obstacles)
+
+
+def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
+    """Return a copy of the message with obstacles of earlier messages added, confidence 0."""
+    added = [poses.replaced(earlier.obstacles[row], confidence=0.0) for earlier, row in sources]
+    return poses.replaced(msg, obstacles=[*msg.obstacles, *added])

@@ -194,6 +194,23 @@ def test_review_ranks_tracks_and_pins_a_box_of_the_worst(folder, capsys):
     assert report['own boxes']['pins']['gained'] > 0
 
 
+def test_coasting_finds_missed_boxes(folder, capsys):
+    assert run('tracks', folder, '--coast', 0.5, '--far-misses', '--json') == 0
+    rows = json.loads(capsys.readouterr().out)['results'][str(folder)]
+    assert list(rows) == ['input', 'final', 'coast 0.5 s']
+    assert rows['final']['added'] == 0 < rows['coast 0.5 s']['added']
+    assert rows['final']['recall'] < rows['coast 0.5 s']['recall']
+
+
+def test_highway_measures_all_methods_at_both_speeds(capsys):
+    assert run('highway', '--seeds', 1, '--sweeps', 6, '--json') == 0
+    results = json.loads(capsys.readouterr().out)['results']
+    assert list(results) == ['stamp', 'sight']
+    for rows in results.values():
+        assert {'input', 'smoothing only', 'ours, early', 'ours, track'} <= set(rows)
+        assert all(0.5 < iou < 1 for found in rows.values() for iou in found.values())
+
+
 def test_a_pin_holds_the_true_box_at_its_stamp(folder):
     drive = Drive.read(folder)
     array = drive.boxes[2]
@@ -210,5 +227,5 @@ def test_a_pin_holds_the_true_box_at_its_stamp(folder):
 def test_every_measurement_prints_json(name):
     parser = argparse.ArgumentParser()
     bench.add_arguments(parser)
-    data = [] if name in ('lidars', 'load', 'node', 'paper', 'speed') else ['folder']
+    data = [] if name in ('highway', 'lidars', 'load', 'node', 'paper', 'speed') else ['folder']
     assert parser.parse_args([name, *data, '--json']).json

@@ -62,6 +62,7 @@ def test_relabel_is_measured_in_its_own_processes(report):
     assert 0 < relabel['solve'] < relabel['total'] == pytest.approx(1.0 / relabel['faster'])
     assert relabel['rest'] == pytest.approx(1 - relabel['solve'] / relabel['total'])
     assert 0 < relabel['start'] < relabel['total']
+    assert 0 < relabel['help'] < relabel['total']
     assert 0 < relabel['rest, long'] < 1 and relabel['few'] in (800, 4_000)
     # Two of the processes have torch: less would be one that is not counted.
     assert min(relabel[case] for case in ('memory', 'short', 'long')) > 300
@@ -74,6 +75,8 @@ def test_the_text_holds_all_results(report):
     assert f'one tick: {report["tick"]["total"]:.1f} ms' in text
     assert f'relabel: {report["relabel"]["faster"]:.1f} times faster' in text
     assert f'ten times as long {report["relabel"]["long"]:.0f} MB' in text
+    for name, wanted in speed_report.WANTED.items():
+        assert f'(wanted: {wanted:g})' in text and report['relabel'][name] > 0
     assert 'face observations' in text and 'of the limit' in text
 
 

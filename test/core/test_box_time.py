@@ -11,6 +11,7 @@ from boxreg_ros.core.box_time import (
     swept,
 )
 from boxreg_ros.core.metrics import iou_3d
+from boxreg_ros.core.observation import Observation
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.scenarios import highway
 from boxreg_ros.structures import Sweep
@@ -42,27 +43,46 @@ def test_motion_to_sight_is_that_of_the_points_of_the_box():
     np.testing.assert_array_equal(whole[1:], boxes[1:])
 
 
+def seen(known, velocity, delays):
+    """Return an observation of `surface`, with delays [s], of a box of the `known` time."""
+    delays = np.broadcast_to(delays, MIN_VOTE_POINTS).astype(np.float32)
+    sight = float(np.median(delays))
+    points = surface() + np.outer(delays - sight * (known == 'sight'), velocity)
+    return Observation(0, BOX, points, delays, np.zeros((1, 3)), np.nan, len(points), sight)
+
+
 @pytest.mark.parametrize('known', ['stamp', 'sight'])
 def test_points_on_the_faces_decide(known):
     evidence = BoxTimeEvidence()
     assert evidence.decided() == 'unknown'
     assert evidence.resolved(Config()).sampling.box_time == 'sight'
-    motion = np.array([-1.2, 0, 0])
-    points = surface() + motion * (known == 'stamp')
+    velocity = np.array([30.0, 0, 0])
+    found = seen(known, velocity, -0.04)
+    few = found._replace(points=found.points[1:], delays=found.delays[1:])
     for _ in range(MIN_VOTES):
-        evidence.add(BOX, points, 0.1 * motion)  # slow
-        evidence.add(BOX, points[1:], motion)  # few points
+        evidence.add(found, 0.1 * velocity)  # slow
+        evidence.add(few, velocity)
     assert not evidence.votes
     for _ in range(MIN_VOTES):
-        evidence.add(BOX, points, motion)
+        evidence.add(found, velocity)
     assert evidence.votes == {known: MIN_VOTES}
     assert evidence.resolved(Config()).sampling.box_time == known
     other = 'sight' if known == 'stamp' else 'stamp'
     config = Config().updated({'sampling.box_time': other})
     assert evidence.resolved(config) == config
     for _ in range(MIN_VOTES):  # as many for the other: undecided
-        evidence.add(BOX, surface() + motion * (other == 'stamp'), motion)
+        evidence.add(seen(other, velocity, -0.04), velocity)
     assert evidence.decided() == 'unknown'
+
+
+@pytest.mark.parametrize('known', ['stamp', 'sight'])
+def test_points_of_two_lidars_are_compared_at_their_own_times(known):
+    # The second LiDAR sees the object 50 ms after the first.
+    evidence = BoxTimeEvidence()
+    velocity = np.array([10.0, 0, 0])
+    delays = np.repeat([0.0, 0.05], MIN_VOTE_POINTS // 2)
+    evidence.add(seen(known, velocity, delays), velocity)
+    assert evidence.votes == {known: 1}
 
 
 @pytest.mark.parametrize('at_sight', [False, True], ids=['stamp', 'sight'])

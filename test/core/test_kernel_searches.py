@@ -181,19 +181,17 @@ def weighed(problem, state, config):
     B, N = problem.valid.shape
     prior = PriorArrays(problem.prior_mean.numpy(), problem.prior_information.numpy())
     poses, shared = (part.numpy() for part in state)
-    expected = ExpectedArrays(*map(contiguous, expected))
+    faces = FaceArrays(*map(contiguous, observations))
+    expected = ExpectedArrays(*map(contiguous, expected[:5]))
     windows, of_class, numbers = (
         problem.arrays(), problem.class_arrays(), weight_numbers(config, True)
     )  # fmt: skip
     pairs = []
     for b in range(B):
         terms = normal_equations.unweighted_terms(N, 0, prior, b)
-        own = [b, b, b, b, (slice(None), b), b]
-        faces = FaceArrays(*(
-            np.ascontiguousarray(part[place].numpy()[:, None] if i == 4 else part[place][None])
-            for i, (part, place) in enumerate(zip(observations, own, strict=True))
-        ))  # fmt: skip
-        weights.weigh(b, windows, poses[b], shared[b], faces, expected, of_class, numbers, terms)
+        weights.weigh(
+            b, windows, poses[b], shared[b], b, faces, expected, of_class, numbers, terms
+        )
         pairs.append((term_arrays(known, problem, b), terms))
     return pairs
 

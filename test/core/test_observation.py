@@ -344,3 +344,23 @@ def test_farthest_points_by_hand():
 
 def test_equal_points_are_each_picked_once():
     assert sorted(farthest_point_sample(np.ones((12, 3)), 12)) == list(range(12))
+
+
+def test_a_box_is_seen_at_the_median_time_of_its_points():
+    behind, ahead = CAR.copy(), CAR.copy()
+    behind[0], ahead[0] = CAR[0] - 20, CAR[0] + 20
+    points = near(*([x, 0, 0.1 * k] for x, count in ((0, 4), (20, 3)) for k in range(count)))
+    times = np.array([0.04, 0.01, 0.02, 0.07, 0.09, 0.05, 0.06])
+    seen = observed(points, CAR, behind, ahead, times=times)
+    assert [o.sight for o in seen] == pytest.approx([0.03, 0.0, 0.06])
+
+
+def test_an_observation_of_another_box_keeps_its_points_in_place():
+    (seen,) = observed([near([1, 0, 0])], CAR, origin=np.array([0.0, 0, 2]))
+    shift = np.array([0.5, 0, 0])
+    moved = seen.relative_to(CAR - [*shift, 0, 0, 0, 0, 0, 0], shift)
+    assert moved.points.tolist() == [[1.5, 0, 0]]
+    assert moved.origins.tolist() == (seen.origins + shift).tolist()
+    same = seen.relative_to(CAR, np.zeros(3))
+    assert same.points is seen.points
+    assert same.box is CAR

@@ -411,6 +411,8 @@ def pandaset(root, labels=True):
 SEGMENT = '10023947602400723454_1120_000_1140_000'
 WAYMO_SHAPE = (16, 360)
 TOP_IN_VEHICLE = (1.4, 0.0, 2.0)
+FRONT_IN_VEHICLE = (3.8, 0.0, 0.8)
+"""Its only pixel is 1 m ahead."""
 INCLINATIONS = (-0.35, 0.05)
 
 
@@ -500,17 +502,18 @@ def waymo(root, labels=True):
     })  # fmt: skip
     # The LiDAR itself is turned by 90 degrees: columns begin at the rear of the vehicle anyway.
     extrinsic = [0, -1, 0, 1.4, 1, 0, 0, 0, 0, 0, 1, 2.0, 0, 0, 0, 1]
+    front = [1, 0, 0, FRONT_IN_VEHICLE[0], 0, 1, 0, 0, 0, 0, 1, FRONT_IN_VEHICLE[2], 0, 0, 0, 1]
     name = '[LiDARCalibrationComponent].'
     write_parquet(split / 'lidar_calibration' / file, {
-        'key.segment_context_name': [SEGMENT],
-        'key.laser_name': pyarrow.array([1], pyarrow.int8()),
+        'key.segment_context_name': [SEGMENT] * 2,
+        'key.laser_name': pyarrow.array([1, 2], pyarrow.int8()),
         f'{name}extrinsic.transform': pyarrow.array(
-            [[float(value) for value in extrinsic]], pyarrow.list_(pyarrow.float64(), 16)
+            np.array([extrinsic, front], float).tolist(), pyarrow.list_(pyarrow.float64(), 16)
         ),
-        f'{name}beam_inclination.min': [INCLINATIONS[0]],
-        f'{name}beam_inclination.max': [INCLINATIONS[1]],
+        f'{name}beam_inclination.min': [INCLINATIONS[0], -0.1],
+        f'{name}beam_inclination.max': [INCLINATIONS[1], 0.1],
         f'{name}beam_inclination.values': pyarrow.array(
-            [None], pyarrow.list_(pyarrow.float64())
+            [None] * 2, pyarrow.list_(pyarrow.float64())
         ),
     })  # fmt: skip
     transforms = []

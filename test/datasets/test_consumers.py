@@ -29,6 +29,8 @@ def test_av2_has_the_same_clouds_and_poses(tmp_path):
     T = np.array(found['city_SE3_ego'])
     points = np.array(found['points'])[:, :3] @ T[:3, :3].T + T[:3, 3]
     np.testing.assert_allclose(sweeps[3].points, points, atol=5e-5)
+    positions = np.array(found['positions']) @ T[:3, :3].T + T[:3, 3]
+    np.testing.assert_allclose(sweeps[3].origins, positions, atol=1e-9)
 
 
 def test_pykitti_has_the_same_poses_of_the_gps_unit(tmp_path):

@@ -88,7 +88,8 @@ CASES = {
         '001',
         'car-p',
         'Car',
-        layouts.lidar_position,
+        # The LiDAR is 0.8 m ahead of the vehicle's frame, whose y axis, ahead, is west here.
+        lambda i: layouts.lidar_position(i) + np.array([-0.8, 0, 1.85]),
         stamps_ns=lambda: [round(seconds * 1e9) for seconds in layouts.pandaset_seconds()],
         has_times=True,
     ),
@@ -137,6 +138,65 @@ def test_clouds_poses_and_boxes_are_those_of_the_drive(tmp_path, name):
         np.testing.assert_allclose(array.boxes, [case.box(i)], atol=2e-6)
         assert array.track_ids == (case.track,)
         assert array.class_names == (case.class_name,)
+
+
+def sensors_of(name, root, *lidars):
+    """Return the first sweep of a scene, and the position of the sensor of each point."""
+    (sweep, *_), _ = read(source_of(name, f'{root}#{CASES[name].scene}', lidars=lidars))
+    np.testing.assert_allclose(sweep.origin, sweep.origins.mean(axis=0))
+    return sweep, sweep.origins[sweep.sensors]
+
+
+def test_points_of_argoverse2_are_of_the_upper_or_the_lower_lidar(tmp_path):
+    layouts.argoverse2(tmp_path)
+    _, found = sensors_of('argoverse2', tmp_path)
+    is_upper = np.arange(len(found)) % 64 < 32
+    expected = layouts.ego_position(0) + np.array([0, 1.35, 0])
+    np.testing.assert_allclose(found[is_upper], [np.add(expected, [0, 0, 1.7])] * is_upper.sum())
+    np.testing.assert_allclose(
+        found[~is_upper], [np.add(expected, [0, 0, 1.5])] * (~is_upper).sum()
+    )
+
+
+def test_points_of_waymo_are_of_the_lidars_that_are_asked_for(tmp_path):
+    layouts.waymo(tmp_path)
+    sweep, found = sensors_of('waymo', tmp_path, 'TOP', 'FRONT')
+    ego = layouts.ego_position(0)
+    np.testing.assert_allclose(sweep.points[:-1], layouts.waymo_points(0), atol=3e-5)
+    np.testing.assert_allclose(sweep.points[-1], np.add(ego, [0, 4.8, 0.8]), atol=3e-5)
+    np.testing.assert_allclose(found[:-1], [np.add(ego, [0, 1.4, 2.0])] * (len(found) - 1))
+    np.testing.assert_allclose(found[-1], np.add(ego, [0, 3.8, 0.8]), atol=1e-9)
+    (alone, *_), _ = read(source_of('waymo', tmp_path, lidars=['FRONT']))
+    np.testing.assert_allclose(alone.points, sweep.points[-1:], atol=1e-6)
+    assert alone.sensors is None
+    with pytest.raises(RecordingError, match=r"TOP, FRONT, .*, REAR, got 'BACK'"):
+        source_of('waymo', tmp_path, lidars=['TOP', 'BACK']).__enter__()
+    with pytest.raises(RecordingError, match='expected the LiDAR REAR, got others'):
+        source_of('waymo', tmp_path, lidars=['REAR']).__enter__()
+
+
+def test_points_of_pandaset_are_of_either_lidar(tmp_path):
+    layouts.pandaset(tmp_path)
+    sweep, found = sensors_of('pandaset', tmp_path, 'pandar64', 'pandarGT')
+    n = len(layouts.face_in_map(0))
+    both = np.concatenate([layouts.face_in_map(0), layouts.face_in_map(0) + 50])
+    np.testing.assert_allclose(sweep.points, both, atol=3e-5)
+    vehicle = layouts.lidar_position(0)  # x is north, y is west
+    np.testing.assert_allclose(found[:n], [np.add(vehicle, [-0.8, 0, 1.85])] * n, atol=1e-9)
+    np.testing.assert_allclose(found[n:], [np.add(vehicle, [-1.41, -0.02, 1.55])] * n, atol=1e-9)
+    _, arrays = read(source_of('pandaset', tmp_path, lidars=['pandarGT']))
+    assert arrays[0].track_ids == ('other',)
+
+
+def test_several_lidars_of_a_scene_on_the_command_line(tmp_path, capsys):
+    layouts.waymo(tmp_path / 'waymo')
+    layouts.kitti_tracking(tmp_path / 'kitti')
+    out = str(tmp_path / 'out')
+    lidars = ['--points=TOP', '--points=FRONT', '--formats=csv']
+    assert main(['relabel', f'waymo:{tmp_path / "waymo"}', '-o', out, *lidars]) == 0
+    capsys.readouterr()
+    assert main(['relabel', f'kitti-tracking:{tmp_path / "kitti"}', '-o', f'{out}2', *lidars]) == 1
+    assert "LiDARs velodyne, got 'TOP', 'FRONT'" in capsys.readouterr().err
 
 
 def test_times_of_points_are_seconds_after_the_stamp(tmp_path):
@@ -365,7 +425,7 @@ def test_another_lidar_or_fixed_frame_is_refused(tmp_path):
     layouts.nuscenes(tmp_path)
     address = f'{tmp_path}#scene-0061'
     with pytest.raises(RecordingError, match="LiDARs LIDAR_TOP, got 'LIDAR_BACK'"):
-        source_of('nuscenes', address, points='LIDAR_BACK').__enter__()
+        source_of('nuscenes', address, lidars=['LIDAR_BACK']).__enter__()
     with (
         source_of('nuscenes', address) as source,
         pytest.raises(RecordingError, match="'map' or 'LIDAR_TOP', got 'utm'"),

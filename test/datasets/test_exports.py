@@ -2,7 +2,7 @@
 
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.items import input_boxes
+from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.recording import Recording
 import layouts
 import numpy as np

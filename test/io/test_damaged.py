@@ -209,6 +209,26 @@ def test_a_damaged_page_costs_the_messages_on_it(tmp_path):
     assert 30 < len(sweeps) <= 40
 
 
+def test_damaged_rows_behind_a_gap_of_ids_are_skipped(tmp_path, drive):
+    """Ids are not tried one by one: the last row is a million million ids behind the others."""
+    file = database_of(drive.write(tmp_path / 'drive', 'sqlite3'))
+    with closing(sqlite3.connect(file)) as database:
+        database.execute('UPDATE messages SET id = 1000000000000 WHERE id IN '
+                         '(SELECT max(id) FROM messages)')  # fmt: skip
+        ((stamp_ns,),) = database.execute('SELECT timestamp FROM messages WHERE id > 1e11')
+        database.commit()
+    data = bytearray(file.read_bytes())
+    stored = stamp_ns.to_bytes(8, 'big')
+    place = data.rfind(stored)
+    while place >= 0:
+        data[max(place - 8, 0) : place] = b'\xff' * 8
+        place = data.rfind(stored, 0, place)
+    file.write_bytes(data)
+    sweeps, _, damages = read(file)
+    assert len(sweeps) >= len(drive.stamps) - 1
+    assert damages
+
+
 def test_a_topic_whose_definition_was_not_found(tmp_path, drive):
     drive.items.append(('/talk', START, drive.messages.header(START, 'x')))
     folder = write_recording(

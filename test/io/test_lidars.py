@@ -1,12 +1,15 @@
 """Several LiDARs: which clouds are merged, and which LiDAR measured which point."""
 
-from boxreg_ros.errors import ConfigError
+from types import SimpleNamespace
+
+from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.lidars import ignore, Lidars, merged, SensorPlacement, SweepMerger
-from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.io.transforms import sweep_to_frame, TransformTree
 from boxreg_ros.structures import Sweep
-from lidar_drives import LidarDrive, LIDARS
+from lidar_drives import DELAY_NS, LidarDrive, LIDARS, SPEED
 import numpy as np
 import pytest
+from ros_messages import SECOND
 
 MS = 10**6
 PERIOD = 100 * MS
@@ -122,6 +125,28 @@ def test_the_stamp_is_that_of_the_first_topic_that_is_there():
     np.testing.assert_allclose(part.sweep.times, [0, 0, -0.02, -0.02], atol=1e-12)
 
 
+@pytest.mark.parametrize('lost', [('a', 2), ('b', 2), ('c', 2)])
+def test_a_lost_cloud_does_not_shift_the_pairs_after_it(lost):
+    # Without the first cloud of its period, the others are near the first of the next one.
+    offsets = {'a': 0, 'b': 40, 'c': 70}
+    complete, rest = groups(periods(6, offsets, skip={lost}))
+    expected = [
+        [1000 + 100 * k + offset for name, offset in offsets.items() if (name, k) != lost]
+        for k in range(6)
+    ]
+    assert complete + rest == expected
+
+
+def test_lidars_of_different_rates_are_paired_again_after_they_pass_each_other():
+    order = [('a', 1000 + 100 * k) for k in range(60)] + [('b', 1051 + 103 * k) for k in range(58)]
+    complete, rest = groups(sorted(order, key=lambda item: item[1]), topics=('a', 'b'))
+    sweeps = complete + rest
+    pairs = [sweep for sweep in sweeps if len(sweep) == 2]
+    assert len(pairs) >= 54
+    assert all(abs(first - second) <= 100 for first, second in pairs)
+    assert sum(len(sweep) for sweep in sweeps) == len(order)
+
+
 def test_a_dropped_cloud_is_not_waited_for():
     merger = SweepMerger(('a', 'b'), 0.1, ignore)
     merger.add(cloud('a', 1000, is_dropped=True))
@@ -146,8 +171,8 @@ def test_settings_that_contradict_each_other_are_refused(fields, text):
         Lidars(**fields)
 
 
-def placement_of(drive, lidars):
-    """Return the sweep of the first cloud of a drive in its frame, placed, and what is missing."""
+def placement_of(drive, lidars, frame_id='base'):
+    """Return the sweep of the first cloud of a drive in a frame, placed, and what is missing."""
     tree = TransformTree()
     placement = SensorPlacement(lidars)
     cloud = None
@@ -158,7 +183,8 @@ def placement_of(drive, lidars):
             placement.add_info(message)
         elif topic == '/points':
             cloud = cloud or placement.sweep_of(message, topic)
-    return placement.placed(cloud, tree)
+    T_frame_base = tree.lookup(frame_id, 'base', cloud.stamp_ns)
+    return placement.placed(sweep_to_frame(cloud, T_frame_base, frame_id), tree)
 
 
 def test_the_info_names_the_lidar_and_the_time_of_every_point():
@@ -168,6 +194,19 @@ def test_the_info_names_the_lidar_and_the_time_of_every_point():
     assert sweep.sensors.tolist() == [0] * half + [1] * half
     np.testing.assert_allclose(sweep.origins, list(LIDARS.values()))
     np.testing.assert_allclose(sweep.times, [0.0] * half + [0.03] * half)
+
+
+def test_each_lidar_is_where_it_was_at_its_own_stamp():
+    sweep, _, _ = placement_of(LidarDrive(2, 'info'), Lidars(info='/points_info'), 'odom')
+    front, rear = LIDARS.values()
+    moved = SPEED * DELAY_NS / SECOND  # of the vehicle, until the rear LiDAR measures
+    np.testing.assert_allclose(sweep.origins, [front, np.add(rear, [moved, 0, 0])])
+
+
+def test_an_info_of_points_that_draco_has_sorted_is_refused():
+    message = SimpleNamespace(format='draco', compressed_data=b'DRACO\2\3\0\1')
+    with pytest.raises(UnsupportedMessage, match=r"order that '/i' counts them.*encode_method 2"):
+        SensorPlacement(Lidars(info='/i')).sweep_of(message, '/points')
 
 
 def test_rows_of_the_info_count_points_that_are_not_finite():

@@ -4,14 +4,17 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import json
 from pathlib import Path
+import socket
 from threading import Thread
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage import urls
 from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.urls import RemoteFile, url_of
 from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.offline.journal import Journal
 from mcap.reader import make_reader
 from mcap_files import rewritten
 import numpy as np
@@ -19,6 +22,7 @@ import pytest
 from ros_messages import Drive, SECOND, START
 
 pytest.importorskip('aiohttp', reason='the extra "remote" is not installed')
+fsspec = pytest.importorskip('fsspec')
 
 QUICK = ['--set=min_observations=3', '--formats=csv']
 
@@ -83,6 +87,22 @@ def store(monkeypatch):
     system = s3fs.S3FileSystem()
     system.makedirs('drives', exist_ok=True)
     yield system
+    server.stop()
+
+
+@pytest.fixture
+def google_store(monkeypatch):
+    """Yield a file system of Google's object store with the bucket ``drives``."""
+    monkeypatch.setenv('GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT', 'false')  # gRPC, not in the emulator
+    gcsfs = pytest.importorskip('gcsfs')
+    emulator = pytest.importorskip('gcp_storage_emulator.server')
+    server = emulator.create_server('127.0.0.1', 0, in_memory=True, default_bucket='drives')
+    server.start()
+    address = f'http://127.0.0.1:{server._api._httpd.server_port}'
+    monkeypatch.setenv('STORAGE_EMULATOR_HOST', address)
+    monkeypatch.setitem(fsspec.config.conf, 'gs', {'token': 'anon'})
+    gcsfs.GCSFileSystem.clear_instance_cache()
+    yield gcsfs.GCSFileSystem(token='anon')
     server.stop()
 
 
@@ -162,13 +182,14 @@ def test_other_storages_over_http(tmp_path, storage):
             assert len(list(recording.items(tree))) == 12
 
 
-def test_an_object_store_in_and_out(tmp_path, whole, store, capsys):
+@pytest.mark.parametrize(('scheme', 'fixture'), [('s3', 'store'), ('gs', 'google_store')])
+def test_an_object_store_in_and_out(tmp_path, whole, scheme, fixture, request, capsys):
+    store = request.getfixturevalue(fixture)
     store.put(str(whole), 'drives/one/whole.mcap')
     local = tmp_path / 'local'
-    command = ['relabel', str(whole), '-o', str(local), *QUICK]
-    assert main(command) == 0
-    out = 's3://drives/results/one'
-    command = ['relabel', 's3://drives/one', '-o', out, *QUICK, '--resume']
+    assert main(['relabel', str(whole), '-o', str(local), *QUICK]) == 0
+    out = f'{scheme}://drives/results/one'
+    command = ['relabel', f'{scheme}://drives/one', '-o', out, *QUICK, '--resume']
     assert main(command) == 0
     capsys.readouterr()
     assert store.cat('drives/results/one/boxes.csv') == boxes(local)
@@ -177,8 +198,42 @@ def test_an_object_store_in_and_out(tmp_path, whole, store, capsys):
     assert main(command) == 0
     assert 'up to date' in capsys.readouterr().out
     store.pipe('drives/other/file', b'x')
-    assert main(['relabel', str(whole), '-o', 's3://drives/other', *QUICK]) == 1
+    assert main(['relabel', str(whole), '-o', f'{scheme}://drives/other', *QUICK]) == 1
     assert 'expected a new folder or an earlier result' in capsys.readouterr().err
+
+
+def test_an_interrupted_run_goes_on_from_the_journal_in_the_store(tmp_path, store, monkeypatch):
+    recording = Drive(sweeps=60).write(tmp_path / 'drive')
+    command = ['relabel', str(recording), '--set=track_window=16', *QUICK, '--resume', '-o']
+    local = tmp_path / 'local'
+    append = Journal._append
+    appended = []
+
+    def append_until(limit):
+        def limited(journal, content):
+            append(journal, content)
+            appended.append(content)
+            if len(appended) == limit:
+                raise KeyboardInterrupt
+
+        appended.clear()
+        monkeypatch.setattr(Journal, '_append', limited)
+
+    append_until(None)
+    assert main([*command, str(local)]) == 0
+    records = len(appended)
+    assert records > 3
+    append_until(3)
+    out = 's3://drives/interrupted/one'
+    assert main([*command, out]) != 0
+    names = [f'drives/interrupted/.one.journal/00000{i}' for i in range(3)]
+    assert store.find('drives/interrupted') == names
+    # Another machine has only the store: what was solved before is not solved again.
+    append_until(None)
+    assert main([*command, out]) == 0
+    assert len(appended) == records - 3
+    assert store.cat('drives/interrupted/one/boxes.csv') == boxes(local)
+    assert not any('.journal' in name for name in store.find('drives/interrupted'))
 
 
 def test_batch_with_an_object_store(tmp_path, whole, store, capsys):
@@ -200,6 +255,61 @@ def test_errors_name_url_and_remedy(tmp_path, capsys):
         assert 'credentials' in line
     with pytest.raises(RecordingError, match='expected a scheme of fsspec'):
         part_of(Path('nonsense://host/file.mcap'))
+
+
+class Refusing(BaseHTTPRequestHandler):
+    """Refuse every request."""
+
+    def do_GET(self):
+        self.send_error(403)
+
+    do_HEAD = do_GET
+
+    def log_message(self, *_):
+        """Be silent."""
+
+
+def test_refused_credentials_are_named(tmp_path, capsys):
+    server = ThreadingHTTPServer(('127.0.0.1', 0), Refusing)
+    Thread(target=server.serve_forever, daemon=True).start()
+    url = f'http://127.0.0.1:{server.server_port}/one.mcap'
+    assert main(['relabel', url, '-o', str(tmp_path / 'out')]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f'boxreg: {url}: expected credentials that give access, got: ')
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize('out', ['results', 's3://missing-bucket/results'])
+def test_refused_credentials_of_an_object_store(tmp_path, whole, store, out, monkeypatch, capsys):
+    """No credentials at all, where drives are read or results are written."""
+    for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv('AWS_EC2_METADATA_DISABLED', 'true')
+    monkeypatch.setenv('HOME', str(tmp_path))
+    type(store).clear_instance_cache()
+    drives = ['s3://drives/one/whole.mcap'] if out == 'results' else []
+    target = out if '://' in out else str(tmp_path / out)
+    command = ['batch', str(whole), *drives, '-o', target, '--set=min_observations=3']
+    assert main(command) == 1
+    streams = capsys.readouterr()
+    (line,) = streams.err.splitlines()
+    assert 'expected credentials that give access, got: ' in line
+    if drives:
+        assert '1 of 2 drives done' in streams.out
+
+
+def test_a_server_that_does_not_answer_fails_its_drive_only(tmp_path, monkeypatch, capsys):
+    path = Drive(sweeps=6).write(tmp_path / 'drive')
+    monkeypatch.setattr(urls, 'ANSWER_SECONDS', 1.0)
+    with socket.create_server(('127.0.0.1', 0)) as silent:
+        url = f'http://127.0.0.1:{silent.getsockname()[1]}/silent.mcap'
+        command = ['batch', url, str(path), '-o', str(tmp_path / 'out')]
+        assert main([*command, '--set=min_observations=3']) == 1
+    streams = capsys.readouterr()
+    (line,) = streams.err.splitlines()
+    assert line.startswith(f'boxreg: silent: {url}: got no answer')
+    assert '1 of 2 drives done' in streams.out
 
 
 def test_ranges_are_read_once(tmp_path):

@@ -1,47 +1,92 @@
 """The budget of a tick follows the deadline, the period of the boxes and the time of a window."""
 
-import time
-
 from boxreg_ros.config import Config
+from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.io.warm_up import warm_up
-from boxreg_ros.live.budget import TickBudget
+from boxreg_ros.live.budget import BATCH_OVERHEAD, OVERRUNS, TickBudget
 import pytest
 
 
+class Clock:
+    """A clock that moves on by `step` at each look [s]."""
+
+    def __init__(self):
+        self.now = 1000.0
+        self.step = 0.0
+
+    def __call__(self):
+        self.now += self.step
+        return self.now
+
+
 def solved(deadline):
-    """Return a budget that has timed some batches."""
-    budget = TickBudget(deadline)
+    """Return a budget that has timed windows of 1 ms, and its clock."""
+    clock = Clock()
+    budget = TickBudget(deadline, clock)
+    clock.step = 1e-3 * (1 + BATCH_OVERHEAD)
     warm_up(Config(estimate='final'), budget.submit)
-    return budget
+    clock.step = 0.0
+    return budget, clock
+
+
+def windows(budget, since):
+    """Return the number of windows of a tick, with those that a batch costs in any case."""
+    budget.begin(since)
+    return budget.windows() + BATCH_OVERHEAD
+
+
+def tick(budget, clock, solving=0.0, publishing=0.0):
+    """Run a tick whose solving and publishing take a time [s]."""
+    budget.begin(clock.now)
+    budget.windows()
+    clock.now += solving
+    budget.submit([], Config(), InputModel(Config().faces))()
+    clock.now += publishing
+    budget.end()
 
 
 def test_one_window_is_solved_while_no_time_is_known():
     budget = TickBudget(3600.0)
-    budget.begin(time.monotonic())
     assert budget.windows() == 1
 
 
 def test_the_number_of_windows_follows_the_time_left():
-    budget = solved(3600.0)
-    budget.begin(time.monotonic())
-    many = budget.windows()
-    assert many > 1000
-    budget.begin(time.monotonic() - 1800.0)
-    assert budget.windows() == pytest.approx(many / 2, rel=0.05)
-    budget.begin(time.monotonic() - 3600.0)
-    assert budget.windows() == 1
+    budget, clock = solved(0.1)
+    assert windows(budget, clock.now) == pytest.approx(100, abs=1)
+    assert windows(budget, clock.now - 0.05) == pytest.approx(50, abs=1)
+    assert windows(budget, clock.now - 0.1) == 1 + BATCH_OVERHEAD
 
 
 def test_time_for_publishing_is_left():
-    budget = solved(3600.0)
-    budget.begin(time.monotonic())
-    many = budget.windows()
-    warm_up(Config(estimate='final'), budget.submit)
-    time.sleep(0.1)
-    budget.end()
-    budget.begin(time.monotonic() - 3599.9)
-    assert budget.windows() == 1
-    assert many > 1
+    budget, clock = solved(0.1)
+    tick(budget, clock, publishing=0.03)
+    budget.end()  # of a later message in the same tick
+    assert windows(budget, clock.now) == pytest.approx(70, abs=1)
+
+
+def test_the_largest_of_recent_overruns_is_a_reserve():
+    budget, clock = solved(0.1)
+    tick(budget, clock, solving=0.12)
+    tick(budget, clock, solving=0.05)
+    assert windows(budget, clock.now) == pytest.approx(80, abs=1)
+    for _ in range(OVERRUNS - 2):
+        tick(budget, clock)
+    assert windows(budget, clock.now) == pytest.approx(80, abs=1)
+    tick(budget, clock)
+    assert windows(budget, clock.now) == pytest.approx(100, abs=1)
+
+
+def test_a_long_interruption_leaves_time_for_windows():
+    budget, clock = solved(0.1)
+    tick(budget, clock, solving=5.0)
+    assert windows(budget, clock.now) == pytest.approx(50, abs=1)
+
+
+def test_a_tick_that_cannot_be_in_time_takes_no_reserve():
+    budget, clock = solved(0.02)  # less than a batch of one window
+    tick(budget, clock, solving=0.05)
+    budget.deadline = 0.1
+    assert windows(budget, clock.now) == pytest.approx(100, abs=1)
 
 
 @pytest.mark.parametrize(

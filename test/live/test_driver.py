@@ -4,13 +4,13 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.transforms import matrix
 from boxreg_ros.live.driver import LiveRegistrar, ReceivedMessage, refined_to_frame
-from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
+from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
 from lidar_drives import LidarDrive
 from msg_adapters import adapter_for, pointcloud, vision
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
 import pytest
-from ros_messages import DETECTIONS, Drive, SECOND, START, TRACKED
+from ros_messages import DETECTIONS, Drive, MARKERS, SECOND, START, TRACKED
 
 
 class Live(LiveRegistrar):
@@ -111,6 +111,32 @@ class Turned:
         half = np.sqrt(0.5)
         static = m.transform(START, 'turned', 'odom', (0, 0, 0), (0, 0, half, half))
         self.items = [('/tf_static', START, m.tf(static)), *drive.items]
+
+
+@pytest.mark.parametrize('type_name', [DETECTIONS, TRACKED, MARKERS])
+def test_a_missed_detection_is_published_behind_the_boxes_of_its_message(type_name):
+    drive = Drive(sweeps=9, boxes=type_name)
+    missed = items_of(drive, '/boxes')[6]
+    lists = {DETECTIONS: 'detections', TRACKED: 'objects', MARKERS: 'markers'}
+    del getattr(missed, lists[type_name])[0]
+    live = Live(output_frame='odom', coast=0.5)
+    live.adapter = adapter_for(type_name)
+    out = live.feed(drive) + live.flush()
+    for is_final in (False, True):
+        item = [item for item in out if item.is_final == is_final][6]
+        assert item.given.track_ids == live.adapter.from_msg(missed).track_ids
+        array = live.adapter.from_msg(item.message)
+        before = live.adapter.from_msg(items_of(drive, '/boxes')[5])
+        assert array.track_ids == before.track_ids[::-1]
+        assert array.class_names == before.class_names[::-1]
+        assert array.scores[1] == (1.0 if type_name == MARKERS else 0.0)
+        assert item.refined.status[1] == COASTED
+        np.testing.assert_allclose(array.boxes[:, :6], item.refined.boxes.boxes[:, :6], atol=1e-6)
+        assert np.abs(array.boxes[1, :3] - drive.truth[array.stamp_ns][0, :3]).max() < 0.3
+    others = [item for item in out if item.refined.boxes.stamp_ns != array.stamp_ns]
+    assert not any(COASTED in item.refined.status for item in others)
+    assert live.counts[COASTED] == 1
+    assert not live.reports
 
 
 def test_a_wrong_pose_convention_is_reported_with_every_array():

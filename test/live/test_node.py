@@ -12,7 +12,7 @@ from boxreg_ros.config import Config, settings
 from boxreg_ros.io.markers import BOX_NAMESPACES, MarkerBoard
 from boxreg_ros.live.topics import import_message
 from boxreg_ros.offline.calibrate import calibrated, GAPS, Measured, write_settings
-from boxreg_ros.structures import BoxArray, KEPT, REFINED, RefinedBoxes
+from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import markers, vision
 import numpy as np
@@ -529,6 +529,18 @@ def test_markers_keep_one_id_per_track():
     assert board.is_showing and board.clear() and not board.is_showing
     given.boxes[1, 4] = 0.0  # no width: viewers reject it
     assert not board.update(given, refined_of(given, KEPT, KEPT)).markers
+
+
+def test_a_coasted_box_has_a_colour_of_its_own_and_no_box_of_the_input():
+    board = MarkerBoard()
+    given = boxes_of('a', 'b')
+    board.update(given, refined_of(given, REFINED, KEPT))
+    refined = refined_of(boxes_of('b', 'a'), KEPT, COASTED)
+    found = {(m.ns, m.id): m for m in board.update(boxes_of('b'), refined).markers}
+    assert found['input', 1].action == 0
+    assert found['input', 0].action == 2, 'deleted'
+    assert found['refined', 0].action == 0
+    assert found['refined', 0].color != found['refined', 1].color
 
 
 def test_missing_ros_is_reported_with_a_remedy():

@@ -1,5 +1,6 @@
 """Clouds that are not a PointCloud2: compressed ones, and Livox's own message."""
 
+import base64
 import sys
 from types import SimpleNamespace
 import zlib
@@ -108,6 +109,62 @@ def test_a_stream_that_is_cut_short_gives_one_clear_line(kind, left):
     assert f'got {left} bytes' in str(caught.value)
     assert 'cut short' in str(caught.value)
     assert '\n' not in str(caught.value)
+
+
+# Five points of x, y, z, intensity (float32), t (uint32), ring (uint16) and rgb (float32), as
+# draco_point_cloud_transport writes them: an attribute per field, of types POSITION, GENERIC and,
+# as four uint8, COLOR. Encoded by the draco3d of npm, in the order of the points and by k-d tree.
+PLUGIN_STREAMS = {
+    'sequential': (
+        'RFJBQ08CAwAAAAAFAAAAAQcACQEAAAAJAQABAAkBAAIECQEAAwQGAQAEBAQBAAUCAgQABgAAAAABAQEAAAAAAADA'
+        'PwAAQEAAAJBAAADAQAAAyEIAAMtCAADOQgAA0UIAANRCAABIQwCASUMAAEtDAIBMQwAATkMAAOBAAAAAQQAAEEEA'
+        'ACBBAAAwQQABAQAWA80MSzUzAwTgggAJPSChByT0gIQeAAAAAAAJPQAAAQEBAQPNDAM1MwME4IIAAAAAAwAAAAAB'
+        'AQEBCTUDAzUDAzUDAzUDAzEzBUDdf1CWAAAAABMAAAA='
+    ),
+    'k-d tree': (
+        'RFJBQ08CAwABAAAFAAAAAQcACQEAAAAJAQABAAkBAAIECQEAAwQGAQAEBAQBAAUCAgQABgMWAAAABQAAAFUEcclq'
+        'R4QAAAAADAAAAwDAAAAOAED/CzwAgv9f8P8X/P8AwMbtAQAAAEAEAAAAABIA8P8PTP+D/3/9/x/8AAAACQACABAA'
+        'ABIAggUAoAAgAAAgAAACABI6AAAAAAAIAAAAAIAAAAAAAAYAAAAAAAAAAAAAAAAAEACABgCgABA4AAAAAAEAAAEA'
+        'EACQ0AMEAAAAAAAAAAQAAAAAAAAAAAAAAAAAwEAQAADIQgAAwEAQAABIQwAAwEAQAADgQAAAgEAQ'
+    ),
+}
+
+
+def plugin_cloud(method):
+    """Return a cloud of `PLUGIN_STREAMS`, with gaps between its fields."""
+    columns = [(name, 'f4', np.zeros(5)) for name in ('x', 'y', 'z', 'intensity')]
+    columns += [('t', 'u4', np.zeros(5)), ('ring', 'u2', np.zeros(5)), ('rgb', 'f4', np.zeros(5))]
+    message = MESSAGES.cloud(START, 'lidar', columns, padding=3)
+    return compressed(message, 'draco', base64.b64decode(PLUGIN_STREAMS[method]))
+
+
+@pytest.mark.parametrize('method', PLUGIN_STREAMS)
+def test_draco_streams_of_the_transport_plugin_have_its_fields(method):
+    pytest.importorskip('DracoPy')
+    message = plugin_cloud(method)
+    found = clouds.plain(message)
+    sweep = pointcloud.from_msg(found)
+    order = np.argsort(sweep.points[:, 0])
+    k = np.arange(5)
+    expected = np.stack([1.5 * k, 100 + 1.5 * k, 200 + 1.5 * k], axis=1)
+    tolerance = 1e-2  # 16 bits per field
+    np.testing.assert_allclose(sweep.points[order], expected, atol=tolerance)
+    np.testing.assert_allclose(sweep.times[order], 1e-3 * k, atol=1e-9)
+    np.testing.assert_allclose(pointcloud.intensities(found)[order], 7 + k, atol=tolerance)
+    assert pointcloud.described(found).startswith('unknown layout (x, y, z, intensity, t, ring')
+    kinds = {field.name: field.datatype for field in found.fields}
+    assert kinds == {'x': 7, 'y': 7, 'z': 7, 'intensity': 7, 't': 6, 'ring': 4, 'rgb': 7}
+    rows = np.asarray(found.data).reshape(5, -1)
+    assert rows[order[0], 22:26].tolist() == [0, 1, 2, 3]
+    assert clouds.is_reordered(message) == (method == 'k-d tree')
+
+
+def test_fields_of_draco_beyond_the_point_are_refused():
+    pytest.importorskip('DracoPy')
+    message = plugin_cloud('sequential')
+    message.point_step = 8
+    with pytest.raises(UnsupportedMessage, match='within a point_step of 8 bytes'):
+        clouds.plain(message)
 
 
 def test_attributes_that_do_not_fit_the_fields_are_refused():

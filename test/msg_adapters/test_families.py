@@ -39,10 +39,14 @@ INPUT_COVARIANCE = 0.5 * np.eye(6)
 WITH_COVARIANCE = (DETECTIONS, TRACKED, DETECTED, OBJECTS_WITH_COVARIANCE)
 
 
-def message_of(type_name, rpy=RPY):
+def boxes_at(*rows, rpy=RPY):
+    """Return some of the two boxes, for `Messages.boxes`."""
     quaternions = Rotation.from_euler('ZYX', rpy[:, ::-1]).as_quat()
-    boxes = [(n + 1, (POSITIONS[n], quaternions[n]), SIZES[n]) for n in range(2)]
-    return M.boxes(type_name, STAMP, 'lidar', boxes)
+    return [(n + 1, (POSITIONS[n], quaternions[n]), SIZES[n]) for n in rows]
+
+
+def message_of(type_name, rpy=RPY):
+    return M.boxes(type_name, STAMP, 'lidar', boxes_at(0, 1, rpy=rpy))
 
 
 def bytes_of(message, type_name):
@@ -107,6 +111,28 @@ def test_other_fields_are_copied(type_name):
             assert item.kinematics.has_position_covariance
             item.kinematics.has_position_covariance = False
     assert bytes_of(again, type_name) == before
+
+
+@pytest.mark.parametrize('type_name', ADAPTERS)
+def test_boxes_of_earlier_messages_are_added(type_name):
+    """They get the stamp of the message and the score 0; `to_msg` sets all boxes."""
+    adapter = adapter_for(type_name)
+    earlier = M.boxes(type_name, STAMP - 10**8, 'lidar', boxes_at(0, 1))
+    message = M.boxes(type_name, STAMP, 'lidar', boxes_at(0))
+    before = bytes_of(message, type_name), bytes_of(earlier, type_name)
+    given = adapter.from_msg(earlier)
+    moved = replace(moved_boxes(given), stamp_ns=STAMP)
+    out = adapter.to_msg(adapter.with_added(message, [(earlier, 1)]), moved)
+    assert (bytes_of(message, type_name), bytes_of(earlier, type_name)) == before
+    M.store.serialize_cdr(out, type_name)
+    found = adapter.from_msg(out)
+    assert (found.stamp_ns, found.frame_id) == (STAMP, 'lidar')
+    assert (found.track_ids, found.class_names) == (given.track_ids, given.class_names)
+    np.testing.assert_allclose(found.boxes, moved.boxes, atol=1e-6)
+    has_score = type_name not in (MARKERS, BOXES)
+    assert found.scores.tolist() == [given.scores[0], 0.0 if has_score else 1.0]
+    if type_name == MARKERS:
+        assert [marker.text for marker in out.markers] == ['', 'coasted']
 
 
 @pytest.mark.parametrize('type_name', WITH_COVARIANCE)

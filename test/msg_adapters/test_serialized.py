@@ -109,6 +109,19 @@ def test_boxes_are_read_and_written_without_objects(type_name):
 
 
 @pytest.mark.parametrize('type_name', BOX_FIELDS)
+def test_boxes_of_earlier_messages_are_added_by_the_objects(type_name):
+    adapters = Adapters(type_name)
+    message = message_of(type_name)
+    data = serialize_message(message)
+    added = adapters.fast.with_added(data, [(data, 1)])
+    assert added == adapters.slow.with_added(message, [(message, 1)])
+    boxes = adapters.slow.from_msg(added)
+    assert len(boxes.boxes) == 6
+    written = adapters.fast.to_msg(added, boxes)
+    assert written == adapters.slow.to_msg(added, boxes)
+
+
+@pytest.mark.parametrize('type_name', BOX_FIELDS)
 def test_another_output_frame_is_left_to_the_objects(type_name):
     T = np.eye(4)
     T[:2, :3] = [[0, -1, 0], [1, 0, 0]]

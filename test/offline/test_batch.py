@@ -2,7 +2,9 @@
 
 import csv
 import json
+import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 import time
@@ -12,6 +14,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.offline.job_process import JobRunner, memory_bytes
 from boxreg_ros.offline.result_folder import whole_folder
+from paths import ROOT
 import pytest
 from ros_messages import Drive
 
@@ -102,13 +105,27 @@ def test_missing_and_repeated_drives_fail_and_the_others_go_on(tmp_path, capsys)
     )
 
 
-def test_shards_are_merged_to_the_results_of_one_run(tmp_path, capsys):
+def test_shards_of_the_recipe_for_slurm_are_merged_to_the_results_of_one_run(tmp_path, capsys):
     paths = [str(Drive(sweeps=n).write(tmp_path / str(n))) for n in (5, 6)]
+    (tmp_path / 'drives.txt').write_text('\n'.join(paths))
     out = tmp_path / 'out'
-    assert main(['batch', *paths, '-o', str(out), '--shard=1/2', *QUICK]) == 0
+    page = (ROOT / 'docs' / 'tasks' / 'many-recordings.md').read_text()
+    (recipe,) = re.findall("--wrap '(.+)'", page)
+    recipe = recipe.replace('/shared/out', str(out)).replace('/8', '/2')
+
+    def run_shard(number):
+        environment = {
+            **os.environ,
+            'SLURM_ARRAY_TASK_ID': str(number),
+            'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}',
+        }
+        command = ['sh', '-c', f'{recipe} {" ".join(QUICK)}']
+        subprocess.run(command, env=environment, cwd=tmp_path, check=True)
+
+    run_shard(1)
     assert main(['batch', '-o', str(out), '--merge']) == 1
     assert 'got all but 2; run these first' in capsys.readouterr().err
-    assert main(['batch', *paths, '-o', str(out), '--shard=2/2', *QUICK]) == 0
+    run_shard(2)
     assert main(['batch', '-o', str(out), '--merge']) == 0
     assert f'{out}: 2 of 2 drives done' in capsys.readouterr().out
     assert [row['boxes_in'] for row in index_of(out).values()] == ['10', '12']

@@ -6,7 +6,7 @@ import json
 from boxreg_ros import cli
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.items import input_boxes
+from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.labels import FORMATS, frames_of, Options
 from boxreg_ros.offline.convert import Conversion, convert
 from boxreg_ros.offline.formats import FORMAT_COLUMNS, rows

@@ -11,7 +11,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import ConfigError, RecordingError, UnsupportedMessage
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.items import input_boxes
+from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.labels import Options
 from boxreg_ros.labels.cloud_spool import Spool

@@ -210,8 +210,10 @@ def test_registrar_takes_input_while_windows_are_registered(stream):
     assert events == [*expected, 'wait', 'begin', 'wait']
 
 
-@pytest.mark.parametrize('changes', [{'estimate': 'final'}, {'device': 'meta'}])
-def test_no_worker_for_sliding_windows_or_other_devices(changes):
+@pytest.mark.parametrize(
+    'changes', [{'estimate': 'final'}, {'device': 'meta'}, {'solver.threads': 1}]
+)
+def test_no_worker_for_sliding_windows_other_devices_or_one_core(changes):
     with registration_worker(SHORT.updated(changes), Stopwatch(), print) as begin:
         assert begin is None
 
@@ -254,12 +256,13 @@ def test_the_reader_imports_no_solver():
     assert (done.stdout, done.stderr) == ('\n', '')
 
 
-def test_relabel_writes_the_same_files_with_a_worker(tmp_path):
+def test_relabel_writes_the_same_files_in_one_process(tmp_path, monkeypatch):
     request = Request((Drive(sweeps=30).write(tmp_path / 'drive'),), config=SHORT)
     summary = relabel(request, tmp_path / 'worker')
     assert 0 < summary['seconds']['solve'] < summary['seconds']['total']
-    no_worker = SHORT.updated({'device': 'cpu:0'})
-    relabel(Request(request.recordings, config=no_worker), tmp_path / 'direct')
+    monkeypatch.setattr(os, 'fork', None)
+    one_core = SHORT.updated({'solver.threads': 1})
+    relabel(Request(request.recordings, config=one_core), tmp_path / 'direct')
     direct, worker = (tmp_path / name / 'boxes.csv' for name in ('direct', 'worker'))
     assert worker.read_bytes() == direct.read_bytes()
 

@@ -51,6 +51,21 @@ def test_part_of_the_boxes_is_missing_and_ids_change():
     assert 60 < len(long) < 120
 
 
+def test_far_boxes_are_missed_more_often_and_in_runs():
+    """The distance of track k is 100 k m: its square is 1 / 1200 k^2 of the mean square."""
+    origins = np.zeros((SWEEPS, 3))
+    found = break_tracks(arrays(), np.random.default_rng(1), 0.0, origins, far_misses=True)
+    left = np.zeros(TRACKS)
+    for array in found:
+        for name in array.track_ids:
+            left[int(name.split('_')[0])] += 1 / SWEEPS
+    gaps = 0.08  # of 3 to 8 sweeps, as without far misses
+    assert abs(1 - left[:20].mean() - gaps - 0.08 * 0.11) < 0.04
+    assert abs(1 - left[-20:].mean() - gaps - 0.08 * 2.1) < 0.06
+    lengths = [length for number in range(40, TRACKS) for length in runs(found, str(number))[0]]
+    assert np.mean(lengths) > 2.5
+
+
 def test_boxes_that_are_left_are_unchanged():
     given = arrays()
     for array in break_tracks(given, np.random.default_rng(2)):
@@ -66,6 +81,8 @@ def test_ghosts_have_their_rate_and_short_lives():
     assert set(ghosts.values()) <= {1, 2, 3}
     with pytest.raises(ConfigError, match='ghosts: expected 0 or more'):
         break_tracks(arrays(), np.random.default_rng(3), -1.0, origins)
+    with pytest.raises(ConfigError, match='origins'):
+        break_tracks(arrays(), np.random.default_rng(3), far_misses=True)
 
 
 def test_same_seed_breaks_alike_and_keeps_the_truth():

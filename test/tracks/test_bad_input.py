@@ -1,7 +1,9 @@
 """Faulty ids, classes and rates: all boxes are returned, added ones are marked."""
 
 from collections import Counter
+from dataclasses import replace
 
+from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.structures import ADDED
 from drives import complete, drive, path, steps_of
 import numpy as np
@@ -33,14 +35,15 @@ def test_two_objects_with_one_id_in_each_message():
 def test_id_reused_after_a_minute_is_another_object():
     first = path((5, 6), (4, 0), 10)
     second = path((9, -6), (4, 0), 10)
-    pause = 60
+    pause = 600  # steps of 0.1 s
     truth = [[box] for box in first] + [[]] * pause + [[box] for box in second]
     given = [[('7', box[0])] if box else [] for box in truth]
     rows, _ = complete(drive(truth, given))
     assert len(own_rows(rows)) == 20
     assert steps_of(rows, '7')[:10] == list(range(10))
     assert max(steps_of(rows, '7')) < 10 + pause
-    assert [step for step in steps_of(rows, '7_2') if step >= 70] == list(range(70, 80))
+    again = 10 + pause
+    assert [k for k in steps_of(rows, '7_2') if k >= again] == list(range(again, again + 10))
 
 
 def test_tracks_that_cross_keep_their_objects():
@@ -65,14 +68,30 @@ def test_tracks_that_cross_keep_their_objects():
 
 
 def test_detector_at_2_hz_under_a_lidar_at_20_hz():
-    # Steps of the helper are 0.1 s: a message at each tenth sweep is 1 Hz under 10 Hz.
     boxes = path((5, 6), (4, 0), 61)
     truth = [[box] for box in boxes]
     given = [[('7', box)] if k % 10 == 0 else None for k, box in enumerate(boxes)]
-    rows, tracks = complete(drive(truth, given))
-    assert steps_of(rows, '7') == list(range(0, 61, 10)), 'no box at stamps without a message'
+    # Sweeps of the helper are 0.1 s apart, these 0.05 s: 8 m/s.
+    items = [replace(item, stamp_ns=item.stamp_ns // 2) for item in drive(truth, given)]
+    rows, tracks = complete(items)
+    assert steps_of(rows, '7') == list(range(0, 31, 5)), 'no box at stamps without a message'
     assert {row[3] for row in rows} == {'refined'}
     assert (tracks['7'].filled, tracks['7'].extended) == (0, 0)
+    assert iou_3d(np.array([row[4] for row in rows]), boxes[::10]).min() > 0.9
+
+
+def test_detector_at_2_hz_that_misses_a_box():
+    """The missing box is added at the stamp of its message."""
+    boxes = path((5, 6), (4, 0), 61)
+    truth = [[box] for box in boxes]
+    given = [[('7', box)] if k % 10 == 0 else None for k, box in enumerate(boxes)]
+    given[30] = []
+    items = [replace(item, stamp_ns=item.stamp_ns // 2) for item in drive(truth, given)]
+    rows, _ = complete(items)
+    assert steps_of(rows, '7') == list(range(0, 31, 5))
+    (added,) = [row for row in rows if row[3] == 'interpolated']
+    assert added[0] == 15
+    assert iou_3d(added[4][None], boxes[[30]]) > 0.85
 
 
 def test_class_that_changes_along_a_track_becomes_the_majority():

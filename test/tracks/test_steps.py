@@ -1,10 +1,11 @@
 """Each step from tracks to whole tracks, on tables of boxes with a known answer."""
 
 from boxreg_ros.config import Config
+from boxreg_ros.core.motion import motion_at
 from boxreg_ros.tracks.extend import extend, num_free, num_supported
 from boxreg_ros.tracks.fill import fill
 from boxreg_ros.tracks.links import best_links
-from boxreg_ros.tracks.motion import between, is_parked, motion_at
+from boxreg_ros.tracks.motion import between, is_parked
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import stitch
@@ -116,6 +117,15 @@ def test_fragments_that_disagree_are_not_stitched(change):
     change(later)
     found, _ = stitch([tracklet('a', boxes[:10]), tracklet('b', later, 15)], CONFIG)
     assert ids(found) == ['a', 'b']
+
+
+def test_a_gap_longer_than_both_fragments_is_left():
+    """Two short ghosts would fit each other anywhere."""
+    boxes = path((0, 0), (5, 0), 40)
+    ghosts = [tracklet('a', boxes[:3]), tracklet('b', boxes[12:15], 12)]
+    assert len(stitch(ghosts, CONFIG)[0]) == 2
+    longer = [tracklet('a', boxes[:12]), tracklet('b', boxes[21:24], 21)]
+    assert len(stitch(longer, CONFIG)[0]) == 1
 
 
 def test_tracks_that_cross_are_not_exchanged():

@@ -73,7 +73,6 @@ class ExpectedArrays(NamedTuple):
     pose_deviation: Any
     widened_deviation: Any
     unmodelled_bias: Any
-    input_error: Any
 
 
 class InputArrays(NamedTuple):
@@ -151,10 +150,6 @@ class SolutionArrays(NamedTuple):
     ----------
     poses, shared : array, shapes (B, N, 6) and (B, 23)
         Boxes, and the variables that all observations of a window share.
-    pose_covariances, extent_covariances : array, shapes (B, N, 6, 6) and (B, 3, 3)
-        Of windows that are done.
-    face_distances : array, shape (B, N, 6)
-        Of windows that are done [m].
     evidence : array, shape (B, 3, 3)
         Logarithms of the input extents; corrections by the points alone, and their weights.
     prior_state, prior_step, prior_information : array, shapes (B, 35), (B, 35), (B, 35, 35)
@@ -164,13 +159,32 @@ class SolutionArrays(NamedTuple):
 
     poses: Any
     shared: Any
-    pose_covariances: Any
-    extent_covariances: Any
-    face_distances: Any
     evidence: Any
     prior_state: Any
     prior_step: Any
     prior_information: Any
+
+
+class EndArrays(NamedTuple):
+    """
+    How a round ends for the b windows that take part.
+
+    Attributes
+    ----------
+    is_done : array, shape (b,)
+        Whether a window is settled, or this was the last round.
+    pose_blocks, border_blocks : array, shapes (b, N, 6, 6) and (b, N, 6, 23)
+        Blocks of the poses in the inverse curvature, of windows that are done: their own, and
+        those with the shared variables.
+    corner : array, shape (b, 23, 23)
+        Block of the shared variables in the inverse curvature.
+
+    """
+
+    is_done: Any
+    pose_blocks: Any
+    border_blocks: Any
+    corner: Any
 
 
 class PriorArrays(NamedTuple):
@@ -326,14 +340,6 @@ class ShapeNumbers(NamedTuple):
     is_moving: bool
 
 
-class PosteriorNumbers(NamedTuple):
-    """Constants of `boxreg_ros.core.covariance` and `input_model`; there they are described."""
-
-    pose_model_deviation: tuple[float, ...]
-    extent_model_deviation: tuple[float, ...]
-    min_extent_gain: float
-
-
 class RoundNumbers(NamedTuple):
     """Constants and settings of a round."""
 
@@ -341,7 +347,7 @@ class RoundNumbers(NamedTuple):
     weights: WeightNumbers
     shape: ShapeNumbers
     search: SearchNumbers
-    posterior: PosteriorNumbers
+    min_extent_gain: float
 
 
 class ExpectationNumbers(NamedTuple):
@@ -361,7 +367,6 @@ class ExpectationNumbers(NamedTuple):
     pinned_extent: float
     pinned_margins: float
     pivot_deviation: float
-    constant_extent_errors: tuple[float, ...]
 
 
 class NoiseNumbers(NamedTuple):

@@ -1,11 +1,12 @@
 """
 Means and deviations of one window before its points are used, in plain loops.
 
-The torch twin is `boxreg_ros.core.input_model.expect_torch`; the formulas are (M15) and (M28).
+And evidence of the points about its extents, after a round. The torch twins are `expect_torch`
+and `evidence_of_extents` of `boxreg_ros.core.input_model`; the formulas are (M15) to (M17).
 
 """
 
-from math import exp, hypot, log, sqrt
+from math import exp, isfinite, log, sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.kernels.compile import kernel
@@ -31,10 +32,9 @@ class Ratios(NamedTuple):
 
     Attributes
     ----------
-    raw : array, shape (9,)
-        Errors of the input over those of the settings, as measured.
     ratio, constant : array, shape (6,)
-        The same, lowered for low-noise input, and of the part that is constant along a track.
+        Errors of the input over those of the settings, lowered for low-noise input; of the part
+        that is constant along a track.
     widening : array, shape (9,)
         Factor on deviations for the correlation of neighbours.
     slow : array, shape (9,)
@@ -42,7 +42,6 @@ class Ratios(NamedTuple):
 
     """
 
-    raw: Any
     ratio: Any
     constant: Any
     widening: Any
@@ -77,8 +76,6 @@ def fill_ratios(b, windows, known, numbers, ratios):
     weight = known.weight[kind]
     interval = windows.times[b, length - 1] / max(length - 1, 1)
     for j in range(POSE + SIZE):
-        deviation = known.deviation[kind, j]
-        ratios.raw[j] = sqrt(1 + weight * (deviation**2 - 1))
         typical = numbers.typical_correlation
         correlation = typical + weight * (known.correlation[kind, j] - typical)
         ratios.widening[j] = sqrt((1 + correlation) / (1 - correlation))
@@ -113,9 +110,7 @@ def fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expecte
     kind = windows.kind[b]
     has_pin = windows.pinned[b].any()
     usual, usual_extent = of_class.pose[b], of_class.extent[b]
-    shared, deviation, error = expected.shared[b], expected.deviation[b], expected.input_error[b]
-    count = windows.lengths[b] + windows.marginalised_extents[b, 3]
-    slowest = ratios.slow.max()
+    shared, deviation = expected.shared[b], expected.deviation[b]
     shared[:] = 0.0
     for j in range(POSE):
         share = numbers.yaw_bias if j == HEADING else 1.0
@@ -124,7 +119,6 @@ def fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expecte
         expected.widened_deviation[b, j] = usual[j] * ratios.ratio[j] * ratios.widening[j]
         expected.unmodelled_bias[b, j] = bias if has_pin else 0.0
         deviation[BIAS + j] = numbers.pinned_extent if has_pin else bias
-        error[BIAS + j] = usual[j] * ratios.raw[j] * slowest * share
     for k in range(SIZE):
         part = usual_extent * ratios.slow[POSE + k] * min(2 * ratios.constant[k], 1.0)
         factor = population_factor(
@@ -132,11 +126,6 @@ def fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expecte
         )
         shared[EXTENT + k] = mean[k] if has_pin else mean[k] * factor
         deviation[EXTENT + k] = numbers.pinned_extent if has_pin else mean[k] * factor * part
-        of_mean = min(ratios.widening[POSE + k] / sqrt(count), 1.0)
-        both = hypot(of_mean, slowest * numbers.constant_extent_errors[k])
-        error[EXTENT + k] = mean[k] * usual_extent * ratios.raw[POSE + k] * both
-    for j in range(BIAS + POSE):
-        error[j] = deviation[j] if has_pin else max(error[j], deviation[j])
     widening = max(2 - 2 * ratios.constant[0], 1.0) * (numbers.pinned_margins if has_pin else 1.0)
     for face in range(6):
         size = max(mean[face // 2] / numbers.large_extent[face // 2], 1.0)
@@ -149,7 +138,7 @@ def fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expecte
 
 
 @kernel
-def expect(begin, end, windows, of_class, known, numbers, expected):
+def expect(begin, end, windows, of_class, known, numbers, expected, widening, slow):
     """
     Write means and deviations of the windows `begin` to `end`.
 
@@ -167,11 +156,29 @@ def expect(begin, end, windows, of_class, known, numbers, expected):
         Constants.
     expected : ExpectedArrays
         Written.
+    widening : array, shape (B, 3)
+        Factor on the deviations of extents for the correlation of their errors, written.
+    slow : array, shape (B, 1)
+        Largest part of an error that is constant over the window, written.
 
     """
-    ratios = Ratios(np.empty(9), np.empty(6), np.empty(6), np.empty(9), np.empty(9))
+    ratios = Ratios(np.empty(6), np.empty(6), np.empty(9), np.empty(9))
     mean = np.empty(SIZE)
     for b in range(begin, end):
         fill_mean_extents(b, windows, mean)
         fill_ratios(b, windows, known, numbers, ratios)
         fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expected)
+        widening[b] = ratios.widening[POSE:]
+        slow[b, 0] = ratios.slow.max()
+
+
+@kernel
+def fill_evidence(given, expected, deviation, shared, corner, min_gain, evidence):
+    """Write corrections of the extents by the points alone, and their weights, (2, 3) (M17)."""
+    for k in range(SIZE):
+        gain = 1 - corner[k, k] / deviation[k] ** 2
+        power = (deviation[k] / expected[k]) ** 2
+        by_points = log(shared[EXTENT + k] / expected[k]) / gain + log(expected[k])
+        is_evidence = gain > min_gain and isfinite(by_points)
+        evidence[0, k] = (by_points - given[k]) / power if is_evidence else 0.0
+        evidence[1, k] = gain * power if is_evidence else 0.0

@@ -9,7 +9,6 @@ The torch twin is `boxreg_ros.core.face_support.observe_faces_torch`; the formul
 from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.kernels.arrays import FaceArrays
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.rotation import fill_rotation
 import numpy as np
@@ -296,15 +295,6 @@ def clear_padding(length, row, faces):
     faces.inset[row, length:] = 0.0
     faces.inset_shares[:, row, length:] = 0.0
     faces.num_points[row, length:] = 0.0
-
-
-@kernel
-def empty_faces(B, N):
-    """Return room for the face observations of B windows of N observations."""
-    return FaceArrays(
-        np.empty((B, N, 6, 4, 4)), np.empty((B, N, 6)), np.empty((B, N, 6)), np.empty((B, N, 6)),
-        np.empty((2, B, N, 6)), np.empty((B, N)),
-    )  # fmt: skip
 
 
 @kernel

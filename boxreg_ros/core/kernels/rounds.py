@@ -17,8 +17,8 @@ from boxreg_ros.core.kernels.arrowhead import (
     POSE,
 )
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.covariance import fill_evidence, fill_posterior
-from boxreg_ros.core.kernels.face_support import empty_face_work, empty_faces, observe_window
+from boxreg_ros.core.kernels.expectation import fill_evidence
+from boxreg_ros.core.kernels.face_support import empty_face_work, observe_window
 from boxreg_ros.core.kernels.lbfgs import empty_search, minimise
 from boxreg_ros.core.kernels.normal_equations import (
     accumulate,
@@ -74,14 +74,10 @@ class RoundWork(NamedTuple):
     ----------
     points, shape, scratch, search : FaceWork, ShapeWork, Scratch, Search
         Of the parts of the round.
-    faces : FaceArrays
-        Face observations of the window.
     x : array, shape (6 N + 23,)
-        Its variables.
+        Variables of the window.
     A : ArrowheadArrays
         Curvature, then its factor.
-    blocks, border, corner : array, shapes (N, 6, 6), (N, 6, 23) and (23, 23)
-        Of the inverse of the curvature.
 
     """
 
@@ -89,12 +85,8 @@ class RoundWork(NamedTuple):
     shape: Any
     scratch: Any
     search: Any
-    faces: Any
     x: Any
     A: Any
-    blocks: Any
-    border: Any
-    corner: Any
 
 
 @kernel
@@ -104,9 +96,7 @@ def empty_round_work(begin, end, windows, N, numbers):
     return RoundWork(
         empty_face_work(begin, end, windows, numbers.faces),
         empty_shape_work(begin, end, windows, N, numbers.shape.cells),
-        empty_scratch(N), empty_search(D, numbers.search.history), empty_faces(1, N), np.empty(D),
-        empty_arrowhead(N), np.empty((N, POSE, POSE)), np.empty((N, POSE, SHARED)),
-        np.empty((SHARED, SHARED)),
+        empty_scratch(N), empty_search(D, numbers.search.history), np.empty(D), empty_arrowhead(N),
     )  # fmt: skip
 
 
@@ -122,9 +112,10 @@ def leave_prior(b, terms, work, solution):
 
 @kernel
 def run_window(
-    b, windows, thinned, known, prior, every_free, expected, of_class, numbers, work, solution
-):
-    """Take one round with window `b`; return whether it is done. See `run_windows`."""
+    b, row, windows, thinned, known, prior, every_free, expected, of_class, numbers, work, faces,
+    solution, ends,
+):  # fmt: skip
+    """Take one round with window `b`, at `row` of `faces` and `ends`; see `run_windows`."""
     poses, shared, free = solution.poses[b], solution.shared[b], every_free[b]
     search, x, A, kind = numbers.search, work.x, work.A, windows.kind[b]
     N = len(poses)
@@ -132,10 +123,10 @@ def run_window(
     shared[ANCHOR:SIDESLIP] = 0.0
     observe_window(
         b, windows, poses, shared, known.occlusion_inset[kind], known.range_inset[kind],
-        numbers.faces, work.points, 0, work.faces,
+        numbers.faces, work.points, row, faces,
     )  # fmt: skip
     terms = unweighted_terms(N, N if search.uses_shape else 0, prior, b)
-    weigh(b, windows, poses, shared, work.faces, expected, of_class, numbers.weights, terms)
+    weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers.weights, terms)
     if search.uses_shape:
         terms.start[:] = poses
         agree(
@@ -152,26 +143,22 @@ def run_window(
     )
     poses[:] = found
     shared[:] = x[n:]
-    invert_corner(A.corner, work.corner)
+    invert_corner(A.corner, ends.corner[row])
     fill_evidence(
-        solution.evidence[b, 0], expected.shared[b], expected.deviation[b], shared, work.corner,
-        numbers.posterior.min_extent_gain, solution.evidence[b, 1:],
+        solution.evidence[b, 0], expected.shared[b], expected.deviation[b], shared,
+        ends.corner[row], numbers.min_extent_gain, solution.evidence[b, 1:],
     )  # fmt: skip
+    ends.is_done[row] = is_done
     if is_done:
-        invert_poses(A, work.corner, work.blocks, work.border)
-        fill_posterior(
-            b, windows, work.faces, free, expected, work.blocks, work.border, work.corner,
-            numbers.posterior, solution,
-        )  # fmt: skip
+        invert_poses(A, ends.corner[row], ends.pose_blocks[row], ends.border_blocks[row])
         if len(solution.prior_state) and windows.lengths[b] == N:
             leave_prior(b, terms, work, solution)
-    return is_done
 
 
 @kernel
 def run_windows(
-    begin, end, rows, windows, thinned, known, prior, free, expected, of_class, numbers, solution,
-    is_done,
+    begin, end, rows, windows, thinned, known, prior, free, expected, of_class, numbers, faces,
+    solution, ends,
 ):  # fmt: skip
     """
     Take one round with the windows `rows[begin:end]`.
@@ -196,15 +183,17 @@ def run_windows(
         Settings of the class of each window.
     numbers : RoundNumbers
         Constants and settings.
+    faces : FaceArrays
+        Face observations of these windows, written.
     solution : SolutionArrays
         Start of the round; its end is written.
-    is_done : array, shape (b,)
-        Whether a window is settled, or this was the last round; written.
+    ends : EndArrays
+        Written.
 
     """
     work = empty_round_work(0, len(windows.counts), windows, solution.poses.shape[1], numbers)
-    for i in range(begin, end):
-        is_done[i] = run_window(
-            rows[i], windows, thinned, known, prior, free, expected, of_class, numbers, work,
-            solution,
+    for row in range(begin, end):
+        run_window(
+            rows[row], row, windows, thinned, known, prior, free, expected, of_class, numbers,
+            work, faces, solution, ends,
         )  # fmt: skip

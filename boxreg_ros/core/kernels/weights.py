@@ -245,7 +245,7 @@ def robustify_motion(poses, shared, length, outlier, terms):
 
 
 @kernel
-def weigh(b, windows, poses, shared, faces, expected, of_class, numbers, terms):
+def weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers, terms):
     """
     Write data and weights of the terms of window `b`, but those of rigid shape and prior.
 
@@ -259,8 +259,10 @@ def weigh(b, windows, poses, shared, faces, expected, of_class, numbers, terms):
         Input of the windows.
     poses, shared : array, shapes (N, 6) and (23,)
         Its boxes and shared variables at the start of the round.
+    row : int
+        Where the window is in `faces`.
     faces : FaceArrays
-        Face observations of this window, as the only one.
+        Face observations.
     expected : ExpectedArrays
         Means and deviations of input and shared variables.
     of_class : ClassArrays
@@ -278,19 +280,19 @@ def weigh(b, windows, poses, shared, faces, expected, of_class, numbers, terms):
     length = windows.lengths[b]
     boxes, times = windows.boxes[b], windows.times[b]
     terms.times[:] = times
-    terms.inset[:] = faces.inset[0]
+    terms.inset[:] = faces.inset[row]
     terms.expected[:] = expected.shared[b]
     for n in range(N):
         fill_rotation(poses[n, 3], poses[n, 4], poses[n, 5], terms.axes[n])
         for k in range(6):
             terms.given[n, k] = boxes[n, POSE[k]]
     fill_neighbour_deviation(boxes, times, length, terms.axes, numbers, off_track)
-    distance = faces.distance[0]
+    distance = faces.distance[row]
     fill_face_weights(
-        distance, faces.weight[0], off_track, length, of_class.shape[b], numbers, face_weight
+        distance, faces.weight[row], off_track, length, of_class.shape[b], numbers, face_weight
     )
     for n in range(length):
-        scale_moments(faces.moments[0, n], face_weight[n], terms.W_faces[n])
+        scale_moments(faces.moments[row, n], face_weight[n], terms.W_faces[n])
     deviation, widened = expected.pose_deviation[b], expected.widened_deviation[b]
     fill_input_weights(
         poses, shared[BIAS:GAP], length, off_track, deviation, widened, numbers, terms

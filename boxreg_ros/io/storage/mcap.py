@@ -343,7 +343,9 @@ class McapFile(ChunkedFile):
             return records.Chunk('', data, chunk.last_ns, chunk.start_ns, 0, size)
         if data[:1] != bytes([Opcode.CHUNK]):
             raise RecordingError('no chunk at the place that the index names')
-        record: records.Chunk = records.Chunk.read(ReadDataStream(BytesIO(data[HEAD_BYTES:])))
+        stream = BytesIO(data)  # shares the bytes
+        stream.seek(HEAD_BYTES)
+        record: records.Chunk = records.Chunk.read(ReadDataStream(stream))
         if record.compression == 'zstd':
             size = zstandard.frame_content_size(record.data)
             if size not in (-1, record.uncompressed_size):

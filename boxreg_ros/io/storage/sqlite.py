@@ -224,7 +224,7 @@ class SqliteFile:
             last_id = self._next_readable(last_id)
 
     def _next_readable(self, last_id: int) -> int | None:
-        """Return an id behind which rows are readable again; None without."""
+        """Return an id just before a row that may be readable; None without such a row."""
         step = 1
         query = 'SELECT id FROM messages NOT INDEXED WHERE id > ? ORDER BY id LIMIT 1'
         while last_id + step < MAX_ID:
@@ -233,7 +233,7 @@ class SqliteFile:
                 if found is None:
                     return None
                 if found[0] > last_id + step:
-                    return last_id + step
+                    return int(found[0]) - 1
             step *= 2
         return None
 

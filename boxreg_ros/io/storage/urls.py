@@ -27,7 +27,11 @@ REQUEST_BYTES = 2**16
 """Smaller reads fetch a block of this size: a request takes as long as 1 MB of data."""
 READERS = 4
 """Requests at a time; chosen: object stores send some 50 MB/s each."""
+ANSWER_SECONDS = 60.0
+"""Longest time for an answer [s]: 256 kB/s for the largest range, and ten times a slow listing."""
 CAUSES = 'check the address, the network and the credentials'
+REFUSED_STATUS = (401, 403)
+"""Answers of HTTP to wrong or missing credentials."""
 
 
 class Entry(NamedTuple):
@@ -132,7 +136,10 @@ class RemoteFile:
 
     def _request(self, first: int, end: int) -> bytes:
         with _answers(self._path):
-            return bytes(self._system.cat_file(self._name, start=first, end=end))
+            content = self._system.cat_file(
+                self._name, start=first, end=end, **_limit(self._system)
+            )
+            return bytes(content)
 
 
 def url_of(path: Path) -> str | None:
@@ -158,17 +165,18 @@ def entry_of(path: Path) -> Entry:
     """
     system, name = _system_of(path)
     with _answers(path):
-        return _entry(path, system.info(name))
+        return _entry(path, system.info(name, **_limit(system)))
 
 
 def entries_of(path: Path) -> list[Entry]:
     """Return a file behind a URL, or the files in the folder that it is, sorted by name."""
     system, name = _system_of(path)
     with _answers(path):
-        about = system.info(name)
+        about = system.info(name, **_limit(system))
         if about['type'] != 'directory':
             return [_entry(path, about)]
-        inner = sorted(system.ls(name, detail=True), key=lambda one: str(one['name']))
+        listed = system.ls(name, detail=True, **_limit(system))
+        inner = sorted(listed, key=lambda one: str(one['name']))
         files = [one for one in inner if one['type'] == 'file']
     return [_entry(path / Path(one['name']).name, one) for one in files]
 
@@ -184,23 +192,42 @@ def read_text(path: Path) -> str:
     """Return the text of a file of this machine or behind a URL; OSError if there is none."""
     if url_of(path) is None:
         return path.read_text(encoding='utf-8')
+    return read_bytes(path).decode()
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the content of a file behind a URL; OSError if there is none."""
     system, name = _system_of(path)
     with _answers(path, missing_is_error=False):
-        return bytes(system.cat_file(name)).decode()
+        return bytes(system.cat_file(name, **_limit(system)))
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a file behind a URL; it appears whole."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file behind a URL; it appears whole."""
     system, name = _system_of(path)
     with _answers(path):
-        system.pipe_file(name, text.encode())
+        system.pipe_file(name, content)
+
+
+def delete_files(path: Path) -> None:
+    """Delete all files below a folder behind a URL."""
+    system, name = _system_of(path)
+    names = names_of(path)
+    with _answers(path):
+        for one in names:
+            system.rm_file(f'{name}/{one}')
 
 
 def names_of(path: Path) -> list[str]:
     """Return the names of all files below a folder behind a URL; none if it does not exist."""
     system, name = _system_of(path)
     with _answers(path):
-        found = system.find(name)
+        found = system.find(name, **_limit(system))
     return [str(one).removeprefix(name).lstrip('/') for one in found]
 
 
@@ -226,6 +253,11 @@ def upload(folder: Path, target: Path, last: str) -> None:
             system.rm_file(f'{name}/{file}')
         for file in sorted(files, key=lambda file: (file == last, file)):
             system.put_file(str(folder / file), f'{name}/{file}')
+
+
+def _limit(system: Any) -> dict[str, float]:
+    """Return the argument of fsspec that limits the time of a request, where it has one."""
+    return {'timeout': ANSWER_SECONDS} if system.async_impl else {}
 
 
 def _entry(path: Path, about: dict[str, Any]) -> Entry:
@@ -255,10 +287,30 @@ def _answers(path: Path, missing_is_error: bool = True) -> Iterator[None]:
     """Turn the errors of file systems, which are of any class, into RecordingError."""
     try:
         yield
-    except FileNotFoundError:
+    except Exception as error:
+        url = url_of(path)
+        # That of HTTP is a FileNotFoundError for each status.
+        if _is_refusal(error) or _is_refusal(error.__cause__):
+            raise RecordingError(
+                f'{url}: expected credentials that give access, got: {_reason(error)}; set those '
+                f'of this storage, as AWS_ACCESS_KEY_ID or GOOGLE_APPLICATION_CREDENTIALS'
+            ) from None
+        if not isinstance(error, FileNotFoundError):
+            raise RecordingError(f'{url}: got no answer: {_reason(error)}; {CAUSES}') from None
         if not missing_is_error:
             raise
-        raise RecordingError(f'{url_of(path)}: expected a file, got none; {CAUSES}') from None
-    except Exception as error:
-        reason = ' '.join(str(error).split()) or type(error).__name__
-        raise RecordingError(f'{url_of(path)}: got no answer: {reason}; {CAUSES}') from None
+        raise RecordingError(f'{url}: expected a file, got none; {CAUSES}') from None
+
+
+def _is_refusal(error: BaseException | None) -> bool:
+    """Return whether a server has refused the credentials, or there are none."""
+    if isinstance(error, PermissionError) or type(error).__name__ == 'NoCredentialsError':
+        return True  # the second one of botocore
+    status = getattr(error, 'status', getattr(error, 'code', None))
+    return status in REFUSED_STATUS
+
+
+def _reason(error: Exception) -> str:
+    """Return the text of an error in one line, of the one that caused it where there is one."""
+    cause = error.__cause__ or error
+    return ' '.join(str(cause).split()) or type(cause).__name__

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation, WARNING
-from boxreg_ros.structures import HEIGHT, X, Y, Z
+from boxreg_ros.structures import Floats, HEIGHT, X, Y, Z
 import numpy as np
+from numpy.typing import NDArray
 
 NEIGHBOURHOOD = 15.0
 """Boxes within this distance share their ground [m]. Chosen: 1 m off at a slope of 7 %."""
@@ -28,15 +29,23 @@ def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
         offset = boxes[rows][:, None, [X, Y]] - boxes[rows][None, :, [X, Y]]
         near = np.linalg.norm(offset, axis=2) < NEIGHBOURHOOD
         np.fill_diagonal(near, False)
-        for i, row in enumerate(rows):
-            index = int(owner[row])
-            if near[i].sum() < MIN_NEIGHBOURS or index in reported:
-                continue
-            height = bottom[row] - np.median(bottom[rows[near[i]]])
-            if abs(height) > MAX_OFFSET:
+        counts = near.sum(axis=1)
+        heights = bottom[rows] - _medians(bottom[rows], near)
+        for i in np.flatnonzero((counts >= MIN_NEIGHBOURS) & (np.abs(heights) > MAX_OFFSET)):
+            index = int(owner[rows[i]])
+            if index not in reported:
                 reported.add(index)
-                text = f'bottom {height:+.2f} m off those of {near[i].sum()} boxes around it'
-                yield Violation(tracks[index].track_id, int(stamps_ns[row]), text)
+                text = f'bottom {heights[i]:+.2f} m off those of {counts[i]} boxes around it'
+                yield Violation(tracks[index].track_id, int(stamps_ns[rows[i]]), text)
+
+
+def _medians(values: Floats, is_in: NDArray[np.bool_]) -> Floats:
+    """Return for each row of `is_in` (n, n) the median of the values (n,) in it; inf for none."""
+    ordered = np.sort(np.where(is_in, values, np.inf), axis=1)
+    counts = is_in.sum(axis=1)
+    rows = np.arange(len(values))
+    medians: Floats = (ordered[rows, (counts - 1) // 2] + ordered[rows, counts // 2]) / 2
+    return medians
 
 
 RULE = Rule(

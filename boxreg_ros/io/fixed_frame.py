@@ -1,0 +1,285 @@
+"""
+The clouds and boxes of a recording in the fixed frame: the one way to read a recording.
+
+`FixedFrameItems` confirms time jumps, moves every item and merges the clouds of several LiDARs.
+`boxreg relabel` hands the items to the registrar; `calibrate`, `convert`, `evaluate` and
+`bench real` read the same ones.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import cast, NamedTuple
+
+from boxreg_ros.config import Config
+from boxreg_ros.errors import TransformUnavailable
+from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage
+from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING, MergedSweep
+from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
+from boxreg_ros.io.transforms import inverse, sweep_to_frame, TransformTree
+from boxreg_ros.structures import BoxArray, Floats, Sweep
+from msg_adapters.convention import Convention, STANDARD
+import numpy as np
+
+
+class MovedItem(NamedTuple):
+    """
+    A cloud or boxes of a recording, and the same in the fixed frame.
+
+    Attributes
+    ----------
+    items : tuple of Item
+        As recorded: one, or the clouds of several LiDARs that were merged.
+    moved : Sweep or BoxArray, or None
+        In the fixed frame, boxes with their ids; None where no transform is known.
+    T_fixed_item : array, shape (4, 4), or None
+        Pose of the frame of a single item; None where unknown, and for merged clouds.
+    restarts : bool
+        True if time went back before it.
+
+    """
+
+    items: tuple[Item, ...]
+    moved: Sweep | BoxArray | None
+    T_fixed_item: Floats | None
+    restarts: bool
+
+    @property
+    def given(self) -> Sweep | BoxArray:
+        """Return the content as recorded; of merged clouds the first."""
+        return self.items[0].content
+
+    @property
+    def received_ns(self) -> int:
+        """Return when it was complete [ns]."""
+        return self.items[-1].received_ns
+
+
+class StoredCloud(NamedTuple):
+    """A cloud for label files: its sweep, the pose of its frame, and intensities; see `Spool`."""
+
+    sweep: Sweep
+    T_fixed_sweep: Floats | None
+    intensities: Floats | None
+
+
+class FixedFrameItems:
+    """
+    Bring the items of a recording into the fixed frame.
+
+    Parameters
+    ----------
+    source : ItemSource
+        Open.
+    config : Config
+        `max_gap`, `tolerance` and `merge_span` are used.
+    convention : Convention
+        Convention of the boxes, and whether ids are to be assigned.
+    fixed_frame : str, optional
+        Fixed frame to use instead of the one that the source chooses.
+    stage : callable, optional
+        Measures the stages ``read``, ``decode`` and ``transform``.
+
+    Attributes
+    ----------
+    session : Session
+        Has the transforms, the fixed frame and the finding of the pose check.
+    counts : Counter
+        Sweeps, box arrays, time jumps, clouds without a transform or whose LiDARs are not all
+        known, and clouds and box arrays without a stamp.
+    missing_transforms : int
+        Number of clouds and box arrays without a transform.
+    first_missing_transform, first_unplaced : str
+        Error of the first of them, and of the first cloud whose LiDARs are not all known.
+
+    Raises
+    ------
+    RecordingError
+        If no motion of the sensor is known, or no transforms lead to `fixed_frame`.
+
+    """
+
+    def __init__(
+        self,
+        source: ItemSource,
+        config: Config,
+        convention: Convention = STANDARD,
+        fixed_frame: str | None = None,
+        stage: Stage = not_measured,
+    ) -> None:
+        self._source = source
+        self._stage = stage
+        self._is_merging = len(source.placement.lidars.topics) > 1
+        self._jumps = JumpConfirmation[Item]()
+        self._restarts = False
+        self.session = Session(convention, config, placement=source.placement)
+        with stage('read'):
+            self.session.fixed_frame = source.choose_fixed_frame(self.tree, fixed_frame)
+        self.counts: Counter[str] = Counter()
+        self.missing_transforms = 0
+        self.first_missing_transform = ''
+        self.first_unplaced = ''
+
+    @property
+    def tree(self) -> TransformTree:
+        """Return the transforms, up to the last item that was read."""
+        return self.session.tree
+
+    @property
+    def fixed_frame(self) -> str:
+        """Return the fixed frame."""
+        return self.session.fixed_frame
+
+    def read(
+        self, *, with_clouds: bool = True, with_intensities: bool = False
+    ) -> Iterator[MovedItem]:
+        """Yield clouds and boxes in the order they were received; see `Recording.items`."""
+        items = self._source.items(
+            self.tree,
+            with_clouds=with_clouds,
+            with_intensities=with_intensities,
+            stage=self._stage,
+        )
+        for item in items:
+            confirmed, restarts = [item], False
+            if not is_placeholder(item.content):
+                confirmed, restarts = self._jumps.add(item, item.content)
+            if restarts:
+                yield from map(self._merged, self.session.unmerged())
+                # The tree, which is ahead of the items, has detected the jump itself.
+                self.session.restart()
+                self.counts['time_jump'] += 1
+                self._restarts = True
+            for ready in confirmed:
+                yield from self._moved(ready)
+        for late in self._jumps.release():
+            yield from self._moved(late)
+        yield from map(self._merged, self.session.unmerged())
+
+    def pose_of(self, frame_id: str, stamp_ns: int) -> Floats | None:
+        """Return the pose (4, 4) of a frame in the fixed frame at a stamp; None if unknown."""
+        try:
+            return self.tree.lookup(self.fixed_frame, frame_id, stamp_ns)
+        except TransformUnavailable:
+            return None
+
+    def stored_cloud(self, item: MovedItem, frame_id: str) -> StoredCloud:
+        """
+        Return a cloud for label files: merged ones in `frame_id`, a single one in its own frame.
+
+        The times of its points are those by which it was moved.
+
+        """
+        moved = item.moved
+        given = item.given
+        assert isinstance(given, Sweep)
+        if not isinstance(moved, Sweep):
+            return StoredCloud(given, None, item.items[0].intensities)
+        if len(item.items) == 1:
+            given = replace(given, times=moved.times)
+            return StoredCloud(given, item.T_fixed_item, item.items[0].intensities)
+        T_fixed_frame = self.pose_of(frame_id, moved.stamp_ns)
+        if T_fixed_frame is not None:
+            moved = sweep_to_frame(moved, inverse(T_fixed_frame), frame_id)
+        intensities = [part.intensities for part in item.items]
+        known = [values for values in intensities if values is not None]
+        whole = np.concatenate(known) if len(known) == len(item.items) else None
+        return StoredCloud(moved, T_fixed_frame, whole)
+
+    def left_out(self) -> str:
+        """Return how many messages are not used so far, and why, in one line; empty if all are."""
+        parts = []
+        unreadable = self._source.unreadable.total()
+        if unreadable:
+            first = next(iter(self._source.first_errors.values()))
+            parts.append(f'{unreadable} messages could not be read, first: {first}')
+        if self.missing_transforms:
+            parts.append(
+                f'{self.missing_transforms} messages had no transform, first: '
+                f'{self.first_missing_transform}'
+            )
+        for topic, counts in self.session.lidar_counts.items():
+            if counts[CLOUD_LATE] or counts[CLOUD_MISSING]:
+                parts.append(
+                    f'LiDAR {topic}: {counts[CLOUD_LATE]} clouds late, '
+                    f'{counts[CLOUD_MISSING]} missing'
+                )
+        if self.first_unplaced:
+            parts.append(f'the LiDARs of some clouds are not known, first: {self.first_unplaced}')
+        return '; '.join(parts)
+
+    def _moved(self, item: Item) -> Iterator[MovedItem]:
+        """Yield an item in the fixed frame, or the sweeps that are complete with its cloud."""
+        with self._stage('transform'):
+            admitted = self.session.admit(item.content)
+            self._count(item.content, admitted)
+            if not self._is_merging or not isinstance(item.content, Sweep):
+                yield self._item((item,), admitted.moved, admitted.T_fixed_item)
+                return
+            if not isinstance(admitted.moved, Sweep):
+                return  # the other LiDARs go on
+            complete = self.session.merged(admitted.moved, (item, admitted.T_fixed_item))
+        yield from map(self._merged, complete)
+
+    def _merged(self, merged: MergedSweep) -> MovedItem:
+        """Return a sweep of several LiDARs."""
+        self.counts['sweeps'] += 1
+        parts = cast(tuple[tuple[Item, Floats], ...], merged.extras)
+        items = tuple(item for item, _ in parts)
+        T_fixed_item = parts[0][1] if len(parts) == 1 else None
+        return self._item(items, merged.sweep, T_fixed_item)
+
+    def _item(
+        self, items: tuple[Item, ...], moved: Sweep | BoxArray | None, T_fixed_item: Floats | None
+    ) -> MovedItem:
+        restarts = self._restarts
+        self._restarts = False
+        return MovedItem(items, moved, T_fixed_item, restarts)
+
+    def _count(self, given: Sweep | BoxArray, admitted: Admitted) -> None:
+        kind = 'sweeps' if isinstance(given, Sweep) else 'box_arrays'
+        if not (self._is_merging and isinstance(given, Sweep)):  # those are counted merged
+            self.counts[kind] += 1
+        if given.stamp_ns <= 0 and not is_placeholder(given):
+            self.counts[f'{kind}_without_stamp'] += 1
+        if not admitted.reason:
+            return
+        if isinstance(given, Sweep):
+            self.counts[admitted.reason] += 1
+        if admitted.moved is None:
+            self.missing_transforms += 1
+            self.first_missing_transform = self.first_missing_transform or admitted.detail
+        else:
+            self.first_unplaced = self.first_unplaced or admitted.detail
+
+
+def input_boxes(
+    source: AbstractContextManager[ItemSource], fixed_frame: str | None = None
+) -> tuple[list[BoxArray], str]:
+    """
+    Return the input boxes of a recording in the fixed frame that `relabel` would choose.
+
+    Parameters
+    ----------
+    source : context manager of ItemSource
+        Recording that is not open yet.
+    fixed_frame : str, optional
+        Fixed frame to use instead.
+
+    Returns
+    -------
+    arrays : list of BoxArray
+        All that could be decoded and transformed.
+    others : str
+        Number of the others, and why; empty if there are none.
+
+    """
+    with source as recording:
+        items = FixedFrameItems(recording, Config(), fixed_frame=fixed_frame)
+        moved = [item.moved for item in items.read(with_clouds=False)]
+        others = items.left_out()
+    return [boxes for boxes in moved if isinstance(boxes, BoxArray)], others
