@@ -798,7 +798,8 @@ class InputModel:
         )
         kinds = kind.cpu().numpy()
         gap_correction, occlusion_inset, range_inset = (
-            part.cpu().numpy()[kinds][:, None] for part in offsets
+            np.broadcast_to(part.cpu().numpy(), (len(KINDS), 6))[kinds][:, None]
+            for part in offsets
         )
         occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
         is_visible = occluded < MAX_VISIBLE_SHARE

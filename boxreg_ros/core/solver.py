@@ -6,6 +6,7 @@ minimised. How many rounds there are, and what they use, is a `Plan`, chosen onc
 
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import inf
 from multiprocessing import cpu_count
@@ -31,7 +32,7 @@ from boxreg_ros.core.input_model import (
     UNKNOWN_NOISE,
     UNKNOWN_POPULATION,
 )
-from boxreg_ros.core.kernels import compiled, pool_of, shared_by
+from boxreg_ros.core.kernels import compiled, shared_by
 from boxreg_ros.core.rounds import Plan, Round, run_round
 from boxreg_ros.structures import POSE
 import torch
@@ -87,11 +88,18 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     every = torch.arange(len(free), device=free.device)
     rows, turn, points = every, 0, plan.coarse_points
     workers = config.solver.threads or NUM_CORES
-    with shared_by(workers):
+    # No longer lived: a forked worker would wait for threads that it does not have.
+    with (
+        ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool,
+        shared_by(pool, workers),
+    ):
         while len(rows):
             expected = expect(problem, offsets, noise, population)
             batch = Round(problem.thinned(points), solution, expected, free)
-            rows = rows[~_take_round(batch, offsets, plan, turn, config, rows, workers)]
+            work = partial(run_round, batch, offsets, plan, turn, config)
+            parts = _split(rows, problem.length, workers)
+            is_done = map(work, parts) if len(parts) == 1 else pool.map(work, parts)
+            rows = rows[~torch.cat(list(is_done))]
             turn += 1
             if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
                 residuals = normalised_residuals(problem, solution.state)
@@ -101,21 +109,6 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
             if not len(rows) and 2 * points <= problem.returns.width:
                 rows, points = every, inf  # settled on few points: once more with all
     return solution
-
-
-def _take_round(
-    batch: Round,
-    offsets: FaceOffsets,
-    plan: Plan,
-    turn: int,
-    config: Config,
-    rows: Tensor,
-    workers: int,
-) -> Tensor:
-    """Take a round with the windows `rows`, shared between threads; return which are done."""
-    work = partial(run_round, batch, offsets, plan, turn, config)
-    parts = _split(rows, batch.problem.length, workers)
-    return work(rows) if len(parts) == 1 else torch.cat(list(pool_of(workers).map(work, parts)))
 
 
 def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: Plan) -> Solution:

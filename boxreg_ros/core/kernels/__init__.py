@@ -13,13 +13,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
 from itertools import pairwise
-import os
 from types import ModuleType
 from typing import Any, NamedTuple
 from warnings import warn
 
 import numpy as np
-import torch
 from torch import Tensor
 
 
@@ -38,26 +36,22 @@ MIN_WINDOWS_PER_THREAD = 8
 """Fewest windows that a thread gets. Chosen: they take longer than handing them over, 0.1 ms."""
 
 
-_workers: ContextVar[int] = ContextVar('workers', default=1)
+class _Threads(NamedTuple):
+    pool: ThreadPoolExecutor
+    workers: int
 
 
-@cache
-def pool_of(workers: int) -> ThreadPoolExecutor:
-    """Return threads that run torch in one thread each; they wait for the next work."""
-    return ThreadPoolExecutor(workers, 'solver', torch.set_num_threads, (1,))
-
-
-os.register_at_fork(after_in_child=pool_of.cache_clear)  # no thread survives a fork
+_threads: ContextVar[_Threads | None] = ContextVar('threads', default=None)
 
 
 @contextmanager
-def shared_by(workers: int) -> Iterator[None]:
+def shared_by(pool: ThreadPoolExecutor, workers: int) -> Iterator[None]:
     """Let `run` share the windows of each kernel between the caller and `workers` - 1 threads."""
-    token = _workers.set(workers)
+    token = _threads.set(_Threads(pool, workers))
     try:
         yield
     finally:
-        _workers.reset(token)
+        _threads.reset(token)
 
 
 def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
@@ -76,13 +70,13 @@ def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
         The other arguments.
 
     """
-    workers = _workers.get()
-    parts = min(workers, windows // MIN_WINDOWS_PER_THREAD)
-    if parts < 2:
+    threads = _threads.get()
+    parts = 1 if threads is None else min(threads.workers, windows // MIN_WINDOWS_PER_THREAD)
+    if threads is None or parts < 2:
         kernel(0, windows, *arguments)
         return
     ends = [windows * part // parts for part in range(parts + 1)]
-    submit = pool_of(workers).submit
+    submit = threads.pool.submit
     others = [submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])]
     kernel(0, ends[1], *arguments)
     for other in others:
