@@ -7,14 +7,16 @@ numbers each and the shared variables s, the same for all observations, see `Sta
 """
 
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from operator import attrgetter
 from typing import NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.arrowhead import LINK
 from boxreg_ros.core.kernels import contiguous
-from boxreg_ros.core.kernels.arrays import WindowArrays
-from boxreg_ros.structures import POSE
+from boxreg_ros.core.kernels.arrays import ClassArrays, WindowArrays
+from boxreg_ros.structures import Floats, Ints, POSE
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +24,10 @@ CLASS_NUMBERS = [item.name for item in fields(ClassConfig)[1:]]
 """Names of the columns of `Problem.class_numbers`."""
 numbers_of = attrgetter(*CLASS_NUMBERS)
 """Returns the numbers of a `ClassConfig`, in this order."""
+ACCELERATIONS = ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning')
+"""Settings of `ClassConfig` that are the deviations of the accelerations of a pose."""
+FACE_GAPS = ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
+"""Settings of `ClassConfig` that are the expected margins of the six faces."""
 POSE_ERRORS = ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading')
 """The settings of `ClassConfig` that are the deviations of an input pose: x y z roll pitch yaw."""
 
@@ -44,6 +50,12 @@ PADDING_POSITION = 1e6
 PRIOR_POSES = 2
 """Poses that the marginalisation prior refers to: no residual spans more than three poses."""
 PRIOR_SIZE = PRIOR_POSES * LINK + SHARED
+
+
+@cache
+def _columns_of(*names: str) -> Ints:
+    """Return the columns of `Problem.class_numbers` with these names."""
+    return np.array([CLASS_NUMBERS.index(name) for name in names])
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +179,8 @@ class Problem(NamedTuple):
 
     def of_class(self, *names: str) -> Tensor:
         """Return the settings `names` of the class of each window, shape (B, number of names)."""
-        return self.class_numbers[:, [CLASS_NUMBERS.index(name) for name in names]]
+        columns = torch.from_numpy(_columns_of(*names))
+        return self.class_numbers.index_select(1, columns.to(self.class_numbers.device))
 
     def arrays(self) -> WindowArrays:
         """Return the windows for the kernels, which take no padding."""
@@ -183,6 +196,29 @@ class Problem(NamedTuple):
             contiguous(self.counts),
             self.returns.stride,
             contiguous(self.pinned),
+            contiguous(self.marginalised_extents),
+            contiguous(self.kind),
+        )
+
+    def class_arrays(self) -> ClassArrays:
+        """Return the settings of the class of each window for the kernels."""
+        numbers = contiguous(self.class_numbers)
+
+        def of_class(*names: str) -> Floats:
+            found: Floats = numbers.take(_columns_of(*names), axis=1)
+            return found[:, 0] if len(names) == 1 else found
+
+        return ClassArrays(
+            acceleration=of_class(*ACCELERATIONS),
+            slip=of_class('slip', 'climb'),
+            drift=of_class('drift'),
+            pose=of_class(*POSE_ERRORS),
+            extent=of_class('extent'),
+            gap_spread=of_class('gap_spread'),
+            sideslip=of_class('sideslip'),
+            shape=of_class('shape'),
+            gaps=of_class(*FACE_GAPS),
+            pivot=of_class('pivot'),
         )
 
     def thinned(self, points: float) -> 'Problem':

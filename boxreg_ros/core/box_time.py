@@ -96,6 +96,8 @@ class BoxTimeEvidence:
             Of the object [m/s].
 
         """
+        if not seen.sight:
+            return
         motion = velocity * seen.sight
         if hypot(*motion.tolist()) < MIN_MOTION or len(seen.points) < MIN_VOTE_POINTS:
             return

@@ -5,16 +5,34 @@ docs/method.md, section Input model, has the formulas (M14) to (M18).
 
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import FaceConfig, KINDS
-from boxreg_ros.core.batch import EXTENT, GAP, PIVOT, POSE_ERRORS, Problem, SHARED, State
+from boxreg_ros.core.batch import (
+    EXTENT,
+    FACE_GAPS,
+    GAP,
+    PIVOT,
+    POSE_ERRORS,
+    Problem,
+    SHARED,
+    State,
+)
 from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
-from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
-from boxreg_ros.structures import Floats, ROLL
+from boxreg_ros.core.geometry import FACE_AXIS
+from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels.arrays import (
+    ExpectationNumbers,
+    ExpectedArrays,
+    InputArrays,
+    NoiseNumbers,
+)
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, POSE, ROLL
 import numpy as np
+from numpy.typing import NDArray
 import torch
 from torch import Tensor
 
@@ -25,8 +43,6 @@ MAD_TO_DEVIATION = 1.48
 QUARTILES_TO_DEVIATION = 0.74
 """Standard deviation over interquartile range. Derived: 1 / 1.349 for a Gaussian."""
 
-FACE_GAPS = ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom')
-"""Settings of `ClassConfig` that are the expected margins of the six faces."""
 FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
 """Faces with one labelling margin: ends, sides, top, bottom."""
 GAP_DEVIATIONS = {
@@ -125,6 +141,10 @@ REPEATED_BOX_TOLERANCE = 1e-3
 """A box that differs from the one before by less repeats it [m, rad]."""
 
 
+RESIDUAL_ERRORS = (*POSE_ERRORS, 'extent', 'extent', 'extent')
+"""Settings of `ClassConfig` that are the expected deviations of `input_residuals`."""
+
+
 class InputNoise(NamedTuple):
     """
     Estimated errors of the input poses and extents.
@@ -161,37 +181,8 @@ class InputNoise(NamedTuple):
         `MIN_OBSERVATIONS_FOR_NOISE` observations are left out too.
 
         """
-        valid = residuals.isfinite().all(2)
-        valid &= valid.sum(1, keepdim=True) >= MIN_OBSERVATIONS_FOR_NOISE
-        residuals = residuals.nan_to_num()
-        total = int(valid.sum())
-        if not total:
-            return cls()
-        tracks = valid.any(1).sum()
-        count = valid.sum(1)[:, None, None].clamp(min=1)
-        mean = (residuals * valid[..., None]).sum(1, keepdim=True) / count
-        offset = MAD_TO_DEVIATION * mean[valid.any(1), 0].abs().median(0).values
-        centred = residuals - mean
-        deviation = MAD_TO_DEVIATION * centred[valid].abs().median(0).values
-        # Lag-one autocorrelation of errors clipped at three deviations.
-        bounded = centred.clamp(-3 * deviation, 3 * deviation)
-        both = valid[:, 1:] & valid[:, :-1]
-        first, second = bounded[:, :-1][both], bounded[:, 1:][both]
-        power = (first.square() + second.square()).sum(0) / 2
-        # A constant error, such as that of an extent that a tracker holds, is fully correlated;
-        # with one or two tracks it cannot be distinguished from the labelling margin.
-        constant = 1 - 2 / tracks
-        ratio = (first * second).sum(0) / power.clamp(min=MIN_POWER)
-        # The mean of a track removes part of the variance of its errors, the more the slower they
-        # change, and part of the products of neighbours.
-        removed = torch.zeros_like(ratio)
-        for _ in range(CORRELATION_ITERATIONS):
-            whole = ratio + (1 - ratio) * removed
-            correlation = whole.where(power > MIN_POWER, constant).clamp(0.0, MAX_CORRELATION)
-            variance, removed = _removed_by_means(correlation, total / tracks)
-        deviation = deviation / (1 - variance).clamp(min=MIN_LEFT).sqrt()
-        weight = deviation.new_tensor([total / (total + OBSERVATIONS_FOR_HALF_WEIGHT)])
-        return cls(deviation, correlation, offset, weight)
+        by_kernel = compiled(residuals) is not None
+        return (estimate_noise_compiled if by_kernel else estimate_noise_torch)(residuals)
 
     @classmethod
     def estimate_by_kind(cls, residuals: Tensor, kind: Tensor) -> 'InputNoise':
@@ -209,11 +200,14 @@ class InputNoise(NamedTuple):
         for kinds in set(chain.from_iterable(sets)) - estimates.keys():
             rows = torch.isin(kind, kind.new_tensor(list(kinds)))
             estimates[kinds] = cls.estimate(residuals[rows])
-        by_kind = [estimates[own]._with_prior(estimates[others]) for own, others in sets]
-        return cls(*(torch.stack(parts) for parts in zip(*by_kind, strict=True)))
+        own, others = (
+            cls(*map(torch.stack, zip(*(estimates[kinds] for kinds in side), strict=True)))
+            for side in zip(*sets, strict=True)
+        )
+        return own._with_prior(others)
 
     def _with_prior(self, others: 'InputNoise') -> 'InputNoise':
-        """Return this estimate of one kind, and as far as it has no weight that of `others`."""
+        """Return these estimates by kind, and as far as they have no weight those of `others`."""
         weight = self.weight + (1 - self.weight) * others.weight
         share = self.weight / weight.clamp(min=1e-9)
         return InputNoise(
@@ -253,12 +247,16 @@ class Population(NamedTuple):
 
     def factors(self, problem: Problem, given: Tensor, error: Tensor) -> Tensor:
         """Return the `population_factor` of each window, by tracks of its kind, (B, 3)."""
-        factors = torch.ones_like(given)
-        for kind in self.kind.unique():
-            rows = problem.kind == kind
-            own = self.evidence[self.kind == kind]
-            factors[rows] = population_factor(own, given[rows], error[rows])
-        return factors
+        median, slopes = (torch.from_numpy(part).to(given)[problem.kind] for part in self.slopes())
+        return _factor(median, slopes, given, error)
+
+    def slopes(self) -> tuple[Floats, Floats]:
+        """Return `population_slopes` by kind, shapes (K, 3) and (K, 3, 3); 0 without tracks."""
+        evidence, kind = self.evidence.cpu().numpy(), self.kind.cpu().numpy()
+        median, slopes = np.zeros((len(KINDS), 3)), np.zeros((len(KINDS), 3, 3))
+        for k in set(kind.tolist()):
+            median[k], slopes[k] = population_slopes(evidence[kind == k])
+        return median, slopes
 
 
 def _removed_by_means(correlation: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
@@ -276,6 +274,58 @@ def _removed_by_means(correlation: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
     return of_mean, 2 * inner - of_mean
 
 
+def estimate_noise_compiled(residuals: Tensor) -> InputNoise:
+    """Return the same as `InputNoise.estimate`, by the kernel."""
+    kernels = compiled(residuals)
+    assert kernels is not None
+    numbers = NoiseNumbers(
+        MAD_TO_DEVIATION, MIN_OBSERVATIONS_FOR_NOISE, CORRELATION_ITERATIONS, MAX_CORRELATION,
+        MIN_LEFT, MIN_POWER,
+    )  # fmt: skip
+    deviation, correlation, offset = np.empty((3, 9))
+    values = contiguous(residuals.to(torch.float64))
+    total = kernels.noise.estimate(values, numbers, deviation, correlation, offset)
+    if not total:
+        return UNKNOWN_NOISE
+    weight = np.array([total / (total + OBSERVATIONS_FOR_HALF_WEIGHT)])
+    return InputNoise(*map(torch.from_numpy, (deviation, correlation, offset, weight)))
+
+
+def estimate_noise_torch(residuals: Tensor) -> InputNoise:
+    """Return the same as `InputNoise.estimate`, by torch."""
+    valid = residuals.isfinite().all(2)
+    valid &= valid.sum(1, keepdim=True) >= MIN_OBSERVATIONS_FOR_NOISE
+    residuals = residuals.nan_to_num()
+    total = int(valid.sum())
+    if not total:
+        return UNKNOWN_NOISE
+    tracks = valid.any(1).sum()
+    count = valid.sum(1)[:, None, None].clamp(min=1)
+    mean = (residuals * valid[..., None]).sum(1, keepdim=True) / count
+    offset = MAD_TO_DEVIATION * mean[valid.any(1), 0].abs().median(0).values
+    centred = residuals - mean
+    deviation = MAD_TO_DEVIATION * centred[valid].abs().median(0).values
+    # Lag-one autocorrelation of errors clipped at three deviations.
+    bounded = centred.clamp(-3 * deviation, 3 * deviation)
+    both = valid[:, 1:] & valid[:, :-1]
+    first, second = bounded[:, :-1][both], bounded[:, 1:][both]
+    power = (first.square() + second.square()).sum(0) / 2
+    # A constant error, such as that of an extent that a tracker holds, is fully correlated;
+    # with one or two tracks it cannot be distinguished from the labelling margin.
+    constant = 1 - 2 / tracks
+    ratio = (first * second).sum(0) / power.clamp(min=MIN_POWER)
+    # The mean of a track removes part of the variance of its errors, the more the slower they
+    # change, and part of the products of neighbours.
+    removed = torch.zeros_like(ratio)
+    for _ in range(CORRELATION_ITERATIONS):
+        whole = ratio + (1 - ratio) * removed
+        correlation = whole.where(power > MIN_POWER, constant).clamp(0.0, MAX_CORRELATION)
+        variance, removed = _removed_by_means(correlation, total / tracks)
+    deviation = deviation / (1 - variance).clamp(min=MIN_LEFT).sqrt()
+    weight = deviation.new_tensor([total / (total + OBSERVATIONS_FOR_HALF_WEIGHT)])
+    return InputNoise(deviation, correlation, offset, weight)
+
+
 UNKNOWN_NOISE = InputNoise()
 UNKNOWN_POPULATION = Population()
 
@@ -288,21 +338,45 @@ def input_residuals(problem: Problem, state: State) -> Tensor:
     and for those without points, since their fit follows the input.
 
     """
-    difference = problem.pose - state.pose
-    axes = rotation_from_rpy(state.pose[..., 3:])
-    along = (axes.mT @ difference[..., :3, None])[..., 0]
-    extent = problem.boxes[..., 3:6] / state.shared[:, None, EXTENT] - 1
-    residuals = torch.cat([along, difference[..., 3:], extent], -1)
+    boxes, pose, extent, counts = _boxes_and_fit(problem, state)
     # The first box is compared with the last one: a track that is held throughout is left out.
-    change = (problem.boxes - problem.boxes.roll(1, 1)).abs().amax(-1)
-    is_new = (problem.counts > 0) & ~(change < REPEATED_BOX_TOLERANCE)
-    return torch.where(is_new[..., None], residuals, torch.nan)
+    before = np.roll(boxes, 1, axis=1)
+    residuals = _residuals(boxes, before, pose, extent[:, None], counts > 0)
+    return torch.from_numpy(residuals).to(problem.boxes)
+
+
+def residuals_at(problem: Problem, state: State, columns: Ints) -> Floats:
+    """Return `normalised_residuals` (B, 9) of one observation of each window, in `columns`."""
+    boxes, pose, extent, counts = _boxes_and_fit(problem, state)
+    rows = np.arange(len(boxes))
+    before, has_points = boxes[rows, columns - 1], counts[rows, columns] > 0
+    residuals = _residuals(boxes[rows, columns], before, pose[rows, columns], extent, has_points)
+    return residuals / problem.of_class(*RESIDUAL_ERRORS).cpu().numpy()
+
+
+def _boxes_and_fit(problem: Problem, state: State) -> Iterator[Floats]:
+    parts = problem.boxes, state.pose, state.shared[:, EXTENT], problem.counts
+    return (part.cpu().numpy() for part in parts)
+
+
+def _residuals(
+    boxes: Floats, before: Floats, pose: Floats, extent: Floats, has_points: NDArray[np.bool_]
+) -> Floats:
+    """Return input minus fit (..., 9), NaN for boxes without points or as the one `before`."""
+    difference = boxes[..., POSE] - pose
+    to_box = np.swapaxes(matrix_from_rpy(pose[..., 3:]), -1, -2)
+    along = (to_box @ difference[..., :3, None])[..., 0]
+    residuals = np.concatenate(
+        [along, difference[..., 3:], boxes[..., BOX_EXTENT] / extent - 1], axis=-1
+    )
+    is_repeated = np.abs(boxes - before).max(-1) < REPEATED_BOX_TOLERANCE
+    residuals[~has_points | is_repeated] = np.nan
+    return residuals
 
 
 def normalised_residuals(problem: Problem, state: State) -> Tensor:
     """Return `input_residuals` over the expected deviations of the class, (B, N, 9)."""
-    expected = problem.of_class(*POSE_ERRORS, *['extent'] * 3)
-    return input_residuals(problem, state) / expected[:, None]
+    return input_residuals(problem, state) / problem.of_class(*RESIDUAL_ERRORS)[:, None]
 
 
 def smoothed_angles(problem: Problem) -> Tensor:
@@ -392,6 +466,77 @@ def expect(
     larger than cars, in proportion: of trams, and of machines with booms.
 
     """
+    by_kernel = compiled(problem.boxes) is not None
+    return (expect_compiled if by_kernel else expect_torch)(problem, offsets, noise, population)
+
+
+def expect_compiled(
+    problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
+) -> Expectation:
+    """Return the same as `expect`, by the kernel."""
+    arrays, widening, slow = _expected_arrays(problem, offsets, noise, population)
+    parts = [torch.from_numpy(part) for part in arrays]
+    spread = torch.from_numpy(widening), torch.from_numpy(slow)
+    error = _input_error(problem, noise.of(problem), *spread)
+    return Expectation(*parts, _at_least_prior(problem, error, parts[1]))
+
+
+def _expected_arrays(
+    problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
+) -> tuple[ExpectedArrays, Floats, Floats]:
+    """Return what the kernel writes."""
+    kernels = compiled(problem.boxes)
+    assert kernels is not None
+    B = len(problem.boxes)
+    expected = ExpectedArrays(*(np.empty((B, size)) for size in (SHARED, SHARED, 6, 6, 6)))
+    widening, slow = np.empty((B, 3)), np.empty((B, 1))
+    run(
+        kernels.expectation.expect, B, problem.arrays(), problem.class_arrays(),
+        input_arrays(offsets, noise, population), _expectation_numbers(), expected, widening, slow,
+    )  # fmt: skip
+    return expected, widening, slow
+
+
+def input_arrays(
+    offsets: FaceOffsets,
+    noise: InputNoise = UNKNOWN_NOISE,
+    population: Population = UNKNOWN_POPULATION,
+) -> InputArrays:
+    """Return margins, noise and population of the input for the kernels."""
+
+    def by_kind(part: Tensor) -> Floats:
+        values = part.numpy()
+        if values.ndim == 1:
+            values = np.tile(values, (len(KINDS), 1))
+        return values.astype(np.float64, copy=False)
+
+    *deviations, weight = map(by_kind, noise)
+    return InputArrays(*deviations, weight[:, 0], *map(by_kind, offsets), *population.slopes())
+
+
+def _expectation_numbers() -> ExpectationNumbers:
+    return ExpectationNumbers(
+        low_noise_ratio=LOW_NOISE_RATIO,
+        ratio_bounds=RATIO_BOUNDS,
+        typical_correlation=TYPICAL_CORRELATION,
+        correlation_interval=CORRELATION_INTERVAL,
+        white_correlation=WHITE_CORRELATION,
+        correlation_span=CORRELATION_SPAN,
+        filtered_offset=FILTERED_OFFSET,
+        max_filtered_bias=MAX_FILTERED_BIAS,
+        yaw_bias=YAW_BIAS,
+        population_radius=POPULATION_RADIUS,
+        large_extent=LARGE_EXTENT,
+        pinned_extent=PINNED_EXTENT,
+        pinned_margins=PINNED_MARGINS,
+        pivot_deviation=PIVOT_DEVIATION,
+    )
+
+
+def expect_torch(
+    problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
+) -> Expectation:
+    """Return the same as `expect`, by torch."""
     valid = problem.valid
     usual = problem.of_class(*POSE_ERRORS)
     usual_extent = problem.of_class('extent')
@@ -434,18 +579,24 @@ def expect(
     bias = torch.where(has_pin, PINNED_EXTENT, bias)
     shared = expected_shared(problem, offsets, mean)
     shared[:, EXTENT] = torch.where(has_pin, mean, extent)
-    input_deviation = torch.cat([extent_deviation, bias], 1)
-    input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
     sideslip = problem.of_class('sideslip')
-    deviations = [input_deviation, spread, mean[:, :1] * PIVOT_DEVIATION, one, sideslip]
+    pivot = mean[:, :1] * PIVOT_DEVIATION
+    deviations = torch.cat([extent_deviation, bias, spread, pivot, one, sideslip], 1)
+    input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
     return Expectation(
         shared,
-        torch.cat(deviations, 1),
+        deviations,
         deviation,
         deviation * widening[:, :6],
         unmodelled,
-        torch.where(has_pin, input_deviation, input_error.maximum(input_deviation)),
+        _at_least_prior(problem, input_error, deviations),
     )
+
+
+def _at_least_prior(problem: Problem, error: Tensor, deviation: Tensor) -> Tensor:
+    """Return errors of the input (B, 9), no less than its prior; that of pinned boxes is right."""
+    prior = deviation[:, : GAP.start]
+    return torch.where(problem.pinned.any(1)[:, None], prior, error.maximum(prior))
 
 
 def _input_error(problem: Problem, noise: InputNoise, widening: Tensor, slow: Tensor) -> Tensor:
@@ -472,6 +623,14 @@ def _input_error(problem: Problem, noise: InputNoise, widening: Tensor, slow: Te
     bias_ratio = slow * slow.new_tensor([1, 1, 1, 1, 1, YAW_BIAS])
     bias = problem.of_class(*POSE_ERRORS) * ratio[:, :6] * bias_ratio
     return torch.cat([extent, bias], 1)
+
+
+def expect_shared(problem: Problem, offsets: FaceOffsets) -> Tensor:
+    """Return the means of the shared variables as `expect` does without a population, (B, 23)."""
+    if compiled(problem.boxes) is None:
+        return expected_shared(problem, offsets, mean_input_extents(problem))
+    arrays, _, _ = _expected_arrays(problem, offsets, UNKNOWN_NOISE, UNKNOWN_POPULATION)
+    return torch.from_numpy(arrays.shared)
 
 
 def expected_shared(problem: Problem, offsets: FaceOffsets, extent: Tensor) -> Tensor:
@@ -527,20 +686,35 @@ def population_factor(evidence: Tensor, given: Tensor, error: Tensor) -> Tensor:
     labelling margin accounts for a common error.
 
     """
-    log, correction, weight = evidence.to(given).unbind(1)
-    median = log.median(0).values
+    median, slopes = map(torch.from_numpy, population_slopes(evidence.cpu().numpy()))
+    return _factor(median.to(given), slopes.to(given), given, error)
+
+
+def population_slopes(evidence: Floats) -> tuple[Floats, Floats]:
+    """
+    Return the regression of `population_factor` on the `evidence` (n, 3, 3) of tracks.
+
+    The median (3,) of the logarithms of extents, and the slopes (3, 3) of the corrections, one row
+    for each corrected extent.
+
+    """
+    log, correction, weight = evidence.swapaxes(0, 1)  # (n, 3) each
+    median = np.sort(log, axis=0)[(len(log) - 1) // 2]
     off = log - median
-    own = given.log() - median
-    similarity = 1 / (1 + (off / POPULATION_RADIUS).square().sum(1, keepdim=True))
-    own_similarity = 1 / (1 + (own / POPULATION_RADIUS).square().sum(1, keepdim=True))
+    similarity = 1 / (1 + np.square(off / POPULATION_RADIUS).sum(1, keepdims=True))
     A = similarity * off
-    weighted = weight.mT[..., None] * A  # (3, n, 3)
-    others = CROSS_SLOPE_INFORMATION - 1
-    ridge = CROSS_SLOPE_INFORMATION - others * torch.eye(3).to(A)
-    curvature = weighted.mT @ A + torch.diag_embed(ridge) / SLOPE_DEVIATION**2
-    pull = ((similarity * correction).mT[:, None] @ weighted)[:, 0]
-    slopes = torch.linalg.solve(curvature, pull)
-    return torch.exp(error**2 * (own_similarity * own @ slopes.mT))
+    weighted = weight.T[..., None] * A  # (3, n, 3)
+    ridge = np.full((3, 3), CROSS_SLOPE_INFORMATION) - (CROSS_SLOPE_INFORMATION - 1) * np.eye(3)
+    curvature = weighted.swapaxes(1, 2) @ A + ridge[:, None] * np.eye(3) / SLOPE_DEVIATION**2
+    pull = (similarity * correction).T[:, None] @ weighted  # (3, 1, 3)
+    return median, np.linalg.solve(curvature, pull.swapaxes(1, 2))[..., 0]
+
+
+def _factor(median: Tensor, slopes: Tensor, given: Tensor, error: Tensor) -> Tensor:
+    """Return the factors (B, 3) of extents that are `given`, by `population_slopes`."""
+    own = given.log() - median
+    similarity = 1 / (1 + (own / POPULATION_RADIUS).square().sum(1, keepdim=True))
+    return torch.exp(error**2 * (slopes @ (similarity * own)[..., None])[..., 0])
 
 
 def evidence_of_extents(
@@ -601,13 +775,15 @@ class InputModel:
         # Of each track of each kind: sums over its face observations, see
         # `add_face_observations`; its last input residuals; its extent evidence.
         self._faces = [dict[str, Floats]() for _ in KINDS]
+        self._offsets_of_kinds: list[tuple[Floats, ...] | None] = [None] * len(KINDS)
         self._known_offsets: FaceOffsets | None = None  # of the present sums
         self._residuals = [dict[str, Floats]() for _ in KINDS]
         self._evidence = [dict[str, Floats]() for _ in KINDS]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what was observed; margins that follow from it are computed again."""
-        return {**vars(self), '_known_offsets': None}
+        nothing: list[None] = [None] * len(KINDS)
+        return {**vars(self), '_known_offsets': None, '_offsets_of_kinds': nothing}
 
     def add_face_observations(
         self,
@@ -634,32 +810,36 @@ class InputModel:
             What `observations` were made with.
 
         """
-        distance = observations.distance
-        per_track = (part.to(distance).expand(len(KINDS), 6)[kind] for part in offsets)
-        gap_correction, occlusion_inset, range_inset = (part[:, None] for part in per_track)
-        occluded, distant = observations.inset_shares
+        distance, weight, (occluded, distant), num_points = (
+            part.cpu().numpy() for part in observations[1:3] + observations[4:]
+        )
+        kinds = kind.cpu().numpy()
+        gap_correction, occlusion_inset, range_inset = (
+            np.broadcast_to(part.cpu().numpy(), (len(KINDS), 6))[kinds][:, None]
+            for part in offsets
+        )
         occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
         is_visible = occluded < MAX_VISIBLE_SHARE
         is_distant = distant > MIN_DISTANT_SHARE
-        has_points = (observations.num_points >= MIN_BOX_POINTS)[..., None]
+        has_points = (num_points >= MIN_BOX_POINTS)[..., None]
         # Three quantities: gap, occlusion inset, range inset; all (3, B, N, 6).
-        counts = torch.stack([
+        counts = np.stack([
             has_points & is_visible & ~is_distant,
             has_points & (occluded > MIN_OCCLUDED_SHARE),
             is_visible & is_distant,
         ])  # fmt: skip
-        counts &= (observations.weight > 0) & (distance.abs() < MAX_FACE_DISTANCE)
-        counts &= new[..., None]
-        values = torch.stack([
+        counts &= (weight > 0) & (np.abs(distance) < MAX_FACE_DISTANCE)
+        counts &= new.cpu().numpy()[..., None]
+        values = np.stack([
             0 * occluded, occluded * occlusion_inset, distant * range_inset
         ]) - distance  # fmt: skip
         values[::2] += gap_correction  # an occlusion inset is counted from the present gap
-        shares = torch.stack([torch.ones_like(distance), occluded, distant])
+        shares = np.stack([np.ones_like(distance), occluded, distant])
         # (B, 3 quantities, 3 sums: value, count, share; 6 faces)
-        sums = torch.stack([values * counts, counts, shares * counts], 1).sum(3).movedim(2, 0)
+        sums = np.moveaxis(np.stack([values * counts, counts, shares * counts], 1).sum(3), 2, 0)
         self._known_offsets = None
-        rows = zip(track_ids, kind.tolist(), sums.cpu().numpy(), strict=True)
-        for track_id, k, row in rows:
+        for track_id, k, row in zip(track_ids, kinds.tolist(), sums, strict=True):
+            self._offsets_of_kinds[k] = None
             _of_track(self._faces[k], track_id, np.zeros((3, 3, 6)))[:] += row
 
     def add_fits(
@@ -691,8 +871,9 @@ class InputModel:
     def offsets(self) -> FaceOffsets:
         """Return the labelling margins and insets to expect of each kind."""
         if self._known_offsets is None:
-            rows = [self._offsets(k) for k in range(len(KINDS))]
-            parts = map(np.stack, zip(*rows, strict=True))
+            for k, known in enumerate(self._offsets_of_kinds):
+                self._offsets_of_kinds[k] = known or self._offsets(k)
+            parts = map(np.stack, zip(*self._offsets_of_kinds, strict=True))
             self._known_offsets = FaceOffsets(*map(torch.from_numpy, parts))
         return self._known_offsets
 
@@ -721,9 +902,6 @@ class InputModel:
         """Return the noise of all fits that were added."""
         rows, kind = _flat(self._residuals)
         known = np.array(rows).reshape(-1, MAX_FITS_PER_TRACK, 9)
-        # Fits are counted from the end: columns before the longest track are empty.
-        is_empty = np.isnan(known[:, :, 0]).all(0)
-        known = known[:, np.argmin(is_empty) :]
         return InputNoise.estimate_by_kind(torch.from_numpy(known), kind)
 
     def population(self) -> Population:

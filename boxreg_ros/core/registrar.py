@@ -237,9 +237,10 @@ class BoxRegistrar:
             seen = self._seen([*given, *confirmed], boxes.stamp_ns, sweep)
         for sighting, (observation, velocity) in zip(given, seen, strict=False):
             self.box_time.add(observation, velocity)
-            is_pinned = boxes.pinned is not None and bool(boxes.pinned[sighting.row])
+            if boxes.pinned is not None and boxes.pinned[sighting.row]:
+                observation = observation._replace(is_pinned=True)
             track = sighting.track
-            track.add(observation._replace(is_pinned=is_pinned), array, sighting.row)
+            track.add(observation, array, sighting.row)
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
@@ -276,17 +277,21 @@ class BoxRegistrar:
         boxes = np.array([sighting.box for sighting in sightings])
         at_sweep = boxes.copy()
         offset = (sweep.stamp_ns - stamp_ns) * 1e-9  # [s]
-        velocities = np.array([s.track.input_velocity(s.box, stamp_ns) for s in sightings])
-        # The points are relative to the box: motion-compensated to the stamp of the box.
-        at_sweep[:, X : Z + 1] += offset * velocities
-        motion = np.zeros_like(velocities)
-        if self.config.sampling.deskew:
-            motion = motion_to_sight(sweep, at_sweep, velocities)
+        velocities = np.zeros((len(boxes), 3))
+        motion = velocities
+        if offset or sweep.times is not None:
+            velocities = np.array([s.track.input_velocity(s.box, stamp_ns) for s in sightings])
+            # The points are relative to the box: motion-compensated to the stamp of the box.
+            at_sweep[:, X : Z + 1] += offset * velocities
+            if self.config.sampling.deskew:
+                motion = motion_to_sight(sweep, at_sweep, velocities)
         found = observe(sweep, swept(at_sweep, motion), stamp_ns, self.config)
-        return [
-            (seen.relative_to(box, moved / 2), velocity)
-            for seen, box, moved, velocity in zip(found, boxes, motion, velocities, strict=True)
-        ]
+        if offset or motion.any():
+            found = [
+                seen.relative_to(box, moved / 2)
+                for seen, box, moved in zip(found, boxes, motion, strict=True)
+            ]
+        return list(zip(found, velocities, strict=True))
 
     def _end_silent_tracks(self, now_ns: int) -> None:
         oldest_ns = now_ns - round(self.config.max_gap * 1e9)
@@ -505,8 +510,8 @@ class _Track:
 
     Attributes
     ----------
-    variance : float
-        Of the position of the newest estimate, the sum over its axes [m^2].
+    covariance : array, shape (6, 6), or None
+        Of the newest estimate.
     num_carried : int
         Newest observations that were in no window yet, because the budget was used up.
     detected_ns : int
@@ -520,7 +525,7 @@ class _Track:
     class_name: str
     entries: list[_Entry] = field(default_factory=list)
     prior: MarginalisationPrior | None = None
-    variance: float = inf
+    covariance: Floats | None = None
     num_carried: int = 0
     detected_ns: int = 0
     least_points: float = inf
@@ -544,9 +549,12 @@ class _Track:
 
     def urgency(self) -> tuple[int, float, float]:
         """Return the key that sorts tracks by the gain of solving them, highest gain first."""
+        variance = inf
+        if self.covariance is not None:
+            variance = float(np.trace(self.covariance[:3, :3]))  # of the position [m^2]
         sensors = self.entries[-1].observation.origins
         distance = float(np.linalg.norm(sensors, axis=1).min())  # NaN if unknown
-        return -self.num_carried, -self.variance, distance if distance >= 0 else inf
+        return -self.num_carried, -variance, distance if distance >= 0 else inf
 
     def carry(self, length: int) -> None:
         """
@@ -630,7 +638,7 @@ class _Track:
     def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
         """Pass the estimate of the window of `entries` to the box arrays that are not settled."""
         self.prior = estimate.prior
-        self.variance = float(np.trace(estimate.covariances[-1, :3, :3]))
+        self.covariance = estimate.covariances[-1]
         self.num_carried = 0
         for i, (entry, box) in enumerate(zip(entries, estimate.boxes, strict=True)):
             entry.estimate = box

@@ -20,10 +20,9 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
 from boxreg_ros.core.face_support import motion_compensated, observe_faces, to_box_frame
 from boxreg_ros.core.input_model import (
-    expected_shared,
+    expect_shared,
     InputModel,
-    mean_input_extents,
-    normalised_residuals,
+    residuals_at,
     smoothed_angles,
 )
 from boxreg_ros.core.kernels import compiled, contiguous, run
@@ -32,7 +31,7 @@ from boxreg_ros.core.rounds import COARSE_POINTS
 from boxreg_ros.core.solver import solve
 from boxreg_ros.core.window import group_windows, MarginalisationPrior, stack_windows, Window
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, KEPT, REFINED
+from boxreg_ros.structures import Floats, Ints, KEPT, REFINED
 import numpy as np
 from numpy.typing import NDArray
 import torch
@@ -133,8 +132,7 @@ def _update_offsets(model: InputModel, windows: Sequence[Window], config: Config
     problem = problem.thinned(COARSE_POINTS)
     offsets = model.offsets()
     pose = torch.cat([problem.boxes[..., :3], smoothed_angles(problem)], -1)
-    shared = expected_shared(problem, offsets, mean_input_extents(problem))
-    state = State(pose, shared)
+    state = State(pose, expect_shared(problem, offsets))
     observations = observe_faces(problem, state, offsets, config)
     track_ids = [window.track_id for window in new_parts]
     model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)
@@ -150,11 +148,10 @@ def _update_noise(
 ) -> None:
     """Update the noise with the best fit of each window, `lag` from its end, and its extents."""
     best = [max(0, len(window.observations) - 1 - config.lag) for window in windows]
-    residuals = normalised_residuals(problem, solution.state)
-    residuals = residuals[range(len(windows)), best]
+    residuals = residuals_at(problem, solution.state, np.array(best))
     track_ids = [window.track_id for window in windows]
-    evidence = solution.extent_evidence
-    model.add_fits(track_ids, problem.kind, residuals.cpu().numpy(), evidence.cpu().numpy())
+    evidence = solution.extent_evidence.cpu().numpy()
+    model.add_fits(track_ids, problem.kind, residuals, evidence)
 
 
 @torch.inference_mode()
@@ -167,23 +164,21 @@ def _accepted(
     `base` (B, 3) is what the centres of `problem` are relative to [m].
 
     """
-    extent = _extents(problem, solution.state, config)
-    pose = solution.state.pose
-    boxes = torch.cat([pose[..., :3], extent, wrap_angle(pose[..., 3:])], -1)
-    held = _held(problem, pose, extent)
-    failed = _failed_tests(problem, boxes, extent, solution.posterior.poses, held)
+    pose, extent = solution.state.pose, _extents(problem, solution.state, config)
+    held = _held(problem, pose, extent).cpu().numpy()
+    pose, extent = pose.cpu().numpy(), extent.cpu().numpy()
+    covariances, extents, distances = (part.cpu().numpy() for part in solution.posterior)
+    found = np.concatenate([pose[..., :3], extent, wrap_angle(pose[..., 3:])], -1)
+    is_finite = np.isfinite(found).all(-1) & (extent > 0).all(-1)
+    is_finite &= np.isfinite(covariances).all((2, 3))
+    priors = _priors(base, solution, is_finite.all(1))
+    failed = _failed_tests(problem, is_finite, held)
     is_kept = failed.any(0)
     reasons = np.select(failed, KEPT_REASONS, '')
     status = np.where(is_kept, KEPT, REFINED)
-    # Before input boxes are put in: on a CPU the arrays share memory with the tensors.
-    is_solved = (boxes.isfinite().all(-1) & (extent > 0).all(-1)).all(1)
-    is_solved &= solution.posterior.poses.isfinite().all((1, 2, 3))
-    priors = _priors(base, solution, is_solved)
-    found = boxes.cpu().numpy()
     found[..., :3] += base[:, None]
-    covariances, extents, distances = (part.cpu().numpy() for part in solution.posterior)
-    count = problem.counts.clamp(min=1)
-    outside = (1 - held / count).clamp(0, 1).cpu().numpy()
+    count = problem.counts.clamp(min=1).cpu().numpy()
+    outside = (1 - held / count).clip(0, 1)
     extent_covariances = np.repeat(extents[:, None], found.shape[1], axis=1)
     for b, i in np.argwhere(problem.valid.cpu().numpy() & is_kept).tolist():
         found[b, i] = windows[b].observations[i].box
@@ -200,26 +195,21 @@ def _accepted(
     return estimates
 
 
-def _failed_tests(
-    problem: Problem, boxes: Tensor, extent: Tensor, covariances: Tensor, after: Tensor
-) -> NDArray[np.bool_]:
+def _failed_tests(problem: Problem, is_finite: NDArray[np.bool_], held: Ints) -> NDArray[np.bool_]:
     """
     Return the acceptance tests that each refined box fails (M27), shape (3, B, N).
 
     In the order of `KEPT_REASONS`: its window has points; box and covariance are finite and the
     extent is positive; it holds nearly as many points as its input box, which the objective does
-    not ask for: `after` (B, N).
+    not ask for: `held` (B, N).
 
     """
-    is_finite = boxes.isfinite().all(-1) & (extent > 0).all(-1)
-    is_finite &= covariances.isfinite().all((2, 3))
-    is_blind = (problem.counts.sum(1) == 0)[:, None].expand_as(is_finite)
-    before = problem.counts  # at most: counting those of the input boxes takes time
-    if (after < MIN_HELD_PART * before - MAX_LOST_POINTS).any():
-        before = _held(problem, problem.pose, problem.boxes[..., 3:6])
-    has_lost = after < MIN_HELD_PART * before - MAX_LOST_POINTS
-    failed: NDArray[np.bool_] = torch.stack([is_blind, ~is_finite, has_lost]).cpu().numpy()
-    return failed
+    before = problem.counts.cpu().numpy()  # at most: counting those of the input boxes takes time
+    is_blind = np.broadcast_to(before.sum(1, keepdims=True) == 0, before.shape)
+    if (held < MIN_HELD_PART * before - MAX_LOST_POINTS).any():
+        before = _held(problem, problem.pose, problem.boxes[..., 3:6]).cpu().numpy()
+    has_lost = held < MIN_HELD_PART * before - MAX_LOST_POINTS
+    return np.stack([is_blind, ~is_finite, has_lost])
 
 
 def _extents(problem: Problem, state: State, config: Config) -> Tensor:
@@ -252,14 +242,14 @@ def _held_torch(problem: Problem, pose: Tensor, extent: Tensor) -> Tensor:
 
 
 def _priors(
-    base: Floats, solution: Solution, is_solved: Tensor
+    base: Floats, solution: Solution, is_solved: NDArray[np.bool_]
 ) -> list[MarginalisationPrior | None]:
     """Return the marginalisation prior that each window leaves, if it leaves one."""
     if solution.prior is None or solution.marginalised_extents is None:
         return [None] * len(base)
-    has_prior = (is_solved & solution.prior.step.isfinite().all(1)).tolist()
     parts = (*solution.prior, solution.marginalised_extents)
     arrays = [part.cpu().numpy() for part in parts]
+    has_prior = (is_solved & np.isfinite(arrays[1]).all(1)).tolist()
     return [
         MarginalisationPrior(base[b], *(array[b] for array in arrays)) if has_prior[b] else None
         for b in range(len(base))

@@ -9,6 +9,7 @@ from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, Problem, State
 from boxreg_ros.core.face_support import motion_compensated, to_box_frame
 from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels.arrays import ShapeNumbers
 import numpy as np
 import torch
 from torch import Tensor
@@ -68,15 +69,25 @@ def agreement_compiled(problem: Problem, state: State) -> tuple[Tensor, Tensor]:
     B, N = problem.valid.shape
     information = np.empty((B, N, 6, 6))
     wanted = np.empty((B, N, 6))
-    limits = (
-        SHAPE_MARGIN, MIN_FLATNESS, float(MIN_CELL_POINTS), EFFECTIVE_POINTS, STEP_RIDGE
-    )  # fmt: skip
     run(
         kernels.rigid_shape.agreement, B, problem.arrays(), contiguous(state.pose),
-        contiguous(state.shared[:, EXTENT]), problem.returns.is_moving,
-        contiguous(problem.of_class('shape')[:, 0]), CELLS, limits, information, wanted,
+        contiguous(state.shared[:, EXTENT]), contiguous(problem.of_class('shape')[:, 0]),
+        shape_numbers(problem), information, wanted,
     )  # fmt: skip
     return torch.from_numpy(information), torch.from_numpy(wanted)
+
+
+def shape_numbers(problem: Problem) -> ShapeNumbers:
+    """Return the constants for the kernel."""
+    return ShapeNumbers(
+        cells=CELLS,
+        margin=SHAPE_MARGIN,
+        flatness=MIN_FLATNESS,
+        min_cell_points=float(MIN_CELL_POINTS),
+        effective_points=EFFECTIVE_POINTS,
+        ridge=STEP_RIDGE,
+        is_moving=problem.returns.is_moving,
+    )
 
 
 def agreement_torch(problem: Problem, state: State) -> tuple[Tensor, Tensor]:

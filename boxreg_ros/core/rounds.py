@@ -5,9 +5,10 @@ By a kernel, one call for all windows, or by its torch twin, which is the refere
 
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import lbfgs, terms
@@ -16,10 +17,10 @@ from boxreg_ros.core.batch import (
     ANCHOR,
     MarginalPrior,
     POSE_ERRORS,
-    Posterior,
     PRIOR_SIZE,
     Problem,
     SHARED,
+    Solution,
     State,
 )
 from boxreg_ros.core.covariance import posterior
@@ -30,22 +31,26 @@ from boxreg_ros.core.face_support import (
     FaceOffsets,
     observe_faces,
 )
-from boxreg_ros.core.input_model import evidence_of_extents, Expectation
+from boxreg_ros.core.input_model import (
+    evidence_of_extents,
+    Expectation,
+    input_arrays,
+    MIN_EXTENT_GAIN,
+)
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.kernels.arrays import (
+    EndArrays,
     ExpectedArrays,
+    PriorArrays,
     RoundNumbers,
-    RoundResults,
     SearchNumbers,
-    ShapeArrays,
-    StartArrays,
+    SolutionArrays,
 )
 from boxreg_ros.core.lbfgs import minimize, select
 from boxreg_ros.core.prior import marginalise
-from boxreg_ros.core.rigid_shape import agreement
+from boxreg_ros.core.rigid_shape import agreement, shape_numbers
 from boxreg_ros.core.terms import Objective, Term
 from boxreg_ros.core.weights import (
-    class_deviations,
     prior_information,
     robustify_motion,
     weigh,
@@ -54,6 +59,8 @@ from boxreg_ros.core.weights import (
 import numpy as np
 import torch
 from torch import Tensor
+
+_T = TypeVar('_T', bound=tuple[Any, ...])
 
 # Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
 # each of them.
@@ -116,159 +123,127 @@ class Plan:
 
 class Round(NamedTuple):
     """
-    What all windows of a batch share in one round; `rows` of it can be selected.
+    What all windows of a batch share in one round.
 
     Attributes
     ----------
     problem : Problem
         The windows, with the points of this round.
-    state : State
-        Start of the round.
+    solution : Solution
+        Where the round begins; the round writes its end.
     expected : Expectation
         Means and deviations of input and shared variables.
     free : Tensor, shape (B, D)
         1 for variables that are estimated.
-    log_extent : Tensor, shape (B, 3)
-        Logarithms of the mean extents of the input.
 
     """
 
     problem: Problem
-    state: State
+    solution: Solution
     expected: Expectation
     free: Tensor
-    log_extent: Tensor
 
-
-class RoundResult(NamedTuple):
-    """
-    What a round makes of the windows `rows` (b,).
-
-    Attributes
-    ----------
-    rows : Tensor, shape (b,)
-        Indices of the windows in the batch.
-    state : State
-        End of the round.
-    is_done : Tensor, shape (b,)
-        Whether a window is settled, or this was the last round.
-    extent_evidence : Tensor, shape (b, 2, 3)
-        Corrections of extents by the points alone, and their weights.
-    posterior : Posterior
-        Of the d windows that are done.
-    prior : MarginalPrior or None
-        What the full ones among these leave to the next window, NaN for others.
-
-    """
-
-    rows: Tensor
-    state: State
-    is_done: Tensor
-    extent_evidence: Tensor
-    posterior: Posterior
-    prior: MarginalPrior | None
+    @property
+    def state(self) -> State:
+        """Poses and shared variables at present."""
+        return self.solution.state
 
 
 @torch.inference_mode()
 def run_round(
     batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
-) -> RoundResult:
-    """Take one round with the windows `rows`; nothing is written but the result."""
-    part = select(batch, rows)
-    shared = part.state.shared.clone()
-    shared[:, ANCHOR] = 0.0
-    part = part._replace(state=State(part.state.pose, shared))
-    take = run_round_torch
-    if compiled(shared) is not None:
-        take = run_round_compiled
-    fit = take(part, offsets, plan, turn, config)
-    done = fit.is_done.nonzero()[:, 0]
-    faces = fit.observations.moments, fit.observations.inset, fit.observations.weight
-    settled = select(
-        (part.problem, fit.state, *faces, part.expected, part.free, fit.inverse), done
-    )
-    evidence = evidence_of_extents(part.log_extent, part.expected, fit.state, fit.inverse.corner)
-    return RoundResult(
-        rows, fit.state, fit.is_done, evidence, posterior(*settled, config), fit.prior
-    )
-
-
-class Fit(NamedTuple):
+) -> Tensor:
     """
-    The end of a round of b windows.
+    Take one round with the windows `rows` (b,), and write its end to the solution of the batch.
 
-    Attributes
-    ----------
-    state : State
-        Poses and shared variables.
-    is_done : Tensor, shape (b,)
-        Whether a window is settled, or this was the last round.
-    observations : FaceObservations
-        Of this round.
-    inverse : InverseBlocks
-        Of the curvature; blocks of the poses only of windows that are done.
-    prior : MarginalPrior or None
-        What full windows that are done leave to the next ones, NaN for others.
+    Returns which of these windows are done (b,): settled, or at the end of the last round. Only
+    those have covariances and, if they are full, a prior for the next window.
 
     """
-
-    state: State
-    is_done: Tensor
-    observations: FaceObservations
-    inverse: InverseBlocks
-    prior: MarginalPrior | None
+    by_kernel = compiled(batch.free) is not None
+    take = run_round_compiled if by_kernel else run_round_torch
+    return take(batch, offsets, plan, turn, config, rows)
 
 
 def run_round_compiled(
-    part: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config
-) -> Fit:
+    batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
+) -> Tensor:
     """Take a round by the kernel."""
-    problem, state, expected, free, _ = part
-    kernels = compiled(state.pose)
+    problem, solution, expected, free = batch
+    kernels = compiled(free)
     assert kernels is not None
-    B, N = problem.valid.shape
-    _, *insets = map(contiguous, offsets.of(problem))
-    start = StartArrays(
-        contiguous(state.pose),
-        contiguous(state.shared),
-        contiguous(free),
-        contiguous(problem.prior_mean),
-        contiguous(prior_information(problem, config)),
-    )
     numbers = RoundNumbers(
         face_numbers(problem, config),
         weight_numbers(config, _is_smooth(plan, turn)),
+        shape_numbers(problem),
         _search_numbers(plan, turn, config),
+        MIN_EXTENT_GAIN,
     )
-    columns = {name: contiguous(getattr(expected, name)) for name in ExpectedArrays._fields}
-    shape = ShapeArrays(np.zeros((B, 0, 6, 6)), np.zeros((B, 0, 6)))
-    if _uses_rigid_shape(plan, turn):
-        shape = ShapeArrays(*map(contiguous, agreement(problem.thinned(SHAPE_POINTS), state)))
-    faces = empty_faces(B, N)
-    num_priors = B if plan.marginalises and config.window == N else 0
-    results = RoundResults(
-        x=np.empty(tuple(free.shape)),
-        is_done=np.zeros(B, bool),
-        pose_blocks=np.empty((B, N, LINK, LINK)),
-        border_blocks=np.empty((B, N, LINK, SHARED)),
-        corner=np.empty((B, SHARED, SHARED)),
-        prior_mean=np.full((num_priors, PRIOR_SIZE), np.nan),
-        prior_step=np.full((num_priors, PRIOR_SIZE), np.nan),
-        prior_information=np.full((num_priors, PRIOR_SIZE, PRIOR_SIZE), np.nan),
+    prior = PriorArrays(
+        contiguous(problem.prior_mean), contiguous(prior_information(problem, config))
     )
-    run(
-        kernels.rounds.run_windows, B, problem.arrays(), start, tuple(insets),
-        ExpectedArrays(**columns), class_deviations(problem, config), shape, numbers, faces,
-        results,
+    b, N = len(rows), problem.length
+    faces = empty_faces(b, N)
+    ends = EndArrays(
+        np.empty(b, bool), np.empty((b, N, LINK, LINK)), np.empty((b, N, LINK, SHARED)),
+        np.empty((b, SHARED, SHARED)),
     )  # fmt: skip
-    x, is_done, links, border, corner, *prior = map(torch.from_numpy, results)
-    return Fit(
-        State.unpack(x, N),
-        is_done,
-        FaceObservations(*map(torch.from_numpy, faces)),
-        InverseBlocks(links, border, corner),
-        MarginalPrior(*prior) if num_priors else None,
+    run(
+        kernels.rounds.run_windows, b, rows.numpy(), problem.arrays(),
+        problem.thinned(SHAPE_POINTS).arrays(), input_arrays(offsets), prior, contiguous(free),
+        ExpectedArrays(*map(contiguous, expected[:5])),
+        problem.class_arrays(), numbers, faces,
+        _solution_arrays(solution, plan.marginalises and config.window == N), ends,
+    )  # fmt: skip
+    is_done, *inverse = map(torch.from_numpy, ends)
+    observations = FaceObservations(*map(torch.from_numpy, faces))
+    done = is_done.nonzero()[:, 0]
+    inverse_of_done = _part(InverseBlocks(*inverse), done)
+    _write_posterior(batch, rows, done, observations, inverse_of_done, config)
+    return is_done
+
+
+def _part(values: _T, rows: Tensor) -> _T:
+    """Return the rows of a tuple of tensors; `values` as they are for all rows."""
+    first = values[0]
+    return values if len(rows) == len(first) else select(values, rows)
+
+
+def _write_posterior(
+    batch: Round,
+    rows: Tensor,
+    done: Tensor,
+    observations: FaceObservations,
+    inverse: InverseBlocks,
+    config: Config,
+) -> None:
+    """
+    Write the covariances of windows that are done.
+
+    `observations` are of all `rows`, `inverse` is of the `done` ones among them.
+
+    """
+    if not len(done):
+        return
+    faces = _part((observations.moments, observations.inset, observations.weight), done)
+    ended = rows[done]
+    problem, state, expected, free = (
+        _part(part, ended) for part in (batch.problem, batch.state, batch.expected, (batch.free,))
     )
+    _write(
+        posterior(problem, state, *faces, expected, *free, inverse, config),
+        batch.solution.posterior,
+        ended,
+    )
+
+
+def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
+    """Return the memory of a solution for the kernel, without prior if none is left."""
+    prior = [np.empty((0, PRIOR_SIZE))] * 2 + [np.empty((0, PRIOR_SIZE, PRIOR_SIZE))]
+    if leaves_prior and solution.prior is not None:
+        prior = [part.numpy() for part in solution.prior]
+    parts = *solution.state, solution.extent_evidence
+    return SolutionArrays(*(part.numpy() for part in parts), *prior)
 
 
 def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
@@ -283,14 +258,22 @@ def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
         settled_step=SETTLED_STEP,
         may_settle=turn > 0,
         is_last=turn + 1 >= plan.rounds,
+        uses_shape=_uses_rigid_shape(plan, turn),
     )
 
 
 def run_round_torch(
-    part: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config
-) -> Fit:
+    batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
+) -> Tensor:
     """Take a round by torch."""
-    problem, state, expected, free, _ = part
+    solution = batch.solution
+    problem, state, expected, free, log_extent = select(
+        (batch.problem, batch.state, batch.expected, batch.free, solution.extent_evidence[:, 0]),
+        rows,
+    )
+    shared = state.shared.clone()
+    shared[:, ANCHOR] = 0.0
+    state = State(state.pose, shared)
     observations = observe_faces(problem, state, offsets, config)
     weighted = _weighted_terms(problem, state, expected, observations, plan, turn, config)
     x = state.pack()
@@ -300,21 +283,23 @@ def run_round_torch(
     step = (found.pose - state.pose) / problem.of_class(*POSE_ERRORS)[:, None]
     moved = step.square().mean(2).amax(1)
     is_done = (moved <= SETTLED_STEP**2) & (turn > 0) | (turn + 1 >= plan.rounds)
-    inverse = InverseBlocks(
-        x.new_zeros(*problem.valid.shape, LINK, LINK),
-        x.new_zeros(*problem.valid.shape, LINK, SHARED),
-        torch.cholesky_inverse(objective.factor.corner),
-    )
-    prior = None
-    if is_done.any():
-        factor = select(objective.factor, is_done.nonzero()[:, 0])
-        for whole, part_of_done in zip(
-            inverse, factor.inverse_blocks(problem.length), strict=True
-        ):
-            whole[is_done] = part_of_done
-        if plan.marginalises and problem.length == config.window:
-            prior = _prior_of_full(weighted, found, problem)
-    return Fit(found, is_done, observations, inverse, prior)
+    corner = torch.cholesky_inverse(objective.factor.corner)
+    solution.state.pose[rows], solution.state.shared[rows] = found
+    evidence = evidence_of_extents(log_extent, expected, found, corner)
+    solution.extent_evidence[rows, 1:] = evidence
+    done = is_done.nonzero()[:, 0]
+    if len(done):
+        inverse = InverseBlocks(*select(objective.factor, done).inverse_blocks(problem.length))
+        _write_posterior(batch, rows, done, observations, inverse, config)
+        if plan.marginalises and problem.length == config.window and solution.prior is not None:
+            prior = select(_prior_of_full(weighted, found, problem), done)
+            _write(prior, solution.prior, rows[done])
+    return is_done
+
+
+def _write(parts: Iterable[Tensor], wholes: Iterable[Tensor], rows: Tensor) -> None:
+    for part, whole in zip(parts, wholes, strict=True):
+        whole[rows] = part
 
 
 def _is_smooth(plan: Plan, turn: int) -> bool:

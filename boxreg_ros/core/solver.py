@@ -6,7 +6,6 @@ minimised. How many rounds there are, and what they use, is a `Plan`, chosen onc
 
 """
 
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import inf
@@ -26,16 +25,15 @@ from boxreg_ros.core.batch import (
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.input_model import (
     expect,
-    expected_shared,
+    expect_shared,
     InputModel,
     InputNoise,
-    mean_input_extents,
     normalised_residuals,
     UNKNOWN_NOISE,
     UNKNOWN_POPULATION,
 )
-from boxreg_ros.core.kernels import shared_by
-from boxreg_ros.core.rounds import Plan, Round, RoundResult, run_round
+from boxreg_ros.core.kernels import compiled, shared_by
+from boxreg_ros.core.rounds import Plan, Round, run_round
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor
@@ -46,6 +44,7 @@ from torch.nn.functional import pad
 NOISE_ROUNDS = 2
 """First rounds of a whole track whose residuals give the input noise. Later fits follow the
 input: the noise would be estimated smaller in every round."""
+NUM_CORES = cpu_count()
 OBSERVATIONS_PER_THREAD = 2500
 """Observations that a thread solves at once: more save calls, fewer save memory traffic."""
 
@@ -84,26 +83,23 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     noise = model.noise() if learns_noise and not plan.estimates_noise else UNKNOWN_NOISE
     known = model.population() if learns_extents else UNKNOWN_POPULATION
     population = known
-    solution = _start(problem, config, offsets, plan)
     free = free_variables(problem, config)
+    solution = start(problem, free, offsets, plan)
     every = torch.arange(len(free), device=free.device)
     rows, turn, points = every, 0, plan.coarse_points
-    workers = config.solver.threads or cpu_count()
+    workers = config.solver.threads or NUM_CORES
+    # No longer lived: a forked worker would wait for threads that it does not have.
     with (
         ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool,
         shared_by(pool, workers),
     ):
         while len(rows):
             expected = expect(problem, offsets, noise, population)
-            log_extent = solution.extent_evidence[:, 0]
-            batch = Round(problem.thinned(points), solution.state, expected, free, log_extent)
+            batch = Round(problem.thinned(points), solution, expected, free)
             work = partial(run_round, batch, offsets, plan, turn, config)
             parts = _split(rows, problem.length, workers)
-            results: Iterable[RoundResult] = map(work, parts)
-            if len(parts) > 1:
-                results = pool.map(work, parts)
-            unfinished = [_store(result, solution) for result in list(results)]
-            rows = torch.cat(unfinished)
+            is_done = map(work, parts) if len(parts) == 1 else pool.map(work, parts)
+            rows = rows[~torch.cat(list(is_done))]
             turn += 1
             if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
                 residuals = normalised_residuals(problem, solution.state)
@@ -115,43 +111,33 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     return solution
 
 
-def _start(problem: Problem, config: Config, offsets: FaceOffsets, plan: Plan) -> Solution:
+def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: Plan) -> Solution:
     """Return the state that the first round starts from, without covariances and prior."""
-    pose = problem.start[..., POSE].clone()
-    shared = expected_shared(problem, offsets, mean_input_extents(problem))
+    pose = problem.start[..., POSE].contiguous()  # a copy
+    shared = expect_shared(problem, offsets)
     log_extent = shared[:, EXTENT].log()
     if plan.starts_from_fit:
-        is_free = free_variables(problem, config)[:, -SHARED:][:, EXTENT]
-        shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], is_free)
+        shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], free[:, -SHARED:][:, EXTENT])
     prior = extents = None
     if plan.marginalises:
         unknown = torch.full_like(problem.prior_mean, torch.nan)
-        prior = MarginalPrior(unknown, unknown.clone(), problem.prior_information.clone())
+        information = torch.full_like(problem.prior_information, torch.nan)
+        prior = MarginalPrior(unknown, unknown.clone(), information)
         first = pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
         extents = problem.marginalised_extents + first
     evidence = pad(log_extent[:, None], (0, 0, 0, 2))  # (B, 3, 3)
     return Solution(State(pose, shared), Posterior.zeros(pose), prior, extents, evidence)
 
 
-def _store(result: RoundResult, solution: Solution) -> Tensor:
-    """Write the result of a round to its rows of `solution`; return those that are not done."""
-    rows = result.rows
-    solution.state.pose[rows] = result.state.pose
-    solution.state.shared[rows] = result.state.shared
-    solution.extent_evidence[rows, 1:] = result.extent_evidence
-    done = rows[result.is_done]
-    for whole, part in zip(solution.posterior, result.posterior, strict=True):
-        whole[done] = part
-    if result.prior is not None and solution.prior is not None:
-        for whole, part in zip(solution.prior, result.prior, strict=True):
-            whole[done] = part[result.is_done]
-    return rows[~result.is_done]
-
-
 def _split(rows: Tensor, length: int, workers: int) -> tuple[Tensor, ...]:
-    """Return parts of `rows` for threads: one on a GPU, or if there are few observations."""
-    size = (OBSERVATIONS_PER_THREAD if rows.is_cpu else inf) / length
-    if len(rows) <= size:
+    """
+    Return parts of `rows` for threads, windows of `length` each.
+
+    One on a GPU, where the kernels share windows by themselves, and for few observations.
+
+    """
+    size = OBSERVATIONS_PER_THREAD / length
+    if compiled(rows) is not None or not rows.is_cpu or len(rows) <= size:
         return (rows,)
     parts = workers * int(1 + len(rows) / size / workers)
     return rows.tensor_split(min(len(rows), parts))

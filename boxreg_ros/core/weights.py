@@ -7,14 +7,13 @@ docs/method.md, section Weights, has the formulas (M19) to (M25).
 
 from math import inf
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, FaceConfig
 from boxreg_ros.core import terms
-from boxreg_ros.core.batch import BIAS, EXTENT, GAP, POSE_ERRORS, Problem, State
+from boxreg_ros.core.batch import ACCELERATIONS, BIAS, EXTENT, GAP, Problem, State
 from boxreg_ros.core.face_support import BOTTOM, FaceObservations
 from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
 from boxreg_ros.core.input_model import Expectation
-from boxreg_ros.core.kernels import contiguous
-from boxreg_ros.core.kernels.arrays import ClassDeviations, WeightNumbers
+from boxreg_ros.core.kernels.arrays import WeightNumbers
 from boxreg_ros.core.terms import Term
 from boxreg_ros.structures import YAW
 import torch
@@ -48,8 +47,6 @@ DRIVING_SPAN = 5
 """Boxes in these medians."""
 DRIVING_REACH = 4
 """Steps before and after one where the object drives that are not held at rest either."""
-ACCELERATIONS = ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning')
-"""Settings of `ClassConfig` that are the deviations of the accelerations of a pose."""
 DRIFT_RATIOS = (1.0, 1.0, 0.5, 0.15, 0.15, 0.15)
 """Deviation of the steps of a parked box in x y z [m] and roll pitch yaw [rad], over `drift`."""
 
@@ -145,20 +142,10 @@ def weight_numbers(config: Config, is_smooth: bool) -> WeightNumbers:
         driving_span=DRIVING_SPAN,
         driving_reach=DRIVING_REACH,
         face_outlier=config.faces.outlier,
+        face_deviations=_rigid_face_deviations(config.faces),
+        drift_ratios=DRIFT_RATIOS,
         is_robust=is_smooth and ingredients.robust_motion,
         pin_deviations=PIN_DEVIATIONS,
-    )
-
-
-def class_deviations(problem: Problem, config: Config) -> ClassDeviations:
-    """Return the deviations of the class of each window for the kernel."""
-    drift = problem.of_class('drift')
-    return ClassDeviations(
-        faces=contiguous(face_deviations(problem, config)),
-        acceleration=contiguous(problem.of_class(*ACCELERATIONS)),
-        slip=contiguous(problem.of_class('slip', 'climb')),
-        zero_motion=contiguous(drift * drift.new_tensor(DRIFT_RATIOS)),
-        pose=contiguous(problem.of_class(*POSE_ERRORS)),
     )
 
 
@@ -348,12 +335,15 @@ def face_deviations(problem: Problem, config: Config) -> Tensor:
     least; the road is not.
 
     """
-    faces = config.faces
-    of_rigid = [faces.ends] * 2 + [faces.sides] * 2 + [faces.top, faces.bottom]
     shape = problem.of_class('shape')
-    deviation = shape.maximum(shape.new_tensor(of_rigid))
-    deviation[:, BOTTOM] = faces.bottom
+    deviation = shape.maximum(shape.new_tensor(_rigid_face_deviations(config.faces)))
+    deviation[:, BOTTOM] = config.faces.bottom
     return deviation
+
+
+def _rigid_face_deviations(faces: FaceConfig) -> tuple[float, ...]:
+    """Return the deviation of one observation of each face of a rigid object [m]."""
+    return faces.ends, faces.ends, faces.sides, faces.sides, faces.top, faces.bottom
 
 
 def _diagonal(weight: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, KINDS
@@ -40,6 +41,7 @@ VALUES_PER_POINT = 18
 """Values held per point while a batch is solved; estimated from the temporary tensors."""
 PRIOR_ANGLES = [3, 4, 5, 9, 10, 11]
 """Angles among the variables of the marginalisation prior: of its two poses."""
+_FIELDS = [attrgetter(name) for name in Observation._fields]
 
 
 NO_PRIOR = (
@@ -225,9 +227,9 @@ def _tensor(array: NDArray[Any], device: str) -> Tensor:
 
 
 def _columns(windows: Sequence[Window]) -> Any:
-    """Return the observations of all windows as one `Observation` of tuples."""
+    """Return the observations of all windows as one `Observation` of lists."""
     every = [observation for window in windows for observation in window.observations]
-    return Observation._make(zip(*every, strict=True))
+    return Observation._make(list(map(get, every)) for get in _FIELDS)
 
 
 def _stack_observations(
@@ -380,6 +382,8 @@ def resolve_headings(
     """
     input_yaw = boxes[..., YAW]
     chain = input_yaw.copy()
+    if chain.shape[1] == 1:
+        return chain  # nothing contradicts a single heading
     trend = boxes[:, 0, YAW]
     for column in range(1, chain.shape[1]):
         change = (chain[:, column] - trend + np.pi / 2) % np.pi - np.pi / 2

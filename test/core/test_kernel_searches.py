@@ -8,7 +8,15 @@ import sys
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import batch, prior, registration, rigid_shape
-from boxreg_ros.core.batch import EXTENT, free_variables, SHARED, State
+from boxreg_ros.core.batch import (
+    EXTENT,
+    free_variables,
+    MarginalPrior,
+    Posterior,
+    SHARED,
+    Solution,
+    State,
+)
 from boxreg_ros.core.face_support import (
     FaceOffsets,
     FAR,
@@ -16,13 +24,18 @@ from boxreg_ros.core.face_support import (
     observe_faces_torch,
 )
 from boxreg_ros.core.geometry import rotation_from_rpy
-from boxreg_ros.core.input_model import expect, InputModel
-from boxreg_ros.core.kernels.arrays import (
-    ExpectedArrays,
-    FaceArrays,
-    ShapeArrays,
-    StartArrays,
+from boxreg_ros.core.input_model import (
+    estimate_noise_compiled,
+    estimate_noise_torch,
+    expect,
+    expect_compiled,
+    expect_torch,
+    InputModel,
+    InputNoise,
+    Population,
 )
+from boxreg_ros.core.kernels import contiguous
+from boxreg_ros.core.kernels.arrays import ExpectedArrays, FaceArrays, PriorArrays
 from boxreg_ros.core.observation import own_points, own_points_numpy
 from boxreg_ros.core.registration import register
 from boxreg_ros.core.rounds import (
@@ -32,12 +45,7 @@ from boxreg_ros.core.rounds import (
     run_round_compiled,
     run_round_torch,
 )
-from boxreg_ros.core.weights import (
-    class_deviations,
-    robustify_motion,
-    weigh,
-    weight_numbers,
-)
+from boxreg_ros.core.weights import robustify_motion, weigh, weight_numbers
 from boxreg_ros.structures import Sweep
 import numpy as np
 from paths import ROOT
@@ -171,18 +179,19 @@ def weighed(problem, state, config):
         for term in weigh(problem, state, observations, expected, config)
     ]
     B, N = problem.valid.shape
-    free = free_variables(problem, config)
-    prior = problem.prior_mean, problem.prior_information
-    start = StartArrays(*(part.numpy() for part in (*state, free, *prior)))
-    shape = ShapeArrays(np.zeros((B, 0, 6, 6)), np.zeros((B, 0, 6)))
-    faces = FaceArrays(*(np.ascontiguousarray(part.numpy()) for part in observations))
-    columns = (getattr(expected, name) for name in ExpectedArrays._fields)
-    expected = ExpectedArrays(*(np.ascontiguousarray(column.numpy()) for column in columns))
-    of_class, numbers = class_deviations(problem, config), weight_numbers(config, True)
+    prior = PriorArrays(problem.prior_mean.numpy(), problem.prior_information.numpy())
+    poses, shared = (part.numpy() for part in state)
+    faces = FaceArrays(*map(contiguous, observations))
+    expected = ExpectedArrays(*map(contiguous, expected[:5]))
+    windows, of_class, numbers = (
+        problem.arrays(), problem.class_arrays(), weight_numbers(config, True)
+    )  # fmt: skip
     pairs = []
     for b in range(B):
-        terms = normal_equations.unweighted_terms(N, start, shape, b)
-        weights.weigh(b, problem.arrays(), start, faces, expected, of_class, numbers, terms)
+        terms = normal_equations.unweighted_terms(N, 0, prior, b)
+        weights.weigh(
+            b, windows, poses[b], shared[b], b, faces, expected, of_class, numbers, terms
+        )
         pairs.append((term_arrays(known, problem, b), terms))
     return pairs
 
@@ -244,7 +253,26 @@ def batch_of(problem, state, config):
     """Return what a round of a problem begins with."""
     expected = expect(problem, OFFSETS)
     free = free_variables(problem, config)
-    return Round(problem, state, expected, free, expected.shared[:, EXTENT].log())
+    state = State(*(part.clone() for part in state))
+    prior = MarginalPrior(
+        *(torch.full_like(part, torch.nan) for part in (
+            problem.prior_mean, problem.prior_mean, problem.prior_information
+        ))
+    )  # fmt: skip
+    evidence = torch.zeros(len(free), 3, 3, dtype=D)
+    evidence[:, 0] = expected.shared[:, EXTENT].log()
+    solution = Solution(state, Posterior.zeros(state.pose), prior, None, evidence)
+    return Round(problem, solution, expected, free)
+
+
+def both_rounds(problem, state, config, plan):
+    """Return the solution and which windows are done after a round by the kernel, and by torch."""
+    results = []
+    for take in (run_round_compiled, run_round_torch):
+        batch = batch_of(problem, state, config)
+        is_done = take(batch, OFFSETS, *PLANS[plan], config, torch.arange(len(problem.boxes)))
+        results.append((batch.solution, is_done))
+    return results
 
 
 @pytest.mark.parametrize('iterations', [1, 8])
@@ -256,25 +284,23 @@ def test_a_round_equals_that_of_torch(plan, kind, iterations):
     pinned[2, 4] = True
     problem = problem._replace(pinned=pinned)
     config = Config().updated({'window': 12, 'solver.iterations': iterations})
-    batch = batch_of(problem, state, config)
-    arguments = batch, OFFSETS, *PLANS[plan], config
-    found, known = run_round_compiled(*arguments), run_round_torch(*arguments)
-    assert torch.equal(found.is_done, known.is_done)
-    done = known.is_done
+    (found, found_done), (known, done) = both_rounds(problem, state, config, plan)
+    assert torch.equal(found_done, done)
     # Steps of the search after the first one amplify the order of sums; so does the inverse of the
     # curvature of the window with a pin, whose weights differ by a factor of 1e6.
     tolerance = 1e-9 if iterations == 1 else 1e-5
     assert_equal(found.state.pose[problem.valid], known.state.pose[problem.valid], tolerance)
     assert_equal(found.state.shared, known.state.shared, tolerance)
-    assert_equal(found.inverse.corner, known.inverse.corner, 1e-7)
-    assert_equal(found.inverse.links[done], known.inverse.links[done], 1e-7)
-    assert_equal(found.inverse.border[done], known.inverse.border[done], 1e-7)
-    assert (found.prior is None) == (plan == 'whole track')
-    if known.prior is not None:
-        is_full = done & problem.valid.all(1)
-        for part, twin in zip(found.prior, known.prior, strict=True):
-            assert_equal(part[is_full], twin[is_full], max(tolerance, 1e-7))
-        assert not found.prior.step[~is_full].isfinite().any()
+    assert_equal(found.extent_evidence, known.extent_evidence, 1e-6)
+    is_valid = problem.valid & done[:, None]
+    for name in ('poses', 'face_distances'):
+        part, twin = (getattr(side.posterior, name)[is_valid] for side in (found, known))
+        assert_equal(part, twin, 1e-7)
+    assert_equal(found.posterior.extents[done], known.posterior.extents[done], 1e-7)
+    is_full = done & problem.valid.all(1) & (plan != 'whole track')
+    for part, twin in zip(found.prior, known.prior, strict=True):
+        assert_equal(part[is_full], twin[is_full], max(tolerance, 1e-7))
+    assert not found.prior.step[~is_full].isfinite().any()
 
 
 @pytest.mark.parametrize('case', CASES)
@@ -284,12 +310,55 @@ def test_a_round_of_degenerate_points_equals_that_of_torch(case):
     numbers = torch.tensor([[getattr(Config().vehicle, name) for name in names]] * 3, dtype=D)
     problem = problem._replace(class_numbers=numbers)
     config = Config().updated({'window': 5})
-    arguments = batch_of(problem, state, config), OFFSETS, *PLANS['warm'], config
-    found, known = run_round_compiled(*arguments), run_round_torch(*arguments)
+    (found, _), (known, _) = both_rounds(problem, state, config, 'warm')
     rows = [0, 2] if case == 'one window not finite' else [0, 1, 2]
     assert_equal(found.state.pose[rows], known.state.pose[rows])
     assert_equal(found.state.shared[rows], known.state.shared[rows])
-    assert_equal(found.inverse.links[rows], known.inverse.links[rows])
+    for part, twin in zip(found.posterior, known.posterior, strict=True):
+        assert_equal(part[rows], twin[rows])
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+@pytest.mark.parametrize('kind', ['usual', 'pinned', 'low noise', 'two boxes'])
+def test_expectations_equal_those_of_torch(kind, seed):
+    rng = np.random.default_rng(seed)
+    problem, _ = drives('usual', 2 if kind == 'two boxes' else 12)
+    pinned = torch.zeros_like(problem.valid)
+    pinned[0, :1] = kind == 'pinned'
+    marginalised = torch.from_numpy(rng.uniform(1, 4, (3, 4)))
+    problem = problem._replace(
+        pinned=pinned, marginalised_extents=marginalised, kind=torch.tensor([0, 1, 2])
+    )
+    deviation = 0.1 if kind == 'low noise' else 1.0
+    parts = deviation * rng.random((3, 9)), rng.uniform(0, 0.9, (3, 9)), rng.random((3, 9))
+    noise = InputNoise(*map(torch.from_numpy, (*parts, rng.random((3, 1)))))
+    extents = np.log([4.0, 2.0, 1.6]) + 0.2 * rng.normal(size=(20, 3))
+    evidence = np.stack([extents, 50 * rng.normal(size=(20, 3)), rng.random((20, 3))], 1)
+    population = Population(torch.from_numpy(evidence), torch.arange(20) % 2)
+    offsets = FaceOffsets(*torch.from_numpy(0.1 * rng.normal(size=(3, 3, 6))))
+    found = expect_compiled(problem, offsets, noise, population)
+    known = expect_torch(problem, offsets, noise, population)
+    for part, twin in zip(found, known, strict=True):
+        assert_equal(part, twin, 1e-12)
+
+
+@pytest.mark.parametrize('kind', ['usual', 'held', 'short tracks', 'one track', 'nothing'])
+def test_noise_equals_that_of_torch(kind):
+    rng = np.random.default_rng(5)
+    residuals = rng.normal(size=(1 if kind == 'one track' else 7, 30, 9)).cumsum(1)
+    residuals[:, ::4, 2] = np.nan
+    residuals[:, 7:9] = np.inf
+    if kind == 'held':
+        residuals[..., 6:] = residuals[:, :1, 6:]
+    if kind == 'short tracks':
+        residuals[::2, 5:] = np.nan
+    if kind == 'nothing':
+        residuals[:] = np.nan
+    values = torch.from_numpy(residuals)
+    found, known = estimate_noise_compiled(values), estimate_noise_torch(values)
+    for part, twin in zip(found, known, strict=True):
+        assert_equal(part, twin, 1e-12)
+    assert (known.weight > 0).all() == (kind != 'nothing')
 
 
 @pytest.mark.parametrize('road', [True, False])
@@ -360,12 +429,9 @@ def test_non_finite_values_leave_other_windows_bitwise_unchanged():
     config, others = Config().updated({'window': 12}), [0, 2]
     broken = State(state.pose.clone(), state.shared)
     broken.pose[1, 3, 0] = torch.nan
-    known, found = (
-        run_round_compiled(batch_of(problem, start, config), OFFSETS, *PLANS['warm'], config)
-        for start in (state, broken)
-    )
+    known, found = (both_rounds(problem, start, config, 'warm')[0][0] for start in (state, broken))
     assert torch.equal(found.state.pose[others], known.state.pose[others])
-    for part, right in zip(found.inverse, known.inverse, strict=True):
+    for part, right in zip(found.posterior, known.posterior, strict=True):
         assert torch.equal(part[others], right[others])
     assert not found.state.pose[1].isfinite().all()
 

@@ -9,10 +9,11 @@ from typing import Any
 from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import LINK
-from boxreg_ros.core.batch import EXTENT, free_variables, SHARED, State
+from boxreg_ros.core.batch import free_variables, SHARED, State
 from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.input_model import expect, InputModel
 from boxreg_ros.core.rounds import Plan, Round, run_round
+from boxreg_ros.core.solver import start
 from boxreg_ros.core.window import stack_windows
 import numpy as np
 import torch
@@ -68,8 +69,9 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
     expected = expect(problem, offsets)
     state = State(problem.pose, expected.shared)
     free = free_variables(problem, config)
-    batch = Round(problem, state, expected, free, expected.shared[:, EXTENT].log())
     plan = Plan.choose(config, is_warm=True)
+    solution = start(problem, free, offsets, plan)
+    batch = Round(problem, solution, expected, free)
     rows = torch.arange(count, device=free.device)
     points = problem.returns.points
     size_of_points = float(points.numel() * points.element_size())

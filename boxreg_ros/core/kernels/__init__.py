@@ -25,7 +25,9 @@ class Kernels(NamedTuple):
     """The modules with compiled functions."""
 
     crop: ModuleType
+    expectation: ModuleType
     face_support: ModuleType
+    noise: ModuleType
     rigid_shape: ModuleType
     rounds: ModuleType
 
@@ -74,9 +76,8 @@ def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
         kernel(0, windows, *arguments)
         return
     ends = [windows * part // parts for part in range(parts + 1)]
-    others = [
-        threads.pool.submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])
-    ]
+    submit = threads.pool.submit
+    others = [submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])]
     kernel(0, ends[1], *arguments)
     for other in others:
         other.result()
@@ -96,7 +97,14 @@ def compiled(like: Tensor) -> Kernels | None:
 def load() -> Kernels | None:
     """Return the kernels; None where numba does not work, with one warning."""
     try:
-        from boxreg_ros.core.kernels import crop, face_support, rigid_shape, rounds
+        from boxreg_ros.core.kernels import (
+            crop,
+            expectation,
+            face_support,
+            noise,
+            rigid_shape,
+            rounds,
+        )
     except Exception as error:  # whatever an incomplete or unsupported installation raises
         reason = ' '.join(f'{type(error).__name__}: {error}'.split())
         warn(
@@ -106,4 +114,4 @@ def load() -> Kernels | None:
             stacklevel=2,
         )
         return None
-    return Kernels(crop, face_support, rigid_shape, rounds)
+    return Kernels(crop, expectation, face_support, noise, rigid_shape, rounds)

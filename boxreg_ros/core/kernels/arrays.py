@@ -32,6 +32,10 @@ class WindowArrays(NamedTuple):
         Every n-th point is used.
     pinned : array, shape (B, N)
         Whether a person has corrected a box.
+    marginalised_extents : array, shape (B, 4)
+        Sum of the input extents of marginalised observations [m], and the number of these.
+    kind : array, shape (B,)
+        Kind of the object of each window.
 
     """
 
@@ -46,6 +50,8 @@ class WindowArrays(NamedTuple):
     counts: Any
     stride: int
     pinned: Any
+    marginalised_extents: Any
+    kind: Any
 
 
 class FaceArrays(NamedTuple):
@@ -69,67 +75,131 @@ class ExpectedArrays(NamedTuple):
     unmodelled_bias: Any
 
 
-class ClassDeviations(NamedTuple):
+class InputArrays(NamedTuple):
     """
-    Deviations of the class of each window.
+    What is known of the input of all tracks, one row for each of K kinds of objects.
 
     Attributes
     ----------
-    faces : array, shape (B, 6)
-        Of one observation of each face [m].
+    deviation, correlation, offset : array, shape (K, 9)
+        As in `boxreg_ros.core.input_model.InputNoise`.
+    weight : array, shape (K,)
+        Of this noise against the settings.
+    gap_correction, occlusion_inset, range_inset : array, shape (K, 6)
+        As in `boxreg_ros.core.face_support.FaceOffsets` [m].
+    median, slopes : array, shapes (K, 3) and (K, 3, 3)
+        Of the population of extents (M16); slopes are 0 where there is none.
+
+    """
+
+    deviation: Any
+    correlation: Any
+    offset: Any
+    weight: Any
+    gap_correction: Any
+    occlusion_inset: Any
+    range_inset: Any
+    median: Any
+    slopes: Any
+
+
+class ClassArrays(NamedTuple):
+    """
+    Settings of the class of each window.
+
+    Attributes
+    ----------
     acceleration : array, shape (B, 6)
-        Of the accelerations along the axes of the body.
+        Deviation of the accelerations along the axes of the body.
     slip : array, shape (B, 2)
         Of the velocity of the pivot along the y and z axes [m/s].
-    zero_motion : array, shape (B, 6)
-        Of the steps of a parked box [m, rad].
+    drift : array, shape (B,)
+        Of the step of a parked box [m].
     pose : array, shape (B, 6)
         Of the input poses [m, rad].
+    extent : array, shape (B,)
+        Of the input extents, as part of each.
+    gap_spread, sideslip : array, shape (B,)
+        Of labelling margins [m], and of the angle from heading to path [rad].
+    shape : array, shape (B,)
+        How far the surface is from rigid [m].
+    gaps : array, shape (B, 6)
+        Expected labelling margins [m].
+    pivot : array, shape (B,)
+        Distance of the pivot behind the centre, as part of the length.
 
     """
 
-    faces: Any
     acceleration: Any
     slip: Any
-    zero_motion: Any
+    drift: Any
     pose: Any
+    extent: Any
+    gap_spread: Any
+    sideslip: Any
+    shape: Any
+    gaps: Any
+    pivot: Any
 
 
-class StartArrays(NamedTuple):
+class SolutionArrays(NamedTuple):
     """
-    Start of a round.
+    State of a batch, where a round begins, and what it writes.
 
     Attributes
     ----------
     poses, shared : array, shapes (B, N, 6) and (B, 23)
         Boxes, and the variables that all observations of a window share.
-    free : array, shape (B, 6 N + 23)
-        1 for variables that are estimated, 0 for those held fixed.
-    prior_mean, W_prior : array, shapes (B, 35) and (B, 35, 35)
-        Marginalisation prior (M9).
+    evidence : array, shape (B, 3, 3)
+        Logarithms of the input extents; corrections by the points alone, and their weights.
+    prior_state, prior_step, prior_information : array, shapes (B, 35), (B, 35), (B, 35, 35)
+        What full windows that are done leave to the next ones; B = 0 if it is not wanted.
 
     """
 
     poses: Any
     shared: Any
-    free: Any
-    prior_mean: Any
-    W_prior: Any
+    evidence: Any
+    prior_state: Any
+    prior_step: Any
+    prior_information: Any
 
 
-class ShapeArrays(NamedTuple):
+class EndArrays(NamedTuple):
     """
-    Rigid shape (M4) of a batch; without observations, N = 0, where it is not used.
+    How a round ends for the b windows that take part.
 
     Attributes
     ----------
-    W, wanted : array, shapes (B, N, 6, 6) and (B, N, 6)
-        Information about a step of each pose in box axes, and the step that is wanted.
+    is_done : array, shape (b,)
+        Whether a window is settled, or this was the last round.
+    pose_blocks, border_blocks : array, shapes (b, N, 6, 6) and (b, N, 6, 23)
+        Blocks of the poses in the inverse curvature, of windows that are done: their own, and
+        those with the shared variables.
+    corner : array, shape (b, 23, 23)
+        Block of the shared variables in the inverse curvature.
 
     """
 
+    is_done: Any
+    pose_blocks: Any
+    border_blocks: Any
+    corner: Any
+
+
+class PriorArrays(NamedTuple):
+    """
+    Marginalisation prior (M9) of a batch.
+
+    Attributes
+    ----------
+    mean, W : array, shapes (B, 35) and (B, 35, 35)
+        Minimum and information matrix.
+
+    """
+
+    mean: Any
     W: Any
-    wanted: Any
 
 
 class TermArrays(NamedTuple):
@@ -200,37 +270,6 @@ class ArrowheadArrays(NamedTuple):
     corner: Any
 
 
-class RoundResults(NamedTuple):
-    """
-    What a round writes.
-
-    Attributes
-    ----------
-    x : array, shape (B, 6 N + 23)
-        Poses and shared variables at the end of the round.
-    is_done : array, shape (B,)
-        Whether a window is settled, or this was the last round.
-    pose_blocks, border_blocks : array, shapes (B, N, 6, 6) and (B, N, 6, 23)
-        Blocks of the poses in the inverse curvature, of windows that are done: their own, and
-        those with the shared variables.
-    corner : array, shape (B, 23, 23)
-        Block of the shared variables in the inverse curvature.
-    prior_mean, prior_step, prior_information : array, shapes (B, 35), (B, 35), (B, 35, 35)
-        What full windows that are done leave to the next ones, NaN for others; B = 0 if it is not
-        wanted.
-
-    """
-
-    x: Any
-    is_done: Any
-    pose_blocks: Any
-    border_blocks: Any
-    corner: Any
-    prior_mean: Any
-    prior_step: Any
-    prior_information: Any
-
-
 class FaceNumbers(NamedTuple):
     """Constants and settings of `boxreg_ros.core.face_support`; there they are described."""
 
@@ -267,6 +306,8 @@ class WeightNumbers(NamedTuple):
     driving_span: int
     driving_reach: int
     face_outlier: float
+    face_deviations: tuple[float, ...]
+    drift_ratios: tuple[float, ...]
     is_robust: bool
     pin_deviations: tuple[float, ...]
 
@@ -284,6 +325,19 @@ class SearchNumbers(NamedTuple):
     settled_step: float
     may_settle: bool
     is_last: bool
+    uses_shape: bool
+
+
+class ShapeNumbers(NamedTuple):
+    """Constants of `boxreg_ros.core.rigid_shape`; there they are described."""
+
+    cells: tuple[int, ...]
+    margin: float
+    flatness: float
+    min_cell_points: float
+    effective_points: float
+    ridge: float
+    is_moving: bool
 
 
 class RoundNumbers(NamedTuple):
@@ -291,7 +345,39 @@ class RoundNumbers(NamedTuple):
 
     faces: FaceNumbers
     weights: WeightNumbers
+    shape: ShapeNumbers
     search: SearchNumbers
+    min_extent_gain: float
+
+
+class ExpectationNumbers(NamedTuple):
+    """Constants of `boxreg_ros.core.input_model`; there they are described."""
+
+    low_noise_ratio: float
+    ratio_bounds: tuple[float, ...]
+    typical_correlation: float
+    correlation_interval: float
+    white_correlation: float
+    correlation_span: float
+    filtered_offset: float
+    max_filtered_bias: float
+    yaw_bias: float
+    population_radius: float
+    large_extent: tuple[float, ...]
+    pinned_extent: float
+    pinned_margins: float
+    pivot_deviation: float
+
+
+class NoiseNumbers(NamedTuple):
+    """Constants of `boxreg_ros.core.input_model`; there they are described."""
+
+    mad_to_deviation: float
+    min_observations: int
+    iterations: int
+    max_correlation: float
+    min_left: float
+    min_power: float
 
 
 class CropNumbers(NamedTuple):

@@ -287,18 +287,20 @@ def empty_face_work(begin, end, windows, numbers):
 
 
 @kernel
-def clear_padding(length, b, faces):
-    """Set the face observations of the padding of window `b` to zero."""
-    faces.moments[b, length:] = 0.0
-    faces.distance[b, length:] = 0.0
-    faces.weight[b, length:] = 0.0
-    faces.inset[b, length:] = 0.0
-    faces.inset_shares[:, b, length:] = 0.0
-    faces.num_points[b, length:] = 0.0
+def clear_padding(length, row, faces):
+    """Set the face observations of the padding of window `row` to zero."""
+    faces.moments[row, length:] = 0.0
+    faces.distance[row, length:] = 0.0
+    faces.weight[row, length:] = 0.0
+    faces.inset[row, length:] = 0.0
+    faces.inset_shares[:, row, length:] = 0.0
+    faces.num_points[row, length:] = 0.0
 
 
 @kernel
-def observe_window(b, windows, poses, shared, occlusion_inset, range_inset, numbers, work, faces):
+def observe_window(
+    b, windows, poses, shared, occlusion_inset, range_inset, numbers, work, row, faces
+):
     """
     Write the face observations of window `b`.
 
@@ -316,6 +318,8 @@ def observe_window(b, windows, poses, shared, occlusion_inset, range_inset, numb
         Constants and settings.
     work : FaceWork
         Arrays to work in.
+    row : int
+        Where in `faces` the window is written.
     faces : FaceArrays
         Written; zero for padding.
 
@@ -328,19 +332,19 @@ def observe_window(b, windows, poses, shared, occlusion_inset, range_inset, numb
     tangent = np.empty(6)
     velocity = np.zeros(3)
     length = windows.lengths[b]
-    clear_padding(length, b, faces)
+    clear_padding(length, row, faces)
     for k in range(3):
         half[k] = shared[EXTENT + k] / 2
     for n in range(length):
         m = windows.counts[b, n]
         box, pose, origins = windows.boxes[b, n], poses[n], windows.origins[b, n]
         ground = windows.ground[b, n]
-        distance, weight, inset = faces.distance[b, n], faces.weight[b, n], faces.inset[b, n]
+        distance, weight, inset = faces.distance[row, n], faces.weight[row, n], faces.inset[row, n]
         points = returns_of(windows, windows.points, b, n)
         fill_visibility(box, origins, points, numbers, R, toward, tangent)
         fill_insets(
-            origins, tangent, occlusion_inset, range_inset, numbers, faces.inset_shares[:, b, n],
-            inset, weight,
+            origins, tangent, occlusion_inset, range_inset, numbers,
+            faces.inset_shares[:, row, n], inset, weight,
         )  # fmt: skip
         for k in range(3):
             shift[k] = pose[k] - box[k]
@@ -353,15 +357,15 @@ def observe_window(b, windows, poses, shared, occlusion_inset, range_inset, numb
         to_box_axes(m, work.moved, shift, R, work.local)
         near = fill_depths(m, half, level, numbers, work)
         wanted = ceil(max(numbers.min_points, numbers.share * near))
-        outermost_points(m, wanted, numbers, work, faces.moments[b, n])
+        outermost_points(m, wanted, numbers, work, faces.moments[row, n])
         for face in range(FACES):
             distance[face] = -work.mean_depth[face]
             if work.number[face] < numbers.min_points:
                 weight[face] = 0.0
         gap = shared[GAP + BOTTOM]
-        add_road(shift, ground, half[2], gap, faces.moments[b, n, BOTTOM], distance)
+        add_road(shift, ground, half[2], gap, faces.moments[row, n, BOTTOM], distance)
         weight[BOTTOM] = 1.0 if isfinite(ground) else 0.0
-        faces.num_points[b, n] = near
+        faces.num_points[row, n] = near
 
 
 @kernel
@@ -377,7 +381,7 @@ def observe_faces(
     work = empty_face_work(begin, end, windows, numbers)
     for b in range(begin, end):
         observe_window(
-            b, windows, poses[b], shared[b], occlusion_inset[b], range_inset[b], numbers, work,
+            b, windows, poses[b], shared[b], occlusion_inset[b], range_inset[b], numbers, work, b,
             faces,
         )  # fmt: skip
 

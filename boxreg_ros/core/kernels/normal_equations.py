@@ -47,14 +47,14 @@ def is_wanted(A: Any) -> bool:
 
 
 @kernel
-def unweighted_terms(N, start, shape, b):
-    """Return room for the terms of window `b`: only rigid shape and prior have weights."""
+def unweighted_terms(N, shapes, prior, b):
+    """Return room for the terms of window `b`: only its prior has weights; `shapes` are 0 or N."""
     return TermArrays(
         np.empty((N, 6)), np.empty((N, 6)), np.zeros((N, 6, 4, 4)),
         np.empty((N, 3, 3)), np.zeros((N, 6)),
-        start.poses[b], shape.wanted[b], shape.W[b],
+        np.empty((N, 6)), np.empty((N, 6)), np.empty((shapes, 6, 6)),
         np.empty(N), np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 2)), np.zeros((N, 6)),
-        start.prior_mean[b], start.W_prior[b], np.empty(SHARED), np.zeros(SHARED),
+        prior.mean[b], prior.W[b], np.empty(SHARED), np.zeros(SHARED),
     )  # fmt: skip
 
 

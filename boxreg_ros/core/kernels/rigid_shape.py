@@ -5,6 +5,8 @@ The torch twin is `boxreg_ros.core.rigid_shape.agreement_torch`, which has the f
 
 """
 
+from typing import Any, NamedTuple
+
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.face_support import fill_moved, fill_velocity, to_box_axes
 from boxreg_ros.core.kernels.rotation import fill_rotation
@@ -42,10 +44,118 @@ def fill_planes(sums, roughness, flatness, min_points, planes, thickness):
                 planes[cell, 3] -= axes[k, 0] * mean[k]
 
 
+class ShapeWork(NamedTuple):
+    """
+    Arrays to work in, for N observations of at most M points and C cells.
+
+    Attributes
+    ----------
+    moved, local : array, shapes (3, M) and (N, 3, M)
+        Points at the stamp of their box, and in box axes [m].
+    sums : array, shape (C, 4, 4)
+        Second moments of the points in each cell.
+    planes, thickness : array, shapes (C, 4) and (C,)
+        See `fill_planes`.
+
+    """
+
+    moved: Any
+    local: Any
+    sums: Any
+    planes: Any
+    thickness: Any
+
+
 @kernel
-def agreement(
-    begin, end, windows, poses, extents, is_moving, roughness, cells, limits, information, wanted
-):
+def empty_shape_work(begin, end, windows, N, cells):
+    """Return arrays for the windows `begin` to `end`."""
+    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
+    C = cells[0] * cells[1] * cells[2]
+    return ShapeWork(
+        np.empty((3, M)), np.empty((N, 3, M)), np.empty((C, 4, 4)), np.empty((C, 4)), np.empty(C)
+    )
+
+
+@kernel
+def fill_sums(b, windows, poses, half, numbers, work):
+    """Write the points of window `b` in box axes, and the moments of each cell."""
+    velocity = np.zeros(3)
+    R = np.empty((3, 3))
+    shift = np.empty(3)
+    work.sums[:] = 0.0
+    for n in range(len(poses)):
+        m = windows.counts[b, n]
+        local = work.local[n]
+        fill_rotation(poses[n, 3], poses[n, 4], poses[n, 5], R)
+        for k in range(3):
+            shift[k] = poses[n, k] - windows.boxes[b, n, k]
+        if numbers.is_moving:
+            fill_velocity(poses, windows.times[b], n, windows.lengths[b], velocity)
+        fill_moved(windows, b, n, velocity, numbers.is_moving, work.moved)
+        to_box_axes(m, work.moved, shift, R, local)
+        for i in range(m):
+            x, y, z = local[0, i], local[1, i], local[2, i]
+            if not is_near(x, y, z, half, numbers.margin):
+                continue
+            moment = work.sums[cell_of(x, y, z, half, numbers.cells)]
+            p = (x, y, z, 1.0)
+            for a in range(4):
+                for c in range(4):
+                    moment[a, c] += p[a] * p[c]
+
+
+@kernel
+def fill_agreement(m, local, half, numbers, work, total, wanted):
+    """Write information (6, 6) and wanted step (6,) of an observation of m points."""
+    lever = np.empty(6)
+    pull = np.zeros(6)
+    total[:] = 0.0
+    used = 0
+    for i in range(m):
+        x, y, z = local[0, i], local[1, i], local[2, i]
+        if not is_near(x, y, z, half, numbers.margin):
+            continue
+        cell = cell_of(x, y, z, half, numbers.cells)
+        if work.thickness[cell] == 0.0:
+            continue
+        used += 1
+        a, c, d = work.planes[cell, 0], work.planes[cell, 1], work.planes[cell, 2]
+        off = a * x + c * y + d * z + work.planes[cell, 3]
+        weight = 1 / (work.thickness[cell] + off**2)
+        lever[0], lever[1], lever[2] = a, c, d
+        lever[3] = y * d - z * c
+        lever[4] = z * a - x * d
+        lever[5] = x * c - y * a
+        for j in range(6):
+            pull[j] += weight * lever[j] * off
+            for k in range(6):
+                total[j, k] += weight * lever[j] * lever[k]
+    # So many points of one observation err on their own.
+    scale = numbers.effective_points / max(float(used), numbers.effective_points)
+    for j in range(6):
+        pull[j] *= scale
+        for k in range(6):
+            total[j, k] *= scale
+    wanted[:] = np.linalg.solve(total + numbers.ridge * np.eye(6), pull)
+
+
+@kernel
+def agree(b, windows, poses, extents, roughness, numbers, work, information, wanted):
+    """Write information (N, 6, 6) and wanted steps (N, 6) of window `b`, see `agreement`."""
+    half = extents / 2
+    fill_sums(b, windows, poses, half, numbers, work)
+    fill_planes(
+        work.sums, roughness, numbers.flatness, numbers.min_cell_points, work.planes,
+        work.thickness,
+    )  # fmt: skip
+    for n in range(len(poses)):
+        fill_agreement(
+            windows.counts[b, n], work.local[n], half, numbers, work, information[n], wanted[n]
+        )
+
+
+@kernel
+def agreement(begin, end, windows, poses, extents, roughness, numbers, information, wanted):
     """
     Write information (B, N, 6, 6) and wanted steps (B, N, 6) of windows `begin` to `end`.
 
@@ -59,88 +169,20 @@ def agreement(
         Poses of this round.
     extents : array, shape (B, 3)
         Extents [m].
-    is_moving : bool
-        Whether points are to be moved to the stamp of their box.
     roughness : array, shape (B,)
         How far the surface of each window's object is from rigid [m].
-    cells : tuple of int
-        Cells along each axis of a box.
-    limits : tuple of float
-        `SHAPE_MARGIN`, `MIN_FLATNESS`, `MIN_CELL_POINTS`, `EFFECTIVE_POINTS`, `STEP_RIDGE`.
+    numbers : ShapeNumbers
+        Constants.
     information, wanted : array, shapes (B, N, 6, 6) and (B, N, 6)
         Written.
 
     """
-    margin, flatness, min_points, independent, ridge = limits
-    N = poses.shape[1]
-    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
-    moved = np.empty((3, M))
-    velocity = np.zeros(3)
-    cell_count = cells[0] * cells[1] * cells[2]
-    local = np.empty((N, 3, M))
-    R = np.empty((3, 3))
-    half = np.empty(3)
-    shift = np.empty(3)
-    planes = np.empty((cell_count, 4))
-    thickness = np.empty(cell_count)
-    lever = np.empty(6)
+    work = empty_shape_work(begin, end, windows, poses.shape[1], numbers.cells)
     for b in range(begin, end):
-        for k in range(3):
-            half[k] = extents[b, k] / 2
-        sums = np.zeros((cell_count, 4, 4))
-        for n in range(N):
-            m = windows.counts[b, n]
-            fill_rotation(poses[b, n, 3], poses[b, n, 4], poses[b, n, 5], R)
-            for k in range(3):
-                shift[k] = poses[b, n, k] - windows.boxes[b, n, k]
-            if is_moving:
-                fill_velocity(poses[b], windows.times[b], n, windows.lengths[b], velocity)
-            fill_moved(windows, b, n, velocity, is_moving, moved)
-            to_box_axes(m, moved, shift, R, local[n])
-            for i in range(m):
-                x, y, z = local[n, 0, i], local[n, 1, i], local[n, 2, i]
-                if not is_near(x, y, z, half, margin):
-                    continue
-                moment = sums[cell_of(x, y, z, half, cells)]
-                p = (x, y, z, 1.0)
-                for a in range(4):
-                    for c in range(4):
-                        moment[a, c] += p[a] * p[c]
-        fill_planes(sums, roughness[b], flatness, min_points, planes, thickness)
-        for n in range(N):
-            m = windows.counts[b, n]
-            total = information[b, n]
-            total[:] = 0.0
-            pull = np.zeros(6)
-            used = 0
-            for i in range(m):
-                x, y, z = local[n, 0, i], local[n, 1, i], local[n, 2, i]
-                if not is_near(x, y, z, half, margin):
-                    continue
-                cell = cell_of(x, y, z, half, cells)
-                if thickness[cell] == 0.0:
-                    continue
-                used += 1
-                a, c, d = planes[cell, 0], planes[cell, 1], planes[cell, 2]
-                off = a * x + c * y + d * z + planes[cell, 3]
-                weight = 1 / (thickness[cell] + off**2)
-                lever[0], lever[1], lever[2] = a, c, d
-                lever[3] = y * d - z * c
-                lever[4] = z * a - x * d
-                lever[5] = x * c - y * a
-                for j in range(6):
-                    pull[j] += weight * lever[j] * off
-                    for k in range(6):
-                        total[j, k] += weight * lever[j] * lever[k]
-            # So many points of one observation err on their own.
-            scale = independent / max(float(used), independent)
-            for j in range(6):
-                pull[j] *= scale
-                for k in range(6):
-                    total[j, k] *= scale
-            step = np.linalg.solve(total + ridge * np.eye(6), pull)
-            for j in range(6):
-                wanted[b, n, j] = step[j]
+        agree(
+            b, windows, poses[b], extents[b], roughness[b], numbers, work, information[b],
+            wanted[b],
+        )  # fmt: skip
 
 
 @kernel

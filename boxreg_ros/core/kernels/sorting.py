@@ -20,6 +20,30 @@ def sort(values):
 
 @kernel
 def lower_median(values):
-    """Return the median of values (n,), the lower one of two; the values are sorted."""
-    sort(values)
-    return values[(len(values) - 1) // 2]
+    """
+    Return the median of values (n,), the lower one of two; any value if one is NaN.
+
+    By Hoare's selection, which sorts the values in part.
+
+    """
+    wanted = (len(values) - 1) // 2
+    first, last = 0, len(values) - 1
+    while first < last:
+        pivot = values[(first + last) // 2]
+        low, high = first, last
+        while low <= high:
+            while values[low] < pivot:
+                low += 1
+            while values[high] > pivot:
+                high -= 1
+            if low <= high:
+                values[low], values[high] = values[high], values[low]
+                low += 1
+                high -= 1
+        if wanted <= high:
+            last = high
+        elif wanted >= low:
+            first = low
+        else:
+            break
+    return values[wanted]

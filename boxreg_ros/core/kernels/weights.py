@@ -21,6 +21,8 @@ from boxreg_ros.core.kernels.rotation import fill_rotation
 from boxreg_ros.core.kernels.sorting import lower_median
 import numpy as np
 
+BOTTOM = 5
+"""The face that is observed by the road."""
 POSE = (0, 1, 2, 6, 7, 8)
 """Where the pose stands in a box."""
 
@@ -135,15 +137,17 @@ def weigh_pins(pinned, length, widened, unmodelled_bias, pin_deviations, W):
 
 
 @kernel
-def fill_face_weights(distance, weight, off_track, length, deviation, numbers, face_weight):
-    """Write the weights of the faces (M20), (N, 6) [1/m^2]."""
+def fill_face_weights(distance, weight, off_track, length, shape, numbers, face_weight):
+    """Write the weights of the faces (M20), (N, 6) [1/m^2], of an object rigid up to `shape`."""
     for n in range(length):
         off = off_track[n, 0] ** 2 + off_track[n, 1] ** 2
         same_object = 1 / (1 + off**2) ** 2
         for face in range(6):
+            deviation = numbers.face_deviations[face]
+            if face != BOTTOM:
+                deviation = max(deviation, shape)
             robust = 1 / (1 + (distance[n, face] / numbers.face_outlier) ** 2) ** 2
-            precision = robust * same_object / deviation[face] ** 2
-            face_weight[n, face] = weight[n, face] * precision
+            face_weight[n, face] = weight[n, face] * robust * same_object / deviation**2
 
 
 @kernel
@@ -192,14 +196,14 @@ def fill_acceleration_weights(deviation, length, terms):
 
 
 @kernel
-def fill_motion_weights(length, parked, slip, zero_motion, terms):
+def fill_motion_weights(length, parked, slip, drift, numbers, terms):
     """Write the weights of slip and, where the object is parked, of zero motion (M25)."""
     for n in range(length - 1):
         for k in range(2):
             terms.W_slip[n, k] = 1 / slip[k] ** 2
         for k in range(6):
             if parked[n]:
-                terms.W_zero_motion[n, k] = 1 / zero_motion[k] ** 2
+                terms.W_zero_motion[n, k] = 1 / (drift * numbers.drift_ratios[k]) ** 2
 
 
 @kernel
@@ -241,7 +245,7 @@ def robustify_motion(poses, shared, length, outlier, terms):
 
 
 @kernel
-def weigh(b, windows, start, faces, expected, of_class, numbers, terms):
+def weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers, terms):
     """
     Write data and weights of the terms of window `b`, but those of rigid shape and prior.
 
@@ -253,42 +257,42 @@ def weigh(b, windows, start, faces, expected, of_class, numbers, terms):
         The window.
     windows : WindowArrays
         Input of the windows.
-    start : StartArrays
-        Boxes at the start of the round.
+    poses, shared : array, shapes (N, 6) and (23,)
+        Its boxes and shared variables at the start of the round.
+    row : int
+        Where the window is in `faces`.
     faces : FaceArrays
         Face observations.
     expected : ExpectedArrays
         Means and deviations of input and shared variables.
-    of_class : ClassDeviations
-        Of the class of each window.
+    of_class : ClassArrays
+        Settings of the class of each window.
     numbers : WeightNumbers
         Constants and settings.
     terms : TermArrays
         Written.
 
     """
-    N = start.poses.shape[1]
+    N = len(poses)
     off_track = np.empty((N, 6))
     face_weight = np.empty((N, 6))
     parked = np.empty(N, np.bool_)
     length = windows.lengths[b]
-    boxes, times, poses, shared = (
-        windows.boxes[b], windows.times[b], start.poses[b], start.shared[b]
-    )  # fmt: skip
+    boxes, times = windows.boxes[b], windows.times[b]
     terms.times[:] = times
-    terms.inset[:] = faces.inset[b]
+    terms.inset[:] = faces.inset[row]
     terms.expected[:] = expected.shared[b]
     for n in range(N):
         fill_rotation(poses[n, 3], poses[n, 4], poses[n, 5], terms.axes[n])
         for k in range(6):
             terms.given[n, k] = boxes[n, POSE[k]]
     fill_neighbour_deviation(boxes, times, length, terms.axes, numbers, off_track)
-    distance = faces.distance[b]
+    distance = faces.distance[row]
     fill_face_weights(
-        distance, faces.weight[b], off_track, length, of_class.faces[b], numbers, face_weight
+        distance, faces.weight[row], off_track, length, of_class.shape[b], numbers, face_weight
     )
     for n in range(length):
-        scale_moments(faces.moments[b, n], face_weight[n], terms.W_faces[n])
+        scale_moments(faces.moments[row, n], face_weight[n], terms.W_faces[n])
     deviation, widened = expected.pose_deviation[b], expected.widened_deviation[b]
     fill_input_weights(
         poses, shared[BIAS:GAP], length, off_track, deviation, widened, numbers, terms
@@ -303,6 +307,6 @@ def weigh(b, windows, start, faces, expected, of_class, numbers, terms):
     fill_acceleration_weights(of_class.acceleration[b], length, terms)
     yaw_deviation = max(deviation[5], of_class.pose[b, 5])
     fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked)
-    fill_motion_weights(length, parked, of_class.slip[b], of_class.zero_motion[b], terms)
+    fill_motion_weights(length, parked, of_class.slip[b], of_class.drift[b], numbers, terms)
     if numbers.is_robust:
         robustify_motion(poses, shared, length, numbers.motion_outlier, terms)

@@ -1,0 +1,184 @@
+"""
+Means and deviations of one window before its points are used, in plain loops.
+
+And evidence of the points about its extents, after a round. The torch twins are `expect_torch`
+and `evidence_of_extents` of `boxreg_ros.core.input_model`; the formulas are (M15) to (M17).
+
+"""
+
+from math import exp, isfinite, log, sqrt
+from typing import Any, NamedTuple
+
+from boxreg_ros.core.kernels.compile import kernel
+from boxreg_ros.core.kernels.normal_equations import (
+    ANCHOR,
+    BIAS,
+    EXTENT,
+    GAP,
+    PIVOT,
+    SIDESLIP,
+)
+import numpy as np
+
+POSE, SIZE = 6, 3
+"""Numbers of a pose, and of an extent."""
+HEADING = 5
+"""Place of the yaw in a pose."""
+
+
+class Ratios(NamedTuple):
+    """
+    What the noise of the input says about one window, for the pose and the extents.
+
+    Attributes
+    ----------
+    ratio, constant : array, shape (6,)
+        Errors of the input over those of the settings, lowered for low-noise input; of the part
+        that is constant along a track.
+    widening : array, shape (9,)
+        Factor on deviations for the correlation of neighbours.
+    slow : array, shape (9,)
+        Part of the errors that is constant over the window.
+
+    """
+
+    ratio: Any
+    constant: Any
+    widening: Any
+    slow: Any
+
+
+@kernel
+def clamp(value, low, high):
+    """Return a value within bounds."""
+    return min(max(value, low), high)
+
+
+@kernel
+def fill_mean_extents(b, windows, mean):
+    """Write the mean input extents, marginalised ones included; of pinned boxes if there are."""
+    has_pin = windows.pinned[b].any()
+    for k in range(SIZE):
+        total, count = 0.0, 0.0
+        if not has_pin:
+            total, count = windows.marginalised_extents[b, k], windows.marginalised_extents[b, 3]
+        for n in range(windows.lengths[b]):
+            if windows.pinned[b, n] or not has_pin:
+                total += windows.boxes[b, n, 3 + k]
+                count += 1.0
+        mean[k] = total / count
+
+
+@kernel
+def fill_ratios(b, windows, known, numbers, ratios):
+    """Write how large and how correlated the errors of the input of one window are."""
+    kind, length = windows.kind[b], windows.lengths[b]
+    weight = known.weight[kind]
+    interval = windows.times[b, length - 1] / max(length - 1, 1)
+    for j in range(POSE + SIZE):
+        typical = numbers.typical_correlation
+        correlation = typical + weight * (known.correlation[kind, j] - typical)
+        ratios.widening[j] = sqrt((1 + correlation) / (1 - correlation))
+        slow = correlation ** (numbers.correlation_interval / interval) - numbers.white_correlation
+        ratios.slow[j] = clamp(slow / numbers.correlation_span, 0.1, 1.0)
+    offset = known.offset[kind]
+    filtered = ((offset[0] + offset[1] + offset[POSE]) / 3 / numbers.filtered_offset) ** 2
+    filtered = weight * min(filtered, numbers.max_filtered_bias)
+    for j in range(POSE):
+        deviation = known.deviation[kind, j]
+        lowered = deviation * min((deviation / numbers.low_noise_ratio) ** 2, 1.0)
+        lowered = clamp(lowered, numbers.ratio_bounds[0], numbers.ratio_bounds[1])
+        ratio = sqrt(1 + weight * (lowered**2 - 1))
+        ratios.ratio[j] = ratio
+        ratios.constant[j] = clamp(max(ratio, filtered) if j < SIZE else ratio, 0.1, 2.0)
+
+
+@kernel
+def population_factor(k, mean, part, median, slopes, radius):
+    """Return expected over given extent `k`, by the population of tracks (M16)."""
+    distance, pull = 0.0, 0.0
+    for m in range(SIZE):
+        own = log(mean[m]) - median[m]
+        distance += (own / radius) ** 2
+        pull += slopes[k, m] * own
+    return exp(part**2 * pull / (1 + distance))
+
+
+@kernel
+def fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expected):
+    """Write means and deviations of window `b`, given `ratios` and `mean` input extents."""
+    kind = windows.kind[b]
+    has_pin = windows.pinned[b].any()
+    usual, usual_extent = of_class.pose[b], of_class.extent[b]
+    shared, deviation = expected.shared[b], expected.deviation[b]
+    shared[:] = 0.0
+    for j in range(POSE):
+        share = numbers.yaw_bias if j == HEADING else 1.0
+        bias = usual[j] * share * ratios.slow[j] * ratios.constant[j]
+        expected.pose_deviation[b, j] = usual[j] * ratios.ratio[j]
+        expected.widened_deviation[b, j] = usual[j] * ratios.ratio[j] * ratios.widening[j]
+        expected.unmodelled_bias[b, j] = bias if has_pin else 0.0
+        deviation[BIAS + j] = numbers.pinned_extent if has_pin else bias
+    for k in range(SIZE):
+        part = usual_extent * ratios.slow[POSE + k] * min(2 * ratios.constant[k], 1.0)
+        factor = population_factor(
+            k, mean, part, known.median[kind], known.slopes[kind], numbers.population_radius
+        )
+        shared[EXTENT + k] = mean[k] if has_pin else mean[k] * factor
+        deviation[EXTENT + k] = numbers.pinned_extent if has_pin else mean[k] * factor * part
+    widening = max(2 - 2 * ratios.constant[0], 1.0) * (numbers.pinned_margins if has_pin else 1.0)
+    for face in range(6):
+        size = max(mean[face // 2] / numbers.large_extent[face // 2], 1.0)
+        shared[GAP + face] = of_class.gaps[b, face] + known.gap_correction[kind, face]
+        deviation[GAP + face] = of_class.gap_spread[b] * size * widening
+    shared[PIVOT] = mean[0] * of_class.pivot[b]
+    deviation[PIVOT] = mean[0] * numbers.pivot_deviation
+    deviation[ANCHOR:SIDESLIP] = 1.0
+    deviation[SIDESLIP] = of_class.sideslip[b]
+
+
+@kernel
+def expect(begin, end, windows, of_class, known, numbers, expected, widening, slow):
+    """
+    Write means and deviations of the windows `begin` to `end`.
+
+    Parameters
+    ----------
+    begin, end : int
+        First window, and the one after the last.
+    windows : WindowArrays
+        Input of the windows.
+    of_class : ClassArrays
+        Settings of the class of each window.
+    known : InputArrays
+        Noise, margins and population of the input, by kind.
+    numbers : ExpectationNumbers
+        Constants.
+    expected : ExpectedArrays
+        Written.
+    widening : array, shape (B, 3)
+        Factor on the deviations of extents for the correlation of their errors, written.
+    slow : array, shape (B, 1)
+        Largest part of an error that is constant over the window, written.
+
+    """
+    ratios = Ratios(np.empty(6), np.empty(6), np.empty(9), np.empty(9))
+    mean = np.empty(SIZE)
+    for b in range(begin, end):
+        fill_mean_extents(b, windows, mean)
+        fill_ratios(b, windows, known, numbers, ratios)
+        fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expected)
+        widening[b] = ratios.widening[POSE:]
+        slow[b, 0] = ratios.slow.max()
+
+
+@kernel
+def fill_evidence(given, expected, deviation, shared, corner, min_gain, evidence):
+    """Write corrections of the extents by the points alone, and their weights, (2, 3) (M17)."""
+    for k in range(SIZE):
+        gain = 1 - corner[k, k] / deviation[k] ** 2
+        power = (deviation[k] / expected[k]) ** 2
+        by_points = log(shared[EXTENT + k] / expected[k]) / gain + log(expected[k])
+        is_evidence = gain > min_gain and isfinite(by_points)
+        evidence[0, k] = (by_points - given[k]) / power if is_evidence else 0.0
+        evidence[1, k] = gain * power if is_evidence else 0.0
