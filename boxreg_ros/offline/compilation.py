@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-COMPILING = 'compiling the solver, once after an installation: half a minute'
+COMPILING = 'compiling the solver, once after an installation: about a minute'
 
 
 @contextmanager

@@ -539,7 +539,7 @@ KNOWN_ROTATION = rotation_from_rpy(torch.tensor([0.1, 0.2, 0.3], dtype=D)).ravel
 
 def rotated(folder, places, prepare='pass'):
     """Return the warning and the numbers of a rotation by a kernel, compiled in a process."""
-    # One kernel stands for all, which take half a minute.
+    # One kernel stands for all, which take a minute.
     done = subprocess.run(
         [sys.executable, '-c', ROTATE.replace('PREPARE', prepare)],
         cwd=folder, env={**os.environ, **places}, capture_output=True, text=True, check=True,
