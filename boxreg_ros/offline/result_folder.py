@@ -18,8 +18,10 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import names_of, read_text, upload, url_of
 from boxreg_ros.io.whole_files import DISK_ERRORS
 
-REFUSED_ERRORS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST)
-"""No permission, read-only file system, a file where a folder is needed."""
+REFUSED_ERRORS = (
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT,
+)  # fmt: skip
+"""No permission, read-only file system, a file in place of a folder, no folders as in /proc."""
 SUMMARY = 'summary.json'
 CONFIG = 'config.yaml'
 

@@ -1,8 +1,10 @@
 """Interrupted runs: the journal, equal bytes, full disks and outputs that cannot be written."""
 
 import errno
+from itertools import product
 import json
 import os
+from pathlib import Path
 import pickle
 import random
 import resource
@@ -180,8 +182,7 @@ def test_outputs_that_cannot_be_written_are_named(tmp_path, capsys, monkeypatch)
     file = tmp_path / 'file'
     file.touch()
     recording = Drive(sweeps=6).write(tmp_path / 'drive')
-    out = file / 'out'
-    for options in ([], ['--resume']):
+    for out, options in product((file / 'out', Path('/proc/out')), ([], ['--resume'])):
         assert main(['relabel', str(recording), '-o', str(out), *options]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"boxreg: output '{out}': expected a folder that can be written")
