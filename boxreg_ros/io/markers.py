@@ -42,7 +42,7 @@ DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
 TEXT_HEIGHT = 3.0
 """Height of the state of the recording above the sensor [m]; chosen."""
 ARROW, CUBE, SPHERE, LINE_STRIP, TEXT = 0, 1, 2, 4, 9
-OUTLINE_SIGNS = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
+OUTLINE = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
 """Signs of x and y along the outline of a face."""
 ADD, DELETE, DELETEALL = 0, 2, 3
 BUDGET = 'budget'
@@ -220,7 +220,7 @@ def _outline(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Flo
         header=header, ns=FINAL, id=number, type=LINE_STRIP, action=ADD,
         pose=_pose(m, box[X : Z + 1], quaternion_xyzw), scale=m.Vector3(x=0.1),
         color=_colour(m, CYAN),
-        points=[m.Point(x=x * length / 2, y=y * width / 2, z=-height / 2) for x, y in OUTLINE_SIGNS],
+        points=[m.Point(x=x * length / 2, y=y * width / 2, z=-height / 2) for x, y in OUTLINE],
     )  # fmt: skip
 
 
