@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
     """
     rng = np.random.default_rng(0)
-    report: dict[str, float] = {}
+    report: dict[str, float] = {'load before': os.getloadavg()[0]}
     for victim in VICTIMS:
         losses = [_killed(args, victim, rng.uniform(*RUNNING_TIMES)) for _ in range(args.kills)]
         for kind, counts in zip(Loss._fields, zip(*losses, strict=True), strict=True):

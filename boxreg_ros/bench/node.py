@@ -541,7 +541,7 @@ def observer(keeps_messages: bool = False) -> Iterator[dict[str, Any]]:
     node = rclpy.create_node('bench_observer')
     for name, topic in (('early', 'refined_boxes'), ('final', 'refined_boxes_final')):
         node.create_subscription(
-            MarkerArray, topic, partial(add_arrival, name), QoSProfile(depth=100), raw=True
+            MarkerArray, topic, partial(add_arrival, name), QoSProfile(depth=1000), raw=True
         )
     node.create_subscription(DiagnosticArray, '/diagnostics', add_counters, 10)
     executor = SingleThreadedExecutor()

@@ -27,7 +27,7 @@ TRANSLUCENT_GREY: Colour = (0.7, 0.7, 0.7, 0.25)
 GREEN = (0.1, 0.8, 0.3, 0.45)
 ORANGE = (1.0, 0.6, 0.1, 0.45)
 YELLOW = (1.0, 0.95, 0.2, 0.45)
-CYAN = (0.1, 0.8, 1.0, 0.3)
+CYAN = (0.1, 0.8, 1.0, 1.0)
 BLUE = (0.2, 0.5, 1.0, 0.6)
 VIOLET = (0.6, 0.3, 0.9, 0.45)
 WHITE = (1.0, 1.0, 1.0, 1.0)
@@ -41,7 +41,9 @@ NAMESPACES = (*BOX_NAMESPACES, FINAL, RECORDING)
 DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
 TEXT_HEIGHT = 3.0
 """Height of the state of the recording above the sensor [m]; chosen."""
-ARROW, CUBE, SPHERE, TEXT = 0, 1, 2, 9
+ARROW, CUBE, SPHERE, LINE_STRIP, TEXT = 0, 1, 2, 4, 9
+OUTLINE = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
+"""Signs of x and y along the outline of a face."""
 ADD, DELETE, DELETEALL = 0, 2, 3
 BUDGET = 'budget'
 """Reason of boxes that there was no time for, see `reasons`."""
@@ -166,14 +168,14 @@ class MarkerBoard:
         return m.MarkerArray(markers=markers)
 
     def update_finals(self, refined: RefinedBoxes) -> Any:
-        """Return the markers that bring what is shown of final boxes up to date: cyan boxes."""
+        """Return the markers that bring the outlines of final boxes up to date."""
         m = self._messages
         boxes = refined.boxes
         header = self._header_of(boxes)
         quaternions_xyzw = quaternions_of(boxes.boxes)
         rows = np.flatnonzero(is_valid_box(boxes.boxes)).tolist()
         markers = [
-            _cube(m, header, FINAL, number, boxes.boxes[i], quaternions_xyzw[i], CYAN)
+            _outline(m, header, number, boxes.boxes[i], quaternions_xyzw[i])
             for i, number in self._shown_finals.replace(boxes.track_ids, rows)
         ]
         markers += [
@@ -208,6 +210,17 @@ def _cube(
         header=header, ns=ns, id=number, type=CUBE, action=ADD,
         pose=_pose(m, box[X : Z + 1], quaternion_xyzw),
         scale=m.Vector3(x=length, y=width, z=height), color=_colour(m, colour),
+    )  # fmt: skip
+
+
+def _outline(m: Any, header: Any, number: int, box: Floats, quaternion_xyzw: Floats) -> Any:
+    """Return the outline of the bottom face: it hides no colour of the box above it."""
+    length, width, height = _plain(box[LENGTH : HEIGHT + 1])
+    return m.Marker(
+        header=header, ns=FINAL, id=number, type=LINE_STRIP, action=ADD,
+        pose=_pose(m, box[X : Z + 1], quaternion_xyzw), scale=m.Vector3(x=0.1),
+        color=_colour(m, CYAN),
+        points=[m.Point(x=x * length / 2, y=y * width / 2, z=-height / 2) for x, y in OUTLINE],
     )  # fmt: skip
 
 
