@@ -289,7 +289,7 @@ def estimate_noise_torch(residuals: Tensor) -> InputNoise:
     total = int(valid.sum())
     if not total:
         return UNKNOWN_NOISE
-    tracks = valid.any(1).sum()
+    tracks = valid.any(1).sum().to(residuals)
     count = valid.sum(1)[:, None, None].clamp(min=1)
     mean = (residuals * valid[..., None]).sum(1, keepdim=True) / count
     offset = MAD_TO_DEVIATION * mean[valid.any(1), 0].abs().median(0).values
