@@ -299,7 +299,7 @@ def estimate_noise_torch(residuals: Tensor) -> InputNoise:
     total = int(valid.sum())
     if not total:
         return UNKNOWN_NOISE
-    tracks = valid.any(1).sum()
+    tracks = valid.any(1).sum().to(residuals)
     count = valid.sum(1)[:, None, None].clamp(min=1)
     mean = (residuals * valid[..., None]).sum(1, keepdim=True) / count
     offset = MAD_TO_DEVIATION * mean[valid.any(1), 0].abs().median(0).values
@@ -351,7 +351,8 @@ def residuals_at(problem: Problem, state: State, columns: Ints) -> Floats:
     rows = np.arange(len(boxes))
     before, has_points = boxes[rows, columns - 1], counts[rows, columns] > 0
     residuals = _residuals(boxes[rows, columns], before, pose[rows, columns], extent, has_points)
-    return residuals / problem.of_class(*RESIDUAL_ERRORS).cpu().numpy()
+    normalised: Floats = residuals / problem.of_class(*RESIDUAL_ERRORS).cpu().numpy()
+    return normalised
 
 
 def _boxes_and_fit(problem: Problem, state: State) -> Iterator[Floats]:
@@ -475,10 +476,11 @@ def expect_compiled(
 ) -> Expectation:
     """Return the same as `expect`, by the kernel."""
     arrays, widening, slow = _expected_arrays(problem, offsets, noise, population)
-    parts = [torch.from_numpy(part) for part in arrays]
+    shared, deviation, pose, widened, bias = map(torch.from_numpy, arrays)
     spread = torch.from_numpy(widening), torch.from_numpy(slow)
     error = _input_error(problem, noise.of(problem), *spread)
-    return Expectation(*parts, _at_least_prior(problem, error, parts[1]))
+    error = _at_least_prior(problem, error, deviation)
+    return Expectation(shared, deviation, pose, widened, bias, error)
 
 
 def _expected_arrays(
@@ -510,8 +512,13 @@ def input_arrays(
             values = np.tile(values, (len(KINDS), 1))
         return values.astype(np.float64, copy=False)
 
-    *deviations, weight = map(by_kind, noise)
-    return InputArrays(*deviations, weight[:, 0], *map(by_kind, offsets), *population.slopes())
+    deviation, correlation, offset, weight = map(by_kind, noise)
+    gap_correction, occlusion_inset, range_inset = map(by_kind, offsets)
+    median, slopes = population.slopes()
+    return InputArrays(
+        deviation, correlation, offset, weight[:, 0], gap_correction, occlusion_inset, range_inset,
+        median, slopes,
+    )  # fmt: skip
 
 
 def _expectation_numbers() -> ExpectationNumbers:

@@ -164,9 +164,9 @@ def _accepted(
     `base` (B, 3) is what the centres of `problem` are relative to [m].
 
     """
-    pose, extent = solution.state.pose, _extents(problem, solution.state, config)
-    held = _held(problem, pose, extent).cpu().numpy()
-    pose, extent = pose.cpu().numpy(), extent.cpu().numpy()
+    extents_of_boxes = _extents(problem, solution.state, config)
+    held = _held(problem, solution.state.pose, extents_of_boxes).cpu().numpy()
+    pose, extent = solution.state.pose.cpu().numpy(), extents_of_boxes.cpu().numpy()
     covariances, extents, distances = (part.cpu().numpy() for part in solution.posterior)
     found = np.concatenate([pose[..., :3], extent, wrap_angle(pose[..., 3:])], -1)
     is_finite = np.isfinite(found).all(-1) & (extent > 0).all(-1)

@@ -225,16 +225,16 @@ def _write_posterior(
     """
     if not len(done):
         return
-    faces = _part((observations.moments, observations.inset, observations.weight), done)
     ended = rows[done]
-    problem, state, expected, free = (
-        _part(part, ended) for part in (batch.problem, batch.state, batch.expected, (batch.free,))
+    problem = _part(batch.problem, ended)
+    state = _part(batch.state, ended)
+    expected = _part(batch.expected, ended)
+    moments, inset, weight = _part(
+        (observations.moments, observations.inset, observations.weight), done
     )
-    _write(
-        posterior(problem, state, *faces, expected, *free, inverse, config),
-        batch.solution.posterior,
-        ended,
-    )
+    free = batch.free[ended]
+    found = posterior(problem, state, moments, inset, weight, expected, free, inverse, config)
+    _write(found, batch.solution.posterior, ended)
 
 
 def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
@@ -282,7 +282,7 @@ def run_round_torch(
     found = State.unpack(minimize(objective, x, *limits, objective.newton).x, problem.length)
     step = (found.pose - state.pose) / problem.of_class(*POSE_ERRORS)[:, None]
     moved = step.square().mean(2).amax(1)
-    is_done = (moved <= SETTLED_STEP**2) & (turn > 0) | (turn + 1 >= plan.rounds)
+    is_done: Tensor = (moved <= SETTLED_STEP**2) & (turn > 0) | (turn + 1 >= plan.rounds)
     corner = torch.cholesky_inverse(objective.factor.corner)
     solution.state.pose[rows], solution.state.shared[rows] = found
     evidence = evidence_of_extents(log_extent, expected, found, corner)

@@ -319,10 +319,10 @@ def test_a_round_of_degenerate_points_equals_that_of_torch(case):
 
 
 @pytest.mark.parametrize('seed', [0, 1])
-@pytest.mark.parametrize('kind', ['usual', 'pinned', 'low noise', 'two boxes'])
+@pytest.mark.parametrize('kind', ['usual', 'pinned', 'low noise', 'few boxes'])
 def test_expectations_equal_those_of_torch(kind, seed):
     rng = np.random.default_rng(seed)
-    problem, _ = drives('usual', 2 if kind == 'two boxes' else 12)
+    problem, _ = drives('usual', 3 if kind == 'few boxes' else 12)
     pinned = torch.zeros_like(problem.valid)
     pinned[0, :1] = kind == 'pinned'
     marginalised = torch.from_numpy(rng.uniform(1, 4, (3, 4)))
