@@ -183,14 +183,16 @@ def run_round(
         take = run_round_compiled
     fit = take(part, offsets, plan, turn, config)
     done = fit.is_done.nonzero()[:, 0]
-    faces = fit.observations.moments, fit.observations.inset, fit.observations.weight
-    settled = select(
-        (part.problem, fit.state, *faces, part.expected, part.free, fit.inverse), done
+    found = fit.observations
+    moments, inset, weight = select((found.moments, found.inset, found.weight), done)
+    problem, state, expected, free, inverse = select(
+        (part.problem, fit.state, part.expected, part.free, fit.inverse), done
+    )
+    covariances = posterior(
+        problem, state, moments, inset, weight, expected, free, inverse, config
     )
     evidence = evidence_of_extents(part.log_extent, part.expected, fit.state, fit.inverse.corner)
-    return RoundResult(
-        rows, fit.state, fit.is_done, evidence, posterior(*settled, config), fit.prior
-    )
+    return RoundResult(rows, fit.state, fit.is_done, evidence, covariances, fit.prior)
 
 
 class Fit(NamedTuple):
