@@ -393,8 +393,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'consistent) and the mean squared error over variance (1 is consistent). Errors are\n'
         'along the axes of the true boxes, without heading flips. All boxes of a track share its\n'
         'constant errors: numbers of classes with one or two tracks have little significance.\n'
-        'The second run, "without input errors", has the inverse curvature and the model error\n'
-        'alone.',
+        'The second run, "model error by hand", is the version before: independent residuals of\n'
+        'faces, and chosen deviations of 3 cm along the box and of its length.',
         _covariance,
     ),
     'review': (

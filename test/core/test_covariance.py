@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import covariance
-from boxreg_ros.core.batch import SHARED
+from boxreg_ros.core.batch import EXTENT, GAP, SHARED, State
 from boxreg_ros.core.input_model import Expectation
 from boxreg_ros.core.refine import refine
 from boxreg_ros.simulation.simulate import simulate
@@ -118,3 +118,22 @@ def test_variance_of_the_mean_of_correlated_residuals(correlation, count):
         assert 1.5 < found < 5
     else:
         np.testing.assert_allclose(found, known, rtol=0.1)
+
+
+def test_residuals_of_faces_are_from_the_margins_of_other_tracks():
+    # Points 1.9 m ahead of the centre, in a box 4 m long: with the expected margin of 0.05 m they
+    # are 0.05 m inside. The margin of the estimate, 0.3 m, takes up an error of the length.
+    problem = problem_of(np.array([[[0.0, 0, 0, 4, 2, 1.5, 0, 0, 0]]]))
+    shared = torch.zeros(1, SHARED, dtype=D)
+    shared[:, EXTENT] = torch.tensor([4.0, 2.0, 1.5], dtype=D)
+    shared[:, GAP] = 0.3
+    margins = torch.zeros(1, SHARED, dtype=D)
+    margins[:, GAP] = 0.05
+    expected = expectation(0.05, [0.0] * 9)._replace(shared=margins)
+    centroid = torch.zeros(1, 1, 6, 3, dtype=D)
+    centroid[..., 0] = 1.9
+    found = covariance._face_distances(
+        problem, State(problem.pose, shared), expected, torch.eye(3, dtype=D)[None, None],
+        centroid, torch.zeros(1, 1, 6, dtype=D),
+    )  # fmt: skip
+    np.testing.assert_allclose(found[0, 0, 0], -0.05)
