@@ -382,8 +382,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'Several LiDARs',
         'A simulated truck with four LiDARs at its corners, which turn a quarter of a period\n'
         'apart: a topic per LiDAR (*corners*), a cloud concatenated in the\n'
-        'frame of the truck with its info message (*concatenated*) and without\n'
-        '(*concatenated-alone*), and a single LiDAR on the roof. Input boxes and truth are the\n'
+        'frame of the truck with its info message (*concatenated*), without it\n'
+        '(*concatenated-alone*), without it but with the names of its LiDARs\n'
+        '(*concatenated-named*), and a single LiDAR on the roof. Input boxes and truth are the\n'
         'same.',
         _lidars,
     ),

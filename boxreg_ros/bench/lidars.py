@@ -2,8 +2,8 @@
 `boxreg bench lidars`: accuracy on a truck with LiDARs at its corners.
 
 The same drives are recorded in four ways: a topic per LiDAR, a concatenated cloud with its info
-message, the concatenated cloud alone, and a single LiDAR on the roof. The input boxes and the
-truth are the same.
+message, the concatenated cloud alone, and a single LiDAR on the roof. The concatenated cloud alone
+is read with and without the names of its LiDARs. The input boxes and the truth are the same.
 
 """
 
@@ -18,15 +18,23 @@ from boxreg_ros.bench.common import add_json_argument, line, print_json, progres
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
-from boxreg_ros.io.lidars import Lidars
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
-from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, TRUCK_SENSORS, write_truck
+from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, write_truck
 import numpy as np
 
 CLASSES = ('car', 'van', 'truck')
+WAYS = {
+    'corners': ('corners', Lidars(tuple(f'/points/{name}' for name in CORNER_LIDARS))),
+    'concatenated': ('concatenated', SINGLE_LIDAR),
+    'concatenated-alone': ('concatenated-alone', SINGLE_LIDAR),
+    'concatenated-named': ('concatenated-alone', Lidars(frames=tuple(CORNER_LIDARS))),
+    'roof': ('roof', SINGLE_LIDAR),
+}
+"""Name -> layout of `TRUCK_SENSORS`, and how it is read."""
 MIN_POINTS = 100
 """True boxes with fewer points of all corners are left out, as in `boxreg bench real`."""
 
@@ -42,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the mean IoU of the input and of each way to record the LiDARs."""
-    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ('input', *TRUCK_SENSORS)}
-    with progress_bar(args.seeds * len(TRUCK_SENSORS), args) as bar:
+    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ('input', *WAYS)}
+    with progress_bar(args.seeds * len(WAYS), args) as bar:
         for seed in range(args.seeds):
             for name, ious in measured(seed, args.sweeps, bar.update).items():
                 rows[name].append(ious)
@@ -62,32 +70,29 @@ def run(args: argparse.Namespace) -> int:
 
 def measured(seed: int, sweeps: int | None, done: Any) -> dict[str, tuple[float, float]]:
     """
-    Return mean BEV and 3D IoU of the input and of each layout for one drive.
+    Return mean BEV and 3D IoU of the input and of each way for one drive.
 
     Parameters
     ----------
     seed, sweeps
         Of the drive.
     done : callable
-        Called after each layout.
+        Called after each way.
 
     """
     scene = truck_scene(seed, sweeps)
     found: dict[str, tuple[float, float]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for layout in TRUCK_SENSORS:
+        for name, (layout, lidars) in WAYS.items():
             path = Path(folder) / f'{layout}.mcap'
-            out = Path(folder) / layout
+            out = Path(folder) / name
             write_truck(path, scene, layout)
-            topics = (
-                tuple(f'/points/{name}' for name in CORNER_LIDARS) if layout == 'corners' else ()
-            )
             if not found:
-                arrays, _ = input_boxes(Recording([path], Lidars(topics)))
+                arrays, _ = input_boxes(Recording([path], lidars))
                 found['input'] = _ious(BoxTable.from_arrays(arrays, 'input'), scene.truth)
-            request = Request((path,), lidars=Lidars(topics), formats=('csv',), config=Config())
+            request = Request((path,), lidars=lidars, formats=('csv',), config=Config())
             relabel(request, out)
-            found[layout] = _ious(BoxTable.read(out / 'boxes.csv'), scene.truth)
+            found[name] = _ious(BoxTable.read(out / 'boxes.csv'), scene.truth)
             done()
     return found
 
