@@ -3,12 +3,9 @@
 from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import InverseBlocks, product
 from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Posterior, Problem, SHARED, State
+from boxreg_ros.core.expectation import Expectation
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
-from boxreg_ros.core.input_model import (
-    Expectation,
-    MAX_CORRELATION,
-    OBSERVATIONS_FOR_HALF_WEIGHT,
-)
+from boxreg_ros.core.input_noise import MAX_CORRELATION, OBSERVATIONS_FOR_HALF_WEIGHT
 from boxreg_ros.core.weights import face_deviations
 import torch
 from torch import Tensor

@@ -16,9 +16,9 @@ from boxreg_ros.core.batch import (
     Solution,
     State,
 )
+from boxreg_ros.core.expectation import expect
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
-from boxreg_ros.core.input_model import expect
 from boxreg_ros.core.lbfgs import HISTORY, minimize, select
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import POSE

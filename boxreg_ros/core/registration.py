@@ -7,7 +7,7 @@ Windows in, refined boxes out: the method in one readable function.
                                                                                     v
                                    input box kept <-- acceptance tests <-- refined boxes
 
-The rounds are in `solver`, their parts in `input_model` (expectation), `face_support` (face
+The rounds are in `solver`, their parts in `expectation`, `face_support` (face
 observations), `weights`, and `lbfgs` with `terms` (minimisation). `paper` has the published
 objective to the letter. docs/method.md has the formulas.
 
@@ -18,16 +18,14 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
+from boxreg_ros.core.expectation import expect_shared
 from boxreg_ros.core.face_support import motion_compensated, observe_faces, to_box_frame
-from boxreg_ros.core.input_model import (
-    expect_shared,
-    InputModel,
-    residuals_at,
-    smoothed_angles,
-)
+from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.input_noise import residuals_at
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.rounds import COARSE_POINTS
+from boxreg_ros.core.smoothing import smoothed_angles
 from boxreg_ros.core.solver import solve
 from boxreg_ros.core.window import group_windows, MarginalisationPrior, stack_windows, Window
 from boxreg_ros.rotations import wrap_angle

@@ -24,18 +24,18 @@ from boxreg_ros.core.batch import (
     State,
 )
 from boxreg_ros.core.covariance import posterior
+from boxreg_ros.core.expectation import (
+    evidence_of_extents,
+    Expectation,
+    input_arrays,
+    MIN_EXTENT_GAIN,
+)
 from boxreg_ros.core.face_support import (
     empty_faces,
     face_numbers,
     FaceObservations,
     FaceOffsets,
     observe_faces,
-)
-from boxreg_ros.core.input_model import (
-    evidence_of_extents,
-    Expectation,
-    input_arrays,
-    MIN_EXTENT_GAIN,
 )
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.kernels.arrays import (

@@ -22,17 +22,12 @@ from boxreg_ros.core.batch import (
     Solution,
     State,
 )
+from boxreg_ros.core.expectation import expect, expect_shared
 from boxreg_ros.core.face_support import FaceOffsets
-from boxreg_ros.core.input_model import (
-    expect,
-    expect_shared,
-    InputModel,
-    InputNoise,
-    normalised_residuals,
-    UNKNOWN_NOISE,
-    UNKNOWN_POPULATION,
-)
+from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.input_noise import InputNoise, normalised_residuals, UNKNOWN_NOISE
 from boxreg_ros.core.kernels import compiled, shared_by
+from boxreg_ros.core.population import UNKNOWN_POPULATION
 from boxreg_ros.core.rounds import Plan, Round, run_round
 from boxreg_ros.structures import POSE
 import torch

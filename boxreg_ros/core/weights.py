@@ -10,9 +10,9 @@ from math import inf
 from boxreg_ros.config import Config, FaceConfig
 from boxreg_ros.core import terms
 from boxreg_ros.core.batch import ACCELERATIONS, BIAS, EXTENT, GAP, Problem, State
+from boxreg_ros.core.expectation import Expectation
 from boxreg_ros.core.face_support import BOTTOM, FaceObservations
 from boxreg_ros.core.geometry import FACE_AXIS, rotation_from_rpy
-from boxreg_ros.core.input_model import Expectation
 from boxreg_ros.core.kernels.arrays import WeightNumbers
 from boxreg_ros.core.terms import Term
 from boxreg_ros.structures import YAW

@@ -17,15 +17,13 @@ from typing import Any
 
 from boxreg_ros.config import Config, KINDS, Setting, settings
 from boxreg_ros.core.batch import EXTENT, State
+from boxreg_ros.core.expectation import expect
 from boxreg_ros.core.face_support import FaceOffsets, observe_faces
-from boxreg_ros.core.input_model import (
-    expect,
-    FACE_GROUPS,
+from boxreg_ros.core.input_model import FACE_GROUPS, InputModel, MAX_TRACKS
+from boxreg_ros.core.input_noise import (
     input_residuals,
-    InputModel,
     InputNoise,
     MAD_TO_DEVIATION,
-    MAX_TRACKS,
     MIN_OBSERVATIONS_FOR_NOISE,
 )
 from boxreg_ros.core.observation import Observation, observe

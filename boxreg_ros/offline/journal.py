@@ -43,7 +43,7 @@ TRUSTED_NAMES = (
 class Records(Protocol):
     """The records of a journal, in their order."""
 
-    def next(self) -> bytes | None:
+    def next_record(self) -> bytes | None:
         """Return the next record of an earlier run; None behind the last whole one."""
 
     def append(self, content: bytes) -> None:
@@ -85,7 +85,7 @@ class FileRecords:
             ) from None
         self._file.seek(0)
 
-    def next(self) -> bytes | None:
+    def next_record(self) -> bytes | None:
         """Return the next record; None behind the last whole one, where the file is cut off."""
         begin = self._file.tell()
         head = self._file.read(HEAD.size)
@@ -129,7 +129,7 @@ class ObjectRecords:
         self._stored = set(names_of(folder))
         self._count = 0
 
-    def next(self) -> bytes | None:
+    def next_record(self) -> bytes | None:
         """Return the next record; None behind the last one."""
         name = self._name()
         if name not in self._stored:
@@ -187,8 +187,8 @@ class Journal:
         """Open the journal and find the records of an earlier run."""
         kind = FileRecords if url_of(self._path) is None else ObjectRecords
         self._records: Records = kind(self._path)
-        if self._records.next() == self._fingerprint:
-            self._earlier = iter(self._records.next, None)
+        if self._records.next_record() == self._fingerprint:
+            self._earlier = iter(self._records.next_record, None)
         else:
             self._records.clear()
             self._append(self._fingerprint)

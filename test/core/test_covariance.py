@@ -3,7 +3,7 @@
 from boxreg_ros.config import Config
 from boxreg_ros.core import covariance
 from boxreg_ros.core.batch import EXTENT, GAP, SHARED, State
-from boxreg_ros.core.input_model import Expectation
+from boxreg_ros.core.expectation import Expectation
 from boxreg_ros.core.refine import refine
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np

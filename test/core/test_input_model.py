@@ -2,22 +2,17 @@
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
 from boxreg_ros.core.batch import State
+from boxreg_ros.core.expectation import evidence_of_extents, Expectation
 from boxreg_ros.core.face_support import FaceObservations, FaceOffsets, observe_faces
-from boxreg_ros.core.input_model import (
-    evidence_of_extents,
-    Expectation,
-    GAP_DEVIATIONS,
+from boxreg_ros.core.input_model import GAP_DEVIATIONS, InputModel, MAX_FITS_PER_TRACK, MAX_TRACKS
+from boxreg_ros.core.input_noise import (
     input_residuals,
-    InputModel,
     InputNoise,
-    MAX_FITS_PER_TRACK,
-    MAX_TRACKS,
     MIN_OBSERVATIONS_FOR_NOISE,
     OBSERVATIONS_FOR_HALF_WEIGHT,
-    Population,
-    population_factor,
-    smoothed_angles,
 )
+from boxreg_ros.core.population import Population, population_factor
+from boxreg_ros.core.smoothing import smoothed_angles
 import numpy as np
 import pytest
 from scenes import problem_of, returns_of, shared_of

@@ -17,6 +17,7 @@ from boxreg_ros.core.batch import (
     Solution,
     State,
 )
+from boxreg_ros.core.expectation import expect, expect_compiled, expect_torch
 from boxreg_ros.core.face_support import (
     FaceOffsets,
     FAR,
@@ -24,19 +25,12 @@ from boxreg_ros.core.face_support import (
     observe_faces_torch,
 )
 from boxreg_ros.core.geometry import rotation_from_rpy
-from boxreg_ros.core.input_model import (
-    estimate_noise_compiled,
-    estimate_noise_torch,
-    expect,
-    expect_compiled,
-    expect_torch,
-    InputModel,
-    InputNoise,
-    Population,
-)
+from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.input_noise import estimate_noise_compiled, estimate_noise_torch, InputNoise
 from boxreg_ros.core.kernels import contiguous
 from boxreg_ros.core.kernels.arrays import ExpectedArrays, FaceArrays, PriorArrays
 from boxreg_ros.core.observation import own_points, own_points_numpy
+from boxreg_ros.core.population import Population
 from boxreg_ros.core.registration import register
 from boxreg_ros.core.rounds import (
     MOTION_TERMS,

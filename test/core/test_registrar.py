@@ -5,8 +5,7 @@ from itertools import pairwise
 
 from boxreg_ros import Config, refine
 from boxreg_ros.config import Ingredients
-from boxreg_ros.core import input_model as calibration
-from boxreg_ros.core import registration
+from boxreg_ros.core import population, registration
 from boxreg_ros.core.geometry import face_distances
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.registrar import BoxRegistrar
@@ -406,7 +405,7 @@ def test_short_tracks_are_kept_and_boxes_without_points_refined(stream, estimate
 @pytest.fixture
 def no_extent_law(monkeypatch):
     """Turn off the population prior on extents, which is estimated from all tracks."""
-    monkeypatch.setattr(calibration, 'SLOPE_DEVIATION', 1e-9)
+    monkeypatch.setattr(population, 'SLOPE_DEVIATION', 1e-9)
 
 
 @each_estimate

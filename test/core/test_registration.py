@@ -5,9 +5,11 @@ from dataclasses import fields, replace
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core import batch, paper, registration, rounds, solver, terms
 from boxreg_ros.core.batch import POSE_ERRORS, State
+from boxreg_ros.core.expectation import CONSTANT_EXTENT_ERRORS, expect
 from boxreg_ros.core.face_support import FaceOffsets, observe_faces
 from boxreg_ros.core.geometry import rotation_from_rpy
-from boxreg_ros.core.input_model import CONSTANT_EXTENT_ERRORS, expect, InputModel, InputNoise
+from boxreg_ros.core.input_model import InputModel
+from boxreg_ros.core.input_noise import InputNoise
 from boxreg_ros.core.lbfgs import minimize, Minimum, select
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.paper import solve_paper

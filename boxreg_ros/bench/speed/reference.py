@@ -15,8 +15,9 @@ from time import perf_counter
 from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, free_variables, POSE_ERRORS, Problem, Solution, State
+from boxreg_ros.core.expectation import expect
 from boxreg_ros.core.face_support import observe_faces
-from boxreg_ros.core.input_model import expect, InputModel
+from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.refine import refine, Track
 from boxreg_ros.core.rounds import SETTLED_STEP

@@ -10,8 +10,9 @@ from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import LINK
 from boxreg_ros.core.batch import free_variables, SHARED, State
+from boxreg_ros.core.expectation import expect
 from boxreg_ros.core.face_support import observe_faces
-from boxreg_ros.core.input_model import expect, InputModel
+from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.rounds import Plan, Round, run_round
 from boxreg_ros.core.solver import start
 from boxreg_ros.core.window import stack_windows

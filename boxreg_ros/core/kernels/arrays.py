@@ -66,7 +66,7 @@ class FaceArrays(NamedTuple):
 
 
 class ExpectedArrays(NamedTuple):
-    """Means and deviations, as `boxreg_ros.core.input_model.Expectation` has them."""
+    """Means and deviations, as `boxreg_ros.core.expectation.Expectation` has them."""
 
     shared: Any
     deviation: Any
@@ -82,7 +82,7 @@ class InputArrays(NamedTuple):
     Attributes
     ----------
     deviation, correlation, offset : array, shape (K, 9)
-        As in `boxreg_ros.core.input_model.InputNoise`.
+        As in `boxreg_ros.core.input_noise.InputNoise`.
     weight : array, shape (K,)
         Of this noise against the settings.
     gap_correction, occlusion_inset, range_inset : array, shape (K, 6)
@@ -351,7 +351,7 @@ class RoundNumbers(NamedTuple):
 
 
 class ExpectationNumbers(NamedTuple):
-    """Constants of `boxreg_ros.core.input_model`; there they are described."""
+    """Constants of `boxreg_ros.core.expectation`; there they are described."""
 
     low_noise_ratio: float
     ratio_bounds: tuple[float, ...]
@@ -370,7 +370,7 @@ class ExpectationNumbers(NamedTuple):
 
 
 class NoiseNumbers(NamedTuple):
-    """Constants of `boxreg_ros.core.input_model`; there they are described."""
+    """Constants of `boxreg_ros.core.input_noise`; there they are described."""
 
     mad_to_deviation: float
     min_observations: int

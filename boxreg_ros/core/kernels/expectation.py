@@ -2,7 +2,7 @@
 Means and deviations of one window before its points are used, in plain loops.
 
 And evidence of the points about its extents, after a round. The torch twins are `expect_torch`
-and `evidence_of_extents` of `boxreg_ros.core.input_model`; the formulas are (M15) to (M17).
+and `evidence_of_extents` of `boxreg_ros.core.expectation`; the formulas are (M15) to (M17).
 
 """
 

@@ -1,7 +1,7 @@
 """
 Noise of the input boxes of many tracks, in plain loops.
 
-The torch twin is `boxreg_ros.core.input_model.estimate_noise_torch`; the formulas are (M14).
+The torch twin is `boxreg_ros.core.input_noise.estimate_noise_torch`; the formulas are (M14).
 
 """
 
