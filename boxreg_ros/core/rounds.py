@@ -60,7 +60,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_T = TypeVar('_T', bound=tuple[Any, ...])
+_Parts = TypeVar('_Parts', bound=tuple[Any, ...])
 
 # Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
 # each of them.
@@ -203,7 +203,7 @@ def run_round_compiled(
     return is_done
 
 
-def _part(values: _T, rows: Tensor) -> _T:
+def _part(values: _Parts, rows: Tensor) -> _Parts:
     """Return the rows of a tuple of tensors; `values` as they are for all rows."""
     first = values[0]
     return values if len(rows) == len(first) else select(values, rows)
