@@ -368,7 +368,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     'sensitivity': (
         'Sensitivity',
         'One setting or constant halved or doubled. A positive loss means that the default is '
-        'better.\nThe run is of an earlier build: some names have changed since.',
+        'better.\nBoth runs are of earlier builds: some names have changed since.',
         _sensitivity,
     ),
     'highway': (
