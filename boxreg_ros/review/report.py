@@ -90,8 +90,6 @@ def write_report(
         True boxes in the fixed frame, by the same stamps and track ids.
 
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
     begin_ns = min((int(track.stamps_ns[0]) for track in tracks), default=0)
     max_points = points_per_box(sum(len(track.stamps_ns) for track in tracks))
     review = list(_rows_of(folder / REVIEW))
@@ -116,33 +114,52 @@ def write_report(
         'sensor': np.round(points.origins[::stride, :2], 2),
         'total': [_total([pair[k] for pair in qualities]) for k in range(2)],
     }
+    page = _page(
+        line=line,
+        settings=[(item, value) for item, value in config.items() if value != item.default],
+        data=compressed(as_json(data)),
+        parts=parts,
+        **_of_summary(summary),
+        **_of_tracks(tracks),
+    )
+    # File names need not be valid UTF-8.
+    (folder / REPORT).write_text(page, encoding='utf-8', errors='backslashreplace')
+
+
+def _page(**content: Any) -> str:
+    """Return the page with its content, styles and scripts."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     environment = Environment(
         loader=FileSystemLoader(SHARE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters['code'] = _code
     css, script = (_as_markup((SHARE / name).read_text(encoding='utf-8')) for name in ASSETS)
+    template = environment.get_template(TEMPLATE)
+    return template.render(css=css, script=script, plotly=compressed(_plotly_script()), **content)
+
+
+def _of_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the page shows of ``summary.json``."""
+    return {
+        'summary': summary,
+        'names': [Path(os.path.abspath(name)).name for name in summary['recordings']],
+        'warnings': _warnings(summary),
+        'reasons': _explained(summary['reasons']),
+        'dropped': _explained(summary['dropped']),
+        'rules': _violated(summary['rules']),
+    }
+
+
+def _of_tracks(tracks: Sequence[TrackChanges]) -> dict[str, Any]:
+    """Return the number of the tracks, and by how much their refined boxes changed."""
     changes = np.concatenate([np.zeros((0, 4)), *(t.change[t.is_refined] for t in tracks)])
-    page = environment.get_template(TEMPLATE).render(
-        line=line,
-        summary=summary,
-        names=[Path(os.path.abspath(name)).name for name in summary['recordings']],
-        warnings=_warnings(summary),
-        shift=mean(np.linalg.norm(changes[:, :3], axis=1)),
-        turn=float(np.degrees(mean(np.abs(changes[:, 3])))),
-        reasons=_explained(summary['reasons']),
-        dropped=_explained(summary['dropped']),
-        rules=_violated(summary['rules']),
-        settings=[(item, value) for item, value in config.items() if value != item.default],
-        count=len(tracks),
-        css=css,
-        script=script,
-        data=compressed(as_json(data)),
-        parts=parts,
-        plotly=compressed(_plotly_script()),
-    )
-    # File names need not be valid UTF-8.
-    (folder / REPORT).write_text(page, encoding='utf-8', errors='backslashreplace')
+    return {
+        'count': len(tracks),
+        'shift': mean(np.linalg.norm(changes[:, :3], axis=1)),
+        'turn': float(np.degrees(mean(np.abs(changes[:, 3])))),
+    }
 
 
 def _total(qualities: Sequence[Quality]) -> dict[str, Any]:

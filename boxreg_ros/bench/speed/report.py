@@ -24,23 +24,38 @@ WANTED_TRACKS = 400
 
 def text(report: dict[str, Any]) -> str:
     """Return the report of `command.measure` as text."""
-    s, t, c, r = (report[name] for name in ('solver', 'tick', 'crop', 'relabel'))
-    lines = [
+    return '\n'.join([
         f'on {report["device"]}, load of the machine {report["load"]:.1f} when it began',
-        *_solver_lines(s, report['windows']),
-    ]
-    for name, rows in report['scaling'].items():
+        *_solver_lines(report['solver'], report['windows']),
+        *_scaling_lines(report['scaling']),
+        *_tick_lines(report),
+        *_roofline_lines(report['roofline']),
+        _crop_line(report['crop']),
+        *_relabel_lines(report['relabel']),
+    ])  # fmt: skip
+
+
+def _scaling_lines(found: dict[str, Any]) -> list[str]:
+    """Return the lines of the times by number of windows, observations and points."""
+    lines = []
+    for name, rows in found.items():
         cells = '   '.join(f'{x}: {y:.2f}' for x, y in rows)
         lines.append(f'ms per window over {name:8s} {cells}')
-    rates = '   '.join(f'{x}: {1e3 / y:,.0f}' for x, y in report['scaling']['windows'])
+    rates = '   '.join(f'{x}: {1e3 / y:,.0f}' for x, y in found['windows'])
     lines.append(f'windows per second        {rates}')
+    return lines
+
+
+def _tick_lines(report: dict[str, Any]) -> list[str]:
+    """Return the lines of ticks, of tracks that are held, and of cores."""
+    tick = report['tick']
     stages = ('decode', 'transform', 'crop and sample', 'solve', 'encode')
-    shares = ', '.join(f'{k} {t[k]:.1f} ({t[k] / t["total"]:.0%})' for k in stages)
-    lines.append(f'one tick: {t["total"]:.1f} ms of {1e3 * SWEEP_PERIOD:.0f}: {shares}')
-    lines.append(
-        f'the first tick of the process that solves: {t["first"]:.0f} ms, '
-        f'that of the first full window: {t["first full"]:.0f} ms'
-    )
+    shares = ', '.join(f'{k} {tick[k]:.1f} ({tick[k] / tick["total"]:.0%})' for k in stages)
+    lines = [
+        f'one tick: {tick["total"]:.1f} ms of {1e3 * SWEEP_PERIOD:.0f}: {shares}',
+        f'the first tick of the process that solves: {tick["first"]:.0f} ms, '
+        f'that of the first full window: {tick["first full"]:.0f} ms',
+    ]
     for tracks, found in report['ticks'].items():
         wanted = f' (wanted: {WANTED_TICKS[tracks]:g})' if tracks in WANTED_TICKS else ''
         lines.append(f'one tick of {tracks} tracks: {found:.1f} ms{wanted}')
@@ -50,40 +65,42 @@ def text(report: dict[str, Any]) -> str:
     )
     times = ', '.join(f'{name} {ms:.0f} ms' for name, ms in report['cores'].items())
     lines.append(f'{report["most windows"]} windows: {times}')
-    lines += _roofline_lines(report['roofline'])
-    open3d = c['Open3D, box by box']
-    lines.append(
-        f'crop of all boxes: {c["ours"]:.1f} ms; box by box with numpy '
-        f'{c["numpy, box by box"]:.0f} ms ({c["numpy, box by box"] / c["ours"]:.0f} times), '
-        + (
-            f'with Open3D {open3d:.0f} ms ({open3d / c["ours"]:.0f} times)'
-            if open3d
-            else c['reason']
-        )
+    return lines
+
+
+def _crop_line(found: dict[str, Any]) -> str:
+    """Return the line of the crop and of what does the same."""
+    ours, by_numpy, by_open3d = (
+        found[name] for name in ('ours', 'numpy, box by box', 'Open3D, box by box')
     )
-    busy = ('read', 'decode', 'transform', 'registrar', 'solve', 'write')
-    lines.append(
-        f'relabel: {r["faster"]:.1f} times faster than the recording lasts ({r["total"]:.1f} s; '
-        f'{r["compressed"]:.1f} times where it is compressed; busy, partly at once: '
-        + ', '.join(f'{k} {r[k]:.1f}' for k in busy)
-        + f'), all but the solve {r["rest"]:.0%}'
+    other = found['reason']
+    if by_open3d:
+        other = f'with Open3D {by_open3d:.0f} ms ({by_open3d / ours:.0f} times)'
+    return (
+        f'crop of all boxes: {ours:.1f} ms; box by box with numpy {by_numpy:.0f} ms '
+        f'({by_numpy / ours:.0f} times), {other}'
     )
-    lines.append(
-        f'ten times as long, sweeps of {r["few"]:,} points: {r["faster, long"]:.1f} times faster '
+
+
+def _relabel_lines(found: dict[str, Any]) -> list[str]:
+    """Return the lines of `boxreg relabel`: speed, start and memory."""
+    stages = ('read', 'decode', 'transform', 'registrar', 'solve', 'write')
+    busy = ', '.join(f'{name} {found[name]:.1f}' for name in stages)
+    few = f'{found["few"]:,} points'
+    return [
+        f'relabel: {found["faster"]:.1f} times faster than the recording lasts '
+        f'({found["total"]:.1f} s; {found["compressed"]:.1f} times where it is compressed; busy, '
+        f'partly at once: {busy}), all but the solve {found["rest"]:.0%}',
+        f'ten times as long, sweeps of {few}: {found["faster, long"]:.1f} times faster '
         f'than it lasts (wanted: {WANTED["faster, long"]:g}), all but the solve '
-        f'{r["rest, long"]:.0%}'
-    )
-    lines.append(
-        f'the recording is open after {r["start"]:.2f} s (wanted: {WANTED["start"]:g}); '
-        f'relabel --help takes {r["help"]:.2f} s (wanted: {WANTED["help"]:g})'
-    )
-    lines.append(
+        f'{found["rest, long"]:.0%}',
+        f'the recording is open after {found["start"]:.2f} s (wanted: {WANTED["start"]:g}); '
+        f'relabel --help takes {found["help"]:.2f} s (wanted: {WANTED["help"]:g})',
         f'peak memory of all its processes, shared pages counted once: '
-        f'{r["memory, shared once"]:.0f} MB (wanted: {WANTED["memory, shared once"]:g}), in each '
-        f'process {r["memory"]:.0f} MB; '
-        f'sweeps of {r["few"]:,} points {r["short"]:.0f} MB, ten times as long {r["long"]:.0f} MB'
-    )
-    return '\n'.join(lines)
+        f'{found["memory, shared once"]:.0f} MB (wanted: {WANTED["memory, shared once"]:g}), in '
+        f'each process {found["memory"]:.0f} MB; sweeps of {few} {found["short"]:.0f} MB, ten '
+        f'times as long {found["long"]:.0f} MB',
+    ]
 
 
 def _solver_lines(found: dict[str, float], count: int) -> list[str]:
