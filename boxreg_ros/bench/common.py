@@ -17,6 +17,8 @@ from boxreg_ros.offline.box_scores import match, Matches
 from boxreg_ros.offline.evaluate import finite
 from tqdm import tqdm
 
+BOXREG = (sys.executable, '-m', 'boxreg_ros.cli')
+"""The command in a process of its own, of this environment."""
 NAME_WIDTH = 22  # characters of the first column
 CELL_WIDTH = 9  # characters of each other column
 ESTIMATES = ('early', 'final', 'track')

@@ -19,9 +19,8 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any, NamedTuple
 
-from boxreg_ros.bench.common import add_json_argument, print_json
+from boxreg_ros.bench.common import add_json_argument, BOXREG, print_json
 from boxreg_ros.bench.node import (
-    BOXREG,
     children_of,
     COMPLETION_TIME,
     node_command,

@@ -18,20 +18,18 @@ from pathlib import Path
 import signal
 import struct
 import subprocess
-import sys
 from tempfile import TemporaryDirectory
 from threading import Thread
 import time
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, print_json
+from boxreg_ros.bench.common import add_json_argument, BOXREG, print_json
 from boxreg_ros.bench.recorded import RecordedLabels
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.labels import module_of
 from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
 import numpy as np
 
-BOXREG = (sys.executable, '-m', 'boxreg_ros.cli')
 PROFILE = Path(__file__).parents[1] / 'share' / 'fastdds.xml'
 CIRCLE_PERIOD = 5.0  # time until a car is back where it began [s]
 TRACK_LIFETIME = 200  # sweeps until a track gets a new id

@@ -19,12 +19,11 @@ from pathlib import Path
 import resource
 import shutil
 import subprocess
-import sys
 from tempfile import TemporaryDirectory
 import time
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, print_json
+from boxreg_ros.bench.common import add_json_argument, BOXREG, print_json
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.offline.job import JOB_FAILED, jobs_of
 from boxreg_ros.offline.job_process import JobRunner
@@ -35,7 +34,6 @@ import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
 OPTIONS = ('--formats=csv', '--workers=1')
-BOXREG = (sys.executable, '-m', 'boxreg_ros.cli')
 FLEET_JOBS = 10_000
 FLEET_CORES = 500
 FLEET_HOURS = 10_000

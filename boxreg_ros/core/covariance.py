@@ -5,7 +5,12 @@ from boxreg_ros.core.arrowhead import InverseBlocks, product
 from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Posterior, Problem, SHARED, State
 from boxreg_ros.core.expectation import Expectation
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
-from boxreg_ros.core.input_noise import MAX_CORRELATION, OBSERVATIONS_FOR_HALF_WEIGHT
+from boxreg_ros.core.input_noise import (
+    MAX_CORRELATION,
+    MIN_LEFT,
+    MIN_POWER,
+    OBSERVATIONS_FOR_HALF_WEIGHT,
+)
 from boxreg_ros.core.weights import face_deviations
 import torch
 from torch import Tensor
@@ -22,8 +27,6 @@ MIN_DURATION = 1e-3
 """Shortest time between two observations [s]; padding has none."""
 MIN_WEIGHT = 1e-9
 """Faces with less weight in total have no residuals."""
-MIN_LEFT = 0.3
-"""Least part of the variance that the mean of a window is taken to leave."""
 CORRELATED_FACES = (1.0, 1.0, 0.0, 0.0, 1.0, 1.0)
 """Faces whose correlation counts. The spread of the margins of the sides, `gap_spread`, covers
 theirs: with them too, normalised squared errors across are 0.3 on simulated data."""
@@ -144,7 +147,7 @@ def _variance_of_mean(residuals: Tensor, is_seen: Tensor) -> Tensor:
     both = is_seen[:, 1:] & is_seen[:, :-1]
     first, second = residuals[:, :-1] * both, residuals[:, 1:] * both
     power = (first**2 + second**2).sum((1, 2)) / 2
-    ratio = (first * second).sum((1, 2)) / power.clamp(min=MIN_WEIGHT)
+    ratio = (first * second).sum((1, 2)) / power.clamp(min=MIN_POWER)
     n = is_seen.sum((1, 2)) / is_seen.any(1).sum(1).clamp(min=1)
     n = n.clamp(min=1)
     unbiased = (ratio + 1 / n) / (1 - 4 / n).clamp(min=MIN_LEFT)

@@ -33,7 +33,7 @@ MAX_CORRELATION = 0.9
 CORRELATION_ITERATIONS = 5
 """Alternating evaluations of the correlation and of the variance that track means remove."""
 MIN_LEFT = 0.3
-"""Least part of the variance that the means of tracks are taken to leave."""
+"""Least part of a variance or correlation that the mean of a track or window is taken to leave."""
 MIN_POWER = 1e-12
 """Errors with a smaller variance do not change along a track [m^2, rad^2]."""
 REPEATED_BOX_TOLERANCE = 1e-3

@@ -87,14 +87,14 @@ class FileRecords:
 
     def next_record(self) -> bytes | None:
         """Return the next record; None behind the last whole one, where the file is cut off."""
-        begin = self._file.tell()
+        record_start = self._file.tell()
         head = self._file.read(HEAD.size)
         if len(head) == HEAD.size:
             size, crc = HEAD.unpack(head)
             content = self._file.read(size)
             if len(content) == size and zlib.crc32(content) == crc:
                 return content
-        self._file.truncate(begin)
+        self._file.truncate(record_start)
         return None
 
     def append(self, content: bytes) -> None:

@@ -9,10 +9,10 @@ import os
 from pathlib import Path
 from shutil import disk_usage
 import subprocess
-import sys
 import tempfile
 from time import perf_counter, sleep
 
+from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.bench.speed.streams import SWEEP_PERIOD, traffic
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.structures import Sweep
@@ -20,7 +20,6 @@ import numpy as np
 
 BYTES_PER_POINT = 20
 """Size of a point in a recording."""
-CLI = 'boxreg_ros.cli'
 
 
 def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
@@ -38,7 +37,7 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
     of three runs with ``--help`` [s].
 
     """
-    command = [sys.executable, '-m', CLI, 'relabel']
+    command = [*BOXREG, 'relabel']
     result = {'help': min(_seconds([*command, '--help']) for _ in range(3))}
     with tempfile.TemporaryDirectory(prefix='boxreg-') as name:
         path, out = Path(name) / 'drive.mcap', Path(name) / 'out'
