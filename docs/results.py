@@ -411,8 +411,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'Speed',
         'Times in ms unless the name says otherwise. CUDA has not been run: the torch twins of\n'
         'the kernels are tested on the CPU only. *solver: reference* is one fit of a window by\n'
-        'torch.optim.LBFGS. Its IoU and ours differ by less than the standard error of their\n'
-        'difference, *IoU, error*; the value of the objective is lower with ours.',
+        'torch.optim.LBFGS; *IoU, error* is the standard error of the difference between its IoU\n'
+        'and ours.',
         _figures,
     ),
     'load': (
