@@ -104,8 +104,7 @@ def clustered_error(values: Floats, clusters: Sequence[str]) -> float:
 
 def _sums_by_cluster(values: Floats, clusters: Sequence[str]) -> Floats:
     _, codes = np.unique(np.array(clusters, str), return_inverse=True)
-    sums: Floats = np.bincount(codes, values)
-    return sums
+    return np.bincount(codes, values).astype(np.float64)
 
 
 def _mean(values: Floats) -> float:

@@ -171,10 +171,10 @@ def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
     for given, result in zip(drive.boxes, results, strict=True):
         for track_id, status in zip(given.track_ids, result.status, strict=False):
             is_rejected[track_id.startswith(GHOST_PREFIX)].append(status == REJECTED)
-    parts = [float(np.mean(rows)) if rows else math.nan for rows in is_rejected.values()]
+    ghosts, lost = (float(np.mean(rows)) if rows else math.nan for rows in is_rejected.values())
     table = table_of(results)
     scores = track_scores(table, drive.truth)
-    return Row(scores, *parts, scores_by_kind(table, drive.truth))
+    return Row(scores, ghosts, lost, scores_by_kind(table, drive.truth))
 
 
 def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScores]:

@@ -208,10 +208,11 @@ def test_coasting_finds_missed_boxes(folder, capsys):
     assert list(rows) == ['input', 'final', 'coast 0.5 s']
     assert rows['final']['added'] == 0 < rows['coast 0.5 s']['added']
     assert rows['final']['recall'] < rows['coast 0.5 s']['recall']
-    # All objects are cars: the scores of the kind are those of all.
+    # Only vehicles have boxes in this drive.
     last = rows['coast 0.5 s']
-    assert list(last['by_kind']) == ['vehicle']
-    assert last['by_kind']['vehicle'].items() <= last.items()
+    assert set(last['by_kind']) == {'vehicle', 'cyclist', 'pedestrian'}
+    assert last['by_kind']['vehicle']['added_iou'] == last['added_iou']
+    assert last['by_kind']['pedestrian']['recall'] == 0
     assert 0.5 < last['given_iou'] < 1
 
 
