@@ -137,28 +137,15 @@ def expect_compiled(
     problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
 ) -> Expectation:
     """Return the same as `expect`, by the kernel."""
-    arrays, widening, slow = _expected_arrays(problem, offsets, noise, population)
-    shared, deviation, pose, widened, bias = map(torch.from_numpy, arrays)
-    spread = torch.from_numpy(widening), torch.from_numpy(slow)
-    error = _input_error(problem, noise.of(problem), *spread)
-    error = _at_least_prior(problem, error, deviation)
-    return Expectation(shared, deviation, pose, widened, bias, error)
-
-
-def _expected_arrays(
-    problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
-) -> tuple[ExpectedArrays, Floats, Floats]:
-    """Return what the kernel writes."""
     kernels = compiled(problem.boxes)
     assert kernels is not None
     B = len(problem.boxes)
-    expected = ExpectedArrays(*(np.empty((B, size)) for size in (SHARED, SHARED, 6, 6, 6)))
-    widening, slow = np.empty((B, 3)), np.empty((B, 1))
+    expected = ExpectedArrays(*(np.empty((B, size)) for size in (SHARED, SHARED, 6, 6, 6, 9)))
     run(
         kernels.expectation.expect, B, problem.arrays(), problem.class_arrays(),
-        input_arrays(offsets, noise, population), _expectation_numbers(), expected, widening, slow,
+        input_arrays(offsets, noise, population), _expectation_numbers(), expected,
     )  # fmt: skip
-    return expected, widening, slow
+    return Expectation(*map(torch.from_numpy, expected))
 
 
 def input_arrays(
@@ -199,6 +186,8 @@ def _expectation_numbers() -> ExpectationNumbers:
         pinned_extent=PINNED_EXTENT,
         pinned_margins=PINNED_MARGINS,
         pivot_deviation=PIVOT_DEVIATION,
+        constant_extent_errors=tuple(CONSTANT_EXTENT_ERRORS[kind] for kind in KINDS),
+        estimated_kind=KINDS.index('vehicle'),
     )
 
 
@@ -298,8 +287,7 @@ def expect_shared(problem: Problem, offsets: FaceOffsets) -> Tensor:
     """Return the means of the shared variables as `expect` does without a population, (B, 23)."""
     if compiled(problem.boxes) is None:
         return expected_shared(problem, offsets, mean_input_extents(problem))
-    arrays, _, _ = _expected_arrays(problem, offsets, UNKNOWN_NOISE, UNKNOWN_POPULATION)
-    return torch.from_numpy(arrays.shared)
+    return expect_compiled(problem, offsets, UNKNOWN_NOISE, UNKNOWN_POPULATION).shared
 
 
 def expected_shared(problem: Problem, offsets: FaceOffsets, extent: Tensor) -> Tensor:

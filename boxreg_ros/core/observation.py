@@ -133,7 +133,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     own = find(sweep, boxes, config)
     rows, owner = _sampled(own, sweep, n, config)
 
-    points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
+    points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32, 'C')
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
     parts = _slices(owner, n)

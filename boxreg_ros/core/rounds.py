@@ -8,22 +8,21 @@ By a kernel, one call for all windows, or by its torch twin, which is the refere
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import lbfgs, terms
-from boxreg_ros.core.arrowhead import InverseBlocks, LINK
+from boxreg_ros.core.arrowhead import InverseBlocks
 from boxreg_ros.core.batch import (
     ANCHOR,
     MarginalPrior,
     POSE_ERRORS,
     PRIOR_SIZE,
     Problem,
-    SHARED,
     Solution,
     State,
 )
-from boxreg_ros.core.covariance import posterior
+from boxreg_ros.core.covariance import covariance_numbers, posterior
 from boxreg_ros.core.expectation import (
     evidence_of_extents,
     Expectation,
@@ -31,7 +30,6 @@ from boxreg_ros.core.expectation import (
     MIN_EXTENT_GAIN,
 )
 from boxreg_ros.core.face_support import (
-    empty_faces,
     face_numbers,
     FaceObservations,
     FaceOffsets,
@@ -39,8 +37,8 @@ from boxreg_ros.core.face_support import (
 )
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.kernels.arrays import (
-    EndArrays,
     ExpectedArrays,
+    PosteriorArrays,
     PriorArrays,
     RoundNumbers,
     SearchNumbers,
@@ -59,8 +57,6 @@ from boxreg_ros.core.weights import (
 import numpy as np
 import torch
 from torch import Tensor
-
-_Parts = TypeVar('_Parts', bound=tuple[Any, ...])
 
 # Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
 # each of them.
@@ -177,64 +173,20 @@ def run_round_compiled(
         weight_numbers(config, _is_smooth(plan, turn)),
         shape_numbers(problem),
         _search_numbers(plan, turn, config),
+        covariance_numbers(),
         MIN_EXTENT_GAIN,
     )
     prior = PriorArrays(
         contiguous(problem.prior_mean), contiguous(prior_information(problem, config))
     )
-    b, N = len(rows), problem.length
-    faces = empty_faces(b, N)
-    ends = EndArrays(
-        np.empty(b, bool), np.empty((b, N, LINK, LINK)), np.empty((b, N, LINK, SHARED)),
-        np.empty((b, SHARED, SHARED)),
-    )  # fmt: skip
+    is_done = np.empty(len(rows), bool)
     run(
-        kernels.rounds.run_windows, b, rows.numpy(), problem.arrays(),
+        kernels.rounds.run_windows, len(rows), rows.numpy(), problem.arrays(),
         problem.thinned(SHAPE_POINTS).arrays(), input_arrays(offsets), prior, contiguous(free),
-        ExpectedArrays(*map(contiguous, expected[:5])),
-        problem.class_arrays(), numbers, faces,
-        _solution_arrays(solution, plan.marginalises and config.window == N), ends,
+        ExpectedArrays(*map(contiguous, expected)), problem.class_arrays(), numbers,
+        _solution_arrays(solution, plan.marginalises and config.window == problem.length), is_done,
     )  # fmt: skip
-    is_done, *inverse = map(torch.from_numpy, ends)
-    observations = FaceObservations(*map(torch.from_numpy, faces))
-    done = is_done.nonzero()[:, 0]
-    inverse_of_done = _part(InverseBlocks(*inverse), done)
-    _write_posterior(batch, rows, done, observations, inverse_of_done, config)
-    return is_done
-
-
-def _part(values: _Parts, rows: Tensor) -> _Parts:
-    """Return the rows of a tuple of tensors; `values` as they are for all rows."""
-    first = values[0]
-    return values if len(rows) == len(first) else select(values, rows)
-
-
-def _write_posterior(
-    batch: Round,
-    rows: Tensor,
-    done: Tensor,
-    observations: FaceObservations,
-    inverse: InverseBlocks,
-    config: Config,
-) -> None:
-    """
-    Write the covariances of windows that are done.
-
-    `observations` are of all `rows`, `inverse` is of the `done` ones among them.
-
-    """
-    if not len(done):
-        return
-    ended = rows[done]
-    problem = _part(batch.problem, ended)
-    state = _part(batch.state, ended)
-    expected = _part(batch.expected, ended)
-    moments, inset, weight = _part(
-        (observations.moments, observations.inset, observations.weight), done
-    )
-    free = batch.free[ended]
-    found = posterior(problem, state, moments, inset, weight, expected, free, inverse, config)
-    _write(found, batch.solution.posterior, ended)
+    return torch.from_numpy(is_done)
 
 
 def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
@@ -242,8 +194,9 @@ def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
     prior = [np.empty((0, PRIOR_SIZE))] * 2 + [np.empty((0, PRIOR_SIZE, PRIOR_SIZE))]
     if leaves_prior and solution.prior is not None:
         prior = [part.numpy() for part in solution.prior]
+    posterior = PosteriorArrays(*(part.numpy() for part in solution.posterior))
     parts = *solution.state, solution.extent_evidence
-    return SolutionArrays(*(part.numpy() for part in parts), *prior)
+    return SolutionArrays(*(part.numpy() for part in parts), posterior, *prior)
 
 
 def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
@@ -289,11 +242,15 @@ def run_round_torch(
     solution.extent_evidence[rows, 1:] = evidence
     done = is_done.nonzero()[:, 0]
     if len(done):
+        ended = rows[done]
         inverse = InverseBlocks(*select(objective.factor, done).inverse_blocks(problem.length))
-        _write_posterior(batch, rows, done, observations, inverse, config)
+        covariances = posterior(
+            *select((problem, found, observations, expected, free), done), inverse, config
+        )
+        _write(covariances, solution.posterior, ended)
         if plan.marginalises and problem.length == config.window and solution.prior is not None:
             prior = select(_prior_of_full(weighted, found, problem), done)
-            _write(prior, solution.prior, rows[done])
+            _write(prior, solution.prior, ended)
     return is_done
 
 

@@ -73,6 +73,7 @@ class ExpectedArrays(NamedTuple):
     pose_deviation: Any
     widened_deviation: Any
     unmodelled_bias: Any
+    input_error: Any
 
 
 class InputArrays(NamedTuple):
@@ -152,6 +153,8 @@ class SolutionArrays(NamedTuple):
         Boxes, and the variables that all observations of a window share.
     evidence : array, shape (B, 3, 3)
         Logarithms of the input extents; corrections by the points alone, and their weights.
+    posterior : PosteriorArrays
+        Of windows that are done.
     prior_state, prior_step, prior_information : array, shapes (B, 35), (B, 35), (B, 35, 35)
         What full windows that are done leave to the next ones; B = 0 if it is not wanted.
 
@@ -160,30 +163,35 @@ class SolutionArrays(NamedTuple):
     poses: Any
     shared: Any
     evidence: Any
+    posterior: Any
     prior_state: Any
     prior_step: Any
     prior_information: Any
 
 
-class EndArrays(NamedTuple):
+class PosteriorArrays(NamedTuple):
+    """Covariances and residuals, as `boxreg_ros.core.batch.Posterior` has them."""
+
+    poses: Any
+    extents: Any
+    face_distances: Any
+
+
+class InverseArrays(NamedTuple):
     """
-    How a round ends for the b windows that take part.
+    Blocks of the inverse curvature of one window.
 
     Attributes
     ----------
-    is_done : array, shape (b,)
-        Whether a window is settled, or this was the last round.
-    pose_blocks, border_blocks : array, shapes (b, N, 6, 6) and (b, N, 6, 23)
-        Blocks of the poses in the inverse curvature, of windows that are done: their own, and
-        those with the shared variables.
-    corner : array, shape (b, 23, 23)
-        Block of the shared variables in the inverse curvature.
+    poses, border : array, shapes (N, 6, 6) and (N, 6, 23)
+        Of each pose: its own, and those with the shared variables.
+    corner : array, shape (23, 23)
+        Of the shared variables.
 
     """
 
-    is_done: Any
-    pose_blocks: Any
-    border_blocks: Any
+    poses: Any
+    border: Any
     corner: Any
 
 
@@ -340,6 +348,21 @@ class ShapeNumbers(NamedTuple):
     is_moving: bool
 
 
+class CovarianceNumbers(NamedTuple):
+    """Constants and settings of `boxreg_ros.core.covariance`; there they are described."""
+
+    residual_correlation: float
+    max_correlation: float
+    half_weight: float
+    min_left: float
+    min_power: float
+    min_weight: float
+    min_duration: float
+    time_deviation: float
+    heading_deviation: float
+    correlated_faces: tuple[float, ...]
+
+
 class RoundNumbers(NamedTuple):
     """Constants and settings of a round."""
 
@@ -347,6 +370,7 @@ class RoundNumbers(NamedTuple):
     weights: WeightNumbers
     shape: ShapeNumbers
     search: SearchNumbers
+    covariance: CovarianceNumbers
     min_extent_gain: float
 
 
@@ -367,6 +391,8 @@ class ExpectationNumbers(NamedTuple):
     pinned_extent: float
     pinned_margins: float
     pivot_deviation: float
+    constant_extent_errors: tuple[tuple[float, ...], ...]
+    estimated_kind: int
 
 
 class NoiseNumbers(NamedTuple):

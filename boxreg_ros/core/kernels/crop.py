@@ -6,7 +6,7 @@ The numpy twins are `crop_numpy` and `own_points_numpy` of `boxreg_ros.core.obse
 """
 
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.sorting import sort
+from boxreg_ros.core.kernels.selection import nth
 import numpy as np
 
 SIDE = 256
@@ -134,12 +134,11 @@ def crop(points, centers, rotations, half, reach, margin):
 def flat_height(heights, quantiles, flatness, min_points):
     """Return the height of a road from heights beside a box; NaN where it is not flat."""
     n = len(heights)
-    sort(heights)
     if n < min_points:
         return np.nan
-    low = heights[int(quantiles[0] * n)]
-    high = heights[int(quantiles[2] * n)]
-    return heights[int(quantiles[1] * n)] if high - low < flatness else np.nan
+    low = nth(heights, int(quantiles[0] * n))
+    high = nth(heights, int(quantiles[2] * n))
+    return nth(heights, int(quantiles[1] * n)) if high - low < flatness else np.nan
 
 
 @kernel
@@ -147,16 +146,16 @@ def road_heights(owner, height, offset, outside, half, numbers):
     """Return the height of the road beside each of n boxes (n,); NaN where not found [m]."""
     n = len(half)
     beside = np.empty(len(owner), np.bool_)
+    square = np.hypot(half[:, 0], half[:, 1]) + numbers.road_width
     first = np.zeros(n + 1, np.int64)
     for k in range(len(owner)):
         box = owner[k]
         aside = max(outside[k, 0], outside[k, 1])
-        square = np.hypot(half[box, 0], half[box, 1]) + numbers.road_width
         beside[k] = (
             aside > numbers.road_gap
             and max(aside, outside[k, 2]) < numbers.road_width
             and abs(height[k]) < numbers.road_range
-            and max(abs(offset[k, 0]), abs(offset[k, 1])) < square
+            and max(abs(offset[k, 0]), abs(offset[k, 1])) < square[box]
         )
         first[box + 1] += beside[k]
     for box in range(n):

@@ -6,7 +6,7 @@ and `evidence_of_extents` of `boxreg_ros.core.expectation`; the formulas are (M1
 
 """
 
-from math import exp, isfinite, log, sqrt
+from math import exp, hypot, isfinite, log, sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.kernels.compile import kernel
@@ -138,7 +138,32 @@ def fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expecte
 
 
 @kernel
-def expect(begin, end, windows, of_class, known, numbers, expected, widening, slow):
+def fill_input_error(b, windows, of_class, known, numbers, ratios, mean, expected):
+    """Write the deviations of the errors of mean extents and bias of window `b` (M28), (9,)."""
+    kind = windows.kind[b]
+    weight, slow = known.weight[kind], ratios.slow.max()
+    deviation, error = expected.deviation[b], expected.input_error[b]
+    count = windows.lengths[b] + windows.marginalised_extents[b, 3]
+    for k in range(SIZE):
+        j = POSE + k
+        noise = sqrt(1 + weight * (known.deviation[kind, j] ** 2 - 1))
+        of_mean = min(ratios.widening[j] / sqrt(count), 1.0)
+        constant = slow * noise
+        if kind != numbers.estimated_kind:
+            constant = max(min(noise / numbers.low_noise_ratio, 1.0), noise)
+        constant *= numbers.constant_extent_errors[kind][k]
+        error[EXTENT + k] = mean[k] * of_class.extent[b] * hypot(noise * of_mean, constant)
+    for j in range(POSE):
+        noise = sqrt(1 + weight * (known.deviation[kind, j] ** 2 - 1))
+        share = numbers.yaw_bias if j == HEADING else 1.0
+        error[BIAS + j] = of_class.pose[b, j] * noise * slow * share
+    has_pin = windows.pinned[b].any()
+    for s in range(GAP):
+        error[s] = deviation[s] if has_pin else max(error[s], deviation[s])
+
+
+@kernel
+def expect(begin, end, windows, of_class, known, numbers, expected):
     """
     Write means and deviations of the windows `begin` to `end`.
 
@@ -156,10 +181,6 @@ def expect(begin, end, windows, of_class, known, numbers, expected, widening, sl
         Constants.
     expected : ExpectedArrays
         Written.
-    widening : array, shape (B, 3)
-        Factor on the deviations of extents for the correlation of their errors, written.
-    slow : array, shape (B, 1)
-        Largest part of an error that is constant over the window, written.
 
     """
     ratios = Ratios(np.empty(6), np.empty(6), np.empty(9), np.empty(9))
@@ -168,8 +189,7 @@ def expect(begin, end, windows, of_class, known, numbers, expected, widening, sl
         fill_mean_extents(b, windows, mean)
         fill_ratios(b, windows, known, numbers, ratios)
         fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expected)
-        widening[b] = ratios.widening[POSE:]
-        slow[b, 0] = ratios.slow.max()
+        fill_input_error(b, windows, of_class, known, numbers, ratios, mean, expected)
 
 
 @kernel

@@ -18,7 +18,7 @@ from boxreg_ros.core.kernels.normal_equations import (
     slip_of,
 )
 from boxreg_ros.core.kernels.rotation import fill_rotation
-from boxreg_ros.core.kernels.sorting import lower_median
+from boxreg_ros.core.kernels.selection import lower_median
 import numpy as np
 
 BOTTOM = 5
@@ -137,15 +137,19 @@ def weigh_pins(pinned, length, widened, unmodelled_bias, pin_deviations, W):
 
 
 @kernel
+def face_deviation(face, shape, deviations):
+    """Return the deviation of one observation of a face of an object rigid up to `shape` [m]."""
+    return deviations[face] if face == BOTTOM else max(deviations[face], shape)
+
+
+@kernel
 def fill_face_weights(distance, weight, off_track, length, shape, numbers, face_weight):
     """Write the weights of the faces (M20), (N, 6) [1/m^2], of an object rigid up to `shape`."""
     for n in range(length):
         off = off_track[n, 0] ** 2 + off_track[n, 1] ** 2
         same_object = 1 / (1 + off**2) ** 2
         for face in range(6):
-            deviation = numbers.face_deviations[face]
-            if face != BOTTOM:
-                deviation = max(deviation, shape)
+            deviation = face_deviation(face, shape, numbers.face_deviations)
             robust = 1 / (1 + (distance[n, face] / numbers.face_outlier) ** 2) ** 2
             face_weight[n, face] = weight[n, face] * robust * same_object / deviation**2
 
