@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
-from boxreg_ros.core.expectation import expect_shared
+from boxreg_ros.core.expectation import shared_without_population
 from boxreg_ros.core.face_support import motion_compensated, observe_faces, to_box_frame
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import residuals_at
@@ -132,7 +132,7 @@ def _update_offsets(
     problem = problem.part(new, [columns[row] for row in new]).thinned(COARSE_POINTS)
     offsets = model.offsets()
     pose = torch.cat([problem.boxes[..., :3], smoothed_angles(problem)], -1)
-    state = State(pose, expect_shared(problem, offsets))
+    state = State(pose, shared_without_population(problem, offsets))
     observations = observe_faces(problem, state, offsets, config)
     track_ids = [windows[row].track_id for row in new]
     model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)

@@ -25,19 +25,19 @@ from boxreg_ros.core.batch import (
 from boxreg_ros.core.covariance import covariance_numbers, posterior
 from boxreg_ros.core.expectation import (
     evidence_of_extents,
+    expect,
     Expectation,
-    input_arrays,
+    expectation_numbers,
+    Known,
     MIN_EXTENT_GAIN,
 )
 from boxreg_ros.core.face_support import (
     face_numbers,
     FaceObservations,
-    FaceOffsets,
     observe_faces,
 )
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.kernels.arrays import (
-    ExpectedArrays,
     PosteriorArrays,
     PriorArrays,
     RoundNumbers,
@@ -127,8 +127,8 @@ class Round(NamedTuple):
         The windows, with the points of this round.
     solution : Solution
         Where the round begins; the round writes its end.
-    expected : Expectation
-        Means and deviations of input and shared variables.
+    known : Known
+        What is known of the input.
     free : Tensor, shape (B, D)
         1 for variables that are estimated.
 
@@ -136,7 +136,7 @@ class Round(NamedTuple):
 
     problem: Problem
     solution: Solution
-    expected: Expectation
+    known: Known
     free: Tensor
 
     @property
@@ -146,9 +146,7 @@ class Round(NamedTuple):
 
 
 @torch.inference_mode()
-def run_round(
-    batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
-) -> Tensor:
+def run_round(batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor) -> Tensor:
     """
     Take one round with the windows `rows` (b,), and write its end to the solution of the batch.
 
@@ -158,17 +156,18 @@ def run_round(
     """
     by_kernel = compiled(batch.free) is not None
     take = run_round_compiled if by_kernel else run_round_torch
-    return take(batch, offsets, plan, turn, config, rows)
+    return take(batch, plan, turn, config, rows)
 
 
 def run_round_compiled(
-    batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
+    batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor
 ) -> Tensor:
     """Take a round by the kernel."""
-    problem, solution, expected, free = batch
+    problem, solution, known, free = batch
     kernels = compiled(free)
     assert kernels is not None
     numbers = RoundNumbers(
+        expectation_numbers(),
         face_numbers(problem, config),
         weight_numbers(config, _is_smooth(plan, turn)),
         shape_numbers(problem),
@@ -182,8 +181,8 @@ def run_round_compiled(
     is_done = np.empty(len(rows), bool)
     run(
         kernels.rounds.run_windows, len(rows), rows.numpy(), problem.arrays(),
-        problem.thinned(SHAPE_POINTS).arrays(), input_arrays(offsets), prior, contiguous(free),
-        ExpectedArrays(*map(contiguous, expected)), problem.class_arrays(), numbers,
+        problem.thinned(SHAPE_POINTS).arrays(), known.arrays(), prior, contiguous(free),
+        problem.class_arrays(), numbers,
         _solution_arrays(solution, plan.marginalises and config.window == problem.length), is_done,
     )  # fmt: skip
     return torch.from_numpy(is_done)
@@ -194,9 +193,13 @@ def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
     prior = [np.empty((0, PRIOR_SIZE))] * 2 + [np.empty((0, PRIOR_SIZE, PRIOR_SIZE))]
     if leaves_prior and solution.prior is not None:
         prior = [part.numpy() for part in solution.prior]
-    posterior = PosteriorArrays(*(part.numpy() for part in solution.posterior))
-    parts = *solution.state, solution.extent_evidence
-    return SolutionArrays(*(part.numpy() for part in parts), posterior, *prior)
+    return SolutionArrays(
+        solution.state.pose.numpy(),
+        solution.state.shared.numpy(),
+        solution.extent_evidence.numpy(),
+        PosteriorArrays(*(part.numpy() for part in solution.posterior)),
+        *prior,
+    )
 
 
 def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
@@ -215,19 +218,17 @@ def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
     )
 
 
-def run_round_torch(
-    batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
-) -> Tensor:
+def run_round_torch(batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor) -> Tensor:
     """Take a round by torch."""
     solution = batch.solution
-    problem, state, expected, free, log_extent = select(
-        (batch.problem, batch.state, batch.expected, batch.free, solution.extent_evidence[:, 0]),
-        rows,
+    problem, state, free, log_extent = select(
+        (batch.problem, batch.state, batch.free, solution.extent_evidence[:, 0]), rows
     )
+    expected = expect(problem, batch.known)
     shared = state.shared.clone()
     shared[:, ANCHOR] = 0.0
     state = State(state.pose, shared)
-    observations = observe_faces(problem, state, offsets, config)
+    observations = observe_faces(problem, state, batch.known.offsets, config)
     weighted = _weighted_terms(problem, state, expected, observations, plan, turn, config)
     x = state.pack()
     objective = Objective(weighted, x, problem.length, free)
@@ -244,9 +245,8 @@ def run_round_torch(
     if len(done):
         ended = rows[done]
         inverse = InverseBlocks(*select(objective.factor, done).inverse_blocks(problem.length))
-        covariances = posterior(
-            *select((problem, found, observations, expected, free), done), inverse, config
-        )
+        parts = select((problem, found, observations, expected, free), done)
+        covariances = posterior(*parts, inverse=inverse, config=config)
         _write(covariances, solution.posterior, ended)
         if plan.marginalises and problem.length == config.window and solution.prior is not None:
             prior = select(_prior_of_full(weighted, found, problem), done)

@@ -66,7 +66,7 @@ class FaceArrays(NamedTuple):
 
 
 class ExpectedArrays(NamedTuple):
-    """Means and deviations, as `boxreg_ros.core.expectation.Expectation` has them."""
+    """Those of one window, as `boxreg_ros.core.expectation.Expectation` has them for a batch."""
 
     shared: Any
     deviation: Any
@@ -363,17 +363,6 @@ class CovarianceNumbers(NamedTuple):
     correlated_faces: tuple[float, ...]
 
 
-class RoundNumbers(NamedTuple):
-    """Constants and settings of a round."""
-
-    faces: FaceNumbers
-    weights: WeightNumbers
-    shape: ShapeNumbers
-    search: SearchNumbers
-    covariance: CovarianceNumbers
-    min_extent_gain: float
-
-
 class ExpectationNumbers(NamedTuple):
     """Constants of `boxreg_ros.core.expectation`; there they are described."""
 
@@ -393,6 +382,18 @@ class ExpectationNumbers(NamedTuple):
     pivot_deviation: float
     constant_extent_errors: tuple[tuple[float, ...], ...]
     estimated_kind: int
+
+
+class RoundNumbers(NamedTuple):
+    """Constants and settings of a round."""
+
+    expectation: ExpectationNumbers
+    faces: FaceNumbers
+    weights: WeightNumbers
+    shape: ShapeNumbers
+    search: SearchNumbers
+    covariance: CovarianceNumbers
+    min_extent_gain: float
 
 
 class NoiseNumbers(NamedTuple):

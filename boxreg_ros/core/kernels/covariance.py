@@ -226,11 +226,11 @@ def fill_posterior(
     """
     length = windows.lengths[b]
     distances, free_shared = found.face_distances[b], free[6 * len(poses) :]
-    deviation, error = expected.deviation[b], expected.input_error[b]
+    deviation, error = expected.deviation, expected.input_error
     for face in range(FACES):
         work.claimed[face] = face_deviation(face, shape, weights.face_deviations) ** 2
     fill_face_distances(
-        windows.boxes[b], poses, shared, expected.shared[b], row, faces, work.R, distances
+        windows.boxes[b], poses, shared, expected.shared, row, faces, work.R, distances
     )
     weight = faces.weight[row]
     remove_means(length, weight, distances, numbers.min_weight, work)

@@ -1,5 +1,5 @@
 """
-One round of windows, in plain loops: observe, weigh, sum up, factorise, minimise.
+One round of windows, in plain loops: expect, observe, weigh, sum up, factorise, minimise.
 
 The torch twin is `boxreg_ros.core.rounds.run_round_torch`. What a window works with stays in the
 processor's cache from one step to the next.
@@ -8,7 +8,7 @@ processor's cache from one step to the next.
 
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.kernels.arrays import FaceArrays, InverseArrays
+from boxreg_ros.core.kernels.arrays import ExpectedArrays, FaceArrays, InverseArrays
 from boxreg_ros.core.kernels.arrowhead import (
     empty_arrowhead,
     factorise,
@@ -19,13 +19,18 @@ from boxreg_ros.core.kernels.arrowhead import (
 )
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.covariance import empty_covariance_work, fill_posterior
-from boxreg_ros.core.kernels.expectation import fill_evidence
+from boxreg_ros.core.kernels.expectation import (
+    empty_expectation_work,
+    expect,
+    fill_evidence,
+)
 from boxreg_ros.core.kernels.face_support import empty_face_work, observe_window
 from boxreg_ros.core.kernels.lbfgs import empty_search, minimise
 from boxreg_ros.core.kernels.normal_equations import (
     accumulate,
     ANCHOR,
     empty_scratch,
+    GAP,
     marginalise,
     SHARED,
     SIDESLIP,
@@ -74,8 +79,11 @@ class RoundWork(NamedTuple):
 
     Attributes
     ----------
-    points, shape, scratch, search, covariance : tuple
-        Of the parts of the round: `FaceWork`, `ShapeWork`, `Scratch`, `Search`, `CovarianceWork`.
+    expectation, points, shape, scratch, search, covariance : tuple
+        Of the parts of the round: `ExpectationWork`, `FaceWork`, `ShapeWork`, `Scratch`, `Search`
+        and `CovarianceWork`.
+    expected : ExpectedArrays
+        Means and deviations of input and shared variables.
     faces : FaceArrays
         Face observations of the window, its only one.
     inverse : InverseArrays
@@ -87,11 +95,13 @@ class RoundWork(NamedTuple):
 
     """
 
+    expectation: Any
     points: Any
     shape: Any
     scratch: Any
     search: Any
     covariance: Any
+    expected: Any
     faces: Any
     inverse: Any
     x: Any
@@ -103,9 +113,13 @@ def empty_round_work(begin, end, windows, N, numbers):
     """Return arrays for the windows `begin` to `end`."""
     D = POSE * N + SHARED
     return RoundWork(
-        empty_face_work(begin, end, windows, numbers.faces),
+        empty_expectation_work(), empty_face_work(begin, end, windows, numbers.faces),
         empty_shape_work(begin, end, windows, N, numbers.shape.cells),
         empty_scratch(N), empty_search(D, numbers.search.history), empty_covariance_work(N),
+        ExpectedArrays(
+            np.empty(SHARED), np.empty(SHARED), np.empty(POSE), np.empty(POSE), np.empty(POSE),
+            np.empty(GAP),
+        ),
         FaceArrays(
             np.empty((1, N, 6, 4, 4)), np.empty((1, N, 6)), np.empty((1, N, 6)),
             np.empty((1, N, 6)), np.empty((1, N, 2, 6)), np.empty((1, N)),
@@ -128,16 +142,16 @@ def leave_prior(b, terms, work, solution):
 
 
 @kernel
-def run_window(
-    b, windows, thinned, known, prior, every_free, expected, of_class, numbers, work, solution
-):
+def run_window(b, windows, thinned, known, prior, every_free, of_class, numbers, work, solution):
     """Take one round with window `b`, see `run_windows`; return whether it is done."""
     poses, shared, free = solution.poses[b], solution.shared[b], every_free[b]
     search, x, A, kind = numbers.search, work.x, work.A, windows.kind[b]
-    faces, inverse, shape = work.faces, work.inverse, of_class.shape[b]
+    expected, faces, inverse = work.expected, work.faces, work.inverse
+    shape = of_class.shape[b]
     N = len(poses)
     n = POSE * N
     shared[ANCHOR:SIDESLIP] = 0.0
+    expect(b, windows, of_class, known, numbers.expectation, work.expectation, expected)
     observe_window(
         b, windows, poses, shared, known.occlusion_inset[kind], known.range_inset[kind],
         numbers.faces, work.points, 0, faces,
@@ -162,7 +176,7 @@ def run_window(
     shared[:] = x[n:]
     invert_corner(A.corner, inverse.corner)
     fill_evidence(
-        solution.evidence[b, 0], expected.shared[b], expected.deviation[b], shared,
+        solution.evidence[b, 0], expected.shared, expected.deviation, shared,
         inverse.corner, numbers.min_extent_gain, solution.evidence[b, 1:],
     )  # fmt: skip
     if is_done:
@@ -178,8 +192,7 @@ def run_window(
 
 @kernel
 def run_windows(
-    begin, end, rows, windows, thinned, known, prior, free, expected, of_class, numbers, solution,
-    is_done,
+    begin, end, rows, windows, thinned, known, prior, free, of_class, numbers, solution, is_done
 ):  # fmt: skip
     """
     Take one round with the windows `rows[begin:end]`.
@@ -193,13 +206,11 @@ def run_windows(
     windows, thinned : WindowArrays
         Input of the windows, and the same with the points of the rigid shape.
     known : InputArrays
-        Insets of the points, by kind.
+        Noise, margins and population of the input, by kind.
     prior : PriorArrays
         Marginalisation prior.
     free : array, shape (B, 6 N + 23)
         1 for variables that are estimated, 0 for those held fixed.
-    expected : ExpectedArrays
-        Means and deviations of input and shared variables.
     of_class : ClassArrays
         Settings of the class of each window.
     numbers : RoundNumbers
@@ -213,6 +224,5 @@ def run_windows(
     work = empty_round_work(0, len(windows.counts), windows, solution.poses.shape[1], numbers)
     for row in range(begin, end):
         is_done[row] = run_window(
-            rows[row], windows, thinned, known, prior, free, expected, of_class, numbers, work,
-            solution,
+            rows[row], windows, thinned, known, prior, free, of_class, numbers, work, solution,
         )  # fmt: skip

@@ -285,7 +285,7 @@ def weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers, te
     boxes, times = windows.boxes[b], windows.times[b]
     terms.times[:] = times
     terms.inset[:] = faces.inset[row]
-    terms.expected[:] = expected.shared[b]
+    terms.expected[:] = expected.shared
     for n in range(N):
         fill_rotation(poses[n, 3], poses[n, 4], poses[n, 5], terms.axes[n])
         for k in range(6):
@@ -297,17 +297,15 @@ def weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers, te
     )
     for n in range(length):
         scale_moments(faces.moments[row, n], face_weight[n], terms.W_faces[n])
-    deviation, widened = expected.pose_deviation[b], expected.widened_deviation[b]
+    deviation, widened = expected.pose_deviation, expected.widened_deviation
     fill_input_weights(
         poses, shared[BIAS:GAP], length, off_track, deviation, widened, numbers, terms
     )
     weigh_pins(
-        windows.pinned[b], length, widened, expected.unmodelled_bias[b], numbers.pin_deviations,
+        windows.pinned[b], length, widened, expected.unmodelled_bias, numbers.pin_deviations,
         terms.W_input,
     )  # fmt: skip
-    fill_shared_weights(
-        shared, expected.deviation[b], distance, face_weight, length, numbers, terms
-    )
+    fill_shared_weights(shared, expected.deviation, distance, face_weight, length, numbers, terms)
     fill_acceleration_weights(of_class.acceleration[b], length, terms)
     yaw_deviation = max(deviation[5], of_class.pose[b, 5])
     fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked)
