@@ -7,6 +7,7 @@ By a kernel, one call for all windows, or by its torch twin, which is the refere
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from typing import NamedTuple
 
@@ -244,9 +245,12 @@ def run_round_torch(batch: Round, plan: Plan, turn: int, config: Config, rows: T
     done = is_done.nonzero()[:, 0]
     if len(done):
         ended = rows[done]
-        inverse = InverseBlocks(*select(objective.factor, done).inverse_blocks(problem.length))
-        parts = select((problem, found, observations, expected, free), done)
-        covariances = posterior(*parts, inverse=inverse, config=config)
+        inverse = InverseBlocks(*objective.factor.inverse_blocks(problem.length))
+        of_done = partial(select, rows=done)
+        covariances = posterior(
+            of_done(problem), of_done(found), of_done(observations), of_done(expected),
+            of_done(free), of_done(inverse), config,
+        )  # fmt: skip
         _write(covariances, solution.posterior, ended)
         if plan.marginalises and problem.length == config.window and solution.prior is not None:
             prior = select(_prior_of_full(weighted, found, problem), done)
