@@ -7,7 +7,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.kernels import load
 from boxreg_ros.core.kernels.arrays import CropNumbers
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import Floats, Ints, ROLL, Sweep
+from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, YAW
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,16 +131,16 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     centers = boxes[:, :3]
     find = own_points if load() is not None else own_points_numpy
     own = find(sweep, boxes, config)
-    rows, owner = _sampled(own, sweep, n, config)
+    rows, owner = _thinned(own, sweep, n, config)
 
-    points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
+    points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32, 'C')
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
     parts = _slices(owner, n)
     if config.sampling.deskew and sweep.times is not None:
         delays = sweep.times[rows].astype(np.float32)
         sights = _medians(delays, np.bincount(owner, minlength=n))
-    up = matrix_from_rpy(boxes[:, ROLL:])[:, 2, 2]
+    up = np.cos(boxes[:, ROLL:YAW]).prod(1)  # of the z axis of each box, in the fixed frame
     ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
     columns = zip(
         boxes,
@@ -191,9 +191,8 @@ class OwnPoints(NamedTuple):
     Attributes
     ----------
     row, owner : array, shape (P,)
-        Row of the point in its sweep, ascending, and of the box.
-    x : array, shape (P,)
-        Its x coordinate from the centre of the box [m].
+        Row of the point in its sweep, and of the box. Ascending by box, then by the x coordinate
+        of the point.
     road : array, shape (n,)
         Height of the road above the bottom of each box, along its z axis [m]; NaN if unknown.
     num_inside : array, shape (n,)
@@ -203,7 +202,6 @@ class OwnPoints(NamedTuple):
 
     row: Ints
     owner: Ints
-    x: Floats
     road: Floats
     num_inside: Ints
 
@@ -247,8 +245,9 @@ def own_points_numpy(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
     is_own &= height > (np.nan_to_num(road) + GROUND_CLEARANCE).take(near.owner)
     own = np.flatnonzero(is_own)
     own = own[np.argsort(near.row[own], kind='stable')]  # ascending by point, as the kernel has it
+    own = own[_order_by_x(near.owner[own], near.offset[0, own], n)]
     num_inside = np.bincount(near.owner.take(np.flatnonzero(depth <= 0)), minlength=n)
-    return OwnPoints(near.row[own], near.owner[own], near.offset[0, own], road, num_inside)
+    return OwnPoints(near.row[own], near.owner[own], road, num_inside)
 
 
 def _shapes(boxes: Floats, margin: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -308,14 +307,28 @@ def _least_depth(near: Crop, depth: Floats, num_points: int) -> Floats:
     return least.take(near.row)
 
 
-def _sampled(own: OwnPoints, sweep: Sweep, n: int, config: Config) -> tuple[Ints, Ints]:
-    """Return sweep row and box of the points that are kept, ascending by box; (P,) each."""
-    rows = _sorted_by_x(own.row, own.owner, own.x / np.abs(own.x).max(initial=1.0), n)
-    ends = np.cumsum(np.bincount(own.owner, minlength=n)).tolist()
-    parts = [slice(first, last) for first, last in pairwise([0, *ends])]
-    kept = [_thinned(rows[part], sweep.points, config) for part in parts]
-    counts = [len(part) for part in kept]
-    return np.concatenate(kept), np.repeat(np.arange(n), counts)
+def _thinned(own: OwnPoints, sweep: Sweep, n: int, config: Config) -> tuple[Ints, Ints]:
+    """
+    Return sweep row and box of the points of n boxes that are kept, ascending by box; (P,) each.
+
+    Farthest points for the paper, else every n-th.
+
+    """
+    most = config.sampling.points
+    counts = np.bincount(own.owner, minlength=n)
+    first = np.cumsum(counts) - counts
+    is_kept = np.ones(len(own.row), bool)
+    if config.objective == 'paper':
+        for box in np.flatnonzero(counts > most):
+            part = slice(first[box], first[box] + counts[box])
+            picks = farthest_point_sample(sweep.points[own.row[part]].astype(np.float64), most)
+            is_kept[part] = False
+            is_kept[first[box] + picks] = True
+    elif counts.max(initial=0) > most:
+        stride = np.maximum(1, -(-counts // most))
+        place = np.arange(len(own.row)) - first[own.owner]
+        is_kept = place % stride[own.owner] == 0
+    return own.row[is_kept], own.owner[is_kept]
 
 
 def _pairs(points: NDArray[np.floating], centers: Floats, reach: Floats) -> tuple[Ints, Ints]:
@@ -399,27 +412,20 @@ def _flat_heights(heights: Floats, owner: Ints, n: int) -> Floats:
     return np.where(is_road, road - 2.0 * np.arange(n), np.nan)
 
 
-def _sorted_by_x(rows: Ints, owner: Ints, x: Floats, n: int) -> Ints:
+def _order_by_x(owner: Ints, x: Floats, n: int) -> Ints:
     """
-    Return `rows` of the sweep, ascending for each box, sorted by `owner` (one of `n`), then `x`.
+    Return the order of P pairs by `owner`, one of `n`, then by `x`, (P,).
 
     Both are packed into 32 bits. Two stable sorts by 16 bits each, which numpy does by radix, take
-    half the time of one by comparisons. `x` is -1 to 1. Values closer than 2^-23, with 64 boxes,
-    may count as equal and are in the order of their rows: every machine sorts them alike.
+    half the time of one by comparisons. Values closer than 2^-23 of the largest one, with 64
+    boxes, may count as equal and keep their order: every machine sorts them alike.
 
     """
+    x = x / np.abs(x).max(initial=1.0)
     place = ((owner + 0.5 + x / 4) * 2.0 ** (32 - n.bit_length())).astype(np.uint32)
     order = np.argsort(place.astype(np.uint16), kind='stable')
     order = order[np.argsort((place >> 16).astype(np.uint16)[order], kind='stable')]
-    return rows[order]
-
-
-def _thinned(rows: Ints, points: NDArray[np.floating], config: Config) -> Ints:
-    """Return the `rows` of `points` to keep: farthest points for the paper, else every n-th."""
-    most = config.sampling.points
-    if config.objective == 'paper' and len(rows) > most:
-        return rows[farthest_point_sample(points[rows].astype(np.float64), most)]
-    return rows[:: max(1, -(-len(rows) // most))]
+    return np.asarray(order)
 
 
 def farthest_point_sample(points: Floats, count: int) -> Ints:
