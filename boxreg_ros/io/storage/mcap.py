@@ -49,14 +49,14 @@ Parsed here: the library takes 40 us for a chunk, 0.25 s for a recording of 10 G
 """
 MESSAGE_OFFSET = struct.Struct('<HQ')
 """Id of a channel, and where the index of its messages in a chunk is."""
-SUMMARY_RECORDS = {
-    Opcode.SCHEMA: records.Schema,
-    Opcode.CHANNEL: records.Channel,
-    Opcode.STATISTICS: records.Statistics,
-    Opcode.ATTACHMENT_INDEX: records.AttachmentIndex,
-    Opcode.METADATA_INDEX: records.MetadataIndex,
+SUMMARY_RECORDS: dict[int, Callable[[ReadDataStream], records.McapRecord]] = {
+    Opcode.SCHEMA: records.Schema.read,
+    Opcode.CHANNEL: records.Channel.read,
+    Opcode.STATISTICS: records.Statistics.read,
+    Opcode.ATTACHMENT_INDEX: records.AttachmentIndex.read,
+    Opcode.METADATA_INDEX: records.MetadataIndex.read,
 }
-"""Records of the summary that are used, beside the chunk indexes."""
+"""How the records of the summary are parsed that are used, beside the chunk indexes."""
 GROUP_BYTES = 2**22
 """Messages outside of chunks are grouped to chunks of this size [bytes], as writers do."""
 SEARCH_BYTES = 2**20
@@ -212,7 +212,7 @@ class McapFile(ChunkedFile):
             if opcode == Opcode.CHUNK_INDEX:
                 chunks.append(_indexed_chunk(content))
             elif opcode in SUMMARY_RECORDS:
-                found.append(SUMMARY_RECORDS[opcode].read(ReadDataStream(BytesIO(content))))
+                found.append(SUMMARY_RECORDS[opcode](ReadDataStream(BytesIO(content))))
         return found, chunks
 
     # Scan -------------------------------------------------------------------------------------
