@@ -27,6 +27,8 @@ def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
     order = np.argsort(stamps_ns, kind='stable')
     starts = np.flatnonzero(np.diff(stamps_ns[order])) + 1
     for rows in np.split(order, starts):
+        if len(rows) <= MIN_NEIGHBOURS or np.ptp(bottom[rows]) <= MAX_OFFSET:
+            continue  # none can be off the median of the others
         places = boxes[rows][:, [X, Y]]
         near = cdist(places, places) < NEIGHBOURHOOD
         np.fill_diagonal(near, False)

@@ -1,10 +1,12 @@
-"""Pairs of boxes of one stamp that may overlap."""
+"""Pairs of boxes of one stamp that may overlap, found once for all rules."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
+from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.review.rules.protocol import LabelTrack
 from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, X, Z
 import numpy as np
@@ -21,19 +23,26 @@ class Pairs(NamedTuple):
         Indices of the two tracks, ascending.
     stamps_ns : array, shape (k,)
         Their stamp [ns].
-    first, second : array, shape (k, 9)
-        Their boxes.
+    iou : array, shape (k,)
+        3D IoU of their boxes.
 
     """
 
     tracks: Ints
     stamps_ns: Ints
-    first: Floats
-    second: Floats
+    iou: Floats
 
 
-def near_pairs(tracks: Sequence[LabelTrack]) -> Pairs:
-    """Return the pairs whose bounding spheres intersect."""
+class Labels(tuple[LabelTrack, ...]):
+    """The tracks that rules are applied to."""
+
+    @cached_property
+    def near_pairs(self) -> Pairs:
+        """Return the pairs of boxes whose bounding spheres intersect."""
+        return _near_pairs(self)
+
+
+def _near_pairs(tracks: Sequence[LabelTrack]) -> Pairs:
     stamps_ns = np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)])
     boxes = np.concatenate([np.zeros((0, 9)), *(t.boxes for t in tracks)])
     owner = np.repeat(np.arange(len(tracks)), [len(t.boxes) for t in tracks])
@@ -46,4 +55,4 @@ def near_pairs(tracks: Sequence[LabelTrack]) -> Pairs:
         i, j = np.nonzero(is_near & (owner[rows][:, None] < owner[rows]))
         found.append(np.column_stack([rows[i], rows[j]]))
     a, b = np.concatenate(found).T
-    return Pairs(np.column_stack([owner[a], owner[b]]), stamps_ns[a], boxes[a], boxes[b])
+    return Pairs(np.column_stack([owner[a], owner[b]]), stamps_ns[a], iou_3d(boxes[a], boxes[b]))
