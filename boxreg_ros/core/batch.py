@@ -15,6 +15,7 @@ from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.arrowhead import LINK
 from boxreg_ros.core.kernels import contiguous
 from boxreg_ros.core.kernels.arrays import ClassArrays, WindowArrays
+from boxreg_ros.core.track_window import PRIOR_POSES
 from boxreg_ros.structures import Floats, Ints, POSE
 import numpy as np
 import torch
@@ -47,8 +48,6 @@ SIDESLIP = 22
 PADDING_POSITION = 1e6
 """Coordinate of padding points [m]; derived: near no box, and finite in float32."""
 
-PRIOR_POSES = 2
-"""Poses that the marginalisation prior refers to: no residual spans more than three poses."""
 PRIOR_SIZE = PRIOR_POSES * LINK + SHARED
 
 
