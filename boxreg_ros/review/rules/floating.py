@@ -8,7 +8,6 @@ from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation, WARNIN
 from boxreg_ros.structures import Floats, HEIGHT, X, Y, Z
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 NEIGHBOURHOOD = 15.0
 """Boxes within this distance share their ground [m]. Chosen: 1 m off at a slope of 7 %."""
@@ -29,8 +28,8 @@ def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
     for rows in np.split(order, starts):
         if len(rows) <= MIN_NEIGHBOURS or np.ptp(bottom[rows]) <= MAX_OFFSET:
             continue  # none can be off the median of the others
-        places = boxes[rows][:, [X, Y]]
-        near = cdist(places, places) < NEIGHBOURHOOD
+        x, y = boxes[rows][:, [X, Y]].T
+        near = np.hypot(np.subtract.outer(x, x), np.subtract.outer(y, y)) < NEIGHBOURHOOD
         np.fill_diagonal(near, False)
         counts = near.sum(axis=1)
         heights = bottom[rows] - _medians(bottom[rows], near)
