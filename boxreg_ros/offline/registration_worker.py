@@ -17,11 +17,10 @@ from typing import Any, cast
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.core.kernels import load
 from boxreg_ros.core.observation import Observation, stack_origins
 from boxreg_ros.core.registrar import CPU, GetEstimates, Submit, submit_locally
 from boxreg_ros.core.track_window import Estimate, Window
-from boxreg_ros.io.warm_up import warm_up
+from boxreg_ros.io.warm_up import warm_up, warm_up_crop
 from boxreg_ros.offline.compilation import announced_compilation
 from boxreg_ros.offline.reader import uses_one_core
 from boxreg_ros.offline.stopwatch import Stopwatch
@@ -54,7 +53,8 @@ def registration_worker(
         with announced_compilation(announce):
             yield None
         return
-    load()  # the worker then shares what this process imports
+    with announced_compilation(announce):
+        warm_up_crop(config)  # the worker then shares what numba sets up
     with (
         run_in_worker(partial(_serve, config), 'registers windows') as process,
         announced_compilation(announce),
