@@ -96,11 +96,17 @@ def _serve(config: Config, receive: Receive, send: Send) -> None:
     with announced_compilation(send), ThreadPoolExecutor(1) as pool:
         warmed_up = pool.submit(warm_up, config)  # while the first windows fill and are received
         while True:
-            packed, config, model = receive()
+            received = receive()
             warmed_up.result()
-            begun = time.perf_counter()
-            estimates = submit_locally(_unpacked(*packed), config, model)()
-            send((estimates, model.__getstate__(), time.perf_counter() - begun))
+            send(_registered(*received))
+            del received  # before the next windows are received
+
+
+def _registered(packed: Any, config: Config, model: InputModel) -> tuple[Any, ...]:
+    """Return the estimates of windows, the state of the input model, and the time taken [s]."""
+    begun = time.perf_counter()
+    estimates = submit_locally(_unpacked(*packed), config, model)()
+    return estimates, model.__getstate__(), time.perf_counter() - begun
 
 
 def _packed(windows: Sequence[Window]) -> tuple[Any, ...]:
