@@ -78,24 +78,16 @@ class Window(NamedTuple):
         """Return whether all observations but the newest have an estimate to start from."""
         return self.num_new == 1 and len(self.start) == len(self.observations) - 1 > 1
 
-    def margin_part(self) -> 'Window':
+    def margin_columns(self) -> range:
         """
-        Return the observations for the labelling margins, each in one such part only.
+        Return which observations give labelling margins; each does so in one window only.
 
         The newest is left to the next window, which has an estimate to start from. Of many, every
         n-th is taken so that about `MARGIN_OBSERVATIONS` remain.
 
         """
         last = len(self.observations) - 1
-        stride = 1 + self.num_new // MARGIN_OBSERVATIONS
-        part = slice(max(0, last - self.num_new), last, stride)
-        return Window(
-            self.track_id,
-            self.class_name,
-            self.observations[part],
-            self.num_new,
-            self.start[part],
-        )
+        return range(max(0, last - self.num_new), last, 1 + self.num_new // MARGIN_OBSERVATIONS)
 
 
 class Estimate(NamedTuple):

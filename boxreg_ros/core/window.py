@@ -6,7 +6,14 @@ from operator import attrgetter
 from typing import Any
 
 from boxreg_ros.config import Config, KINDS
-from boxreg_ros.core.batch import numbers_of, PRIOR_SIZE, Problem, Returns, SHARED
+from boxreg_ros.core.batch import (
+    numbers_of,
+    PADDING_PERIOD,
+    PRIOR_SIZE,
+    Problem,
+    Returns,
+    SHARED,
+)
 from boxreg_ros.core.observation import Observation, stack_origins
 from boxreg_ros.core.track_window import MarginalisationPrior, Window
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
@@ -23,8 +30,6 @@ An error model that is constant over a track holds for a limited time: 0.97 halv
 after 23 observations.
 
 """
-PADDING_PERIOD = 0.1
-"""Time step of padding observations [s]; any positive number keeps times increasing."""
 MAX_REVERSE_SPEED = 6.0
 """A faster object moves forward [m/s]; chosen: no road vehicle reverses at 22 km/h."""
 KNOWN_FLIP_SHARE = 0.75
