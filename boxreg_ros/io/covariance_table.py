@@ -25,6 +25,7 @@ COVARIANCE_NUMBERS = tuple(
 POSE_TRIANGLE = np.triu_indices(6)
 EXTENT_TRIANGLE = np.triu_indices(3)
 NUM_POSE = len(POSE_TRIANGLE[0])
+NUMBERS_FORMAT = ','.join(['%.7g'] * len(COVARIANCE_NUMBERS)) + '\n'
 
 
 class BoxCovariance(NamedTuple):
@@ -52,8 +53,8 @@ class CovarianceWriter:
 
     def __init__(self, path: Path) -> None:
         self._file = path.open('w', newline='', encoding='utf-8')
-        self._table = csv.writer(self._file, lineterminator='\n')
-        self._table.writerow((*COVARIANCE_KEYS, *COVARIANCE_NUMBERS))
+        self._file.write(','.join((*COVARIANCE_KEYS, *COVARIANCE_NUMBERS)) + '\n')
+        self._row_begins = csv.writer(self._file, lineterminator=',')
 
     def write(self, refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> None:
         """Add a row for each box with an estimate: kept boxes have none."""
@@ -71,8 +72,8 @@ class CovarianceWriter:
         rows = zip(refined.status, boxes.track_ids, distances, numbers.tolist(), strict=True)
         for status, track_id, distance, row in rows:
             if status != KEPT:
-                cells = [f'{number:.7g}' for number in row]
-                self._table.writerow((boxes.stamp_ns, track_id, distance, *cells))
+                self._row_begins.writerow((boxes.stamp_ns, track_id, distance))
+                self._file.write(NUMBERS_FORMAT % tuple(row))
 
     def close(self) -> None:
         """Close the file."""

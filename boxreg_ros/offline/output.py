@@ -86,7 +86,7 @@ class Sink:
         self.corrections = Corrections(
             read_decisions(request.decisions) if request.decisions is not None else ()
         )
-        # These import torch, after the fork of the reader.
+        # These import numba, after the fork of the reader.
         from boxreg_ros.review.changes import Changes
         from boxreg_ros.review.track_points import PointCollector
 

@@ -105,7 +105,7 @@ def relabel(
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         plan, completion = _survey(request, clock, shown, journal)
         receive = workers.enter_context(reader(request))
-        # The recording is opened while this process imports torch, which takes a second.
+        # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
 

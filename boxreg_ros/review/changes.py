@@ -168,7 +168,8 @@ class Changes:
         found = []
         for track_id, rows in self._rows_by_track(counts[:, 0]).items():
             parts = zip(*(self._names[row] for row in rows), strict=True)
-            _, classes, status, reasons, input_ids = parts
+            _, classes, words, reasons, input_ids = parts
+            status = np.array(words)
             is_refined = np.isin(status, (REFINED, HUMAN))
             unknown = np.where(is_refined, 0.0, np.nan)[:, None]
             found.append(
@@ -185,7 +186,7 @@ class Changes:
                     face_distances=face_distances[rows],
                     outside=outside[rows, 0],
                     is_flipped=errors.is_flipped[rows] & is_refined,
-                    status=np.array(status),
+                    status=status,
                     reasons=np.array(reasons),
                     num_points=counts[rows, 1],
                 )

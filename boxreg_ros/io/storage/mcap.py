@@ -3,6 +3,7 @@ MCAP files: read by their index, or scanned record by record where the index is 
 
 The records are parsed by the mcap library. Its readers stop at the first error; here a damaged
 chunk is left out and noted, and after a damaged record the next plausible chunk is searched for.
+They also copy the bytes of a message three times; here messages are views of their chunk.
 
 """
 
@@ -13,16 +14,16 @@ from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 import struct
-from typing import NamedTuple, TypeVar
+from typing import Any, cast, IO, NamedTuple, TypeVar
 import zlib
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.chunks import Chunk, ChunkedFile, MAX_CHUNK_BYTES, StoredMessage
-from boxreg_ros.io.storage.record import Definition, one_line
+from boxreg_ros.io.storage.record import Bytes, Definition, one_line
+from lz4.frame import decompress as decompress_lz4
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.stream_reader import breakup_chunk
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -57,6 +58,7 @@ SUMMARY_RECORDS: dict[int, Callable[[ReadDataStream], records.McapRecord]] = {
     Opcode.METADATA_INDEX: records.MetadataIndex.read,
 }
 """How the records of the summary are parsed that are used, beside the chunk indexes."""
+DEFINITIONS: dict[int, Any] = {Opcode.SCHEMA: records.Schema, Opcode.CHANNEL: records.Channel}
 GROUP_BYTES = 2**22
 """Messages outside of chunks are grouped to chunks of this size [bytes], as writers do."""
 SEARCH_BYTES = 2**20
@@ -341,17 +343,23 @@ class McapFile(ChunkedFile):
             self._channels.setdefault(record.id, record)
 
     def _unpack(self, chunk: Chunk) -> list[StoredMessage]:
+        content = memoryview(_content(self._chunk_record(chunk)))
+        stream = _stream_of(content)
         found = []
-        for record in breakup_chunk(self._chunk_record(chunk), validate_crc=True):
-            if isinstance(record, records.Message):
+        while stream.count < len(content):
+            opcode, length = stream.read1(), stream.read8()
+            if opcode == Opcode.MESSAGE:
+                record = records.Message.read(stream, length)
                 found.append(
                     StoredMessage(
                         record.channel_id, record.log_time, record.data,
                         record.publish_time, record.sequence,
                     )
                 )  # fmt: skip
-            elif not self.is_indexed:
-                self._add_definition(record)
+                continue
+            body = stream.read(length)
+            if opcode in DEFINITIONS and not self.is_indexed:
+                self._add_definition(DEFINITIONS[opcode].read(ReadDataStream(BytesIO(body))))
         return found
 
     def _chunk_record(self, chunk: Chunk) -> records.Chunk:
@@ -362,9 +370,8 @@ class McapFile(ChunkedFile):
             return records.Chunk('', data, chunk.last_ns, chunk.start_ns, 0, size)
         if data[:1] != bytes([Opcode.CHUNK]):
             raise RecordingError('no chunk at the place that the index names')
-        stream = BytesIO(data)  # shares the bytes
-        stream.seek(HEAD_BYTES)
-        record: records.Chunk = records.Chunk.read(ReadDataStream(stream))
+        view = memoryview(data)[HEAD_BYTES:]
+        record: records.Chunk = records.Chunk.read(_stream_of(view))
         if record.compression == 'zstd':
             size = zstandard.frame_content_size(record.data)
             if size not in (-1, record.uncompressed_size):
@@ -390,6 +397,40 @@ def _indexed_chunk(content: bytes) -> Chunk:
     offsets = content[INDEX_HEAD.size : INDEX_HEAD.size + offsets_size]
     counts = {channel: 1 for channel, _ in MESSAGE_OFFSET.iter_unpack(offsets)}
     return Chunk(first_byte, first_byte + length, start_ns, last_ns, counts)
+
+
+class _Views:
+    """A file in memory whose parts are read as views, not as copies."""
+
+    def __init__(self, content: memoryview) -> None:
+        self._content = content
+        self._position = 0
+
+    def read(self, length: int) -> memoryview:
+        """Return the next bytes; fewer at the end."""
+        begin = self._position
+        self._position = begin + length
+        return self._content[begin : self._position]
+
+
+def _stream_of(content: memoryview) -> ReadDataStream:
+    """Return the stream that the records of the library are read from."""
+    return ReadDataStream(cast(IO[bytes], _Views(content)))
+
+
+def _content(chunk: records.Chunk) -> Bytes:
+    """Return the content of a chunk; RecordingError if it is damaged or cannot be unpacked."""
+    content: Bytes = chunk.data
+    if chunk.compression == 'zstd':
+        content = zstandard.decompress(content, chunk.uncompressed_size)
+    elif chunk.compression == 'lz4':
+        content = decompress_lz4(content)
+    elif chunk.compression:
+        names = ', '.join(map(repr, COMPRESSIONS))
+        raise RecordingError(f'compression: expected one of {names}, got {chunk.compression!r}')
+    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
+        raise RecordingError('its content is not that of its checksum')
+    return content
 
 
 def _is_within(chunk: Chunk, size: int) -> bool:
