@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from boxreg_ros import __version__
 from boxreg_ros.allocation import collect_rarely, keep_freed_memory
-from boxreg_ros.errors import BoxregError, ConfigError
+from boxreg_ros.errors import BoxregError, ConfigError, remedy_of
 
 
 class Command(NamedTuple):
@@ -116,7 +116,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (BoxregError, OSError) as error:
         if is_debug:
             raise
-        return _fail(str(error), WRONG_USAGE if isinstance(error, ConfigError) else FAILED)
+        remedy = f'; {remedy_of(error)}' if isinstance(error, OSError) else ''
+        status = WRONG_USAGE if isinstance(error, ConfigError) else FAILED
+        return _fail(f'{error}{remedy}', status)
     except Exception as error:
         if is_debug:
             raise

@@ -24,6 +24,7 @@ MEASUREMENTS = {
     'lidars': Measurement('lidars', 'accuracy on a truck with LiDARs at its corners'),
     'covariance': Measurement('covariance', 'covariances against errors, by estimate and class'),
     'review': Measurement('review', 'how early the review list shows the bad tracks'),
+    'report': Measurement('report', 'first paint and frame times of report.html'),
     'speed': Measurement('speed.command', 'time per tick, per box and per window'),
     'scale': Measurement('scale', 'core hours and memory per hour, and a simulated fleet'),
     'load': Measurement('load', 'latency and accuracy of the live node by number of tracks'),

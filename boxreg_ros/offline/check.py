@@ -38,7 +38,10 @@ def run(args: argparse.Namespace) -> int:
     config = Config() if args.config is None else Config.from_yaml(args.config)
     tracks = _tracks(args.source, config)
     if not tracks:
-        raise RecordingError(f'{args.source}: expected boxes with a track id, got none')
+        raise RecordingError(
+            f'{args.source}: expected boxes with a track id, got none; run a tracker first, or '
+            f'boxreg relabel --associate'
+        )
     found = violations(tracks)
     if args.json:
         print(json.dumps(_report(tracks, found)))
