@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.review.changes import TrackChanges
+from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, Floats, KEPT, LENGTH, WIDTH, X, Y, YAW
 import numpy as np
 from scipy.special import erf
@@ -49,6 +50,11 @@ MIN_SIZE_SPREAD = 0.03
 """Least relative deviation of the extents of a class. Chosen: models of one maker differ so."""
 QUARTILES_TO_DEVIATION = 0.74
 """Standard deviation over interquartile range of a normal variable. Derived: 1 / 1.349."""
+MIN_TRAVELLED = 0.5
+"""Lengths that a track must have travelled to show a path. Chosen: errors of the centre are
+smaller."""
+FACE_PAIRS = ('ends', 'sides', 'top and bottom')
+"""Names of the faces across each axis of a box."""
 FEW_POINTS = 10
 """Boxes with fewer points are reported as such. Chosen."""
 
@@ -138,12 +144,13 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     misfit = _folded_mean(off, face_pairs) / across
     turn = deviations[:, 3] * length / (2 * width)
     is_refined = track.is_refined
-    losses = {
-        'uncertain position and size': ONE_OF_PAIR * uncertain.sum(axis=1),
-        'uncertain heading': MEAN_OF_NORMAL * turn,
-        'faces off their points': (misfit - uncertain).sum(axis=1),
-        'points left outside': _left_outside(track, extents, usual.outside),
-    }
+    losses = {'uncertain heading': MEAN_OF_NORMAL * turn}
+    for axis, faces in enumerate(FACE_PAIRS):
+        pair = slice(2 * axis, 2 * axis + 2)
+        losses[f'uncertain {faces}'] = ONE_OF_PAIR * uncertain[:, pair].sum(axis=1)
+        losses[f'{faces} off their points'] = (misfit - uncertain)[:, pair].sum(axis=1)
+    losses['heading off its path'] = _heading_off_path(track) * length / (2 * width)
+    losses['points left outside'] = _left_outside(track, extents, usual.outside)
     losses = {reason: np.where(is_refined, loss, 0.0) for reason, loss in losses.items()}
     is_kept = track.status == KEPT
     losses['kept as in the input'] = np.where(is_kept, KEPT_LOSS, 0.0)
@@ -154,14 +161,28 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     return Risk(total.clip(max=MAX_LOSS * REFERENCE_LENGTH / 2), parts)
 
 
-def reasons_of(track: TrackChanges, risk: Risk, row: int | None = None) -> str:
-    """Return why a track, or its box in `row`, has its risk, in words, largest part first."""
-    values = {
-        reason: part.mean() if row is None else part[row] for reason, part in risk.parts.items()
+def typical_parts(risks: Sequence[Risk]) -> dict[str, float]:
+    """Return the median of each part over the tracks [m]; none for fewer than `MIN_COMPARED`."""
+    if len(risks) < MIN_COMPARED:
+        return {}
+    means = {
+        reason: [float(risk.parts[reason].mean()) for risk in risks] for reason in risks[0].parts
     }
-    largest = sorted(values.items(), key=lambda item: -item[1])
-    words = [f'{reason} ({value:.2f} m)' for reason, value in largest[:3] if value >= 0.01]
-    points = float(np.median(track.num_points)) if row is None else float(track.num_points[row])
+    return {reason: float(np.median(values)) for reason, values in means.items()}
+
+
+def reasons_of(track: TrackChanges, risk: Risk, typical: Mapping[str, float]) -> str:
+    """
+    Return why a track has its risk, in words.
+
+    First the part that exceeds the `typical` one of the recording most: what all tracks have in
+    common is no reason to open this one.
+
+    """
+    values = {reason: float(part.mean()) for reason, part in risk.parts.items()}
+    largest = sorted(values, key=lambda reason: typical.get(reason, 0.0) - values[reason])
+    words = [f'{name} ({values[name]:.2f} m)' for name in largest[:3] if values[name] >= 0.01]
+    points = float(np.median(track.num_points))
     if points < FEW_POINTS:
         words.append(f'few points ({points:.0f} per box)')
     kept = Counter(filter(None, track.reasons.tolist()))
@@ -202,6 +223,33 @@ def _left_outside(track: TrackChanges, extents: Floats, usual: float) -> Floats:
     fill = (extents / (extents + 2 * NEAR_MARGIN)).prod(axis=1) / USUAL_FILL
     shift = excess * fill.clip(max=1.0)
     return np.asarray(2 * shift / (1 + shift))
+
+
+def _heading_off_path(track: TrackChanges) -> float:
+    """
+    Return the angle from the heading of a track to its path that its motion does not explain.
+
+    The regression of the sideways on the forward steps, whatever the direction of travel. Its mean
+    over n steps at a speed v has the deviation `sideslip`, and `slip` / (v sqrt(n)) of the steps.
+    What it is beyond `MAX_DEVIATIONS` counts [rad].
+
+    """
+    is_known = np.isfinite(track.boxes[:, X])
+    boxes = track.boxes[is_known]
+    if len(boxes) < 2:
+        return 0.0
+    steps = np.diff(boxes[:, [X, Y]], axis=0)
+    yaw = boxes[:-1, YAW] + wrap_angle(np.diff(boxes[:, YAW])) / 2
+    forward = steps[:, 0] * np.cos(yaw) + steps[:, 1] * np.sin(yaw)
+    sideways = steps[:, 1] * np.cos(yaw) - steps[:, 0] * np.sin(yaw)
+    seconds = np.ptp(track.stamps_ns[is_known]) * 1e-9
+    travelled = np.abs(forward).sum()
+    if not travelled > MIN_TRAVELLED * boxes[:, LENGTH].mean():
+        return 0.0
+    angle = np.abs((forward * sideways).sum() / (forward**2).sum())
+    settings = DEFAULTS.class_config(track.class_name)
+    of_steps = settings.slip * seconds / travelled / np.sqrt(len(steps))
+    return float(max(0.0, angle - MAX_DEVIATIONS * np.hypot(settings.sideslip, of_steps)))
 
 
 def _unlike(track: TrackChanges, extents: Floats, usual: Usual) -> Floats:
