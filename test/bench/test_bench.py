@@ -7,11 +7,10 @@ import sys
 
 from boxreg_ros import __version__, cli
 from boxreg_ros.bench import main as bench
-from boxreg_ros.bench import review
 from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
-from boxreg_ros.bench.review import with_pins
+from boxreg_ros.bench.review import _without_constant_error, with_pins
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
@@ -213,7 +212,7 @@ def test_errors_that_are_constant_in_the_box_frame_are_removed(folder):
         columns = ('refined',), ('',), np.ones(1, int), np.eye(6)[None]
         changes.add(array, RefinedBoxes(array, *columns))
     (track,) = changes.tracks()
-    found = review._without_constant_error(drive, track)
+    found = _without_constant_error(drive, track)
     np.testing.assert_allclose(found.boxes, truth.boxes[is_car], atol=1e-9)
 
 
