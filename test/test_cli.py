@@ -260,7 +260,8 @@ def test_unknown_class_names_are_named_with_their_kind(tmp_path, capsys):
 
 
 def _name_first(boxes, name):
-    boxes.detections[0].results[0].hypothesis.class_id = name
+    for result in boxes.detections[0].results:
+        result.hypothesis.class_id = name
 
 
 def test_a_lag_beyond_the_window_is_refused(tmp_path, capsys):

@@ -51,6 +51,24 @@ def test_risk_is_the_expected_loss_of_overlap():
         np.testing.assert_allclose(parts[f'uncertain {faces}'], expected)
 
 
+def test_estimates_that_disagree_beyond_their_deviations_raise_the_risk():
+    # Boxes of a length of 4.5 m that are .5 m apart share 4 of 5 m.
+    array = BoxArray(0, 'odom', ('1',), ('car',), np.ones(1), np.array([CAR]))
+    early = BoxArray(0, 'odom', ('1',), ('car',), np.ones(1), np.array([CAR]))
+    early.boxes[0, 0] += 0.5
+    parts = []
+    for deviation in (1e-6, 0.3):
+        changes = Changes('odom')
+        columns = ('refined',), ('',), np.array([50]), deviation**2 * np.eye(6)[None]
+        spread = {'extent_covariances': 1e-12 * np.eye(3)[None]}
+        refined, before = (RefinedBoxes(boxes, *columns, **spread) for boxes in (array, early))
+        changes.add(array, refined, before)
+        (track,) = changes.tracks()
+        parts.append(assess(track).parts['estimates disagree'])
+    np.testing.assert_allclose(parts[0], (1 - 4 / 5) * 4.5 / 2, rtol=1e-3)
+    assert parts[1] == 0  # the deviations explain it
+
+
 def test_a_face_far_off_its_points_costs_its_distance():
     # .33 m beyond the .03 m of a car's surface is certain: the loss is .3 / 1.8, less what the
     # deviation of the face costs anyway.
@@ -116,7 +134,7 @@ def test_tables_list_the_riskiest_track_first(tmp_path):
     assert [line['rank'] for line in lines] == ['1', '2', '3']
     risks = [float(line['risk_m']) for line in lines]
     assert risks == sorted(risks, reverse=True)
-    assert 'uncertain ends' in lines[0]['reasons']
+    assert 'uncertain heading' in lines[0]['reasons']
 
 
 def test_the_first_reason_is_what_other_tracks_do_not_have():
