@@ -298,7 +298,7 @@ def test_the_remedy_of_a_file_is_that_of_the_cause():
         (['relabel', '{}/none.mcap', '-o', '{}/out'], 'correct its path'),
         (['evaluate', '{}/none.csv', '{}/none.csv'], 'correct its path'),
         (['evaluate', '{}', '{}'], 'name a file in this folder'),
-        (['check', 'csv:{}/none.csv'], 'correct its path'),
+        (['check', 'csv:{}/none.csv'], 'correct the path'),
         (['relabel', '{}/drive', '-o', '{}/out', '--config', '{}/none'], 'correct its path'),
         (['relabel', '{}/drive', '-o', '{}/out', '--decisions', '{}/none'], 'correct its path'),
     ],
@@ -443,7 +443,7 @@ def test_a_run_that_is_interrupted_in_a_step_leaves_no_files(tmp_path, step):
         [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=60
     )
     assert (done.returncode, done.stderr) == (130, 'boxreg: interrupted; nothing was written\n')
-    assert list((tmp_path / 'r').iterdir()) == []
+    assert list((tmp_path / 'r').glob('*')) == []
 
 
 def test_a_run_under_nohup_ignores_sighup(tmp_path):
