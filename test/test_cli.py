@@ -312,7 +312,9 @@ def test_errors_of_files_have_the_remedy_of_their_cause(tmp_path, capsys, words,
     assert remedy in line
 
 
-@pytest.mark.parametrize('command', [['--help'], [], ['relabel', '--help'], ['relable']])
+@pytest.mark.parametrize(
+    'command', [['--help'], [], ['relabel', '--help'], ['relable'], ['bench', '--help']]
+)
 def test_parsing_imports_no_large_library(command):
     code = (
         'import sys\n'
