@@ -6,8 +6,10 @@ numbers each and the shared variables s, the same for all observations, see `Sta
 
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import chain
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -46,6 +48,9 @@ SIDESLIP = 22
 
 PADDING_POSITION = 1e6
 """Coordinate of padding points [m]; derived: near no box, and finite in float32."""
+
+PADDING_PERIOD = 0.1
+"""Time step of padding observations [s]; any positive number keeps times increasing."""
 
 PRIOR_POSES = 2
 """Poses that the marginalisation prior refers to: no residual spans more than three poses."""
@@ -221,6 +226,28 @@ class Problem(NamedTuple):
             pivot=of_class('pivot'),
         )
 
+    def part(self, windows: Sequence[int], columns: Sequence[Sequence[int]]) -> 'Problem':
+        """
+        Return some `windows` with some of their observations only.
+
+        Of each window those in its `columns`, at least one. Marginalised observations are left
+        out: their extents are not counted, their prior is kept.
+
+        """
+        lengths = torch.tensor(list(map(len, columns)))
+        valid = torch.arange(int(lengths.max())) < lengths[:, None]
+        column = torch.tensor([c[-1] for c in columns])[:, None].repeat(1, valid.shape[1])
+        column[valid] = torch.tensor(list(chain.from_iterable(columns)))
+        device = self.valid.device
+        valid, column = valid.to(device), column.to(device)
+        row = torch.tensor(windows, device=device)[:, None]
+        observed = {name: getattr(self, name)[row, column] for name in OBSERVED}
+        observed['times'] = observed['times'] + PADDING_PERIOD * (~valid).cumsum(1)
+        of_window = {name: getattr(self, name)[row[:, 0]] for name in OF_WINDOW}
+        none = torch.zeros_like(of_window['marginalised_extents'])
+        whole = self._replace(**observed, **of_window, valid=valid)
+        return whole._replace(marginalised_extents=none)
+
     def thinned(self, points: float) -> 'Problem':
         """Return the problem with every n-th point: at least `points` per box, if there are."""
         returns = self.returns
@@ -229,6 +256,14 @@ class Problem(NamedTuple):
         counts = -(-self.counts // stride)
         returns = replace(returns, width=width, stride=stride * returns.stride)
         return self._replace(returns=returns, counts=counts)
+
+
+OBSERVED = ('boxes', 'start', 'times', 'first', 'counts', 'origins', 'ground', 'pinned')
+"""Fields of `Problem` with one value per observation, besides `valid`."""
+OF_WINDOW = (
+    'prior_mean', 'prior_information', 'marginalised_extents', 'class_numbers', 'kind'
+)  # fmt: skip
+"""Fields of `Problem` with one value per window."""
 
 
 class State(NamedTuple):

@@ -4,6 +4,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import InverseBlocks, product
 from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Posterior, Problem, SHARED, State
 from boxreg_ros.core.expectation import Expectation
+from boxreg_ros.core.face_support import FaceObservations
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
 from boxreg_ros.core.input_noise import (
     MAX_CORRELATION,
@@ -11,6 +12,7 @@ from boxreg_ros.core.input_noise import (
     MIN_POWER,
     OBSERVATIONS_FOR_HALF_WEIGHT,
 )
+from boxreg_ros.core.kernels.arrays import CovarianceNumbers
 from boxreg_ros.core.weights import face_deviations
 import torch
 from torch import Tensor
@@ -47,12 +49,26 @@ UNDERRATED = slice(EXTENT.start, GAP.stop)
 """Shared variables of (M28): those, and the labelling margins, for the errors of faces."""
 
 
+def covariance_numbers() -> CovarianceNumbers:
+    """Return the constants for the kernel."""
+    return CovarianceNumbers(
+        residual_correlation=RESIDUAL_CORRELATION,
+        max_correlation=MAX_CORRELATION,
+        half_weight=float(OBSERVATIONS_FOR_HALF_WEIGHT),
+        min_left=MIN_LEFT,
+        min_power=MIN_POWER,
+        min_weight=MIN_WEIGHT,
+        min_duration=MIN_DURATION,
+        time_deviation=TIME_DEVIATION,
+        heading_deviation=HEADING_MODEL_DEVIATION,
+        correlated_faces=CORRELATED_FACES,
+    )
+
+
 def posterior(
     problem: Problem,
     state: State,
-    moments: Tensor,
-    inset: Tensor,
-    weight: Tensor,
+    observations: FaceObservations,
     expected: Expectation,
     free: Tensor,
     inverse: InverseBlocks,
@@ -67,8 +83,8 @@ def posterior(
         B windows.
     state : State
         Their estimate.
-    moments, inset, weight : Tensor, shapes (B, N, 6, 4, 4), (B, N, 6) and (B, N, 6)
-        Of the `FaceObservations` of the last round.
+    observations : FaceObservations
+        Of the last round.
     expected : Expectation
         Means and deviations of the last round.
     free : Tensor, shape (B, 6 N + 23)
@@ -81,9 +97,8 @@ def posterior(
     """
     R = rotation_from_rpy(state.pose[..., 3:])
     estimated = free[:, -SHARED:][:, INPUT_ERRORS]
-    distances = _face_distances(problem, state, expected, R, moments[..., 3, :3], inset)
-    distances = torch.where(weight > 0, distances, 0.0)
-    of_faces = _correlated_information(problem, weight, distances, expected, config)
+    distances = _face_distances(problem, state, expected, R, observations)
+    of_faces = _correlated_information(problem, observations.weight, distances, expected, config)
     underrated = torch.cat([_underrated_information(expected, estimated), of_faces], 1)
     columns = inverse.border[..., UNDERRATED]  # (B, N, 6, 15)
     poses = inverse.links + product(columns * underrated[:, None, None], columns.mT)
@@ -148,7 +163,7 @@ def _variance_of_mean(residuals: Tensor, is_seen: Tensor) -> Tensor:
     first, second = residuals[:, :-1] * both, residuals[:, 1:] * both
     power = (first**2 + second**2).sum((1, 2)) / 2
     ratio = (first * second).sum((1, 2)) / power.clamp(min=MIN_POWER)
-    n = is_seen.sum((1, 2)) / is_seen.any(1).sum(1).clamp(min=1)
+    n = is_seen.sum((1, 2)).to(residuals) / is_seen.any(1).sum(1).clamp(min=1)
     n = n.clamp(min=1)
     unbiased = (ratio + 1 / n) / (1 - 4 / n).clamp(min=MIN_LEFT)
     correlation = RESIDUAL_CORRELATION + _weight_of(n) * (unbiased - RESIDUAL_CORRELATION)
@@ -195,20 +210,19 @@ def _face_distances(
     state: State,
     expected: Expectation,
     R: Tensor,
-    centroid: Tensor,
-    inset: Tensor,
+    observations: FaceObservations,
 ) -> Tensor:
     """
     Return the mean of (M2) over the outermost points of each face, shape (B, N, 6) [m].
 
     With the labelling margins `expected` by other tracks: those of the estimate would take up the
-    error of extents that are held. `R` (B, N, 3, 3) are the axes of the boxes, `centroid`
-    (B, N, 6, 3) is that of the points, from the centre of the input box [m].
+    error of extents that are held. 0 without points. `R` (B, N, 3, 3) are the axes of the boxes.
 
     """
+    centroid = observations.moments[..., 3, :3]  # from the centre of the input box [m]
     normals = R.mT[..., FACE_AXIS, :] * FACE_SIGN.to(R)[:, None]  # (B, N, 6, 3)
     shift = (state.pose - problem.pose)[..., None, :3]
     outward = ((centroid - shift) * normals).sum(-1)
     half = state.shared[:, EXTENT][:, FACE_AXIS] / 2
-    surface = (half - expected.shared[:, GAP])[:, None] - inset
-    return outward - surface
+    surface = (half - expected.shared[:, GAP])[:, None] - observations.inset
+    return torch.where(observations.weight > 0, outward - surface, 0.0)

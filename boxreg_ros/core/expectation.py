@@ -1,8 +1,8 @@
 """
 Means and deviations of a batch before its points are used (M15), and evidence beyond them (M17).
 
-By a kernel, or by its torch twin, which is the reference. docs/method.md, section Input model, has
-the formulas.
+By torch; the kernel of a round does the same for one window. docs/method.md, section Input model,
+has the formulas.
 
 """
 
@@ -22,8 +22,7 @@ from boxreg_ros.core.batch import (
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.geometry import FACE_AXIS
 from boxreg_ros.core.input_noise import InputNoise, UNKNOWN_NOISE
-from boxreg_ros.core.kernels import compiled, run
-from boxreg_ros.core.kernels.arrays import ExpectationNumbers, ExpectedArrays, InputArrays
+from boxreg_ros.core.kernels.arrays import ExpectationNumbers, InputArrays
 from boxreg_ros.core.population import Population, POPULATION_RADIUS, UNKNOWN_POPULATION
 from boxreg_ros.structures import Floats
 import numpy as np
@@ -108,14 +107,47 @@ class Expectation(NamedTuple):
     input_error: Tensor
 
 
-def expect(
-    problem: Problem,
-    offsets: FaceOffsets,
-    noise: InputNoise = UNKNOWN_NOISE,
-    population: Population = UNKNOWN_POPULATION,
-) -> Expectation:
+class Known(NamedTuple):
     """
-    Return the expectation of a batch, given margins, noise and population of the input (M15).
+    What is known of the input of a stream, see `InputModel`.
+
+    Attributes
+    ----------
+    offsets : FaceOffsets
+        Labelling margins and insets.
+    noise : InputNoise
+        Errors of poses and extents.
+    population : Population
+        Evidence of the points about extents.
+
+    """
+
+    offsets: FaceOffsets
+    noise: InputNoise = UNKNOWN_NOISE
+    population: Population = UNKNOWN_POPULATION
+
+    def arrays(self) -> InputArrays:
+        """Return margins, noise and population for the kernels."""
+        deviation, correlation, offset, weight = map(_by_kind, self.noise)
+        gap_correction, occlusion_inset, range_inset = map(_by_kind, self.offsets)
+        median, slopes = self.population.slopes()
+        return InputArrays(
+            deviation, correlation, offset, weight[:, 0], gap_correction, occlusion_inset,
+            range_inset, median, slopes,
+        )  # fmt: skip
+
+
+def _by_kind(part: Tensor) -> Floats:
+    """Return values by kind (K, ...), of one row for all kinds if it has no such axis."""
+    values = part.numpy()
+    if values.ndim == 1:
+        values = np.tile(values, (len(KINDS), 1))
+    return values.astype(np.float64, copy=False)
+
+
+def expect(problem: Problem, known: Known) -> Expectation:
+    """
+    Return the expectation of a batch, given what is `known` of the input (M15).
 
     Notes
     -----
@@ -129,87 +161,10 @@ def expect(
     larger than cars, in proportion: of trams, and of machines with booms.
 
     """
-    by_kernel = compiled(problem.boxes) is not None
-    return (expect_compiled if by_kernel else expect_torch)(problem, offsets, noise, population)
-
-
-def expect_compiled(
-    problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
-) -> Expectation:
-    """Return the same as `expect`, by the kernel."""
-    arrays, widening, slow = _expected_arrays(problem, offsets, noise, population)
-    shared, deviation, pose, widened, bias = map(torch.from_numpy, arrays)
-    spread = torch.from_numpy(widening), torch.from_numpy(slow)
-    error = _input_error(problem, noise.of(problem), *spread)
-    error = _at_least_prior(problem, error, deviation)
-    return Expectation(shared, deviation, pose, widened, bias, error)
-
-
-def _expected_arrays(
-    problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
-) -> tuple[ExpectedArrays, Floats, Floats]:
-    """Return what the kernel writes."""
-    kernels = compiled(problem.boxes)
-    assert kernels is not None
-    B = len(problem.boxes)
-    expected = ExpectedArrays(*(np.empty((B, size)) for size in (SHARED, SHARED, 6, 6, 6)))
-    widening, slow = np.empty((B, 3)), np.empty((B, 1))
-    run(
-        kernels.expectation.expect, B, problem.arrays(), problem.class_arrays(),
-        input_arrays(offsets, noise, population), _expectation_numbers(), expected, widening, slow,
-    )  # fmt: skip
-    return expected, widening, slow
-
-
-def input_arrays(
-    offsets: FaceOffsets,
-    noise: InputNoise = UNKNOWN_NOISE,
-    population: Population = UNKNOWN_POPULATION,
-) -> InputArrays:
-    """Return margins, noise and population of the input for the kernels."""
-
-    def by_kind(part: Tensor) -> Floats:
-        values = part.numpy()
-        if values.ndim == 1:
-            values = np.tile(values, (len(KINDS), 1))
-        return values.astype(np.float64, copy=False)
-
-    deviation, correlation, offset, weight = map(by_kind, noise)
-    gap_correction, occlusion_inset, range_inset = map(by_kind, offsets)
-    median, slopes = population.slopes()
-    return InputArrays(
-        deviation, correlation, offset, weight[:, 0], gap_correction, occlusion_inset, range_inset,
-        median, slopes,
-    )  # fmt: skip
-
-
-def _expectation_numbers() -> ExpectationNumbers:
-    return ExpectationNumbers(
-        low_noise_ratio=LOW_NOISE_RATIO,
-        ratio_bounds=RATIO_BOUNDS,
-        typical_correlation=TYPICAL_CORRELATION,
-        correlation_interval=CORRELATION_INTERVAL,
-        white_correlation=WHITE_CORRELATION,
-        correlation_span=CORRELATION_SPAN,
-        filtered_offset=FILTERED_OFFSET,
-        max_filtered_bias=MAX_FILTERED_BIAS,
-        yaw_bias=YAW_BIAS,
-        population_radius=POPULATION_RADIUS,
-        large_extent=LARGE_EXTENT,
-        pinned_extent=PINNED_EXTENT,
-        pinned_margins=PINNED_MARGINS,
-        pivot_deviation=PIVOT_DEVIATION,
-    )
-
-
-def expect_torch(
-    problem: Problem, offsets: FaceOffsets, noise: InputNoise, population: Population
-) -> Expectation:
-    """Return the same as `expect`, by torch."""
     valid = problem.valid
     usual = problem.of_class(*POSE_ERRORS)
     usual_extent = problem.of_class('extent')
-    noise = noise.of(problem)
+    noise = known.noise.of(problem)
 
     # Deviations: the expected ones, and by the weight of the noise the estimated ones.
     ratio = noise.deviation[:, :6]
@@ -235,7 +190,7 @@ def expect_torch(
     # Extents: the mean of the input, corrected by the population.
     mean = mean_input_extents(problem)
     part = usual_extent * slow[:, 6:] * (2 * constant[:, :3]).clamp(max=1)
-    extent = mean * population.factors(problem, mean, part)
+    extent = mean * known.population.factors(problem, mean, part)
 
     one = torch.ones_like(usual)
     size = (mean / mean.new_tensor(LARGE_EXTENT)).clamp(min=1)[:, FACE_AXIS]
@@ -246,7 +201,7 @@ def expect_torch(
     unmodelled = torch.where(has_pin, bias, 0.0)
     spread = torch.where(has_pin, PINNED_MARGINS, 1.0) * spread
     bias = torch.where(has_pin, PINNED_EXTENT, bias)
-    shared = expected_shared(problem, offsets, mean)
+    shared = shared_without_population(problem, known.offsets)
     shared[:, EXTENT] = torch.where(has_pin, mean, extent)
     sideslip = problem.of_class('sideslip')
     pivot = mean[:, :1] * PIVOT_DEVIATION
@@ -259,6 +214,28 @@ def expect_torch(
         deviation * widening[:, :6],
         unmodelled,
         _at_least_prior(problem, input_error, deviations),
+    )
+
+
+def expectation_numbers() -> ExpectationNumbers:
+    """Return the constants for the kernel."""
+    return ExpectationNumbers(
+        low_noise_ratio=LOW_NOISE_RATIO,
+        ratio_bounds=RATIO_BOUNDS,
+        typical_correlation=TYPICAL_CORRELATION,
+        correlation_interval=CORRELATION_INTERVAL,
+        white_correlation=WHITE_CORRELATION,
+        correlation_span=CORRELATION_SPAN,
+        filtered_offset=FILTERED_OFFSET,
+        max_filtered_bias=MAX_FILTERED_BIAS,
+        yaw_bias=YAW_BIAS,
+        population_radius=POPULATION_RADIUS,
+        large_extent=LARGE_EXTENT,
+        pinned_extent=PINNED_EXTENT,
+        pinned_margins=PINNED_MARGINS,
+        pivot_deviation=PIVOT_DEVIATION,
+        constant_extent_errors=tuple(CONSTANT_EXTENT_ERRORS[kind] for kind in KINDS),
+        estimated_kind=KINDS.index('vehicle'),
     )
 
 
@@ -294,21 +271,14 @@ def _input_error(problem: Problem, noise: InputNoise, widening: Tensor, slow: Te
     return torch.cat([extent, bias], 1)
 
 
-def expect_shared(problem: Problem, offsets: FaceOffsets) -> Tensor:
-    """Return the means of the shared variables as `expect` does without a population, (B, 23)."""
-    if compiled(problem.boxes) is None:
-        return expected_shared(problem, offsets, mean_input_extents(problem))
-    arrays, _, _ = _expected_arrays(problem, offsets, UNKNOWN_NOISE, UNKNOWN_POPULATION)
-    return torch.from_numpy(arrays.shared)
-
-
-def expected_shared(problem: Problem, offsets: FaceOffsets, extent: Tensor) -> Tensor:
+def shared_without_population(problem: Problem, offsets: FaceOffsets) -> Tensor:
     """
     Return the means of the shared variables, (B, 23), see `State`, without a population.
 
-    Given the margins of the input, and the mean extents (B, 3) of `mean_input_extents`.
+    Given the margins of the input.
 
     """
+    extent = mean_input_extents(problem)
     shared = extent.new_zeros((len(extent), SHARED))
     shared[:, EXTENT] = extent
     shared[:, GAP] = problem.of_class(*FACE_GAPS) + offsets.of(problem).gap_correction

@@ -100,7 +100,7 @@ class FaceObservations(NamedTuple):
         1 for a visible face, less for an occluded or distant one, 0 without points.
     inset : Tensor, shape (B, N, 6)
         How far further inside than the labelling margin they are expected [m].
-    inset_shares : Tensor, shape (2, B, N, 6)
+    inset_shares : Tensor, shape (B, N, 2, 6)
         Multiples of `occlusion_inset` and of `range_inset` in that.
     num_points : Tensor, shape (B, N)
         Points in and near the box.
@@ -145,7 +145,7 @@ def visibility(problem: Problem) -> Tensor:
 
 def inset_shares(problem: Problem, tangent: Tensor, config: Config) -> Tensor:
     """
-    Return the multiples of the two insets of `FaceOffsets` (M11), shape (2, B, N, 6).
+    Return the multiples of the two insets of `FaceOffsets` (M11), shape (B, N, 2, 6).
 
     Of the occlusion inset, by the `tangent` (B, N, 6) of `visibility`: a body is round at its
     edges. And of the range inset: fewer points reach the outermost parts of an object that is
@@ -155,11 +155,11 @@ def inset_shares(problem: Problem, tangent: Tensor, config: Config) -> Tensor:
     shifted = tangent + tangent.new_tensor(EDGE_LEAD)
     occluded = 0.5 - 0.5 * shifted / (shifted.square() + VISIBILITY_SOFTNESS).sqrt()
     if not config.ingredients.range_inset:
-        return torch.stack([occluded, torch.zeros_like(occluded)])
+        return torch.stack([occluded, torch.zeros_like(occluded)], 2)
     reach = problem.origins[..., :2].norm(dim=-1).amin(-1, keepdim=True)
     beyond = reach.nan_to_num() - NEAR_RANGE
     distant = (1 - occluded) * (beyond / RANGE_SPAN).clamp(0, MAX_RANGE_SHARE)
-    return torch.stack([occluded, distant])
+    return torch.stack([occluded, distant], 2)
 
 
 def observe_faces(
@@ -224,7 +224,7 @@ def empty_faces(B: int, N: int) -> FaceArrays:
         distance=np.empty((B, N, 6)),
         weight=np.empty((B, N, 6)),
         inset=np.empty((B, N, 6)),
-        inset_shares=np.empty((2, B, N, 6)),
+        inset_shares=np.empty((B, N, 2, 6)),
         num_points=np.empty((B, N)),
     )
 
@@ -262,8 +262,8 @@ def observe_faces_torch(
     tangent = visibility(problem)
     shares = inset_shares(problem, tangent, config)
     _, occlusion_inset, range_inset = (part.to(shares)[:, None] for part in offsets.of(problem))
-    range_inset = shares[1] * range_inset
-    inset = (shares[0] * occlusion_inset + range_inset).to(state.pose)
+    range_inset = shares[:, :, 1] * range_inset
+    inset = (shares[:, :, 0] * occlusion_inset + range_inset).to(state.pose)
     occluded_weight = OCCLUDED_FACE_WEIGHT if config.ingredients.occluded_faces else 0.0
     weight = torch.where(tangent > 0, 1.0, occluded_weight).to(state.pose)
     weight = weight / (1 + (range_inset / RANGE_INSET_HALF_WEIGHT) ** 2)

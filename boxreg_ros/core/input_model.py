@@ -114,9 +114,10 @@ class InputModel:
             What `observations` were made with.
 
         """
-        distance, weight, (occluded, distant), num_points = (
+        distance, weight, inset_shares, num_points = (
             part.cpu().numpy() for part in observations[1:3] + observations[4:]
         )
+        occluded, distant = np.moveaxis(inset_shares, 2, 0)
         kinds = kind.cpu().numpy()
         gap_correction, occlusion_inset, range_inset = (
             np.broadcast_to(part.cpu().numpy(), (len(KINDS), 6))[kinds][:, None]

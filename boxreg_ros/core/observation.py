@@ -7,7 +7,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.kernels import load
 from boxreg_ros.core.kernels.arrays import CropNumbers
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import Floats, Ints, ROLL, Sweep
+from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, YAW
 import numpy as np
 from numpy.typing import NDArray
 
@@ -133,14 +133,14 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     own = find(sweep, boxes, config)
     rows, owner = _sampled(own, sweep, n, config)
 
-    points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32)
+    points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32, 'C')
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
     parts = _slices(owner, n)
     if config.sampling.deskew and sweep.times is not None:
         delays = sweep.times[rows].astype(np.float32)
         sights = _medians(delays, np.bincount(owner, minlength=n))
-    up = matrix_from_rpy(boxes[:, ROLL:])[:, 2, 2]
+    up = np.cos(boxes[:, ROLL:YAW]).prod(1)  # of the z axis of each box, in the fixed frame
     ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
     columns = zip(
         boxes,

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
-from boxreg_ros.core.expectation import expect_shared
+from boxreg_ros.core.expectation import shared_without_population
 from boxreg_ros.core.face_support import motion_compensated, observe_faces, to_box_frame
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import residuals_at
@@ -100,11 +100,11 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
     """
     estimates: dict[int, Estimate] = {}
     groups = group_windows(windows, config)
-    for rows in groups:
-        _update_offsets(model, [windows[i] for i in rows], config)
-    for rows in groups:
-        part = [windows[i] for i in rows]
-        problem, base = stack_windows(part, config)
+    parts = [[windows[i] for i in rows] for rows in groups]
+    stacked = [stack_windows(part, config) for part in parts]
+    for part, (problem, _) in zip(parts, stacked, strict=True):
+        _update_offsets(model, part, problem, config)
+    for rows, part, (problem, base) in zip(groups, parts, stacked, strict=True):
         if config.objective == 'paper':
             solution = solve_paper(problem, config)
         else:
@@ -116,23 +116,25 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
 
 
 @torch.inference_mode()
-def _update_offsets(model: InputModel, windows: Sequence[Window], config: Config) -> None:
+def _update_offsets(
+    model: InputModel, windows: Sequence[Window], problem: Problem, config: Config
+) -> None:
     """
     Update the labelling margins with new observations, their faces as in the input boxes.
 
-    At smoothed angles, see `smoothed_angles`.
+    At smoothed angles, see `smoothed_angles`. `problem` has the `windows`.
 
     """
-    new_parts = [window.margin_part() for window in windows if window.num_new > 0]
-    if not new_parts:
+    columns = [window.margin_columns() for window in windows]
+    new = [row for row, part in enumerate(columns) if part]
+    if not new:
         return
-    problem, _ = stack_windows(new_parts, config)
-    problem = problem.thinned(COARSE_POINTS)
+    problem = problem.part(new, [columns[row] for row in new]).thinned(COARSE_POINTS)
     offsets = model.offsets()
     pose = torch.cat([problem.boxes[..., :3], smoothed_angles(problem)], -1)
-    state = State(pose, expect_shared(problem, offsets))
+    state = State(pose, shared_without_population(problem, offsets))
     observations = observe_faces(problem, state, offsets, config)
-    track_ids = [window.track_id for window in new_parts]
+    track_ids = [windows[row].track_id for row in new]
     model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)
 
 

@@ -7,40 +7,39 @@ By a kernel, one call for all windows, or by its torch twin, which is the refere
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core import lbfgs, terms
-from boxreg_ros.core.arrowhead import InverseBlocks, LINK
+from boxreg_ros.core.arrowhead import InverseBlocks
 from boxreg_ros.core.batch import (
     ANCHOR,
     MarginalPrior,
     POSE_ERRORS,
     PRIOR_SIZE,
     Problem,
-    SHARED,
     Solution,
     State,
 )
-from boxreg_ros.core.covariance import posterior
+from boxreg_ros.core.covariance import covariance_numbers, posterior
 from boxreg_ros.core.expectation import (
     evidence_of_extents,
+    expect,
     Expectation,
-    input_arrays,
+    expectation_numbers,
+    Known,
     MIN_EXTENT_GAIN,
 )
 from boxreg_ros.core.face_support import (
-    empty_faces,
     face_numbers,
     FaceObservations,
-    FaceOffsets,
     observe_faces,
 )
 from boxreg_ros.core.kernels import compiled, contiguous, run
 from boxreg_ros.core.kernels.arrays import (
-    EndArrays,
-    ExpectedArrays,
+    PosteriorArrays,
     PriorArrays,
     RoundNumbers,
     SearchNumbers,
@@ -59,8 +58,6 @@ from boxreg_ros.core.weights import (
 import numpy as np
 import torch
 from torch import Tensor
-
-_Parts = TypeVar('_Parts', bound=tuple[Any, ...])
 
 # Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
 # each of them.
@@ -131,8 +128,8 @@ class Round(NamedTuple):
         The windows, with the points of this round.
     solution : Solution
         Where the round begins; the round writes its end.
-    expected : Expectation
-        Means and deviations of input and shared variables.
+    known : Known
+        What is known of the input.
     free : Tensor, shape (B, D)
         1 for variables that are estimated.
 
@@ -140,7 +137,7 @@ class Round(NamedTuple):
 
     problem: Problem
     solution: Solution
-    expected: Expectation
+    known: Known
     free: Tensor
 
     @property
@@ -150,9 +147,7 @@ class Round(NamedTuple):
 
 
 @torch.inference_mode()
-def run_round(
-    batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
-) -> Tensor:
+def run_round(batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor) -> Tensor:
     """
     Take one round with the windows `rows` (b,), and write its end to the solution of the batch.
 
@@ -162,79 +157,36 @@ def run_round(
     """
     by_kernel = compiled(batch.free) is not None
     take = run_round_compiled if by_kernel else run_round_torch
-    return take(batch, offsets, plan, turn, config, rows)
+    return take(batch, plan, turn, config, rows)
 
 
 def run_round_compiled(
-    batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
+    batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor
 ) -> Tensor:
     """Take a round by the kernel."""
-    problem, solution, expected, free = batch
+    problem, solution, known, free = batch
     kernels = compiled(free)
     assert kernels is not None
     numbers = RoundNumbers(
+        expectation_numbers(),
         face_numbers(problem, config),
         weight_numbers(config, _is_smooth(plan, turn)),
         shape_numbers(problem),
         _search_numbers(plan, turn, config),
+        covariance_numbers(),
         MIN_EXTENT_GAIN,
     )
     prior = PriorArrays(
         contiguous(problem.prior_mean), contiguous(prior_information(problem, config))
     )
-    b, N = len(rows), problem.length
-    faces = empty_faces(b, N)
-    ends = EndArrays(
-        np.empty(b, bool), np.empty((b, N, LINK, LINK)), np.empty((b, N, LINK, SHARED)),
-        np.empty((b, SHARED, SHARED)),
-    )  # fmt: skip
+    is_done = np.empty(len(rows), bool)
     run(
-        kernels.rounds.run_windows, b, rows.numpy(), problem.arrays(),
-        problem.thinned(SHAPE_POINTS).arrays(), input_arrays(offsets), prior, contiguous(free),
-        ExpectedArrays(*map(contiguous, expected[:5])),
-        problem.class_arrays(), numbers, faces,
-        _solution_arrays(solution, plan.marginalises and config.window == N), ends,
+        kernels.rounds.run_windows, len(rows), rows.numpy(), problem.arrays(),
+        problem.thinned(SHAPE_POINTS).arrays(), known.arrays(), prior, contiguous(free),
+        problem.class_arrays(), numbers,
+        _solution_arrays(solution, plan.marginalises and config.window == problem.length), is_done,
     )  # fmt: skip
-    is_done, *inverse = map(torch.from_numpy, ends)
-    observations = FaceObservations(*map(torch.from_numpy, faces))
-    done = is_done.nonzero()[:, 0]
-    inverse_of_done = _part(InverseBlocks(*inverse), done)
-    _write_posterior(batch, rows, done, observations, inverse_of_done, config)
-    return is_done
-
-
-def _part(values: _Parts, rows: Tensor) -> _Parts:
-    """Return the rows of a tuple of tensors; `values` as they are for all rows."""
-    first = values[0]
-    return values if len(rows) == len(first) else select(values, rows)
-
-
-def _write_posterior(
-    batch: Round,
-    rows: Tensor,
-    done: Tensor,
-    observations: FaceObservations,
-    inverse: InverseBlocks,
-    config: Config,
-) -> None:
-    """
-    Write the covariances of windows that are done.
-
-    `observations` are of all `rows`, `inverse` is of the `done` ones among them.
-
-    """
-    if not len(done):
-        return
-    ended = rows[done]
-    problem = _part(batch.problem, ended)
-    state = _part(batch.state, ended)
-    expected = _part(batch.expected, ended)
-    moments, inset, weight = _part(
-        (observations.moments, observations.inset, observations.weight), done
-    )
-    free = batch.free[ended]
-    found = posterior(problem, state, moments, inset, weight, expected, free, inverse, config)
-    _write(found, batch.solution.posterior, ended)
+    return torch.from_numpy(is_done)
 
 
 def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
@@ -242,8 +194,13 @@ def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
     prior = [np.empty((0, PRIOR_SIZE))] * 2 + [np.empty((0, PRIOR_SIZE, PRIOR_SIZE))]
     if leaves_prior and solution.prior is not None:
         prior = [part.numpy() for part in solution.prior]
-    parts = *solution.state, solution.extent_evidence
-    return SolutionArrays(*(part.numpy() for part in parts), *prior)
+    return SolutionArrays(
+        solution.state.pose.numpy(),
+        solution.state.shared.numpy(),
+        solution.extent_evidence.numpy(),
+        PosteriorArrays(*(part.numpy() for part in solution.posterior)),
+        *prior,
+    )
 
 
 def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
@@ -262,19 +219,17 @@ def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
     )
 
 
-def run_round_torch(
-    batch: Round, offsets: FaceOffsets, plan: Plan, turn: int, config: Config, rows: Tensor
-) -> Tensor:
+def run_round_torch(batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor) -> Tensor:
     """Take a round by torch."""
     solution = batch.solution
-    problem, state, expected, free, log_extent = select(
-        (batch.problem, batch.state, batch.expected, batch.free, solution.extent_evidence[:, 0]),
-        rows,
+    problem, state, free, log_extent = select(
+        (batch.problem, batch.state, batch.free, solution.extent_evidence[:, 0]), rows
     )
+    expected = expect(problem, batch.known)
     shared = state.shared.clone()
     shared[:, ANCHOR] = 0.0
     state = State(state.pose, shared)
-    observations = observe_faces(problem, state, offsets, config)
+    observations = observe_faces(problem, state, batch.known.offsets, config)
     weighted = _weighted_terms(problem, state, expected, observations, plan, turn, config)
     x = state.pack()
     objective = Objective(weighted, x, problem.length, free)
@@ -289,11 +244,17 @@ def run_round_torch(
     solution.extent_evidence[rows, 1:] = evidence
     done = is_done.nonzero()[:, 0]
     if len(done):
-        inverse = InverseBlocks(*select(objective.factor, done).inverse_blocks(problem.length))
-        _write_posterior(batch, rows, done, observations, inverse, config)
+        ended = rows[done]
+        inverse = InverseBlocks(*objective.factor.inverse_blocks(problem.length))
+        of_done = partial(select, rows=done)
+        covariances = posterior(
+            of_done(problem), of_done(found), of_done(observations), of_done(expected),
+            of_done(free), of_done(inverse), config,
+        )  # fmt: skip
+        _write(covariances, solution.posterior, ended)
         if plan.marginalises and problem.length == config.window and solution.prior is not None:
             prior = select(_prior_of_full(weighted, found, problem), done)
-            _write(prior, solution.prior, rows[done])
+            _write(prior, solution.prior, ended)
     return is_done
 
 

@@ -22,7 +22,7 @@ from boxreg_ros.core.batch import (
     Solution,
     State,
 )
-from boxreg_ros.core.expectation import expect, expect_shared
+from boxreg_ros.core.expectation import Known, shared_without_population
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import InputNoise, normalised_residuals, UNKNOWN_NOISE
@@ -72,14 +72,13 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
 
     """
     plan = Plan.choose(config, is_warm)
-    offsets = model.offsets()
     learns_noise = config.ingredients.noise_estimation
     learns_extents = config.ingredients.population_extents
     noise = model.noise() if learns_noise and not plan.estimates_noise else UNKNOWN_NOISE
-    known = model.population() if learns_extents else UNKNOWN_POPULATION
-    population = known
+    population = model.population() if learns_extents else UNKNOWN_POPULATION
+    known = Known(model.offsets(), noise, population)
     free = free_variables(problem, config)
-    solution = start(problem, free, offsets, plan)
+    solution = start(problem, free, known.offsets, plan)
     every = torch.arange(len(free), device=free.device)
     rows, turn, points = every, 0, plan.coarse_points
     workers = config.solver.threads or NUM_CORES
@@ -89,9 +88,8 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
         shared_by(pool, workers),
     ):
         while len(rows):
-            expected = expect(problem, offsets, noise, population)
-            batch = Round(problem.thinned(points), solution, expected, free)
-            work = partial(run_round, batch, offsets, plan, turn, config)
+            batch = Round(problem.thinned(points), solution, known, free)
+            work = partial(run_round, batch, plan, turn, config)
             parts = _split(rows, problem.length, workers)
             is_done = map(work, parts) if len(parts) == 1 else pool.map(work, parts)
             rows = rows[~torch.cat(list(is_done))]
@@ -99,8 +97,10 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
             if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
                 residuals = normalised_residuals(problem, solution.state)
                 noise = InputNoise.estimate_by_kind(residuals, problem.kind)
+                known = known._replace(noise=noise)
             if plan.estimates_noise and learns_extents:
-                population = known.joined(solution.extent_evidence, problem.kind)
+                joined = population.joined(solution.extent_evidence, problem.kind)
+                known = known._replace(population=joined)
             if not len(rows) and 2 * points <= problem.returns.width:
                 rows, points = every, inf  # settled on few points: once more with all
     return solution
@@ -109,7 +109,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
 def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: Plan) -> Solution:
     """Return the state that the first round starts from, without covariances and prior."""
     pose = problem.start[..., POSE].contiguous()  # a copy
-    shared = expect_shared(problem, offsets)
+    shared = shared_without_population(problem, offsets)
     log_extent = shared[:, EXTENT].log()
     if plan.starts_from_fit:
         shared[:, EXTENT].lerp_(problem.start[:, 0, 3:6], free[:, -SHARED:][:, EXTENT])

@@ -6,7 +6,14 @@ from operator import attrgetter
 from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config, KINDS
-from boxreg_ros.core.batch import numbers_of, PRIOR_SIZE, Problem, Returns, SHARED
+from boxreg_ros.core.batch import (
+    numbers_of,
+    PADDING_PERIOD,
+    PRIOR_SIZE,
+    Problem,
+    Returns,
+    SHARED,
+)
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
@@ -22,8 +29,6 @@ An error model that is constant over a track holds for a limited time: 0.97 halv
 after 23 observations.
 
 """
-PADDING_PERIOD = 0.1
-"""Time step of padding observations [s]; any positive number keeps times increasing."""
 MARGIN_OBSERVATIONS = 30
 """Observations of a window that give labelling margins; measured: 130 add nothing."""
 MAX_REVERSE_SPEED = 6.0
@@ -118,24 +123,16 @@ class Window(NamedTuple):
         """Return whether all observations but the newest have an estimate to start from."""
         return self.num_new == 1 and len(self.start) == len(self.observations) - 1 > 1
 
-    def margin_part(self) -> 'Window':
+    def margin_columns(self) -> range:
         """
-        Return the observations for the labelling margins, each in one such part only.
+        Return which observations give labelling margins; each does so in one window only.
 
         The newest is left to the next window, which has an estimate to start from. Of many, every
         n-th is taken so that about `MARGIN_OBSERVATIONS` remain.
 
         """
         last = len(self.observations) - 1
-        stride = 1 + self.num_new // MARGIN_OBSERVATIONS
-        part = slice(max(0, last - self.num_new), last, stride)
-        return Window(
-            self.track_id,
-            self.class_name,
-            self.observations[part],
-            self.num_new,
-            self.start[part],
-        )
+        return range(max(0, last - self.num_new), last, 1 + self.num_new // MARGIN_OBSERVATIONS)
 
 
 def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:

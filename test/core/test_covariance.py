@@ -4,6 +4,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core import covariance
 from boxreg_ros.core.batch import EXTENT, GAP, SHARED, State
 from boxreg_ros.core.expectation import Expectation
+from boxreg_ros.core.face_support import FaceObservations
 from boxreg_ros.core.refine import refine
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
@@ -130,10 +131,13 @@ def test_residuals_of_faces_are_from_the_margins_of_other_tracks():
     margins = torch.zeros(1, SHARED, dtype=D)
     margins[:, GAP] = 0.05
     expected = expectation(0.05, [0.0] * 9)._replace(shared=margins)
-    centroid = torch.zeros(1, 1, 6, 3, dtype=D)
-    centroid[..., 0] = 1.9
+    moments = torch.zeros(1, 1, 6, 4, 4, dtype=D)
+    moments[..., 3, 0] = 1.9
+    ones = torch.ones(1, 1, 6, dtype=D)
+    shares = torch.zeros(1, 1, 2, 6, dtype=D)
+    observations = FaceObservations(moments, 0 * ones, ones, 0 * ones, shares, ones[..., 0])
     found = covariance._face_distances(
         problem, State(problem.pose, shared), expected, torch.eye(3, dtype=D)[None, None],
-        centroid, torch.zeros(1, 1, 6, dtype=D),
+        observations,
     )  # fmt: skip
     np.testing.assert_allclose(found[0, 0, 0], -0.05)

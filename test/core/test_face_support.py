@@ -48,7 +48,7 @@ def test_without_a_sensor_faces_toward_the_centre_of_mass_are_visible():
 def test_occlusion_inset_grows_as_a_face_turns_away():
     open_ = torch.linspace(-50, 50, 201, dtype=D)[None, :, None].expand(-1, -1, 6)
     problem = problem_of([[[0, 0, 0, 4, 2, 2, 0, 0, 0]] * 201])
-    hidden, distant = inset_shares(problem, open_, CONFIG)[:, 0]
+    hidden, distant = inset_shares(problem, open_, CONFIG)[0].unbind(1)
     assert (hidden.diff(dim=0) <= 0).all()
     np.testing.assert_allclose(hidden[0], 1, atol=1e-4)
     np.testing.assert_allclose(hidden[-1], 0, atol=1e-4)
@@ -62,7 +62,7 @@ def test_range_inset_grows_with_range(away, share):
     # From 20 m on the share grows by 1 in another 50 m, to 1.5 at most; the range is horizontal.
     # Front and roof are visible; back and bottom are occluded and have the occlusion inset only.
     problem = seen_from([0.6 * away, 0.8 * away, 5.0])
-    hidden, distant = inset_shares(problem, visibility(problem), CONFIG)[:, 0, 0]
+    hidden, distant = inset_shares(problem, visibility(problem), CONFIG)[0, 0]
     np.testing.assert_allclose(distant, share * (1 - hidden))
     assert (hidden[[0, 2, 4]] < 0.2).all()
     assert (hidden[[1, 3, 5]] > 0.8).all()

@@ -411,7 +411,7 @@ def show_faces(
     # Distance of the points from where they are expected: from the face less its margin.
     out = (offsets.gap_correction - shifts)[:, None].expand(b, n, 6) - further
     whole = torch.ones(b, n, 6, dtype=D)
-    shares = torch.stack([hidden * whole, distant * whole])
+    shares = torch.stack([hidden * whole, distant * whole], 2)
     inset = hidden * offsets.occlusion_inset + distant * offsets.range_inset + 0 * whole
     observations = FaceObservations(
         torch.zeros(b, n, 6, 4, 4, dtype=D), out, bool(seen) * whole, inset, shares,

@@ -17,7 +17,7 @@ from boxreg_ros.core.batch import (
     Solution,
     State,
 )
-from boxreg_ros.core.expectation import expect, expect_compiled, expect_torch
+from boxreg_ros.core.expectation import expect, expectation_numbers, Known
 from boxreg_ros.core.face_support import (
     FaceOffsets,
     FAR,
@@ -56,6 +56,7 @@ import torch
 
 D = torch.float64
 arrowhead = pytest.importorskip('boxreg_ros.core.kernels.arrowhead')
+expectation = pytest.importorskip('boxreg_ros.core.kernels.expectation')
 face_support = pytest.importorskip('boxreg_ros.core.kernels.face_support')
 normal_equations = pytest.importorskip('boxreg_ros.core.kernels.normal_equations')
 rounds = pytest.importorskip('boxreg_ros.core.kernels.rounds')
@@ -130,9 +131,7 @@ def assert_same_faces(problem, state, config):
         pair = (getattr(side, name)[is_seen] for side in (found, known))
         assert_equal(*pair)
     assert_equal(found.weight[problem.valid], known.weight[problem.valid].nan_to_num())
-    is_valid = problem.valid[..., None].expand_as(is_seen)
-    for found_share, known_share in zip(found.inset_shares, known.inset_shares, strict=True):
-        assert_equal(found_share[is_valid], known_share[is_valid])
+    assert_equal(found.inset_shares[problem.valid], known.inset_shares[problem.valid])
     assert_equal(found.num_points[problem.valid], known.num_points[problem.valid])
     return is_seen
 
@@ -167,7 +166,7 @@ def test_observed_faces_from_known_sensors_equal_those_of_torch(far, sensors):
 def weighed(problem, state, config):
     """Return the terms of each window by torch, and by the kernel, with robust motion."""
     observations = observe_faces_torch(problem, state, OFFSETS, config)
-    expected = expect(problem, OFFSETS)
+    expected = expect(problem, Known(OFFSETS))
     known = [
         robustify_motion(term, state) if term.function in MOTION_TERMS else term
         for term in weigh(problem, state, observations, expected, config)
@@ -176,7 +175,6 @@ def weighed(problem, state, config):
     prior = PriorArrays(problem.prior_mean.numpy(), problem.prior_information.numpy())
     poses, shared = (part.numpy() for part in state)
     faces = FaceArrays(*map(contiguous, observations))
-    expected = ExpectedArrays(*map(contiguous, expected[:5]))
     windows, of_class, numbers = (
         problem.arrays(), problem.class_arrays(), weight_numbers(config, True)
     )  # fmt: skip
@@ -184,8 +182,9 @@ def weighed(problem, state, config):
     for b in range(B):
         terms = normal_equations.unweighted_terms(N, 0, prior, b)
         weights.weigh(
-            b, windows, poses[b], shared[b], b, faces, expected, of_class, numbers, terms
-        )
+            b, windows, poses[b], shared[b], b, faces,
+            ExpectedArrays(*(part[b].numpy() for part in expected)), of_class, numbers, terms,
+        )  # fmt: skip
         pairs.append((term_arrays(known, problem, b), terms))
     return pairs
 
@@ -214,7 +213,7 @@ def drives(kind, N=12):
         },
     )  # fmt: skip
     pose = problem.pose + 0.05 * torch.from_numpy(rng.normal(size=(3, N, 6)))
-    shared = expect(problem, OFFSETS).shared
+    shared = expect(problem, Known(OFFSETS)).shared
     return problem, State(pose, shared + 0.02 * torch.from_numpy(rng.normal(size=shared.shape)))
 
 
@@ -245,7 +244,7 @@ PLANS = {
 
 def batch_of(problem, state, config):
     """Return what a round of a problem begins with."""
-    expected = expect(problem, OFFSETS)
+    known = Known(OFFSETS)
     free = free_variables(problem, config)
     state = State(*(part.clone() for part in state))
     prior = MarginalPrior(
@@ -254,9 +253,9 @@ def batch_of(problem, state, config):
         ))
     )  # fmt: skip
     evidence = torch.zeros(len(free), 3, 3, dtype=D)
-    evidence[:, 0] = expected.shared[:, EXTENT].log()
+    evidence[:, 0] = expect(problem, known).shared[:, EXTENT].log()
     solution = Solution(state, Posterior.zeros(state.pose), prior, None, evidence)
-    return Round(problem, solution, expected, free)
+    return Round(problem, solution, known, free)
 
 
 def both_rounds(problem, state, config, plan):
@@ -264,7 +263,7 @@ def both_rounds(problem, state, config, plan):
     results = []
     for take in (run_round_compiled, run_round_torch):
         batch = batch_of(problem, state, config)
-        is_done = take(batch, OFFSETS, *PLANS[plan], config, torch.arange(len(problem.boxes)))
+        is_done = take(batch, *PLANS[plan], config, torch.arange(len(problem.boxes)))
         results.append((batch.solution, is_done))
     return results
 
@@ -330,10 +329,17 @@ def test_expectations_equal_those_of_torch(kind, seed):
     evidence = np.stack([extents, 50 * rng.normal(size=(20, 3)), rng.random((20, 3))], 1)
     population = Population(torch.from_numpy(evidence), torch.arange(20) % 2)
     offsets = FaceOffsets(*torch.from_numpy(0.1 * rng.normal(size=(3, 3, 6))))
-    found = expect_compiled(problem, offsets, noise, population)
-    known = expect_torch(problem, offsets, noise, population)
-    for part, twin in zip(found, known, strict=True):
-        assert_equal(part, twin, 1e-12)
+    known = Known(offsets, noise, population)
+    twins = expect(problem, known)
+    found = ExpectedArrays(*(np.empty(part.shape[1:]) for part in twins))
+    work = expectation.empty_expectation_work()
+    for b in range(3):
+        expectation.expect(
+            b, problem.arrays(), problem.class_arrays(), known.arrays(), expectation_numbers(),
+            work, found,
+        )  # fmt: skip
+        for part, twin in zip(found, twins, strict=True):
+            assert_equal(part, twin[b], 1e-12)
 
 
 @pytest.mark.parametrize('kind', ['usual', 'held', 'short tracks', 'one track', 'nothing'])

@@ -164,7 +164,6 @@ def test_priors_are_stacked():
     np.testing.assert_array_equal(problem.prior_mean[1], 0)
     np.testing.assert_array_equal(problem.prior_information[1], 0)
     assert prior.information[3, 3] == 4  # the input is not changed
-    assert with_prior(one).margin_part().prior is None
 
 
 @pytest.mark.parametrize('turns', [2 * np.pi, -2 * np.pi, 6 * np.pi])
@@ -201,14 +200,24 @@ def test_a_solved_window_starts_from_its_estimates():
     known[:3, 0] = 0.2
     np.testing.assert_allclose(problem.start[0] - problem.boxes[0], known, atol=1e-12)
     # The newest of the window before updates the margins now, at its estimate.
-    part = window.margin_part()
-    assert part.observations == window.observations[2:3]
-    np.testing.assert_array_equal(part.start, solved[2:])
-    first = window._replace(num_new=4, start=solved[:0]).margin_part()
-    assert first.observations == window.observations[:3]
-    np.testing.assert_array_equal(
-        stack_windows([first], CONFIG)[0].start, stack_windows([first], CONFIG)[0].boxes
-    )
+    assert list(window.margin_columns()) == [2]
+    assert list(window._replace(num_new=4, start=solved[:0]).margin_columns()) == [0, 1, 2]
+
+
+def test_a_part_of_a_problem_has_the_observations_asked_for():
+    # Of five and four boxes: two of the first window, one of the second, which is padded.
+    one, other = windows([5, 4])
+    problem, _ = stack_windows([with_prior(one), other], CONFIG)
+    part = problem.part([1, 0], [[2], [1, 3]])
+    np.testing.assert_array_equal(part.valid, [[True, False], [True, True]])
+    for name in ('boxes', 'start', 'first', 'counts', 'origins', 'ground', 'pinned'):
+        whole = getattr(problem, name)
+        np.testing.assert_array_equal(getattr(part, name)[0, 0], whole[1, 2])
+        np.testing.assert_array_equal(getattr(part, name)[1], whole[0, [1, 3]])
+    assert (part.times.diff(dim=1) > 0).all()
+    np.testing.assert_array_equal(part.points[0, 0], problem.points[1, 2])
+    np.testing.assert_array_equal(part.marginalised_extents, 0)
+    np.testing.assert_array_equal(part.kind, problem.kind[[1, 0]])
 
 
 def test_groups_contain_each_window_that_is_long_enough_once():

@@ -10,7 +10,7 @@ from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import LINK
 from boxreg_ros.core.batch import free_variables, SHARED, State
-from boxreg_ros.core.expectation import expect
+from boxreg_ros.core.expectation import expect, Known
 from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.rounds import Plan, Round, run_round
@@ -66,13 +66,12 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
     """Return function, bytes and operations of each stage of one round of `count` windows."""
     windows, _ = make_windows(count, config.window, 128, config)
     problem, _ = stack_windows(windows, config)
-    offsets = InputModel(config.faces).offsets()
-    expected = expect(problem, offsets)
-    state = State(problem.pose, expected.shared)
+    known = Known(InputModel(config.faces).offsets())
+    state = State(problem.pose, expect(problem, known).shared)
     free = free_variables(problem, config)
     plan = Plan.choose(config, is_warm=True)
-    solution = start(problem, free, offsets, plan)
-    batch = Round(problem, solution, expected, free)
+    solution = start(problem, free, known.offsets, plan)
+    batch = Round(problem, solution, known, free)
     rows = torch.arange(count, device=free.device)
     points = problem.returns.points
     size_of_points = float(points.numel() * points.element_size())
@@ -82,12 +81,12 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
     size_of_inverse = 8.0 * poses * LINK * (LINK + SHARED)
     return {
         'face observations': (
-            lambda: observe_faces(problem, state, offsets, config),
+            lambda: observe_faces(problem, state, known.offsets, config),
             size_of_points,
             flops_of_points,
         ),
         'round': (
-            lambda: run_round(batch, offsets, plan, 0, config, rows),
+            lambda: run_round(batch, plan, 0, config, rows),
             size_of_points + size_of_inverse,
             flops_of_points + poses * FLOPS_PER_POSE,
         ),

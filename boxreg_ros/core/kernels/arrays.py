@@ -66,13 +66,14 @@ class FaceArrays(NamedTuple):
 
 
 class ExpectedArrays(NamedTuple):
-    """Means and deviations, as `boxreg_ros.core.expectation.Expectation` has them."""
+    """Those of one window, as `boxreg_ros.core.expectation.Expectation` has them for a batch."""
 
     shared: Any
     deviation: Any
     pose_deviation: Any
     widened_deviation: Any
     unmodelled_bias: Any
+    input_error: Any
 
 
 class InputArrays(NamedTuple):
@@ -152,6 +153,8 @@ class SolutionArrays(NamedTuple):
         Boxes, and the variables that all observations of a window share.
     evidence : array, shape (B, 3, 3)
         Logarithms of the input extents; corrections by the points alone, and their weights.
+    posterior : PosteriorArrays
+        Of windows that are done.
     prior_state, prior_step, prior_information : array, shapes (B, 35), (B, 35), (B, 35, 35)
         What full windows that are done leave to the next ones; B = 0 if it is not wanted.
 
@@ -160,30 +163,35 @@ class SolutionArrays(NamedTuple):
     poses: Any
     shared: Any
     evidence: Any
+    posterior: Any
     prior_state: Any
     prior_step: Any
     prior_information: Any
 
 
-class EndArrays(NamedTuple):
+class PosteriorArrays(NamedTuple):
+    """Covariances and residuals, as `boxreg_ros.core.batch.Posterior` has them."""
+
+    poses: Any
+    extents: Any
+    face_distances: Any
+
+
+class InverseArrays(NamedTuple):
     """
-    How a round ends for the b windows that take part.
+    Blocks of the inverse curvature of one window.
 
     Attributes
     ----------
-    is_done : array, shape (b,)
-        Whether a window is settled, or this was the last round.
-    pose_blocks, border_blocks : array, shapes (b, N, 6, 6) and (b, N, 6, 23)
-        Blocks of the poses in the inverse curvature, of windows that are done: their own, and
-        those with the shared variables.
-    corner : array, shape (b, 23, 23)
-        Block of the shared variables in the inverse curvature.
+    poses, border : array, shapes (N, 6, 6) and (N, 6, 23)
+        Of each pose: its own, and those with the shared variables.
+    corner : array, shape (23, 23)
+        Of the shared variables.
 
     """
 
-    is_done: Any
-    pose_blocks: Any
-    border_blocks: Any
+    poses: Any
+    border: Any
     corner: Any
 
 
@@ -340,14 +348,19 @@ class ShapeNumbers(NamedTuple):
     is_moving: bool
 
 
-class RoundNumbers(NamedTuple):
-    """Constants and settings of a round."""
+class CovarianceNumbers(NamedTuple):
+    """Constants and settings of `boxreg_ros.core.covariance`; there they are described."""
 
-    faces: FaceNumbers
-    weights: WeightNumbers
-    shape: ShapeNumbers
-    search: SearchNumbers
-    min_extent_gain: float
+    residual_correlation: float
+    max_correlation: float
+    half_weight: float
+    min_left: float
+    min_power: float
+    min_weight: float
+    min_duration: float
+    time_deviation: float
+    heading_deviation: float
+    correlated_faces: tuple[float, ...]
 
 
 class ExpectationNumbers(NamedTuple):
@@ -367,6 +380,20 @@ class ExpectationNumbers(NamedTuple):
     pinned_extent: float
     pinned_margins: float
     pivot_deviation: float
+    constant_extent_errors: tuple[tuple[float, ...], ...]
+    estimated_kind: int
+
+
+class RoundNumbers(NamedTuple):
+    """Constants and settings of a round."""
+
+    expectation: ExpectationNumbers
+    faces: FaceNumbers
+    weights: WeightNumbers
+    shape: ShapeNumbers
+    search: SearchNumbers
+    covariance: CovarianceNumbers
+    min_extent_gain: float
 
 
 class NoiseNumbers(NamedTuple):

@@ -6,11 +6,11 @@ The numpy twins are `crop_numpy` and `own_points_numpy` of `boxreg_ros.core.obse
 """
 
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.sorting import sort
+from boxreg_ros.core.kernels.selection import nth
 import numpy as np
 
-SIDE = 256
-"""Cells of the raster along x and y; those of far places share a cell."""
+MIN_SIDE, MAX_SIDE = 16, 256
+"""Cells of the raster along x and y; those of far places share a cell. Powers of two."""
 LARGEST = 1e9
 """Coordinates are limited to this, so that they fit an integer [m]."""
 
@@ -22,33 +22,42 @@ def metre(value):
 
 
 @kernel
-def cell_of(x, y):
-    """Return the cell of whole metres; `SIDE` is a power of two."""
-    return (x & (SIDE - 1)) * SIDE + (y & (SIDE - 1))
+def side_of(num_points):
+    """Return the side of the raster: it has at least as many cells as there are points."""
+    side = MIN_SIDE
+    while side < MAX_SIDE and side * side < num_points:
+        side *= 2
+    return side
 
 
 @kernel
-def raster(centers, reach):
+def cell_of(x, y, side):
+    """Return the cell of whole metres; `side` is a power of two."""
+    return (x & (side - 1)) * side + (y & (side - 1))
+
+
+@kernel
+def raster(centers, reach, side):
     """
     Return which boxes touch each cell of 1 m, as `first` and `boxes`.
 
     Those of cell c are boxes[first[c]:first[c + 1]]. `centers` and `reach` are (n, 3) [m], `reach`
-    half the upright bounding boxes.
+    half the upright bounding boxes. The raster has `side` cells along x and y.
 
     """
-    first = np.zeros(SIDE * SIDE + 1, np.int64)
+    first = np.zeros(side * side + 1, np.int64)
     boxes = np.empty(0, np.int64)
     for is_counted in (False, True):
         if is_counted:
-            for cell in range(SIDE * SIDE):
+            for cell in range(side * side):
                 first[cell + 1] += first[cell]
             boxes = np.empty(first[-1], np.int64)
         for box in range(len(centers) - 1, -1, -1):
             x = metre(centers[box, 0] - reach[box, 0])
             y = metre(centers[box, 1] - reach[box, 1])
-            for i in range(min(SIDE, metre(centers[box, 0] + reach[box, 0]) - x + 1)):
-                for j in range(min(SIDE, metre(centers[box, 1] + reach[box, 1]) - y + 1)):
-                    cell = cell_of(x + i, y + j)
+            for i in range(min(side, metre(centers[box, 0] + reach[box, 0]) - x + 1)):
+                for j in range(min(side, metre(centers[box, 1] + reach[box, 1]) - y + 1)):
+                    cell = cell_of(x + i, y + j, side)
                     if is_counted:
                         first[cell] -= 1
                         boxes[first[cell]] = box
@@ -58,16 +67,16 @@ def raster(centers, reach):
 
 
 @kernel
-def near_points(points, first):
+def near_points(points, first, side):
     """Return the points (3, M) in cells that boxes touch, with their cells."""
     near = np.empty(points.shape[1], np.int32)
     cells = np.empty(points.shape[1], np.int32)
-    is_touched = np.empty(SIDE * SIDE, np.bool_)  # small enough for the processor's cache
-    for cell in range(SIDE * SIDE):
+    is_touched = np.empty(side * side, np.bool_)  # small enough for the processor's cache
+    for cell in range(side * side):
         is_touched[cell] = first[cell + 1] > first[cell]
     count = 0
     for i in range(points.shape[1]):
-        cell = cell_of(metre(points[0, i]), metre(points[1, i]))
+        cell = cell_of(metre(points[0, i]), metre(points[1, i]), side)
         if is_touched[cell]:
             near[count] = i
             cells[count] = cell
@@ -99,8 +108,9 @@ def crop(points, centers, rotations, half, reach, margin):
         Point minus centre, and distance outside of the faces [m].
 
     """
-    first, boxes = raster(centers, reach)
-    near, cells = near_points(points, first)
+    side = side_of(points.shape[1])
+    first, boxes = raster(centers, reach, side)
+    near, cells = near_points(points, first, side)
     capacity = 0
     for cell in cells:
         capacity += first[cell + 1] - first[cell]
@@ -134,12 +144,11 @@ def crop(points, centers, rotations, half, reach, margin):
 def flat_height(heights, quantiles, flatness, min_points):
     """Return the height of a road from heights beside a box; NaN where it is not flat."""
     n = len(heights)
-    sort(heights)
     if n < min_points:
         return np.nan
-    low = heights[int(quantiles[0] * n)]
-    high = heights[int(quantiles[2] * n)]
-    return heights[int(quantiles[1] * n)] if high - low < flatness else np.nan
+    low = nth(heights, int(quantiles[0] * n))
+    high = nth(heights, int(quantiles[2] * n))
+    return nth(heights, int(quantiles[1] * n)) if high - low < flatness else np.nan
 
 
 @kernel
@@ -147,16 +156,16 @@ def road_heights(owner, height, offset, outside, half, numbers):
     """Return the height of the road beside each of n boxes (n,); NaN where not found [m]."""
     n = len(half)
     beside = np.empty(len(owner), np.bool_)
+    square = np.hypot(half[:, 0], half[:, 1]) + numbers.road_width
     first = np.zeros(n + 1, np.int64)
     for k in range(len(owner)):
         box = owner[k]
         aside = max(outside[k, 0], outside[k, 1])
-        square = np.hypot(half[box, 0], half[box, 1]) + numbers.road_width
         beside[k] = (
             aside > numbers.road_gap
             and max(aside, outside[k, 2]) < numbers.road_width
             and abs(height[k]) < numbers.road_range
-            and max(abs(offset[k, 0]), abs(offset[k, 1])) < square
+            and max(abs(offset[k, 0]), abs(offset[k, 1])) < square[box]
         )
         first[box + 1] += beside[k]
     for box in range(n):
@@ -174,6 +183,22 @@ def road_heights(owner, height, offset, outside, half, numbers):
             numbers.min_road_points,
         )  # fmt: skip
     return road
+
+
+@kernel
+def least_depths(row, depth):
+    """Return for each pair the least `depth` (P,) of all pairs of its point, its `row`."""
+    least = np.empty(len(row))
+    start = 0
+    while start < len(row):
+        end = start
+        lowest = depth[start]
+        while end < len(row) and row[end] == row[start]:
+            lowest = min(lowest, depth[end])
+            end += 1
+        least[start:end] = lowest
+        start = end
+    return least
 
 
 @kernel
@@ -201,9 +226,7 @@ def own_points(points, centers, rotations, half, reach, numbers):
     row, owner, offset, outside = crop(points, centers, rotations, half, reach, numbers.margin)
     height = np.empty(len(row))
     depth = np.empty(len(row))
-    least = np.empty(len(row))
     num_inside = np.zeros(len(half), np.int64)
-    start = 0
     for k in range(len(row)):
         R = rotations[owner[k]]
         height[k] = half[owner[k], 2]
@@ -211,12 +234,7 @@ def own_points(points, centers, rotations, half, reach, numbers):
             height[k] += R[j, 2] * offset[k, j]
         depth[k] = max(outside[k, 0], outside[k, 1], outside[k, 2])
         num_inside[owner[k]] += depth[k] <= 0.0
-        if row[k] != row[start]:
-            start = k
-        least[k] = depth[k]
-        for other in range(start, k):  # the same point in other boxes
-            least[other] = min(least[other], depth[k])
-            least[k] = min(least[k], depth[other])
+    least = least_depths(row, depth)
     road = np.full(len(half), np.nan)
     if numbers.has_road:
         road = road_heights(owner, height, offset, outside, half, numbers)

@@ -1,12 +1,12 @@
 """
 Means and deviations of one window before its points are used, in plain loops.
 
-And evidence of the points about its extents, after a round. The torch twins are `expect_torch`
+And evidence of the points about its extents, after a round. The torch twins are `expect`
 and `evidence_of_extents` of `boxreg_ros.core.expectation`; the formulas are (M15) to (M17).
 
 """
 
-from math import exp, isfinite, log, sqrt
+from math import exp, hypot, isfinite, log, sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.kernels.compile import kernel
@@ -26,12 +26,14 @@ HEADING = 5
 """Place of the yaw in a pose."""
 
 
-class Ratios(NamedTuple):
+class ExpectationWork(NamedTuple):
     """
-    What the noise of the input says about one window, for the pose and the extents.
+    What the input says about one window.
 
     Attributes
     ----------
+    mean : array, shape (3,)
+        Mean input extents [m].
     ratio, constant : array, shape (6,)
         Errors of the input over those of the settings, lowered for low-noise input; of the part
         that is constant along a track.
@@ -42,10 +44,17 @@ class Ratios(NamedTuple):
 
     """
 
+    mean: Any
     ratio: Any
     constant: Any
     widening: Any
     slow: Any
+
+
+@kernel
+def empty_expectation_work():
+    """Return the arrays for one window."""
+    return ExpectationWork(np.empty(SIZE), np.empty(6), np.empty(6), np.empty(9), np.empty(9))
 
 
 @kernel
@@ -70,7 +79,7 @@ def fill_mean_extents(b, windows, mean):
 
 
 @kernel
-def fill_ratios(b, windows, known, numbers, ratios):
+def fill_ratios(b, windows, known, numbers, work):
     """Write how large and how correlated the errors of the input of one window are."""
     kind, length = windows.kind[b], windows.lengths[b]
     weight = known.weight[kind]
@@ -78,9 +87,9 @@ def fill_ratios(b, windows, known, numbers, ratios):
     for j in range(POSE + SIZE):
         typical = numbers.typical_correlation
         correlation = typical + weight * (known.correlation[kind, j] - typical)
-        ratios.widening[j] = sqrt((1 + correlation) / (1 - correlation))
+        work.widening[j] = sqrt((1 + correlation) / (1 - correlation))
         slow = correlation ** (numbers.correlation_interval / interval) - numbers.white_correlation
-        ratios.slow[j] = clamp(slow / numbers.correlation_span, 0.1, 1.0)
+        work.slow[j] = clamp(slow / numbers.correlation_span, 0.1, 1.0)
     offset = known.offset[kind]
     filtered = ((offset[0] + offset[1] + offset[POSE]) / 3 / numbers.filtered_offset) ** 2
     filtered = weight * min(filtered, numbers.max_filtered_bias)
@@ -89,8 +98,8 @@ def fill_ratios(b, windows, known, numbers, ratios):
         lowered = deviation * min((deviation / numbers.low_noise_ratio) ** 2, 1.0)
         lowered = clamp(lowered, numbers.ratio_bounds[0], numbers.ratio_bounds[1])
         ratio = sqrt(1 + weight * (lowered**2 - 1))
-        ratios.ratio[j] = ratio
-        ratios.constant[j] = clamp(max(ratio, filtered) if j < SIZE else ratio, 0.1, 2.0)
+        work.ratio[j] = ratio
+        work.constant[j] = clamp(max(ratio, filtered) if j < SIZE else ratio, 0.1, 2.0)
 
 
 @kernel
@@ -105,28 +114,28 @@ def population_factor(k, mean, part, median, slopes, radius):
 
 
 @kernel
-def fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expected):
-    """Write means and deviations of window `b`, given `ratios` and `mean` input extents."""
+def fill_expectation(b, windows, of_class, known, numbers, work, expected):
+    """Write means and deviations of window `b`, given what `work` has of its input."""
     kind = windows.kind[b]
     has_pin = windows.pinned[b].any()
     usual, usual_extent = of_class.pose[b], of_class.extent[b]
-    shared, deviation = expected.shared[b], expected.deviation[b]
+    shared, deviation, mean = expected.shared, expected.deviation, work.mean
     shared[:] = 0.0
     for j in range(POSE):
         share = numbers.yaw_bias if j == HEADING else 1.0
-        bias = usual[j] * share * ratios.slow[j] * ratios.constant[j]
-        expected.pose_deviation[b, j] = usual[j] * ratios.ratio[j]
-        expected.widened_deviation[b, j] = usual[j] * ratios.ratio[j] * ratios.widening[j]
-        expected.unmodelled_bias[b, j] = bias if has_pin else 0.0
+        bias = usual[j] * share * work.slow[j] * work.constant[j]
+        expected.pose_deviation[j] = usual[j] * work.ratio[j]
+        expected.widened_deviation[j] = usual[j] * work.ratio[j] * work.widening[j]
+        expected.unmodelled_bias[j] = bias if has_pin else 0.0
         deviation[BIAS + j] = numbers.pinned_extent if has_pin else bias
     for k in range(SIZE):
-        part = usual_extent * ratios.slow[POSE + k] * min(2 * ratios.constant[k], 1.0)
+        part = usual_extent * work.slow[POSE + k] * min(2 * work.constant[k], 1.0)
         factor = population_factor(
             k, mean, part, known.median[kind], known.slopes[kind], numbers.population_radius
         )
         shared[EXTENT + k] = mean[k] if has_pin else mean[k] * factor
         deviation[EXTENT + k] = numbers.pinned_extent if has_pin else mean[k] * factor * part
-    widening = max(2 - 2 * ratios.constant[0], 1.0) * (numbers.pinned_margins if has_pin else 1.0)
+    widening = max(2 - 2 * work.constant[0], 1.0) * (numbers.pinned_margins if has_pin else 1.0)
     for face in range(6):
         size = max(mean[face // 2] / numbers.large_extent[face // 2], 1.0)
         shared[GAP + face] = of_class.gaps[b, face] + known.gap_correction[kind, face]
@@ -138,14 +147,39 @@ def fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expecte
 
 
 @kernel
-def expect(begin, end, windows, of_class, known, numbers, expected, widening, slow):
+def fill_input_error(b, windows, of_class, known, numbers, work, expected):
+    """Write the deviations of the errors of mean extents and bias of window `b` (M28), (9,)."""
+    kind = windows.kind[b]
+    weight, slow = known.weight[kind], work.slow.max()
+    deviation, error, mean = expected.deviation, expected.input_error, work.mean
+    count = windows.lengths[b] + windows.marginalised_extents[b, 3]
+    for k in range(SIZE):
+        j = POSE + k
+        noise = sqrt(1 + weight * (known.deviation[kind, j] ** 2 - 1))
+        of_mean = min(work.widening[j] / sqrt(count), 1.0)
+        constant = slow * noise
+        if kind != numbers.estimated_kind:
+            constant = max(min(noise / numbers.low_noise_ratio, 1.0), noise)
+        constant *= numbers.constant_extent_errors[kind][k]
+        error[EXTENT + k] = mean[k] * of_class.extent[b] * hypot(noise * of_mean, constant)
+    for j in range(POSE):
+        noise = sqrt(1 + weight * (known.deviation[kind, j] ** 2 - 1))
+        share = numbers.yaw_bias if j == HEADING else 1.0
+        error[BIAS + j] = of_class.pose[b, j] * noise * slow * share
+    has_pin = windows.pinned[b].any()
+    for s in range(GAP):
+        error[s] = deviation[s] if has_pin else max(error[s], deviation[s])
+
+
+@kernel
+def expect(b, windows, of_class, known, numbers, work, expected):
     """
-    Write means and deviations of the windows `begin` to `end`.
+    Write means and deviations of window `b`.
 
     Parameters
     ----------
-    begin, end : int
-        First window, and the one after the last.
+    b : int
+        The window.
     windows : WindowArrays
         Input of the windows.
     of_class : ClassArrays
@@ -154,22 +188,16 @@ def expect(begin, end, windows, of_class, known, numbers, expected, widening, sl
         Noise, margins and population of the input, by kind.
     numbers : ExpectationNumbers
         Constants.
+    work : ExpectationWork
+        Arrays to work in.
     expected : ExpectedArrays
         Written.
-    widening : array, shape (B, 3)
-        Factor on the deviations of extents for the correlation of their errors, written.
-    slow : array, shape (B, 1)
-        Largest part of an error that is constant over the window, written.
 
     """
-    ratios = Ratios(np.empty(6), np.empty(6), np.empty(9), np.empty(9))
-    mean = np.empty(SIZE)
-    for b in range(begin, end):
-        fill_mean_extents(b, windows, mean)
-        fill_ratios(b, windows, known, numbers, ratios)
-        fill_expectation(b, windows, of_class, known, numbers, ratios, mean, expected)
-        widening[b] = ratios.widening[POSE:]
-        slow[b, 0] = ratios.slow.max()
+    fill_mean_extents(b, windows, work.mean)
+    fill_ratios(b, windows, known, numbers, work)
+    fill_expectation(b, windows, of_class, known, numbers, work, expected)
+    fill_input_error(b, windows, of_class, known, numbers, work, expected)
 
 
 @kernel

@@ -293,7 +293,7 @@ def clear_padding(length, row, faces):
     faces.distance[row, length:] = 0.0
     faces.weight[row, length:] = 0.0
     faces.inset[row, length:] = 0.0
-    faces.inset_shares[:, row, length:] = 0.0
+    faces.inset_shares[row, length:] = 0.0
     faces.num_points[row, length:] = 0.0
 
 
@@ -344,7 +344,7 @@ def observe_window(
         fill_visibility(box, origins, points, numbers, R, toward, tangent)
         fill_insets(
             origins, tangent, occlusion_inset, range_inset, numbers,
-            faces.inset_shares[:, row, n], inset, weight,
+            faces.inset_shares[row, n], inset, weight,
         )  # fmt: skip
         for k in range(3):
             shift[k] = pose[k] - box[k]

@@ -9,7 +9,7 @@ from math import sqrt
 
 from boxreg_ros.core.kernels.compile import kernel
 from boxreg_ros.core.kernels.lbfgs import are_finite
-from boxreg_ros.core.kernels.sorting import lower_median
+from boxreg_ros.core.kernels.selection import lower_median
 import numpy as np
 
 

@@ -1,5 +1,5 @@
 """
-One round of windows, in plain loops: observe, weigh, sum up, factorise, minimise.
+One round of windows, in plain loops: expect, observe, weigh, sum up, factorise, minimise.
 
 The torch twin is `boxreg_ros.core.rounds.run_round_torch`. What a window works with stays in the
 processor's cache from one step to the next.
@@ -8,6 +8,7 @@ processor's cache from one step to the next.
 
 from typing import Any, NamedTuple
 
+from boxreg_ros.core.kernels.arrays import ExpectedArrays, FaceArrays, InverseArrays
 from boxreg_ros.core.kernels.arrowhead import (
     empty_arrowhead,
     factorise,
@@ -17,13 +18,19 @@ from boxreg_ros.core.kernels.arrowhead import (
     POSE,
 )
 from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.expectation import fill_evidence
+from boxreg_ros.core.kernels.covariance import empty_covariance_work, fill_posterior
+from boxreg_ros.core.kernels.expectation import (
+    empty_expectation_work,
+    expect,
+    fill_evidence,
+)
 from boxreg_ros.core.kernels.face_support import empty_face_work, observe_window
 from boxreg_ros.core.kernels.lbfgs import empty_search, minimise
 from boxreg_ros.core.kernels.normal_equations import (
     accumulate,
     ANCHOR,
     empty_scratch,
+    GAP,
     marginalise,
     SHARED,
     SIDESLIP,
@@ -72,8 +79,15 @@ class RoundWork(NamedTuple):
 
     Attributes
     ----------
-    points, shape, scratch, search : FaceWork, ShapeWork, Scratch, Search
-        Of the parts of the round.
+    expectation, points, shape, scratch, search, covariance : tuple
+        Of the parts of the round: `ExpectationWork`, `FaceWork`, `ShapeWork`, `Scratch`, `Search`
+        and `CovarianceWork`.
+    expected : ExpectedArrays
+        Means and deviations of input and shared variables.
+    faces : FaceArrays
+        Face observations of the window, its only one.
+    inverse : InverseArrays
+        Blocks of the inverse curvature.
     x : array, shape (6 N + 23,)
         Variables of the window.
     A : ArrowheadArrays
@@ -81,10 +95,15 @@ class RoundWork(NamedTuple):
 
     """
 
+    expectation: Any
     points: Any
     shape: Any
     scratch: Any
     search: Any
+    covariance: Any
+    expected: Any
+    faces: Any
+    inverse: Any
     x: Any
     A: Any
 
@@ -94,9 +113,21 @@ def empty_round_work(begin, end, windows, N, numbers):
     """Return arrays for the windows `begin` to `end`."""
     D = POSE * N + SHARED
     return RoundWork(
-        empty_face_work(begin, end, windows, numbers.faces),
+        empty_expectation_work(), empty_face_work(begin, end, windows, numbers.faces),
         empty_shape_work(begin, end, windows, N, numbers.shape.cells),
-        empty_scratch(N), empty_search(D, numbers.search.history), np.empty(D), empty_arrowhead(N),
+        empty_scratch(N), empty_search(D, numbers.search.history), empty_covariance_work(N),
+        ExpectedArrays(
+            np.empty(SHARED), np.empty(SHARED), np.empty(POSE), np.empty(POSE), np.empty(POSE),
+            np.empty(GAP),
+        ),
+        FaceArrays(
+            np.empty((1, N, 6, 4, 4)), np.empty((1, N, 6)), np.empty((1, N, 6)),
+            np.empty((1, N, 6)), np.empty((1, N, 2, 6)), np.empty((1, N)),
+        ),
+        InverseArrays(
+            np.empty((N, POSE, POSE)), np.empty((N, POSE, SHARED)), np.empty((SHARED, SHARED))
+        ),
+        np.empty(D), empty_arrowhead(N),
     )  # fmt: skip
 
 
@@ -111,27 +142,27 @@ def leave_prior(b, terms, work, solution):
 
 
 @kernel
-def run_window(
-    b, row, windows, thinned, known, prior, every_free, expected, of_class, numbers, work, faces,
-    solution, ends,
-):  # fmt: skip
-    """Take one round with window `b`, at `row` of `faces` and `ends`; see `run_windows`."""
+def run_window(b, windows, thinned, known, prior, every_free, of_class, numbers, work, solution):
+    """Take one round with window `b`, see `run_windows`; return whether it is done."""
     poses, shared, free = solution.poses[b], solution.shared[b], every_free[b]
     search, x, A, kind = numbers.search, work.x, work.A, windows.kind[b]
+    expected, faces, inverse = work.expected, work.faces, work.inverse
+    shape = of_class.shape[b]
     N = len(poses)
     n = POSE * N
     shared[ANCHOR:SIDESLIP] = 0.0
+    expect(b, windows, of_class, known, numbers.expectation, work.expectation, expected)
     observe_window(
         b, windows, poses, shared, known.occlusion_inset[kind], known.range_inset[kind],
-        numbers.faces, work.points, row, faces,
+        numbers.faces, work.points, 0, faces,
     )  # fmt: skip
     terms = unweighted_terms(N, N if search.uses_shape else 0, prior, b)
-    weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers.weights, terms)
+    weigh(b, windows, poses, shared, 0, faces, expected, of_class, numbers.weights, terms)
     if search.uses_shape:
         terms.start[:] = poses
         agree(
-            b, thinned, poses, shared[:3], of_class.shape[b], numbers.shape, work.shape,
-            terms.W_shape, terms.wanted,
+            b, thinned, poses, shared[:3], shape, numbers.shape, work.shape, terms.W_shape,
+            terms.wanted,
         )  # fmt: skip
     x[:n] = poses.ravel()
     x[n:] = shared
@@ -143,22 +174,25 @@ def run_window(
     )
     poses[:] = found
     shared[:] = x[n:]
-    invert_corner(A.corner, ends.corner[row])
+    invert_corner(A.corner, inverse.corner)
     fill_evidence(
-        solution.evidence[b, 0], expected.shared[b], expected.deviation[b], shared,
-        ends.corner[row], numbers.min_extent_gain, solution.evidence[b, 1:],
+        solution.evidence[b, 0], expected.shared, expected.deviation, shared,
+        inverse.corner, numbers.min_extent_gain, solution.evidence[b, 1:],
     )  # fmt: skip
-    ends.is_done[row] = is_done
     if is_done:
-        invert_poses(A, ends.corner[row], ends.pose_blocks[row], ends.border_blocks[row])
+        invert_poses(A, inverse.corner, inverse.poses, inverse.border)
+        fill_posterior(
+            b, windows, poses, shared, 0, faces, expected, shape, free, inverse, numbers.weights,
+            numbers.covariance, work.covariance, solution.posterior,
+        )  # fmt: skip
         if len(solution.prior_state) and windows.lengths[b] == N:
             leave_prior(b, terms, work, solution)
+    return is_done
 
 
 @kernel
 def run_windows(
-    begin, end, rows, windows, thinned, known, prior, free, expected, of_class, numbers, faces,
-    solution, ends,
+    begin, end, rows, windows, thinned, known, prior, free, of_class, numbers, solution, is_done
 ):  # fmt: skip
     """
     Take one round with the windows `rows[begin:end]`.
@@ -172,28 +206,23 @@ def run_windows(
     windows, thinned : WindowArrays
         Input of the windows, and the same with the points of the rigid shape.
     known : InputArrays
-        Insets of the points, by kind.
+        Noise, margins and population of the input, by kind.
     prior : PriorArrays
         Marginalisation prior.
     free : array, shape (B, 6 N + 23)
         1 for variables that are estimated, 0 for those held fixed.
-    expected : ExpectedArrays
-        Means and deviations of input and shared variables.
     of_class : ClassArrays
         Settings of the class of each window.
     numbers : RoundNumbers
         Constants and settings.
-    faces : FaceArrays
-        Face observations of these windows, written.
     solution : SolutionArrays
         Start of the round; its end is written.
-    ends : EndArrays
-        Written.
+    is_done : array, shape (b,)
+        Written: whether a window is settled, or this was the last round.
 
     """
     work = empty_round_work(0, len(windows.counts), windows, solution.poses.shape[1], numbers)
     for row in range(begin, end):
-        run_window(
-            rows[row], row, windows, thinned, known, prior, free, expected, of_class, numbers,
-            work, faces, solution, ends,
+        is_done[row] = run_window(
+            rows[row], windows, thinned, known, prior, free, of_class, numbers, work, solution,
         )  # fmt: skip

@@ -18,7 +18,7 @@ from boxreg_ros.core.kernels.normal_equations import (
     slip_of,
 )
 from boxreg_ros.core.kernels.rotation import fill_rotation
-from boxreg_ros.core.kernels.sorting import lower_median
+from boxreg_ros.core.kernels.selection import lower_median
 import numpy as np
 
 BOTTOM = 5
@@ -137,15 +137,19 @@ def weigh_pins(pinned, length, widened, unmodelled_bias, pin_deviations, W):
 
 
 @kernel
+def face_deviation(face, shape, deviations):
+    """Return the deviation of one observation of a face of an object rigid up to `shape` [m]."""
+    return deviations[face] if face == BOTTOM else max(deviations[face], shape)
+
+
+@kernel
 def fill_face_weights(distance, weight, off_track, length, shape, numbers, face_weight):
     """Write the weights of the faces (M20), (N, 6) [1/m^2], of an object rigid up to `shape`."""
     for n in range(length):
         off = off_track[n, 0] ** 2 + off_track[n, 1] ** 2
         same_object = 1 / (1 + off**2) ** 2
         for face in range(6):
-            deviation = numbers.face_deviations[face]
-            if face != BOTTOM:
-                deviation = max(deviation, shape)
+            deviation = face_deviation(face, shape, numbers.face_deviations)
             robust = 1 / (1 + (distance[n, face] / numbers.face_outlier) ** 2) ** 2
             face_weight[n, face] = weight[n, face] * robust * same_object / deviation**2
 
@@ -281,7 +285,7 @@ def weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers, te
     boxes, times = windows.boxes[b], windows.times[b]
     terms.times[:] = times
     terms.inset[:] = faces.inset[row]
-    terms.expected[:] = expected.shared[b]
+    terms.expected[:] = expected.shared
     for n in range(N):
         fill_rotation(poses[n, 3], poses[n, 4], poses[n, 5], terms.axes[n])
         for k in range(6):
@@ -293,17 +297,15 @@ def weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers, te
     )
     for n in range(length):
         scale_moments(faces.moments[row, n], face_weight[n], terms.W_faces[n])
-    deviation, widened = expected.pose_deviation[b], expected.widened_deviation[b]
+    deviation, widened = expected.pose_deviation, expected.widened_deviation
     fill_input_weights(
         poses, shared[BIAS:GAP], length, off_track, deviation, widened, numbers, terms
     )
     weigh_pins(
-        windows.pinned[b], length, widened, expected.unmodelled_bias[b], numbers.pin_deviations,
+        windows.pinned[b], length, widened, expected.unmodelled_bias, numbers.pin_deviations,
         terms.W_input,
     )  # fmt: skip
-    fill_shared_weights(
-        shared, expected.deviation[b], distance, face_weight, length, numbers, terms
-    )
+    fill_shared_weights(shared, expected.deviation, distance, face_weight, length, numbers, terms)
     fill_acceleration_weights(of_class.acceleration[b], length, terms)
     yaw_deviation = max(deviation[5], of_class.pose[b, 5])
     fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked)
