@@ -412,6 +412,33 @@ def test_an_interrupted_run_does_not_wait_for_the_interpreter(tmp_path):
     assert process.returncode == 130
 
 
+SIGNAL_IN_TORCH = """
+import os, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == 'torch.autograd':
+            os.kill(os.getpid(), int(os.environ['NUMBER']))
+sys.meta_path.insert(0, Finder())
+from boxreg_ros.cli import command
+command()
+"""
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_the_import_of_torch_ends_the_process_at_once(tmp_path, number):
+    # An exception would pass through its libraries, which abort.
+    recording = Drive(sweeps=4).write(tmp_path / 'drive')
+    command = [sys.executable, '-c', SIGNAL_IN_TORCH, 'relabel', recording, '-o', tmp_path / 'out']
+    done = subprocess.run(
+        [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=60,
+        env=os.environ | {'NUMBER': str(int(number))},
+    )  # fmt: skip
+    cause = 'interrupted' if number == signal.SIGINT else 'ended by SIGTERM'
+    assert done.stderr == f'boxreg: {cause}; nothing was written\n'
+    assert done.returncode == 128 + number
+    assert not (tmp_path / 'out').exists()
+
+
 @pytest.mark.parametrize(
     'step',
     [
