@@ -8,7 +8,7 @@ from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
 import numpy as np
 
@@ -97,7 +97,7 @@ def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:
                 found.setdefault(key, covariance)
             return found
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        raise RecordingError(unreadable(path, error)) from None
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise RecordingError(
             f'{path}: expected the columns of covariances.csv with a number in each cell, got '

@@ -330,7 +330,10 @@ class Recording:
         frames = [str(header.frame_id).lstrip('/') for header in headers]
         if not frames:
             topics = ', '.join(map(repr, self.points_topics))
-            raise RecordingError(f'{self}: no point clouds on {topics} in this part')
+            raise RecordingError(
+                f'{self}: expected point clouds on {topics} in this part, got none; choose '
+                f'another with --start and --end'
+            )
         return frames
 
     def _read(

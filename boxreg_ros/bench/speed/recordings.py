@@ -57,16 +57,8 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
             ('compressed', points, seconds),
             ('memory', points, seconds),
         ):
-            a, b, c, d = tee(traffic(tracks, size, round(length / SWEEP_PERIOD)), 4)
-            write_recording(
-                path,
-                (Sweep(i.stamp_ns, 'lidar', i.points) for i in a),
-                (np.zeros(len(i.points)) for i in b),
-                (i.boxes for i in c),
-                (i.T_fixed_sensor for i in d),
-                'odom',
-                is_compressed=case == 'compressed',
-            )
+            sweeps = round(length / SWEEP_PERIOD)
+            write_traffic(path, tracks, size, sweeps, is_compressed=case == 'compressed')
             with path.open('rb') as file:
                 os.fsync(file.fileno())  # else the disk still writes while it is read
             run = [*command, str(path), '-o', str(out)]
@@ -83,6 +75,22 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
             elif case == 'long':
                 result |= {'faster, long': faster, 'rest, long': rest, 'cores, long': cores}
     return result
+
+
+def write_traffic(
+    path: Path, tracks: int, points: int, count: int, is_compressed: bool = False
+) -> None:
+    """Write a recording of `traffic`."""
+    a, b, c, d = tee(traffic(tracks, points, count), 4)
+    write_recording(
+        path,
+        (Sweep(i.stamp_ns, 'lidar', i.points) for i in a),
+        (np.zeros(len(i.points)) for i in b),
+        (i.boxes for i in c),
+        (i.T_fixed_sensor for i in d),
+        'odom',
+        is_compressed=is_compressed,
+    )
 
 
 def _seconds(command: list[str]) -> float:

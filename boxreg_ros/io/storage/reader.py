@@ -225,8 +225,8 @@ def readable(origin: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise RecordingError(
-            f'{origin}: {one_line(error)}; expected an MCAP file, rosbag2 folder, .db3 file or '
-            f'ROS 1 bag'
+            f'{origin}: expected an MCAP file, rosbag2 folder, .db3 file or ROS 1 bag, got: '
+            f'{one_line(error)}; copy or record it again'
         ) from None
 
 
