@@ -51,6 +51,10 @@ Accuracy is measured against true boxes of vehicles with at least 100 points:
 
 Tables by class are of all true boxes with points, for classes with at least 20 of them.
 
+Tables of differences are of the mean IoU of two methods. The standard error is that of the tracks,
+whose boxes share their errors (cluster-robust). *ahead* is the number of tracks whose BEV IoU is
+not lower.
+
 The rows are methods. *early* is the estimate of the newest box of a sliding window, *final* that
 of the box `lag` observations before it, *track* that from the whole track:
 
@@ -156,6 +160,7 @@ def _accuracy(results: Any) -> Iterable[str]:
         yield from _groups(measured, '3D IoU')
         if 'by_class' in measured['input']:
             yield _classes(measured)
+        yield from _compared(measured)
         for name, reason in skipped.items():
             yield f'{name}: {reason}.'
 
@@ -170,6 +175,35 @@ def _groups(measured: Any, iou: str) -> Iterable[str]:
             [name, *(_number(row.get(label)) for label in labels)] for name, row in grouped.items()
         ]
         yield _table([f'{iou} {title}', *labels], rows)
+
+
+def _compared(measured: Any) -> Iterable[str]:
+    """Yield the table of moving objects, and that of the differences between methods."""
+    moving = {name: row['moving'] for name, row in measured.items() if 'moving' in row}
+    if moving:
+        rows = [
+            [name, *(_number(row[key]) for key in ('iou_bev', 'iou_3d')),
+             _number(row['yaw_degrees'], 2)]
+            for name, row in moving.items()
+        ]  # fmt: skip
+        head = f'moving objects ({moving["input"]["boxes"]} boxes)'
+        yield _table([head, 'BEV', '3D', 'median error of yaw [degrees]'], rows)
+    rows = [
+        [f'{name} - {other}', scope, *_difference(found)]
+        for name, row in measured.items()
+        for scope, others in row.get('differences', {}).items()
+        for other, found in others.items()
+    ]
+    if rows:
+        yield _table(['difference', 'objects', 'BEV', '3D', 'tracks', 'ahead'], rows)
+
+
+def _difference(found: Any) -> Iterable[str]:
+    """Yield both differences with their standard errors, and the numbers of tracks."""
+    for key in ('iou_bev', 'iou_3d'):
+        yield f'{_signed(found[key], 4)} ± {_number(found[f"{key}_error"], 4)}'
+    yield str(found['tracks'])
+    yield str(found['tracks_ahead'])
 
 
 def _classes(measured: Any) -> str:
@@ -260,6 +294,20 @@ def _tracks(results: Any) -> Iterable[str]:
             for name, row in rows.items()
         ]
         yield _table(['', *(title for title, _ in keys)], lines)
+        yield from _kinds(rows)
+
+
+def _kinds(rows: Any) -> Iterable[str]:
+    """Yield the scores by kind of object in the last row."""
+    name, last = list(rows.items())[-1]
+    keys = ('recall', 'precision', 'added', 'added_iou', 'given_iou')
+    lines = [
+        [kind, *(_number(scores[key], 0 if key == 'added' else 3) for key in keys)]
+        for kind, scores in last.get('by_kind', {}).items()
+    ]
+    if lines:
+        titles = ('recall', 'precision', 'added', '3D IoU of added', '3D IoU of others')
+        yield _table([f'{name}, by kind', *titles], lines)
 
 
 def _figures(results: Any) -> Iterable[str]:

@@ -1,5 +1,5 @@
 """
-Baselines of `boxreg bench`: a smoother, a rectangle fit per sweep, and ICP.
+Baselines of `boxreg bench`: two smoothers, a rectangle fit per sweep, and ICP.
 
 Each takes a track and returns one box (N, 9) per observation, without access to the truth. They
 are standard methods with tuned parameters, and nothing else uses them.
@@ -12,10 +12,24 @@ from typing import Any
 
 from boxreg_ros.core.refine import Track
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix, wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, HEIGHT, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
+from boxreg_ros.structures import (
+    BOX_EXTENT,
+    Floats,
+    HEIGHT,
+    Ints,
+    LENGTH,
+    PITCH,
+    ROLL,
+    WIDTH,
+    X,
+    Y,
+    YAW,
+)
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
+from scipy.optimize import least_squares
+from scipy.sparse import csr_array, eye_array, kron, vstack
 
 # Smoother: standard deviations.
 POSITION_DEVIATION = 0.3  # of the centre of an input box [m]
@@ -24,6 +38,11 @@ ACCELERATION = 1.2  # in the plane [m/s^2], half of it in z
 ANGULAR_ACCELERATION = 0.4  # of yaw [rad/s^2], half of it of roll and pitch
 MIN_TRAVEL = 0.15  # a track whose ends are closer than this is parked [m]
 REWEIGHTINGS = 5  # iterations of the robust fit
+
+# Smoother of constant turn rate and acceleration: deviations of x, y [m], yaw [rad], speed [m/s],
+# turn rate [rad/s] and acceleration [m/s^2] from the prediction, per root of a second.
+CTRA_DEVIATIONS = np.array([0.05, 0.05, 0.02, 0.1, 0.2, 2.0])
+CTRA_OUTLIER = 2.0  # deviations of the input at which its weight is 1/2
 
 # Rectangle fit and ICP: which points are used.
 SCAN_MARGIN = 0.4  # points this far outside the box are used [m]
@@ -76,6 +95,74 @@ def _smooth(stamps_ns: Ints, given: Floats) -> Floats:
         boxes[:, :2] = np.median(given[:, :2], axis=0)
         boxes[:, YAW] = np.median(np.unwrap(_without_flips(given[:, YAW])))
     return boxes
+
+
+def ctra_smoothed(track: Track) -> Floats:
+    """
+    Return the boxes of `smoothed`, those of a moving object on a path of smooth turn rate.
+
+    Constant turn rate and acceleration (CTRA): speed, turn rate and acceleration are states of
+    each box beside x, y and yaw, and the heading is that of the path. The residuals are those of
+    the motion model of Justo Miro et al., Correcting and Quantifying Systematic Errors in 3D Box
+    Annotations for Autonomous Driving, 2026.
+
+    """
+    boxes = smoothed(track)
+    if len(boxes) < 3 or _is_parked(track.boxes):
+        return boxes
+    times = (track.stamps_ns - track.stamps_ns[0]) / 1e9
+    place = boxes[:, [X, Y, YAW]]
+    place[:, 2] = np.unwrap(place[:, 2])
+    turned = wrap_angle(2 * (track.boxes[:, YAW] - place[:, 2])) / 2  # without half turns
+    given = np.column_stack([track.boxes[:, X], track.boxes[:, Y], place[:, 2] + turned])
+    fit = least_squares(
+        _ctra_residuals,
+        _ctra_start(times, place).ravel(),
+        jac_sparsity=_ctra_sparsity(len(boxes)),
+        x_scale='jac',
+        args=(times, given),
+    )
+    boxes[:, [X, Y, YAW]] = fit.x.reshape(-1, 6)[:, :3]
+    boxes[:, YAW] = wrap_angle(boxes[:, YAW])
+    return boxes
+
+
+def _ctra_start(times: Floats, place: Floats) -> Floats:
+    """Return states (N, 6) of constant speed between `place` (N, 3): x, y and yaw."""
+    rates = np.gradient(place, times, axis=0)
+    speed = rates[:, 0] * np.cos(place[:, 2]) + rates[:, 1] * np.sin(place[:, 2])
+    return np.column_stack([place, speed, rates[:, 2], np.gradient(speed, times)])
+
+
+def _ctra_residuals(states: Floats, times: Floats, given: Floats) -> Floats:
+    """Return the residuals of the input `given` (N, 3), robust, and of the N - 1 predictions."""
+    x, y, yaw, speed, turn_rate, acceleration = states.reshape(-1, 6).T
+    of_input = np.column_stack([x, y, yaw]) - given
+    of_input /= [POSITION_DEVIATION, POSITION_DEVIATION, ANGLE_DEVIATION]
+    squared = np.square(of_input / CTRA_OUTLIER)
+    robust = of_input * np.sqrt(np.log1p(squared) / np.maximum(squared, 1e-12))  # Cauchy's
+    seconds = np.diff(times)
+    middle = (yaw + turn_rate * np.append(seconds, 0) / 2)[:-1]  # heading of the chord
+    chord = speed[:-1] * seconds + acceleration[:-1] * seconds**2 / 2
+    of_motion = np.column_stack(
+        [
+            np.diff(x) - chord * np.cos(middle),
+            np.diff(y) - chord * np.sin(middle),
+            np.diff(yaw) - turn_rate[:-1] * seconds,
+            np.diff(speed) - acceleration[:-1] * seconds,
+            np.diff(turn_rate),
+            np.diff(acceleration),
+        ]
+    )
+    of_motion /= CTRA_DEVIATIONS * np.sqrt(seconds)[:, None]
+    return np.concatenate([robust.ravel(), of_motion.ravel()])
+
+
+def _ctra_sparsity(n: int) -> Any:
+    """Return which of the residuals of `_ctra_residuals` depend on which of the 6 n states."""
+    own = kron(eye_array(n), csr_array(np.eye(3, 6)))
+    steps = kron(eye_array(n - 1, n) + eye_array(n - 1, n, k=1), np.ones((6, 6)))
+    return vstack([own, steps])
 
 
 def _is_parked(boxes: Floats) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 
-from boxreg_ros.bench.baselines import icp, l_shaped, smoothed, smoothed_live
+from boxreg_ros.bench.baselines import ctra_smoothed, icp, l_shaped, smoothed, smoothed_live
 from boxreg_ros.config import Config
 from boxreg_ros.core.refine import Track
 from boxreg_ros.io.box_table import BoxTable
@@ -15,6 +15,7 @@ import numpy as np
 
 BASELINES: dict[str, tuple[str, Callable[[Track], Floats]]] = {
     'smoothing': ('smoothing only', smoothed),
+    'ctra': ('CTRA smoothing', ctra_smoothed),
     'l-shape': ('L-shape per sweep', l_shaped),
     'icp': ('ICP on box points', icp),
 }

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
-from boxreg_ros.config import COMPLETE_STEPS, Config
+from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
@@ -41,12 +41,15 @@ class Row:
         Of the boxes that are not rejected.
     ghosts, lost : float
         Rejected part of the ghosts, and of the other boxes of the input; NaN without any.
+    by_kind : dict of str to TrackScores
+        Scores of the boxes of each kind of object.
 
     """
 
     scores: TrackScores
     ghosts: float
     lost: float
+    by_kind: dict[str, TrackScores]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,10 +96,16 @@ def run(args: argparse.Namespace) -> int:
             rows = {}
             found = with_coast(drive, args.coast) if args.coast else after_each_step(drive)
             for name, row in found:
-                rows[name] = asdict(row.scores) | {'ghosts_rejected': row.ghosts, 'lost': row.lost}
+                rows[name] = asdict(row.scores) | {
+                    'ghosts_rejected': row.ghosts,
+                    'lost': row.lost,
+                    'by_kind': {kind: asdict(scores) for kind, scores in row.by_kind.items()},
+                }
                 bar.update()
                 if not args.json:
                     print(line(name, _cells(row)))
+            if not args.json:
+                _print_kinds(row)
             report[str(folder)] = rows
     if args.json:
         print_json(report)
@@ -151,8 +160,9 @@ def _registered(items: Sequence[Sweep | BoxArray], config: Config) -> list[Refin
 
 
 def _input_row(drive: Drive) -> Row:
-    scores = track_scores(BoxTable.from_arrays(drive.boxes), drive.truth)
-    return Row(scores, math.nan, math.nan)
+    table = BoxTable.from_arrays(drive.boxes)
+    scores = track_scores(table, drive.truth)
+    return Row(scores, math.nan, math.nan, scores_by_kind(table, drive.truth))
 
 
 def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
@@ -161,8 +171,23 @@ def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
     for given, result in zip(drive.boxes, results, strict=True):
         for track_id, status in zip(given.track_ids, result.status, strict=False):
             is_rejected[track_id.startswith(GHOST_PREFIX)].append(status == REJECTED)
-    parts = [float(np.mean(rows)) if rows else math.nan for rows in is_rejected.values()]
-    return Row(track_scores(table_of(results), drive.truth), *parts)
+    ghosts, lost = (float(np.mean(rows)) if rows else math.nan for rows in is_rejected.values())
+    table = table_of(results)
+    scores = track_scores(table, drive.truth)
+    return Row(scores, ghosts, lost, scores_by_kind(table, drive.truth))
+
+
+def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScores]:
+    """Return the scores of the boxes of each kind of object that the truth has."""
+    scores = {}
+    for kind in KINDS:
+        true, found = (
+            table.rows(np.array([Config().kind(name) == kind for name in table.class_names], bool))
+            for table in (truth, predicted)
+        )
+        if len(true.boxes):
+            scores[kind] = track_scores(found, true)
+    return scores
 
 
 def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
@@ -170,6 +195,13 @@ def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
     table = BoxTable.from_arrays([result.boxes for result in results])
     table = replace(table, status=tuple(word for r in results for word in r.status))
     return table.rows(np.array([status != REJECTED for status in table.status], bool))
+
+
+def _print_kinds(row: Row) -> None:
+    """Print the scores of each kind of object in the last row."""
+    print(line('last row, by kind', ('recall', 'prec.', 'added', '3D added', '3D others')))
+    for kind, s in row.by_kind.items():
+        print(line(kind, (s.recall, s.precision, str(s.added), s.added_iou, s.given_iou)))
 
 
 def _cells(row: Row) -> tuple[float | str, ...]:

@@ -127,8 +127,11 @@ def _update_noise(
     config: Config,
 ) -> None:
     """Update the noise with the best fit of each window, `lag` from its end, and its extents."""
-    best = [max(0, len(window.observations) - 1 - config.lag) for window in windows]
-    residuals = residuals_at(problem, solution.state, np.array(best))
+    lag = min(config.lag, config.window - 1)
+    best = np.array([len(window.observations) - 1 - lag for window in windows])
+    residuals = residuals_at(problem, solution.state, best.clip(0))
+    # Each box counts once. The first one stays the best of its window as long as this grows.
+    residuals[best < 0] = np.nan
     track_ids = [window.track_id for window in windows]
     evidence = solution.extent_evidence.cpu().numpy()
     model.add_fits(track_ids, problem.kind, residuals, evidence)

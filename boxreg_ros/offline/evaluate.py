@@ -126,7 +126,10 @@ def _track_lines(scores: TrackScores) -> str:
         f'{scores.hota:.3f} (detection {scores.det_a:.3f}, association {scores.ass_a:.3f})'
     ]
     if scores.added:
-        lines.append(f'{scores.added} added boxes with a mean 3D IoU of {scores.added_iou:.3f}')
+        lines.append(
+            f'{scores.added} added boxes with a mean 3D IoU of {scores.added_iou:.3f}, the others '
+            f'have {scores.given_iou:.3f}'
+        )
     return '\n'.join(lines)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.overlap import best_pairs, Overlaps, overlaps
-from boxreg_ros.structures import ADDED, Ints
+from boxreg_ros.structures import ADDED, Floats, Ints
 import numpy as np
 
 LEAST_IOU = 0.5
@@ -34,6 +34,8 @@ class TrackScores:
         of one object, the ids do not change places.
     added, added_iou : int and float
         Boxes that the input did not have, and their mean 3D IoU; 0 for a ghost.
+    given_iou : float
+        Mean 3D IoU of the other boxes, likewise.
     hota, det_a, ass_a, idf1 : float
         HOTA, its parts for detection and association, and IDF1; NaN without trackeval.
 
@@ -46,6 +48,7 @@ class TrackScores:
     ids_per_object: float
     added: int
     added_iou: float
+    given_iou: float
     hota: float
     det_a: float
     ass_a: float
@@ -80,7 +83,7 @@ def track_scores(predicted: BoxTable, truth: BoxTable, scope: Ints | None = None
     found = 0
     ids: dict[str, set[str]] = {}  # predicted ids that find each object
     last: dict[str, str] = {}  # the newest of them
-    added: list[float] = []
+    iou_of: dict[bool, list[float]] = {True: [], False: []}  # of added boxes, and of the others
     for stamp in stamps:
         found += len(best_pairs(stamp.iou, LEAST_IOU)[0])
         objects = [truth.track_ids[row] for row in stamp.true]
@@ -90,15 +93,17 @@ def track_scores(predicted: BoxTable, truth: BoxTable, scope: Ints | None = None
         for row, column in zip(*pairs, strict=True):
             last[objects[row]] = names[column]
             ids.setdefault(objects[row], set()).add(names[column])
-        added += _iou_of_added(stamp, predicted)
+        for row, value in zip(stamp.predicted, _iou_of_predicted(stamp), strict=True):
+            iou_of[predicted.status[row] in ADDED].append(float(value))
     return TrackScores(
         recall=_part(found, num_true),
         precision=_part(found, num_predicted),
         misses=num_true - found,
         ghosts=num_predicted - found,
         ids_per_object=_part(sum(map(len, ids.values())), len(ids)),
-        added=len(added),
-        added_iou=_part(sum(added), len(added)),
+        added=len(iou_of[True]),
+        added_iou=_part(sum(iou_of[True]), len(iou_of[True])),
+        given_iou=_part(sum(iou_of[False]), len(iou_of[False])),
         **_trackeval_scores(stamps, predicted, truth),
     )
 
@@ -114,16 +119,12 @@ def _scoped(stamp: Overlaps, is_in_scope: Any) -> Overlaps:
     )
 
 
-def _iou_of_added(stamp: Overlaps, predicted: BoxTable) -> list[float]:
-    """Return the IoU of each box of a stamp that the input did not have."""
+def _iou_of_predicted(stamp: Overlaps) -> Floats:
+    """Return the IoU of each predicted box of a stamp with the true box that it finds, else 0."""
     rows, columns = best_pairs(stamp.iou)
     iou = np.zeros(len(stamp.predicted))
     iou[columns] = stamp.iou[rows, columns]
-    return [
-        float(value)
-        for row, value in zip(stamp.predicted, iou, strict=True)
-        if predicted.status[row] in ADDED
-    ]
+    return iou
 
 
 def _trackeval_scores(

@@ -1,6 +1,6 @@
 """The baselines on known answers: a smoother, a rectangle fit per sweep, and ICP."""
 
-from boxreg_ros.bench.baselines import icp, l_shaped, smoothed, smoothed_live
+from boxreg_ros.bench.baselines import ctra_smoothed, icp, l_shaped, smoothed, smoothed_live
 from boxreg_ros.core.refine import Track
 import numpy as np
 import pytest
@@ -48,6 +48,35 @@ def test_smoother_handles_yaw_near_pi():
     truth[:, 8] = (truth[:, 8] + np.pi) % (2 * np.pi) - np.pi
     found = smoothed(make_track(truth))[:, 8]
     assert np.abs(np.cos(found) + 1).max() < 1e-2
+
+
+def bend(n, speed=8.0, turn_rate=0.4):
+    """Return the boxes of a car on a circle."""
+    boxes = car(n, 0.0)
+    boxes[:, 8] = turn_rate * 0.1 * np.arange(n)
+    radius = speed / turn_rate
+    boxes[:, :2] = radius * np.column_stack([np.sin(boxes[:, 8]), 1 - np.cos(boxes[:, 8])])
+    return boxes
+
+
+def test_ctra_takes_the_heading_from_the_path():
+    truth = bend(40)
+    noisy = truth.copy()
+    rng = np.random.default_rng(4)
+    noisy[:, :2] += rng.normal(0, 0.05, (40, 2))
+    noisy[:, 8] += 0.1 + rng.normal(0, 0.05, 40)  # a constant error: no smoother of yaw removes it
+    noisy[7, 8] += np.pi
+    found, plain = (smoother(make_track(noisy)) for smoother in (ctra_smoothed, smoothed))
+    assert np.abs(found - truth)[:, 8].mean() < 0.05
+    assert np.abs(plain - truth)[:, 8].mean() > 0.08
+    assert np.abs(found - truth)[:, :2].mean() < 0.05
+
+
+def test_ctra_keeps_perfect_short_and_parked_tracks():
+    truth = bend(30)
+    np.testing.assert_allclose(ctra_smoothed(make_track(truth)), truth, atol=1e-3)
+    for boxes in (truth[:2], car(20, 0.0)):
+        np.testing.assert_allclose(ctra_smoothed(make_track(boxes)), smoothed(make_track(boxes)))
 
 
 def test_live_smoother_uses_past_boxes_only():

@@ -29,6 +29,7 @@ ROWS = {
     'smoothing, early',
     'smoothing, final',
     'smoothing only',
+    'CTRA smoothing',
     'L-shape per sweep',
     'ICP on box points',
     'paper, track',
@@ -108,6 +109,12 @@ def test_real_prints_all_methods_and_groups(folder, capsys):
     assert 0.6 < report['input']['iou_3d'] < 0.95
     assert report['smoothing only']['flips'] == 0
     assert len(report['ours, track']['recall_3d']) == 3
+    ours = report['ours, track']
+    gain = ours['differences']['all']['smoothing only']
+    assert gain['iou_3d'] == pytest.approx(ours['iou_3d'] - report['smoothing only']['iou_3d'])
+    assert 0 < gain['iou_3d_error'] < 0.2
+    assert gain['tracks'] <= 4
+    assert 0 < ours['moving']['boxes'] < ours['boxes']
     # Group means are of the same boxes as the overall mean, so they lie on both sides of it.
     for grouping in ('by_range', 'by_points'):
         values = report['input'][grouping].values()
@@ -117,6 +124,7 @@ def test_real_prints_all_methods_and_groups(folder, capsys):
     assert all(method in text for method in ROWS)
     assert '3D by range [m]' in text
     assert '3D by points' in text
+    assert 'ours, track, all, minus' in text
     assert run('real', folder, '--methods', 'l-shape', 'smoothing', '--json') == 0
     report = json.loads(capsys.readouterr().out)['results'][str(folder)]
     smoothed = {'smoothing, early', 'smoothing, final', 'smoothing only'}
@@ -222,6 +230,12 @@ def test_coasting_finds_missed_boxes(folder, capsys):
     assert list(rows) == ['input', 'final', 'coast 0.5 s']
     assert rows['final']['added'] == 0 < rows['coast 0.5 s']['added']
     assert rows['final']['recall'] < rows['coast 0.5 s']['recall']
+    # Only vehicles have boxes in this drive.
+    last = rows['coast 0.5 s']
+    assert set(last['by_kind']) == {'vehicle', 'cyclist', 'pedestrian'}
+    assert last['by_kind']['vehicle']['added_iou'] == last['added_iou']
+    assert last['by_kind']['pedestrian']['recall'] == 0
+    assert 0.5 < last['given_iou'] < 1
 
 
 def test_highway_measures_all_methods_at_both_speeds(capsys):

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 from boxreg_ros import Config, refine, Track
 from boxreg_ros.core import covariance, rounds, window
-from boxreg_ros.core.metrics import iou_3d, pose_errors
+from boxreg_ros.core.metrics import iou_3d, iou_bev, pose_errors
 from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.simulation.noise import detector_noise
 from boxreg_ros.simulation.simulate import simulate
 import numpy as np
 import pytest
@@ -104,6 +105,24 @@ def test_hard_braking_is_followed(estimate, most):
         missing.append([1 - iou_3d(boxes, truth).mean() for boxes in (track.boxes, refined.boxes)])
     before, after = np.mean(missing, axis=0)
     assert after < most * before
+
+
+@each_estimate
+def test_true_boxes_among_those_of_a_detector_are_not_lost(estimate):
+    # Eight cars around the sensor: the boxes of the first are true, those of the others have the
+    # errors of a detector. The noise is that of all of them.
+    rng = np.random.default_rng(1)
+    angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    truths = [drive(30, turn=0.1, start=(12 * np.cos(a), 12 * np.sin(a), a + 1.2)) for a in angles]
+    tracks = [track_of(truth, rng, str(i)) for i, truth in enumerate(truths)]
+    given = [truths[0], *(detector_noise(t, np.zeros((30, 3)), rng) for t in truths[1:])]
+    tracks = [replace(t, boxes=boxes) for t, boxes in zip(tracks, given, strict=True)]
+    exact, *others = refine(tracks, Config(estimate=estimate))
+    assert iou_bev(exact.boxes, truths[0]).mean() > 0.96
+    assert iou_3d(exact.boxes, truths[0]).mean() > 0.94
+    before = np.mean([iou_3d(b, t).mean() for b, t in zip(given[1:], truths[1:], strict=True)])
+    after = np.mean([iou_3d(o.boxes, t).mean() for o, t in zip(others, truths[1:], strict=True)])
+    assert 1 - after < 0.75 * (1 - before)
 
 
 def test_a_parked_object_does_not_move():

@@ -193,6 +193,19 @@ def test_observations_update_the_margins_once():
     np.testing.assert_array_equal(model.offsets().gap_correction, known)
 
 
+@pytest.mark.parametrize('length', [9, 13, 16])
+def test_each_box_counts_once_in_the_noise(length):
+    # Ten boxes a window: the first one is the best of its window from the tenth on.
+    model = InputModel(ALONE.faces)
+    whole = window(drive(length))
+    for end in range(3, length + 1):
+        seen = whole.observations[max(0, end - 10) : end]
+        register([whole._replace(observations=seen, num_new=len(seen))], ALONE, model)
+    counted = length - 9
+    known = counted / (counted + 14) if counted >= 5 else 0.0
+    np.testing.assert_allclose(model.noise().weight[0], known)
+
+
 def test_short_windows_have_no_estimate():
     many = [window(drive(2), 0, name='a'), window(drive(3), 0, name='b')]
     short, long = register(many, ALONE, InputModel(ALONE.faces))

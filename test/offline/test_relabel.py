@@ -43,6 +43,21 @@ def keys(rows):
     return [(int(row['stamp_ns']), row['track_id']) for row in rows]
 
 
+@pytest.mark.parametrize('setting', ['auto', 'stamp'])
+@pytest.mark.parametrize('scenario, known', [('highway', 'stamp'), ('highway-sight', 'sight')])
+def test_the_summary_states_the_time_of_the_boxes(tmp_path, scenario, known, setting):
+    assert (
+        main(['simulate', '-o', f'{tmp_path}/way.mcap', '--scenario', scenario, '--sweeps=4']) == 0
+    )
+    settings = {'sampling.box_time': setting}
+    summary, _ = run(tmp_path / 'way.mcap', tmp_path / 'out', settings=settings, formats=('csv',))
+    assert summary['box_time']['setting'] == setting
+    assert summary['box_time']['estimated'] == known
+    other = {'stamp': 'sight', 'sight': 'stamp'}[known]
+    votes = summary['box_time']['votes']
+    assert votes[known] > 2 * votes[other]
+
+
 @pytest.mark.parametrize('estimate', ['track', 'final', 'early'])
 @pytest.mark.parametrize('boxes', ['vision', 'markers'])
 def test_every_box_is_written_once_in_order(tmp_path, estimate, boxes):

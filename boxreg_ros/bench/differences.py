@@ -1,0 +1,111 @@
+"""
+Differences of two methods on the same true boxes, with standard errors over tracks.
+
+The boxes of a track share its errors: a recording with many boxes of few tracks decides little.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.box_scores import Mask, Matches
+from boxreg_ros.structures import Floats
+import numpy as np
+
+COMPARED = {
+    'ours, early': ('input', 'smoothing, early'),
+    'ours, final': ('smoothing, final',),
+    'ours, track': ('smoothing only', 'CTRA smoothing', 'ours, final'),
+}
+"""Methods that each estimate must not lose to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """
+    Mean IoU of one method minus that of another, over the true boxes that both have.
+
+    Attributes
+    ----------
+    iou_bev, iou_bev_error, iou_3d, iou_3d_error : float
+        Means, and their standard errors by `clustered_error`.
+    tracks, tracks_ahead : int
+        Number of tracks, and of those whose mean BEV IoU by the first method is not lower.
+
+    """
+
+    iou_bev: float
+    iou_bev_error: float
+    iou_3d: float
+    iou_3d_error: float
+    tracks: int
+    tracks_ahead: int
+
+
+def differences(
+    method: str, found: Mapping[str, Matches], truth: BoxTable, scope: Mask
+) -> dict[str, Difference]:
+    """
+    Return the differences of a method to those it is `COMPARED` with.
+
+    Parameters
+    ----------
+    method : str
+        One of `found`.
+    found : mapping of str to Matches
+        By method, all of the same n true boxes.
+    truth : BoxTable
+        The true boxes.
+    scope : array, shape (n,)
+        Which of them count.
+
+    """
+    return {
+        other: _difference(found[method], found[other], truth, scope)
+        for other in COMPARED.get(method, ())
+        if other in found
+    }
+
+
+def _difference(first: Matches, second: Matches, truth: BoxTable, scope: Mask) -> Difference:
+    both = scope & first.is_matched & second.is_matched
+    tracks = [truth.track_ids[row] for row in first.rows[both]]
+    bev = (first.iou_bev - second.iou_bev)[both]
+    volume = (first.iou_3d - second.iou_3d)[both]
+    sums = _sums_by_cluster(bev, tracks)
+    return Difference(
+        iou_bev=_mean(bev),
+        iou_bev_error=clustered_error(bev, tracks),
+        iou_3d=_mean(volume),
+        iou_3d_error=clustered_error(volume, tracks),
+        tracks=len(sums),
+        tracks_ahead=int((sums >= 0).sum()),
+    )
+
+
+def clustered_error(values: Floats, clusters: Sequence[str]) -> float:
+    """
+    Return the standard error of the mean of `values` (n,) whose errors `clusters` share.
+
+    The cluster-robust one: sqrt(G / (G - 1) * sum of squares of the sums s_g) / n, with the
+    deviations from the mean summed over each of G clusters. NaN for fewer than two.
+
+    """
+    count = len(set(clusters))
+    if count < 2:
+        return math.nan
+    sums = _sums_by_cluster(values - values.mean(), clusters)
+    return math.sqrt(count / (count - 1) * float(np.square(sums).sum())) / len(values)
+
+
+def _sums_by_cluster(values: Floats, clusters: Sequence[str]) -> Floats:
+    _, codes = np.unique(np.array(clusters, str), return_inverse=True)
+    return np.bincount(codes, values).astype(np.float64)
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if len(values) else math.nan
