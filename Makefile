@@ -37,7 +37,7 @@ JAZZY_TESTS := $(addprefix --ignore test/core/,test_refine.py test_kernel_cache.
 # Each worker begins with one end of the suite and takes tests of the other when it is done.
 SHARED := -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo test environments test-main test-jazzy lint format docs figures clean
+.PHONY: help demo test environments compiled compiled-jazzy test-main coverage test-jazzy lint format docs figures clean
 
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -54,10 +54,20 @@ test: ## set up, run the whole suite, and a part of it as on Ubuntu 24.04
 	@$(MAKE) --no-print-directory --jobs environments
 	@$(MAKE) --no-print-directory test-main test-jazzy
 
-# They do not depend on each other, and most of their time is download and unpacking.
-environments: $(tests) $(consumers) $(if $(PYTHON_JAZZY),$(jazzy))
+# They do not depend on each other: download, unpacking and compilation share the cores.
+environments: $(tests) $(consumers) compiled $(if $(PYTHON_JAZZY),compiled-jazzy)
+
+# Each Python has compiled kernels of its own.
+compiled: $(runtime)
+	$(BIN)/python test/warmed.py
+
+compiled-jazzy: $(jazzy)
+	$(VENV_JAZZY)/bin/python test/warmed.py
 
 test-main: $(tests) $(consumers)
+	$(BIN)/python -m pytest $(SHARED)
+
+coverage: $(tests) $(consumers) ## run the suite and print the part of the lines that it executes
 	$(BIN)/python -m pytest $(SHARED) --cov --cov-report=term:skip-covered
 
 test-jazzy: $(if $(PYTHON_JAZZY),$(jazzy)) ## run a part of the suite with the versions of Ubuntu 24.04

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from boxreg_ros import __version__
 from boxreg_ros.allocation import collect_rarely, keep_freed_memory
-from boxreg_ros.errors import BoxregError, ConfigError
+from boxreg_ros.errors import BoxregError, ConfigError, remedy_of
 
 
 class Command(NamedTuple):
@@ -56,6 +56,7 @@ FAILED = 1
 WRONG_USAGE = 2
 SIGNALLED = 128
 """Added to the number of the signal that ended a run, as shells do."""
+INTERRUPTED = 'interrupted; nothing was written'
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
@@ -108,15 +109,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except KeyboardInterrupt:
-        return _fail('interrupted; nothing was written', SIGNALLED + signal.SIGINT)
+        return _fail(INTERRUPTED, SIGNALLED + signal.SIGINT)
     except _EndedBySignal as end:
         number = end.args[0]
-        name = signal.Signals(number).name
-        return _fail(f'ended by {name}; nothing was written', SIGNALLED + number)
+        return _fail(_ended_by(number), SIGNALLED + number)
     except (BoxregError, OSError) as error:
         if is_debug:
             raise
-        return _fail(str(error), WRONG_USAGE if isinstance(error, ConfigError) else FAILED)
+        remedy = f'; {remedy_of(error)}' if isinstance(error, OSError) else ''
+        status = WRONG_USAGE if isinstance(error, ConfigError) else FAILED
+        return _fail(f'{error}{remedy}', status)
     except Exception as error:
         if is_debug:
             raise
@@ -130,9 +132,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
-    """Raise `_EndedBySignal` on `ENDING_SIGNALS` inside the block, so that files are removed."""
+    """
+    Raise `_EndedBySignal` on `ENDING_SIGNALS` inside the block, so that files are removed.
+
+    `KeyboardInterrupt` on SIGINT. While torch is imported there are no files yet, and an exception
+    within its libraries would abort the process: it ends at once.
+
+    """
+
+    def interrupt(number: int, frame: Any) -> None:
+        if _is_importing_torch():
+            os._exit(_fail(INTERRUPTED, SIGNALLED + number))
+        signal.default_int_handler(number, frame)
 
     def end(number: int, _: Any) -> None:
+        if _is_importing_torch():
+            os._exit(_fail(_ended_by(number), SIGNALLED + number))
         for one in ours:  # a second signal must not interrupt the clean-up
             signal.signal(one, signal.SIG_IGN)
         raise _EndedBySignal(number)
@@ -140,15 +155,32 @@ def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
     before = {one: signal.getsignal(one) for one in ENDING_SIGNALS}
     # A signal that is ignored stays so: nohup ignores SIGHUP.
     ours = [one for one, handler in before.items() if handler == signal.SIG_DFL]
+    handles_interrupts = signal.getsignal(signal.SIGINT) == signal.default_int_handler
     if arguments[:1] == ['node'] or current_thread() is not main_thread():
         ours = []  # the node handles signals itself; only the main thread may set handlers
+        handles_interrupts = False
     try:
         for one in ours:
             signal.signal(one, end)
+        if handles_interrupts:
+            signal.signal(signal.SIGINT, interrupt)
         yield
     finally:
         for one in ours:
             signal.signal(one, before[one])
+        if handles_interrupts:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _ended_by(number: int) -> str:
+    """Return the message of a run that a signal has ended."""
+    return f'ended by {signal.Signals(number).name}; nothing was written'
+
+
+def _is_importing_torch() -> bool:
+    """Return whether the import of torch has begun and not ended."""
+    spec = getattr(sys.modules.get('torch'), '__spec__', None)
+    return bool(getattr(spec, '_initializing', False))
 
 
 def _run(arguments: list[str]) -> int:

@@ -16,7 +16,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import ConfigError, unreadable
 import yaml
 
 _T = TypeVar('_T')
@@ -494,7 +494,9 @@ class Config:
                             if str(key).partition('.')[0] not in NODE_OPTIONS
                         }
             return cls.from_dict(values)
-        except (OSError, ConfigError, *YAML_ERRORS) as error:
+        except OSError as error:
+            raise ConfigError(f'config file {unreadable(path, error)}') from None
+        except (ConfigError, *YAML_ERRORS) as error:
             reason = ' '.join(str(error).split())
             raise ConfigError(f'config file {str(path)!r}: {reason}') from None
 

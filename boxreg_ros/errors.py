@@ -1,5 +1,20 @@
 """Errors; each message names the argument, what was expected, the actual value and a remedy."""
 
+import errno
+from os import PathLike
+
+FILE_REMEDIES = {
+    errno.ENOENT: 'correct its path',
+    errno.ENOTDIR: 'correct its path',
+    errno.EISDIR: 'name a file in this folder',
+    errno.EACCES: 'change its permissions, or run as another user',
+    errno.EPERM: 'change its permissions, or run as another user',
+    errno.ENOSPC: 'free some space on its disk',
+    errno.EMFILE: 'raise the limit of open files (ulimit -n)',
+}
+"""Remedy by the cause why a file cannot be used."""
+OTHER_REMEDY = 'check its disk or network, and copy it again'
+
 
 class BoxregError(Exception):
     """Base class of all errors of this package; the message is written for the user."""
@@ -23,3 +38,13 @@ class UnsupportedMessage(BoxregError):
 
 class RecordingError(BoxregError):
     """A recording cannot be read, or does not contain the data requested."""
+
+
+def remedy_of(error: OSError) -> str:
+    """Return what helps against an error of a file."""
+    return FILE_REMEDIES.get(error.errno or 0, OTHER_REMEDY)
+
+
+def unreadable(path: str | PathLike[str], error: OSError) -> str:
+    """Return the message of a file that cannot be read, with the remedy for its cause."""
+    return f'{path}: cannot be read: {error.strerror}; {remedy_of(error)}'

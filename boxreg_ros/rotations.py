@@ -9,7 +9,6 @@ leading dimensions, also none and empty ones; NaN gives NaN.
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, overload, TYPE_CHECKING
 
 from boxreg_ros.structures import Floats
@@ -105,21 +104,24 @@ def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Floats:
         If the norm of a quaternion is zero.
 
     """
-    q = np.asarray(quaternion_xyzw, float)
-    is_finite = np.isfinite(q).all(-1)
-    R = np.full((*q.shape[:-1], 3, 3), np.nan)
-    if is_finite.any():  # versions of SciPy differ on empty arrays and on NaN
-        R[is_finite] = _scipy().from_quat(q[is_finite]).as_matrix()
-    return R
+    x, y, z, w = np.moveaxis(_unit(quaternion_xyzw), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def quaternion_from_matrix(R: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), x y z w with w >= 0, of R (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation  # takes 0.3 s, which most commands do not need
+
     R = np.asarray(R, float)
     is_finite = np.isfinite(R).all((-2, -1))
     quaternions = np.full((*R.shape[:-2], 4), np.nan)
     if is_finite.any():  # versions of SciPy differ on empty arrays
-        found = _scipy().from_matrix(R[is_finite]).as_quat()
+        found = Rotation.from_matrix(R[is_finite]).as_quat()
         quaternions[is_finite] = np.where(found[..., 3:] < 0, -found, found)
     return quaternions
 
@@ -161,15 +163,23 @@ def interpolate_rotation(first_xyzw: ArrayLike, second_xyzw: ArrayLike, share: f
         Rotation matrix.
 
     """
-    rotation = _scipy()
-    first, second = rotation.from_quat(np.asarray([first_xyzw, second_xyzw], float))
-    step = (first.inv() * second).as_rotvec()
-    return np.asarray((first * rotation.from_rotvec(share * step)).as_matrix())
+    first, second = _unit(np.stack([first_xyzw, second_xyzw]))
+    if first @ second < 0:
+        second = -second  # the same rotation, on the shortest path
+    angle = 2 * np.arctan2(np.linalg.norm(second - first), np.linalg.norm(second + first))
+    # sin(part * angle) / sin(angle), with its limit for equal rotations
+    parts = np.array([1 - share, share])
+    weights = parts * np.sinc(parts * angle / np.pi) / np.sinc(angle / np.pi)
+    return matrix_from_quaternion(weights @ np.stack([first, second]))
 
 
-@cache
-def _scipy() -> Any:
-    """Return SciPy's class; its import takes 0.3 s, which `boxreg --help` does not need."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation
+def _unit(quaternion_xyzw: ArrayLike) -> Floats:
+    """Return unit quaternions (..., 4); NaN where one is not finite."""
+    q = np.asarray(quaternion_xyzw, float)
+    largest = np.abs(q).max(-1, keepdims=True)
+    if np.any(largest == 0):
+        raise ValueError('quaternion_xyzw: expected a rotation, got a quaternion of zero norm')
+    with np.errstate(invalid='ignore'):
+        scaled = q / largest  # so that no square overflows or vanishes
+    unit: Floats = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return unit

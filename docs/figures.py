@@ -19,6 +19,7 @@ import sys
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from boxreg_ros.bench.report import BROWSER_OPTIONS, BROWSERS
 from boxreg_ros.config import Config
 from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.io.box_table import BoxTable
@@ -45,18 +46,12 @@ POINT_STEP = 3
 """Every n-th point is drawn."""
 RESULT = 'street'
 """Result folder of `STREET`, inside of the folder of the runs."""
-BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
-BROWSER_OPTIONS = (
-    '--headless', '--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader',
-    '--virtual-time-budget=20000', '--disable-quic', '--no-first-run',
-    '--disable-background-networking', '--disable-component-update', '--disable-sync',
-    '--hide-scrollbars',
+SCREENSHOT_OPTIONS = (
+    '--headless', *BROWSER_OPTIONS, '--virtual-time-budget=20000', '--disable-quic',
+    '--no-first-run', '--disable-background-networking', '--disable-component-update',
+    '--disable-sync', '--hide-scrollbars',
 )  # fmt: skip
-"""
-Root needs ``--no-sandbox``; the page is our own. SwiftShader draws WebGL without a GPU; the budget
-lets the page finish its drawing. Most others keep it off the network.
-
-"""
+"""The budget lets the page finish its drawing. Most others keep it off the network."""
 PAGE_SIZE = (1366, 900)
 """Width and height of the screenshot [CSS pixels]: a small laptop."""
 SCALE = 1.2
@@ -89,7 +84,7 @@ def draw_report(runs: Path, target: Path) -> None:
     screenshot = runs / target.name
     width, height = PAGE_SIZE
     command = [
-        browser, *BROWSER_OPTIONS, f'--user-data-dir={runs / "profile"}',
+        browser, *SCREENSHOT_OPTIONS, f'--user-data-dir={runs / "profile"}',
         f'--window-size={width},{height}', f'--force-device-scale-factor={SCALE}',
         f'--screenshot={screenshot}',
         f'{(runs / RESULT / REPORT).as_uri()}#track={densest_vehicle(runs / RESULT)}',

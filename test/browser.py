@@ -3,14 +3,13 @@
 from contextlib import contextmanager
 import shutil
 
+from boxreg_ros.bench.report import BROWSER_OPTIONS, BROWSERS
 import pytest
 
-EXECUTABLE = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser'))), None)
+EXECUTABLE = next(filter(None, map(shutil.which, BROWSERS)), None)
 NEEDS_BROWSER = pytest.mark.skipif(
     EXECUTABLE is None, reason='no Chromium on PATH: apt install chromium'
 )
-OPTIONS = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader']
-"""Root needs ``--no-sandbox``; the others draw WebGL without a GPU."""
 
 
 @contextmanager
@@ -19,7 +18,7 @@ def opened_page(url, expected='', **context):
     playwright = pytest.importorskip('playwright.sync_api')
     errors = []
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=EXECUTABLE, args=OPTIONS)
+        browser = driver.chromium.launch(executable_path=EXECUTABLE, args=BROWSER_OPTIONS)
         page = browser.new_page(**{'viewport': {'width': 1366, 'height': 800}, **context})
         page.on('console', lambda line: errors.append(line.text) if line.type == 'error' else None)
         page.on('pageerror', lambda error: errors.append(str(error)))

@@ -30,8 +30,10 @@ torch.set_num_threads(1)
 def pytest_xdist_setupnodes():
     """Compile the kernels once, before the workers start nodes that wait for them."""
     # Imported here: messages are imported after their checks are switched on.
-    from boxreg_ros.config import Config
-    from boxreg_ros.io.warm_up import warm_up
+    import warmed  # noqa: F401
 
-    for estimate in ('final', 'track'):
-        warm_up(Config(estimate=estimate))
+
+def pytest_sessionstart():
+    """Load the kernels in each process of a run in parallel."""
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        import warmed  # noqa: F401

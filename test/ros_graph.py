@@ -49,8 +49,8 @@ class Graph:
         self.processes = []
         self.publishers = {}
 
-    def start(self, *ros_args, command=('-m', NODE)):
-        """Start the node with arguments after --ros-args."""
+    def start(self, *ros_args, command=(NODE,)):
+        """Start a node with arguments after --ros-args."""
         process = NodeProcess(self, [*command, '--ros-args', *ros_args])
         self.processes.append(process)
         return process
@@ -123,17 +123,16 @@ class Graph:
 
 
 class NodeProcess:
-    """A process of Python with some arguments; its output is written to a file."""
+    """An entry point, or Python, with some arguments; the output is written to a file."""
 
     def __init__(self, graph, command):
         self._graph = graph
         self._log = graph.folder / f'node{len(graph.processes)}.log'
         self.is_ending = False
         environment = {'ROS_DOMAIN_ID': str(graph.domain), 'ROS_LOG_DIR': str(graph.folder)}
-        option, *words = command
-        if option == '-m':
-            module, *arguments = words
-            self.popen = PreloadedProcess(module, arguments, environment, self._log)
+        program, *arguments = command
+        if ':' in program:
+            self.popen = PreloadedProcess(program, arguments, environment, self._log)
             return
         with self._log.open('w') as log:
             self.popen = subprocess.Popen(

@@ -14,7 +14,7 @@ from boxreg_ros.core.batch import (
 from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.observation import observe
 from boxreg_ros.core.refine import Track
-from boxreg_ros.core.window import Window
+from boxreg_ros.core.track_window import Window
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 from scipy.spatial.transform import Rotation

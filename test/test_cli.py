@@ -1,5 +1,6 @@
 """The command line: arguments, exit status, one line per failure, signals."""
 
+import errno
 import fcntl
 import io
 import os
@@ -13,6 +14,7 @@ import time
 
 from boxreg_ros import cli
 from boxreg_ros.config import Config
+from boxreg_ros.errors import unreadable
 from boxreg_ros.reasons import REASONS
 from paths import ROOT
 import pytest
@@ -213,7 +215,106 @@ def test_run_that_refines_no_box_fails_and_keeps_the_result(tmp_path, capsys):
     assert 'up to date' in out
 
 
-@pytest.mark.parametrize('command', [['--help'], [], ['relabel', '--help'], ['relable']])
+def test_run_that_refines_less_than_half_says_why(tmp_path, capsys):
+    drive = Drive(sweeps=12)
+    clouds = [item for item in drive.items if item[0] == '/points']
+    drive.items = [item for item in drive.items if item not in clouds[5:]]
+    status, out, err = boxreg(
+        capsys, 'relabel', drive.write(tmp_path / 'drive'), '-o', tmp_path / 'out', *QUICK
+    )
+    assert (status, out.count(' refined')) == (0, 1)
+    (line,) = err.splitlines()
+    reason = REASONS['no_sweep']
+    assert 'of 24 boxes were refined; most frequent reason: no_sweep (14 boxes): ' in line
+    assert f'{reason.meaning}; remedy: {reason.remedy}; time ranges: boxes ' in line
+
+
+def test_recordings_without_overlap_in_time_name_both_ranges(tmp_path, capsys):
+    # The labels are of 2011, the clouds of 2019; each recording is whole by itself.
+    years = {2011: 1_300_000_000, 2019: 1_560_000_000}
+    paths = []
+    for (year, start), left_out in zip(years.items(), ('/points', '/boxes'), strict=True):
+        drive = Drive(sweeps=5, start=start * 10**9)
+        drive.items = [item for item in drive.items if item[0] != left_out]
+        paths.append(drive.write(tmp_path / str(year)))
+    status, _, err = boxreg(capsys, 'relabel', *paths, '-o', tmp_path / 'out', *QUICK)
+    assert status == 1
+    (line,) = [line for line in err.splitlines() if 'time ranges' in line]
+    assert 'none of 10 boxes was refined' in line
+    boxes, clouds = line.partition('time ranges: boxes ')[2].split(', clouds ')
+    assert boxes.endswith('s (2011-03-13)')
+    assert clouds.endswith('s (2019-06-08)')
+    assert (tmp_path / 'out' / 'boxes.csv').exists()
+
+
+def test_unknown_class_names_are_named_with_their_kind(tmp_path, capsys):
+    drive = Drive(sweeps=5)
+    for index in range(5):
+        drive.replace('/boxes', index, lambda boxes: _name_first(boxes, 'hovercraft'))
+    recording = drive.write(tmp_path / 'drive')
+    status, _, err = boxreg(capsys, 'relabel', recording, '-o', tmp_path / 'out', *QUICK)
+    assert status == 0
+    (line,) = err.splitlines()
+    assert "unknown class names are treated as vehicles: 'hovercraft' (5 boxes)" in line
+    assert 'vehicle.names' in line
+
+
+def _name_first(boxes, name):
+    for result in boxes.detections[0].results:
+        result.hypothesis.class_id = name
+
+
+def test_a_lag_beyond_the_window_is_refused(tmp_path, capsys):
+    recording = Drive(sweeps=2).write(tmp_path / 'drive')
+    settings = ['--set', 'window=8', '--set', 'lag=8']
+    status, _, err = boxreg(capsys, 'relabel', recording, '-o', tmp_path / 'out', *settings)
+    assert status == 2
+    assert 'lag: expected less than window (8), got 8' in err
+    assert 'lower lag or raise window' in err
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason='root may read every file')
+def test_a_file_without_permission_names_the_remedy(tmp_path, capsys):
+    recording = Drive(sweeps=2).write(tmp_path / 'drive')
+    file = next(recording.glob('*.mcap')) if recording.is_dir() else recording
+    file.chmod(0)
+    status, _, err = boxreg(capsys, 'relabel', recording, '-o', tmp_path / 'out')
+    assert status == 1
+    assert str(file) in err
+    assert 'change its permissions' in err
+    assert 'recover' not in err
+
+
+def test_the_remedy_of_a_file_is_that_of_the_cause():
+    for number, words in ((errno.EACCES, 'permissions'), (errno.EIO, 'disk')):
+        text = unreadable('a.mcap', OSError(number, os.strerror(number)))
+        assert text.startswith(f'a.mcap: cannot be read: {os.strerror(number)}; ')
+        assert words in text
+
+
+@pytest.mark.parametrize(
+    ('words', 'remedy'),
+    [
+        (['relabel', '{}/none.mcap', '-o', '{}/out'], 'correct its path'),
+        (['evaluate', '{}/none.csv', '{}/none.csv'], 'correct its path'),
+        (['evaluate', '{}', '{}'], 'name a file in this folder'),
+        (['check', 'csv:{}/none.csv'], 'correct the path'),
+        (['relabel', '{}/drive', '-o', '{}/out', '--config', '{}/none'], 'correct its path'),
+        (['relabel', '{}/drive', '-o', '{}/out', '--decisions', '{}/none'], 'correct its path'),
+    ],
+)
+def test_errors_of_files_have_the_remedy_of_their_cause(tmp_path, capsys, words, remedy):
+    Drive(sweeps=2).write(tmp_path / 'drive')
+    status, _, err = boxreg(capsys, *[word.format(tmp_path) for word in words])
+    assert status in (1, 2)
+    (line,) = err.splitlines()
+    assert str(tmp_path) in line
+    assert remedy in line
+
+
+@pytest.mark.parametrize(
+    'command', [['--help'], [], ['relabel', '--help'], ['relable'], ['bench', '--help']]
+)
 def test_parsing_imports_no_large_library(command):
     code = (
         'import sys\n'
@@ -309,6 +410,69 @@ def test_an_interrupted_run_does_not_wait_for_the_interpreter(tmp_path):
     process.send_signal(signal.SIGINT)
     assert process.communicate(timeout=60) == ('', 'boxreg: interrupted; nothing was written\n')
     assert process.returncode == 130
+
+
+SIGNAL_IN_TORCH = """
+import os, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == 'torch.autograd':
+            os.kill(os.getpid(), int(os.environ['NUMBER']))
+sys.meta_path.insert(0, Finder())
+from boxreg_ros.cli import command
+command()
+"""
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_the_import_of_torch_ends_the_process_at_once(tmp_path, number):
+    # An exception would pass through its libraries, which abort.
+    recording = Drive(sweeps=4).write(tmp_path / 'drive')
+    command = [sys.executable, '-c', SIGNAL_IN_TORCH, 'relabel', recording, '-o', tmp_path / 'out']
+    done = subprocess.run(
+        [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=60,
+        env=os.environ | {'NUMBER': str(int(number))},
+    )  # fmt: skip
+    cause = 'interrupted' if number == signal.SIGINT else 'ended by SIGTERM'
+    assert done.stderr == f'boxreg: {cause}; nothing was written\n'
+    assert done.returncode == 128 + number
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(
+    'step',
+    [
+        'boxreg_ros.offline.reader:reader',
+        'boxreg_ros.review.risk:assess',
+        'boxreg_ros.review.payload:compressed',
+        'boxreg_ros.review.report:_page',
+    ],
+)
+def test_a_run_that_is_interrupted_in_a_step_leaves_no_files(tmp_path, step):
+    # SIGINT is sent as the step begins: reading, ranking, drawing of a track and of the page.
+    pytest.importorskip('plotly')
+    recording = Drive(sweeps=8).write(tmp_path / 'drive')
+    module, name = step.split(':')
+    program = (
+        'import importlib, os, signal, sys\n'
+        f'module = importlib.import_module({module!r})\n'
+        f'begun = module.{name}\n'
+        'def interrupted(*args, **options):\n'
+        '    os.kill(os.getpid(), signal.SIGINT)\n'
+        '    return begun(*args, **options)\n'
+        'for one in list(sys.modules.values()):\n'
+        f'    if getattr(one, {name!r}, None) is begun:\n'
+        f'        setattr(one, {name!r}, interrupted)\n'
+        'import boxreg_ros.cli as c\n'
+        'c.command()\n'
+    )
+    out = tmp_path / 'r' / 'out'
+    command = [sys.executable, '-c', program, 'relabel', recording, '-o', out, '--report', *QUICK]
+    done = subprocess.run(
+        [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (130, 'boxreg: interrupted; nothing was written\n')
+    assert list((tmp_path / 'r').glob('*')) == []
 
 
 def test_a_run_under_nohup_ignores_sighup(tmp_path):

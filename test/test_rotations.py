@@ -13,7 +13,7 @@ from boxreg_ros.rotations import (
 )
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 import torch
 
 HALF = np.sqrt(0.5)
@@ -113,6 +113,13 @@ def test_norm_and_sign_of_a_quaternion_are_ignored():
     R = matrix_from_quaternion(quaternion_xyzw)
     np.testing.assert_allclose(matrix_from_quaternion(-7.0 * quaternion_xyzw), R, atol=1e-14)
     np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-14)
+
+
+@pytest.mark.parametrize('norm', [1e-200, 1e-3, 1.0, 1e200])
+def test_matrix_of_a_quaternion_of_any_norm_equals_scipy(norm):
+    quaternion_xyzw = np.random.default_rng(4).normal(size=(50, 4))
+    scipy = Rotation.from_quat(quaternion_xyzw).as_matrix()
+    np.testing.assert_allclose(matrix_from_quaternion(norm * quaternion_xyzw), scipy, atol=1e-14)
 
 
 def test_quaternion_of_norm_zero_is_refused():
@@ -235,3 +242,13 @@ def test_interpolation_takes_the_shortest_path():
     first, second = quaternion_from_rpy([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]])
     found = rpy_from_matrix(interpolate_rotation(first, second, 0.5))
     assert abs(found[2]) == pytest.approx(np.pi, abs=1e-12)
+
+
+@pytest.mark.parametrize('distance', [0.0, 1e-12, 1e-4, 1.0])
+def test_interpolation_equals_scipy(distance):
+    first, step = np.random.default_rng(5).normal(size=(2, 4))
+    second = first + distance * step
+    slerp = Slerp([0, 1], Rotation.from_quat([first, second]))
+    for share in (0.0, 0.3, 1.0):
+        found = interpolate_rotation(first, second, share)
+        np.testing.assert_allclose(found, slerp(share).as_matrix(), atol=1e-14)

@@ -24,6 +24,7 @@ MEASUREMENTS = {
     'lidars': Measurement('lidars', 'accuracy on a truck with LiDARs at its corners'),
     'covariance': Measurement('covariance', 'covariances against errors, by estimate and class'),
     'review': Measurement('review', 'how early the review list shows the bad tracks'),
+    'report': Measurement('report', 'first paint and frame times of report.html'),
     'speed': Measurement('speed.command', 'time per tick, per box and per window'),
     'scale': Measurement('scale', 'core hours and memory per hour, and a simulated fleet'),
     'load': Measurement('load', 'latency and accuracy of the live node by number of tracks'),
@@ -32,15 +33,28 @@ MEASUREMENTS = {
 }
 
 
+class _Parser(argparse.ArgumentParser):
+    """The parser of a sub-command: its module, which is slow to import, adds the options."""
+
+    measurement = ''
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Add the options of the sub-command, then parse."""
+        _module(self.measurement).add_arguments(self)
+        return super().parse_known_args(args, namespace)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the sub-commands and their options."""
+    """Declare the sub-commands; only the one that is used declares its options."""
     names = ','.join(MEASUREMENTS)
-    kinds = parser.add_subparsers(dest='kind', required=True, metavar=f'{{{names}}}')
+    kinds = parser.add_subparsers(
+        dest='kind', required=True, metavar=f'{{{names}}}', parser_class=_Parser
+    )
     for name, measurement in MEASUREMENTS.items():
         kind = kinds.add_parser(
             name, help=measurement.summary, description=f'{measurement.summary}.'
         )
-        _module(name).add_arguments(kind)
+        kind.measurement = name
 
 
 def run(args: argparse.Namespace) -> int:

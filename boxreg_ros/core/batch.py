@@ -17,6 +17,7 @@ from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.arrowhead import LINK
 from boxreg_ros.core.kernels import contiguous
 from boxreg_ros.core.kernels.arrays import ClassArrays, WindowArrays
+from boxreg_ros.core.track_window import PRIOR_POSES
 from boxreg_ros.structures import Floats, Ints, POSE
 import numpy as np
 import torch
@@ -51,9 +52,6 @@ PADDING_POSITION = 1e6
 
 PADDING_PERIOD = 0.1
 """Time step of padding observations [s]; any positive number keeps times increasing."""
-
-PRIOR_POSES = 2
-"""Poses that the marginalisation prior refers to: no residual spans more than three poses."""
 PRIOR_SIZE = PRIOR_POSES * LINK + SHARED
 
 

@@ -5,17 +5,20 @@ docs/method.md, section Input model, has the formulas.
 
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import FaceConfig, KINDS
-from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
-from boxreg_ros.core.input_noise import InputNoise
-from boxreg_ros.core.population import Population
-from boxreg_ros.structures import Floats
+from boxreg_ros.structures import Floats, Ints
 import numpy as np
-import torch
-from torch import Tensor
+
+if TYPE_CHECKING:  # a process that only keeps the model between two batches needs no torch
+    from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
+    from boxreg_ros.core.input_noise import InputNoise
+    from boxreg_ros.core.population import Population
+    from torch import Tensor
 
 # Constants whose origin is not stated are chosen; `boxreg bench sensitivity` halves and doubles
 # each of them.
@@ -175,6 +178,9 @@ class InputModel:
 
     def offsets(self) -> FaceOffsets:
         """Return the labelling margins and insets to expect of each kind."""
+        from boxreg_ros.core.face_support import FaceOffsets
+        import torch
+
         if self._known_offsets is None:
             for k, known in enumerate(self._offsets_of_kinds):
                 self._offsets_of_kinds[k] = known or self._offsets(k)
@@ -205,14 +211,21 @@ class InputModel:
 
     def noise(self) -> InputNoise:
         """Return the noise of all fits that were added."""
+        from boxreg_ros.core.input_noise import InputNoise
+        import torch
+
         rows, kind = _flat(self._residuals)
         known = np.array(rows).reshape(-1, MAX_FITS_PER_TRACK, 9)
-        return InputNoise.estimate_by_kind(torch.from_numpy(known), kind)
+        return InputNoise.estimate_by_kind(torch.from_numpy(known), torch.from_numpy(kind))
 
     def population(self) -> Population:
         """Return the evidence of extents of the last fits that were added."""
+        from boxreg_ros.core.population import Population
+        import torch
+
         rows, kind = _flat(self._evidence)
-        return Population(torch.from_numpy(np.array(rows).reshape(-1, 3, 3)), kind)
+        evidence = np.array(rows).reshape(-1, 3, 3)
+        return Population(torch.from_numpy(evidence), torch.from_numpy(kind))
 
     def _means_of_tracks(self, quantity: int, faces: Sequence[int]) -> list[Floats]:
         means = []
@@ -235,11 +248,11 @@ def _pooled(known: Floats, expected: Sequence[float], deviations: Sequence[float
     return values
 
 
-def _flat(known: Sequence[dict[str, Floats]]) -> tuple[list[Floats], Tensor]:
+def _flat(known: Sequence[dict[str, Floats]]) -> tuple[list[Floats], Ints]:
     """Return the arrays of the tracks of all kinds, and their kinds (n,)."""
-    counts = torch.tensor([len(tracks) for tracks in known])
+    counts = [len(tracks) for tracks in known]
     rows = [row for tracks in known for row in tracks.values()]
-    return rows, torch.arange(len(known)).repeat_interleave(counts)
+    return rows, np.repeat(np.arange(len(known)), counts)
 
 
 def _posterior_mean(means: Floats, prior: float, deviation: float) -> float:

@@ -2,12 +2,10 @@
 
 from typing import NamedTuple
 
-from boxreg_ros.core.geometry import rotation_from_rpy
-from boxreg_ros.rotations import wrap_angle
+from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BOX_EXTENT, checked, Floats, HEIGHT, ROLL
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-import torch
 
 MAX_PAIRS = 1000
 """Pairs whose intersection is computed at once; derived: about 100 MB of temporary arrays."""
@@ -62,7 +60,7 @@ def pose_errors(boxes: ArrayLike, truth: ArrayLike) -> PoseErrors:
     a, b = _rows(boxes, truth)
     difference = a - b
     rotation = wrap_angle(difference[:, ROLL:])
-    axes = rotation_from_rpy(torch.from_numpy(b[:, ROLL:])).numpy()
+    axes = matrix_from_rpy(b[:, ROLL:])
     translation = (difference[:, None, :3] @ axes)[:, 0]
     is_flipped = np.abs(rotation[:, 2]) > np.pi / 2
     return PoseErrors(translation, difference[:, BOX_EXTENT], rotation, is_flipped)
@@ -174,9 +172,7 @@ def _intersection(a: Floats, b: Floats) -> Floats:
 
 def _half_spaces(a: Floats, b: Floats) -> tuple[Floats, Floats]:
     """Return the normals (n, 12, 3) and offsets (n, 12) of both boxes, origin: the centre of a."""
-    axes_a, axes_b = (
-        rotation_from_rpy(torch.from_numpy(rows[:, ROLL:])).mT.numpy() for rows in (a, b)
-    )
+    axes_a, axes_b = (np.swapaxes(matrix_from_rpy(rows[:, ROLL:]), 1, 2) for rows in (a, b))
     normals = np.concatenate([axes_a, -axes_a, axes_b, -axes_b], axis=1)
     shift = np.einsum('nij,nj->ni', axes_b, b[:, :3] - a[:, :3])
     half_a = a[:, BOX_EXTENT] / 2

@@ -1,5 +1,6 @@
 """Observations of boxes in a sweep: crop, ownership, height of the road, sampling."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -171,6 +172,17 @@ def _origins(sweep: Sweep, rows: Ints, parts: list[slice], centers: Floats) -> l
         sees = counts >= MIN_SENSOR_PART * counts.sum()
         origins.append(sweep.origins[sees] - center)
     return origins
+
+
+def stack_origins(origins: Sequence[Floats]) -> Floats:
+    """Return the sensors (k, 3) of O observations as one array (O, K, 3); the last repeats."""
+    counts = np.array(list(map(len, origins)))
+    if counts.max() == 1:
+        return np.concatenate(origins)[:, None]
+    first = np.cumsum(counts) - counts
+    column = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # (O, K)
+    stacked: Floats = np.concatenate(origins)[first[:, None] + column]
+    return stacked
 
 
 def _medians(values: NDArray[np.float32], counts: Ints) -> Floats:

@@ -9,8 +9,9 @@ the Schur complement, as in fixed-lag smoothing: docs/method.md (M13).
 from collections.abc import Sequence
 
 from boxreg_ros.core.arrowhead import cholesky, LINK
-from boxreg_ros.core.batch import MarginalPrior, PRIOR_POSES, PRIOR_SIZE, SHARED, State
+from boxreg_ros.core.batch import MarginalPrior, PRIOR_SIZE, SHARED, State
 from boxreg_ros.core.terms import shared_prior, Term
+from boxreg_ros.core.track_window import PRIOR_POSES
 import torch
 from torch.linalg import solve_triangular
 from torch.nn.functional import pad

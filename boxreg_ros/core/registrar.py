@@ -1,23 +1,22 @@
 """The stateful object of the core: sweeps and box arrays in, refined boxes out."""
 
+from __future__ import annotations
+
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import dist, inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.batch import PRIOR_POSES
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation, observe
-from boxreg_ros.core.registration import Estimate, register
 from boxreg_ros.core.support import is_owned, MIN_HITS, points_inside, points_to_confirm
-from boxreg_ros.core.window import MarginalisationPrior, Window
+from boxreg_ros.core.track_window import Estimate, MarginalisationPrior, PRIOR_POSES, Window
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.structures import (
     BoxArray,
@@ -25,7 +24,6 @@ from boxreg_ros.structures import (
     Floats,
     is_valid_box,
     KEPT,
-    LENGTH,
     REFINED,
     RefinedBoxes,
     Sweep,
@@ -33,7 +31,6 @@ from boxreg_ros.structures import (
     Z,
 )
 import numpy as np
-import torch
 
 GetEstimates = Callable[[], list[Estimate | None]]
 """Waits for the estimates of submitted windows, None for windows that are too short."""
@@ -42,6 +39,8 @@ Submit = Callable[[list[Window], Config, InputModel], GetEstimates]
 Budget = Callable[[], int]
 """Returns how many windows may be solved for the box array at hand."""
 
+CPU = 'cpu'
+"""The device that torch has everywhere: it is not imported to check that."""
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
 ID_SWITCH_OBSERVATIONS = 6
@@ -198,7 +197,7 @@ class BoxRegistrar:
                 self._settle_after_lag()
             yield from self._pop_settled()
 
-    def _open(self, pair: Pair) -> '_PendingArray':
+    def _open(self, pair: Pair) -> _PendingArray:
         """Make a box array pending: its valid boxes become observations of their tracks."""
         boxes, sweep = pair
         array = _PendingArray(boxes)
@@ -219,7 +218,7 @@ class BoxRegistrar:
             self._observe(array, sweep)
         return array
 
-    def _observe(self, array: '_PendingArray', sweep: Sweep) -> None:
+    def _observe(self, array: _PendingArray, sweep: Sweep) -> None:
         """Add an observation to the track of each box that has no reason not to be refined."""
         boxes = array.input
         given = []
@@ -249,7 +248,7 @@ class BoxRegistrar:
             row = array.add_predicted(sighting)
             sighting.track.add(observation, array, row, is_predicted=True)
 
-    def _coasting(self, array: '_PendingArray') -> list['_Sighting']:
+    def _coasting(self, array: _PendingArray) -> list[_Sighting]:
         """Return the predicted boxes of the tracks that have no box in `array`."""
         if not (self.config.coasts and array.is_observed):
             return []
@@ -269,7 +268,7 @@ class BoxRegistrar:
         return found
 
     def _seen(
-        self, sightings: list['_Sighting'], stamp_ns: int, sweep: Sweep
+        self, sightings: list[_Sighting], stamp_ns: int, sweep: Sweep
     ) -> list[tuple[Observation, Floats]]:
         """Return for each box its observation, and the velocity of its input."""
         if not sightings:
@@ -280,7 +279,7 @@ class BoxRegistrar:
         velocities = np.zeros((len(boxes), 3))
         motion = velocities
         if offset or sweep.times is not None:
-            velocities = np.array([s.track.input_velocity(s.box, stamp_ns) for s in sightings])
+            velocities = _input_velocities(sightings, boxes, stamp_ns)
             # The points are relative to the box: motion-compensated to the stamp of the box.
             at_sweep[:, X : Z + 1] += offset * velocities
             if self.config.sampling.deskew:
@@ -318,7 +317,7 @@ class BoxRegistrar:
             tracks = self._tracks.values()
             self._solve([track for track in tracks if len(track.entries) > full // 2])
 
-    def _within_budget(self, tracks: list['_Track']) -> list['_Track']:
+    def _within_budget(self, tracks: list[_Track]) -> list[_Track]:
         """Return the tracks to solve now; the others are carried to the next box array."""
         if self._budget is None:
             return tracks
@@ -339,7 +338,7 @@ class BoxRegistrar:
                 entry.settle()
         del self._ended_tracks[limit:]
 
-    def _solve(self, tracks: list['_Track']) -> None:
+    def _solve(self, tracks: list[_Track]) -> None:
         """Submit the windows of `tracks` and of ended tracks, after collecting those before."""
         self._collect()
         ended = self._ended_tracks
@@ -359,8 +358,7 @@ class BoxRegistrar:
 
     def _collect(self) -> None:
         """Wait for the estimates of submitted windows; write them to the box arrays."""
-        with _one_torch_thread():
-            estimates = self._get_estimates()
+        estimates = self._get_estimates()
         for (track, entries, is_ended), estimate in zip(self._submitted, estimates, strict=True):
             if estimate is not None:
                 track.write(estimate, entries)
@@ -428,7 +426,7 @@ class _PendingArray:
             if is_valid[row]:
                 known.add(track_id)
 
-    def add_predicted(self, sighting: '_Sighting') -> int:
+    def add_predicted(self, sighting: _Sighting) -> int:
         """Add the predicted box of a track; return its row."""
         given = self.input
         self.input = replace(
@@ -485,11 +483,21 @@ class _PendingArray:
         return whole if len(rows) == n else whole.take(rows)
 
 
+class _Place(NamedTuple):
+    """Centre and length of an input box [m] as plain numbers, which id switches are found by."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    length: float
+
+
 @dataclass(slots=True)
 class _Entry:
     """An observation of a track, and the row of the box array its estimate is written to."""
 
     observation: Observation
+    place: _Place
     array: _PendingArray
     row: int
     is_predicted: bool = False
@@ -579,7 +587,9 @@ class _Track:
         array.num_points[row] = seen.num_points
         array.reasons[row] = 'short_track'  # until there is an estimate
         array.num_unsettled += 1
-        self.entries.append(_Entry(seen, array, row, is_predicted))
+        x, y, _, length, *_ = seen.box.tolist()
+        place = _Place(seen.stamp_ns, x, y, length)
+        self.entries.append(_Entry(seen, place, array, row, is_predicted))
         if not is_predicted:
             self.detected_ns = seen.stamp_ns
 
@@ -602,7 +612,7 @@ class _Track:
         motion = motion_at(stamps_ns, np.array(boxes), -1, config.class_config(self.class_name))
         return motion.predict(stamp_ns)
 
-    def split_at_id_switch(self) -> '_Track | None':
+    def split_at_id_switch(self) -> _Track | None:
         """
         Move the last two observations to a new track if they are of another object.
 
@@ -610,30 +620,22 @@ class _Track:
         of the object and `ID_SWITCH_SPEED`. A single one may be an outlier.
 
         """
-        recent = [entry.observation for entry in self.entries[-ID_SWITCH_OBSERVATIONS:]]
+        recent = [entry.place for entry in self.entries[-ID_SWITCH_OBSERVATIONS:]]
         if len(recent) < ID_SWITCH_OBSERVATIONS - 1:
             return None
         first, latest = recent[0], recent[-3]
-        first_x, first_y = first.box[:Z].tolist()
-        x, y = latest.box[:Z].tolist()
         duration_ns = latest.stamp_ns - first.stamp_ns
-        for observation in recent[-2:]:
-            elapsed_ns = observation.stamp_ns - latest.stamp_ns
+        for place in recent[-2:]:
+            elapsed_ns = place.stamp_ns - latest.stamp_ns
             part = elapsed_ns / duration_ns
-            predicted = x + part * (x - first_x), y + part * (y - first_y)
-            gate = latest.box[LENGTH] / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
-            if dist(observation.box[:Z], predicted) < gate:
+            x = latest.x + part * (latest.x - first.x)
+            y = latest.y + part * (latest.y - first.y)
+            gate = latest.length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
+            if dist((place.x, place.y), (x, y)) < gate:
                 return None
         moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
         del self.entries[-2:]
         return _Track(self.track_id, self.class_name, moved, detected_ns=self.detected_ns)
-
-    def input_velocity(self, box: Floats, stamp_ns: int) -> Floats:
-        """Return the mean velocity (3,) of the input centre up to the newest `box` [m/s]."""
-        if not self.entries:
-            return np.zeros(3)
-        first = self.entries[-VELOCITY_OBSERVATIONS:][0].observation
-        return (box - first.box)[X : Z + 1] / (stamp_ns - first.stamp_ns) * 1e9
 
     def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
         """Pass the estimate of the window of `entries` to the box arrays that are not settled."""
@@ -652,6 +654,18 @@ class _Sighting(NamedTuple):
     track: _Track
     box: Floats
     row: int = -1
+
+
+def _input_velocities(sightings: list[_Sighting], boxes: Floats, stamp_ns: int) -> Floats:
+    """Return the mean velocities (n, 3) of the input centres up to the new `boxes` [m/s]."""
+    velocities = np.zeros((len(boxes), 3))
+    known = [row for row, sighting in enumerate(sightings) if sighting.track.entries]
+    if known:
+        entries = [sightings[row].track.entries[-VELOCITY_OBSERVATIONS:][0] for row in known]
+        before = np.array([entry.observation.box for entry in entries])
+        elapsed = stamp_ns - np.array([entry.observation.stamp_ns for entry in entries])
+        velocities[known] = (boxes[known] - before)[:, X : Z + 1] / elapsed[:, None] * 1e9
+    return velocities
 
 
 def _confirmed(
@@ -675,23 +689,18 @@ class _SubmittedTrack(NamedTuple):
 
 
 def submit_locally(windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
-    """Return a function that runs `register` in this process."""
+    """Return a function that runs `register` in this process, which imports torch."""
+    from boxreg_ros.core.registration import register
+
     return partial(register, windows, config, model)
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Run torch in one thread: for small tensors more threads only wait for each other."""
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(num_threads)
 
 
 def _check_device(device: str) -> None:
     """Raise ConfigError if torch cannot use `device`."""
+    if device == CPU:
+        return
+    import torch
+
     try:
         torch.zeros(1, device=device)
     except (AssertionError, RuntimeError) as error:  # torch raises either

@@ -13,8 +13,8 @@ objective to the letter. docs/method.md has the formulas.
 
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
@@ -27,7 +27,8 @@ from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.rounds import COARSE_POINTS
 from boxreg_ros.core.smoothing import smoothed_angles
 from boxreg_ros.core.solver import solve
-from boxreg_ros.core.window import group_windows, MarginalisationPrior, stack_windows, Window
+from boxreg_ros.core.track_window import Estimate, MarginalisationPrior, Window
+from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, KEPT, REFINED
 import numpy as np
@@ -45,39 +46,18 @@ KEPT_REASONS = ('no_points', 'not_finite', 'no_gain')
 """Why a box is kept, in the order of `_failed_tests`."""
 
 
-class Estimate(NamedTuple):
-    """
-    The refined boxes of one window.
-
-    Attributes
-    ----------
-    boxes : array, shape (N, 9)
-        Refined boxes, or input boxes where those are kept; fixed frame [m, rad].
-    status : tuple of N str
-        ``refined`` or ``kept``.
-    reasons : tuple of N str
-        One of `KEPT_REASONS` for kept boxes, '' for refined ones.
-    covariances : array, shape (N, 6, 6)
-        Of x y z roll pitch yaw [m, rad]; the identity for kept boxes.
-    extent_covariances : array, shape (N, 3, 3)
-        Of length, width and height [m]; the identity for kept boxes.
-    face_distances, outside : array, shapes (N, 6) and (N,)
-        As in `RefinedBoxes`.
-    prior : MarginalisationPrior or None
-        For the next window, if this one is full and was solved.
-
-    """
-
-    boxes: Floats
-    status: tuple[str, ...]
-    reasons: tuple[str, ...]
-    covariances: Floats
-    extent_covariances: Floats
-    face_distances: Floats
-    outside: Floats
-    prior: MarginalisationPrior | None = None
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Run torch in one thread: for small tensors more threads only wait for each other."""
+    num_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(num_threads)
 
 
+@_one_torch_thread()
 def register(windows: list[Window], config: Config, model: InputModel) -> list[Estimate | None]:
     """
     Refine the boxes of many windows.

@@ -18,7 +18,6 @@ from boxreg_ros.core.batch import (
     EXTENT,
     GAP,
     PIVOT,
-    PRIOR_POSES,
     PRIOR_SIZE,
     SHARED,
     SIDESLIP,
@@ -26,6 +25,7 @@ from boxreg_ros.core.batch import (
 )
 from boxreg_ros.core.geometry import rotation_derivatives, rotation_from_rpy
 from boxreg_ros.core.lbfgs import select
+from boxreg_ros.core.track_window import PRIOR_POSES
 import torch
 from torch import Tensor
 

@@ -1,9 +1,9 @@
-"""Windows of observations, and batches of windows as padded tensors."""
+"""Batches of windows as padded tensors."""
 
 from collections.abc import Sequence
 from functools import partial
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.batch import (
@@ -14,7 +14,8 @@ from boxreg_ros.core.batch import (
     Returns,
     SHARED,
 )
-from boxreg_ros.core.observation import Observation
+from boxreg_ros.core.observation import Observation, stack_origins
+from boxreg_ros.core.track_window import MarginalisationPrior, Window
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +30,6 @@ An error model that is constant over a track holds for a limited time: 0.97 halv
 after 23 observations.
 
 """
-MARGIN_OBSERVATIONS = 30
-"""Observations of a window that give labelling margins; measured: 130 add nothing."""
 MAX_REVERSE_SPEED = 6.0
 """A faster object moves forward [m/s]; chosen: no road vehicle reverses at 22 km/h."""
 KNOWN_FLIP_SHARE = 0.75
@@ -56,83 +55,6 @@ NO_PRIOR = (
     np.zeros(4),
 )
 """State, step, information and extents of a prior without information."""
-
-
-class MarginalisationPrior(NamedTuple):
-    """
-    Quadratic prior on a window from observations that have been marginalised.
-
-    Its variables are the poses of the two oldest observations and the parameters that all
-    observations of a track share (35 in all).
-
-    Attributes
-    ----------
-    base : array, shape (3,)
-        Fixed origin of all positions of the track, in the fixed frame [m].
-    state : array, shape (35,)
-        Linearisation point: the variables when the last observation was marginalised.
-    step : array, shape (35,)
-        Minimum of the quadratic form minus `state`.
-    information : array, shape (35, 35)
-        Hessian of the quadratic form.
-    marginalised_extents : array, shape (4,)
-        Sum of the input extents of marginalised observations [m], and their number.
-
-    """
-
-    base: Floats
-    state: Floats
-    step: Floats
-    information: Floats
-    marginalised_extents: Floats
-
-    @classmethod
-    def none(cls, base: Floats) -> 'MarginalisationPrior':
-        """Return a prior without information, NaN as its linearisation point."""
-        return cls(base, *NO_PRIOR)
-
-
-class Window(NamedTuple):
-    """
-    Consecutive observations of one track.
-
-    Attributes
-    ----------
-    track_id, class_name : str
-        Identity and category.
-    observations : sequence of N Observation
-        Ascending by stamp.
-    num_new : int
-        Observations, the last ones, that have been in no window before.
-    start : array, shape (N - num_new, 9)
-        Boxes of the other observations as estimated in the window before; empty without one.
-    prior : MarginalisationPrior or None
-        From observations before the window.
-
-    """
-
-    track_id: str
-    class_name: str
-    observations: Sequence[Observation]
-    num_new: int
-    start: Floats
-    prior: MarginalisationPrior | None = None
-
-    @property
-    def is_warm(self) -> bool:
-        """Return whether all observations but the newest have an estimate to start from."""
-        return self.num_new == 1 and len(self.start) == len(self.observations) - 1 > 1
-
-    def margin_columns(self) -> range:
-        """
-        Return which observations give labelling margins; each does so in one window only.
-
-        The newest is left to the next window, which has an estimate to start from. Of many, every
-        n-th is taken so that about `MARGIN_OBSERVATIONS` remain.
-
-        """
-        last = len(self.observations) - 1
-        return range(max(0, last - self.num_new), last, 1 + self.num_new // MARGIN_OBSERVATIONS)
 
 
 def group_windows(windows: Sequence[Window], config: Config) -> list[list[int]]:
@@ -181,7 +103,7 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     valid = np.arange(lengths.max()) < lengths[:, None]  # (B, N)
     columns = _columns(windows)
     boxes, times, origins, ground = _stack_observations(columns, valid)
-    priors = [w.prior or MarginalisationPrior.none(w.observations[0].box[:3]) for w in windows]
+    priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
     base, state, step, information, extents = (
         np.array(part) for part in zip(*priors, strict=True)
     )
@@ -217,6 +139,11 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
         pinned=on_device(pinned),
     )
     return problem, base
+
+
+def _no_prior(base: Floats) -> MarginalisationPrior:
+    """Return a prior without information, NaN as its linearisation point."""
+    return MarginalisationPrior(base, *NO_PRIOR)
 
 
 def _tensor(array: NDArray[Any], device: str) -> Tensor:
@@ -258,17 +185,6 @@ def _stack_observations(
     source = np.minimum(column, last)
     times = times[row, source] + PADDING_PERIOD * np.maximum(column - last, 0)
     return boxes[row, source], times, origins, ground
-
-
-def stack_origins(origins: Sequence[Floats]) -> Floats:
-    """Return the sensors (k, 3) of O observations as one array (O, K, 3); the last repeats."""
-    counts = np.array(list(map(len, origins)))
-    if counts.max() == 1:
-        return np.concatenate(origins)[:, None]
-    first = np.cumsum(counts) - counts
-    column = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # (O, K)
-    stacked: Floats = np.concatenate(origins)[first[:, None] + column]
-    return stacked
 
 
 def _places_of_returns(columns: Any, valid: NDArray[np.bool_]) -> tuple[Ints, Ints]:

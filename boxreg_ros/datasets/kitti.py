@@ -15,7 +15,7 @@ from pathlib import Path
 from boxreg_ros.datasets.files import read_bin, require
 from boxreg_ros.datasets.poses import pose_rows
 from boxreg_ros.datasets.protocol import SweepFile
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.labels.sidecar import POSES_FILE, read_poses, read_stamps, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy
@@ -32,7 +32,7 @@ def oxts_rows(path: Path) -> Floats:
     try:
         rows = np.loadtxt(path, ndmin=2)
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        raise RecordingError(unreadable(path, error)) from None
     except ValueError as error:
         raise RecordingError(f'{path}: expected {OXTS_COLUMNS} numbers a line: {error}') from None
     if rows.shape[1] != OXTS_COLUMNS or not np.isfinite(rows[:, :6]).all():

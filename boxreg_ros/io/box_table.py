@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, Ints, ROLL
 import numpy as np
@@ -95,7 +95,10 @@ class BoxTable:
         """
         tables = cls.read_frames(path)
         if len(tables) > 1:
-            raise RecordingError(f'{path}: expected one frame, got {", ".join(sorted(tables))}')
+            raise RecordingError(
+                f'{path}: expected one frame, got {", ".join(sorted(tables))}; transform all '
+                f'boxes to one of them'
+            )
         return next(iter(tables.values()), cls.from_arrays([]))
 
     @classmethod
@@ -108,13 +111,15 @@ class BoxTable:
                 if missing:
                     raise RecordingError(
                         f'{path}: not a table of boxes, columns missing: {", ".join(missing)}; '
-                        f'expected those of boxes.csv'
+                        f'expected those of boxes.csv; add them, or give another file'
                     )
                 rows = [(reader.line_num, row) for row in reader]
         except OSError as error:
-            raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+            raise RecordingError(unreadable(path, error)) from None
         except (UnicodeDecodeError, csv.Error) as error:
-            raise RecordingError(f'{path}: cannot be read as CSV: {error}') from None
+            raise RecordingError(
+                f'{path}: cannot be read as CSV: {error}; give a table like boxes.csv'
+            ) from None
         of_frame: dict[str, list[tuple[int, dict[str, str]]]] = {}
         for line, row in rows:
             of_frame.setdefault(row['frame_id'], []).append((line, row))
@@ -135,7 +140,7 @@ class BoxTable:
                     what += ' of 64 bits' * isinstance(error, OverflowError)
                     raise RecordingError(
                         f'{path}: line {line}, column {name}: expected {what}, got '
-                        f'{row[name] or "nothing"}'
+                        f'{row[name] or "nothing"}; correct the line'
                     ) from None
             return values
 

@@ -8,7 +8,7 @@ from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
 import numpy as np
 
@@ -25,6 +25,7 @@ COVARIANCE_NUMBERS = tuple(
 POSE_TRIANGLE = np.triu_indices(6)
 EXTENT_TRIANGLE = np.triu_indices(3)
 NUM_POSE = len(POSE_TRIANGLE[0])
+NUMBERS_FORMAT = ','.join(['%.7g'] * len(COVARIANCE_NUMBERS)) + '\n'
 
 
 class BoxCovariance(NamedTuple):
@@ -52,8 +53,8 @@ class CovarianceWriter:
 
     def __init__(self, path: Path) -> None:
         self._file = path.open('w', newline='', encoding='utf-8')
-        self._table = csv.writer(self._file, lineterminator='\n')
-        self._table.writerow((*COVARIANCE_KEYS, *COVARIANCE_NUMBERS))
+        self._file.write(','.join((*COVARIANCE_KEYS, *COVARIANCE_NUMBERS)) + '\n')
+        self._row_begins = csv.writer(self._file, lineterminator=',')
 
     def write(self, refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> None:
         """Add a row for each box with an estimate: kept boxes have none."""
@@ -71,8 +72,8 @@ class CovarianceWriter:
         rows = zip(refined.status, boxes.track_ids, distances, numbers.tolist(), strict=True)
         for status, track_id, distance, row in rows:
             if status != KEPT:
-                cells = [f'{number:.7g}' for number in row]
-                self._table.writerow((boxes.stamp_ns, track_id, distance, *cells))
+                self._row_begins.writerow((boxes.stamp_ns, track_id, distance))
+                self._file.write(NUMBERS_FORMAT % tuple(row))
 
     def close(self) -> None:
         """Close the file."""
@@ -96,7 +97,7 @@ def read_covariances(path: Path) -> dict[tuple[int, str], BoxCovariance]:
                 found.setdefault(key, covariance)
             return found
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        raise RecordingError(unreadable(path, error)) from None
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise RecordingError(
             f'{path}: expected the columns of covariances.csv with a number in each cell, got '

@@ -9,6 +9,7 @@ from boxreg_ros.structures import (
     BoxArray,
     Floats,
     HEIGHT,
+    Ints,
     is_valid_box,
     LENGTH,
     ROLL,
@@ -69,7 +70,7 @@ class PoseCheck:
             *(replace(convention, pose_reference=name) for name in REFERENCES),
             *(replace(convention, size_order=order) for order in SIZE_ORDERS),
         ]
-        self._counts: list[list[int]] = []
+        self._counts: list[Ints] = []
         self._sweep: Sweep | None = None
         self._boxes: BoxArray | None = None
         self._seen = 0
@@ -102,14 +103,13 @@ class PoseCheck:
         kept = BoxArray(0, '', ('',) * n, ('',) * n, np.ones(n), boxes.boxes[valid])
         raw = self._convention.from_centers(kept)
         candidates = [kept.boxes, *(other.to_centers(raw).boxes for other in self._others)]
-        for rows in zip(*candidates, strict=True):
+        for rows in np.stack(candidates, axis=1):  # (boxes, conventions, 9)
             if self._is_over:
                 break
             self._seen += 1
-            reach = 1.5 * np.linalg.norm(rows[0][LENGTH : HEIGHT + 1])
-            near = points[(np.abs(points - rows[0][X : Z + 1]) < reach).all(axis=1)]
-            counts = [_inside(near, box) for box in rows]
-            if max(counts) >= MIN_POINTS_OF_POSE:
+            reach = 1.5 * np.linalg.norm(rows[0, LENGTH : HEIGHT + 1])
+            counts = _inside(_near(points, rows[0, X : Z + 1], reach), rows)
+            if counts.max() >= MIN_POINTS_OF_POSE:
                 self._counts.append(counts)
 
     def _result(self) -> str:
@@ -151,10 +151,20 @@ class PoseCheck:
         )
 
 
-def _inside(points: NDArray[np.floating], box: Floats) -> int:
-    """Count the points in a box, a margin around it included."""
-    R = matrix_from_rpy(box[ROLL:])
-    local = (points - box[X : Z + 1]) @ R
-    return int(
-        (np.abs(local) <= box[LENGTH : HEIGHT + 1] / 2 + HELD_POINT_MARGIN).all(axis=1).sum()
-    )
+def _near(
+    points: NDArray[np.floating], centre: Floats, reach: np.floating
+) -> NDArray[np.floating]:
+    """Return the points whose coordinates all differ by less than `reach` from a centre (3,)."""
+    columns = points.T  # each lies without gaps
+    for axis, place in enumerate(centre):
+        columns = columns.take(np.flatnonzero(np.abs(columns[axis] - place) < reach), 1)
+    return columns.T
+
+
+def _inside(points: NDArray[np.floating], boxes: Floats) -> Ints:
+    """Count the points in each of n boxes, a margin around it included, (n,)."""
+    R = matrix_from_rpy(boxes[:, ROLL:])
+    local = (points - boxes[:, None, X : Z + 1]) @ R  # (n, points, 3)
+    limit = boxes[:, None, LENGTH : HEIGHT + 1] / 2 + HELD_POINT_MARGIN
+    counts: Ints = (np.abs(local) <= limit).all(axis=2).sum(axis=1)
+    return counts

@@ -21,7 +21,7 @@ from boxreg_ros.io.motion import RecordedMotion
 from boxreg_ros.io.resync import Timeline
 from boxreg_ros.io.storage.files import is_ros1, part_of
 from boxreg_ros.io.storage.reader import Reader
-from boxreg_ros.io.storage.record import Damage, Record
+from boxreg_ros.io.storage.record import Bytes, Damage, Record
 from boxreg_ros.io.topics import ODOMETRY_TYPE, Topics
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Floats, Sweep
@@ -217,7 +217,7 @@ class Recording:
             if topic in self.data_topics and self._decoded_topics.isdisjoint(alike):
                 raise UnsupportedMessage(f'no message on {topic!r} can be read; first: {first}')
 
-    def box_message(self, data: bytes) -> tuple[Any, BoxArray]:
+    def box_message(self, data: Bytes) -> tuple[Any, BoxArray]:
         """
         Return a message of the boxes' topic from its bytes, and its boxes.
 
@@ -240,7 +240,7 @@ class Recording:
         encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
         return bytes(encode(replaced, kind))
 
-    def received_ns(self, topic: str, received_ns: int, data: bytes) -> int:
+    def received_ns(self, topic: str, received_ns: int, data: Bytes) -> int:
         """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
         (connection, *_) = self._topics.connections({topic})
         return self._timeline.received_ns(connection, received_ns, data)
@@ -330,7 +330,10 @@ class Recording:
         frames = [str(header.frame_id).lstrip('/') for header in headers]
         if not frames:
             topics = ', '.join(map(repr, self.points_topics))
-            raise RecordingError(f'{self}: no point clouds on {topics} in this part')
+            raise RecordingError(
+                f'{self}: expected point clouds on {topics} in this part, got none; choose '
+                f'another with --start and --end'
+            )
         return frames
 
     def _read(
@@ -388,7 +391,7 @@ class Recording:
             boxes: BoxArray = self._adapter.from_msg(message)
         return boxes
 
-    def _stamp_of(self, connection: Connection, data: bytes) -> int | None:
+    def _stamp_of(self, connection: Connection, data: Bytes) -> int | None:
         """Return the stamp of clouds, boxes and motion [ns]; None if there is none."""
         if connection.topic in self._topics.static_transforms:
             return None

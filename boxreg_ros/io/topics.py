@@ -90,7 +90,7 @@ class Topics:
         """
         candidates = self.filled(types)
         if asked is not None:
-            return self._checked(asked, content, types, candidates)
+            return self._checked(asked, role, content, types, candidates)
         if len(candidates) == 1:
             return candidates[0]
         if candidates:
@@ -100,27 +100,34 @@ class Topics:
             )
         if empty := sorted(self.of(types)):
             raise RecordingError(
-                f'{self._origin}: no {content}: no messages on {", ".join(empty)}'
+                f'{self._origin}: no {content}: no messages on {", ".join(empty)}; record the '
+                f'topic while its publisher runs'
             )
         there = ', '.join(f'{topic} ({kind})' for topic, kind in self.kinds.items())
         raise RecordingError(
             f'{self._origin}: no {content}, expected a topic of type {" or ".join(types)}; '
-            f'there: {there or "no topics"}'
+            f'there: {there or "no topics"}; give a recording that has one'
         )
 
     def _checked(
-        self, asked: str, content: str, types: Sequence[str], candidates: Sequence[str]
+        self,
+        asked: str,
+        role: str,
+        content: str,
+        types: Sequence[str],
+        candidates: Sequence[str],
     ) -> str:
         """Return the topic asked for if it is there, and of one of the types."""
         if asked not in self.kinds:
             fitting = ', '.join(candidates) or 'none'
             raise RecordingError(
-                f'{self._origin}: no topic {asked!r}; topics with {content}: {fitting}'
+                f'{self._origin}: no topic {asked!r}; topics with {content}: {fitting}; choose '
+                f'one with --{role}'
             )
         if self.kinds[asked] not in types:
             raise UnsupportedMessage(
                 f'topic {asked!r}: {content} expected as one of {", ".join(types)}, got '
-                f'{self.kinds[asked]}'
+                f'{self.kinds[asked]}; choose another topic with --{role}'
             )
         return asked
 

@@ -49,6 +49,9 @@ A vehicle has tens of frames; trackers that publish a frame per object add some 
 """
 FLOAT32_RANGE = 4096.0
 """Nearer to the origin, float32 coordinates are 0.25 mm apart or less [m]: 2**(12 - 24) m."""
+BLOCK_POINTS = 2**15
+"""Points that are moved at a time. Swept: in blocks of 2^12, 2^15 and 2^20 a sweep of 130,000
+points takes 1.2, 0.6 and 0.8 ms."""
 
 
 class TimeJumpDetector:
@@ -395,10 +398,14 @@ def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     t = T_frame_sweep[:3, 3]
     is_near = np.abs(t).max() < FLOAT32_RANGE
     kind = sweep.points.dtype if is_near else np.dtype(np.float64)
-    x, y, z = sweep.points.astype(kind, copy=False).T
-    moved = np.empty((3, len(sweep.points)), kind)
-    for i, (a, b, c) in enumerate(R.astype(kind)):  # not R @: BLAS starts threads of its own
-        moved[i] = a * x + b * y + c * z + t[i].astype(kind)
+    columns = sweep.points.T
+    moved = np.empty(columns.shape, kind)
+    # Not R @: BLAS starts threads of its own. A block stays in the cache for all its sums.
+    for first in range(0, columns.shape[1], BLOCK_POINTS):
+        block = slice(first, first + BLOCK_POINTS)
+        x, y, z = columns[:, block].astype(kind, copy=False)
+        for (a, b, c), offset, row in zip(R.astype(kind), t.astype(kind), moved, strict=True):
+            np.add(a * x + b * y + c * z, offset, out=row[block])
     origins = None if sweep.origins is None else sweep.origins @ R.T + t
     return replace(
         sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t, origins=origins

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxreg_ros.config import YAML_ERRORS
-from boxreg_ros.errors import ConfigError
+from boxreg_ros.errors import ConfigError, unreadable
 from boxreg_ros.io.transforms import inverse
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, Z
@@ -80,7 +80,7 @@ class Camera:
             is_yaml = path.suffix.lower() in ('.yaml', '.yml')
             values = _from_yaml(text) if is_yaml else _from_lines(text)
         except OSError as error:
-            raise ConfigError(f'{path}: cannot be read: {error.strerror}') from None
+            raise ConfigError(unreadable(path, error)) from None
         except (TypeError, AttributeError, *YAML_ERRORS) as error:
             raise ConfigError(f'{path}: not a camera calibration: {error}') from None
         T_camera_sensor = np.eye(4)

@@ -11,9 +11,13 @@ from boxreg_ros.io.box_table import BoxTable, COLUMNS
 from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import refined_boxes
-from boxreg_ros.structures import HEIGHT, LENGTH, X, Z
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, X, Z
 from msg_adapters.poses import quaternions_of
 import numpy as np
+import orjson
+
+PLAIN_RANGE = 1e-4, 1e16
+"""Python writes the magnitudes from the first to the second without an exponent."""
 
 FORMAT = Format(
     name='csv',
@@ -39,8 +43,9 @@ class Writer:
         self.dropped: Counter[str] = Counter()
         self._path = folder / 'boxes.csv'
         self._file = self._path.open('w', newline='', encoding='utf-8')
-        self._table = csv.writer(self._file, lineterminator='\n')
-        self._table.writerow(COLUMNS)
+        self._row_begins = csv.writer(self._file, lineterminator=',')
+        self._row_ends = csv.writer(self._file, lineterminator='\n')
+        self._row_ends.writerow(COLUMNS)
         self._covariances = CovarianceWriter(folder / COVARIANCES)
         self._newest_ns: int | None = None
         self._is_sorted = True
@@ -62,20 +67,13 @@ class Writer:
                 boxes.boxes[:, LENGTH : HEIGHT + 1],
             ]
         )
-        cells = numbers.astype(object)
-        cells[~np.isfinite(numbers)] = ''
-        for i, row in enumerate(cells.tolist()):
-            self._table.writerow(
-                [
-                    stamp_ns,
-                    boxes.frame_id,
-                    boxes.track_ids[i],
-                    boxes.class_names[i],
-                    *row,
-                    refined.status[i],
-                    int(refined.num_points[i]),
-                ]
-            )
+        names = zip(boxes.track_ids, boxes.class_names, strict=True)
+        ends = zip(refined.status, refined.num_points.tolist(), strict=True)
+        rows = zip(names, _texts(numbers), ends, strict=True)
+        for (track_id, class_name), texts, end in rows:
+            self._row_begins.writerow((stamp_ns, boxes.frame_id, track_id, class_name))
+            self._file.write(f'{texts},')
+            self._row_ends.writerow(end)
 
     def close(self) -> None:
         """Close the file; sort it if boxes arrived late."""
@@ -88,6 +86,25 @@ class Writer:
         rows.sort(key=lambda row: int(row[0]))
         with self._path.open('w', newline='', encoding='utf-8') as file:
             csv.writer(file, lineterminator='\n').writerows([header, *rows])
+
+
+def _texts(numbers: Floats) -> Iterator[str]:
+    """
+    Yield the cells of each row of `numbers` (n, k) with commas; not finite ones are empty.
+
+    The texts are those of `repr`, which takes ten times as long as orjson.
+
+    """
+    flat = numbers.ravel()
+    texts = orjson.dumps(flat, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].decode().split(',')
+    low, high = PLAIN_RANGE
+    size = np.abs(flat)
+    is_plain = (size == 0) | (low <= size) & (size < high)
+    for i in np.flatnonzero(~is_plain).tolist():
+        texts[i] = repr(float(flat[i])) if np.isfinite(flat[i]) else ''
+    width = numbers.shape[1]
+    for begin in range(0, len(flat), width):
+        yield ','.join(texts[begin : begin + width])
 
 
 def read(path: Path) -> Iterator[LabelFrame]:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 import orjson
 
 PROVENANCE_FILE = 'boxreg.json'
@@ -48,9 +48,9 @@ def from_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding='utf-8'))
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        raise RecordingError(unreadable(path, error)) from None
     except (ValueError, RecursionError) as error:
-        raise RecordingError(f'{path}: not JSON: {error}') from None
+        raise RecordingError(f'{path}: not JSON: {error}; write it again') from None
 
 
 def json_items(path: Path, prefix: str = 'item') -> Iterator[Any]:
@@ -89,9 +89,10 @@ def _streamed(path: Path, parse: Callable[[BinaryIO], Iterator[Any]]) -> Iterato
         with path.open('rb') as file:
             yield from parse(file)
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        raise RecordingError(unreadable(path, error)) from None
     except ijson.JSONError as error:
-        raise RecordingError(f'{path}: not JSON: {" ".join(str(error).split())}') from None
+        text = ' '.join(str(error).split())
+        raise RecordingError(f'{path}: not JSON: {text}; write it again') from None
 
 
 class JsonList:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import read_provenance, require_single
@@ -223,7 +223,7 @@ def _read_lines(path: Path) -> dict[int, list[_Line]]:
                 raise ValueError(f'got {len(words)} columns')
             lines_by_frame.setdefault(int(words[0]), []).append(line)
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        raise RecordingError(unreadable(path, error)) from None
     except (IndexError, ValueError) as error:
         raise RecordingError(
             f'{path}: expected 17 or 18 columns of KITTI tracking: {error}'

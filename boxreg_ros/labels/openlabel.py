@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import count
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -160,25 +161,28 @@ def _cuboids(refined: RefinedBoxes, is_valid: Mask) -> Iterator[dict[str, Any]]:
     position = boxes.boxes[:, X : Z + 1]
     extent = boxes.boxes[:, LENGTH : HEIGHT + 1]
     values = np.hstack([position, quaternions_of(boxes.boxes), extent])
-    covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS).tolist()
-    extents = refined.extent_covariances.reshape(-1, 9).round(COVARIANCE_DIGITS).tolist()
-    for i in np.flatnonzero(is_valid):
-        texts = {'status': refined.status[i], 'reason': refined.reasons[i]}
-        numbers: dict[str, float] = {'num_points': int(refined.num_points[i])}
-        if np.isfinite(boxes.scores[i]):
-            numbers['score'] = float(boxes.scores[i])
+    covariances = refined.covariances.reshape(-1, 36).round(COVARIANCE_DIGITS)
+    extents = refined.extent_covariances.reshape(-1, 9).round(COVARIANCE_DIGITS)
+    columns = (is_valid, values, refined.num_points, boxes.scores, covariances, extents)
+    rows = zip(refined.status, refined.reasons, *(c.tolist() for c in columns), strict=True)
+    for status, reason, is_box, value, num_points, score, covariance, extent_covariance in rows:
+        if not is_box:
+            continue
+        numbers = [{'name': 'num_points', 'val': num_points}]
+        if isfinite(score):
+            numbers.append({'name': 'score', 'val': score})
         attributes = {
-            'text': [{'name': name, 'val': value} for name, value in texts.items()],
-            'num': [{'name': name, 'val': value} for name, value in numbers.items()],
+            'text': [{'name': 'status', 'val': status}, {'name': 'reason', 'val': reason}],
+            'num': numbers,
             'vec': [
-                {'name': 'covariance', 'val': covariances[i]},
-                {'name': 'extent_covariance', 'val': extents[i]},
+                {'name': 'covariance', 'val': covariance},
+                {'name': 'extent_covariance', 'val': extent_covariance},
             ],
         }
         yield {
             'name': 'box',
             'coordinate_system': boxes.frame_id,
-            'val': values[i].tolist(),
+            'val': value,
             'attributes': attributes,
         }
 

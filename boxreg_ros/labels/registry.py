@@ -146,7 +146,7 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
         able = ', '.join(other for other in FORMATS if can_read(other))
         raise ConfigError(f'format {name!r} can only be written; readable: {able}')
     if not path.exists():
-        raise RecordingError(f'labels {str(path)!r}: no such file or folder')
+        raise RecordingError(f'labels {str(path)!r}: no such file or folder; correct the path')
     if scene is not None and hasattr(module, 'read_scene'):
         return cast(SceneModule, module).read_scene(path, scene)
     read = cast(ReadableModule, module).read

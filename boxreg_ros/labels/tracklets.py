@@ -21,7 +21,7 @@ from typing import cast, NamedTuple
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape, unescape
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import to_json
 from boxreg_ros.labels.protocol import (
@@ -266,7 +266,7 @@ def _read_boxes(path: Path) -> dict[int, list[_ReadBox]]:
         is_swapped = SWAPPED_COMMENT in text[: text.find('<boost_serialization')]
         return _boxes_by_frame(tree.getroot(), is_swapped)
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        raise RecordingError(unreadable(path, error)) from None
     except (ElementTree.ParseError, ValueError) as error:
         raise RecordingError(f'{path}: expected tracklets of KITTI: {error}') from None
 

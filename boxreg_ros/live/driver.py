@@ -248,7 +248,12 @@ class LiveRegistrar:
         if not has_jumped:
             return confirmed, []
         stamp_ns = confirmed[0].content.stamp_ns
-        self._trouble('time_jump', f'stamps went back to {stamp_ns} ns', 1)
+        self._trouble(
+            'time_jump',
+            f'expected stamps of one clock, got some that went back to {stamp_ns} ns; tracks '
+            f'start anew: unless a recording is played in a loop, let one clock set all stamps',
+            1,
+        )
         ready = self.reset()
         self.tree.rewind(stamp_ns)
         return confirmed, ready

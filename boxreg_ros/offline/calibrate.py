@@ -27,7 +27,8 @@ from boxreg_ros.core.input_noise import (
     MIN_OBSERVATIONS_FOR_NOISE,
 )
 from boxreg_ros.core.observation import Observation, observe
-from boxreg_ros.core.window import group_windows, stack_windows, Window
+from boxreg_ros.core.track_window import Window
+from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.arguments import (
     add_recording_arguments,

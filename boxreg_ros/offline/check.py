@@ -38,7 +38,10 @@ def run(args: argparse.Namespace) -> int:
     config = Config() if args.config is None else Config.from_yaml(args.config)
     tracks = _tracks(args.source, config)
     if not tracks:
-        raise RecordingError(f'{args.source}: expected boxes with a track id, got none')
+        raise RecordingError(
+            f'{args.source}: expected boxes with a track id, got none; run a tracker first, or '
+            f'boxreg relabel --associate'
+        )
     found = violations(tracks)
     if args.json:
         print(json.dumps(_report(tracks, found)))
@@ -109,11 +112,11 @@ def _format_of(source: str) -> tuple[str, Path]:
     path = Path(source)
     if (path / 'boxes.csv').is_file():
         return 'csv', path
+    name, colon, rest = source.partition(':')
+    if colon and rest and not path.exists():
+        return name, Path(rest)
     if path.suffix in LABEL_SUFFIXES:
         return LABEL_SUFFIXES[path.suffix], path
-    name, colon, rest = source.partition(':')
-    if colon and rest:
-        return name, Path(rest)
     raise ConfigError(
         f'{source}: expected a result folder, boxes.csv, boxes.parquet, a recording or '
         f'FORMAT:PATH, as in kitti:{source}; see boxreg formats'

@@ -7,6 +7,7 @@ from itertools import pairwise
 import math
 from typing import NamedTuple, TYPE_CHECKING
 
+from boxreg_ros.config import Config, KINDS
 from boxreg_ros.io.covariance_table import BoxCovariance
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, ROLL
@@ -17,11 +18,18 @@ if TYPE_CHECKING:
     from boxreg_ros.io.box_table import BoxTable
     from boxreg_ros.offline.box_scores import Matches
 
+DEFAULTS = Config()
+"""Settings that say which kind a class is of."""
 CONSISTENCY_VARIABLES = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
 RANGE_BINS = (0.0, 20.0, 40.0, math.inf)
 """Limits of the groups by distance from the sensor [m]."""
 MIN_VARIANCE = 1e-12
 """Variances are at least this; derived: an error of a micrometre is none."""
+CONSISTENT_NEES = (0.7, 1.5)
+"""Bounds of a mean normalised squared error that is called consistent. Chosen: deviations that are
+off by less than a fifth."""
+SIGNIFICANT = 2.0
+"""Standard errors beyond those bounds that are no chance: 95 % of a normal variable."""
 
 
 class Consistency(NamedTuple):
@@ -30,18 +38,29 @@ class Consistency(NamedTuple):
 
     Attributes
     ----------
-    boxes : int
-        Boxes with a true box and a covariance.
+    boxes, tracks : int
+        Boxes with a true box and a covariance, and true tracks that they are of.
     coverage : dict
         By variable: part of the errors within two standard deviations; 0.954 is consistent.
     nees : dict
         By variable: mean squared error over variance; 1 is consistent.
+    nees_error : dict
+        By variable: standard error of `nees` over the tracks, whose boxes share their constant
+        errors; NaN for one track.
 
     """
 
     boxes: int
+    tracks: int
     coverage: dict[str, float]
     nees: dict[str, float]
+    nees_error: dict[str, float]
+
+    def is_off(self, variable: str) -> bool:
+        """Return whether the NEES of a variable is out of `CONSISTENT_NEES`, and not by chance."""
+        low, high = CONSISTENT_NEES
+        beyond = max(low - self.nees[variable], self.nees[variable] - high)
+        return beyond > SIGNIFICANT * self.nees_error[variable]
 
 
 def consistency(
@@ -51,7 +70,7 @@ def consistency(
     covariances: Mapping[tuple[int, str], BoxCovariance],
 ) -> dict[str, Consistency]:
     """
-    Return the consistency of all boxes, by class and by range, by the name of the group.
+    Return the consistency of all boxes, by kind, class and range, by the name of the group.
 
     Parameters
     ----------
@@ -74,31 +93,44 @@ def consistency(
     rows = np.array([i for i, _ in known])
     squared = _normalised(matches, truth, rows, [covariance for _, covariance in known])
     classes = np.array([matches.class_names[i] for i in rows], object)
+    tracks = np.array([truth.track_ids[row] for row in matches.rows[rows]], object)
     ranges = np.array([covariance.distance for _, covariance in known])
-    found = {'all': _over(squared, np.ones(len(rows), bool))}
+    kinds = np.array([DEFAULTS.kind(name) for name in classes], object)
+    found = {'all': _over(squared, tracks, np.ones(len(rows), bool))}
+    for kind in KINDS:
+        if kind in kinds:
+            found[f'{kind}s'] = _over(squared, tracks, np.equal(kinds, kind))
     for name in sorted(set(classes)):
-        found[str(name)] = _over(squared, np.equal(classes, name))
+        found[str(name)] = _over(squared, tracks, np.equal(classes, name))
     for low, high in pairwise(RANGE_BINS):
         is_in = (ranges >= low) & (ranges < high)
         if is_in.any():
             label = f'{low:g}-{high:g} m' if high < math.inf else f'{low:g}+ m'
-            found[label] = _over(squared, is_in)
+            found[label] = _over(squared, tracks, is_in)
     return found
 
 
 def table(groups: Mapping[str, Consistency]) -> str:
     """Return the groups as a text table: coverage, then NEES, of each variable."""
     width = max(len(name) for name in groups)
-    titles = ''.join(f'{name:>13}' for name in CONSISTENCY_VARIABLES)
-    lines = [' ' * width + f'{"boxes":>8}{titles}']
+    titles = ''.join(f'{name:>14}' for name in CONSISTENCY_VARIABLES)
+    lines = [' ' * width + f'{"boxes":>8}{"tracks":>8}{titles}']
     for name, group in groups.items():
-        cells = [f'{group.coverage[v]:7.2f}{group.nees[v]:6.2f}' for v in CONSISTENCY_VARIABLES]
-        lines.append(f'{name:{width}}{group.boxes:8d}{"".join(cells)}')
+        cells = ''.join(_cell(group, variable) for variable in CONSISTENCY_VARIABLES)
+        lines.append(f'{name:{width}}{group.boxes:8d}{group.tracks:8d}{cells}')
+    low, high = CONSISTENT_NEES
     lines.append(
         'part of the errors within 2 sigma (0.95 is consistent), mean of squared error over '
-        'variance (1 is consistent)'
+        f'variance (1 is consistent;\n* out of {low:g} to {high:g} by more than {SIGNIFICANT:g} '
+        f'standard errors over the tracks)'
     )
     return '\n'.join(lines)
+
+
+def _cell(group: Consistency, variable: str) -> str:
+    """Return the cell of a variable."""
+    mark = '*' if group.is_off(variable) else ' '
+    return f'{group.coverage[variable]:7.2f}{group.nees[variable]:6.2f}{mark}'
 
 
 def _normalised(
@@ -118,12 +150,19 @@ def _normalised(
     return np.asarray(errors**2 / variances)
 
 
-def _over(squared: Floats, chosen: NDArray[np.bool_]) -> Consistency:
+def _over(squared: Floats, tracks: NDArray[np.object_], chosen: NDArray[np.bool_]) -> Consistency:
     """Return the consistency of the `chosen` boxes."""
     part = squared[chosen]
-    coverage = (part <= 4).mean(axis=0).tolist()
-    nees = part.mean(axis=0).tolist()
+    names, owners = np.unique(tracks[chosen].astype(str), return_inverse=True)
+    nees = part.mean(axis=0)
+    deviations = np.zeros((len(names), len(CONSISTENCY_VARIABLES)))
+    np.add.at(deviations, owners, part - nees)
+    count = len(names)
+    error = np.full(len(CONSISTENCY_VARIABLES), np.nan)
+    if count > 1:  # the standard error of a mean over clusters
+        error = np.sqrt((deviations**2).sum(axis=0) * count / (count - 1)) / len(part)
     by_name = (
-        dict(zip(CONSISTENCY_VARIABLES, values, strict=True)) for values in (coverage, nees)
+        dict(zip(CONSISTENCY_VARIABLES, values.tolist(), strict=True))
+        for values in ((part <= 4).mean(axis=0), nees, error)
     )
-    return Consistency(len(part), *by_name)
+    return Consistency(len(part), count, *by_name)

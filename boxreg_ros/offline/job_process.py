@@ -22,6 +22,7 @@ from boxreg_ros.io.storage.urls import names_of, read_text, url_of, write_text
 from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.job import Job, JOB_DONE, JOB_FAILED, UP_TO_DATE
 from boxreg_ros.offline.result_folder import delete_remains, earlier_summary
+from boxreg_ros.offline.time_limit import within
 
 JOBS = 'jobs'
 """Folder with the key and the log of each job."""
@@ -51,7 +52,7 @@ class JobRunner:
     retries : int
         How often a job whose process was killed is tried again.
     timeout : float or None
-        Longest time of one attempt [s].
+        Longest time to read the files for the key, and of one attempt [s].
     running : set
         Processes that run now, to end them.
 
@@ -72,7 +73,7 @@ class JobRunner:
         state = folder / f'{job.name}.json'
         earlier = _read_state(state)
         try:
-            hashes = job.hashes(earlier.get('files', []))
+            hashes = within(self.timeout, partial(job.hashes, earlier.get('files', [])))
             if url_of(folder) is None:
                 folder.mkdir(parents=True, exist_ok=True)
             job.set_key(hashes, [*self.options, self.config])
@@ -84,6 +85,11 @@ class JobRunner:
                     file.write(json.dumps(known, indent=2))
         except RecordingError as error:
             job.fail(str(error))
+        except TimeoutError:
+            job.fail(
+                f'its files were not read after {self.timeout:g} s: check their disk or network '
+                f'mount, or raise --timeout'
+            )
         except OSError as error:
             job.fail(f'{error}; free some space, or make the file accessible, and run it again')
         return job
@@ -155,7 +161,7 @@ class JobRunner:
         process.terminate()
         _wait_for(process, END_SECONDS)
         process.kill()
-        process.wait()
+        _wait_for(process, END_SECONDS)  # one that reads from a dead mount does not end
         return True
 
 

@@ -23,12 +23,11 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import delete_files, names_of, read_bytes, url_of, write_bytes
 import numpy as np
 
-if TYPE_CHECKING:  # these import torch
+if TYPE_CHECKING:
     from boxreg_ros.config import Config
     from boxreg_ros.core.input_model import InputModel
     from boxreg_ros.core.registrar import GetEstimates, Submit
-    from boxreg_ros.core.registration import Estimate
-    from boxreg_ros.core.window import Window
+    from boxreg_ros.core.track_window import Estimate, Window
 
 HEAD = struct.Struct('<QI')
 """Size [bytes] and CRC-32 of the record that follows."""

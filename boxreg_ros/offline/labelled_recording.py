@@ -78,6 +78,6 @@ def label_frame_of(
     if not tree.connects(fixed_frame, frame):
         raise RecordingError(
             f'{recording}: label frame {frame!r}: expected one that is connected with '
-            f'{fixed_frame!r}; TF: {tree}'
+            f'{fixed_frame!r}; TF: {tree}; choose another with --label-frame'
         )
     return frame

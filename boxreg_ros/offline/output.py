@@ -86,13 +86,14 @@ class Sink:
         self.corrections = Corrections(
             read_decisions(request.decisions) if request.decisions is not None else ()
         )
-        # These import torch, after the fork of the reader.
+        # These import numba, after the fork of the reader.
         from boxreg_ros.review.changes import Changes
         from boxreg_ros.review.track_points import PointCollector
 
         self.changes = Changes(self._fixed_frame)
         self.points = PointCollector(request.config) if request.report else None
         self._order = StampOrder()
+        self._early: dict[object, RefinedBoxes] = {}  # by ticket, until the final estimate is
         self._last_ticket = 0
         self.boxes_in = 0
         self.boxes_out = 0
@@ -125,11 +126,13 @@ class Sink:
     def take(self, ready: Sequence[RefinedBoxes]) -> None:
         """Take results of the registrar; write arrays up to the first one without a result."""
         for refined in ready:
-            if refined.is_final or self._writes_early:
-                ticket = refined.boxes.ticket
-                slot = self._order.waiting_for(ticket)
-                if slot is not None:  # otherwise its early result has been taken
-                    self._order.take(ticket, self.corrections.apply(slot.boxes, refined))
+            ticket = refined.boxes.ticket
+            if not (refined.is_final or self._writes_early):
+                self._early[ticket] = refined
+                continue
+            slot = self._order.waiting_for(ticket)
+            if slot is not None:  # otherwise its early result has been taken
+                self._order.take(ticket, self.corrections.apply(slot.boxes, refined))
         for slot, result in self._order.ready():
             self._put(result, slot)
 
@@ -189,7 +192,7 @@ class Sink:
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
         self.heading_flips += _heading_flips(slot.boxes, refined)
-        self.changes.add(slot.boxes, refined)
+        self.changes.add(slot.boxes, refined, self._early.pop(refined.boxes.ticket, None))
         with self._clock('write'):
             self._output.write(self._frame(refined, slot))
 

@@ -1,26 +1,31 @@
-"""Registration of windows in a worker process while this one reads the recording on."""
+"""
+Registration of windows in a worker process while this one takes the recording on.
+
+Only the worker imports torch, which takes a second and 150 MB.
+
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from itertools import accumulate, islice, pairwise
 import time
 from typing import Any, cast
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.core.observation import Observation
-from boxreg_ros.core.registrar import GetEstimates, Submit
-from boxreg_ros.core.registration import Estimate, register
-from boxreg_ros.core.window import stack_origins, Window
-from boxreg_ros.io.warm_up import warm_up
+from boxreg_ros.core.observation import Observation, stack_origins
+from boxreg_ros.core.registrar import CPU, GetEstimates, Submit, submit_locally
+from boxreg_ros.core.track_window import Estimate, Window
+from boxreg_ros.io.warm_up import warm_up, warm_up_crop
 from boxreg_ros.offline.compilation import announced_compilation
 from boxreg_ros.offline.reader import uses_one_core
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
 import numpy as np
-import torch
 
 
 @contextmanager
@@ -44,22 +49,28 @@ def registration_worker(
         Called with what is waited for where that takes long.
 
     """
-    if config.estimate != 'track' or config.device != 'cpu' or uses_one_core(config):
+    if config.estimate != 'track' or config.device != CPU or uses_one_core(config):
         with announced_compilation(announce):
             yield None
         return
     with announced_compilation(announce):
-        warm_up(config)  # this process and the worker then share what is imported and compiled
-    with run_in_worker(_serve, 'registers windows') as process:
-        yield _Dispatcher(process, clock)
+        warm_up_crop(config)  # the worker then shares what numba sets up
+    with (
+        run_in_worker(partial(_serve, config), 'registers windows') as process,
+        announced_compilation(announce),
+    ):
+        yield _Dispatcher(process, clock, announce)
 
 
 class _Dispatcher:
-    """Send windows to the worker and receive their estimates."""
+    """Send windows to the worker and receive their estimates, and announce what it compiles."""
 
-    def __init__(self, process: WorkerProcess, clock: Stopwatch) -> None:
+    def __init__(
+        self, process: WorkerProcess, clock: Stopwatch, announce: Callable[[str], None]
+    ) -> None:
         self._process = process
         self._clock = clock
+        self._announce = announce
 
     def __call__(self, windows: list[Window], config: Config, model: InputModel) -> GetEstimates:
         """Send windows; return a function that waits for their estimates."""
@@ -68,7 +79,11 @@ class _Dispatcher:
         self._process.send((_packed(windows), config, model))
 
         def awaited() -> list[Estimate | None]:
-            estimates, state, seconds = self._process.receive()
+            received = self._process.receive()
+            while isinstance(received, str):
+                self._announce(received)
+                received = self._process.receive()
+            estimates, state, seconds = received
             vars(model).update(state)  # `register` has updated the copy in the worker
             self._clock.add('solve', seconds)
             return cast(list[Estimate | None], estimates)
@@ -76,14 +91,22 @@ class _Dispatcher:
         return awaited
 
 
-def _serve(receive: Receive, send: Send) -> None:
+def _serve(config: Config, receive: Receive, send: Send) -> None:
     """Register windows in the worker until the connection is closed."""
-    torch.set_num_threads(1)  # the solver divides the windows among threads of its own
-    while True:
-        packed, config, model = receive()
-        begun = time.perf_counter()
-        estimates = register(_unpacked(*packed), config, model)
-        send((estimates, vars(model), time.perf_counter() - begun))
+    with announced_compilation(send), ThreadPoolExecutor(1) as pool:
+        warmed_up = pool.submit(warm_up, config)  # while the first windows fill and are received
+        while True:
+            received = receive()
+            warmed_up.result()
+            send(_registered(*received))
+            del received  # before the next windows are received
+
+
+def _registered(packed: Any, config: Config, model: InputModel) -> tuple[Any, ...]:
+    """Return the estimates of windows, the state of the input model, and the time taken [s]."""
+    begun = time.perf_counter()
+    estimates = submit_locally(_unpacked(*packed), config, model)()
+    return estimates, model.__getstate__(), time.perf_counter() - begun
 
 
 def _packed(windows: Sequence[Window]) -> tuple[Any, ...]:

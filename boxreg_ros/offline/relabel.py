@@ -39,6 +39,7 @@ from boxreg_ros.review.decisions import DECISIONS
 from boxreg_ros.structures import (
     COASTED,
     EXTENDED,
+    HUMAN,
     INTERPOLATED,
     KEPT,
     REFINED,
@@ -105,7 +106,7 @@ def relabel(
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         plan, completion = _survey(request, clock, shown, journal)
         receive = workers.enter_context(reader(request))
-        # The recording is opened while this process imports torch, which takes a second.
+        # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
 
@@ -405,7 +406,7 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
         parts[-1] += f' ({_counts(summary["reasons"])})'
     if summary['heading_flips']:
         parts.append(f'{summary["heading_flips"]:,} heading flips corrected')
-    for word in (REJECTED, INTERPOLATED, EXTENDED, COASTED):
+    for word in (HUMAN, REJECTED, INTERPOLATED, EXTENDED, COASTED):
         if word in status:
             parts.append(f'{status[word]:,} {word}')
     line = (
@@ -509,20 +510,25 @@ def _damage_line(damages: list[dict[str, Any]]) -> str:
 
 def has_failed(summary: dict[str, Any]) -> bool:
     """Return whether a run had boxes and refined none of them."""
-    return bool(summary['boxes_in']) and not summary['status'].get(REFINED)
+    return bool(summary['boxes_in']) and not _refined(summary)
 
 
 def part_refined(summary: dict[str, Any]) -> float:
     """Return the part of the input boxes that were refined; 1 without boxes."""
     boxes = int(summary['boxes_in'])
-    return int(summary['status'].get(REFINED, 0)) / boxes if boxes else 1.0
+    return _refined(summary) / boxes if boxes else 1.0
+
+
+def _refined(summary: dict[str, Any]) -> int:
+    """Return the number of input boxes that were refined, by the points or by a person."""
+    return int(sum(summary['status'].get(word, 0) for word in (REFINED, HUMAN)))
 
 
 def _why_few_were_refined(summary: dict[str, Any]) -> str:
     """Return the most frequent reason why boxes were kept, its remedy, and both time ranges."""
     name, count = next(iter(summary['reasons'].items()))  # sorted by count
     reason = REASONS[name]
-    refined = summary['status'].get(REFINED, 0)
+    refined = _refined(summary)
     part = f'only {refined:,} of {summary["boxes_in"]:,} boxes were refined'
     if not refined:
         part = f'none of {summary["boxes_in"]:,} boxes was refined'

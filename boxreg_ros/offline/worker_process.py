@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+import gc
 import os
 import pickle
 import signal
@@ -108,6 +109,7 @@ def run_in_worker(serve: Serve, purpose: str) -> Iterator[WorkerProcess]:
 
     """
     parent_end, worker_end = socket.socketpair()
+    gc.freeze()  # collections then leave alone what both processes share
     pid = os.fork()
     if pid == 0:
         parent_end.close()

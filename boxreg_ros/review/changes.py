@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-from boxreg_ros.core.metrics import pose_errors
+from boxreg_ros.core.metrics import iou_3d, pose_errors
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BoxArray,
@@ -47,6 +47,8 @@ class TrackChanges:
         Standard deviations of length, width and height [m]; NaN for boxes that are not refined.
     face_distances, outside : array, shapes (n, 6) and (n,)
         As in `RefinedBoxes`.
+    disagreement : array, shape (n,)
+        1 - 3D IoU of the result with the early estimate; 0 where that is not known.
     is_flipped : array, shape (n,)
         True where the heading was flipped by 180 degrees.
     status : array of str, shape (n,)
@@ -69,6 +71,7 @@ class TrackChanges:
     extent_deviations: Floats
     face_distances: Floats
     outside: Floats
+    disagreement: Floats
     is_flipped: NDArray[np.bool_]
     status: NDArray[np.str_]
     reasons: NDArray[np.str_]
@@ -111,11 +114,13 @@ class Changes:
         # Id, class, status, reason, id in the input.
         self._names: list[tuple[str, str, str, str, str]] = []
         # Rows of given (9), boxes (9), deviations (4), extent deviations (3), face distances (6),
-        # part of the points outside (1).
+        # part of the points outside (1), early estimates (9).
         self._numbers: list[Floats] = []
         self._counts: list[Ints] = []  # rows of stamp, number of points
 
-    def add(self, given: BoxArray, refined: RefinedBoxes) -> None:
+    def add(
+        self, given: BoxArray, refined: RefinedBoxes, early: RefinedBoxes | None = None
+    ) -> None:
         """
         Add the boxes of one array.
 
@@ -125,6 +130,8 @@ class Changes:
             The input.
         refined : RefinedBoxes
             The result; added boxes stand behind those of the input.
+        early : RefinedBoxes, optional
+            The early estimate of the same boxes, where the result is another.
 
         """
         boxes = refined.boxes
@@ -147,6 +154,7 @@ class Changes:
                     extent_deviations,
                     refined.face_distances,
                     refined.outside,
+                    _refined_early(early, n),
                 ]
             )
         )
@@ -157,18 +165,20 @@ class Changes:
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
-        numbers = np.concatenate([np.zeros((0, 32)), *self._numbers])
+        numbers = np.concatenate([np.zeros((0, 41)), *self._numbers])
         counts = np.concatenate([np.zeros((0, 2), np.int64), *self._counts])
-        given, boxes, deviations, extent_deviations, face_distances, outside = np.split(
-            numbers, [9, 18, 22, 25, 31], axis=1
+        given, boxes, deviations, extent_deviations, face_distances, outside, early = np.split(
+            numbers, [9, 18, 22, 25, 31, 32], axis=1
         )
+        disagreement = _disagreement(boxes, early)
         errors = pose_errors(given, boxes)  # of the input, in the axes of the result
         yaw_change = wrap_angle(2 * errors.rotation[:, 2]) / 2  # half turns removed
         change = -np.column_stack([errors.translation, yaw_change])
         found = []
         for track_id, rows in self._rows_by_track(counts[:, 0]).items():
             parts = zip(*(self._names[row] for row in rows), strict=True)
-            _, classes, status, reasons, input_ids = parts
+            _, classes, words, reasons, input_ids = parts
+            status = np.array(words)
             is_refined = np.isin(status, (REFINED, HUMAN))
             unknown = np.where(is_refined, 0.0, np.nan)[:, None]
             found.append(
@@ -184,8 +194,9 @@ class Changes:
                     extent_deviations=extent_deviations[rows] + unknown,
                     face_distances=face_distances[rows],
                     outside=outside[rows, 0],
+                    disagreement=disagreement[rows],
                     is_flipped=errors.is_flipped[rows] & is_refined,
-                    status=np.array(status),
+                    status=status,
                     reasons=np.array(reasons),
                     num_points=counts[rows, 1],
                 )
@@ -216,6 +227,23 @@ def known(values: ArrayLike) -> Floats:
     """Return the finite values as one row."""
     values = np.asarray(values, dtype=np.float64)
     return np.asarray(values[np.isfinite(values)])
+
+
+def _refined_early(early: RefinedBoxes | None, count: int) -> Floats:
+    """Return the early estimates of `count` boxes (n, 9), NaN where they are not refined."""
+    found = np.full((count, 9), np.nan)
+    if early is not None:
+        rows = [row for row, word in enumerate(early.status[:count]) if word == REFINED]
+        found[rows] = early.boxes.boxes[rows]
+    return found
+
+
+def _disagreement(boxes: Floats, early: Floats) -> Floats:
+    """Return 1 - 3D IoU of two estimates (n, 9), 0 where one is not known, (n,)."""
+    found = np.zeros(len(boxes))
+    both = np.isfinite(boxes).all(axis=1) & np.isfinite(early).all(axis=1)
+    found[both] = 1 - iou_3d(boxes[both], early[both])
+    return found
 
 
 def _deviations(boxes: Floats, covariances: Floats) -> Floats:

@@ -16,7 +16,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
 from boxreg_ros.structures import (
     BOX_EXTENT,
@@ -81,7 +81,8 @@ class Decision:
         """Check the decision."""
         if self.kind not in DECISION_KINDS:
             raise RecordingError(
-                f'decision: expected one of {", ".join(DECISION_KINDS)}, got {self.kind!r}'
+                f'decision: expected one of {", ".join(DECISION_KINDS)}, got {self.kind!r}; '
+                f'decide again, or remove the row'
             )
         if self.kind != 'pin':
             return
@@ -131,21 +132,31 @@ def read_decisions(path: Path) -> list[Decision]:
     """
     try:
         text = path.read_text(encoding='utf-8-sig')
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f'{path}: cannot be read: {error}') from None
+    except OSError as error:
+        raise RecordingError(unreadable(path, error)) from None
+    except UnicodeDecodeError as error:
+        raise RecordingError(
+            f'{path}: expected decisions of boxreg review, got no text: {error}; give their file'
+        ) from None
     whole = text[: text.rfind('\n') + 1]
     reader = csv.DictReader(io.StringIO(whole, newline=''))
     missing = [name for name in DECISION_COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
         raise RecordingError(
-            f'{path}: expected decisions of boxreg review, columns missing: {", ".join(missing)}'
+            f'{path}: expected decisions of boxreg review, got a file without the columns '
+            f'{", ".join(missing)}; give {DECISIONS} of a reviewed result'
         )
     decisions = []
     for row in reader:
         try:
             decisions.append(_parsed(row))
-        except (RecordingError, ValueError) as error:
+        except RecordingError as error:
             raise RecordingError(f'{path}: line {reader.line_num}: {error}') from None
+        except ValueError as error:
+            raise RecordingError(
+                f'{path}: line {reader.line_num}: expected numbers, got: {error}; correct the '
+                f'line, or remove it'
+            ) from None
     return decisions
 
 

@@ -28,7 +28,7 @@ from boxreg_ros.review.quality import CELL, Quality
 from boxreg_ros.review.rules import RULES
 from boxreg_ros.review.rules.protocol import Rule
 from boxreg_ros.review.track_points import PointCollector
-from boxreg_ros.structures import REFINED
+from boxreg_ros.structures import HUMAN, REFINED
 import numpy as np
 
 REPORT = 'report.html'
@@ -190,7 +190,7 @@ def _plotly_script() -> bytes:
 def _warnings(summary: Mapping[str, Any]) -> list[str]:
     """Return the warnings at the top of the page."""
     found = [summary['warning']] if summary['warning'] else []
-    if summary['boxes_in'] and not summary['status'].get(REFINED):
+    if summary['boxes_in'] and summary['status'].keys().isdisjoint((REFINED, HUMAN)):
         found.append('No box was refined; see "Why boxes were kept" below.')
     if summary['first_missing_transform']:
         found.append(f'First missing transform: {summary["first_missing_transform"]}')

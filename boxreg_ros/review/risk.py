@@ -45,10 +45,18 @@ MIN_COMPARED = 8
 of fewer are the values of single tracks."""
 MAX_DEVIATIONS = 2.0
 """Extents within this many deviations of their class are usual: 95 % of a normal variable."""
-MIN_SIZE_SPREAD = 0.03
-"""Least relative deviation of the extents of a class. Chosen: models of one maker differ so."""
+SIZE_SPREAD = (0.11, 0.06, 0.09)
+"""
+Least relative deviation of length, width and height among the objects of a class.
+
+Literature: cars of KITTI are 3.88 +- 0.43, 1.63 +- 0.10 and 1.53 +- 0.14 m. The quartiles of a few
+tracks may be closer by chance.
+
+"""
 QUARTILES_TO_DEVIATION = 0.74
 """Standard deviation over interquartile range of a normal variable. Derived: 1 / 1.349."""
+FACE_PAIRS = ('ends', 'sides', 'top and bottom')
+"""Names of the faces across each axis of a box."""
 FEW_POINTS = 10
 """Boxes with fewer points are reported as such. Chosen."""
 
@@ -123,7 +131,8 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     extent, nearly all of it at the unseen face of a pair. Its mean is how far the face is off its
     points, beyond what surfaces of its kind are off a rigid box; they are expected by the
     labelling margins of other tracks. Its mean magnitude is that of a folded normal variable. What
-    its mean adds to its deviation is a reason of its own.
+    its mean adds to its deviation is a reason of its own. So is a disagreement between two
+    estimates beyond the loss that the deviations explain.
 
     """
     extents = _extents(track)
@@ -138,12 +147,14 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     misfit = _folded_mean(off, face_pairs) / across
     turn = deviations[:, 3] * length / (2 * width)
     is_refined = track.is_refined
-    losses = {
-        'uncertain position and size': ONE_OF_PAIR * uncertain.sum(axis=1),
-        'uncertain heading': MEAN_OF_NORMAL * turn,
-        'faces off their points': (misfit - uncertain).sum(axis=1),
-        'points left outside': _left_outside(track, extents, usual.outside),
-    }
+    losses = {'uncertain heading': MEAN_OF_NORMAL * turn}
+    for axis, faces in enumerate(FACE_PAIRS):
+        pair = slice(2 * axis, 2 * axis + 2)
+        losses[f'uncertain {faces}'] = ONE_OF_PAIR * uncertain[:, pair].sum(axis=1)
+        losses[f'{faces} off their points'] = (misfit - uncertain)[:, pair].sum(axis=1)
+    expected = np.sum([losses[reason] for reason in losses if 'uncertain' in reason], axis=0)
+    losses['estimates disagree'] = (track.disagreement - expected).clip(0)
+    losses['points left outside'] = _left_outside(track, extents, usual.outside)
     losses = {reason: np.where(is_refined, loss, 0.0) for reason, loss in losses.items()}
     is_kept = track.status == KEPT
     losses['kept as in the input'] = np.where(is_kept, KEPT_LOSS, 0.0)
@@ -154,14 +165,28 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     return Risk(total.clip(max=MAX_LOSS * REFERENCE_LENGTH / 2), parts)
 
 
-def reasons_of(track: TrackChanges, risk: Risk, row: int | None = None) -> str:
-    """Return why a track, or its box in `row`, has its risk, in words, largest part first."""
-    values = {
-        reason: part.mean() if row is None else part[row] for reason, part in risk.parts.items()
+def typical_parts(risks: Sequence[Risk]) -> dict[str, float]:
+    """Return the median of each part over the tracks [m]; none for fewer than `MIN_COMPARED`."""
+    if len(risks) < MIN_COMPARED:
+        return {}
+    means = {
+        reason: [float(risk.parts[reason].mean()) for risk in risks] for reason in risks[0].parts
     }
-    largest = sorted(values.items(), key=lambda item: -item[1])
-    words = [f'{reason} ({value:.2f} m)' for reason, value in largest[:3] if value >= 0.01]
-    points = float(np.median(track.num_points)) if row is None else float(track.num_points[row])
+    return {reason: float(np.median(values)) for reason, values in means.items()}
+
+
+def reasons_of(track: TrackChanges, risk: Risk, typical: Mapping[str, float]) -> str:
+    """
+    Return why a track has its risk, in words.
+
+    First the part that exceeds the `typical` one of the recording most: what all tracks have in
+    common is no reason to open this one.
+
+    """
+    values = {reason: float(part.mean()) for reason, part in risk.parts.items()}
+    largest = sorted(values, key=lambda reason: typical.get(reason, 0.0) - values[reason])
+    words = [f'{name} ({values[name]:.2f} m)' for name in largest[:3] if values[name] >= 0.01]
+    points = float(np.median(track.num_points))
     if points < FEW_POINTS:
         words.append(f'few points ({points:.0f} per box)')
     kept = Counter(filter(None, track.reasons.tolist()))
@@ -177,7 +202,7 @@ def _extents(track: TrackChanges) -> Floats:
 def _median_and_deviation(logs: Floats) -> Floats:
     """Return median and robust deviation of the columns of `logs` (n, 3), shape (2, 3)."""
     low, median, high = np.quantile(logs, (0.25, 0.5, 0.75), axis=0)
-    deviation = (QUARTILES_TO_DEVIATION * (high - low)).clip(min=MIN_SIZE_SPREAD)
+    deviation = (QUARTILES_TO_DEVIATION * (high - low)).clip(min=SIZE_SPREAD)
     return np.array([median, deviation])
 
 

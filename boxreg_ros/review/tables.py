@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from boxreg_ros.review.changes import median, TrackChanges
-from boxreg_ros.review.risk import assess, reasons_of, Risk, Usual
+from boxreg_ros.review.risk import assess, reasons_of, Risk, typical_parts, Usual
 from boxreg_ros.structures import ADDED, BOX_EXTENT, INTERPOLATED, KEPT, REFINED
 import numpy as np
 
@@ -17,10 +17,11 @@ REVIEW = 'review.csv'
 
 
 class TrackRow(NamedTuple):
-    """The source of a row of ``tracks.csv``: the track, and its risk."""
+    """The source of a row of ``tracks.csv``: the track, its risk, and the reasons in words."""
 
     track: TrackChanges
     risk: Risk
+    reasons: str
 
 
 def _count(status: str) -> Callable[[TrackRow], int]:
@@ -46,7 +47,7 @@ TRACK_COLUMNS: Mapping[str, Callable[[TrackRow], Any]] = {
     'length': _extent(0),
     'width': _extent(1),
     'height': _extent(2),
-    'reasons': lambda row: reasons_of(row.track, row.risk),
+    'reasons': lambda row: row.reasons,
 }
 """Columns of ``tracks.csv`` in their order: name, and how the cell follows from a row."""
 REVIEW_COLUMNS = ('rank', 'track_id', 'class_name', 'stamp_ns', 'risk_m', 'reasons')
@@ -55,7 +56,12 @@ REVIEW_COLUMNS = ('rank', 'track_id', 'class_name', 'stamp_ns', 'risk_m', 'reaso
 def assessed(tracks: Sequence[TrackChanges]) -> list[TrackRow]:
     """Return the rows of all tracks, largest risk first, ties by track id."""
     usual = Usual.of(tracks)
-    rows = [TrackRow(track, assess(track, usual)) for track in tracks]
+    risks = [assess(track, usual) for track in tracks]
+    typical = typical_parts(risks)
+    rows = [
+        TrackRow(track, risk, reasons_of(track, risk, typical))
+        for track, risk in zip(tracks, risks, strict=True)
+    ]
     return sorted(rows, key=lambda row: (-row.risk.track, row.track.track_id))
 
 
@@ -99,8 +105,7 @@ def _review_row(rank: int, row: TrackRow) -> list[Any]:
     track = row.track
     worst = int(np.argmax(row.risk.boxes))
     stamp_ns = int(track.stamps_ns[worst])
-    reasons = reasons_of(track, row.risk)
-    return [rank, track.track_id, track.class_name, stamp_ns, row.risk.track, reasons]
+    return [rank, track.track_id, track.class_name, stamp_ns, row.risk.track, row.reasons]
 
 
 def _write(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

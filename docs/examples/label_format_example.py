@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import json
 from pathlib import Path
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.files import to_json
 from boxreg_ros.labels.records import refined_boxes
@@ -68,6 +68,6 @@ def read(path: Path) -> Iterator[LabelFrame]:
             )
             yield LabelFrame(refined, fixed_frame=line['frame_id'], sensor_frame='')
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+        raise RecordingError(unreadable(path, error)) from None
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(f'{path}: expected one JSON object per line: {error!r}') from None

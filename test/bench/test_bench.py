@@ -10,12 +10,16 @@ from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
-from boxreg_ros.bench.review import with_pins
+from boxreg_ros.bench.review import _without_constant_error, with_pins
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
+from boxreg_ros.review.changes import Changes
+from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
+from boxreg_ros.structures import BoxArray, RefinedBoxes
+from browser import NEEDS_BROWSER
 import numpy as np
 import pytest
 import torch
@@ -202,6 +206,24 @@ def test_review_ranks_tracks_and_pins_a_box_of_the_worst(folder, capsys):
     assert report['own boxes']['pins']['gained'] > 0
 
 
+def test_errors_that_are_constant_in_the_box_frame_are_removed(folder):
+    drive = Drive.read(folder)
+    truth = drive.truth
+    is_car = np.array(truth.track_ids) == '9'
+    boxes = truth.boxes[is_car].copy()
+    boxes[:, :3] += matrix_from_rpy(boxes[:, 6:]) @ np.array([0.4, -0.2, 0.1])
+    boxes[:, 3:6] += 0.3
+    boxes[:, 8] += 0.05
+    changes = Changes(truth.frame_id)
+    for stamp_ns, box in zip(truth.stamps_ns[is_car].tolist(), boxes, strict=True):
+        array = BoxArray(stamp_ns, truth.frame_id, ('9',), ('car',), np.ones(1), box[None])
+        columns = ('refined',), ('',), np.ones(1, int), np.eye(6)[None]
+        changes.add(array, RefinedBoxes(array, *columns))
+    (track,) = changes.tracks()
+    found = _without_constant_error(drive, track)
+    np.testing.assert_allclose(found.boxes, truth.boxes[is_car], atol=1e-9)
+
+
 def test_coasting_finds_missed_boxes(folder, capsys):
     assert run('tracks', folder, '--coast', 0.5, '--far-misses', '--json') == 0
     rows = json.loads(capsys.readouterr().out)['results'][str(folder)]
@@ -237,10 +259,22 @@ def test_a_pin_holds_the_true_box_at_its_stamp(folder):
     assert sum(int(array.pinned.sum()) for array in pinned) == 1
 
 
+@NEEDS_BROWSER
+def test_report_measures_paint_and_frames(capsys):
+    pytest.importorskip('plotly')
+    small = ['--tracks', 3, '--boxes', 4, '--points', 2000]
+    assert run('report', *small, '--json') == 0
+    found = json.loads(capsys.readouterr().out)['results']['3 tracks of 4 boxes']
+    assert found['first paint [ms]'] > 0
+    assert 0 < found['script of a step [ms]'] <= found['longest script of a step [ms]']
+    assert 0 < found['frames per second'] < 70
+    assert 0 <= found['part of late frames'] <= 1
+
+
 @pytest.mark.parametrize('name', bench.MEASUREMENTS)
 def test_every_measurement_prints_json(name):
     parser = argparse.ArgumentParser()
     bench.add_arguments(parser)
-    own_data = ('highway', 'kills', 'lidars', 'load', 'node', 'paper', 'speed')
+    own_data = ('highway', 'kills', 'lidars', 'load', 'node', 'paper', 'report', 'speed')
     data = [] if name in own_data else ['folder']
     assert parser.parse_args([name, *data, '--json']).json

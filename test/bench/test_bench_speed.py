@@ -64,7 +64,8 @@ def test_relabel_is_measured_in_its_own_processes(report):
     assert 0 < relabel['start'] < relabel['total']
     assert 0 < relabel['help'] < relabel['total']
     assert 0 < relabel['rest, long'] < 1 and relabel['few'] in (800, 4_000)
-    # Two of the processes have torch: less would be one that is not counted.
+    assert 0 < relabel['cores, long'] <= 3  # processes
+    # One of the processes has torch: less would be one that is not counted.
     assert min(relabel[case] for case in ('memory', 'short', 'long')) > 300
     assert 200 < relabel['memory, shared once'] < relabel['memory']
 

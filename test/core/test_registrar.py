@@ -10,6 +10,7 @@ from boxreg_ros.core.geometry import face_distances
 from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.core.registration import register, solve
+from boxreg_ros.core.window import stack_windows
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
@@ -490,7 +491,7 @@ def test_tracks_are_solved_together_when_a_window_is_full(monkeypatch):
         calls.append({w.track_id: len(w.observations) for w in windows})
         return register(windows, config, model)
 
-    monkeypatch.setattr('boxreg_ros.core.registrar.register', noted)
+    monkeypatch.setattr('boxreg_ros.core.registration.register', noted)
     registrar = BoxRegistrar(config_with('track', track_window=12, max_gap=0.3))
     results = fed(registrar, stream_of([long, short, late])) + registrar.flush()
     assert calls == [
@@ -654,9 +655,9 @@ def test_torch_uses_one_thread_while_registering(stream, monkeypatch):
 
     def noted(*args):
         threads.append(torch.get_num_threads())
-        return register(*args)
+        return stack_windows(*args)
 
-    monkeypatch.setattr('boxreg_ros.core.registrar.register', noted)
+    monkeypatch.setattr('boxreg_ros.core.registration.stack_windows', noted)
     torch.set_num_threads(2)
     try:
         run(stream, config_with())

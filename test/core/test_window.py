@@ -2,9 +2,9 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import PRIOR_SIZE, Problem
+from boxreg_ros.core.track_window import MarginalisationPrior
 from boxreg_ros.core.window import (
     group_windows,
-    MarginalisationPrior,
     PRIOR_DECAY,
     resolve_headings,
     stack_windows,

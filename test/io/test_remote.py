@@ -72,14 +72,30 @@ def http_server(folder):
 
 
 @pytest.fixture
+def sent(monkeypatch):
+    """Return a list that fills with the sizes of the answers of the object store [bytes]."""
+    application = pytest.importorskip('moto.moto_server.werkzeug_app').DomainDispatcherApplication
+    call = application.__call__
+    sizes = []
+
+    def counted(self, *arguments):
+        parts = list(call(self, *arguments))
+        sizes.append(sum(map(len, parts)))
+        return parts
+
+    monkeypatch.setattr(application, '__call__', counted)
+    return sizes
+
+
+@pytest.fixture
 def store(monkeypatch):
     """Yield a file system of an object store with the bucket ``drives``."""
     s3fs = pytest.importorskip('s3fs')
     moto = pytest.importorskip('moto.server')
     server = moto.ThreadedMotoServer(ip_address='127.0.0.1', port=0, verbose=False)
     server.start()
-    port = server.get_host_and_port()[1]
-    monkeypatch.setenv('AWS_ENDPOINT_URL', f'http://127.0.0.1:{port}')
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv('AWS_ENDPOINT_URL', f'http://{host}:{port}')
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'key')
     monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', 'secret')
     monkeypatch.setenv('AWS_DEFAULT_REGION', 'us-east-1')
@@ -131,42 +147,58 @@ def test_recordings_over_http_give_the_same_boxes(tmp_path, whole):
     assert boxes(remote) == boxes(local)
 
 
-def test_bytes_of_a_slice(tmp_path, monkeypatch):
-    """Sweeps of 0.3 MB in chunks of one: the bytes that a slice needs are those of its chunks."""
+@pytest.fixture(scope='module')
+def large(tmp_path_factory):
+    """Return an MCAP file of 60 sweeps of 0.3 MB in chunks of one."""
+    folder = tmp_path_factory.mktemp('large')
     drive = Drive(sweeps=60)
-    padded = [
-        (topic, received, message)
-        for topic, received, message in drive.items
-        if topic != '/points'
-    ]
+    others = [item for item in drive.items if item[0] != '/points']
     rng = np.random.default_rng(0)
-    for stamp in drive.stamps:
-        xyz = rng.normal(size=(25_000, 3))
-        padded.append(('/points', stamp, drive.messages.points(stamp, 'lidar', xyz)))
-    drive.items = sorted(padded, key=lambda item: item[1])
-    path = rewritten(drive.write(tmp_path / 'drive'), tmp_path / 'large.mcap', chunk_size=300_000)
+    clouds = [
+        ('/points', stamp, drive.messages.points(stamp, 'lidar', rng.normal(size=(25_000, 3))))
+        for stamp in drive.stamps
+    ]
+    drive.items = sorted([*others, *clouds], key=lambda item: item[1])
+    return rewritten(drive.write(folder / 'drive'), folder / 'large.mcap', chunk_size=300_000)
+
+
+def bytes_of_a_slice(path):
+    """Return the bytes that the fourth second needs: its chunks are those of a sweep each."""
     begin, end = START + 3 * SECOND, START + 4 * SECOND
     with path.open('rb') as file:
         chunks = make_reader(file).get_summary().chunk_indexes
     # A slice needs its chunks, those of the transforms 2 s around it, and the first of all.
-    needed = (
-        sum(
-            chunk.chunk_length
-            for chunk in chunks
-            if chunk.message_end_time >= begin - 2 * SECOND
-            and chunk.message_start_time < end + 2 * SECOND
-        )
-        + chunks[0].chunk_length
+    return chunks[0].chunk_length + sum(
+        chunk.chunk_length
+        for chunk in chunks
+        if chunk.message_end_time >= begin - 2 * SECOND
+        and chunk.message_start_time < end + 2 * SECOND
     )
-    with http_server(tmp_path) as (server, url):
-        with Recording([Path(f'{url}/large.mcap')], start=3.0, end=4.0) as recording:
-            tree = TransformTree()
-            recording.choose_fixed_frame(tree)
-            stamps = [item.content.stamp_ns for item in recording.items(tree)]
-        sent = sum(server.sent)
-    assert len(stamps) == 20
+
+
+def read_slice(url):
+    """Read the fourth second of a recording."""
+    with Recording([Path(url)], start=3.0, end=4.0) as recording:
+        tree = TransformTree()
+        recording.choose_fixed_frame(tree)
+        assert len(list(recording.items(tree))) == 20
+
+
+def test_bytes_of_a_slice_over_http(large):
+    with http_server(large.parent) as (server, url):
+        read_slice(f'{url}/{large.name}')
+    sent, needed = sum(server.sent), bytes_of_a_slice(large)
     assert 0.5 * needed < sent < 1.2 * needed
-    assert sent < 0.95 * path.stat().st_size
+    assert sent < 0.95 * large.stat().st_size
+
+
+def test_bytes_of_a_slice_of_an_object_store(large, store, sent):
+    store.put(str(large), 'drives/large.mcap')
+    sent.clear()
+    read_slice('s3://drives/large.mcap')
+    needed = bytes_of_a_slice(large)
+    assert 0.5 * needed < sum(sent) < 1.2 * needed
+    assert sum(sent) < 0.95 * large.stat().st_size
 
 
 @pytest.mark.parametrize('storage', ['sqlite3', 'rosbag1'])

@@ -77,6 +77,19 @@ def test_numbers_keep_their_full_precision(tmp_path):
     assert float(rows_of(tmp_path)[0]['x']) == box[0]
 
 
+def test_numbers_are_written_as_python_writes_them(tmp_path):
+    rng = np.random.default_rng(0)
+    edges = [1e-4, np.nextafter(1e-4, 0), 1e-5, 1e15, 1e16, np.nextafter(1e16, 0), 0.0, -0.0, 3.0]
+    magnitudes = 10.0 ** rng.uniform(-25, 25, 600)
+    numbers = [*edges, *magnitudes * rng.choice([-1, 1], len(magnitudes))]
+    places = np.reshape(numbers, (-1, 3))
+    boxes = np.array([TILTED] * len(places))
+    boxes[:, :3] = places
+    write('csv', tmp_path, [refined(1, [*map(str, range(len(boxes)))], boxes)])
+    written = [[row[name] for name in 'xyz'] for row in rows_of(tmp_path)]
+    assert written == [[repr(x) for x in place] for place in places.tolist()]
+
+
 def test_values_that_are_not_finite_are_empty_cells(tmp_path):
     boxes = np.array([TILTED, TILTED])
     boxes[0, 1], boxes[1, 8] = np.nan, np.inf

@@ -63,11 +63,26 @@ def test_failures_are_isolated_and_a_second_run_skips_done_drives(tmp_path, caps
 def test_a_drive_that_takes_too_long_is_ended_and_leaves_nothing(tmp_path, capsys):
     path = Drive(sweeps=6).write(tmp_path / 'one')
     out = tmp_path / 'out'
-    assert main(['batch', str(path), '-o', str(out), '--timeout=0.01', *QUICK]) == 1
-    assert 'not done after 0.01 s' in capsys.readouterr().err
+    assert main(['batch', str(path), '-o', str(out), '--timeout=0.2', *QUICK]) == 1
+    assert 'not done after 0.2 s' in capsys.readouterr().err
     assert {item.name for item in out.iterdir()} == {
         'jobs', 'index.csv', 'summary.json', 'report.html',
     }  # fmt: skip
+
+
+def test_a_drive_whose_files_take_too_long_to_read_fails(tmp_path):
+    endless = tmp_path / 'endless.mcap'
+    endless.touch()
+    os.truncate(endless, 10**12)  # without blocks on the disk; to hash it takes half an hour
+    command = ['batch', str(endless), '-o', str(tmp_path / 'out'), '--timeout=0.2']
+    # The thread that reads ends with the process.
+    batch = [sys.executable, '-m', 'boxreg_ros.cli', *command]
+    done = subprocess.run(batch, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr == (
+        'boxreg: endless: its files were not read after 0.2 s: check their disk or network mount, '
+        'or raise --timeout\n'
+    )
 
 
 def test_manifests_patterns_and_their_errors(tmp_path):

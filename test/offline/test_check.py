@@ -6,6 +6,7 @@ from pathlib import Path
 from boxreg_ros.cli import main
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import CovarianceWriter, read_covariances
+from boxreg_ros.offline.consistency import _over
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import numpy as np
 import pytest
@@ -75,5 +76,23 @@ def test_evaluate_prints_coverage_and_nees(tmp_path, capsys):
     assert found['all']['coverage']['along'] == 0.75
     assert found['all']['nees']['along'] == pytest.approx((3 + 25) / 4)
     assert found['car']['boxes'] == found['0-20 m']['boxes'] == 4
+    # Four tracks of one box each: the standard error of a mean of 1, 1, 1 and 25.
+    assert found['all']['tracks'] == 4
+    error = np.std([1, 1, 1, 25], ddof=1) / 2
+    assert found['all']['nees_error']['along'] == pytest.approx(error)
     assert main(['evaluate', *paths]) == 0
     assert 'part of the errors within 2 sigma' in capsys.readouterr().out
+
+
+def test_nees_counts_tracks_and_marks_what_is_no_chance(tmp_path, capsys):
+    # Two boxes of each of four tracks err alike: they count as four, not as eight.
+    errors = np.repeat([2.0, 2.1, 1.9, 2.0], 2)
+    tracks = np.repeat(np.array(list('abcd'), object), 2)
+    squared = np.repeat(errors[:, None] ** 2, 7, axis=1)
+    group = _over(squared, tracks, np.ones(8, bool))
+    assert group.tracks == 4
+    error = np.std(errors[::2] ** 2, ddof=1) / 2
+    assert group.nees_error['yaw'] == pytest.approx(error)
+    assert group.is_off('yaw')
+    assert not _over(squared / 4, tracks, np.ones(8, bool)).is_off('yaw')
+    assert not _over(squared, np.array(['a'] * 8, object), np.ones(8, bool)).is_off('yaw')

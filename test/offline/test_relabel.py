@@ -18,6 +18,7 @@ from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.convert import Conversion, convert
 from boxreg_ros.offline.relabel import closing_line, notes, relabel, Request
 from boxreg_ros.offline.sources import source_of
+from boxreg_ros.review import tables
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention
 import numpy as np
@@ -411,6 +412,22 @@ def test_results_are_written_to_their_array_by_ticket(tmp_path, monkeypatch):
     held = []
     monkeypatch.setattr('boxreg_ros.core.registrar.BoxRegistrar', ReversingRegistrar)
     assert run(path, tmp_path / 'out')[1] == expected
+
+
+def test_early_and_final_estimates_are_compared(tmp_path, monkeypatch):
+    compared = {}
+    for estimate in ('early', 'final', 'track'):
+
+        def assessed(tracks, name=estimate):
+            compared[name] = np.concatenate([track.disagreement for track in tracks])
+            return []
+
+        monkeypatch.setattr(tables, 'assessed', assessed)
+        recording = Drive(sweeps=8).write(tmp_path / estimate)
+        relabel(Request((recording,), config=Config(estimate=estimate)), tmp_path / 'out')
+    assert np.median(compared['final']) > 0
+    assert not compared['early'].any()
+    assert not compared['track'].any()
 
 
 @pytest.mark.parametrize('pause', [0, 5])

@@ -18,11 +18,13 @@ from boxreg_ros.offline.journal import Journal, journal_path
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import whole_folder
+from preloaded import BOXREG, PreloadedProcess
 import pytest
 from ros_messages import Drive
 
 SETTINGS = {'track_window': 16, 'min_observations': 3}
 """Windows of sixteen observations, so that there are several batches."""
+QUICK = ['--set=solver.rounds=1', '--set=solver.iterations=3']
 
 
 def content_of(folder):
@@ -94,24 +96,23 @@ def test_runs_that_are_killed_at_random_give_the_same_bytes_of_every_file(
     (recording,) = request_of_drive.recordings
     out = tmp_path / 'results' / 'out'
     settings = [f'--set={name}={value}' for name, value in SETTINGS.items()]
-    command = [
-        *(sys.executable, '-m', 'boxreg_ros.cli', 'relabel', str(recording), '-o', str(out)),
-        *('--formats=csv,openlabel,mcap', '--resume', *settings),
-    ]
+    arguments = ['relabel', str(recording), '-o', str(out), '--formats=csv,openlabel,mcap']
+    arguments += ['--resume', *settings]
+    log = tmp_path / 'log'
     draw = random.Random(1)
     kills = 0
     while not out.exists():
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-        try:
-            process.wait(draw.uniform(0.5, 2.0) * 1.5**kills)
-            assert process.returncode == 0
-        except subprocess.TimeoutExpired:
+        process = PreloadedProcess(BOXREG, arguments, {}, log)
+        status = process.wait(draw.uniform(0.1, 0.5) * 1.5**kills)
+        if status is None:
             assert not out.exists() or (out / 'summary.json').exists()
             process.kill()
             process.wait()
             kills += 1
+        else:
+            assert status == 0, log.read_text()
     assert kills
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # removes what is left
+    assert PreloadedProcess(BOXREG, arguments, {}, log).wait() == 0  # removes what is left
     found = content_of(out)
     assert found.keys() == uninterrupted.keys()
     differing = [name for name, content in found.items() if content != uninterrupted[name]]
@@ -169,7 +170,7 @@ def test_file_size_limit_is_an_error_and_leaves_nothing(tmp_path, request_of_dri
     command = ['relabel', str(request_of_drive.recordings[0]), '-o', str(out)]
     for formats in ('csv', 'openlabel,mcap'):
         ran = subprocess.run(
-            [sys.executable, '-c', code, *command, f'--formats={formats}'],
+            [sys.executable, '-c', code, *command, f'--formats={formats}', *QUICK],
             capture_output=True, text=True,
         )  # fmt: skip
         assert ran.returncode == 1

@@ -10,6 +10,7 @@ import time
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.core.registration import register
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.offline import registration_worker as registration
 from boxreg_ros.offline.compilation import announced_compilation, COMPILING
@@ -194,7 +195,7 @@ def test_registrar_takes_input_while_windows_are_registered(stream):
 
     def begin(windows, config, model):
         events.append('begin')
-        estimates = registration.register(windows, config, model)
+        estimates = register(windows, config, model)
         return lambda: events.append('wait') or estimates
 
     registrar = BoxRegistrar(SHORT, begin)
@@ -234,11 +235,15 @@ def test_the_first_compilation_is_announced():
     assert texts == [COMPILING]
 
 
-def test_compilation_is_announced_before_the_worker_begins(monkeypatch):
+def test_compilation_in_the_worker_is_announced_while_its_estimates_are_awaited(
+    stream, monkeypatch
+):
     texts = []
     monkeypatch.setattr(registration, 'warm_up', compile_something)
-    with registration_worker(SHORT, Stopwatch(), texts.append):
-        assert texts == [COMPILING]
+    with registration_worker(SHORT, Stopwatch(), texts.append) as begin:
+        registrar = BoxRegistrar(SHORT, begin)
+        assert len(fed(registrar, stream) + registrar.flush()) == len(stream)
+    assert texts == [COMPILING]
 
 
 def test_the_reader_imports_no_solver():
@@ -250,6 +255,17 @@ def test_the_reader_imports_no_solver():
     )
     done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ('\n', '')
+
+
+def test_only_the_worker_imports_torch(tmp_path):
+    drive = Drive(sweeps=30).write(tmp_path / 'drive')
+    code = (
+        'import sys; from boxreg_ros.cli import main; '
+        "status = main(sys.argv[1:]); print(status, 'torch' in sys.modules)"
+    )
+    command = [sys.executable, '-c', code, 'relabel', str(drive), '-o', str(tmp_path / 'out')]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert (done.stdout.splitlines()[-1:], done.stderr) == (['0 False'], '')
 
 
 def test_relabel_writes_the_same_files_in_one_process(tmp_path, monkeypatch):
@@ -268,7 +284,7 @@ def test_exception_in_the_worker_ends_relabel(tmp_path, monkeypatch):
         raise ValueError('no such window')
 
     recording = Drive(sweeps=30).write(tmp_path / 'drive')
-    monkeypatch.setattr(registration, 'register', fail)  # the fork copies it
+    monkeypatch.setattr('boxreg_ros.core.registration.register', fail)  # the fork copies it
     with pytest.raises(ValueError, match='no such window'):
         relabel(Request((recording,), config=SHORT), tmp_path / 'out')
     assert sorted(item.name for item in tmp_path.iterdir()) == ['drive']

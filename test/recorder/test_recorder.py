@@ -144,13 +144,14 @@ def test_segments_end_after_their_time(tmp_path, segment, expected):
         assert stamps_in(tmp_path, name) == list(range(25))
 
 
-def test_a_segment_ends_by_service_and_where_time_goes_back(tmp_path):
-    items = [*map(final_boxes, range(100, 104)), Split(), *map(final_boxes, (104, 105, 0, 1))]
+def test_a_segment_ends_by_service_and_where_the_clock_changes(tmp_path):
+    numbers = 104, 105, 0, 1, 10**9  # back to another clock, and on to a third
+    items = [*map(final_boxes, range(100, 104)), Split(), *map(final_boxes, numbers)]
     record(settings_of(tmp_path), items)
-    assert [row.frames for row in read_index(tmp_path)] == [4, 2, 2]
+    assert [row.frames for row in read_index(tmp_path)] == [4, 2, 2, 1]
     record(settings_of(tmp_path), [final_boxes(7)])  # continues
-    assert [row.segment[-1] for row in read_index(tmp_path)] == ['1', '2', '3', '4']
-    assert stamps_in(tmp_path) == [100, 101, 102, 103, 104, 105, 0, 1, 7]
+    assert [row.segment[-1] for row in read_index(tmp_path)] == ['1', '2', '3', '4', '5']
+    assert stamps_in(tmp_path) == [100, 101, 102, 103, 104, 105, 0, 1, 10**9, 7]
 
 
 def test_segments_end_at_their_size(tmp_path):

@@ -193,7 +193,7 @@ def test_unreadable_decisions_stop_the_run_before_it_replaces_a_result(result, t
     path = tmp_path / DECISIONS
     path.write_text('a,b\n1,2\n')
     assert boxreg('relabel', recording, '-o', tmp_path / 'out', '--decisions', path) == 1
-    assert 'columns missing' in capsys.readouterr().err
+    assert 'got a file without the columns' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
 
 

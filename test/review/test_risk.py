@@ -45,8 +45,28 @@ def test_risk_is_the_expected_loss_of_overlap():
     # one has them all: twice the variance of one.
     track = track_with(0.05)
     mean = np.hypot(0.05, 0.025) * np.sqrt(2 / np.pi)
-    expected = np.sqrt(2) * mean * (1 / 4.5 + 1 / 1.8 + 1 / 1.5) * 4.5 / 2
-    np.testing.assert_allclose(assess(track).parts['uncertain position and size'], expected)
+    parts = assess(track).parts
+    for faces, across in (('ends', 4.5), ('sides', 1.8), ('top and bottom', 1.5)):
+        expected = np.sqrt(2) * mean / across * 4.5 / 2
+        np.testing.assert_allclose(parts[f'uncertain {faces}'], expected)
+
+
+def test_estimates_that_disagree_beyond_their_deviations_raise_the_risk():
+    # Boxes of a length of 4.5 m that are .5 m apart share 4 of 5 m.
+    array = BoxArray(0, 'odom', ('1',), ('car',), np.ones(1), np.array([CAR]))
+    early = BoxArray(0, 'odom', ('1',), ('car',), np.ones(1), np.array([CAR]))
+    early.boxes[0, 0] += 0.5
+    parts = []
+    for deviation in (1e-6, 0.3):
+        changes = Changes('odom')
+        columns = ('refined',), ('',), np.array([50]), deviation**2 * np.eye(6)[None]
+        spread = {'extent_covariances': 1e-12 * np.eye(3)[None]}
+        refined, before = (RefinedBoxes(boxes, *columns, **spread) for boxes in (array, early))
+        changes.add(array, refined, before)
+        (track,) = changes.tracks()
+        parts.append(assess(track).parts['estimates disagree'])
+    np.testing.assert_allclose(parts[0], (1 - 4 / 5) * 4.5 / 2, rtol=1e-3)
+    assert parts[1] == 0  # the deviations explain it
 
 
 def test_a_face_far_off_its_points_costs_its_distance():
@@ -56,7 +76,7 @@ def test_a_face_far_off_its_points_costs_its_distance():
     parts = assess(track_with(0.001, face_distances=distances)).parts
     noise = np.hypot(0.001, 0.0005) * np.sqrt(2 / np.pi)
     np.testing.assert_allclose(
-        parts['faces off their points'], (0.3 - noise) / 1.8 * 4.5 / 2, rtol=1e-6
+        parts['sides off their points'], (0.3 - noise) / 1.8 * 4.5 / 2, rtol=1e-6
     )
 
 
@@ -114,7 +134,17 @@ def test_tables_list_the_riskiest_track_first(tmp_path):
     assert [line['rank'] for line in lines] == ['1', '2', '3']
     risks = [float(line['risk_m']) for line in lines]
     assert risks == sorted(risks, reverse=True)
-    assert 'uncertain position and size' in lines[0]['reasons']
+    assert 'uncertain heading' in lines[0]['reasons']
+
+
+def test_the_first_reason_is_what_other_tracks_do_not_have():
+    # All tracks are as uncertain; the points of one are off its left side as well.
+    tracks = [track_with(0.3) for _ in range(MIN_COMPARED)]
+    distances = np.array([[0.0, 0.0, 0.5, 0.0, 0.0, 0.0]])
+    tracks.append(track_with(0.3, face_distances=distances))
+    reasons = [row.reasons for row in assessed(tracks)]
+    assert reasons[0].startswith('sides off their points')
+    assert all(text.startswith('uncertain') for text in reasons[1:])
 
 
 def test_no_tracks_give_empty_tables(tmp_path):

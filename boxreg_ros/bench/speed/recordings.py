@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import tee
 import json
@@ -31,9 +32,11 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
     open [s], ``faster`` the length of the recording over ``total``, ``compressed`` the same for
     a recording packed by zstd, ``rest`` the part of the total in which nothing is solved.
     ``memory`` is the peak of all processes [MB], ``memory, shared once`` the same with pages that
-    they share counted once, ``short`` and ``long`` are peaks for recordings of this length and of
+    they share counted once, of a run of its own: to count them takes a fifth of the machine.
+    ``short`` and ``long`` are peaks for recordings of this length and of
     ten times that, with sweeps of ``few`` points: a fifth of all if the disk has no room for more.
-    ``faster, long`` and ``rest, long`` are those of the latter. ``help`` is the shortest time
+    ``faster, long``, ``rest, long`` and ``cores, long``, the cores that are busy on average, are
+    those of the latter. ``help`` is the shortest time
     of three runs with ``--help`` [s].
 
     """
@@ -54,29 +57,40 @@ def relabel(tracks: int, points: int, seconds: float) -> dict[str, float]:
             ('compressed', points, seconds),
             ('memory', points, seconds),
         ):
-            a, b, c, d = tee(traffic(tracks, size, round(length / SWEEP_PERIOD)), 4)
-            write_recording(
-                path,
-                (Sweep(i.stamp_ns, 'lidar', i.points) for i in a),
-                (np.zeros(len(i.points)) for i in b),
-                (i.boxes for i in c),
-                (i.T_fixed_sensor for i in d),
-                'odom',
-                is_compressed=case == 'compressed',
-            )
+            sweeps = round(length / SWEEP_PERIOD)
+            write_traffic(path, tracks, size, sweeps, is_compressed=case == 'compressed')
             with path.open('rb') as file:
                 os.fsync(file.fileno())  # else the disk still writes while it is read
-            result[case], shared_once = _peaks([*command, str(path), '-o', str(out)])
+            run = [*command, str(path), '-o', str(out)]
+            before = os.times()
+            result[case] = _peak(run)
+            cores = _cores(before, os.times())
             spent = json.loads((out / 'summary.json').read_text(encoding='utf-8'))['seconds']
             faster, rest = length / spent['total'], 1 - spent['solve'] / spent['total']
             if case == 'memory':
                 result |= {**spent, 'faster': faster, 'rest': rest}
-                result['memory, shared once'] = shared_once
+                result['memory, shared once'] = _peak_shared_once(run)
             elif case == 'compressed':
                 result[case] = faster
             elif case == 'long':
-                result |= {'faster, long': faster, 'rest, long': rest}
+                result |= {'faster, long': faster, 'rest, long': rest, 'cores, long': cores}
     return result
+
+
+def write_traffic(
+    path: Path, tracks: int, points: int, count: int, is_compressed: bool = False
+) -> None:
+    """Write a recording of `traffic`."""
+    a, b, c, d = tee(traffic(tracks, points, count), 4)
+    write_recording(
+        path,
+        (Sweep(i.stamp_ns, 'lidar', i.points) for i in a),
+        (np.zeros(len(i.points)) for i in b),
+        (i.boxes for i in c),
+        (i.T_fixed_sensor for i in d),
+        'odom',
+        is_compressed=is_compressed,
+    )
 
 
 def _seconds(command: list[str]) -> float:
@@ -86,32 +100,45 @@ def _seconds(command: list[str]) -> float:
     return perf_counter() - begin
 
 
-def _peaks(command: list[str]) -> tuple[float, float]:
-    """
-    Run a command and return the peak memory of its processes [MB].
+def _cores(before: os.times_result, after: os.times_result) -> float:
+    """Return how many cores were busy on average with the commands run between two times."""
+    used = after.children_user + after.children_system
+    used -= before.children_user + before.children_system
+    return used / (after.elapsed - before.elapsed)
 
-    First the sum of the peak of each process, where shared memory, such as libraries, counts for
-    each; then the peak of the sum of their proportional set sizes, where it counts once.
 
-    """
+def _peak(command: list[str]) -> float:
+    """Run a command; return the sum of the peak memory of its processes [MB]."""
     peaks: dict[str, int] = {}
-    shared_once = 0
+    for pids in _running(command):
+        for pid in pids:
+            with suppress(OSError, IndexError):  # it may have ended
+                peaks[pid] = _kilobytes(Path(f'/proc/{pid}/status'), 'VmHWM:')
+    return sum(peaks.values()) / 1024
+
+
+def _peak_shared_once(command: list[str]) -> float:
+    """Run a command; return the peak of the sum of its proportional set sizes [MB]."""
+    most = 0
+    for pids in _running(command):
+        with suppress(OSError, IndexError):  # one may have ended
+            sizes = [_kilobytes(Path(f'/proc/{pid}/smaps_rollup'), 'Pss:') for pid in pids]
+            most = max(most, sum(sizes))
+    return most / 1024
+
+
+def _running(command: list[str]) -> Iterator[list[str]]:
+    """Run a command; yield the ids of its processes, again and again until it ends."""
     with tempfile.TemporaryFile('w+') as output:
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
         while process.poll() is None:
-            with suppress(OSError, IndexError):  # a process may have ended
+            with suppress(OSError):
                 children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text()
-                sizes = 0
-                for pid in (str(process.pid), *children.split()):
-                    folder = Path(f'/proc/{pid}')
-                    peaks[pid] = _kilobytes(folder / 'status', 'VmHWM:')
-                    sizes += _kilobytes(folder / 'smaps_rollup', 'Pss:')
-                shared_once = max(shared_once, sizes)
+                yield [str(process.pid), *children.split()]
             sleep(0.02)
         if process.returncode:
             output.seek(0)
             raise RuntimeError(f'{" ".join(command)} failed: {output.read()}')
-    return sum(peaks.values()) / 1024, shared_once / 1024
 
 
 def _kilobytes(file: Path, name: str) -> int:

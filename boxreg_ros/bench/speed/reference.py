@@ -23,8 +23,9 @@ from boxreg_ros.core.refine import refine, Track
 from boxreg_ros.core.rounds import SETTLED_STEP
 from boxreg_ros.core.solver import solve
 from boxreg_ros.core.terms import Term
+from boxreg_ros.core.track_window import Window
 from boxreg_ros.core.weights import weigh
-from boxreg_ros.core.window import stack_windows, Window
+from boxreg_ros.core.window import stack_windows
 from boxreg_ros.structures import BOX_EXTENT, Floats, POSE
 import numpy as np
 import torch

@@ -93,7 +93,7 @@ def _relabel_lines(found: dict[str, Any]) -> list[str]:
         f'partly at once: {busy}), all but the solve {found["rest"]:.0%}',
         f'ten times as long, sweeps of {few}: {found["faster, long"]:.1f} times faster '
         f'than it lasts (wanted: {WANTED["faster, long"]:g}), all but the solve '
-        f'{found["rest, long"]:.0%}',
+        f'{found["rest, long"]:.0%}, {found["cores, long"]:.1f} cores busy',
         f'the recording is open after {found["start"]:.2f} s (wanted: {WANTED["start"]:g}); '
         f'relabel --help takes {found["help"]:.2f} s (wanted: {WANTED["help"]:g})',
         f'peak memory of all its processes, shared pages counted once: '

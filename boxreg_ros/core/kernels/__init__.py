@@ -7,6 +7,8 @@ is what the tests compare with. `compiled` decides which of them runs.
 
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,11 +16,13 @@ from contextvars import ContextVar
 from functools import cache
 from itertools import pairwise
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 from warnings import warn
 
 import numpy as np
-from torch import Tensor
+
+if TYPE_CHECKING:  # not needed to crop
+    from torch import Tensor
 
 
 class Kernels(NamedTuple):

@@ -15,7 +15,15 @@ from heapq import heapify, heappop, heappush
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.io.storage.record import Damage, note, one_line, Record, shown, span_ns
+from boxreg_ros.io.storage.record import (
+    Bytes,
+    Damage,
+    note,
+    one_line,
+    Record,
+    shown,
+    span_ns,
+)
 from boxreg_ros.io.storage.urls import ByteSource, source_of
 from rosbags.interfaces import Connection
 
@@ -69,7 +77,7 @@ class StoredMessage(NamedTuple):
 
     connection_id: int
     received_ns: int
-    data: bytes
+    data: Bytes
     published_ns: int
     sequence: int
 

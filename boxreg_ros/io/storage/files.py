@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from boxreg_ros.config import YAML_ERRORS
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, StorageFile
 from boxreg_ros.io.storage.rosbag1 import Rosbag1File
@@ -55,7 +55,7 @@ def part_of(path: Path) -> Part:
         files = [entry.path for entry in entries_of(path) if _kind(entry.path) in OPENERS]
         return Part(path, tuple(_some(path, files)))
     if not path.exists():
-        raise RecordingError(f'no such recording: {str(path)!r}')
+        raise RecordingError(f'no such recording: {str(path)!r}; correct its path')
     if not path.is_dir():
         return Part(path, (path,))
     listed = _listed(path)
@@ -69,7 +69,8 @@ def _some(path: Path, files: list[Path]) -> list[Path]:
     """Return the files of a folder; RecordingError if there are none."""
     if not files:
         raise RecordingError(
-            f'{str(path)!r} is no recording: expected {METADATA}, .mcap, .db3 or .bag files in it'
+            f'{str(path)!r} is no recording: expected {METADATA}, .mcap, .db3 or .bag files in '
+            f'it, got none; give the folder that has them'
         )
     return files
 
@@ -97,17 +98,15 @@ def opened(path: Path) -> StorageFile:
     opener = OPENERS.get(_kind(path))
     if opener is None:
         raise RecordingError(
-            f'{str(path)!r}: expected an .mcap, .db3 or .bag file, or a rosbag2 folder'
+            f'{str(path)!r}: expected an .mcap, .db3 or .bag file, or a rosbag2 folder, got '
+            f'another; give a recording, or correct the suffix of its name'
         )
     if url_of(path) is not None:
         return _opened_remote(path, opener)
     try:
         path.open('rb').close()
-    except PermissionError as error:
-        raise RecordingError(
-            f'{path}: expected a file that may be read, got {error.strerror}; change its '
-            f'permissions (chmod u+r) or the user'
-        ) from None
+    except OSError as error:
+        raise RecordingError(unreadable(path, error)) from None
     if path.suffix not in COMPRESSED:
         return opener(path, None)
     with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted

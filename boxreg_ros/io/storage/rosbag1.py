@@ -43,7 +43,10 @@ class Rosbag1File(ChunkedFile):
 
     def _open(self) -> None:
         if self._bytes(0, len(BAG_MAGIC)) != BAG_MAGIC:
-            raise RecordingError(f'{self.name}: expected a ROS 1 bag of version 2.0')
+            raise RecordingError(
+                f'{self.name}: expected a ROS 1 bag of version 2.0, got another file; correct the '
+                f'suffix of its name, or give a bag'
+            )
         if not self._read_index():
             self._scan()
 

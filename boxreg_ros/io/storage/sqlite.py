@@ -79,7 +79,8 @@ class SqliteFile:
         except sqlite3.Error as error:
             self.close()
             raise RecordingError(
-                f'{self.name}: {one_line(error)}; expected a database of rosbag2'
+                f'{self.name}: expected a database of rosbag2, got: {one_line(error)}; copy or '
+                f'record it again'
             ) from None
 
     def close(self) -> None:

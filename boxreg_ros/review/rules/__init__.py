@@ -17,6 +17,7 @@ from boxreg_ros.review.rules import (
     sliding,
     spin,
 )
+from boxreg_ros.review.rules.pairs import Labels
 from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation
 
 RULES: dict[str, Rule] = {
@@ -40,7 +41,7 @@ RULES: dict[str, Rule] = {
 
 def violations(tracks: Sequence[LabelTrack]) -> dict[str, list[Violation]]:
     """Return the violations of each rule that is violated, by its id."""
-    usable = [track for track in tracks if len(track.stamps_ns)]
+    usable = Labels(track for track in tracks if len(track.stamps_ns))
     found = {name: list(rule.find(usable)) for name, rule in RULES.items()}
     return {name: items for name, items in found.items() if items}
 

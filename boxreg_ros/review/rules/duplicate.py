@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
-from boxreg_ros.core.metrics import iou_3d
 from boxreg_ros.review.rules.overlap import DUPLICATE_IOU
-from boxreg_ros.review.rules.pairs import near_pairs
-from boxreg_ros.review.rules.protocol import ERROR, LabelTrack, Rule, Violation
+from boxreg_ros.review.rules.pairs import Labels
+from boxreg_ros.review.rules.protocol import ERROR, Rule, Violation
 import numpy as np
 
 
-def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
+def find(tracks: Labels) -> Iterator[Violation]:
     """Yield ids that occur twice at a stamp, and pairs of tracks with nearly equal boxes."""
     for track in tracks:
         twice = np.flatnonzero(np.diff(track.stamps_ns) == 0)
@@ -19,9 +18,9 @@ def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
             stamp_ns = int(track.stamps_ns[twice[0]])
             text = f'its id occurs twice at {len(twice)} stamps'
             yield Violation(track.track_id, stamp_ns, text)
-    pairs = near_pairs(tracks)
+    pairs = tracks.near_pairs
     reported: set[tuple[int, int]] = set()
-    for row in np.flatnonzero(iou_3d(pairs.first, pairs.second) >= DUPLICATE_IOU):
+    for row in np.flatnonzero(pairs.iou >= DUPLICATE_IOU):
         a, b = pairs.tracks[row].tolist()
         if (a, b) not in reported:
             reported.add((a, b))

@@ -8,7 +8,6 @@ from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation, WARNIN
 from boxreg_ros.structures import Floats, HEIGHT, X, Y, Z
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 NEIGHBOURHOOD = 15.0
 """Boxes within this distance share their ground [m]. Chosen: 1 m off at a slope of 7 %."""
@@ -27,8 +26,10 @@ def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
     order = np.argsort(stamps_ns, kind='stable')
     starts = np.flatnonzero(np.diff(stamps_ns[order])) + 1
     for rows in np.split(order, starts):
-        places = boxes[rows][:, [X, Y]]
-        near = cdist(places, places) < NEIGHBOURHOOD
+        if len(rows) <= MIN_NEIGHBOURS or np.ptp(bottom[rows]) <= MAX_OFFSET:
+            continue  # none can be off the median of the others
+        x, y = boxes[rows][:, [X, Y]].T
+        near = np.hypot(np.subtract.outer(x, x), np.subtract.outer(y, y)) < NEIGHBOURHOOD
         np.fill_diagonal(near, False)
         counts = near.sum(axis=1)
         heights = bottom[rows] - _medians(bottom[rows], near)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
-from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.review.rules.pairs import near_pairs
-from boxreg_ros.review.rules.protocol import ERROR, LabelTrack, Rule, Violation
+from boxreg_ros.review.rules.pairs import Labels
+from boxreg_ros.review.rules.protocol import ERROR, Rule, Violation
 import numpy as np
 
 MAX_IOU = 0.1
@@ -15,14 +14,13 @@ DUPLICATE_IOU = 0.7
 """Above, the boxes are of one object, which `duplicate` reports. Chosen: as KITTI matches cars."""
 
 
-def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:
+def find(tracks: Labels) -> Iterator[Violation]:
     """Yield the largest overlap of each pair of tracks."""
     worst: dict[tuple[int, int], tuple[float, int]] = {}
-    pairs = near_pairs(tracks)
-    overlap = iou_3d(pairs.first, pairs.second)
-    for row in np.flatnonzero((overlap > MAX_IOU) & (overlap < DUPLICATE_IOU)):
+    pairs = tracks.near_pairs
+    for row in np.flatnonzero((pairs.iou > MAX_IOU) & (pairs.iou < DUPLICATE_IOU)):
         key = int(pairs.tracks[row, 0]), int(pairs.tracks[row, 1])
-        found = float(overlap[row]), int(pairs.stamps_ns[row])
+        found = float(pairs.iou[row]), int(pairs.stamps_ns[row])
         worst[key] = max(worst.get(key, found), found)
     for (a, b), (value, stamp_ns) in sorted(worst.items()):
         text = f'overlaps with track {tracks[b].track_id}: 3D IoU {value:.2f}'

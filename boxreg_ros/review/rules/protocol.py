@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.config import Config
 from boxreg_ros.structures import Floats, Ints, is_valid_box, X, Z
 import numpy as np
+
+if TYPE_CHECKING:
+    from boxreg_ros.review.rules.pairs import Labels
 
 ERROR = 'error'
 WARNING = 'warning'
@@ -133,4 +136,4 @@ class Rule(NamedTuple):
     severity: str
     meaning: str
     remedy: str
-    find: Callable[[Sequence[LabelTrack]], Iterator[Violation]]
+    find: Callable[[Labels], Iterator[Violation]]

@@ -1,0 +1,181 @@
+"""
+`boxreg bench report`: how soon `report.html` is painted, and how smoothly it steps.
+
+Each report is opened in a headless Chromium. Without a GPU Chromium draws by software, so frame
+times there are an upper limit.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import shutil
+import subprocess
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, BOXREG, print_json
+from boxreg_ros.bench.speed.recordings import write_traffic
+from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.review.report import REPORT
+import numpy as np
+
+BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
+BROWSER_OPTIONS = ('--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
+"""Root needs ``--no-sandbox``; the others draw WebGL without a GPU."""
+PAGE_SIZE = {'width': 1366, 'height': 800}
+"""Size of the window [CSS pixels]: a small laptop."""
+QUICK = ('--set=solver.rounds=1', '--set=solver.iterations=3', '--formats=csv')
+"""The boxes of the synthetic stream need not be good."""
+STEPS = 120
+"""Steps of the time slider that are measured, one per frame: two seconds at 60 Hz."""
+WARM_UP_STEPS = 10
+"""Steps before those: the first ones compile scripts and shaders."""
+FRAME = 1000 / 60
+"""Time of a frame at 60 Hz [ms]."""
+LATE = 1.5
+"""A frame that takes this many times as long is late: another one was skipped."""
+STEPPING = """
+count => new Promise(done => {
+  const starts = [], scripts = [];
+  const next = now => {
+    starts.push(now);
+    if (starts.length > count) return done([starts, scripts]);
+    const begin = performance.now();
+    step((view.row + 1) % view.part.stamps.length);
+    scripts.push(performance.now() - begin);
+    requestAnimationFrame(next);
+  };
+  requestAnimationFrame(next);
+})
+"""
+"""Script that steps once per frame; it returns when frames began and what steps took [ms]."""
+FIRST_PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `boxreg bench report`."""
+    parser.add_argument(
+        'recordings', type=Path, nargs='*', metavar='RECORDING',
+        help='recordings whose reports are measured',
+    )  # fmt: skip
+    parser.add_argument(
+        '--tracks', type=int, default=1000, metavar='N',
+        help='tracks of a synthetic stream whose report is measured too; 0 for none (default: '
+        '%(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--boxes', type=int, default=80, metavar='N',
+        help='boxes of each of its tracks (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--points', type=int, default=130_000, metavar='N',
+        help='points of each of its sweeps (default: %(default)s)',
+    )  # fmt: skip
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and print."""
+    report: dict[str, Any] = {'load before': os.getloadavg()[0]}
+    with TemporaryDirectory(prefix='boxreg-') as name:
+        folder = Path(name)
+        for recording in args.recordings:
+            report[recording.name] = measure(recording, folder / 'out')
+        if args.tracks:
+            drive = folder / 'drive.mcap'
+            write_traffic(drive, args.tracks, args.points, args.boxes)
+            title = f'{args.tracks:,} tracks of {args.boxes} boxes'
+            report[title] = measure(drive, folder / 'out', *QUICK)
+    if args.json:
+        print_json(report)
+    else:
+        for title, found in report.items():
+            print(f'{title}: {found}')
+    return 0
+
+
+def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
+    """
+    Relabel a recording, and open its report.
+
+    Returns
+    -------
+    found : dict
+        ``drawing [s]`` and ``size [MB]`` of the report; ``first paint [ms]`` from the start of
+        the page; ``script of a step``, ``longest script of a step`` and ``frame`` while stepping
+        [ms], ``frames per second``, and the ``part of late frames``.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be relabelled.
+
+    """
+    command = [*BOXREG, 'relabel', str(recording), '-o', str(out), '--report', *options]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise RecordingError(f'{recording}: {done.stderr.strip()}')
+    summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
+    page = out / REPORT
+    with opened(page.as_uri()) as browser:
+        paint = browser.evaluate(FIRST_PAINT)
+        browser.evaluate('openTrack(DATA.tracks.findIndex(track => track.boxes > 1))')
+        browser.wait_for_function('view.space && view.charts', timeout=120_000)
+        browser.evaluate(STEPPING, WARM_UP_STEPS)
+        starts, scripts = browser.evaluate(STEPPING, STEPS)
+    frames = np.diff(starts)
+    return {
+        'drawing [s]': summary['seconds']['report'],
+        'size [MB]': page.stat().st_size / 1e6,
+        'first paint [ms]': paint,
+        'script of a step [ms]': float(np.median(scripts)),
+        'longest script of a step [ms]': float(np.max(scripts)),
+        'frame [ms]': float(np.median(frames)),
+        'frames per second': float(1000 / frames.mean()),
+        'part of late frames': float((frames > LATE * FRAME).mean()),
+    }
+
+
+@contextmanager
+def opened(url: str) -> Iterator[Any]:
+    """
+    Yield a page of a headless browser when its script is ready.
+
+    Raises
+    ------
+    ConfigError
+        If the browser or the package that drives it is not installed.
+
+    """
+    with _browser() as browser:
+        page = browser.new_page(viewport=PAGE_SIZE)
+        page.goto(url)
+        page.wait_for_selector('html[data-ready]', timeout=120_000)
+        yield page
+
+
+@contextmanager
+def _browser() -> Iterator[Any]:
+    """Yield a headless Chromium."""
+    executable = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if executable is None:
+        raise ConfigError(
+            f'browser: expected one of {", ".join(BROWSERS)} on PATH, got none; apt install '
+            f'chromium'
+        )
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError as error:
+        raise ConfigError(
+            f'bench report needs playwright: pip install playwright ({error})'
+        ) from None
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=executable, args=BROWSER_OPTIONS)
+        yield browser
+        browser.close()

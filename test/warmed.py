@@ -1,0 +1,17 @@
+"""
+Import it to load the kernels, or to compile them if nobody has before.
+
+The processes that nodes are forked from, and those that run tests, import it: every node and every
+worker of `relabel` then begins with the kernels loaded.
+
+"""
+
+from boxreg_ros.config import Config
+from boxreg_ros.io.warm_up import warm_up
+import torch
+
+_threads = torch.get_num_threads()
+torch.set_num_threads(1)  # a fork would not have the threads of torch
+for _estimate in ('final', 'track'):
+    warm_up(Config(estimate=_estimate))
+torch.set_num_threads(_threads)
