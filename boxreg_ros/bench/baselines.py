@@ -39,9 +39,10 @@ ANGULAR_ACCELERATION = 0.4  # of yaw [rad/s^2], half of it of roll and pitch
 MIN_TRAVEL = 0.15  # a track whose ends are closer than this is parked [m]
 REWEIGHTINGS = 5  # iterations of the robust fit
 
-# Smoother of constant turn rate and acceleration: deviations of x, y [m], yaw [rad], speed [m/s],
-# turn rate [rad/s] and acceleration [m/s^2] from the prediction, per root of a second.
-CTRA_DEVIATIONS = np.array([0.05, 0.05, 0.02, 0.1, 0.2, 2.0])
+# Smoother of constant turn rate and acceleration: deviation of x, y [m], yaw [rad], speed [m/s],
+# turn rate [rad/s] and acceleration [m/s^2] from the prediction, per root of a second; that of its
+# authors, who weigh each squared residual by ten times the rate of the boxes.
+CTRA_DEVIATION = 0.32
 CTRA_OUTLIER = 2.0  # deviations of the input at which its weight is 1/2
 
 # Rectangle fit and ICP: which points are used.
@@ -154,7 +155,7 @@ def _ctra_residuals(states: Floats, times: Floats, given: Floats) -> Floats:
             np.diff(acceleration),
         ]
     )
-    of_motion /= CTRA_DEVIATIONS * np.sqrt(seconds)[:, None]
+    of_motion /= CTRA_DEVIATION * np.sqrt(seconds)[:, None]
     return np.concatenate([robust.ravel(), of_motion.ravel()])
 
 
