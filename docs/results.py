@@ -15,13 +15,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Sequence
 import json
+import math
 from pathlib import Path
 import sys
 from typing import Any
 
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
 from boxreg_ros.config import KINDS
-from boxreg_ros.offline.consistency import CONSISTENCY_VARIABLES, CONSISTENT_NEES
+from boxreg_ros.offline.consistency import (
+    CONSISTENCY_VARIABLES,
+    CONSISTENT_NEES,
+    SIGNIFICANT,
+)
 
 DOCS = Path(__file__).resolve().parent
 STORE = DOCS / 'results'
@@ -380,17 +385,20 @@ def _consistent_cells(estimates: Any) -> str:
     ]
     low, high = CONSISTENT_NEES
     coverage = [group['coverage'][variable] for _, group, variable in cells]
-    outside = [
-        f'{name} {group["nees"][variable]:.1f}'
-        for name, group, variable in cells
-        if not low <= group['nees'][variable] <= high
+    nees = [group['nees'][variable] for _, group, variable in cells]
+    overconfident = [
+        f'{name} {value:.1f} ± {group["nees_error"][variable]:.1f}'
+        for (name, group, variable), value in zip(cells, nees, strict=True)
+        if value - high > SIGNIFICANT * (group['nees_error'][variable] or math.inf)
     ]
-    listed = f', not {", ".join(outside)}' if outside else ''
     return (
         f'By kind, along, across, up and in yaw: 90 to 98 % of the errors are within two '
         f'standard deviations in {sum(0.9 <= part <= 0.98 for part in coverage)} of {len(cells)} '
-        f'cells, more in {sum(part > 0.98 for part in coverage)}; the mean of squared error over '
-        f'variance is {low:g} to {high:g} in {len(cells) - len(outside)}{listed}.'
+        f'cells, more in {sum(part > 0.98 for part in coverage)}, less in '
+        f'{sum(part < 0.9 for part in coverage)}. The mean of squared error over variance is '
+        f'{low:g} to {high:g} in {sum(low <= value <= high for value in nees)}, less in '
+        f'{sum(value < low for value in nees)}, more in {sum(value > high for value in nees)}; '
+        f'more by over {SIGNIFICANT:g} standard errors: {", ".join(overconfident) or "none"}.'
     )
 
 

@@ -57,6 +57,8 @@ QUARTILES_TO_DEVIATION = 0.74
 """Standard deviation over interquartile range of a normal variable. Derived: 1 / 1.349."""
 FACE_PAIRS = ('ends', 'sides', 'top and bottom')
 """Names of the faces across each axis of a box."""
+MIN_SHOWN = 0.01
+"""Smaller parts of a risk are no reason [m]; chosen: two decimals are shown."""
 FEW_POINTS = 10
 """Boxes with fewer points are reported as such. Chosen."""
 
@@ -183,9 +185,10 @@ def reasons_of(track: TrackChanges, risk: Risk, typical: Mapping[str, float]) ->
     common is no reason to open this one.
 
     """
-    values = {reason: float(part.mean()) for reason, part in risk.parts.items()}
+    means = {reason: float(part.mean()) for reason, part in risk.parts.items()}
+    values = {reason: value for reason, value in means.items() if value >= MIN_SHOWN}
     largest = sorted(values, key=lambda reason: typical.get(reason, 0.0) - values[reason])
-    words = [f'{name} ({values[name]:.2f} m)' for name in largest[:3] if values[name] >= 0.01]
+    words = [f'{name} ({values[name]:.2f} m)' for name in largest[:3]]
     points = float(np.median(track.num_points))
     if points < FEW_POINTS:
         words.append(f'few points ({points:.0f} per box)')

@@ -380,7 +380,7 @@ function nearestRow(stamp) {
 
 function drawTitle(track) {
   const facts = [`${track.boxes} boxes in ${number(track.seconds, 1)} s`, `${number(track.points, 0)} points (median)`,
-    `shift ${number(track.shift)} m`, `turn ${number(track.turn, 1)}°`, track.flips ? `${track.flips} flips corrected` : '',
+    `shift ${number(track.shift)} m`, `turn ${number(track.turn, 1)}°`, track.flips ? `${track.flips} heading ${track.flips === 1 ? 'flip' : 'flips'} corrected` : '',
     `extents ${track.extents.map(e => e.map(v => number(v)).join(' × ')).join(' → ')} m`,
     isKnown(track.after.iou) ? `3D IoU ${number(track.before.iou, 3)} → ${number(track.after.iou, 3)}` : '',
     isKnown(track.risk) ? `risk ${number(track.risk)} m: ${track.why}` : '', sumOf(track.reasons)];
@@ -578,7 +578,7 @@ async function drawCharts() {
   if (!view.part || view.charts || $('tracks').hidden) return;
   view.charts = true;
   const titles = ['along [m]', 'across [m]', 'up [m]', 'yaw [°]', 'size [m]', 'faces [m]'];
-  const notes = ['refined − input; band: ± 2σ', '', '', '', 'length, width, height; dashed: input', `outermost points − face: ${FACES.map((f, k) => f + ' ' + '●■▲▼✕'[k]).join(', ')}`];
+  const notes = ['refined − input; band: ± 2σ', '', '', '', 'length, width, height; dashed: input', `points − face: ${FACES.map((f, k) => f + ' ' + '●■▲▼✕'[k]).join(' ')}`];
   const layout = { ...LAYOUT(), margin: { l: 56, r: 8, t: 16, b: 34 }, xaxis: { ...AXIS(), title: { text: 'time [s]' }, anchor: 'y6' }, annotations: [] };
   const heights = [1, 1, 1, 1, 1.3, 1.5], gap = 0.035;
   const unit = (1 - gap * 5) / heights.reduce((a, b) => a + b);
