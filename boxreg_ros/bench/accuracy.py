@@ -44,9 +44,9 @@ RANGE_GROUPS = (0, 20, 40, 80, math.inf)  # [m]
 POINT_GROUPS = (0, 30, 100, 300, 1000, math.inf)
 MIN_CLASS_BOXES = 20
 """Classes with fewer true boxes have no row of their own."""
-MIN_TRAVEL = 2.0
+MIN_PATH_EXTENT = 2.0
 """
-Extent of the path of an object that moves [m].
+Least extent of the path of an object that moves [m].
 
 Chosen: labels of parked cars wander by .26 m on KITTI, and nothing that drives stays within 2 m.
 
@@ -136,7 +136,7 @@ def scopes_of(matches: Matches, truth: BoxTable) -> dict[str, Mask]:
     """Return which of the n true boxes count: all, and those of moving objects if there are."""
     _, codes = np.unique(np.array(truth.track_ids, str), return_inverse=True)
     extents = [np.ptp(truth.boxes[codes == code, :2], axis=0) for code in np.unique(codes)]
-    moves = np.linalg.norm(extents, axis=1) >= MIN_TRAVEL
+    moves = np.linalg.norm(extents, axis=1) >= MIN_PATH_EXTENT
     moving: Mask = moves[codes[matches.rows]]
     whole = np.ones(len(moving), bool)
     return {'all': whole, 'moving': moving} if moving.any() else {'all': whole}
