@@ -16,7 +16,7 @@ from boxreg_ros.offline.box_scores import Mask, Matches
 from boxreg_ros.structures import Floats
 import numpy as np
 
-COMPARED = {
+REFERENCES = {
     'ours, early': ('input', 'smoothing, early'),
     'ours, final': ('smoothing, final',),
     'ours, track': ('smoothing only', 'CTRA smoothing', 'ours, final'),
@@ -50,7 +50,7 @@ def differences(
     method: str, found: Mapping[str, Matches], truth: BoxTable, scope: Mask
 ) -> dict[str, Difference]:
     """
-    Return the differences of a method to those it is `COMPARED` with.
+    Return the differences of a method to its `REFERENCES`.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def differences(
     """
     return {
         other: _difference(found[method], found[other], truth, scope)
-        for other in COMPARED.get(method, ())
+        for other in REFERENCES.get(method, ())
         if other in found
     }
 
