@@ -16,7 +16,7 @@ from boxreg_ros.offline.box_scores import Mask, Matches
 from boxreg_ros.structures import Floats
 import numpy as np
 
-REFERENCES = {
+REFERENCE_METHODS = {
     'ours, early': ('input', 'smoothing, early'),
     'ours, final': ('smoothing, final',),
     'ours, track': ('smoothing only', 'CTRA smoothing', 'ours, final'),
@@ -50,7 +50,7 @@ def differences(
     method: str, found: Mapping[str, Matches], truth: BoxTable, scope: Mask
 ) -> dict[str, Difference]:
     """
-    Return the differences of a method to its `REFERENCES`.
+    Return the differences of a method to its `REFERENCE_METHODS`.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def differences(
     """
     return {
         other: _difference(found[method], found[other], truth, scope)
-        for other in REFERENCES.get(method, ())
+        for other in REFERENCE_METHODS.get(method, ())
         if other in found
     }
 
