@@ -35,7 +35,6 @@ PAGE = DOCS / 'results.md'
 DATA = {
     'resim_3bffdcff': 'Real surfaces on a real drive, exact truth, detector noise',
     'resim_7fab2350': 'Real surfaces on a busier street, exact truth, detector noise',
-    'pandaset_002_a_uniform': 'PandaSet 002, human labels, uniform noise',
     'pandaset_002_a': 'PandaSet 002, human labels, detector noise',
     'kitti_raw_0001': 'KITTI raw 0001, human labels, detector noise',
     'street': 'The sample recording, simulated',
@@ -73,9 +72,7 @@ of the box `lag` observations before it, *track* that from the whole track:
 - **ours**: the default objective.
 
 *Detector noise* has the error sizes measured for a published detector: a part that is constant
-over a track, a part that changes slowly, wrong extents, and 2.4 % flipped headings. Two
-tables of KITTI have such noise of other seeds. *Uniform noise* is independent from box to box:
-0.25 m, 10 degrees and 10 % of the extents at most.
+over a track, a part that changes slowly, wrong extents, and 2.4 % flipped headings.
 """
 
 
