@@ -496,9 +496,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'The report in a browser',
         'Chromium without a window and without a GPU, on two cores: it draws by software. *first\n'
         'paint* is from the start of the page. The time slider is stepped once per frame, 120\n'
-        'times: *script* is the time of the page in a frame; the 3D view follows when the\n'
-        'stepping pauses, where its drawing takes longer than a frame. *late* frames were lost\n'
-        'at 60 Hz.',
+        'times: *script* is the time that the page takes of a frame, the rest is the drawing of\n'
+        'the browser; the 3D view follows when the stepping pauses, where its drawing takes\n'
+        'longer than a frame. *late* frames were lost at 60 Hz.',
         _figures,
     ),
     'speed': (

@@ -2,7 +2,7 @@
 `boxreg bench report`: how soon `report.html` is painted, and how smoothly it steps.
 
 Each report is opened in a headless Chromium. Without a GPU Chromium draws by software, so frame
-times there are an upper limit.
+times there are an upper limit; beside them are those of a page with one changing number.
 
 """
 
@@ -55,6 +55,19 @@ count => new Promise(done => {
 })
 """
 """Script that steps once per frame; it returns when frames began and what steps took [ms]."""
+CHANGING_TEXT = """
+count => new Promise(done => {
+  const starts = [];
+  const next = now => {
+    starts.push(now);
+    if (starts.length > count) return done(starts);
+    document.body.textContent = starts.length;
+    requestAnimationFrame(next);
+  };
+  requestAnimationFrame(next);
+})
+"""
+"""Script that changes one line of text per frame, as a reference; it returns when frames began."""
 FIRST_PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
 
 
@@ -82,7 +95,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    report: dict[str, Any] = {'load before': os.getloadavg()[0]}
+    report: dict[str, Any] = {
+        'load before': os.getloadavg()[0],
+        'page of one number': {'frame [ms]': _reference_frame()},
+    }
     with TemporaryDirectory(prefix='boxreg-') as name:
         folder = Path(name)
         for recording in args.recordings:
@@ -140,6 +156,15 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
         'frames per second': float(1000 / frames.mean()),
         'part of late frames': float((frames > LATE * FRAME).mean()),
     }
+
+
+def _reference_frame() -> float:
+    """Return the median time of a frame of a page with one changing number [ms]."""
+    with _browser() as browser:
+        page = browser.new_page(viewport=PAGE_SIZE)
+        page.set_content('<body></body>')
+        starts = page.evaluate(CHANGING_TEXT, STEPS)
+    return float(np.median(np.diff(starts)))
 
 
 @contextmanager

@@ -49,6 +49,9 @@ async function inflate(base64) {
   return new Response(stream).text();
 }
 
+// The page as it is now has been painted.
+function painted() { return new Promise(done => requestAnimationFrame(() => setTimeout(done))); }
+
 function fail(text) {
   $('failure').textContent = text;
   $('failure').hidden = false;
@@ -300,8 +303,7 @@ let plotly;
 
 function withPlotly() {
   plotly ??= (async () => {
-    // The page is painted first: the script takes a second to start.
-    await new Promise(done => requestAnimationFrame(() => setTimeout(done)));
+    await painted();  // the script takes a second to start
     if (!$('plotly')) await new Promise(done => document.addEventListener('DOMContentLoaded', done, { once: true }));
     document.head.append(element('script', {}, await inflate($('plotly').textContent)));
     $('plotly').remove();
@@ -848,6 +850,7 @@ function redrawAll() {
 }
 
 async function main() {
+  await painted();  // title and figures, before the lists of many tracks are made
   DATA = JSON.parse(await inflate($('data').textContent));
   if (IS_REVIEW) {
     $('decide').hidden = false;
