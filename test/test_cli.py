@@ -428,9 +428,11 @@ command()
 def test_a_signal_during_the_import_of_torch_ends_the_process_at_once(tmp_path, number):
     # An exception would pass through its libraries, which abort.
     recording = Drive(sweeps=4).write(tmp_path / 'drive')
-    command = [sys.executable, '-c', SIGNAL_IN_TORCH, 'relabel', recording, '-o', tmp_path / 'out']
+    # With one worker the process that reads the command line imports torch.
+    relabel = 'relabel', recording, '-o', tmp_path / 'out', '--workers', 1
+    command = [sys.executable, '-c', SIGNAL_IN_TORCH, *map(str, relabel)]
     done = subprocess.run(
-        [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=60,
+        command, cwd=ROOT, capture_output=True, text=True, timeout=60,
         env=os.environ | {'NUMBER': str(int(number))},
     )  # fmt: skip
     cause = 'interrupted' if number == signal.SIGINT else 'ended by SIGTERM'

@@ -28,7 +28,7 @@ import numpy as np
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
 BROWSER_OPTIONS = ('--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
 """Root needs ``--no-sandbox``; the others draw WebGL without a GPU."""
-PAGE_SIZE = {'width': 1366, 'height': 800}
+VIEWPORT = {'width': 1366, 'height': 800}
 """Size of the window [CSS pixels]: a small laptop."""
 QUICK = ('--set=solver.rounds=1', '--set=solver.iterations=3', '--formats=csv')
 """The boxes of the synthetic stream need not be good."""
@@ -161,7 +161,7 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
 def _reference_frame() -> float:
     """Return the median time of a frame of a page with one changing number [ms]."""
     with _browser() as browser:
-        page = browser.new_page(viewport=PAGE_SIZE)
+        page = browser.new_page(viewport=VIEWPORT)
         page.set_content('<body></body>')
         starts = page.evaluate(CHANGING_TEXT, STEPS)
     return float(np.median(np.diff(starts)))
@@ -179,7 +179,7 @@ def opened(url: str) -> Iterator[Any]:
 
     """
     with _browser() as browser:
-        page = browser.new_page(viewport=PAGE_SIZE)
+        page = browser.new_page(viewport=VIEWPORT)
         page.goto(url)
         page.wait_for_selector('html[data-ready]', timeout=120_000)
         yield page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from itertools import tee
@@ -109,22 +110,19 @@ def _cores(before: os.times_result, after: os.times_result) -> float:
 
 def _peak(command: list[str]) -> float:
     """Run a command; return the sum of the peak memory of its processes [MB]."""
-    peaks: dict[str, int] = {}
+    peaks: Counter[str] = Counter()
     for pids in _running(command):
-        for pid in pids:
-            with suppress(OSError, IndexError):  # it may have ended
-                peaks[pid] = _kilobytes(Path(f'/proc/{pid}/status'), 'VmHWM:')
-    return sum(peaks.values()) / 1024
+        peaks |= Counter({pid: _kilobytes(f'/proc/{pid}/status', 'VmHWM:') for pid in pids})
+    return peaks.total() / 1024
 
 
 def _peak_shared_once(command: list[str]) -> float:
     """Run a command; return the peak of the sum of its proportional set sizes [MB]."""
-    most = 0
-    for pids in _running(command):
-        with suppress(OSError, IndexError):  # one may have ended
-            sizes = [_kilobytes(Path(f'/proc/{pid}/smaps_rollup'), 'Pss:') for pid in pids]
-            most = max(most, sum(sizes))
-    return most / 1024
+    sizes = [
+        sum(_kilobytes(f'/proc/{pid}/smaps_rollup', 'Pss:') for pid in pids)
+        for pids in _running(command)
+    ]
+    return max(sizes) / 1024
 
 
 def _running(command: list[str]) -> Iterator[list[str]]:
@@ -141,6 +139,8 @@ def _running(command: list[str]) -> Iterator[list[str]]:
             raise RuntimeError(f'{" ".join(command)} failed: {output.read()}')
 
 
-def _kilobytes(file: Path, name: str) -> int:
-    """Return one value of a file of /proc [kB]."""
-    return int(file.read_text().partition(name)[2].split()[0])
+def _kilobytes(file: str, name: str) -> int:
+    """Return one value of a file of /proc [kB]; 0 for a process that has ended."""
+    with suppress(OSError, IndexError):
+        return int(Path(file).read_text().partition(name)[2].split()[0])
+    return 0
