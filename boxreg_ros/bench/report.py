@@ -140,7 +140,7 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
     summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
     page = out / REPORT
     with opened(page.as_uri()) as browser:
-        paint = browser.evaluate(FIRST_PAINT)
+        paint = browser.wait_for_function(FIRST_PAINT, polling=100).json_value()
         browser.evaluate('openTrack(DATA.tracks.findIndex(track => track.boxes > 1))')
         browser.wait_for_function('view.space && view.charts', timeout=120_000)
         browser.evaluate(STEPPING, WARM_UP_STEPS)
