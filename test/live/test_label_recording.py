@@ -92,7 +92,8 @@ class Robot:
 def index_of(folder):
     """Return the index, once the recorder has completed the last segment after its node."""
     deadline = time.monotonic() + 60
-    while not (folder / 'index.csv').is_file() or list(folder.glob('.segment_*')):
+    # The recorder removes its spool of clouds last, a hidden folder.
+    while not (folder / 'index.csv').is_file() or set(folder.glob('.*')) != {folder / '.lock'}:
         assert time.monotonic() < deadline, 'the recorder did not complete the last segment'
         time.sleep(0.05)
     with (folder / 'index.csv').open() as file:
