@@ -226,25 +226,36 @@ class Problem(NamedTuple):
 
     def part(self, windows: Sequence[int], columns: Sequence[Sequence[int]]) -> 'Problem':
         """
-        Return some `windows` with some of their observations only.
+        Return some windows with some of their observations only.
 
-        Of each window those in its `columns`, at least one. Marginalised observations are left
-        out: their extents are not counted, their prior is kept.
+        Marginalised observations are left out: their extents are not counted, their prior is kept.
+
+        Parameters
+        ----------
+        windows : sequence of b int
+            Rows of the windows.
+        columns : sequence of b sequences of int
+            Columns of the observations of each of them, ascending, at least one.
+
+        Returns
+        -------
+        part : Problem
+            Of b windows, padded to the most observations that one of them has.
 
         """
         lengths = torch.tensor(list(map(len, columns)))
         valid = torch.arange(int(lengths.max())) < lengths[:, None]
-        column = torch.tensor([c[-1] for c in columns])[:, None].repeat(1, valid.shape[1])
+        last = torch.tensor([of_window[-1] for of_window in columns])
+        column = last[:, None].repeat(1, valid.shape[1])
         column[valid] = torch.tensor(list(chain.from_iterable(columns)))
         device = self.valid.device
         valid, column = valid.to(device), column.to(device)
         row = torch.tensor(windows, device=device)[:, None]
         observed = {name: getattr(self, name)[row, column] for name in OBSERVED}
         observed['times'] = observed['times'] + PADDING_PERIOD * (~valid).cumsum(1)
-        of_window = {name: getattr(self, name)[row[:, 0]] for name in OF_WINDOW}
-        none = torch.zeros_like(of_window['marginalised_extents'])
-        whole = self._replace(**observed, **of_window, valid=valid)
-        return whole._replace(marginalised_extents=none)
+        shared = {name: getattr(self, name)[row[:, 0]] for name in OF_WINDOW}
+        shared['marginalised_extents'] = torch.zeros_like(shared['marginalised_extents'])
+        return self._replace(**observed, **shared, valid=valid)
 
     def thinned(self, points: float) -> 'Problem':
         """Return the problem with every n-th point: at least `points` per box, if there are."""

@@ -12,6 +12,7 @@ from boxreg_ros.core.arrowhead import LINK
 from boxreg_ros.core.batch import free_variables, SHARED, State
 from boxreg_ros.core.expectation import expect, Known
 from boxreg_ros.core.face_support import observe_faces
+from boxreg_ros.core.geometry import FACE_AXIS
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.rounds import Plan, Round, run_round
 from boxreg_ros.core.solver import start
@@ -77,8 +78,8 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
     size_of_points = float(points.numel() * points.element_size())
     flops_of_points = float(len(points) * FLOPS_PER_POINT)
     poses = float(count * config.window)
-    # Written: own block of each pose and its block with the shared variables, in float64.
-    size_of_inverse = 8.0 * poses * LINK * (LINK + SHARED)
+    # Written: the covariance of each pose and the residuals of its six faces, in float64.
+    size_of_posterior = 8.0 * poses * (LINK * LINK + len(FACE_AXIS))
     return {
         'face observations': (
             lambda: observe_faces(problem, state, known.offsets, config),
@@ -87,7 +88,7 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
         ),
         'round': (
             lambda: run_round(batch, plan, 0, config, rows),
-            size_of_points + size_of_inverse,
+            size_of_points + size_of_posterior,
             flops_of_points + poses * FLOPS_PER_POSE,
         ),
     }
