@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import chain
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.arrowhead import LINK
@@ -254,7 +254,7 @@ class Problem(NamedTuple):
         observed = {name: getattr(self, name)[row, column] for name in OBSERVED}
         observed['times'] = observed['times'] + PADDING_PERIOD * (~valid).cumsum(1)
         kept = {name: getattr(self, name)[row[:, 0]] for name in OF_CLASS}
-        none = {
+        none: dict[str, Any] = {
             name: self.boxes.new_zeros(()).expand(len(windows), *sizes)
             for name, sizes in SIZES_OF_PRIOR.items()
         }
