@@ -159,7 +159,7 @@ def assert_equal(live, offline, where):
 
 @pytest.mark.parametrize('lidars', ['one', 'two'])
 def test_labels_equal_those_of_relabel(tmp_path, lidars):
-    """In every installed format; with the merged clouds of two LiDARs in one with a file for each."""
+    """In every format; with the merged clouds of two LiDARs in one with a file for each."""
     drive = Drive(sweeps=10) if lidars == 'one' else LidarDrive(sweeps=10)
     # Label files state the name of their recording; a segment has this one.
     path = drive.write(tmp_path / 'live_segment_000001', 'mcap-folder')
