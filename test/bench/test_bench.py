@@ -6,11 +6,13 @@ import json
 import sys
 
 from boxreg_ros import __version__, cli
+from boxreg_ros.bench import kinds
 from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
 from boxreg_ros.bench.review import _without_constant_error, with_pins
+from boxreg_ros.bench.tracks import UNBROKEN
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
@@ -131,6 +133,24 @@ def test_real_prints_all_methods_and_groups(folder, capsys):
     assert set(report) == {'input', 'L-shape per sweep'} | smoothed
 
 
+def test_kinds_compares_each_class_with_input_and_smoothing(folder, capsys, monkeypatch):
+    monkeypatch.setattr(kinds, 'MIN_CLASS_BOXES', 10)
+    assert run('kinds', folder, '--json') == 0
+    found = json.loads(capsys.readouterr().out)['results'][str(folder)]
+    assert set(found) == {'car'}
+    assert set(found['car']) == {'ours, early', 'ours, final', 'ours, track'}
+    drive = Drive.read(folder)
+    methods = run_methods(drive, wanted=('ours',))
+    own, given = (match(methods[name], drive.truth, 1) for name in ('ours, track', 'input'))
+    is_car = own.is_matched & np.equal(own.class_names, 'car')
+    gain = found['car']['ours, track']['input']
+    assert gain['boxes'] == is_car.sum()
+    assert gain['iou_bev'] == pytest.approx((own.iou_bev - given.iou_bev)[is_car].mean())
+    assert set(found['car']['ours, final']) == {'input', 'smoothing, final'}
+    assert run('kinds', folder) == 0
+    assert 'ours, early, minus' in capsys.readouterr().out
+
+
 def test_real_refuses_folders_without_truth_or_recording(tmp_path, folder):
     with pytest.raises(RecordingError, match='expected a folder'):
         run('real', tmp_path / 'absent')
@@ -227,9 +247,10 @@ def test_errors_that_are_constant_in_the_box_frame_are_removed(folder):
 def test_coasting_finds_missed_boxes(folder, capsys):
     assert run('tracks', folder, '--coast', 0.5, '--far-misses', '--json') == 0
     rows = json.loads(capsys.readouterr().out)['results'][str(folder)]
-    assert list(rows) == ['input', 'final', 'coast 0.5 s']
+    assert list(rows) == [UNBROKEN, 'input', 'final', 'coast 0.5 s']
     assert rows['final']['added'] == 0 < rows['coast 0.5 s']['added']
     assert rows['final']['recall'] < rows['coast 0.5 s']['recall']
+    assert rows['final']['recall'] < rows[UNBROKEN]['recall']
     # Only vehicles have boxes in this drive.
     last = rows['coast 0.5 s']
     assert set(last['by_kind']) == {'vehicle', 'cyclist', 'pedestrian'}
