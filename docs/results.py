@@ -456,11 +456,12 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
         'removed, and gaps of 3 to 8 sweeps; after half of the gaps the id is another one. The\n'
         'first row is the registration of the tracks before they were broken, which completion\n'
         'has to restore. Each other row has one step more. Recall and precision at a 3D IoU of\n'
-        '0.5, matched by overlap; HOTA and IDF1 by TrackEval. *added* is the number of added boxes. With `--ghosts` there\n'
-        'are boxes without an object; *ghosts rejected* is the part of them that is rejected,\n'
-        '*others rejected* the part of the boxes of objects. With `--far-misses` the boxes are\n'
-        'removed in runs, as often as the square of the distance, like those of a detector that\n'
-        'has too few points. `--coast` is the node: its final boxes without and with `coast`.',
+        '0.5, matched by overlap; HOTA and IDF1 by TrackEval. *added* is the number of added\n'
+        'boxes. With `--ghosts` there are boxes without an object; *ghosts rejected* is the part\n'
+        'of them that is rejected, *others rejected* the part of the boxes of objects. With\n'
+        '`--far-misses` the boxes are removed in runs, as often as the square of the distance,\n'
+        'like those of a detector that has too few points. `--coast` is the node: final boxes\n'
+        'without and with `coast`.',
         _tracks,
     ),
     'paper': (
