@@ -163,7 +163,8 @@ def test_paper_prints_table_one_and_draws_figures(tmp_path, capsys):
     pytest.importorskip('matplotlib', reason='the figures need matplotlib')
     assert run('paper', '--seeds', 1, '--steps', 8, '-o', tmp_path / 'figures') == 0
     text = capsys.readouterr().out
-    for method in ROWS | {'initial, published', 'refined, published'}:
+    held = {f'held extents, {estimate}' for estimate in ('early', 'final', 'track')}
+    for method in ROWS | held | {'initial, published', 'refined, published'}:
         # Per mode once in Table I and, unless published, once by range and once by points.
         assert text.count(method) == (2 if 'published' in method else 6), method
     figures = sorted(path.name for path in (tmp_path / 'figures').iterdir())
@@ -185,9 +186,11 @@ def test_paper_prints_table_one_and_draws_figures(tmp_path, capsys):
 
 
 def test_error_row_of_perfect_boxes():
-    truth = simulate('paper', seed=0, sweeps=6).truth
+    truth = simulate('paper', seed=0, sweeps=12).truth
     row = error_row(match(truth, truth), '3d')
-    np.testing.assert_allclose(row, [0] * 6 + [1] * 3, atol=1e-8)
+    np.testing.assert_allclose(row, [0] * 6 + [1] * 4, atol=1e-8)
+    few = truth.rows(np.arange(12) < 6)
+    assert np.isnan(error_row(match(few, few), '3d')[-1])
 
 
 def test_json_names_version_and_command(folder, capsys, monkeypatch):
