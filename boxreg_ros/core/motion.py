@@ -43,8 +43,6 @@ class EndMotion:
         Of the heading [rad/s].
     speed_variance : float
         Variance of each component of the velocity [m^2/s^2].
-    velocity_age : float
-        Time from the middle of the boxes that the velocity is estimated from to `stamp_ns` [s].
     model : ClassConfig
         Accelerations of its kind of object.
 
@@ -55,7 +53,6 @@ class EndMotion:
     velocity: Floats
     turn_rate: float
     speed_variance: float
-    velocity_age: float
     model: ClassConfig
 
     def predict(self, stamp_ns: int) -> Floats:
@@ -79,15 +76,13 @@ class EndMotion:
         Return the covariance of x and y of the prediction, shape (2, 2) [m^2].
 
         With an acceleration a, the object is a t^2 / 2 off the prediction: a is the usual one
-        along the heading, and the speed times `TURN_RATE` across it, but no more than usual. Along
-        the heading it is a t t_v further off, since the speed is that of the time t_v before.
+        along the heading, and the speed times `TURN_RATE` across it, but no more than usual.
 
         """
-        seconds = abs(stamp_ns - self.stamp_ns) * 1e-9
+        seconds = (stamp_ns - self.stamp_ns) * 1e-9
         speed = float(np.linalg.norm(self.velocity[:2]))
         across = min(self.model.cornering, speed * TURN_RATE)
-        along = self.model.acceleration * (seconds**2 / 2 + seconds * self.velocity_age)
-        deviations = np.array([along, across * seconds**2 / 2])
+        deviations = np.array([self.model.acceleration, across]) * seconds**2 / 2
         variances = deviations**2 + self.speed_variance * seconds**2 + CENTRE_DEVIATION**2
         cos = np.cos(self.box[YAW])
         sin = np.sin(self.box[YAW])
@@ -118,7 +113,7 @@ def motion_at(stamps_ns: Ints, boxes: Floats, row: int, model: ClassConfig) -> E
     box = boxes[row].copy()
     stamp_ns = int(stamps_ns[row])
     if len(near) < 2:
-        return EndMotion(stamp_ns, box, np.zeros(3), 0.0, UNKNOWN_SPEED_DEVIATION**2, 0.0, model)
+        return EndMotion(stamp_ns, box, np.zeros(3), 0.0, UNKNOWN_SPEED_DEVIATION**2, model)
     offsets = seconds - seconds.mean()
     spread = np.square(offsets).sum()
     velocity = offsets @ near[:, X : Z + 1] / spread
@@ -129,8 +124,7 @@ def motion_at(stamps_ns: Ints, boxes: Floats, row: int, model: ClassConfig) -> E
         turn = -turn_rate * seconds.mean()
         velocity[:2] = velocity[:2] @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
     variance = CENTRE_DEVIATION**2 / spread
-    age = abs(float(seconds.mean()))
-    return EndMotion(stamp_ns, box, velocity, turn_rate, float(variance), age, model)
+    return EndMotion(stamp_ns, box, velocity, turn_rate, float(variance), model)
 
 
 def unflipped(yaws: Floats) -> Floats:

@@ -50,11 +50,9 @@ def test_covariance_grows_with_the_acceleration():
     car = CONFIG.vehicle
     motion = motion_at(STAMPS[:20], path((0, 0), (10, 0), 20), -1, car)
     near, far = (motion.covariance(int(STAMPS[19 + k])) for k in (1, 10))
-    # After 1 s: a / 2 along, and half of min(cornering, 10 m/s x 0.5 rad/s) across. The speed is
-    # the mean of the last second, so half a second old.
+    # After 1 s: a / 2 along, and half of min(cornering, 10 m/s x 0.5 rad/s) across.
     rest = motion.speed_variance + 0.1**2
-    assert motion.velocity_age == pytest.approx(0.5)
-    assert far[0, 0] == pytest.approx((car.acceleration * (1 / 2 + 0.5)) ** 2 + rest)
+    assert far[0, 0] == pytest.approx((car.acceleration / 2) ** 2 + rest)
     assert far[1, 1] == pytest.approx((car.cornering / 2) ** 2 + rest)
     assert near[0, 0] < 0.02
 
