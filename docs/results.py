@@ -324,13 +324,14 @@ def _tracks(results: Any) -> Iterable[str]:
 def _kinds(rows: Any) -> Iterable[str]:
     """Yield the scores by kind of object: of the tracks before they were broken, and at last."""
     first, *_, last = rows
-    keys = ('recall', 'precision', 'added', 'added_iou', 'given_iou')
+    keys = ('recall', 'precision', 'ids_per_object', 'added', 'added_iou', 'given_iou')
     lines = [
         [f'{name}: {kind}', *(_number(scores[key], 0 if key == 'added' else 3) for key in keys)]
         for name in (first, last)
         for kind, scores in rows[name]['by_kind'].items()
     ]
-    titles = ('recall', 'precision', 'added', '3D IoU of added', '3D IoU of others')
+    found = ('recall', 'precision', 'ids per object')
+    titles = (*found, 'added', '3D IoU of added', '3D IoU of others')
     yield _table(['by kind', *titles], lines)
 
 

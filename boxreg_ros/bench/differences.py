@@ -50,7 +50,7 @@ class Difference:
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
+class PairedBoxes:
     """
     True boxes that two methods have.
 
@@ -68,7 +68,7 @@ class Pairs:
     iou_3d: Floats
 
     @classmethod
-    def pooled(cls, parts: Mapping[str, Pairs]) -> Pairs:
+    def pooled(cls, parts: Mapping[str, PairedBoxes]) -> PairedBoxes:
         """Return the boxes of several drives, whose names become part of the ids."""
         return cls(
             tuple(f'{name}/{track}' for name, part in parts.items() for track in part.tracks),
@@ -115,10 +115,10 @@ def differences(
     }
 
 
-def paired(first: Matches, second: Matches, truth: BoxTable, scope: Mask) -> Pairs:
+def paired(first: Matches, second: Matches, truth: BoxTable, scope: Mask) -> PairedBoxes:
     """Return the true boxes in `scope` (n,) that two methods have, of n true boxes."""
     both = scope & first.is_matched & second.is_matched
-    return Pairs(
+    return PairedBoxes(
         tuple(truth.track_ids[row] for row in first.rows[both]),
         (first.iou_bev - second.iou_bev)[both],
         (first.iou_3d - second.iou_3d)[both],

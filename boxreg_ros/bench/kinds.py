@@ -16,7 +16,7 @@ from typing import Any
 
 from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES, print_comparison
 from boxreg_ros.bench.common import add_json_argument, print_json, progress_bar
-from boxreg_ros.bench.differences import Difference, paired, Pairs, REFERENCE_METHODS
+from boxreg_ros.bench.differences import Difference, paired, PairedBoxes, REFERENCE_METHODS
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match
@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the differences of each class: a table per recording, or one of all streets."""
-    measured: dict[str, dict[Comparison, dict[str, Pairs]]] = {}  # by table; pairs by drive
+    measured: dict[str, dict[Comparison, dict[str, PairedBoxes]]] = {}  # by table; pairs by drive
     with progress_bar(len(args.data) or args.seeds, args) as bar:
         for table, name, drive in _drives(args):
             comparisons = measured.setdefault(table, {})
@@ -81,7 +81,7 @@ def _drives(args: argparse.Namespace) -> Iterator[tuple[str, str, Drive]]:
             yield f'{args.seeds} simulated streets', str(seed), drive
 
 
-def compared(drive: Drive) -> Iterator[tuple[Comparison, Pairs]]:
+def compared(drive: Drive) -> Iterator[tuple[Comparison, PairedBoxes]]:
     """Yield the true boxes with points of each class, by our estimates and by their references."""
     truth = drive.truth
     methods = run_methods(drive, wanted=COMPARED)
@@ -100,11 +100,11 @@ def compared(drive: Drive) -> Iterator[tuple[Comparison, Pairs]]:
                     yield (class_name, method, other), pairs
 
 
-def _differences(comparisons: Mapping[Comparison, Mapping[str, Pairs]]) -> Differences:
+def _differences(comparisons: Mapping[Comparison, Mapping[str, PairedBoxes]]) -> Differences:
     """Return the pooled difference of each comparison with enough boxes."""
     found: Differences = {}
     for (class_name, method, other), parts in sorted(comparisons.items()):
-        difference = Pairs.pooled(parts).difference()
+        difference = PairedBoxes.pooled(parts).difference()
         if difference.boxes >= MIN_CLASS_BOXES:
             by_method = found.setdefault(class_name, {})
             by_method.setdefault(method, {})[other] = difference

@@ -23,12 +23,16 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.completion import completed, first_pass
 from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.overlap import overlaps
 from boxreg_ros.offline.track_scores import track_scores, TrackScores
+from boxreg_ros.review.rules.overlap import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
-from boxreg_ros.structures import BoxArray, RefinedBoxes, REJECTED, Sweep
+from boxreg_ros.structures import BoxArray, Ints, RefinedBoxes, REJECTED, Sweep
 import numpy as np
 
 TITLES = ('recall', 'prec.', 'ids/obj', 'HOTA', 'IDF1', 'added', '3D added', 'ghosts', 'lost')
+ONE_LABEL = 'with one label'
+"""Objects of the truth without a second label at their place."""
 UNBROKEN = 'unbroken, refined'
 """Row of the tracks before they were broken: the boxes that completion has to restore."""
 
@@ -45,7 +49,8 @@ class Row:
     ghosts, lost : float
         Rejected part of the ghosts, and of the other boxes of the input; NaN without any.
     by_kind : dict of str to TrackScores
-        Scores of the boxes of each kind of object.
+        Scores of the boxes of each kind of object; and if some objects of the truth have two
+        labels, those of the `ONE_LABEL` others.
 
     """
 
@@ -189,7 +194,7 @@ def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
 
 
 def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScores]:
-    """Return the scores of the boxes of each kind of object that the truth has."""
+    """Return the scores of each kind of object that the truth has, and of objects `ONE_LABEL`."""
     scores = {}
     for kind in KINDS:
         true, found = (
@@ -198,7 +203,19 @@ def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScore
         )
         if len(true.boxes):
             scores[kind] = track_scores(found, true)
+    rows = rows_with_one_label(truth)
+    if len(rows) < len(truth.boxes):
+        scores[ONE_LABEL] = track_scores(predicted, truth, rows)
     return scores
+
+
+def rows_with_one_label(truth: BoxTable) -> Ints:
+    """Return the rows of objects that never share `DUPLICATE_IOU` with another one."""
+    doubles: set[str] = set()
+    for stamp in overlaps(truth, truth):
+        is_double = (stamp.iou >= DUPLICATE_IOU).sum(axis=1) > 1  # one is the box itself
+        doubles.update(truth.track_ids[row] for row in stamp.true[is_double])
+    return np.flatnonzero([track_id not in doubles for track_id in truth.track_ids])
 
 
 def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
@@ -210,10 +227,10 @@ def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
 
 def _print_kinds(name: str, by_kind: Mapping[str, Mapping[str, float]]) -> None:
     """Print the scores of each kind of object in the row of a `name`."""
-    print(line(name, ('recall', 'prec.', 'added', '3D added', '3D others')))
+    print(line(name, ('recall', 'prec.', 'ids/obj', 'added', '3D added', '3D others')))
     for kind, s in by_kind.items():
-        numbers = (s['recall'], s['precision'], str(s['added']), s['added_iou'], s['given_iou'])
-        print(line(kind, numbers))
+        found = (s['recall'], s['precision'], s['ids_per_object'])
+        print(line(kind, (*found, str(s['added']), s['added_iou'], s['given_iou'])))
 
 
 def _cells(row: Row) -> tuple[float | str, ...]:

@@ -12,8 +12,9 @@ from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
 from boxreg_ros.bench.review import _without_constant_error, with_pins
-from boxreg_ros.bench.tracks import UNBROKEN
+from boxreg_ros.bench.tracks import ONE_LABEL, rows_with_one_label, scores_by_kind, UNBROKEN
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes
@@ -260,6 +261,24 @@ def test_coasting_finds_missed_boxes(folder, capsys):
     assert last['by_kind']['vehicle']['added_iou'] == last['added_iou']
     assert last['by_kind']['pedestrian']['recall'] == 0
     assert 0.5 < last['given_iou'] < 1
+
+
+def test_objects_with_two_labels_are_scored_apart(folder):
+    drive = Drive.read(folder)
+    truth = drive.truth
+    assert len(rows_with_one_label(truth)) == len(truth.boxes)
+    car = [row for row, track_id in enumerate(truth.track_ids) if track_id == '9']
+    rows = [*range(len(truth.boxes)), *car]
+    doubled = BoxTable(
+        truth.stamps_ns[rows], truth.frame_id, (*truth.track_ids, *('second',) * len(car)),
+        tuple(truth.class_names[row] for row in rows), truth.scores[rows], truth.boxes[rows],
+        tuple(truth.status[row] for row in rows), truth.num_points[rows],
+    )  # fmt: skip
+    names = [doubled.track_ids[row] for row in rows_with_one_label(doubled)]
+    assert set(names) == set(truth.track_ids) - {'9'}
+    scores = scores_by_kind(truth, doubled)
+    assert scores['vehicle'].recall < 1
+    assert scores[ONE_LABEL].recall == scores[ONE_LABEL].precision == 1
 
 
 def test_highway_measures_all_methods_at_both_speeds(capsys):

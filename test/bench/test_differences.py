@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from boxreg_ros.bench.accuracy import scopes_of
-from boxreg_ros.bench.differences import clustered_error, differences, Pairs
+from boxreg_ros.bench.differences import clustered_error, differences, PairedBoxes
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match
 import numpy as np
@@ -64,10 +64,10 @@ def test_differences_by_hand():
 def test_tracks_of_pooled_drives_are_not_mixed():
     # Both drives have a track `a`: with two boxes each, off by 1 and by 3.
     parts = {
-        name: Pairs(('a', 'a'), np.full(2, value), np.full(2, -value))
+        name: PairedBoxes(('a', 'a'), np.full(2, value), np.full(2, -value))
         for name, value in (('first', 1.0), ('second', 3.0))
     }
-    difference = Pairs.pooled(parts).difference()
+    difference = PairedBoxes.pooled(parts).difference()
     assert (difference.boxes, difference.tracks) == (4, 2)
     assert (difference.iou_bev, difference.iou_3d) == (2.0, -2.0)
     assert difference.iou_bev_error == pytest.approx(1.0)
