@@ -494,8 +494,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     ),
     'report': (
         'The report in a browser',
-        'Chromium without a window and without a GPU, on two cores. It draws by the processor, as it\n'
-        'does by itself where it finds no GPU, or by an emulated GPU (SwiftShader). *first\n'
+        'Chromium without a window and without a GPU, on two cores. It draws by the processor,\n'
+        'as it does by itself where it finds no GPU, or by an emulated GPU (SwiftShader). *first\n'
         'paint* is from the start of the page. The time slider is stepped once per frame, 120\n'
         'times: *script* is the time that the page takes of a frame, the rest is the drawing of\n'
         'the browser; the 3D view follows when the stepping pauses, where its drawing takes\n'

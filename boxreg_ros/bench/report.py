@@ -136,8 +136,8 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
     -------
     found : dict
         ``drawing [s]`` and ``size [MB]`` of the report. By `COMPOSITORS`: ``first paint [ms]``
-        from the start of the page; ``script of a step``, ``longest script of a step`` and ``frame`` while stepping
-        [ms], ``frames per second``, and the ``part of late frames``.
+        from the start of the page; ``script of a step``, ``longest script of a step`` and
+        ``frame`` while stepping [ms], ``frames per second``, and the ``part of late frames``.
 
     Raises
     ------
