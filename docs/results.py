@@ -346,8 +346,15 @@ def _review(results: Any) -> Iterable[str]:
                 f'With one box of each of these tracks pinned, the mean 3D IoU of their other '
                 f'boxes rises from {pins["before"]:.3f} to {pins["after"]:.3f}: '
                 f'{pins["gained"]:.0%} of 1 - IoU are removed; the errors that are constant along '
-                f'a track are {pins["constant"]:.0%} of it.'
+                f'a track are {pins["constant"]:.0%} of it. '
+                f'Of these are left: {_left(pins["left"])}.'
             )
+
+
+def _left(errors: Any) -> str:
+    """Return the constant errors of poses as text; extents are those of the pin."""
+    lengths = ', '.join(f'{name} {errors[name]:.2f} m' for name in ('along', 'across', 'up'))
+    return f'{lengths}, yaw {errors["yaw"]:.3f} rad'
 
 
 def _covariance(results: Any) -> Iterable[str]:
