@@ -12,7 +12,7 @@ from boxreg_ros.core.window import (
 from boxreg_ros.structures import POSE, ROLL, YAW
 import numpy as np
 import pytest
-from scenes import drive, track_of, window_of
+from scenes import changed, drive, track_of, window_of
 
 CONFIG = Config()
 
@@ -46,7 +46,7 @@ def flipped(window):
     """Return `window` with the heading signs of all input boxes changed."""
     boxes = [o.box + np.pi * np.eye(9)[8] for o in window.observations]
     pairs = zip(window.observations, boxes, strict=True)
-    return window._replace(observations=[o._replace(box=box) for o, box in pairs])
+    return window._replace(observations=[changed(o, boxes=box) for o, box in pairs])
 
 
 def test_windows_are_padded():
