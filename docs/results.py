@@ -366,8 +366,15 @@ def _review(results: Any) -> Iterable[str]:
                 f'With one box of each of these tracks pinned, the mean 3D IoU of their other '
                 f'boxes rises from {pins["before"]:.3f} to {pins["after"]:.3f}: '
                 f'{pins["gained"]:.0%} of 1 - IoU are removed; the errors that are constant along '
-                f'a track are {pins["constant"]:.0%} of it.'
+                f'a track are {pins["constant"]:.0%} of it. '
+                f'Of these are left: {_left(pins["left"])}.'
             )
+
+
+def _left(errors: Any) -> str:
+    """Return the constant errors of poses as text; extents are those of the pin."""
+    lengths = ', '.join(f'{name} {errors[name]:.2f} m' for name in ('along', 'across', 'up'))
+    return f'{lengths}, yaw {errors["yaw"]:.3f} rad'
 
 
 def _covariance(results: Any) -> Iterable[str]:
@@ -525,7 +532,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
     ),
     'report': (
         'The report in a browser',
-        'Chromium without a window and without a GPU, on two cores: it draws by software. *first\n'
+        'Chromium without a window and without a GPU, on two cores. It draws by the processor,\n'
+        'as it does by itself where it finds no GPU, or by an emulated GPU (SwiftShader). *first\n'
         'paint* is from the start of the page. The time slider is stepped once per frame, 120\n'
         'times: *script* is the time that the page takes of a frame, the rest is the drawing of\n'
         'the browser; the 3D view follows when the stepping pauses, where its drawing takes\n'
