@@ -12,7 +12,7 @@ from boxreg_ros.core.batch import (
     State,
 )
 from boxreg_ros.core.geometry import rotation_from_rpy
-from boxreg_ros.core.observation import observe
+from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.refine import Track
 from boxreg_ros.core.track_window import Window
 from boxreg_ros.structures import BoxArray, Sweep
@@ -100,10 +100,32 @@ def stream_of(tracks):
     return pairs
 
 
+def observation(**changes):
+    """Return an observation of a box at the origin without points, with some columns changed."""
+    blank = Observations(
+        stamps_ns=0, boxes=np.array([0.0, 0, 0, 4, 2, 1.5, 0, 0, 0]), points=np.zeros((0, 3)),
+        delays=np.zeros(0), counts=0, origins=np.full((1, 3), np.nan), ground=np.nan,
+        num_points=0, sights=0.0, is_pinned=False,
+    )  # fmt: skip
+    row = blank._replace(**changes)
+    columns = {name: np.array([value]) for name, value in row._asdict().items()}
+    columns['points'] = row.points.astype(np.float32)
+    columns['delays'] = row.delays.astype(np.float32)
+    columns['counts'] = np.array([len(row.points)])
+    return Observation(Observations(**columns), 0)
+
+
+def changed(seen, **changes):
+    """Return an observation with some columns changed."""
+    table = seen.table.take(np.array([seen.row]))
+    columns = {name: np.array([value]) for name, value in changes.items()}
+    return Observation(table._replace(**columns), 0)
+
+
 def window_of(track, config):
     """Return the window of all observations of `track`; all are new."""
     observations = [
-        observe(sweep, boxes.boxes, boxes.stamp_ns, config)[0]
+        Observation(observe(sweep, boxes.boxes, boxes.stamp_ns, config), 0)
         for sweep, boxes in stream_of([track])
     ]
     name, n = track.track_id, len(observations)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.kernels import load
 from boxreg_ros.core.kernels.arrays import CropNumbers
+from boxreg_ros.core.tables import column
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, YAW
 import numpy as np
@@ -53,58 +54,150 @@ class Crop(NamedTuple):
     outside: Floats
 
 
-class Observation(NamedTuple):
+class Observations(NamedTuple):
     """
-    The points of one track at one stamp, relative to the centre of its input box.
+    Observations of n boxes, one row each: their points, relative to the centre of the box.
 
     Attributes
     ----------
-    stamp_ns : int
-        Stamp of the box [ns].
-    box : array, shape (9,)
-        Input box in the fixed frame.
-    points : array, shape (M, 3)
-        Points near the box and above the road, minus its centre; axes of the fixed frame [m].
-    delays : array, shape (M,)
+    stamps_ns : array, shape (n,)
+        Stamps of the boxes [ns].
+    boxes : array, shape (n, 9)
+        Input boxes in the fixed frame.
+    points : array, shape (P, 3)
+        Points near each box and above the road, minus its centre; axes of the fixed frame [m]. The
+        points of one box follow those of the box before.
+    delays : array, shape (P,)
         Time of each point relative to the stamp [s]; 0 without `sampling.deskew`.
-    origins : array, shape (K, 3)
-        Each sensor that sees the object minus centre [m]; NaN where unknown.
-    ground : float
+    counts : array, shape (n,)
+        Points of each box.
+    origins : array, shape (n, K, 3)
+        Each sensor that sees the object minus centre [m]; NaN where unknown. The last repeats.
+    ground : array, shape (n,)
         Height of the road beside the box minus z of the centre [m]; NaN where not found.
-    num_points : int
+    num_points : array, shape (n,)
         Sweep points inside the input box.
-    sight : float
-        Median of `delays` [s]: when the sweep saw the object.
-    is_pinned : bool
+    sights : array, shape (n,)
+        Median of the delays [s]: when the sweep saw the object.
+    is_pinned : array, shape (n,)
         Whether a person has corrected the box.
 
     """
 
-    stamp_ns: int
-    box: Floats
+    stamps_ns: Ints
+    boxes: Floats
     points: NDArray[np.float32]
     delays: NDArray[np.float32]
+    counts: Ints
     origins: Floats
-    ground: float
-    num_points: int
-    sight: float = 0.0
-    is_pinned: bool = False
+    ground: Floats
+    num_points: Ints
+    sights: Floats
+    is_pinned: NDArray[np.bool_]
 
-    def relative_to(self, box: Floats, shift: Floats) -> 'Observation':
-        """Return this as the observation of another `box` (9,), whose centre is `-shift` away."""
-        if not shift.any():
-            return self._replace(box=box)  # of objects that did not move: no copy of the points
+    @property
+    def first(self) -> Ints:
+        """First of the points of each box, (n,)."""
+        first: Ints = np.cumsum(self.counts) - self.counts
+        return first
+
+    @classmethod
+    def concatenated(cls, tables: Sequence['Observations']) -> 'Observations':
+        """Return the rows of some tables, one after the other; of one table, no copy."""
+        most = max(table.origins.shape[1] for table in tables)
+        if any(table.origins.shape[1] < most for table in tables):
+            tables = [
+                table._replace(origins=_repeat_last(table.origins, most)) for table in tables
+            ]
+        return cls(*(column(tables, name) for name in cls._fields))
+
+    def take(self, rows: Ints) -> 'Observations':
+        """Return some of the rows (n,), in their order."""
+        counts = self.counts[rows]
+        points = _runs(self.first[rows], counts)
+        return Observations(
+            stamps_ns=self.stamps_ns[rows],
+            boxes=self.boxes[rows],
+            points=self.points[points],
+            delays=self.delays[points],
+            counts=counts,
+            origins=self.origins[rows],
+            ground=self.ground[rows],
+            num_points=self.num_points[rows],
+            sights=self.sights[rows],
+            is_pinned=self.is_pinned[rows],
+        )
+
+    def relative_to(self, boxes: Floats, shifts: Floats) -> 'Observations':
+        """Return these for other `boxes` (n, 9), whose centres are `-shifts` (n, 3) away [m]."""
+        if not shifts.any():
+            return self._replace(boxes=boxes)  # of objects that did not move: no copy
+        of_points = np.repeat(shifts.astype(np.float32), self.counts, axis=0)
         return self._replace(
-            box=box,
-            points=self.points + shift.astype(np.float32),
-            origins=self.origins + shift,
-            ground=self.ground + float(shift[2]),
+            boxes=boxes,
+            points=self.points + of_points,
+            origins=self.origins + shifts[:, None],
+            ground=self.ground + shifts[:, 2],
         )
 
 
-def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[Observation]:
+class Observation(NamedTuple):
+    """One row of `Observations`, which describe its properties."""
+
+    table: Observations
+    row: int
+
+    @property
+    def _points(self) -> slice:
+        first = int(self.table.counts[: self.row].sum())
+        return slice(first, first + int(self.table.counts[self.row]))
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the box [ns]."""
+        return int(self.table.stamps_ns[self.row])
+
+    @property
+    def box(self) -> Floats:
+        """Input box in the fixed frame, (9,)."""
+        box: Floats = self.table.boxes[self.row]
+        return box
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """Points minus the centre of the box, (M, 3) [m]."""
+        return self.table.points[self._points]
+
+    @property
+    def delays(self) -> NDArray[np.float32]:
+        """Time of each point relative to the stamp, (M,) [s]."""
+        return self.table.delays[self._points]
+
+    @property
+    def origins(self) -> Floats:
+        """Sensors that see the object minus centre, (K, 3) [m]; the last repeats."""
+        origins: Floats = self.table.origins[self.row]
+        return origins
+
+    @property
+    def ground(self) -> float:
+        """Height of the road minus z of the centre [m]; NaN where not found."""
+        return float(self.table.ground[self.row])
+
+    @property
+    def num_points(self) -> int:
+        """Sweep points inside the box."""
+        return int(self.table.num_points[self.row])
+
+    @property
+    def sight(self) -> float:
+        """When the sweep saw the object, relative to the stamp [s]."""
+        return float(self.table.sights[self.row])
+
+
+def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Observations:
     """
-    Return the observation of each box in a sweep.
+    Return the observations of boxes in a sweep.
 
     A point near several boxes belongs to the box it is deepest inside of, or least outside, so
     that a neighbour's bumper is no evidence. It also belongs to boxes it is nearly as deep inside
@@ -124,8 +217,8 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
 
     Returns
     -------
-    observations : list of n Observation
-        In the order of `boxes`.
+    observations : Observations
+        One row for each of `boxes`; none is pinned.
 
     """
     n = len(boxes)
@@ -135,54 +228,53 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> list[
     rows, owner = _thinned(own, sweep, n, config)
 
     points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32, 'C')
+    counts = np.bincount(owner, minlength=n)
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
-    parts = _slices(owner, n)
     if config.sampling.deskew and sweep.times is not None:
         delays = sweep.times[rows].astype(np.float32)
-        sights = _medians(delays, np.bincount(owner, minlength=n))
+        sights = _medians(delays, counts)
     up = np.cos(boxes[:, ROLL:YAW]).prod(1)  # of the z axis of each box, in the fixed frame
     ground = (own.road - boxes[:, 5] / 2) / up.clip(0.1)  # along z of the fixed frame
-    columns = zip(
-        boxes,
-        [points[part] for part in parts],
-        [delays[part] for part in parts],
-        _origins(sweep, rows, parts, centers),
-        ground.tolist(),
-        own.num_inside.tolist(),
-        sights.tolist(),
-        strict=True,
+    return Observations(
+        stamps_ns=np.full(n, stamp_ns, np.int64),
+        boxes=boxes,
+        points=points,
+        delays=delays,
+        counts=counts,
+        origins=_origins(sweep, rows, owner, centers),
+        ground=ground,
+        num_points=own.num_inside,
+        sights=sights,
+        is_pinned=np.zeros(n, bool),
     )
-    return [Observation(stamp_ns, *values) for values in columns]
 
 
-def _origins(sweep: Sweep, rows: Ints, parts: list[slice], centers: Floats) -> list[Floats]:
+def _origins(sweep: Sweep, rows: Ints, owner: Ints, centers: Floats) -> Floats:
     """
-    Return the sensors that see each of n objects, minus its centre, n arrays (K, 3) [m].
+    Return the sensors that see each of n objects, minus its centre, (n, K, 3) [m].
 
-    These are the sensors with `MIN_SENSOR_PART` of the points in `rows[part]`; all of them for an
-    object without points.
+    These are the sensors with `MIN_SENSOR_PART` of its points, which are `rows` of the sweep; all
+    of them for an object without points. The last repeats.
 
     """
     if sweep.origins is None or sweep.sensors is None:
-        return list((sweep.origin - centers)[:, None])
-    origins = []
-    for part, center in zip(parts, centers, strict=True):
-        counts = np.bincount(sweep.sensors[rows[part]], minlength=len(sweep.origins))
-        sees = counts >= MIN_SENSOR_PART * counts.sum()
-        origins.append(sweep.origins[sees] - center)
+        origin: Floats = (sweep.origin - centers)[:, None]
+        return origin
+    n, S = len(centers), len(sweep.origins)
+    counts = np.bincount(owner * S + sweep.sensors[rows], minlength=n * S).reshape(n, S)
+    sees = counts >= MIN_SENSOR_PART * counts.sum(1, keepdims=True)
+    number = sees.sum(1, keepdims=True)
+    first_seeing = np.argsort(~sees, axis=1, kind='stable')
+    place = np.minimum(np.arange(number.max(initial=1)), number - 1)  # (n, K)
+    sensors = np.take_along_axis(first_seeing, place, axis=1)
+    origins: Floats = sweep.origins[sensors] - centers[:, None]
     return origins
 
 
-def stack_origins(origins: Sequence[Floats]) -> Floats:
-    """Return the sensors (k, 3) of O observations as one array (O, K, 3); the last repeats."""
-    counts = np.array(list(map(len, origins)))
-    if counts.max() == 1:
-        return np.concatenate(origins)[:, None]
-    first = np.cumsum(counts) - counts
-    column = np.minimum(np.arange(counts.max()), counts[:, None] - 1)  # (O, K)
-    stacked: Floats = np.concatenate(origins)[first[:, None] + column]
-    return stacked
+def _repeat_last(origins: Floats, count: int) -> Floats:
+    """Return origins (n, k, 3) as (n, count, 3), the last repeated."""
+    return origins[:, np.minimum(np.arange(count), origins.shape[1] - 1)]
 
 
 def _medians(values: NDArray[np.float32], counts: Ints) -> Floats:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import accumulate, chain
 from math import dist, inf
 from typing import NamedTuple
 
@@ -14,9 +15,16 @@ from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.motion import motion_at
-from boxreg_ros.core.observation import Observation, observe, stack_origins
+from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.support import is_owned, MIN_HITS, points_inside, points_to_confirm
-from boxreg_ros.core.track_window import Estimate, MarginalisationPrior, PRIOR_POSES, Window
+from boxreg_ros.core.tables import column, joined
+from boxreg_ros.core.track_window import (
+    Estimate,
+    Estimates,
+    MarginalisationPrior,
+    PRIOR_POSES,
+    Window,
+)
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.structures import (
     BoxArray,
@@ -232,23 +240,23 @@ class BoxRegistrar:
                     self._tracks[track_id] = _Track(track_id, boxes.class_names[row])
                 given.append(_Sighting(self._tracks[track_id], boxes.boxes[row], row))
         coasting = self._coasting(array)
-        seen = self._seen([*given, *coasting], boxes.stamp_ns, sweep)
+        if not (given or coasting):
+            return
+        seen, velocities = self._seen([*given, *coasting], boxes, sweep)
         confirmed = _confirmed(coasting, seen[len(given) :])
         if len(confirmed) < len(coasting):
             # A box that is not confirmed owns no points.
             self.counts['coast_unconfirmed'] += len(coasting) - len(confirmed)
-            seen = self._seen([*given, *confirmed], boxes.stamp_ns, sweep)
-        for sighting, (observation, velocity) in zip(given, seen, strict=False):
+            seen, velocities = self._seen([*given, *confirmed], boxes, sweep)
+        for sighting, observation, velocity in zip(given, seen, velocities, strict=False):
             self.box_time.add(observation, velocity)
-            if boxes.pinned is not None and boxes.pinned[sighting.row]:
-                observation = observation._replace(is_pinned=True)
             track = sighting.track
             track.add(observation, array, sighting.row)
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
                 self._tracks[track.track_id] = successor
-        for sighting, (observation, _) in zip(confirmed, seen[len(given) :], strict=True):
+        for sighting, observation in zip(confirmed, seen[len(given) :], strict=True):
             row = array.add_predicted(sighting)
             sighting.track.add(observation, array, row, is_predicted=True)
 
@@ -272,11 +280,10 @@ class BoxRegistrar:
         return found
 
     def _seen(
-        self, sightings: list[_Sighting], stamp_ns: int, sweep: Sweep
-    ) -> list[tuple[Observation, Floats]]:
-        """Return for each box its observation, and the velocity of its input."""
-        if not sightings:
-            return []
+        self, sightings: list[_Sighting], given: BoxArray, sweep: Sweep
+    ) -> tuple[list[Observation], Floats]:
+        """Return the observation of each box at the stamp of `given`, and their velocities."""
+        stamp_ns = given.stamp_ns
         boxes = np.array([sighting.box for sighting in sightings])
         at_sweep = boxes.copy()
         offset = (sweep.stamp_ns - stamp_ns) * 1e-9  # [s]
@@ -288,13 +295,13 @@ class BoxRegistrar:
             at_sweep[:, X : Z + 1] += offset * velocities
             if self.config.sampling.deskew:
                 motion = motion_to_sight(sweep, at_sweep, velocities)
-        found = observe(sweep, swept(at_sweep, motion), stamp_ns, self.config)
+        table = observe(sweep, swept(at_sweep, motion), stamp_ns, self.config)
         if offset or motion.any():
-            found = [
-                seen.relative_to(box, moved / 2)
-                for seen, box, moved in zip(found, boxes, motion, strict=True)
-            ]
-        return list(zip(found, velocities, strict=True))
+            table = table.relative_to(boxes, motion / 2)
+        if given.pinned is not None:
+            pinned = [sighting.row >= 0 and given.pinned[sighting.row] for sighting in sightings]
+            table = table._replace(is_pinned=np.array(pinned))
+        return [Observation(table, row) for row in range(len(boxes))], velocities
 
     def _end_silent_tracks(self, now_ns: int) -> None:
         oldest_ns = now_ns - round(self.config.max_gap * 1e9)
@@ -348,7 +355,7 @@ class BoxRegistrar:
         ended = self._ended_tracks
         self._submitted = [_SubmittedTrack(track, track.entries, True) for track in ended]
         self._submitted += [_SubmittedTrack(track, track.entries, False) for track in tracks]
-        windows = [track.window() for track in ended + tracks]
+        windows = _windows(ended + tracks)
         submit = self._submit or submit_locally
         config = self.box_time.resolved(self.config)
         self._get_estimates = submit(windows, config, self._input_model)
@@ -395,8 +402,8 @@ class _PendingArray:
         Why each box is kept as long as it has no estimate.
     num_points : array, shape (n,)
         As in `RefinedBoxes`.
-    estimates : list of n tuples or None
-        The estimate of the window that each box was last in, and its place there.
+    estimates : list of n pairs or None
+        Estimates of the windows that each box was last in, and its row there.
     num_unsettled : int
         Boxes whose estimate may still change; the array is settled at 0 or less.
     is_observed : bool
@@ -409,7 +416,7 @@ class _PendingArray:
         self.input = boxes
         self.reasons = [''] * n
         self.num_points = np.zeros(n, int)
-        self.estimates: list[tuple[Estimate, int] | None] = [None] * n
+        self.estimates: list[tuple[Estimates, int] | None] = [None] * n
         self.num_given = n
         self.num_unsettled = 0
         self.is_observed = False
@@ -454,37 +461,35 @@ class _PendingArray:
 
         """
         n = len(self.estimates)
-        boxes = self.input.boxes.copy()
-        status = [KEPT] * n
-        reasons = self.reasons.copy()
-        covariances = np.tile(np.eye(6), (n, 1, 1))
-        extent_covariances = np.tile(np.eye(3), (n, 1, 1))
-        face_distances = np.zeros((n, 6))
-        outside = np.zeros(n)
-        for row, found in enumerate(self.estimates):
-            if found is not None:
-                estimate, i = found
-                boxes[row] = estimate.boxes[i]
-                status[row] = estimate.status[i]
-                reasons[row] = estimate.reasons[i]
-                covariances[row] = estimate.covariances[i]
-                extent_covariances[row] = estimate.extent_covariances[i]
-                face_distances[row] = estimate.face_distances[i]
-                outside[row] = estimate.outside[i]
-        rows = [row for row in range(n) if row < self.num_given or status[row] == REFINED]
-        status[self.num_given :] = [COASTED] * (n - self.num_given)
-        whole = RefinedBoxes(
-            replace(self.input, boxes=boxes),
-            tuple(status),
-            tuple(reasons),
-            self.num_points.copy(),
-            covariances,
-            is_final,
-            extent_covariances,
-            face_distances,
-            outside,
+        columns = Estimates(
+            boxes=self.input.boxes.copy(),
+            status=np.full(n, KEPT, object),
+            reasons=np.array(self.reasons, object),
+            covariances=np.tile(np.eye(6), (n, 1, 1)),
+            extent_covariances=np.tile(np.eye(3), (n, 1, 1)),
+            face_distances=np.zeros((n, 6)),
+            outside=np.zeros(n),
         )
-        return whole if len(rows) == n else whole.take(rows)
+        estimated = [row for row, found in enumerate(self.estimates) if found is not None]
+        tables, places = joined([found for found in self.estimates if found is not None])
+        if estimated:
+            for name, values in columns._asdict().items():
+                values[estimated] = column(tables, name)[places]
+        is_returned = columns.status == REFINED
+        is_returned[: self.num_given] = True
+        columns.status[self.num_given :] = COASTED
+        whole = RefinedBoxes(
+            replace(self.input, boxes=columns.boxes),
+            tuple(columns.status.tolist()),
+            tuple(columns.reasons.tolist()),
+            self.num_points.copy(),
+            columns.covariances,
+            is_final,
+            columns.extent_covariances,
+            columns.face_distances,
+            columns.outside,
+        )
+        return whole if is_returned.all() else whole.take(np.flatnonzero(is_returned).tolist())
 
 
 class _Place(NamedTuple):
@@ -498,14 +503,19 @@ class _Place(NamedTuple):
 
 @dataclass(slots=True)
 class _Entry:
-    """An observation of a track, and the row of the box array its estimate is written to."""
+    """
+    An observation of a track, and the row of the box array its estimate is written to.
+
+    `estimate` is a row of a table with `boxes`, which the next window starts from.
+
+    """
 
     observation: Observation
     place: _Place
     array: _PendingArray
     row: int
     is_predicted: bool = False
-    estimate: Floats | None = None
+    estimate: tuple[Estimates | Observations, int] | None = None
     is_settled: bool = False
 
     def settle(self) -> None:
@@ -551,14 +561,6 @@ class _Track:
         """Return whether the newest observation is of `array`."""
         return self.entries[-1].array is array
 
-    def window(self) -> Window:
-        """Return the window of all observations held."""
-        observations = [entry.observation for entry in self.entries]
-        estimates = [entry.estimate for entry in self.entries if entry.estimate is not None]
-        num_new = len(observations) - len(estimates)
-        start = np.array(estimates).reshape(-1, 9)
-        return Window(self.track_id, self.class_name, observations, num_new, start, self.prior)
-
     def carry(self, length: int) -> None:
         """
         Leave the newest observation to a later window, which then starts from its input box.
@@ -571,7 +573,7 @@ class _Track:
         before, newest = self.entries[-2:]
         newest.array.reasons[newest.row] = 'budget'
         if before.estimate is not None:  # else the track is cold: its first window is to come
-            newest.estimate = newest.observation.box
+            newest.estimate = newest.observation
         excess = max(0, len(self.entries) - length)
         del self.entries[PRIOR_POSES : PRIOR_POSES + excess]
 
@@ -600,11 +602,9 @@ class _Track:
     def predicted(self, stamp_ns: int, config: Config) -> Floats:
         """Return the box (9,) at a stamp by the motion of the newest estimates."""
         stamps_ns = np.array([entry.observation.stamp_ns for entry in self.entries])
-        boxes = [
-            entry.observation.box if entry.estimate is None else entry.estimate
-            for entry in self.entries
-        ]
-        motion = motion_at(stamps_ns, np.array(boxes), -1, config.class_config(self.class_name))
+        tables, rows = joined([entry.estimate or entry.observation for entry in self.entries])
+        boxes = column(tables, 'boxes')[rows]
+        motion = motion_at(stamps_ns, boxes, -1, config.class_config(self.class_name))
         return motion.predict(stamp_ns)
 
     def split_at_id_switch(self) -> _Track | None:
@@ -637,10 +637,27 @@ class _Track:
         self.prior = estimate.prior
         self.covariance = estimate.covariances[-1]
         self.num_carried = 0
-        for i, (entry, box) in enumerate(zip(entries, estimate.boxes, strict=True)):
-            entry.estimate = box
+        for row, entry in enumerate(entries, estimate.begin):
+            entry.estimate = found = estimate.table, row
             if not entry.is_settled:
-                entry.array.estimates[entry.row] = estimate, i
+                entry.array.estimates[entry.row] = found
+
+
+def _windows(tracks: Sequence[_Track]) -> list[Window]:
+    """Return for each track the window of all observations that it holds."""
+    known = [[e.estimate for e in track.entries if e.estimate is not None] for track in tracks]
+    tables, rows = joined(list(chain.from_iterable(known)))
+    starts = column(tables, 'boxes')[rows] if tables else np.zeros((0, 9))
+    ends = list(accumulate(map(len, known)))
+    windows = []
+    for track, begin, end in zip(tracks, [0, *ends], ends, strict=False):
+        observations = [entry.observation for entry in track.entries]
+        num_new = len(observations) - (end - begin)
+        start = starts[begin:end]
+        windows.append(
+            Window(track.track_id, track.class_name, observations, num_new, start, track.prior)
+        )
+    return windows
 
 
 class _Sighting(NamedTuple):
@@ -657,7 +674,8 @@ def _by_urgency(tracks: list[_Track]) -> list[_Track]:
     known = [track.covariance for track in tracks]
     covariances = np.array([UNKNOWN_COVARIANCE if c is None else c for c in known])  # (n, 6, 6)
     variances = covariances[:, :3, :3].trace(axis1=1, axis2=2)  # of the position [m^2]
-    sensors = stack_origins([track.entries[-1].observation.origins for track in tracks])
+    tables, rows = joined([track.entries[-1].observation for track in tracks])  # of one sweep
+    sensors = column(tables, 'origins')[rows]  # (n, K, 3)
     distances = np.linalg.norm(sensors, axis=2).min(1)  # (n,) [m]; NaN, the last, if unknown
     return [tracks[i] for i in np.lexsort((distances, -variances, -carried)).tolist()]
 
@@ -674,11 +692,9 @@ def _input_velocities(sightings: list[_Sighting], boxes: Floats, stamp_ns: int) 
     return velocities
 
 
-def _confirmed(
-    coasting: list[_Sighting], seen: list[tuple[Observation, Floats]]
-) -> list[_Sighting]:
+def _confirmed(coasting: list[_Sighting], seen: list[Observation]) -> list[_Sighting]:
     """Return those of the predicted boxes that have enough points."""
-    inside = points_inside([observation for observation, _ in seen])
+    inside = points_inside(seen)
     return [
         sighting
         for sighting, count in zip(coasting, inside.tolist(), strict=True)

@@ -15,6 +15,7 @@ objective to the letter. docs/method.md has the formulas.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import repeat
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, Problem, Solution, State
@@ -27,7 +28,7 @@ from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.rounds import COARSE_POINTS
 from boxreg_ros.core.smoothing import smoothed_angles
 from boxreg_ros.core.solver import solve
-from boxreg_ros.core.track_window import Estimate, MarginalisationPrior, Window
+from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, KEPT, REFINED
@@ -163,19 +164,17 @@ def _accepted(
     count = problem.counts.clamp(min=1).cpu().numpy()
     outside = (1 - held / count).clip(0, 1)
     extent_covariances = np.repeat(extents[:, None], found.shape[1], axis=1)
-    for b, i in np.argwhere(problem.valid.cpu().numpy() & is_kept).tolist():
+    valid = problem.valid.cpu().numpy()
+    for b, i in np.argwhere(valid & is_kept).tolist():
         found[b, i] = windows[b].observations[i].box
         covariances[b, i] = np.eye(6)
         extent_covariances[b, i] = np.eye(3)
         distances[b, i] = 0.0
         outside[b, i] = 0.0
-    estimates = []
-    for b, window in enumerate(windows):
-        n = len(window.observations)
-        words = tuple(status[b, :n].tolist()), tuple(reasons[b, :n].tolist())
-        columns = covariances[b, :n], extent_covariances[b, :n], distances[b, :n], outside[b, :n]
-        estimates.append(Estimate(found[b, :n], *words, *columns, priors[b]))
-    return estimates
+    columns = found, status, reasons, covariances, extent_covariances, distances, outside
+    table = Estimates(*(part[valid] for part in columns))
+    ends = np.cumsum(valid.sum(1)).tolist()
+    return list(map(Estimate, repeat(table), [0, *ends], ends, priors))
 
 
 def _failed_tests(problem: Problem, is_finite: NDArray[np.bool_], held: Ints) -> NDArray[np.bool_]:

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.structures import Floats
+import numpy as np
+from numpy.typing import NDArray
 
 MARGIN_OBSERVATIONS = 30
 """Observations of a window that give labelling margins; measured: 130 add nothing."""
@@ -90,34 +92,76 @@ class Window(NamedTuple):
         return range(max(0, last - self.num_new), last, 1 + self.num_new // MARGIN_OBSERVATIONS)
 
 
-class Estimate(NamedTuple):
+class Estimates(NamedTuple):
     """
-    The refined boxes of one window.
+    The refined boxes of many windows, one row each, window after window.
 
     Attributes
     ----------
-    boxes : array, shape (N, 9)
+    boxes : array, shape (n, 9)
         Refined boxes, or input boxes where those are kept; fixed frame [m, rad].
-    status : tuple of N str
+    status : array of str, shape (n,)
         ``refined`` or ``kept``.
-    reasons : tuple of N str
+    reasons : array of str, shape (n,)
         One of `KEPT_REASONS` for kept boxes, '' for refined ones.
-    covariances : array, shape (N, 6, 6)
+    covariances : array, shape (n, 6, 6)
         Of x y z roll pitch yaw [m, rad]; the identity for kept boxes.
-    extent_covariances : array, shape (N, 3, 3)
+    extent_covariances : array, shape (n, 3, 3)
         Of length, width and height [m]; the identity for kept boxes.
-    face_distances, outside : array, shapes (N, 6) and (N,)
+    face_distances, outside : array, shapes (n, 6) and (n,)
         As in `RefinedBoxes`.
+
+    """
+
+    boxes: Floats
+    status: NDArray[np.str_]
+    reasons: NDArray[np.str_]
+    covariances: Floats
+    extent_covariances: Floats
+    face_distances: Floats
+    outside: Floats
+
+
+class Estimate(NamedTuple):
+    """
+    The refined boxes of one window: some successive rows of `Estimates`.
+
+    Attributes
+    ----------
+    table : Estimates
+        Those of all windows that were solved together.
+    begin, end : int
+        First row of the window, and the one after its last.
     prior : MarginalisationPrior or None
         For the next window, if this one is full and was solved.
 
     """
 
-    boxes: Floats
-    status: tuple[str, ...]
-    reasons: tuple[str, ...]
-    covariances: Floats
-    extent_covariances: Floats
-    face_distances: Floats
-    outside: Floats
+    table: Estimates
+    begin: int
+    end: int
     prior: MarginalisationPrior | None = None
+
+    @property
+    def boxes(self) -> Floats:
+        """Boxes of the window, (N, 9) [m, rad]."""
+        return self.table.boxes[self._rows]
+
+    @property
+    def status(self) -> tuple[str, ...]:
+        """``refined`` or ``kept``, N of them."""
+        return tuple(self.table.status[self._rows].tolist())
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why boxes are kept, N of them."""
+        return tuple(self.table.reasons[self._rows].tolist())
+
+    @property
+    def covariances(self) -> Floats:
+        """Covariances of the poses, (N, 6, 6) [m, rad]."""
+        return self.table.covariances[self._rows]
+
+    @property
+    def _rows(self) -> slice:
+        return slice(self.begin, self.end)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import partial
-from operator import attrgetter
 from typing import Any
 
 from boxreg_ros.config import Config, KINDS
@@ -14,7 +13,8 @@ from boxreg_ros.core.batch import (
     Returns,
     SHARED,
 )
-from boxreg_ros.core.observation import Observation, stack_origins
+from boxreg_ros.core.observation import Observations
+from boxreg_ros.core.tables import joined
 from boxreg_ros.core.track_window import MarginalisationPrior, Window
 from boxreg_ros.structures import Floats, Ints, ROLL, YAW
 import numpy as np
@@ -45,7 +45,6 @@ VALUES_PER_POINT = 18
 """Values held per point while a batch is solved; estimated from the temporary tensors."""
 PRIOR_ANGLES = [3, 4, 5, 9, 10, 11]
 """Angles among the variables of the marginalisation prior: of its two poses."""
-_FIELDS = [attrgetter(name) for name in Observation._fields]
 
 
 NO_PRIOR = (
@@ -101,14 +100,17 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     """
     lengths = np.array([len(window.observations) for window in windows])
     valid = np.arange(lengths.max()) < lengths[:, None]  # (B, N)
-    columns = _columns(windows)
-    boxes, times, origins, ground = _stack_observations(columns, valid)
+    tables, rows = joined([item for window in windows for item in window.observations])
+    seen = Observations.concatenated(tables)
+    if 2 * len(rows) < len(seen.boxes):  # of another group: their points are not held twice
+        seen, rows = seen.take(rows), np.arange(len(rows))
+    boxes, times, origins, ground = _stack_observations(seen, rows, valid)
     priors = [w.prior or _no_prior(w.observations[0].box[:3]) for w in windows]
     base, state, step, information, extents = (
         np.array(part) for part in zip(*priors, strict=True)
     )
     pinned = np.zeros(valid.shape, bool)
-    pinned[valid] = columns.is_pinned
+    pinned[valid] = seen.is_pinned[rows]
     if config.ingredients.heading_sign:
         boxes[..., ROLL:] = _resolved_angles(boxes, times, valid, pinned, state[:, 5])
     else:
@@ -118,7 +120,9 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
     start[..., :3] -= base[:, None]
     minimum, is_usable = _prior_minimum(start, state, step)
     information *= PRIOR_DECAY * is_usable[:, None, None]
-    first, counts = _places_of_returns(columns, valid)
+    first, counts = np.zeros((2, *valid.shape), np.int64)
+    first[valid] = seen.first[rows]
+    counts[valid] = seen.counts[rows]
     class_numbers, kind = _of_classes(windows, config)
     on_device = partial(_tensor, device=config.device)
     problem = Problem(
@@ -126,7 +130,7 @@ def stack_windows(windows: Sequence[Window], config: Config) -> tuple[Problem, F
         start=on_device(start),
         valid=on_device(valid),
         times=on_device(times),
-        returns=_returns(columns, config),
+        returns=_returns(seen, int(counts.max()), config),
         first=on_device(first),
         counts=on_device(counts),
         origins=on_device(origins),
@@ -150,17 +154,11 @@ def _tensor(array: NDArray[Any], device: str) -> Tensor:
     return torch.from_numpy(array).to(device)
 
 
-def _columns(windows: Sequence[Window]) -> Any:
-    """Return the observations of all windows as one `Observation` of lists."""
-    every = [observation for window in windows for observation in window.observations]
-    return Observation._make(list(map(get, every)) for get in _FIELDS)
-
-
 def _stack_observations(
-    columns: Any, valid: NDArray[np.bool_]
+    seen: Observations, rows: Ints, valid: NDArray[np.bool_]
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Return input boxes, times, sensor origins and ground heights of `_columns`, padded.
+    Return input boxes, times, sensor origins and ground heights of `rows`, padded.
 
     Shapes (B, N, 9), (B, N), (B, N, K, 3) and (B, N). Padding repeats the last box of a window, at
     later times, and the last sensor of an observation.
@@ -168,44 +166,29 @@ def _stack_observations(
     """
     B, N = valid.shape
     lengths = valid.sum(1)
-    boxes = np.zeros((B, N, 9))
-    boxes[valid] = np.concatenate(columns.box).reshape(-1, 9)
-    sensors = stack_origins(columns.origins)
-    origins = np.zeros((B, N, *sensors.shape[1:]))
-    origins[valid] = sensors
-    ground = np.full((B, N), np.nan)
-    ground[valid] = columns.ground
-    stamps_ns = np.array(columns.stamp_ns)
-    first_ns = np.repeat(stamps_ns[np.cumsum(lengths) - lengths], lengths)
-    times = np.zeros((B, N))
-    times[valid] = (stamps_ns - first_ns) * 1e-9
-    row = np.arange(B)[:, None]
+    begin = np.cumsum(lengths) - lengths
     column = np.arange(N)
     last = lengths[:, None] - 1
-    source = np.minimum(column, last)
-    times = times[row, source] + PADDING_PERIOD * np.maximum(column - last, 0)
-    return boxes[row, source], times, origins, ground
+    padded = rows[begin[:, None] + np.minimum(column, last)]  # (B, N), the last row repeats
+    origins = np.zeros((B, N, *seen.origins.shape[1:]))
+    origins[valid] = seen.origins[rows]
+    ground = np.full((B, N), np.nan)
+    ground[valid] = seen.ground[rows]
+    stamps_ns = seen.stamps_ns[padded]
+    times = (stamps_ns - stamps_ns[:, :1]) * 1e-9 + PADDING_PERIOD * np.maximum(column - last, 0)
+    return seen.boxes[padded], times, origins, ground
 
 
-def _places_of_returns(columns: Any, valid: NDArray[np.bool_]) -> tuple[Ints, Ints]:
-    """Return where the returns of each observation begin in `_returns`, and how many; (B, N)."""
-    counts = np.zeros(valid.shape, dtype=np.int64)
-    counts[valid] = list(map(len, columns.points))
-    first = np.cumsum(counts).reshape(counts.shape) - counts
-    return first, counts
-
-
-def _returns(columns: Any, config: Config) -> Returns:
-    """Return the returns of all observations, one after the other, delayed from their boxes."""
-    counts = list(map(len, columns.points))
-    delays = np.concatenate(columns.delays)
-    if config.sampling.box_time == 'sight' and any(columns.sight):
-        delays -= np.repeat(np.array(columns.sight, dtype=np.float32), counts)
+def _returns(seen: Observations, width: int, config: Config) -> Returns:
+    """Return the returns of all observations, delayed from their boxes."""
+    delays = seen.delays
+    if config.sampling.box_time == 'sight' and seen.sights.any():
+        delays = delays - np.repeat(seen.sights.astype(np.float32), seen.counts)
     return Returns(
-        _tensor(np.concatenate(columns.points), config.device),
+        _tensor(seen.points, config.device),
         _tensor(delays, config.device),
         is_moving=bool(delays.any()),
-        width=max(1, *counts),
+        width=max(1, width),
     )
 
 
@@ -234,8 +217,9 @@ def _resolved_angles(
 def _starting_boxes(windows: Sequence[Window], boxes: Floats) -> Floats:
     """Return where the search starts (B, N, 9): earlier estimates, else the input `boxes`."""
     start = boxes.copy()
-    for row, window in enumerate(windows):
-        start[row, : len(window.start)] = window.start
+    lengths = np.array([len(window.start) for window in windows])
+    is_known = np.arange(boxes.shape[1]) < lengths[:, None]
+    start[is_known] = np.concatenate([window.start for window in windows])
     # Whole turns, and half turns of yaw: a kept box is returned with the heading of its input.
     period = np.pi * np.array([2, 2, 1])
     start[..., ROLL:] += period * np.round((boxes[..., ROLL:] - start[..., ROLL:]) / period)

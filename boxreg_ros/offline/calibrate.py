@@ -26,7 +26,7 @@ from boxreg_ros.core.input_noise import (
     MAD_TO_DEVIATION,
     MIN_OBSERVATIONS_FOR_NOISE,
 )
-from boxreg_ros.core.observation import Observation, observe
+from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.track_window import Window
 from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.errors import ConfigError, RecordingError
@@ -334,8 +334,9 @@ def _true_windows(drive: Drive, config: Config) -> list[Window]:
             continue
         here = rows[truth.stamps_ns[rows] == stamp_ns]
         found = observe(sweep, truth.boxes[here], stamp_ns, config)
-        for i, observation in zip(here, found, strict=True):
-            observations.setdefault(truth.track_ids[i], []).append(observation)
+        for row, i in enumerate(here):
+            seen = Observation(found, row)
+            observations.setdefault(truth.track_ids[i], []).append(seen)
             classes[truth.track_ids[i]] = truth.class_names[i]
     start = np.zeros((0, 9))
     return [
@@ -360,12 +361,24 @@ def _model_of(windows: Sequence[Window], config: Config) -> InputModel:
 
 def _bare(rows: Iterable[Sequence[Any]]) -> Window:
     """Return a window of (stamp, box) without points."""
-    nowhere, no_points = np.full((1, 3), np.nan), np.zeros((0, 3), np.float32)
-    observations = [
-        Observation(stamp_ns, box, no_points, no_points[:, 0], nowhere, np.nan, 0)
-        for stamp_ns, box in rows
-    ]
-    return Window('', '', observations, len(observations), np.zeros((0, 9)))
+    stamps, boxes = zip(*rows, strict=True)
+    n = len(stamps)
+    none = np.zeros(n, int)
+    unknown = np.full(n, np.nan)
+    table = Observations(
+        stamps_ns=np.array(stamps),
+        boxes=np.array(boxes),
+        points=np.zeros((0, 3), np.float32),
+        delays=np.zeros(0, np.float32),
+        counts=none,
+        origins=np.full((n, 1, 3), np.nan),
+        ground=unknown,
+        num_points=none,
+        sights=np.zeros(n),
+        is_pinned=np.zeros(n, bool),
+    )
+    observations = [Observation(table, row) for row in range(n)]
+    return Window('', '', observations, n, np.zeros((0, 9)))
 
 
 def _deviation(offsets: Floats) -> float:

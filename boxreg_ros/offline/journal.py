@@ -19,9 +19,9 @@ from types import TracebackType
 from typing import Any, BinaryIO, cast, Protocol, Self, TYPE_CHECKING
 import zlib
 
+from boxreg_ros.core.tables import column, joined
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import delete_files, names_of, read_bytes, url_of, write_bytes
-import numpy as np
 
 if TYPE_CHECKING:
     from boxreg_ros.config import Config
@@ -33,7 +33,7 @@ HEAD = struct.Struct('<QI')
 """Size [bytes] and CRC-32 of the record that follows."""
 TRUSTED_PACKAGES = ('boxreg_ros', 'numpy')
 TRUSTED_NAMES = (
-    'Estimate', 'MarginalisationPrior', 'ndarray', 'dtype', 'scalar', '_reconstruct',
+    'Estimate', 'Estimates', 'MarginalisationPrior', 'ndarray', 'dtype', 'scalar', '_reconstruct',
     '_frombuffer',
 )  # fmt: skip
 """What a record may refer to: a pickle of other names could run any code."""
@@ -290,7 +290,7 @@ def _checksum(windows: Sequence[Window]) -> int:
     checksum = 0
     for window in windows:
         checksum = zlib.crc32(window.track_id.encode(errors='surrogateescape'), checksum)
-        stamps = np.array([observation.stamp_ns for observation in window.observations])
-        boxes = np.array([observation.box for observation in window.observations])
+        tables, rows = joined(window.observations)
+        stamps, boxes = (column(tables, name)[rows] for name in ('stamps_ns', 'boxes'))
         checksum = zlib.crc32(boxes.tobytes(), zlib.crc32(stamps.tobytes(), checksum))
     return checksum

@@ -11,21 +11,21 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from itertools import accumulate, islice, pairwise
+from itertools import islice
 import time
 from typing import Any, cast
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.core.observation import Observation, stack_origins
+from boxreg_ros.core.observation import Observation, Observations
 from boxreg_ros.core.registrar import CPU, GetEstimates, Submit, submit_locally
+from boxreg_ros.core.tables import joined
 from boxreg_ros.core.track_window import Estimate, Window
 from boxreg_ros.io.warm_up import warm_up, warm_up_crop
 from boxreg_ros.offline.compilation import announced_compilation
 from boxreg_ros.offline.reader import uses_one_core
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.worker_process import Receive, run_in_worker, Send, WorkerProcess
-import numpy as np
 
 
 @contextmanager
@@ -111,44 +111,24 @@ def _registered(packed: Any, config: Config, model: InputModel) -> tuple[Any, ..
 
 def _packed(windows: Sequence[Window]) -> tuple[Any, ...]:
     """
-    Return windows and the columns of all their observations.
+    Return windows, and the observations of all of them as one table.
 
-    A few large arrays are pickled faster than many small ones. In place of its observations a
-    window holds the number of points of each.
+    In place of its observations a window holds their number.
 
     """
-    heads = []
-    for window in windows:
-        counts = [len(observation.points) for observation in window.observations]
-        heads.append(window._replace(observations=cast(Any, counts)))
-    observations = [o for window in windows for o in window.observations]
-    stamps, boxes, points, delays, origins, *others = zip(*observations, strict=True)
-    return (
-        heads,
-        stamps,
-        np.array(boxes),
-        np.concatenate(points),
-        np.concatenate(delays),
-        stack_origins(origins),
-        *others,
-    )
+    tables, rows = joined([item for window in windows for item in window.observations])
+    heads = [
+        window._replace(observations=cast(Any, len(window.observations))) for window in windows
+    ]
+    return heads, Observations.concatenated(tables).take(rows)
 
 
-def _unpacked(heads: list[Any], *columns: Any) -> list[Window]:
+def _unpacked(heads: list[Any], table: Observations) -> list[Window]:
     """Return the windows that `_packed` was given."""
-    stamps, boxes, points, delays, *others = columns
-    counts = [count for head in heads for count in head.observations]
-    ends = accumulate(counts, initial=0)
-    parts = [slice(begin, end) for begin, end in pairwise(ends)]
-    observations = map(
-        Observation,
-        stamps,
-        boxes,
-        [points[part] for part in parts],
-        [delays[part] for part in parts],
-        *others,
-    )
+    rows = iter(range(len(table.boxes)))
     return [
-        head._replace(observations=list(islice(observations, len(head.observations))))
+        head._replace(
+            observations=[Observation(table, row) for row in islice(rows, head.observations)]
+        )
         for head in heads
     ]

@@ -11,12 +11,12 @@ from boxreg_ros.core.box_time import (
     swept,
 )
 from boxreg_ros.core.metrics import iou_3d
-from boxreg_ros.core.observation import Observation
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.scenarios import highway
 from boxreg_ros.structures import Sweep
 import numpy as np
 import pytest
+from scenes import observation
 
 BOX = np.array([20.0, 0, 0, 4, 2, 1.5, 0, 0, 0])
 
@@ -48,7 +48,7 @@ def seen(known, velocity, delays):
     delays = np.broadcast_to(delays, MIN_VOTE_POINTS).astype(np.float32)
     sight = float(np.median(delays))
     points = surface() + np.outer(delays - sight * (known == 'sight'), velocity)
-    return Observation(0, BOX, points, delays, np.zeros((1, 3)), np.nan, len(points), sight)
+    return observation(boxes=BOX, points=points, delays=delays, sights=sight)
 
 
 @pytest.mark.parametrize('known', ['stamp', 'sight'])
@@ -58,7 +58,9 @@ def test_points_on_the_faces_decide(known):
     assert evidence.resolved(Config()).sampling.box_time == 'sight'
     velocity = np.array([30.0, 0, 0])
     found = seen(known, velocity, -0.04)
-    few = found._replace(points=found.points[1:], delays=found.delays[1:])
+    few = observation(
+        boxes=BOX, points=found.points[1:], delays=found.delays[1:], sights=found.sight
+    )
     for _ in range(MIN_VOTES):
         evidence.add(found, 0.1 * velocity)  # slow
         evidence.add(few, velocity)

@@ -1,7 +1,7 @@
 """Observations of boxes in a sweep, against values calculated by hand and plain loops."""
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.observation import farthest_point_sample, observe
+from boxreg_ros.core.observation import farthest_point_sample, Observation, observe
 from boxreg_ros.structures import Sweep
 import numpy as np
 import pytest
@@ -17,7 +17,8 @@ def sweep(points, **more):
 
 def observed(points, *boxes, changes=None, **more):
     config = Config().updated(changes or {})
-    return observe(sweep(points, **more), np.array(boxes), STAMP_NS, config)
+    table = observe(sweep(points, **more), np.array(boxes), STAMP_NS, config)
+    return [Observation(table, row) for row in range(len(boxes))]
 
 
 def near(*offsets):
@@ -109,7 +110,7 @@ def test_the_crop_is_the_same_at_any_position(x, y, kind):
         box = np.r_[center, CAR[3:6], 0, 0, yaw]
         scan = Sweep(STAMP_NS, 'odom', (center + offsets).astype(kind))
         config = Config().updated({'sampling.points': 10000})
-        (seen,) = observe(scan, box[None], STAMP_NS, config)
+        seen = Observation(observe(scan, box[None], STAMP_NS, config), 0)
         known = offsets[(np.abs(offsets[:, 0]) < a) & (np.abs(offsets[:, 1]) < b)]
         # At (4000, -7000) numbers of 32 bits are 0.0005 m apart.
         np.testing.assert_allclose(rows(seen.points), rows(known), atol=5e-4)
@@ -358,9 +359,10 @@ def test_a_box_is_seen_at_the_median_time_of_its_points():
 def test_an_observation_of_another_box_keeps_its_points_in_place():
     (seen,) = observed([near([1, 0, 0])], CAR, origin=np.array([0.0, 0, 2]))
     shift = np.array([0.5, 0, 0])
-    moved = seen.relative_to(CAR - [*shift, 0, 0, 0, 0, 0, 0], shift)
+    other = (CAR - [*shift, 0, 0, 0, 0, 0, 0])[None]
+    moved = seen.table.relative_to(other, shift[None])
     assert moved.points.tolist() == [[1.5, 0, 0]]
-    assert moved.origins.tolist() == (seen.origins + shift).tolist()
-    same = seen.relative_to(CAR, np.zeros(3))
-    assert same.points is seen.points
-    assert same.box is CAR
+    assert moved.origins[0].tolist() == (seen.origins + shift).tolist()
+    same = seen.table.relative_to(other, np.zeros((1, 3)))
+    assert same.points is seen.table.points
+    assert same.boxes is other

@@ -21,7 +21,7 @@ from boxreg_ros.core.window import stack_windows
 from boxreg_ros.structures import POSE
 import numpy as np
 import pytest
-from scenes import drive, EXTENT, problem_of, returns, track_of, window_of
+from scenes import changed, drive, EXTENT, problem_of, returns, track_of, window_of
 import torch
 
 D, NO_OFFSETS = torch.float64, FaceOffsets(*torch.zeros(3, 6))
@@ -169,7 +169,7 @@ def test_an_ill_conditioned_window_does_not_affect_others():
     # Stamps a nanosecond apart let the curvature lose its definiteness in rounding.
     many = windows()
     known = register(many, ALONE, InputModel(ALONE.faces))
-    bad = [o._replace(stamp_ns=i) for i, o in enumerate(many[2].observations)]
+    bad = [changed(o, stamps_ns=i) for i, o in enumerate(many[2].observations)]
     many[2] = many[2]._replace(observations=bad)
     found = register(many, ALONE, InputModel(ALONE.faces))
     for i in (0, 1, 3):
@@ -658,7 +658,7 @@ def test_a_failed_window_leaves_no_prior():
     # All observations have one stamp, which the registrar refuses: no speed is finite. The other
     # window still leaves a prior.
     many = [window(drive(10), 0), window(drive(10, start=(-9.0, 3.0, -1.0)), 1)]
-    bad = [o._replace(stamp_ns=0) for o in many[0].observations]
+    bad = [changed(o, stamps_ns=0) for o in many[0].observations]
     many[0] = many[0]._replace(observations=bad)
     failed, found = register(many, ALONE, InputModel(ALONE.faces))
     assert set(failed.reasons) == {'not_finite'}

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.observation import observe
+from boxreg_ros.core.observation import Observation, observe
 from boxreg_ros.core.track_window import Window
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, Floats, Sweep
@@ -70,7 +70,8 @@ def make_windows(
             assert track.sensor_origins is not None
             repeat = track.points[i][np.arange(max(points, 1)) % len(track.points[i])]
             sweep = Sweep(int(track.stamps_ns[i]), '', repeat, None, track.sensor_origins[i])
-            observations += observe(sweep, track.boxes[i : i + 1], sweep.stamp_ns, config)
+            seen = observe(sweep, track.boxes[i : i + 1], sweep.stamp_ns, config)
+            observations.append(Observation(seen, 0))
         windows.append(Window(str(seed), 'car', observations, length, np.zeros((0, 9))))
         truth.append(scene.truth.boxes[first : first + length])
     return windows, truth

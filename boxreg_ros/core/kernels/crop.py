@@ -152,28 +152,17 @@ def flat_height(heights, quantiles, flatness, min_points):
 
 
 @kernel
-def road_heights(owner, height, offset, outside, half, numbers):
+def road_heights(owner, height, is_beside, n, numbers):
     """Return the height of the road beside each of n boxes (n,); NaN where not found [m]."""
-    n = len(half)
-    beside = np.empty(len(owner), np.bool_)
-    square = np.hypot(half[:, 0], half[:, 1]) + numbers.road_width
     first = np.zeros(n + 1, np.int64)
     for k in range(len(owner)):
-        box = owner[k]
-        aside = max(outside[k, 0], outside[k, 1])
-        beside[k] = (
-            aside > numbers.road_gap
-            and max(aside, outside[k, 2]) < numbers.road_width
-            and abs(height[k]) < numbers.road_range
-            and max(abs(offset[k, 0]), abs(offset[k, 1])) < square[box]
-        )
-        first[box + 1] += beside[k]
+        first[owner[k] + 1] += is_beside[k]
     for box in range(n):
         first[box + 1] += first[box]
     place = first[:-1].copy()
     levels = np.empty(first[-1])
     for k in range(len(owner)):
-        if beside[k]:
+        if is_beside[k]:
             levels[place[owner[k]]] = height[k]
             place[owner[k]] += 1
     road = np.empty(n)
@@ -260,31 +249,76 @@ def own_points(points, centers, rotations, half, reach, numbers):
         Points inside each box.
 
     """
-    row, owner, offset, outside = crop(points, centers, rotations, half, reach, numbers.margin)
-    height = np.empty(len(row))
-    depth = np.empty(len(row))
-    num_inside = np.zeros(len(half), np.int64)
-    for k in range(len(row)):
-        R = rotations[owner[k]]
-        height[k] = half[owner[k], 2]
-        for j in range(3):
-            height[k] += R[j, 2] * offset[k, j]
-        depth[k] = max(outside[k, 0], outside[k, 1], outside[k, 2])
-        num_inside[owner[k]] += depth[k] <= 0.0
-    least = least_depths(row, depth)
-    road = np.full(len(half), np.nan)
-    if numbers.has_road:
-        road = road_heights(owner, height, offset, outside, half, numbers)
+    n = len(half)
+    side = side_of(points.shape[1])
+    first, boxes = raster(centers, reach, side)
+    near, cells = near_points(points, first, side)
+    capacity = 0
+    for cell in cells:
+        capacity += first[cell + 1] - first[cell]
+    row = np.empty(capacity, np.int32)
+    owner = np.empty(capacity, np.int32)
+    x = np.empty(capacity)
+    depth = np.empty(capacity)  # outside of the face that the point is least inside of
+    height = np.empty(capacity)  # above the bottom of the box, along its z axis
+    is_beside = np.empty(capacity, np.bool_)
+    num_inside = np.zeros(n, np.int64)
+    square = np.hypot(half[:, 0], half[:, 1]) + numbers.road_width
     P = 0
-    x = np.empty(len(row))
-    for k in range(len(row)):
+    for k in range(len(near)):
+        for place in range(first[cells[k]], first[cells[k] + 1]):
+            i, box = near[k], boxes[place]
+            dx = points[0, i] - centers[box, 0]
+            dy = points[1, i] - centers[box, 1]
+            dz = points[2, i] - centers[box, 2]
+            if abs(dx) > reach[box, 0] or abs(dy) > reach[box, 1] or abs(dz) > reach[box, 2]:
+                continue
+            # No view of the rotation of a box: counting its references takes longer than this.
+            up = rotations[box, 0, 2] * dx + rotations[box, 1, 2] * dy + rotations[box, 2, 2] * dz
+            u = (
+                abs(
+                    rotations[box, 0, 0] * dx
+                    + rotations[box, 1, 0] * dy
+                    + rotations[box, 2, 0] * dz
+                )
+                - half[box, 0]
+            )
+            v = (
+                abs(
+                    rotations[box, 0, 1] * dx
+                    + rotations[box, 1, 1] * dy
+                    + rotations[box, 2, 1] * dz
+                )
+                - half[box, 1]
+            )
+            w = abs(up) - half[box, 2]
+            aside = max(u, v)
+            deep = max(aside, w)
+            if deep < numbers.margin:
+                high = half[box, 2] + up
+                row[P], owner[P] = i, box
+                x[P], depth[P], height[P] = dx, deep, high
+                is_beside[P] = (
+                    (aside > numbers.road_gap)
+                    & (deep < numbers.road_width)
+                    & (abs(high) < numbers.road_range)
+                    & (max(abs(dx), abs(dy)) < square[box])
+                )
+                num_inside[box] += deep <= 0.0
+                P += 1
+    least = least_depths(row[:P], depth[:P])
+    road = np.full(n, np.nan)
+    if numbers.has_road:
+        road = road_heights(owner[:P], height[:P], is_beside[:P], n, numbers)
+    own = 0
+    for k in range(P):
         ground = road[owner[k]] if road[owner[k]] == road[owner[k]] else 0.0
         if (
             depth[k] < numbers.own_margin
             and depth[k] <= least[k] + numbers.ownership_tolerance
             and height[k] > ground + numbers.clearance
         ):
-            row[P], owner[P], x[P] = row[k], owner[k], offset[k, 0]
-            P += 1
-    order = sorted_by_x(owner[:P], x[:P], len(half))
+            row[own], owner[own], x[own] = row[k], owner[k], x[k]
+            own += 1
+    order = sorted_by_x(owner[:own], x[:own], n)
     return row[order], owner[order], road, num_inside

@@ -27,15 +27,22 @@ FAR_SENSOR = 1e6
 
 
 @kernel
-def add_candidate(depth, index, best_depth, best_index, count):
-    """Insert a point into the `count` smallest depths, ascending; equal ones keep their order."""
-    place = count - 1
-    while place > 0 and depth < best_depth[place - 1]:
-        best_depth[place] = best_depth[place - 1]
-        best_index[place] = best_index[place - 1]
-        place -= 1
-    best_depth[place] = depth
-    best_index[place] = index
+def fill_candidates(depth, m, numbers, index):
+    """
+    Write which of m points may be outermost on a face; return how many, and their largest depth.
+
+    Those further behind the outermost one than `max_depth` are on another surface.
+
+    """
+    limit = numbers.deepest - numbers.max_depth
+    for i in range(m):
+        limit = min(limit, depth[i])
+    limit += numbers.max_depth
+    count = 0
+    for i in range(m):
+        index[count] = i
+        count += depth[i] <= limit
+    return count, limit
 
 
 @kernel
@@ -89,16 +96,23 @@ def outermost_points(m, wanted, numbers, work, moments):
     Writes their second moments (5, 4, 4), how many stand for each face, and their mean depth.
 
     """
-    points, best_depth, best_index = work.moved, work.best_depth, work.best_index
+    points, candidates = work.moved, work.candidates
+    best_depth, best_index = work.best_depth, work.best_index
     for face in range(FACES):
         own_strip, depth = work.strip[numbers.strip_axis[face]], work.depth[face]
-        limit = numbers.deepest
+        count, limit = fill_candidates(depth, m, numbers, candidates)
         best_depth[:, :wanted] = NOWHERE
-        for i in range(m):
-            d = depth[i]
-            if d <= limit and d < best_depth[own_strip[i], wanted - 1]:
-                add_candidate(d, i, best_depth[own_strip[i]], best_index[own_strip[i]], wanted)
-                limit = min(limit, d + numbers.max_depth)
+        for candidate in range(count):
+            i = candidates[candidate]
+            d, s = depth[i], own_strip[i]
+            place = wanted - 1
+            if d < best_depth[s, place]:
+                while place > 0 and d < best_depth[s, place - 1]:
+                    best_depth[s, place] = best_depth[s, place - 1]
+                    best_index[s, place] = best_index[s, place - 1]
+                    place -= 1
+                best_depth[s, place] = d
+                best_index[s, place] = i
         number = 0
         total = 0.0
         moment = moments[face]
@@ -256,6 +270,8 @@ class FaceWork(NamedTuple):
         Strip that each point lies in, along x and along y.
     depth : array, shape (5, M)
         See `fill_depths`.
+    candidates : array, shape (M + 1,)
+        Points that may be outermost on one face.
     best_depth, best_index : array
         The outermost points of each strip of one face.
     number, mean_depth : array, shape (5,)
@@ -268,6 +284,7 @@ class FaceWork(NamedTuple):
     excess: Any
     strip: Any
     depth: Any
+    candidates: Any
     best_depth: Any
     best_index: Any
     number: Any
@@ -281,7 +298,7 @@ def empty_face_work(begin, end, windows, numbers):
     size = ceil(max(numbers.min_points, numbers.share * M)) + 1
     return FaceWork(
         np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),
-        np.empty((FACES, M)), np.empty((numbers.strips, size)),
+        np.empty((FACES, M)), np.empty(M + 1, np.int32), np.empty((numbers.strips, size)),
         np.empty((numbers.strips, size), np.int64), np.empty(FACES, np.int64), np.empty(FACES),
     )  # fmt: skip
 

@@ -1,0 +1,43 @@
+"""
+Rows of tables: what belongs to one item among arrays that hold the same of many.
+
+A table is a named tuple whose fields have one row for each of its items. Items are given as pairs
+of a table and a row in it: many small arrays take longer to stack than a few large ones.
+
+"""
+
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import Any
+
+from boxreg_ros.structures import Ints
+import numpy as np
+
+
+def joined(items: Sequence[tuple[Any, int]]) -> tuple[list[Any], Ints]:
+    """
+    Return the different tables of some items, and the row of each item in their concatenation.
+
+    Parameters
+    ----------
+    items : sequence of n pairs
+        Table, and row in it.
+
+    Returns
+    -------
+    tables : list
+        In the order of their first item.
+    rows : array, shape (n,)
+        Of the items, in the concatenation of `tables`.
+
+    """
+    of_id = {id(table): table for table, _ in items}
+    lengths = [len(table[0]) for table in of_id.values()]
+    first = dict(zip(of_id, accumulate(lengths, initial=0), strict=False))
+    return list(of_id.values()), np.array([first[id(table)] + row for table, row in items], int)
+
+
+def column(tables: Sequence[Any], name: str) -> Any:
+    """Return the field `name` of the concatenation of `tables`; of one table, no copy."""
+    parts = [getattr(table, name) for table in tables]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
