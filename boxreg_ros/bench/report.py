@@ -1,15 +1,16 @@
 """
 `boxreg bench report`: how soon `report.html` is painted, and how smoothly it steps.
 
-Each report is opened in a headless Chromium. Without a GPU Chromium draws by software, so frame
-times there are an upper limit; beside them are those of a page with one changing number.
+Each report is opened in a headless Chromium and draws without a GPU in two ways: by the processor,
+as Chromium does by itself on a machine without a GPU, and by an emulated GPU, which is an upper
+limit of the frame times. Beside them are those of a page with one changing number.
 
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 import json
 import os
@@ -28,6 +29,14 @@ import numpy as np
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
 BROWSER_OPTIONS = ('--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
 """Root needs ``--no-sandbox``; the others draw WebGL without a GPU."""
+COMPOSITORS = {'processor': ('--disable-gpu-compositing',), 'emulated GPU': ()}
+"""
+What puts the parts of the page together, and the options for it.
+
+Chromium leaves that to the processor where it finds no GPU. The emulated GPU is SwiftShader, which
+the options for WebGL make it use for all of the page.
+
+"""
 VIEWPORT = {'width': 1366, 'height': 800}
 """Size of the window [CSS pixels]: a small laptop."""
 QUICK = ('--set=solver.rounds=1', '--set=solver.iterations=3', '--formats=csv')
@@ -97,7 +106,10 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print."""
     report: dict[str, Any] = {
         'load before': os.getloadavg()[0],
-        'page of one number': {'frame [ms]': _reference_frame()},
+        'page of one number': {
+            name: {'frame [ms]': _reference_frame(options)}
+            for name, options in COMPOSITORS.items()
+        },
     }
     with TemporaryDirectory(prefix='boxreg-') as name:
         folder = Path(name)
@@ -123,9 +135,9 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
     Returns
     -------
     found : dict
-        ``drawing [s]`` and ``size [MB]`` of the report; ``first paint [ms]`` from the start of
-        the page; ``script of a step``, ``longest script of a step`` and ``frame`` while stepping
-        [ms], ``frames per second``, and the ``part of late frames``.
+        ``drawing [s]`` and ``size [MB]`` of the report. By `COMPOSITORS`: ``first paint [ms]``
+        from the start of the page; ``script of a step``, ``longest script of a step`` and
+        ``frame`` while stepping [ms], ``frames per second``, and the ``part of late frames``.
 
     Raises
     ------
@@ -139,7 +151,16 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
         raise RecordingError(f'{recording}: {done.stderr.strip()}')
     summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
     page = out / REPORT
-    with opened(page.as_uri()) as browser:
+    return {
+        'drawing [s]': summary['seconds']['report'],
+        'size [MB]': page.stat().st_size / 1e6,
+        **{name: _stepped(page, options) for name, options in COMPOSITORS.items()},
+    }
+
+
+def _stepped(page: Path, options: Sequence[str]) -> dict[str, float]:
+    """Return the time of the first paint of a page, and the times of its steps."""
+    with opened(page.as_uri(), options) as browser:
         paint = browser.wait_for_function(FIRST_PAINT, polling=100).json_value()
         browser.evaluate('openTrack(DATA.tracks.findIndex(track => track.boxes > 1))')
         browser.wait_for_function('view.space && view.charts', timeout=120_000)
@@ -147,8 +168,6 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
         starts, scripts = browser.evaluate(STEPPING, STEPS)
     frames = np.diff(starts)
     return {
-        'drawing [s]': summary['seconds']['report'],
-        'size [MB]': page.stat().st_size / 1e6,
         'first paint [ms]': paint,
         'script of a step [ms]': float(np.median(scripts)),
         'longest script of a step [ms]': float(np.max(scripts)),
@@ -158,9 +177,9 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
     }
 
 
-def _reference_frame() -> float:
+def _reference_frame(options: Sequence[str]) -> float:
     """Return the median time of a frame of a page with one changing number [ms]."""
-    with _browser() as browser:
+    with _browser(options) as browser:
         page = browser.new_page(viewport=VIEWPORT)
         page.set_content('<body></body>')
         starts = page.evaluate(CHANGING_TEXT, STEPS)
@@ -168,9 +187,9 @@ def _reference_frame() -> float:
 
 
 @contextmanager
-def opened(url: str) -> Iterator[Any]:
+def opened(url: str, options: Sequence[str]) -> Iterator[Any]:
     """
-    Yield a page of a headless browser when its script is ready.
+    Yield a page of a headless browser, with some `options`, when its script is ready.
 
     Raises
     ------
@@ -178,7 +197,7 @@ def opened(url: str) -> Iterator[Any]:
         If the browser or the package that drives it is not installed.
 
     """
-    with _browser() as browser:
+    with _browser(options) as browser:
         page = browser.new_page(viewport=VIEWPORT)
         page.goto(url)
         page.wait_for_selector('html[data-ready]', timeout=120_000)
@@ -186,8 +205,8 @@ def opened(url: str) -> Iterator[Any]:
 
 
 @contextmanager
-def _browser() -> Iterator[Any]:
-    """Yield a headless Chromium."""
+def _browser(options: Sequence[str]) -> Iterator[Any]:
+    """Yield a headless Chromium with some `options` beside `BROWSER_OPTIONS`."""
     executable = next(filter(None, map(shutil.which, BROWSERS)), None)
     if executable is None:
         raise ConfigError(
@@ -201,6 +220,8 @@ def _browser() -> Iterator[Any]:
             f'bench report needs playwright: pip install playwright ({error})'
         ) from None
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=executable, args=BROWSER_OPTIONS)
+        browser = driver.chromium.launch(
+            executable_path=executable, args=[*BROWSER_OPTIONS, *options]
+        )
         yield browser
         browser.close()

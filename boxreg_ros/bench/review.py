@@ -18,10 +18,11 @@ from typing import Any
 
 from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
 from boxreg_ros.config import Config
-from boxreg_ros.core.metrics import iou_3d, pose_errors
+from boxreg_ros.core.metrics import iou_3d, pose_errors, PoseErrors
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
+from boxreg_ros.offline.consistency import CONSISTENCY_VARIABLES
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, median, TrackChanges
 from boxreg_ros.review.decisions import Corrections, Decision
@@ -76,7 +77,8 @@ def measure(drive: Drive) -> dict[str, Any]:
         Number of ``tracks`` and of ``bad`` ones; by order the ``shares`` of bad tracks within each
         of `CUTS`; mean 3D IoU of bad tracks ``before`` and ``after`` one box is pinned, and the
         part ``gained`` of what is missing. Pinned boxes do not count. ``constant`` is the part
-        that would be gained without the errors that are constant along a track.
+        that would be gained without the errors that are constant along a track, ``left`` the
+        root mean square of these errors after pinning [m, rad].
 
     """
     tracks = [track for track in refined_tracks(drive) if track.track_id]
@@ -120,7 +122,7 @@ def refined_tracks(drive: Drive) -> list[TrackChanges]:
     return changes.tracks()
 
 
-def _gain(drive: Drive, bad: Sequence[TrackChanges], pins: Mapping[str, int]) -> dict[str, float]:
+def _gain(drive: Drive, bad: Sequence[TrackChanges], pins: Mapping[str, int]) -> dict[str, Any]:
     """Return the 3D IoU of `bad` tracks before and after `pins`, and the parts gained."""
     corrected = refined_tracks(with_pins(drive, pins))
     pinned = [track for track in corrected if track.track_id in pins]
@@ -134,7 +136,19 @@ def _gain(drive: Drive, bad: Sequence[TrackChanges], pins: Mapping[str, int]) ->
         'after': after,
         'gained': (after - before) / missing,
         'constant': (bound - before) / missing,
+        'left': _constant_errors(drive, pinned),
     }
+
+
+def _constant_errors(drive: Drive, tracks: Sequence[TrackChanges]) -> dict[str, float]:
+    """Return the root mean square over tracks of their mean errors [m, rad]."""
+    means = []
+    for track in tracks:
+        _, errors = _errors(drive, track)
+        yaw = errors.rotation[:, 2:]
+        means.append(np.hstack([errors.translation, yaw, errors.extent]).mean(axis=0))
+    values = np.sqrt(np.mean(np.square(means), axis=0))
+    return dict(zip(CONSISTENCY_VARIABLES, values.tolist(), strict=True))
 
 
 def _without_constant_error(drive: Drive, track: TrackChanges) -> TrackChanges:
@@ -144,17 +158,22 @@ def _without_constant_error(drive: Drive, track: TrackChanges) -> TrackChanges:
     A pinned box shows the error at its stamp: for the other stamps it shows what is constant.
 
     """
-    row_of = _rows_of_truth(drive.truth)
-    keys = [(stamp_ns, track.track_id) for stamp_ns in track.stamps_ns.tolist()]
-    rows = [i for i, key in enumerate(keys) if key in row_of]
-    true = drive.truth.boxes[[row_of[keys[i]] for i in rows]]
+    rows, errors = _errors(drive, track)
     boxes = track.boxes.copy()
-    errors = pose_errors(boxes[rows], true)
-    axes = matrix_from_rpy(true[:, ROLL:])
+    axes = matrix_from_rpy(boxes[rows, ROLL:] - errors.rotation)
     boxes[rows, X : Z + 1] -= axes @ errors.translation.mean(axis=0)
     boxes[rows, ROLL:] -= errors.rotation.mean(axis=0)
     boxes[rows, BOX_EXTENT] -= errors.extent.mean(axis=0)
     return replace(track, boxes=boxes)
+
+
+def _errors(drive: Drive, track: TrackChanges) -> tuple[list[int], PoseErrors]:
+    """Return the rows of a track that have a true box, and their errors."""
+    row_of = _rows_of_truth(drive.truth)
+    keys = [(stamp_ns, track.track_id) for stamp_ns in track.stamps_ns.tolist()]
+    rows = [i for i, key in enumerate(keys) if key in row_of]
+    true = drive.truth.boxes[[row_of[keys[i]] for i in rows]]
+    return rows, pose_errors(track.boxes[rows], true)
 
 
 def _rows_of_truth(truth: BoxTable) -> dict[tuple[int, str], int]:
@@ -284,3 +303,5 @@ def _print(title: str, found: dict[str, Any]) -> None:
     names = ('before', 'after', 'gained', 'constant')
     print(line('3D IoU, pinned', [pins[name] for name in names]))
     print('(before and after; part gained of 1 - IoU, and at most, without constant errors)')
+    print(line('constant errors', list(pins['left'])))
+    print(line('left [m, rad]', list(pins['left'].values())))

@@ -674,8 +674,8 @@ def _by_urgency(tracks: list[_Track]) -> list[_Track]:
     known = [track.covariance for track in tracks]
     covariances = np.array([UNKNOWN_COVARIANCE if c is None else c for c in known])  # (n, 6, 6)
     variances = covariances[:, :3, :3].trace(axis1=1, axis2=2)  # of the position [m^2]
-    tables, rows = joined([track.entries[-1].observation for track in tracks])  # of one sweep
-    sensors = column(tables, 'origins')[rows]  # (n, K, 3)
+    tables, rows = joined([track.entries[-1].observation for track in tracks])
+    sensors = Observations.concatenated(tables).origins[rows]
     distances = np.linalg.norm(sensors, axis=2).min(1)  # (n,) [m]; NaN, the last, if unknown
     return [tracks[i] for i in np.lexsort((distances, -variances, -carried)).tolist()]
 
