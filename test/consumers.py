@@ -1,5 +1,5 @@
 """
-Read label files with third-party libraries, which `test/consumers.txt` lists.
+Read label files and recordings with third-party libraries, which `test/consumers.txt` lists.
 
 The libraries have an environment of their own. Tests call `consumer`, which runs this file there
 with the name of a function below and its arguments; the program prints the result as JSON.
@@ -11,6 +11,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+MARKER_ARRAY = 'visualization_msgs.msg.MarkerArray'
 HOME = Path(__file__).resolve().parents[1] / '.venv-consumers'
 
 
@@ -302,6 +303,60 @@ def cloud(path):
     return {
         'fields': [item.name for item in vertex.properties],
         'rows': [[float(value) for value in row] for row in vertex.data.tolist()],
+    }
+
+
+def live_run(path):
+    """Return numbers of messages, clouds and markers of a recording as Rerun reads it."""
+    from rerun.chunk import McapReader
+
+    reader = McapReader(path)
+    tables = [
+        (chunk.entity_path, chunk.to_record_batch())
+        for chunk in reader.stream()
+        if not chunk.is_static
+    ]
+    return {
+        'messages': {channel.topic: channel.message_count for channel in reader.info().channels},
+        'clouds': [
+            {'number': len(points), 'low': points.min(0).tolist(), 'high': points.max(0).tolist()}
+            for points in _clouds_of(tables)
+        ],
+        'markers': [
+            [_marker_of(marker) for marker in rows[0]['markers']]
+            for rows in _column(tables, '/refined_markers', f'{MARKER_ARRAY}:message')
+        ],
+    }
+
+
+def _column(tables, entity, name):
+    """Return the values of a column of an entity, by the time of the log."""
+    values = [
+        row
+        for path, table in tables
+        if path == entity and name in table.schema.names
+        for row in zip(
+            table['message_log_time'].cast('int64').to_pylist(), table[name], strict=True
+        )
+    ]
+    return [value.as_py() for _, value in sorted(values, key=lambda row: row[0])]
+
+
+def _clouds_of(tables):
+    import numpy as np
+
+    for rows in _column(tables, '/points', 'Points3D:positions'):
+        yield np.array(rows)
+
+
+def _marker_of(marker):
+    position, scale, colour = marker['pose']['position'], marker['scale'], marker['color']
+    return {
+        **{name: marker[name] for name in ('ns', 'id', 'action', 'text')},
+        'frame': marker['header']['frame_id'],
+        'position': [position[axis] for axis in 'xyz'],
+        'scale': [scale[axis] for axis in 'xyz'],
+        'colour': [colour[channel] for channel in 'rgba'],
     }
 
 

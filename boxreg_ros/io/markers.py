@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import count
+from textwrap import fill
 from types import SimpleNamespace
 from typing import Any
 
@@ -41,6 +42,8 @@ NAMESPACES = (*BOX_NAMESPACES, FINAL, RECORDING)
 DEVIATIONS = 2.0  # that the ellipse of a covariance reaches out to
 TEXT_HEIGHT = 3.0
 """Height of the state of the recording above the sensor [m]; chosen."""
+TEXT_WIDTH = 30
+"""Longest line of that text [characters]; chosen: about 12 m, so that it hides few boxes."""
 ARROW, CUBE, SPHERE, LINE_STRIP, TEXT = 0, 1, 2, 4, 9
 OUTLINE = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
 """Signs of x and y along the outline of a face."""
@@ -269,11 +272,12 @@ def text_marker(frame_id: str, text: str, is_error: bool) -> Any:
     """Return the state of the recording as text above the sensor; an empty text deletes it."""
     m = ros_messages()
     above = np.array([0.0, 0.0, TEXT_HEIGHT])
+    lines = fill(text, TEXT_WIDTH)
     marker = m.Marker(
         header=m.Header(frame_id=frame_id),
         ns=RECORDING, type=TEXT, action=ADD if text else DELETE,
         pose=_pose(m, above, np.array([0.0, 0.0, 0.0, 1.0])), scale=m.Vector3(z=0.8),
-        color=_colour(m, RED if is_error else WHITE), text=text, frame_locked=True,
+        color=_colour(m, RED if is_error else WHITE), text=lines, frame_locked=True,
     )  # fmt: skip
     return m.MarkerArray(markers=[marker])
 
