@@ -226,6 +226,12 @@ def records_of(path, boxes_topic='/boxes'):
     return records
 
 
+def first_sweeps(records, number):
+    """Return the records up to the box message of a number."""
+    ends = [i for i, record in enumerate(records) if record.boxes_stamp_ns is not None]
+    return records[: ends[number - 1] + 1]
+
+
 def publishers_for(graph, records):
     """Make a publisher for every topic of a recording."""
     for topic, type_name in {record.topic: record.type_name for record in records}.items():

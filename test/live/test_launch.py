@@ -1,12 +1,13 @@
 """The launch file, started as `ros2 launch` starts it."""
 
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
 
-from paths import ROOT, SHARE
+from paths import ROOT, SHARE, TEST
 import pytest
 from ros_domain import next_domain
 from ros_graph import graph_in, numbers_changed, play, publishers_for, records_of
@@ -16,6 +17,8 @@ import yaml
 pytest.importorskip('launch_ros', reason='launch_ros is not installed')
 pytest.importorskip('launch_xml', reason='launch_xml is not installed')
 
+LAUNCH_FILE = SHARE / 'boxreg.launch.xml'
+LAUNCH_TEST = TEST / 'live' / 'sample_launch_test.py'
 ROS2_LAUNCH = """
 import sys
 from launch import LaunchDescription, LaunchService
@@ -56,14 +59,36 @@ def environment(tmp_path):
     }  # fmt: skip
 
 
-def started(environment, log, *arguments):
-    """Start the launch file with arguments; return the process."""
-    command = [sys.executable, '-c', ROS2_LAUNCH, str(SHARE / 'boxreg.launch.xml'), *arguments]
+@contextmanager
+def started(environment, log, *command):
+    """Start Python with arguments; yield the process, and end it and its children afterwards."""
     with log.open('w') as file:
-        return subprocess.Popen(
-            command, env=environment, cwd=log.parent, stdout=file, stderr=subprocess.STDOUT,
-            start_new_session=True,
+        process = subprocess.Popen(
+            [sys.executable, *command], env=environment, cwd=log.parent, stdout=file,
+            stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):  # all have ended
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def launched(environment, log, *arguments):
+    """Start the launch file with arguments, see `started`."""
+    return started(environment, log, '-c', ROS2_LAUNCH, str(LAUNCH_FILE), *arguments)
+
+
+def write_params(path, **settings):
+    """Write the installed parameters with short windows; no message is lost on a busy machine."""
+    params = yaml.safe_load((SHARE / 'params.yaml').read_text(encoding='utf-8'))
+    params['/**']['ros__parameters'] |= {
+        'window': 4, 'lag': 2, 'backlog': 60.0,
+        'deadline': 3600.0,  # all windows are solved on a busy machine
+        **settings,
+    }  # fmt: skip
+    path.write_text(yaml.safe_dump(params))
 
 
 def test_boxes_are_refined_and_sigint_ends_everything(environment, tmp_path):
@@ -71,35 +96,41 @@ def test_boxes_are_refined_and_sigint_ends_everything(environment, tmp_path):
         record._replace(topic=record.topic.replace('/points', '/lidar/points'))
         for record in records_of(Drive(sweeps=6).write(tmp_path / 'drive'))
     ]
-    settings = yaml.safe_load((SHARE / 'params.yaml').read_text(encoding='utf-8'))
-    settings['/**']['ros__parameters'] |= {
-        'window': 4, 'lag': 2, 'backlog': 60.0,
-        'deadline': 3600.0,  # all windows are solved on a busy machine
-        'qos_overrides./lidar/points.subscription.reliability': 'reliable',
-    }  # fmt: skip
-    (tmp_path / 'robot.yaml').write_text(yaml.safe_dump(settings))
+    write_params(
+        tmp_path / 'robot.yaml',
+        **{'qos_overrides./lidar/points.subscription.reliability': 'reliable'},
+    )
     log = tmp_path / 'launch.log'
     with graph_in(tmp_path) as graph:
         publishers_for(graph, records)
         early = graph.collect(DETECTIONS, '/front/refined_boxes')
         environment['ROS_DOMAIN_ID'] = str(graph.domain)
-        launched = started(
+        launching = launched(
             environment, log, 'points:=/lidar/points', 'boxes:=/boxes', 'namespace:=front',
             'name:=refiner', 'params:=robot.yaml', f'boxes_type:={DETECTIONS}',
         )  # fmt: skip
-        try:
+        with launching as process:
             graph.wait_until_connected()
             play(graph, records, early)
             assert numbers_changed(early, records) == [0, 0, *[2] * 4]
-            os.killpg(launched.pid, signal.SIGINT)  # as a terminal does
-            assert launched.wait(10.0) == 0
-        finally:
-            launched.kill()
-            launched.wait()
+            os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+            assert process.wait(10.0) == 0
     output = log.read_text()
     assert 'finished cleanly' in output, output
     assert 'front.refiner' in output
     assert 'ERROR' not in output
+
+
+def test_launch_testing_sees_refined_boxes_and_exit_codes(environment, tmp_path):
+    pytest.importorskip('launch_testing', reason='launch_testing is not installed')
+    reliable = {'qos_overrides./points.subscription.reliability': 'reliable'}
+    write_params(tmp_path / 'robot.yaml', **reliable)
+    environment['PYTHONPATH'] = os.pathsep.join([str(TEST), environment['PYTHONPATH']])
+    log = tmp_path / 'launch_test.log'
+    command = ('-m', 'launch_testing.launch_test', str(LAUNCH_TEST), 'params:=robot.yaml')
+    with started(environment, log, *command) as process:
+        assert process.wait(120.0) == 0, log.read_text()
+    assert log.read_text().count('Ran ') == 2  # while the node runs, and after its end
 
 
 @pytest.mark.parametrize(
@@ -115,8 +146,8 @@ def test_boxes_are_refined_and_sigint_ends_everything(environment, tmp_path):
 )
 def test_wrong_arguments_are_named(environment, tmp_path, argument, words):
     log = Path(tmp_path, 'launch.log')
-    launched = started(environment, log, argument)
-    launched.wait(60.0)
+    with launched(environment, log, argument) as process:
+        process.wait(60.0)
     lines = [line for line in log.read_text().splitlines() if all(w in line for w in words)]
     assert lines, log.read_text()
     assert 'Traceback' not in log.read_text()

@@ -12,7 +12,16 @@ from paths import BAGS, SHARE
 import pytest
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
-from ros_graph import DIAGNOSTICS, graph_in, play, publishers_for, QUICK, Record, records_of
+from ros_graph import (
+    DIAGNOSTICS,
+    first_sweeps,
+    graph_in,
+    play,
+    publishers_for,
+    QUICK,
+    Record,
+    records_of,
+)
 from ros_messages import DETECTIONS, MARKERS, POINTS, TF, typestore
 from rosbags.rosbag2 import StoragePlugin, Writer
 import yaml
@@ -41,7 +50,7 @@ class Run(NamedTuple):
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp('run')
-    records = first_sweeps(records_of(BAGS / 'street.mcap', '/detections'))
+    records = first_sweeps(records_of(BAGS / 'street.mcap', '/detections'), SWEEPS)
     taken = []
     with graph_in(folder) as graph:
         publishers_for(graph, records)
@@ -60,12 +69,6 @@ def run(tmp_path_factory):
         graph.wait(lambda: is_complete(taken), 'markers of all boxes and of the recording')
         published = {topic for topic, _ in graph.node.get_topic_names_and_types()}
     return Run(write(folder / 'bag', taken), taken, published)
-
-
-def first_sweeps(records):
-    """Return the records up to the boxes of sweep number `SWEEPS`."""
-    ends = [i for i, record in enumerate(records) if record.boxes_stamp_ns is not None]
-    return records[: ends[SWEEPS - 1] + 1]
 
 
 def record_topic(graph, topic, taken):
