@@ -1,5 +1,6 @@
 """The examples of the documentation run, and the pages show them as they are."""
 
+import os
 import re
 import subprocess
 import sys
@@ -17,9 +18,12 @@ def example(name):
 
 
 def output_of(example):
+    # An installation beside these sources, as that of colcon, may have no compiled kernels.
+    paths = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
     done = subprocess.run(
-        [sys.executable, example], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+        [sys.executable, example], env={**os.environ, 'PYTHONPATH': paths}, cwd=ROOT,
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -160,16 +160,17 @@ def print_differences(truth: BoxTable, found: Mapping[str, Matches | str]) -> No
         for name in measured:
             found_differences = differences(name, measured, truth, mask)
             if found_differences:
-                titles = ('BEV', '+-', '3D', '+-', 'tracks', 'ahead')
-                print(line(f'{name}, {scope}, minus', titles))
-            for other, difference in found_differences.items():
-                print(line(other, _difference_cells(difference)))
+                print_comparison(f'{name}, {scope}, minus', found_differences)
     print()
 
 
-def _difference_cells(d: Difference) -> tuple[float | str, ...]:
-    numbers = (d.iou_bev, d.iou_bev_error, d.iou_3d, d.iou_3d_error)
-    return (*(f'{number:.4f}' for number in numbers), str(d.tracks), str(d.tracks_ahead))
+def print_comparison(title: str, found: Mapping[str, Difference]) -> None:
+    """Print the differences of one method, one line for each method that it is compared with."""
+    print(line(title, ('BEV', '+-', '3D', '+-', 'tracks', 'ahead')))
+    for other, d in found.items():
+        numbers = (d.iou_bev, d.iou_bev_error, d.iou_3d, d.iou_3d_error)
+        counts = (str(d.tracks), str(d.tracks_ahead))
+        print(line(other, (*(f'{number:.4f}' for number in numbers), *counts)))
 
 
 def _plain(classes: Mapping[str, Scores]) -> dict[str, dict[str, float]]:

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.optimize import least_squares
-from scipy.sparse import csr_array, eye_array, kron, vstack
+from scipy.sparse import csr_array, eye, kron, vstack
 
 # Smoother: standard deviations.
 POSITION_DEVIATION = 0.3  # of the centre of an input box [m]
@@ -161,8 +161,8 @@ def _ctra_residuals(states: Floats, times: Floats, given: Floats) -> Floats:
 
 def _ctra_sparsity(n: int) -> Any:
     """Return which of the residuals of `_ctra_residuals` depend on which of the 6 n states."""
-    own = kron(eye_array(n), csr_array(np.eye(3, 6)))
-    steps = kron(eye_array(n - 1, n) + eye_array(n - 1, n, k=1), np.ones((6, 6)))
+    own = kron(eye(n), csr_array(np.eye(3, 6)))
+    steps = kron(eye(n - 1, n) + eye(n - 1, n, k=1), np.ones((6, 6)))
     return vstack([own, steps])
 
 

@@ -18,8 +18,8 @@ import numpy as np
 
 REFERENCE_METHODS = {
     'ours, early': ('input', 'smoothing, early'),
-    'ours, final': ('smoothing, final',),
-    'ours, track': ('smoothing only', 'CTRA smoothing', 'ours, final'),
+    'ours, final': ('input', 'smoothing, final'),
+    'ours, track': ('input', 'smoothing only', 'CTRA smoothing', 'ours, final'),
 }
 """Methods that each estimate must not lose to."""
 
@@ -31,6 +31,8 @@ class Difference:
 
     Attributes
     ----------
+    boxes : int
+        Number of true boxes.
     iou_bev, iou_bev_error, iou_3d, iou_3d_error : float
         Means, and their standard errors by `clustered_error`.
     tracks, tracks_ahead : int
@@ -38,12 +40,54 @@ class Difference:
 
     """
 
+    boxes: int
     iou_bev: float
     iou_bev_error: float
     iou_3d: float
     iou_3d_error: float
     tracks: int
     tracks_ahead: int
+
+
+@dataclass(frozen=True, slots=True)
+class PairedBoxes:
+    """
+    True boxes that two methods have.
+
+    Attributes
+    ----------
+    tracks : tuple of n str
+        Id of the track of each.
+    iou_bev, iou_3d : array, shape (n,)
+        IoU by the first method minus that by the second.
+
+    """
+
+    tracks: tuple[str, ...]
+    iou_bev: Floats
+    iou_3d: Floats
+
+    @classmethod
+    def pooled(cls, parts: Mapping[str, PairedBoxes]) -> PairedBoxes:
+        """Return the boxes of several drives, whose names become part of the ids."""
+        return cls(
+            tuple(f'{name}/{track}' for name, part in parts.items() for track in part.tracks),
+            np.concatenate([part.iou_bev for part in parts.values()]),
+            np.concatenate([part.iou_3d for part in parts.values()]),
+        )
+
+    def difference(self) -> Difference:
+        """Return the mean differences with their standard errors."""
+        sums = _sums_by_cluster(self.iou_bev, self.tracks)
+        return Difference(
+            boxes=len(self.tracks),
+            iou_bev=_mean(self.iou_bev),
+            iou_bev_error=clustered_error(self.iou_bev, self.tracks),
+            iou_3d=_mean(self.iou_3d),
+            iou_3d_error=clustered_error(self.iou_3d, self.tracks),
+            tracks=len(sums),
+            tracks_ahead=int((sums >= 0).sum()),
+        )
 
 
 def differences(
@@ -65,25 +109,19 @@ def differences(
 
     """
     return {
-        other: _difference(found[method], found[other], truth, scope)
+        other: paired(found[method], found[other], truth, scope).difference()
         for other in REFERENCE_METHODS.get(method, ())
         if other in found
     }
 
 
-def _difference(first: Matches, second: Matches, truth: BoxTable, scope: Mask) -> Difference:
+def paired(first: Matches, second: Matches, truth: BoxTable, scope: Mask) -> PairedBoxes:
+    """Return the true boxes in `scope` (n,) that two methods have, of n true boxes."""
     both = scope & first.is_matched & second.is_matched
-    tracks = [truth.track_ids[row] for row in first.rows[both]]
-    bev = (first.iou_bev - second.iou_bev)[both]
-    volume = (first.iou_3d - second.iou_3d)[both]
-    sums = _sums_by_cluster(bev, tracks)
-    return Difference(
-        iou_bev=_mean(bev),
-        iou_bev_error=clustered_error(bev, tracks),
-        iou_3d=_mean(volume),
-        iou_3d_error=clustered_error(volume, tracks),
-        tracks=len(sums),
-        tracks_ahead=int((sums >= 0).sum()),
+    return PairedBoxes(
+        tuple(truth.track_ids[row] for row in first.rows[both]),
+        (first.iou_bev - second.iou_bev)[both],
+        (first.iou_3d - second.iou_3d)[both],
     )
 
 

@@ -17,6 +17,7 @@ class Measurement(NamedTuple):
 MEASUREMENTS = {
     'paper': Measurement('paper', "the paper's experiment: its Table I and two figures"),
     'real': Measurement('accuracy', 'accuracy on recordings with known truth'),
+    'kinds': Measurement('kinds', 'what each class of objects gains, with standard errors'),
     'tracks': Measurement('tracks', 'broken tracks before and after each completing step'),
     'ablation': Measurement('ablation', 'accuracy without each ingredient of the method'),
     'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),

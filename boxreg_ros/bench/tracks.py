@@ -2,14 +2,15 @@
 `boxreg bench tracks`: broken tracks before and after each step of ``relabel --complete``.
 
 The tracks of each recording are broken by the same rules as in ``boxreg simulate --break``. All
-rows of a table have the same sweeps and the same broken boxes; each row has one step more.
+rows of a table have the same sweeps and the same broken boxes; each row has one step more. The
+first row is a reference: the tracks before they were broken, registered.
 
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 import math
 from pathlib import Path
@@ -22,12 +23,18 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.session import register
 from boxreg_ros.offline.completion import completed, first_pass
 from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.overlap import overlaps
 from boxreg_ros.offline.track_scores import track_scores, TrackScores
+from boxreg_ros.review.rules.overlap import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
-from boxreg_ros.structures import BoxArray, RefinedBoxes, REJECTED, Sweep
+from boxreg_ros.structures import BoxArray, Ints, RefinedBoxes, REJECTED, Sweep
 import numpy as np
 
 TITLES = ('recall', 'prec.', 'ids/obj', 'HOTA', 'IDF1', 'added', '3D added', 'ghosts', 'lost')
+ONE_LABEL = 'with one label'
+"""Objects of the truth without a second label at their place."""
+UNBROKEN = 'unbroken, refined'
+"""Row of the tracks before they were broken: the boxes that completion has to restore."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +49,8 @@ class Row:
     ghosts, lost : float
         Rejected part of the ghosts, and of the other boxes of the input; NaN without any.
     by_kind : dict of str to TrackScores
-        Scores of the boxes of each kind of object.
+        Scores of the boxes of each kind of object; and if some objects of the truth have two
+        labels, those of the `ONE_LABEL` others.
 
     """
 
@@ -85,17 +93,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the scores after each step, one table per recording."""
     report: dict[str, Any] = {}
-    rows_per_drive = 3 if args.coast else 2 + len(COMPLETE_STEPS)
+    rows_per_drive = 4 if args.coast else 3 + len(COMPLETE_STEPS)
     with progress_bar(len(args.data) * rows_per_drive, args) as bar:
         for folder in args.data:
-            drive = broken(Drive.read(folder), args.seed, args.ghosts, args.far_misses)
+            whole = Drive.read(folder)
+            drive = broken(whole, args.seed, args.ghosts, args.far_misses)
             if not args.json:
                 bar.clear()
                 print(f'{folder}: {len(drive.truth.boxes)} true boxes')
                 print(line('', TITLES))
             rows = {}
-            found = with_coast(drive, args.coast) if args.coast else after_each_step(drive)
-            for name, row in found:
+            for name, row in _rows(whole, drive, args.coast):
                 rows[name] = asdict(row.scores) | {
                     'ghosts_rejected': row.ghosts,
                     'lost': row.lost,
@@ -105,7 +113,8 @@ def run(args: argparse.Namespace) -> int:
                 if not args.json:
                     print(line(name, _cells(row)))
             if not args.json:
-                _print_kinds(row)
+                _print_kinds(UNBROKEN, rows[UNBROKEN]['by_kind'])
+                _print_kinds(name, rows[name]['by_kind'])
             report[str(folder)] = rows
     if args.json:
         print_json(report)
@@ -119,6 +128,13 @@ def broken(drive: Drive, seed: int, ghosts: float, far_misses: bool = False) -> 
     rng = np.random.default_rng(seed)
     arrays = break_tracks(drive.boxes, rng, ghosts, origins, far_misses)
     return replace(drive, boxes=tuple(arrays))
+
+
+def _rows(whole: Drive, drive: Drive, coast: float) -> Iterator[tuple[str, Row]]:
+    """Yield the scores of the registered tracks of the `whole` drive, then of the broken one."""
+    config = Config(estimate='final' if coast else 'track')
+    yield UNBROKEN, _row(_registered(_items(whole), config), whole)
+    yield from with_coast(drive, coast) if coast else after_each_step(drive)
 
 
 def after_each_step(drive: Drive) -> Iterator[tuple[str, Row]]:
@@ -178,7 +194,7 @@ def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
 
 
 def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScores]:
-    """Return the scores of the boxes of each kind of object that the truth has."""
+    """Return the scores of each kind of object that the truth has, and of objects `ONE_LABEL`."""
     scores = {}
     for kind in KINDS:
         true, found = (
@@ -187,7 +203,19 @@ def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScore
         )
         if len(true.boxes):
             scores[kind] = track_scores(found, true)
+    rows = rows_with_one_label(truth)
+    if len(rows) < len(truth.boxes):
+        scores[ONE_LABEL] = track_scores(predicted, truth, rows)
     return scores
+
+
+def rows_with_one_label(truth: BoxTable) -> Ints:
+    """Return the rows of objects that never share `DUPLICATE_IOU` with another one."""
+    doubles: set[str] = set()
+    for stamp in overlaps(truth, truth):
+        is_double = (stamp.iou >= DUPLICATE_IOU).sum(axis=1) > 1  # one is the box itself
+        doubles.update(truth.track_ids[row] for row in stamp.true[is_double])
+    return np.flatnonzero([track_id not in doubles for track_id in truth.track_ids])
 
 
 def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
@@ -197,11 +225,12 @@ def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
     return table.rows(np.array([status != REJECTED for status in table.status], bool))
 
 
-def _print_kinds(row: Row) -> None:
-    """Print the scores of each kind of object in the last row."""
-    print(line('last row, by kind', ('recall', 'prec.', 'added', '3D added', '3D others')))
-    for kind, s in row.by_kind.items():
-        print(line(kind, (s.recall, s.precision, str(s.added), s.added_iou, s.given_iou)))
+def _print_kinds(name: str, by_kind: Mapping[str, Mapping[str, float]]) -> None:
+    """Print the scores of each kind of object in the row of a `name`."""
+    print(line(name, ('recall', 'prec.', 'ids/obj', 'added', '3D added', '3D others')))
+    for kind, s in by_kind.items():
+        found = (s['recall'], s['precision'], s['ids_per_object'])
+        print(line(kind, (*found, str(s['added']), s['added_iou'], s['given_iou'])))
 
 
 def _cells(row: Row) -> tuple[float | str, ...]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import chain
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import ClassConfig, Config
 from boxreg_ros.core.arrowhead import LINK
@@ -228,7 +228,7 @@ class Problem(NamedTuple):
         """
         Return some windows with some of their observations only.
 
-        Marginalised observations are left out: their extents are not counted, their prior is kept.
+        Marginalised observations are left out, with their prior and their extents.
 
         Parameters
         ----------
@@ -253,9 +253,12 @@ class Problem(NamedTuple):
         row = torch.tensor(windows, device=device)[:, None]
         observed = {name: getattr(self, name)[row, column] for name in OBSERVED}
         observed['times'] = observed['times'] + PADDING_PERIOD * (~valid).cumsum(1)
-        shared = {name: getattr(self, name)[row[:, 0]] for name in OF_WINDOW}
-        shared['marginalised_extents'] = torch.zeros_like(shared['marginalised_extents'])
-        return self._replace(**observed, **shared, valid=valid)
+        kept = {name: getattr(self, name)[row[:, 0]] for name in OF_CLASS}
+        none: dict[str, Any] = {
+            name: self.boxes.new_zeros(()).expand(len(windows), *sizes)
+            for name, sizes in SIZES_OF_PRIOR.items()
+        }
+        return self._replace(**observed, **kept, **none, valid=valid)
 
     def thinned(self, points: float) -> 'Problem':
         """Return the problem with every n-th point: at least `points` per box, if there are."""
@@ -269,10 +272,14 @@ class Problem(NamedTuple):
 
 OBSERVED = ('boxes', 'start', 'times', 'first', 'counts', 'origins', 'ground', 'pinned')
 """Fields of `Problem` with one value per observation, besides `valid`."""
-OF_WINDOW = (
-    'prior_mean', 'prior_information', 'marginalised_extents', 'class_numbers', 'kind'
-)  # fmt: skip
-"""Fields of `Problem` with one value per window."""
+OF_CLASS = ('class_numbers', 'kind')
+"""Fields of `Problem` with the class of each window."""
+SIZES_OF_PRIOR = {
+    'prior_mean': (PRIOR_SIZE,),
+    'prior_information': (PRIOR_SIZE, PRIOR_SIZE),
+    'marginalised_extents': (4,),
+}
+"""Fields of `Problem` about marginalised observations, and the sizes of their values."""
 
 
 class State(NamedTuple):

@@ -68,6 +68,10 @@ is 50 m/s^2.
 """
 
 
+UNKNOWN_COVARIANCE = np.full((6, 6), inf)
+"""Covariance of a track without an estimate."""
+
+
 class BoxRegistrar:
     """
     Register the boxes of a stream to its sweeps.
@@ -333,7 +337,7 @@ class BoxRegistrar:
         self._settle_ended_tracks_beyond(max(0, limit - len(ready)))
         if len(ready) <= limit:
             return tracks
-        ready.sort(key=_Track.urgency)
+        ready = _by_urgency(ready)
         for track in ready[limit:]:
             track.carry(self._num_overlapping)
         return ready[:limit]
@@ -557,15 +561,6 @@ class _Track:
         """Return whether the newest observation is of `array`."""
         return self.entries[-1].array is array
 
-    def urgency(self) -> tuple[int, float, float]:
-        """Return the key that sorts tracks by the gain of solving them, highest gain first."""
-        variance = inf
-        if self.covariance is not None:
-            variance = float(np.trace(self.covariance[:3, :3]))  # of the position [m^2]
-        sensors = self.entries[-1].observation.origins
-        distance = float(np.linalg.norm(sensors, axis=1).min())  # NaN if unknown
-        return -self.num_carried, -variance, distance if distance >= 0 else inf
-
     def carry(self, length: int) -> None:
         """
         Leave the newest observation to a later window, which then starts from its input box.
@@ -671,6 +666,18 @@ class _Sighting(NamedTuple):
     track: _Track
     box: Floats
     row: int = -1
+
+
+def _by_urgency(tracks: list[_Track]) -> list[_Track]:
+    """Return tracks ordered by the gain of solving them, highest gain first."""
+    carried = np.array([track.num_carried for track in tracks])
+    known = [track.covariance for track in tracks]
+    covariances = np.array([UNKNOWN_COVARIANCE if c is None else c for c in known])  # (n, 6, 6)
+    variances = covariances[:, :3, :3].trace(axis1=1, axis2=2)  # of the position [m^2]
+    tables, rows = joined([track.entries[-1].observation for track in tracks])
+    sensors = Observations.concatenated(tables).origins[rows]
+    distances = np.linalg.norm(sensors, axis=2).min(1)  # (n,) [m]; NaN, the last, if unknown
+    return [tracks[i] for i in np.lexsort((distances, -variances, -carried)).tolist()]
 
 
 def _input_velocities(sightings: list[_Sighting], boxes: Floats, stamp_ns: int) -> Floats:

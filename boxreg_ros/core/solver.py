@@ -116,7 +116,7 @@ def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: Plan) -> S
     prior = extents = None
     if plan.marginalises:
         unknown = torch.full_like(problem.prior_mean, torch.nan)
-        information = torch.full_like(problem.prior_information, torch.nan)
+        information = torch.empty_like(problem.prior_information)  # without a step, of no use
         prior = MarginalPrior(unknown, unknown.clone(), information)
         first = pad(problem.boxes[:, 0, 3:6], (0, 1), value=1.0)
         extents = problem.marginalised_extents + first

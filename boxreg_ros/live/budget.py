@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from math import inf
 import time
@@ -26,10 +26,11 @@ BATCH_OVERHEAD = 25
 `boxreg bench speed`: 10 ms beside 0.4 ms a window."""
 RECENT = 10
 """Last batches and box arrays that times are estimated from; chosen: a second at 10 Hz."""
-OVERRUNS = 100
+OVERRUNS = 300
 """
-Ticks whose largest overrun is left as a reserve; derived: the next one exceeds it with a
-probability of 1 / 101, so that the deadline holds for 99 of 100 box arrays.
+Ticks whose second largest overrun is left as a reserve; derived: the next one exceeds it with a
+probability of 2 / 301, so that the deadline holds for 99 of 100 box arrays, and one interruption
+of the process in half a minute costs no windows.
 
 """
 LARGEST_RESERVE = 0.5
@@ -43,9 +44,9 @@ class TickBudget:
 
     The registrar reads no clock; this object does for it. The time for windows is what is left of
     the deadline after decoding and cropping, which have been done by then, less the time for
-    publishing in the tick before, less a reserve: the largest overrun of the recent ticks. The
-    time of a window is the second longest among the recent batches: a single interruption of the
-    process is ignored.
+    publishing, less a reserve for overruns. The times of a window and of publishing are the second
+    longest of `RECENT` ones, the reserve is the second largest overrun of `OVERRUNS` ticks: a
+    single interruption of the process is ignored.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class TickBudget:
         self._since = clock()
         self._solved_at = self._since
         self._planned_end = inf
-        self._publishing_time = 0.0
+        self._publishing_times = deque[float](maxlen=RECENT)  # [s]
         self._overruns = deque[float](maxlen=OVERRUNS)  # of the planned end [s]
         self._times = deque[float](maxlen=RECENT)  # per window [s]
         self._arrivals = deque[float](maxlen=RECENT)
@@ -89,7 +90,7 @@ class TickBudget:
         """End a tick, unless it has ended: its early boxes are published."""
         if self._solved_at:
             now = self._clock()
-            self._publishing_time = now - self._solved_at
+            self._publishing_times.append(now - self._solved_at)
             self._overruns.append(now - self._planned_end)
             self._solved_at = 0.0
 
@@ -97,11 +98,10 @@ class TickBudget:
         """Return how many windows may be solved; at least one, so that its time is measured."""
         if not self._times:
             return 1
-        reserve = max(0.0, min(LARGEST_RESERVE * self.seconds, max(self._overruns, default=0.0)))
+        reserve = max(0.0, min(LARGEST_RESERVE * self.seconds, _second_longest(self._overruns)))
         planned_end = self._since + self.seconds - reserve
-        time_left = planned_end - self._publishing_time - self._clock()
-        time_of_window = sorted(self._times)[-2:][0]
-        number = int(time_left / time_of_window) - BATCH_OVERHEAD
+        time_left = planned_end - _second_longest(self._publishing_times) - self._clock()
+        number = int(time_left / _second_longest(self._times)) - BATCH_OVERHEAD
         if number > 0:  # else the tick is late whatever is planned
             self._planned_end = planned_end
         return max(1, number)
@@ -130,3 +130,8 @@ class TickBudget:
         if num_solved:
             self._times.append((self._solved_at - begin) / (num_solved + BATCH_OVERHEAD))
         return estimates
+
+
+def _second_longest(times: Collection[float]) -> float:
+    """Return the second longest of some times, the longest of one, 0 of none."""
+    return sorted(times)[-2:][0] if times else 0.0

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 
-from boxreg_ros.allocation import keep_freed_memory
+from boxreg_ros.allocation import collect_rarely, keep_freed_memory
 from boxreg_ros.errors import BoxregError, ConfigError
 
 NAME = 'boxreg_node'
@@ -43,6 +43,7 @@ def main(args: Sequence[str] | None = None, is_managed: bool = False) -> int:
         return _fail(BoxregError(f'{error}: {WITHOUT_ROS}'), 1)
 
     keep_freed_memory()
+    collect_rarely()
     try:
         node = make_node(NAME, list(sys.argv[1:] if args is None else args), is_managed)
     except Exception as error:

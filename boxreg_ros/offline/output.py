@@ -11,7 +11,8 @@ from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.stamp_order import kept, Slot, StampOrder
 from boxreg_ros.labels import LabelFrame, LabelOutput, Provenance
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.offline.reader import ReadItem, Source
+from boxreg_ros.offline.background import Background
+from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.review.decisions import Corrections, read_decisions
@@ -25,13 +26,22 @@ from boxreg_ros.structures import (
 )
 import numpy as np
 
+ARRAYS_AHEAD = 256
+"""
+Most results that wait to be written, some 40 kB each with 64 boxes.
+
+A full window of all tracks returns the results of as many stamps at once.
+
+"""
+
 
 class Sink:
     """
     Collect results, bring them into the order of stamps and write each box array once.
 
     Every box array gets a ticket on its way to the registrar; its result is found by that
-    ticket, because several arrays may have the same stamp.
+    ticket, because several arrays may have the same stamp. Files are written in a thread, while
+    the registrar goes on; attributes are those of all results after the end of the block only.
 
     Parameters
     ----------
@@ -92,6 +102,9 @@ class Sink:
 
         self.changes = Changes(self._fixed_frame)
         self.points = PointCollector(request.config) if request.report else None
+        # Clouds would fill the memory while they wait.
+        waits = uses_one_core(request.config) or self._spool is not None
+        self._background = Background(0 if waits else ARRAYS_AHEAD)
         self._order = StampOrder()
         self._early: dict[object, RefinedBoxes] = {}  # by ticket, until the final estimate is
         self._last_ticket = 0
@@ -134,7 +147,8 @@ class Sink:
             if slot is not None:  # otherwise its early result has been taken
                 self._order.take(ticket, self.corrections.apply(slot.boxes, refined))
         for slot, result in self._order.ready():
-            self._put(result, slot)
+            early = self._early.pop(result.boxes.ticket, None)
+            self._background(self._put, result, slot, early)
 
     def __enter__(self) -> Sink:
         """Return the sink."""
@@ -143,7 +157,9 @@ class Sink:
     def __exit__(self, failure: object, *_: object) -> None:
         """Complete the files; after a failure the caller deletes them."""
         if failure is not None:
+            self._background.abandon()
             return
+        self._background.complete()
         if self.points is not None:
             self.points.flush()
         with self._clock('write'):
@@ -186,13 +202,13 @@ class Sink:
             self._order.expect(Slot(given, item.T_fixed_sensor, item.T_fixed_given, result))
         return item
 
-    def _put(self, refined: RefinedBoxes, slot: Slot) -> None:
-        """Count the boxes of one array and write them in all formats."""
+    def _put(self, refined: RefinedBoxes, slot: Slot, early: RefinedBoxes | None) -> None:
+        """Count the boxes of one array and write them in all formats; in the thread."""
         self.boxes_out += len(refined.status)
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
         self.heading_flips += _heading_flips(slot.boxes, refined)
-        self.changes.add(slot.boxes, refined, self._early.pop(refined.boxes.ticket, None))
+        self.changes.add(slot.boxes, refined, early)
         with self._clock('write'):
             self._output.write(self._frame(refined, slot))
 

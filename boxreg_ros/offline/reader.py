@@ -8,9 +8,8 @@ core; see `reader`.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Generator, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -20,6 +19,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.storage.record import Damage
+from boxreg_ros.offline.background import Background
 from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
@@ -278,12 +278,9 @@ class ReadAhead:
 
 def _read(request: Request, _: Receive, send: Send) -> None:
     """Send the messages, in a thread that waits for the receiver while others are read."""
-    sent: deque[Future[None]] = deque()
-    with ThreadPoolExecutor(1) as pool:
+    with Background(MESSAGES_AHEAD) as background:
         for message in _messages(request):
-            if len(sent) == MESSAGES_AHEAD:
-                sent.popleft().result()
-            sent.append(pool.submit(send, message))
+            background(send, message)
 
 
 def _messages(request: Request) -> Generator[Source | ReadItem | Findings]:

@@ -6,12 +6,15 @@ import json
 import sys
 
 from boxreg_ros import __version__, cli
+from boxreg_ros.bench import kinds
 from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
 from boxreg_ros.bench.review import _without_constant_error, with_pins
+from boxreg_ros.bench.tracks import ONE_LABEL, rows_with_one_label, scores_by_kind, UNBROKEN
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes
@@ -131,6 +134,24 @@ def test_real_prints_all_methods_and_groups(folder, capsys):
     assert set(report) == {'input', 'L-shape per sweep'} | smoothed
 
 
+def test_kinds_compares_each_class_with_input_and_smoothing(folder, capsys, monkeypatch):
+    monkeypatch.setattr(kinds, 'MIN_CLASS_BOXES', 10)
+    assert run('kinds', folder, '--json') == 0
+    found = json.loads(capsys.readouterr().out)['results'][str(folder)]
+    assert set(found) == {'car'}
+    assert set(found['car']) == {'ours, early', 'ours, final', 'ours, track'}
+    drive = Drive.read(folder)
+    methods = run_methods(drive, wanted=('ours',))
+    own, given = (match(methods[name], drive.truth, 1) for name in ('ours, track', 'input'))
+    is_car = own.is_matched & np.equal(own.class_names, 'car')
+    gain = found['car']['ours, track']['input']
+    assert gain['boxes'] == is_car.sum()
+    assert gain['iou_bev'] == pytest.approx((own.iou_bev - given.iou_bev)[is_car].mean())
+    assert set(found['car']['ours, final']) == {'input', 'smoothing, final'}
+    assert run('kinds', folder) == 0
+    assert 'ours, early, minus' in capsys.readouterr().out
+
+
 def test_real_refuses_folders_without_truth_or_recording(tmp_path, folder):
     with pytest.raises(RecordingError, match='expected a folder'):
         run('real', tmp_path / 'absent')
@@ -143,7 +164,8 @@ def test_paper_prints_table_one_and_draws_figures(tmp_path, capsys):
     pytest.importorskip('matplotlib', reason='the figures need matplotlib')
     assert run('paper', '--seeds', 1, '--steps', 8, '-o', tmp_path / 'figures') == 0
     text = capsys.readouterr().out
-    for method in ROWS | {'initial, published', 'refined, published'}:
+    held = {f'held extents, {estimate}' for estimate in ('early', 'final', 'track')}
+    for method in ROWS | held | {'initial, published', 'refined, published'}:
         # Per mode once in Table I and, unless published, once by range and once by points.
         assert text.count(method) == (2 if 'published' in method else 6), method
     figures = sorted(path.name for path in (tmp_path / 'figures').iterdir())
@@ -165,9 +187,11 @@ def test_paper_prints_table_one_and_draws_figures(tmp_path, capsys):
 
 
 def test_error_row_of_perfect_boxes():
-    truth = simulate('paper', seed=0, sweeps=6).truth
+    truth = simulate('paper', seed=0, sweeps=12).truth
     row = error_row(match(truth, truth), '3d')
-    np.testing.assert_allclose(row, [0] * 6 + [1] * 3, atol=1e-8)
+    np.testing.assert_allclose(row, [0] * 6 + [1] * 4, atol=1e-8)
+    few = truth.rows(np.arange(12) < 6)
+    assert np.isnan(error_row(match(few, few), '3d')[-1])
 
 
 def test_json_names_version_and_command(folder, capsys, monkeypatch):
@@ -227,15 +251,34 @@ def test_errors_that_are_constant_in_the_box_frame_are_removed(folder):
 def test_coasting_finds_missed_boxes(folder, capsys):
     assert run('tracks', folder, '--coast', 0.5, '--far-misses', '--json') == 0
     rows = json.loads(capsys.readouterr().out)['results'][str(folder)]
-    assert list(rows) == ['input', 'final', 'coast 0.5 s']
+    assert list(rows) == [UNBROKEN, 'input', 'final', 'coast 0.5 s']
     assert rows['final']['added'] == 0 < rows['coast 0.5 s']['added']
     assert rows['final']['recall'] < rows['coast 0.5 s']['recall']
+    assert rows['input']['recall'] <= rows[UNBROKEN]['recall']
     # Only vehicles have boxes in this drive.
     last = rows['coast 0.5 s']
     assert set(last['by_kind']) == {'vehicle', 'cyclist', 'pedestrian'}
     assert last['by_kind']['vehicle']['added_iou'] == last['added_iou']
     assert last['by_kind']['pedestrian']['recall'] == 0
     assert 0.5 < last['given_iou'] < 1
+
+
+def test_objects_with_two_labels_are_scored_apart(folder):
+    drive = Drive.read(folder)
+    truth = drive.truth
+    assert len(rows_with_one_label(truth)) == len(truth.boxes)
+    car = [row for row, track_id in enumerate(truth.track_ids) if track_id == '9']
+    rows = [*range(len(truth.boxes)), *car]
+    doubled = BoxTable(
+        truth.stamps_ns[rows], truth.frame_id, (*truth.track_ids, *('second',) * len(car)),
+        tuple(truth.class_names[row] for row in rows), truth.scores[rows], truth.boxes[rows],
+        tuple(truth.status[row] for row in rows), truth.num_points[rows],
+    )  # fmt: skip
+    names = [doubled.track_ids[row] for row in rows_with_one_label(doubled)]
+    assert set(names) == set(truth.track_ids) - {'9'}
+    scores = scores_by_kind(truth, doubled)
+    assert scores['vehicle'].recall < 1
+    assert scores[ONE_LABEL].recall == scores[ONE_LABEL].precision == 1
 
 
 def test_highway_measures_all_methods_at_both_speeds(capsys):

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from boxreg_ros.bench.accuracy import scopes_of
-from boxreg_ros.bench.differences import clustered_error, differences
+from boxreg_ros.bench.differences import clustered_error, differences, PairedBoxes
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match
 import numpy as np
@@ -59,6 +59,18 @@ def test_differences_by_hand():
     assert difference.iou_bev_error == pytest.approx(np.sqrt(2 * 2 * s**2) / 8)
     assert (difference.tracks, difference.tracks_ahead) == (2, 1)
     assert differences('ours, final', found, true, everywhere) == {}
+
+
+def test_tracks_of_pooled_drives_are_not_mixed():
+    # Both drives have a track `a`: with two boxes each, off by 1 and by 3.
+    parts = {
+        name: PairedBoxes(('a', 'a'), np.full(2, value), np.full(2, -value))
+        for name, value in (('first', 1.0), ('second', 3.0))
+    }
+    difference = PairedBoxes.pooled(parts).difference()
+    assert (difference.boxes, difference.tracks) == (4, 2)
+    assert (difference.iou_bev, difference.iou_3d) == (2.0, -2.0)
+    assert difference.iou_bev_error == pytest.approx(1.0)
 
 
 def test_scopes_of_parked_and_moving_objects():

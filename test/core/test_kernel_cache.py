@@ -37,7 +37,8 @@ def test_a_caller_is_compiled_again_when_a_called_kernel_of_another_module_chang
 
     def result_and_cache_hits(value):
         (tmp_path / 'inner.py').write_text(CALLED.format(value))
-        command = [sys.executable, 'outer.py']
+        # Python itself would take the old bytecode of a file that changes within a second.
+        command = [sys.executable, '-B', 'outer.py']
         run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
         return run.stdout.split()
 

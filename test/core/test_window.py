@@ -216,7 +216,9 @@ def test_a_part_of_a_problem_has_the_observations_asked_for():
         np.testing.assert_array_equal(getattr(part, name)[1], whole[0, [1, 3]])
     assert (part.times.diff(dim=1) > 0).all()
     np.testing.assert_array_equal(part.points[0, 0], problem.points[1, 2])
-    np.testing.assert_array_equal(part.marginalised_extents, 0)
+    for name in ('prior_mean', 'prior_information', 'marginalised_extents'):
+        values = getattr(part, name)
+        assert values.shape == getattr(problem, name).shape and not values.any()
     np.testing.assert_array_equal(part.kind, problem.kind[[1, 0]])
 
 

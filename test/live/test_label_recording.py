@@ -1,6 +1,7 @@
 """The node writes labels while it drives: equal to those of `relabel`, in whole segments."""
 
 import csv
+from importlib.util import find_spec
 import time
 
 from boxreg_ros.cli import main
@@ -25,7 +26,10 @@ from ros_messages import DETECTIONS, Drive, MARKERS, SECOND
 from std_srvs.srv import Trigger
 
 SETTINGS = {'window': 5, 'lag': 3}
-LIVE_FORMATS = [name for name in FORMATS if name != 'mcap']
+NOT_COMPARED = {'mcap'}
+if find_spec('pyarrow') is None:
+    NOT_COMPARED |= {'parquet', 'argoverse2', 'waymo'}  # those of the extra `formats`
+LIVE_FORMATS = [name for name in FORMATS if name not in NOT_COMPARED]
 CALIBRATION = """\
 P2: 700 0 600 0 0 700 180 0 0 0 1 0
 R_rect: 1 0 0 0 1 0 0 0 1

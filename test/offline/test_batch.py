@@ -127,12 +127,16 @@ def test_shards_of_the_recipe_for_slurm_are_merged_to_the_results_of_one_run(tmp
     page = (ROOT / 'docs' / 'tasks' / 'many-recordings.md').read_text()
     (recipe,) = re.findall("--wrap '(.+)'", page)
     recipe = recipe.replace('/shared/out', str(out)).replace('/8', '/2')
+    program = tmp_path / 'bin' / 'boxreg'  # colcon installs it where only `ros2 run` looks
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m boxreg_ros.cli "$@"\n')
+    program.chmod(0o755)
 
     def run_shard(number):
         environment = {
             **os.environ,
             'SLURM_ARRAY_TASK_ID': str(number),
-            'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}',
+            'PATH': f'{program.parent}:{os.environ["PATH"]}',
         }
         command = ['sh', '-c', f'{recipe} {" ".join(QUICK)}']
         subprocess.run(command, env=environment, cwd=tmp_path, check=True)

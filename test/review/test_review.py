@@ -168,7 +168,7 @@ def test_rejected_tracks_stay_and_pinned_boxes_are_held(result, tmp_path, capsys
     log.append(Decision('nobody', None, 'reject'))
     again = tmp_path / 'again'
     decisions = ['--decisions', tmp_path / DECISIONS]
-    formats = ['--formats', 'openlabel,nuscenes,parquet']
+    formats = ['--formats', 'openlabel,nuscenes']
     assert boxreg('relabel', recording, '-o', again, *formats, *decisions, *QUICK) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if 'decisions' in line]
     for word in ("'nobody'", 'expected', 'got', '--decisions'):

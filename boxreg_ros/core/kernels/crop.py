@@ -126,8 +126,6 @@ def crop(points, centers, rotations, half, reach, margin):
             x = points[0, i] - centers[box, 0]
             y = points[1, i] - centers[box, 1]
             z = points[2, i] - centers[box, 2]
-            if abs(x) > reach[box, 0] or abs(y) > reach[box, 1] or abs(z) > reach[box, 2]:
-                continue
             R = rotations[box]
             u = abs(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) - half[box, 0]
             v = abs(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) - half[box, 1]
@@ -271,8 +269,6 @@ def own_points(points, centers, rotations, half, reach, numbers):
             dx = points[0, i] - centers[box, 0]
             dy = points[1, i] - centers[box, 1]
             dz = points[2, i] - centers[box, 2]
-            if abs(dx) > reach[box, 0] or abs(dy) > reach[box, 1] or abs(dz) > reach[box, 2]:
-                continue
             # No view of the rotation of a box: counting its references takes longer than this.
             up = rotations[box, 0, 2] * dx + rotations[box, 1, 2] * dy + rotations[box, 2, 2] * dz
             u = (
