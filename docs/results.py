@@ -366,9 +366,10 @@ def _review(results: Any) -> Iterable[str]:
                 f'With one box of each of these tracks pinned, the mean 3D IoU of their other '
                 f'boxes rises from {pins["before"]:.3f} to {pins["after"]:.3f}: '
                 f'{pins["gained"]:.0%} of 1 - IoU are removed; the errors that are constant along '
-                f'a track are {pins["constant"]:.0%} of it. '
-                f'Of these are left: {_left(pins["left"])}.'
+                f'a track are {pins["constant"]:.0%} of it.'
             )
+            if 'left' in pins:  # measurements of earlier builds do not have them
+                yield f'Of these are left: {_left(pins["left"])}.'
 
 
 def _left(errors: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import ParamSpec, Self
+from typing import ParamSpec
 
 _P = ParamSpec('_P')
 
@@ -14,7 +14,7 @@ class Background:
     """
     Call functions one after another in a thread, while the caller goes on.
 
-    Use as a context manager, or end it by `complete` or `abandon`.
+    It is ended by `complete` or `abandon`.
 
     Parameters
     ----------
@@ -28,17 +28,6 @@ class Background:
         self._most_waiting = most_waiting
         self._waiting: deque[Future[object]] = deque()
         self._thread = ThreadPoolExecutor(1)
-
-    def __enter__(self) -> Self:
-        """Return the object."""
-        return self
-
-    def __exit__(self, failure: object, *_: object) -> None:
-        """Complete the calls; abandon them if the block has failed."""
-        if failure is None:
-            self.complete()
-        else:
-            self.abandon()
 
     def __call__(
         self, function: Callable[_P, object], *args: _P.args, **kwargs: _P.kwargs

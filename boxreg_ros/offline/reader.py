@@ -278,9 +278,12 @@ class ReadAhead:
 
 def _read(request: Request, _: Receive, send: Send) -> None:
     """Send the messages, in a thread that waits for the receiver while others are read."""
-    with Background(MESSAGES_AHEAD) as background:
+    background = Background(MESSAGES_AHEAD)
+    try:
         for message in _messages(request):
             background(send, message)
+    finally:
+        background.complete()  # an error is sent after the messages before it
 
 
 def _messages(request: Request) -> Generator[Source | ReadItem | Findings]:
