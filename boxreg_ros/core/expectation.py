@@ -71,9 +71,6 @@ MIN_EXTENT_GAIN = 0.2
 """Smallest part of the information about an extent that points must provide to be evidence."""
 PINNED_EXTENT = 0.01
 """Deviation of the extents of a pinned box and of its bias [m, rad]: practically held."""
-PINNED_MARGINS = 4.0
-"""Factor on the deviation of labelling margins beside a pinned box, whose faces are evidence of
-them. Chosen; 4 and 10 give the same."""
 
 
 class Expectation(NamedTuple):
@@ -199,7 +196,6 @@ def expect(problem: Problem, known: Known) -> Expectation:
     has_pin = problem.pinned.any(1)[:, None]
     extent_deviation = torch.where(has_pin, PINNED_EXTENT, extent * part)
     unmodelled = torch.where(has_pin, bias, 0.0)
-    spread = torch.where(has_pin, PINNED_MARGINS, 1.0) * spread
     bias = torch.where(has_pin, PINNED_EXTENT, bias)
     shared = shared_without_population(problem, known.offsets)
     shared[:, EXTENT] = torch.where(has_pin, mean, extent)
@@ -232,7 +228,6 @@ def expectation_numbers() -> ExpectationNumbers:
         population_radius=POPULATION_RADIUS,
         large_extent=LARGE_EXTENT,
         pinned_extent=PINNED_EXTENT,
-        pinned_margins=PINNED_MARGINS,
         pivot_deviation=PIVOT_DEVIATION,
         constant_extent_errors=tuple(CONSTANT_EXTENT_ERRORS[kind] for kind in KINDS),
         estimated_kind=KINDS.index('vehicle'),

@@ -378,7 +378,6 @@ class ExpectationNumbers(NamedTuple):
     population_radius: float
     large_extent: tuple[float, ...]
     pinned_extent: float
-    pinned_margins: float
     pivot_deviation: float
     constant_extent_errors: tuple[tuple[float, ...], ...]
     estimated_kind: int

@@ -135,7 +135,7 @@ def fill_expectation(b, windows, of_class, known, numbers, work, expected):
         )
         shared[EXTENT + k] = mean[k] if has_pin else mean[k] * factor
         deviation[EXTENT + k] = numbers.pinned_extent if has_pin else mean[k] * factor * part
-    widening = max(2 - 2 * work.constant[0], 1.0) * (numbers.pinned_margins if has_pin else 1.0)
+    widening = max(2 - 2 * work.constant[0], 1.0)
     for face in range(6):
         size = max(mean[face // 2] / numbers.large_extent[face // 2], 1.0)
         shared[GAP + face] = of_class.gaps[b, face] + known.gap_correction[kind, face]

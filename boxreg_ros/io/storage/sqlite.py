@@ -269,7 +269,9 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 
 def _connected(path: Path) -> sqlite3.Connection:
-    database = sqlite3.connect(f'file:{quote(str(path))}?immutable=1', uri=True)
+    uri = f'file:{quote(str(path))}?immutable=1'
+    # An overlay is opened by one thread and read by another, never by both at once.
+    database = sqlite3.connect(uri, uri=True, check_same_thread=False)
     database.execute('PRAGMA writable_schema = ON')  # opens files whose end is missing, too
     database.text_factory = lambda text: text.decode(errors='replace')
     return database
