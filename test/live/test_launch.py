@@ -18,7 +18,7 @@ pytest.importorskip('launch_ros', reason='launch_ros is not installed')
 pytest.importorskip('launch_xml', reason='launch_xml is not installed')
 
 LAUNCH_FILE = SHARE / 'boxreg.launch.xml'
-LAUNCH_TEST = TEST / 'live' / 'sample_launch_test.py'
+LAUNCH_TEST = TEST / 'live' / 'launch_sample.py'
 ROS2_LAUNCH = """
 import sys
 from launch import LaunchDescription, LaunchService

@@ -1,7 +1,7 @@
 """
 Refine the sample recording with the node of the launch file.
 
-A test of launch_testing; ``launch_test sample_launch_test.py params:=FILE`` runs it in a sourced
+A test of launch_testing; ``launch_test launch_sample.py params:=FILE`` runs it in a sourced
 workspace, with the parameters of a file, and `test_launch.py` without one.
 
 """
