@@ -85,6 +85,23 @@ def near_points(points, first, side):
 
 
 @kernel
+def candidates(points, centers, reach):
+    """
+    Return the points (3, M) in cells that boxes touch, with their cells, and the raster.
+
+    Also how many pairs of such a point and a box that touches its cell there are.
+
+    """
+    side = side_of(points.shape[1])
+    first, boxes = raster(centers, reach, side)
+    near, cells = near_points(points, first, side)
+    count = 0
+    for cell in cells:
+        count += first[cell + 1] - first[cell]
+    return near, cells, first, boxes, count
+
+
+@kernel
 def crop(points, centers, rotations, half, reach, margin):
     """
     Find the pairs of a point and a box within `margin` of each other, ascending by point.
@@ -108,12 +125,7 @@ def crop(points, centers, rotations, half, reach, margin):
         Point minus centre, and distance outside of the faces [m].
 
     """
-    side = side_of(points.shape[1])
-    first, boxes = raster(centers, reach, side)
-    near, cells = near_points(points, first, side)
-    capacity = 0
-    for cell in cells:
-        capacity += first[cell + 1] - first[cell]
+    near, cells, first, boxes, capacity = candidates(points, centers, reach)
     row = np.empty(capacity, np.int64)
     owner = np.empty(capacity, np.int64)
     offset = np.empty((capacity, 3))
@@ -248,12 +260,7 @@ def own_points(points, centers, rotations, half, reach, numbers):
 
     """
     n = len(half)
-    side = side_of(points.shape[1])
-    first, boxes = raster(centers, reach, side)
-    near, cells = near_points(points, first, side)
-    capacity = 0
-    for cell in cells:
-        capacity += first[cell + 1] - first[cell]
+    near, cells, first, boxes, capacity = candidates(points, centers, reach)
     row = np.empty(capacity, np.int32)
     owner = np.empty(capacity, np.int32)
     x = np.empty(capacity)
