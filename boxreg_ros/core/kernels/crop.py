@@ -87,9 +87,21 @@ def near_points(points, first, side):
 @kernel
 def candidates(points, centers, reach):
     """
-    Return the points (3, M) in cells that boxes touch, with their cells, and the raster.
+    Return the pairs of a point and a box that touches its cell, cell by cell.
 
-    Also how many pairs of such a point and a box that touches its cell there are.
+    Parameters
+    ----------
+    points, centers, reach : array
+        As for `crop`.
+
+    Returns
+    -------
+    near, cells : array, shape (K,)
+        Points in cells that boxes touch, and their cells.
+    first, boxes : array
+        The boxes of each cell, see `raster`.
+    count : int
+        Number of pairs.
 
     """
     side = side_of(points.shape[1])
@@ -276,24 +288,10 @@ def own_points(points, centers, rotations, half, reach, numbers):
             dx = points[0, i] - centers[box, 0]
             dy = points[1, i] - centers[box, 1]
             dz = points[2, i] - centers[box, 2]
-            # No view of the rotation of a box: counting its references takes longer than this.
-            up = rotations[box, 0, 2] * dx + rotations[box, 1, 2] * dy + rotations[box, 2, 2] * dz
-            u = (
-                abs(
-                    rotations[box, 0, 0] * dx
-                    + rotations[box, 1, 0] * dy
-                    + rotations[box, 2, 0] * dz
-                )
-                - half[box, 0]
-            )
-            v = (
-                abs(
-                    rotations[box, 0, 1] * dx
-                    + rotations[box, 1, 1] * dy
-                    + rotations[box, 2, 1] * dz
-                )
-                - half[box, 1]
-            )
+            R = rotations[box]
+            up = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+            u = abs(R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) - half[box, 0]
+            v = abs(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) - half[box, 1]
             w = abs(up) - half[box, 2]
             aside = max(u, v)
             deep = max(aside, w)

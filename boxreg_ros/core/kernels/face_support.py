@@ -271,7 +271,7 @@ class FaceWork(NamedTuple):
     depth : array, shape (5, M)
         See `fill_depths`.
     candidates : array, shape (M + 1,)
-        Points that may be outermost on one face.
+        Points that may be outermost on one face; the last place is for one that may not.
     best_depth, best_index : array
         The outermost points of each strip of one face.
     number, mean_depth : array, shape (5,)

@@ -318,13 +318,11 @@ def add_slip(n, poses, shared, terms, scratch, gradient, A):
         gradient[first + SIDESLIP] += by_sideslip * w * r
         if is_wanted(A):
             for k in range(12):
-                # Written out: a view of a row of A costs as much as the row.
-                pose, a, own = n + k // 6, k % 6, 6 * (k // 6)
-                pull = w * J[k]
+                links, border = A.links[n + k // 6, k % 6], A.border[n + k // 6, k % 6]
                 for m in range(k, 12):
-                    A.links[pose, a, m - own] += pull * J[m]
-                A.border[pose, a, PIVOT] += pull * by_pivot
-                A.border[pose, a, SIDESLIP] += pull * by_sideslip
+                    links[m - 6 * (k // 6)] += w * J[k] * J[m]
+                border[PIVOT] += w * J[k] * by_pivot
+                border[SIDESLIP] += w * J[k] * by_sideslip
             A.corner[PIVOT, PIVOT] += w * by_pivot**2
             A.corner[PIVOT, SIDESLIP] += w * by_pivot * by_sideslip
             A.corner[SIDESLIP, SIDESLIP] += w * by_sideslip**2
