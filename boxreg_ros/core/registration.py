@@ -13,8 +13,7 @@ objective to the letter. docs/method.md has the formulas.
 
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from itertools import repeat
 
 from boxreg_ros.config import Config
@@ -28,6 +27,7 @@ from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.rounds import COARSE_POINTS
 from boxreg_ros.core.smoothing import smoothed_angles
 from boxreg_ros.core.solver import solve
+from boxreg_ros.core.threads import one_torch_thread, shared_between
 from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.rotations import wrap_angle
@@ -47,18 +47,7 @@ KEPT_REASONS = ('no_points', 'not_finite', 'no_gain')
 """Why a box is kept, in the order of `_failed_tests`."""
 
 
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Run torch in one thread: for small tensors more threads only wait for each other."""
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(num_threads)
-
-
-@_one_torch_thread()
+@one_torch_thread()
 def register(windows: list[Window], config: Config, model: InputModel) -> list[Estimate | None]:
     """
     Refine the boxes of many windows.
@@ -83,16 +72,17 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
     groups = group_windows(windows, config)
     parts = [[windows[i] for i in rows] for rows in groups]
     stacked = [stack_windows(part, config) for part in parts]
-    for part, (problem, _) in zip(parts, stacked, strict=True):
-        _update_offsets(model, part, problem, config)
-    for rows, part, (problem, base) in zip(groups, parts, stacked, strict=True):
-        if config.objective == 'paper':
-            solution = solve_paper(problem, config)
-        else:
-            solution = solve(problem, config, model, part[0].is_warm)
-            _update_noise(model, part, problem, solution, config)
-        found = _accepted(part, problem, base, solution, config)
-        estimates.update(zip(rows, found, strict=True))
+    with shared_between(config.solver.threads):
+        for part, (problem, _) in zip(parts, stacked, strict=True):
+            _update_offsets(model, part, problem, config)
+        for rows, part, (problem, base) in zip(groups, parts, stacked, strict=True):
+            if config.objective == 'paper':
+                solution = solve_paper(problem, config)
+            else:
+                solution = solve(problem, config, model, part[0].is_warm)
+                _update_noise(model, part, problem, solution, config)
+            found = _accepted(part, problem, base, solution, config)
+            estimates.update(zip(rows, found, strict=True))
     return [estimates.get(i) for i in range(len(windows))]
 
 

@@ -49,6 +49,7 @@ from boxreg_ros.core.lbfgs import minimize, select
 from boxreg_ros.core.prior import marginalise
 from boxreg_ros.core.rigid_shape import agreement, shape_numbers
 from boxreg_ros.core.terms import Objective, Term
+from boxreg_ros.core.threads import one_torch_thread
 from boxreg_ros.core.weights import (
     prior_information,
     robustify_motion,
@@ -219,6 +220,7 @@ def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
     )
 
 
+@one_torch_thread()
 def run_round_torch(batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor) -> Tensor:
     """Take a round by torch."""
     solution = batch.solution

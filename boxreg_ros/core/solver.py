@@ -6,10 +6,8 @@ minimised. How many rounds there are, and what they use, is a `Plan`, chosen onc
 
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import inf
-from multiprocessing import cpu_count
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import (
@@ -26,9 +24,10 @@ from boxreg_ros.core.expectation import Known, shared_without_population
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import InputNoise, normalised_residuals, UNKNOWN_NOISE
-from boxreg_ros.core.kernels import compiled, shared_by
+from boxreg_ros.core.kernels import compiled
 from boxreg_ros.core.population import UNKNOWN_POPULATION
 from boxreg_ros.core.rounds import Plan, Round, run_round
+from boxreg_ros.core.threads import mapped, num_workers
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor
@@ -39,7 +38,6 @@ from torch.nn.functional import pad
 NOISE_ROUNDS = 2
 """First rounds of a whole track whose residuals give the input noise. Later fits follow the
 input: the noise would be estimated smaller in every round."""
-NUM_CORES = cpu_count()
 OBSERVATIONS_PER_THREAD = 2500
 """Observations that a thread solves at once: more save calls, fewer save memory traffic."""
 
@@ -81,28 +79,21 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     solution = start(problem, free, known.offsets, plan)
     every = torch.arange(len(free), device=free.device)
     rows, turn, points = every, 0, plan.coarse_points
-    workers = config.solver.threads or NUM_CORES
-    # No longer lived: a forked worker would wait for threads that it does not have.
-    with (
-        ThreadPoolExecutor(workers, '', torch.set_num_threads, (1,)) as pool,
-        shared_by(pool, workers),
-    ):
-        while len(rows):
-            batch = Round(problem.thinned(points), solution, known, free)
-            work = partial(run_round, batch, plan, turn, config)
-            parts = _split(rows, problem.length, workers)
-            is_done = map(work, parts) if len(parts) == 1 else pool.map(work, parts)
-            rows = rows[~torch.cat(list(is_done))]
-            turn += 1
-            if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
-                residuals = normalised_residuals(problem, solution.state)
-                noise = InputNoise.estimate_by_kind(residuals, problem.kind)
-                known = known._replace(noise=noise)
-            if plan.estimates_noise and learns_extents:
-                joined = population.joined(solution.extent_evidence, problem.kind)
-                known = known._replace(population=joined)
-            if not len(rows) and 2 * points <= problem.returns.width:
-                rows, points = every, inf  # settled on few points: once more with all
+    while len(rows):
+        batch = Round(problem.thinned(points), solution, known, free)
+        work = partial(run_round, batch, plan, turn, config)
+        is_done = mapped(work, _split(rows, problem.length))
+        rows = rows[~torch.cat(is_done)]
+        turn += 1
+        if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
+            residuals = normalised_residuals(problem, solution.state)
+            noise = InputNoise.estimate_by_kind(residuals, problem.kind)
+            known = known._replace(noise=noise)
+        if plan.estimates_noise and learns_extents:
+            joined = population.joined(solution.extent_evidence, problem.kind)
+            known = known._replace(population=joined)
+        if not len(rows) and 2 * points <= problem.returns.width:
+            rows, points = every, inf  # settled on few points: once more with all
     return solution
 
 
@@ -124,7 +115,7 @@ def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: Plan) -> S
     return Solution(State(pose, shared), Posterior.zeros(pose), prior, extents, evidence)
 
 
-def _split(rows: Tensor, length: int, workers: int) -> tuple[Tensor, ...]:
+def _split(rows: Tensor, length: int) -> tuple[Tensor, ...]:
     """
     Return parts of `rows` for threads, windows of `length` each.
 
@@ -134,5 +125,5 @@ def _split(rows: Tensor, length: int, workers: int) -> tuple[Tensor, ...]:
     size = OBSERVATIONS_PER_THREAD / length
     if compiled(rows) is not None or not rows.is_cpu or len(rows) <= size:
         return (rows,)
-    parts = workers * int(1 + len(rows) / size / workers)
+    parts = num_workers() * int(1 + len(rows) / size / num_workers())
     return rows.tensor_split(min(len(rows), parts))

@@ -9,16 +9,14 @@ is what the tests compare with. `compiled` decides which of them runs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 from types import ModuleType
 from typing import Any, NamedTuple, TYPE_CHECKING
 from warnings import warn
 
+from boxreg_ros.core.threads import mapped, num_workers
 import numpy as np
 
 if TYPE_CHECKING:  # not needed to crop
@@ -36,31 +34,13 @@ class Kernels(NamedTuple):
     rounds: ModuleType
 
 
-MIN_WINDOWS_PER_THREAD = 8
+MIN_WINDOWS_PER_THREAD = 4
 """Fewest windows that a thread gets. Chosen: they take longer than handing them over, 0.1 ms."""
-
-
-class _Threads(NamedTuple):
-    pool: ThreadPoolExecutor
-    workers: int
-
-
-_threads: ContextVar[_Threads | None] = ContextVar('threads', default=None)
-
-
-@contextmanager
-def shared_by(pool: ThreadPoolExecutor, workers: int) -> Iterator[None]:
-    """Let `run` share the windows of each kernel between the caller and `workers` - 1 threads."""
-    token = _threads.set(_Threads(pool, workers))
-    try:
-        yield
-    finally:
-        _threads.reset(token)
 
 
 def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
     """
-    Run a kernel for a number of `windows`, shared between threads within `shared_by`.
+    Run a kernel for a number of `windows`, shared between threads within `shared_between`.
 
     No window depends on another: the results do not depend on the number of threads.
 
@@ -74,17 +54,9 @@ def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
         The other arguments.
 
     """
-    threads = _threads.get()
-    parts = 1 if threads is None else min(threads.workers, windows // MIN_WINDOWS_PER_THREAD)
-    if threads is None or parts < 2:
-        kernel(0, windows, *arguments)
-        return
+    parts = max(1, min(num_workers(), windows // MIN_WINDOWS_PER_THREAD))
     ends = [windows * part // parts for part in range(parts + 1)]
-    submit = threads.pool.submit
-    others = [submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])]
-    kernel(0, ends[1], *arguments)
-    for other in others:
-        other.result()
+    mapped(lambda span: kernel(*span, *arguments), list(pairwise(ends)))
 
 
 def contiguous(tensor: Tensor) -> Any:

@@ -8,28 +8,36 @@ def nth(values, rank):
     """
     Return the value of a rank among values (n,), 0 for the smallest; any value if one is NaN.
 
-    By Hoare's selection, which sorts the values in part.
+    By quickselect, which sorts the values in part. Both passes move values without a branch: half
+    of such branches are predicted wrong, and each costs as much as ten moves.
 
     """
     first, last = 0, len(values) - 1
     while first < last:
-        pivot = values[(first + last) // 2]
-        low, high = first, last
-        while low <= high:
-            while values[low] < pivot:
-                low += 1
-            while values[high] > pivot:
-                high -= 1
-            if low <= high:
-                values[low], values[high] = values[high], values[low]
-                low += 1
-                high -= 1
-        if rank <= high:
-            last = high
-        elif rank >= low:
-            first = low
-        else:
-            break
+        middle = (first + last) // 2
+        pivot = values[middle]
+        if pivot != pivot:
+            return pivot
+        values[middle], values[last] = values[last], pivot
+        place = first
+        for i in range(first, last):
+            value = values[i]
+            values[i] = values[place]
+            values[place] = value
+            place += value < pivot
+        if rank < place:
+            values[last], values[place] = values[place], pivot
+            last = place - 1
+            continue
+        for i in range(place, last):
+            value = values[i]
+            values[i] = values[place]
+            values[place] = value
+            place += value <= pivot
+        values[last], values[place] = values[place], pivot
+        if rank <= place:
+            return pivot
+        first = place + 1
     return values[rank]
 
 

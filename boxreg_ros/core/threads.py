@@ -1,0 +1,66 @@
+"""Threads that share the parts of a batch."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
+from multiprocessing import cpu_count
+from typing import NamedTuple, TypeVar
+
+NUM_CORES = cpu_count()
+
+
+class _Threads(NamedTuple):
+    pool: ThreadPoolExecutor
+    workers: int
+
+
+_threads: ContextVar[_Threads | None] = ContextVar('threads', default=None)
+_Part = TypeVar('_Part')
+_Result = TypeVar('_Result')
+
+
+@contextmanager
+def shared_between(workers: int) -> Iterator[None]:
+    """
+    Let `mapped` use a number of threads, that of the caller included; 0: one per core.
+
+    They end with the block: a process that is forked later would wait for threads that it does
+    not have. Each starts when it gets its first part.
+
+    """
+    workers = workers or NUM_CORES
+    with ThreadPoolExecutor(workers) as pool:
+        token = _threads.set(_Threads(pool, workers))
+        try:
+            yield
+        finally:
+            _threads.reset(token)
+
+
+def num_workers() -> int:
+    """Return how many threads share the parts of a batch: 1 outside of `shared_between`."""
+    threads = _threads.get()
+    return 1 if threads is None else threads.workers
+
+
+def mapped(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list[_Result]:
+    """Return the results of a function for each of some parts; the caller takes the first."""
+    threads = _threads.get()
+    if threads is None or threads.workers < 2 or len(parts) < 2:
+        return [function(part) for part in parts]
+    others = [threads.pool.submit(function, part) for part in parts[1:]]
+    return [function(parts[0]), *(other.result() for other in others)]
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Run torch in the calling thread alone: for small tensors more only wait for each other."""
+    import torch  # the process that crops the points of a recording does without
+
+    num_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(num_threads)
