@@ -11,8 +11,10 @@ from collections.abc import Sequence
 from typing import Any, TYPE_CHECKING
 
 from boxreg_ros.config import FaceConfig, KINDS
+from boxreg_ros.core.track_rows import TrackRows
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # a process that only keeps the model between two batches needs no torch
     from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
@@ -50,7 +52,7 @@ MIN_OCCLUDED_SHARE = 0.5
 MIN_DISTANT_SHARE = 0.5
 """A face with a larger share of the range inset counts as distant: beyond 45 m."""
 MAX_TRACKS = 200
-"""Tracks that the model keeps, those seen last."""
+"""Tracks of each kind that the model keeps, those seen last."""
 MAX_FITS_PER_TRACK = 100
 """Fits of each track that the model keeps, the last ones."""
 
@@ -81,11 +83,12 @@ class InputModel:
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
         # Of each track of each kind: sums over its face observations, see
         # `add_face_observations`; its last input residuals; its extent evidence.
-        self._faces = [dict[str, Floats]() for _ in KINDS]
+        unknown = np.full((MAX_FITS_PER_TRACK, 9), np.nan)
+        self._faces = [TrackRows(np.zeros((3, 3, 6)), MAX_TRACKS) for _ in KINDS]
         self._offsets_of_kinds: list[tuple[Floats, ...] | None] = [None] * len(KINDS)
         self._known_offsets: FaceOffsets | None = None  # of the present sums
-        self._residuals = [dict[str, Floats]() for _ in KINDS]
-        self._evidence = [dict[str, Floats]() for _ in KINDS]
+        self._residuals = [TrackRows(unknown, MAX_TRACKS) for _ in KINDS]
+        self._evidence = [TrackRows(np.zeros((3, 3)), MAX_TRACKS) for _ in KINDS]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what was observed; margins that follow from it are computed again."""
@@ -146,9 +149,10 @@ class InputModel:
         # (B, 3 quantities, 3 sums: value, count, share; 6 faces)
         sums = np.moveaxis(np.stack([values * counts, counts, shares * counts], 1).sum(3), 2, 0)
         self._known_offsets = None
-        for track_id, k, row in zip(track_ids, kinds.tolist(), sums, strict=True):
+        for k in set(kinds.tolist()):
             self._offsets_of_kinds[k] = None
-            _of_track(self._faces[k], track_id, np.zeros((3, 3, 6)))[:] += row
+            rows, kept = _kept(self._faces[k], track_ids, kinds == k)
+            self._faces[k].arrays[kept] += sums[rows]
 
     def add_fits(
         self, track_ids: Sequence[str], kind: Tensor, residuals: Floats, evidence: Floats
@@ -168,13 +172,14 @@ class InputModel:
             Evidence of the extents, see `Population`.
 
         """
-        rows = zip(track_ids, kind.tolist(), residuals, evidence, strict=True)
-        for track_id, k, row, extents in rows:
-            unknown = np.full((MAX_FITS_PER_TRACK, 9), np.nan)
-            known = _of_track(self._residuals[k], track_id, unknown)
-            known[:-1] = known[1:].copy()
-            known[-1] = row
-            _of_track(self._evidence[k], track_id, extents)[:] = extents
+        kinds = kind.cpu().numpy()
+        for k in set(kinds.tolist()):
+            rows, kept = _kept(self._residuals[k], track_ids, kinds == k)
+            known = self._residuals[k].arrays
+            known[kept, :-1] = known[kept, 1:]
+            known[kept, -1] = residuals[rows]
+            rows, kept = _kept(self._evidence[k], track_ids, kinds == k)
+            self._evidence[k].arrays[kept] = evidence[rows]
 
     def offsets(self) -> FaceOffsets:
         """Return the labelling margins and insets to expect of each kind."""
@@ -190,7 +195,7 @@ class InputModel:
 
     def _offsets(self, kind: int) -> tuple[Floats, Floats, Floats]:
         """Return the columns of `FaceOffsets` for one kind, (6,) each."""
-        known = np.array(list(self._faces[kind].values())).reshape(-1, 3, 3, 6)
+        known = self._faces[kind].in_order
         none = (0.0,) * len(FACE_GROUPS)
         deviations = GAP_DEVIATIONS[KINDS[kind]]
         gaps = _pooled(known[:, 0], none, deviations)
@@ -214,22 +219,20 @@ class InputModel:
         from boxreg_ros.core.input_noise import InputNoise
         import torch
 
-        rows, kind = _flat(self._residuals)
-        known = np.array(rows).reshape(-1, MAX_FITS_PER_TRACK, 9)
-        return InputNoise.estimate_by_kind(torch.from_numpy(known), torch.from_numpy(kind))
+        residuals, kind = _of_all_kinds(self._residuals)
+        return InputNoise.estimate_by_kind(torch.from_numpy(residuals), torch.from_numpy(kind))
 
     def population(self) -> Population:
         """Return the evidence of extents of the last fits that were added."""
         from boxreg_ros.core.population import Population
         import torch
 
-        rows, kind = _flat(self._evidence)
-        evidence = np.array(rows).reshape(-1, 3, 3)
+        evidence, kind = _of_all_kinds(self._evidence)
         return Population(torch.from_numpy(evidence), torch.from_numpy(kind))
 
     def _means_of_tracks(self, quantity: int, faces: Sequence[int]) -> list[Floats]:
         means = []
-        for sums in _flat(self._faces)[0]:
+        for sums in _of_all_kinds(self._faces)[0]:
             total, count, share = sums[quantity][:, faces]
             is_known = count >= MIN_TRACK_OBSERVATIONS
             if is_known.any():
@@ -248,11 +251,19 @@ def _pooled(known: Floats, expected: Sequence[float], deviations: Sequence[float
     return values
 
 
-def _flat(known: Sequence[dict[str, Floats]]) -> tuple[list[Floats], Ints]:
-    """Return the arrays of the tracks of all kinds, and their kinds (n,)."""
-    counts = [len(tracks) for tracks in known]
-    rows = [row for tracks in known for row in tracks.values()]
-    return rows, np.repeat(np.arange(len(known)), counts)
+def _of_all_kinds(known: Sequence[TrackRows]) -> tuple[Floats, Ints]:
+    """Return the arrays of the tracks of all kinds, (n, ...), and their kinds (n,)."""
+    parts = [tracks.in_order for tracks in known]
+    return np.concatenate(parts), np.repeat(np.arange(len(known)), list(map(len, parts)))
+
+
+def _kept(
+    known: TrackRows, track_ids: Sequence[str], is_of_kind: NDArray[np.bool_]
+) -> tuple[Ints, Ints]:
+    """Return which tracks `is_of_kind` (B,) are kept, and their rows in the arrays of `known`."""
+    of_kind = np.flatnonzero(is_of_kind)
+    places, rows = known.seen([track_ids[i] for i in of_kind.tolist()])
+    return of_kind[places], rows
 
 
 def _posterior_mean(means: Floats, prior: float, deviation: float) -> float:
@@ -265,12 +276,3 @@ def _posterior_mean(means: Floats, prior: float, deviation: float) -> float:
     error = MIDMEAN_FACTOR * (QUARTILES_TO_DEVIATION * spread + MIN_GAP_DEVIATION)
     weight = deviation**2 / (deviation**2 + error**2 / n)
     return float(prior + weight * (middle - prior))
-
-
-def _of_track(known: dict[str, Floats], track_id: str, fresh: Floats) -> Floats:
-    """Return the array of a track, `fresh` for a new one; delete the one seen longest ago."""
-    found = known.pop(track_id, fresh)
-    known[track_id] = found
-    if len(known) > MAX_TRACKS:
-        del known[next(iter(known))]
-    return found

@@ -247,6 +247,17 @@ def test_residuals_of_the_tracks_seen_last_are_kept():
     np.testing.assert_allclose(noise_of(model).deviation, known.deviation)
 
 
+def test_more_tracks_at_once_than_are_kept_do_not_expel_each_other():
+    names = [str(b) for b in range(MAX_TRACKS + 50)]
+    values = autoregressive(len(names), MIN_OBSERVATIONS_FOR_NOISE, np.ones(9), 0.0, 8)
+    model = InputModel(FACES)
+    for row in values.unbind(1):
+        add_residuals(model, names, row)
+    known = InputNoise.estimate(values[:MAX_TRACKS])
+    assert known.weight > 0.9  # 200 tracks of five fits each against 14: 0.986
+    np.testing.assert_allclose(noise_of(model).deviation, known.deviation)
+
+
 # --- extents ------------------------------------------------------------------------------------
 
 

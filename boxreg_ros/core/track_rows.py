@@ -1,0 +1,77 @@
+"""What is kept of each of many tracks, as rows of one array."""
+
+from collections.abc import Sequence
+
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+
+
+class TrackRows:
+    """
+    One array per track, for a limited number of tracks.
+
+    A new track takes the place of the one that was seen longest ago, but not of one that is seen
+    together with it: where there are too many tracks at once, the first ones stay.
+
+    Parameters
+    ----------
+    fresh : array, shape (...)
+        Array of a new track.
+    capacity : int
+        Most tracks.
+
+    Attributes
+    ----------
+    arrays : array, shape (n, ...)
+        Of n tracks.
+
+    """
+
+    def __init__(self, fresh: Floats, capacity: int) -> None:
+        self._fresh = fresh[None]
+        self._capacity = capacity
+        self._row_of = dict[str, int]()  # of each track, those seen last at the end
+        self.arrays = self._fresh[:0]
+
+    @property
+    def in_order(self) -> Floats:
+        """Copy of the arrays of all tracks, (n, ...), those seen last at the end."""
+        copy: Floats = self.arrays[list(self._row_of.values())]
+        return copy
+
+    def seen(self, track_ids: Sequence[str]) -> tuple[Ints, Ints]:
+        """
+        Note that some different tracks are seen, and make room for the new ones.
+
+        Returns
+        -------
+        places : array, shape (m,)
+            Which of `track_ids` are kept.
+        rows : array, shape (m,)
+            Their rows in `arrays`.
+
+        """
+        for track_id in track_ids:
+            if track_id in self._row_of:
+                self._row_of[track_id] = self._row_of.pop(track_id)
+        together = set(track_ids)
+        for track_id in track_ids:
+            if track_id not in self._row_of:
+                self._give_row(track_id, together)
+        new = np.repeat(self._fresh, len(self._row_of) - len(self.arrays), axis=0)
+        if len(new):
+            self.arrays = np.concatenate([self.arrays, new])
+        rows = np.array([self._row_of.get(track_id, -1) for track_id in track_ids], int)
+        places = np.flatnonzero(rows >= 0)
+        return places, rows[places]
+
+    def _give_row(self, track_id: str, together: set[str]) -> None:
+        """Give a new track a row, unless all others are seen `together` with it."""
+        if len(self._row_of) < self._capacity:
+            self._row_of[track_id] = len(self._row_of)
+            return
+        longest_ago = next(iter(self._row_of))
+        if longest_ago not in together:
+            row = self._row_of.pop(longest_ago)
+            self._row_of[track_id] = row
+            self.arrays[row] = self._fresh[0]
