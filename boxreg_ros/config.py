@@ -311,7 +311,20 @@ class Ingredients:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All settings, with defaults for road vehicles at 10 Hz."""
+    """
+    All settings, with defaults for road vehicles at 10 Hz; checked on construction.
+
+    The groups `sampling`, `faces`, `solver`, `paper`, `complete`, `vehicle`, `cyclist` and
+    `pedestrian` are objects of their own: ``Config.from_dict({'solver': {'rounds': 5}})`` and
+    ``config.updated({'solver.rounds': 5})`` set a part of one. docs/parameters.md lists every
+    setting with its meaning, unit and bounds, as `items` yields them.
+
+    Raises
+    ------
+    ConfigError
+        For a value of the wrong type or out of bounds.
+
+    """
 
     objective: str = setting(
         'robust',
@@ -396,6 +409,13 @@ class Config:
 
     def __post_init__(self) -> None:
         """Check types and bounds."""
+        for part in fields(self):
+            group = type(part.default)
+            if is_dataclass(group) and not isinstance(getattr(self, part.name), group):
+                raise ConfigError(
+                    f'{part.name}: expected {group.__name__}, got {getattr(self, part.name)!r}; '
+                    f'Config.from_dict takes groups as dictionaries'
+                )
         for item, value in self.items():
             _check(item, _cast(item.name, value, item.default))
         if self.lag >= self.window and self.lag != DEFAULT_LAG:
@@ -530,18 +550,25 @@ def _filled(default: _T, value: Any, name: str) -> _T:
     prefix = f'{name}.' if name else ''
     for key in value:
         if key not in known:
-            if prefix + key in RENAMED:
-                raise ConfigError(f'{prefix}{key}: was renamed; set {RENAMED[prefix + key]}')
-            if prefix + key in REMOVED:
-                raise ConfigError(
-                    f'{prefix}{key}: was removed, {REMOVED[prefix + key]}; leave it out'
-                )
-            names = ', '.join(sorted(known))
-            similar = get_close_matches(str(key), known, 1)
-            proposal = f'; did you mean {prefix}{similar[0]}?' if similar else ''
-            raise ConfigError(f'{prefix}{key}: no such setting; expected one of {names}{proposal}')
+            raise ConfigError(_unknown(prefix, str(key), known))
     changes = {key: _filled(known[key], inner, prefix + key) for key, inner in value.items()}
     return replace(default, **changes)  # type: ignore[type-var]
+
+
+def _unknown(prefix: str, key: str, known: Mapping[str, Any]) -> str:
+    """Return the message of a setting that a group does not have, with what to set instead."""
+    name = prefix + key
+    group, dot, last = key.partition('.')
+    if name in RENAMED:
+        return f'{name}: was renamed; set {RENAMED[name]}'
+    if name in REMOVED:
+        return f'{name}: was removed, {REMOVED[name]}; leave it out'
+    if dot and is_dataclass(known.get(group)):
+        return f'{name}: expected a nested group; write {group}: {{{last}: ...}}'
+    names = ', '.join(sorted(set(known) - {'ingredients'}))  # for `boxreg bench ablation` alone
+    similar = get_close_matches(key, known, 1)
+    proposal = f'; did you mean {prefix}{similar[0]}?' if similar else ''
+    return f'{name}: no such setting; expected one of {names}{proposal}'
 
 
 def _cast(name: str, value: Any, default: Any) -> Any:

@@ -1,6 +1,8 @@
 """
 Data that the packages exchange: frozen dataclasses, checked on construction.
 
+They are equal only if they are the same object: their arrays have no truth value.
+
 Shape letters of the whole package: ``B`` windows in a batch, ``N`` observations in a window,
 ``M`` points in an observation, ``K`` nearest points of Eq. 4, ``D`` optimised variables.
 
@@ -25,6 +27,7 @@ X, Y, Z, LENGTH, WIDTH, HEIGHT, ROLL, PITCH, YAW = range(9)
 POSE = [X, Y, Z, ROLL, PITCH, YAW]
 BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
 """Columns of the extents of a box."""
+BOX_AXES = 'x y z length width height roll pitch yaw'
 
 REFINED, KEPT = 'refined', 'kept'
 INTERPOLATED, EXTENDED, REJECTED = 'interpolated', 'extended', 'rejected'
@@ -35,7 +38,9 @@ HUMAN = 'human'
 """Status of a box that a person has corrected and pinned."""
 
 
-def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
+def checked(
+    name: str, value: ArrayLike, shape: tuple[int | None, ...], columns: str = ''
+) -> Floats:
     """
     Return an array argument as float64, contiguous.
 
@@ -44,9 +49,11 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float
     name : str
         Of the argument, for the error message.
     value : array_like
-        The argument.
+        The argument. An empty list has any `shape` of length 0.
     shape : tuple of int or None
         Expected shape; None for any length.
+    columns : str
+        Of the last axis, for the error message.
 
     Returns
     -------
@@ -59,15 +66,41 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float
         If `value` has another shape or is not numeric.
 
     """
-    expected = str(shape).replace('None', 'N')
+    if value is None:  # of which numpy would make NaN
+        raise ShapeError(f'{name}: expected {_expected(shape, columns)}, got None')
     try:
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (RuntimeError, TypeError, ValueError) as error:  # torch raises RuntimeError
-        raise ShapeError(f'{name}: expected numbers of shape {expected}: {error}') from None
-    lengths = zip(shape, array.shape, strict=False)
-    if array.ndim != len(shape) or any(want not in (None, got) for want, got in lengths):
-        raise ShapeError(f'{name}: expected shape {expected}, got {array.shape}')
+        expected = _expected(shape, columns)
+        raise ShapeError(f'{name}: expected numbers of {expected}: {error}') from None
+    if array.shape == (0,) and shape[0] in (None, 0):
+        array = array.reshape(0, *(length or 0 for length in shape[1:]))
+    _check_shape(name, array.shape, shape, columns)
     return array
+
+
+def _check_shape(
+    name: str, found: tuple[int, ...], shape: tuple[int | None, ...], columns: str = ''
+) -> None:
+    """Raise ShapeError if an array `found` has another shape than expected."""
+    lengths = zip(shape, found, strict=False)
+    if len(found) != len(shape) or any(want not in (None, got) for want, got in lengths):
+        raise ShapeError(f'{name}: expected {_expected(shape, columns)}, got {found}')
+
+
+def _expected(shape: tuple[int | None, ...], columns: str) -> str:
+    """Return a shape for an error message."""
+    text = 'shape ' + str(shape).replace('None', 'N')
+    return f'{text} with the columns {columns}' if columns else text
+
+
+def _check_stamp(stamp_ns: object) -> None:
+    """Raise ShapeError for a stamp that is no integer, as one in seconds."""
+    if not isinstance(stamp_ns, int | np.integer):
+        raise ShapeError(
+            f'stamp_ns: expected whole nanoseconds, got {stamp_ns!r}; '
+            f'convert seconds by round(seconds * 1e9)'
+        )
 
 
 def is_valid_box(boxes: Floats) -> NDArray[np.bool_]:
@@ -76,7 +109,12 @@ def is_valid_box(boxes: Floats) -> NDArray[np.bool_]:
     return np.asarray(is_finite & (boxes[..., LENGTH : HEIGHT + 1] > 0).all(axis=-1))
 
 
-@dataclass(frozen=True, slots=True)
+def _is_float_array(value: object) -> bool:
+    """Return whether `value` is an array of single or double precision."""
+    return isinstance(value, np.ndarray) and value.dtype in (np.float32, np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
     """
     A point cloud under one stamp: one revolution of a LiDAR, or several merged.
@@ -119,20 +157,36 @@ class Sweep:
     rows: Ints | None = None
 
     def __post_init__(self) -> None:
-        """Check the shapes."""
-        if self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise ShapeError(f'points: expected shape (M, 3), got {self.points.shape}')
-        if self.times is not None and self.times.shape != self.points.shape[:1]:
-            raise ShapeError(f'times: expected {self.points.shape[:1]}, got {self.times.shape}')
+        """Check the shapes; convert lists to arrays."""
+        _check_stamp(self.stamp_ns)
+        if not _is_float_array(self.points):  # clouds of either precision are not copied
+            self._set('points', checked('points', self.points, (None, 3), 'x y z'))
+        _check_shape('points', self.points.shape, (None, 3), 'x y z')
+        self._set('origin', checked('origin', self.origin, (3,), 'x y z'))
+        M = len(self.points)
+        if self.times is not None:
+            if not _is_float_array(self.times):
+                self._set('times', checked('times', self.times, (M,)))
+            _check_shape('times', self.times.shape, (M,))
         if (self.origins is None) != (self.sensors is None):
             raise ShapeError('origins and sensors: expected both or neither, got one of them')
-        if self.sensors is not None and self.sensors.shape != self.points.shape[:1]:
-            raise ShapeError(
-                f'sensors: expected {self.points.shape[:1]}, got {self.sensors.shape}'
-            )
+        if self.sensors is not None:
+            _check_shape('sensors', np.shape(self.sensors), (M,))
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)  # the class is frozen
 
 
-@dataclass(frozen=True, slots=True)
+def _texts(name: str, values: Sequence[str]) -> tuple[str, ...]:
+    """Return texts as a tuple; raise ShapeError for numbers, of which 0 is taken for no id."""
+    wrong = [value for value in values if not isinstance(value, str)]
+    if wrong or isinstance(values, str):
+        got = repr(wrong[0] if wrong else values)
+        raise ShapeError(f'{name}: expected a tuple with a text for each box, got {got}')
+    return tuple(values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BoxArray:
     """
     All boxes of one stamp; boxes without an identity have the track id ``''``.
@@ -163,18 +217,25 @@ class BoxArray:
     class_names: tuple[str, ...]
     scores: Floats
     boxes: Floats
-    ticket: object = field(default=None, compare=False, repr=False)
+    ticket: object = field(default=None, repr=False)
     pinned: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        """Check that all columns have one length."""
+        """Check that all columns have one length; convert lists to arrays and tuples."""
+        _check_stamp(self.stamp_ns)
         n = len(self.track_ids)
-        checked('boxes', self.boxes, (n, 9))
-        checked('scores', self.scores, (n,))
+        self._set('track_ids', _texts('track_ids', self.track_ids))
+        self._set('class_names', _texts('class_names', self.class_names))
+        self._set('boxes', checked('boxes', self.boxes, (n, 9), BOX_AXES))
+        self._set('scores', checked('scores', self.scores, (n,)))
         if len(self.class_names) != n:
             raise ShapeError(f'class_names: expected {n}, got {len(self.class_names)}')
-        if self.pinned is not None and self.pinned.shape != (n,):
-            raise ShapeError(f'pinned: expected shape ({n},), got {self.pinned.shape}')
+        if self.pinned is not None:
+            self._set('pinned', np.asarray(self.pinned, bool))
+            _check_shape('pinned', self.pinned.shape, (n,))
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)  # the class is frozen
 
     def take(self, rows: Sequence[int]) -> 'BoxArray':
         """Return the boxes `rows` only."""
@@ -188,7 +249,7 @@ class BoxArray:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RefinedBoxes:
     """
     The refined boxes of one box array, in the order of the input.

@@ -94,6 +94,13 @@ def test_unknown_keys_are_refused_by_name(values, name):
         Config.from_dict(values)
 
 
+def test_dotted_keys_and_plain_groups_are_refused_with_how_to_write_them():
+    with pytest.raises(ConfigError, match=r'^solver\.rounds: .*write solver: \{rounds: '):
+        Config.from_dict({'solver.rounds': 3})
+    with pytest.raises(ConfigError, match=r'^solver: expected SolverConfig, .*from_dict'):
+        Config(solver={'rounds': 3})
+
+
 def test_a_removed_setting_is_refused_with_the_reason():
     with pytest.raises(ConfigError, match=r'solver\.history: was removed, no result depends'):
         Config.from_dict({'solver': {'history': 3}})

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, checked, Floats, HEIGHT, ROLL
+from boxreg_ros.structures import BOX_AXES, BOX_EXTENT, checked, Floats, HEIGHT, ROLL
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -126,7 +126,7 @@ def iou_3d(boxes: ArrayLike, truth: ArrayLike) -> Floats:
 
 
 def _rows(boxes: ArrayLike, truth: ArrayLike) -> tuple[Floats, Floats]:
-    a = checked('boxes', boxes, (None, 9))
+    a = checked('boxes', boxes, (None, 9), BOX_AXES)
     return a, checked('truth', truth, a.shape)
 
 

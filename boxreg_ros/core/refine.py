@@ -9,6 +9,7 @@ from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import ConfigError, ShapeError
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
+    BOX_AXES,
     BoxArray,
     checked,
     Floats,
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """
     One object over time, as arrays in the fixed frame.
@@ -54,6 +55,10 @@ class Track:
     ShapeError
         For an array of the wrong shape or type, or stamps that do not increase.
 
+    Notes
+    -----
+    Lists are converted to arrays. Tracks are equal only if they are the same object.
+
     """
 
     track_id: str
@@ -75,21 +80,25 @@ class Track:
         stamps_ns = self._checked_stamps()
         n = len(stamps_ns)
         self._set('stamps_ns', stamps_ns)
-        self._set('boxes', checked('boxes', self.boxes, (n, 9)))
-        if len(self.points) != n:
+        of_track = f'of track {self.track_id!r}'
+        self._set('boxes', checked(f'boxes {of_track}', self.boxes, (n, 9), BOX_AXES))
+        points = tuple(self.points) if isinstance(self.points, Iterable) else ()
+        if len(points) != n:
+            got = len(points) if isinstance(self.points, Iterable) else repr(self.points)
             raise ShapeError(
-                f'points of track {self.track_id!r}: expected {n} arrays, one per stamp, got '
-                f'{len(self.points)}'
+                f'points {of_track}: expected {n} arrays, one per stamp, got {got}; the array of '
+                f'a stamp without points is empty'
             )
-        points = [array if len(array) else np.zeros((0, 3)) for array in self.points]
-        self._set(
-            'points',
-            tuple(checked(f'points[{i}]', array, (None, 3)) for i, array in enumerate(points)),
+        points = tuple(
+            checked(f'points[{i}] {of_track}', array, (None, 3), 'x y z')
+            for i, array in enumerate(points)
         )
+        self._set('points', points)
         if self.sensor_origins is not None:
-            self._set('sensor_origins', checked('sensor_origins', self.sensor_origins, (n, 3)))
+            name = f'sensor_origins {of_track}'
+            self._set('sensor_origins', checked(name, self.sensor_origins, (n, 3), 'x y z'))
         if self.scores is not None:
-            self._set('scores', checked('scores', self.scores, (n,)))
+            self._set('scores', checked(f'scores {of_track}', self.scores, (n,)))
         if self.pinned is not None:
             self._set('pinned', self._checked_pins(np.asarray(self.pinned), n))
 
@@ -129,7 +138,7 @@ class Track:
         object.__setattr__(self, name, value)  # the class is frozen
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RefinedTrack:
     """
     The refined boxes of one track, row by row with its input.
@@ -188,12 +197,15 @@ def refine(tracks: Iterable[Track], config: Config | None = None) -> list[Refine
     Raises
     ------
     ShapeError
-        If a track has no valid box, or two tracks have the same id.
+        If `tracks` are no `Track`, one has no valid box, or two have the same id.
     ConfigError
         If `config` is no Config.
 
     """
     tracks = list(tracks)
+    for track in tracks:
+        if not isinstance(track, Track):
+            raise ShapeError(f'tracks: expected objects of class Track, got {type(track)}')
     if config is None:
         config = Config()
     if not isinstance(config, Config):

@@ -419,22 +419,6 @@ def move_to_frame(item: Sweep | BoxArray, T_frame_item: Floats, frame_id: str) -
     return boxes_to_frame(item, T_frame_item, frame_id)
 
 
-def to_fixed_frame(
-    item: Sweep | BoxArray, tree: TransformTree, fixed_frame: str
-) -> Sweep | BoxArray:
-    """
-    Return a sweep or boxes in the fixed frame.
-
-    Raises
-    ------
-    TransformUnavailable
-        If no transform is known at the stamp.
-
-    """
-    T_fixed_item = tree.lookup(fixed_frame, item.frame_id, item.stamp_ns)
-    return move_to_frame(item, T_fixed_item, fixed_frame)
-
-
 def boxes_to_frame(boxes: BoxArray, T_frame_boxes: Floats, frame_id: str) -> BoxArray:
     """Return the boxes in another frame; NaN stays NaN."""
     moved = boxes.boxes.copy()

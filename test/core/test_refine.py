@@ -301,6 +301,10 @@ def test_stamps_may_be_datetime64_of_any_unit(unit):
         ({'stamps_ns': [None] * 12}, ['stamps_ns', 'object']),
         ({'class_name': None}, ['class_name', 'None']),
         ({'boxes': torch.zeros(12, 9, requires_grad=True)}, ['boxes', 'grad']),
+        ({'boxes': np.zeros((12, 7))}, ["track '1'", '(12, 7)', 'height roll pitch yaw']),
+        ({'points': None}, ["track '1'", '12 arrays', 'None']),
+        ({'points': [np.zeros((5, 4))] * 12}, ['points[0]', '(5, 4)', 'columns x y z']),
+        ({'points': [None] * 12}, ['points[0]', 'columns x y z']),
     ],
 )
 def test_invalid_arguments_of_a_track_are_refused(changes, words):
@@ -317,6 +321,38 @@ def test_config_is_checked_and_tracks_may_be_a_generator():
     np.testing.assert_array_equal(found.boxes, known.boxes)
     empty = replace(track, points=[torch.zeros(0)] * 12)
     assert [len(points) for points in empty.points] == [0] * 12
+
+
+def test_lists_and_single_precision_give_the_boxes_of_arrays():
+    track, _ = a_track()
+    lists = Track(
+        track.track_id,
+        track.class_name,
+        track.stamps_ns.tolist(),
+        track.boxes.tolist(),
+        (points.tolist() for points in track.points),
+        track.sensor_origins.tolist(),
+    )
+    np.testing.assert_array_equal(only(lists).boxes, only(track).boxes)
+    single = replace(track, boxes=track.boxes.astype(np.float32))
+    np.testing.assert_allclose(only(single).boxes, only(track).boxes, atol=1e-3)
+
+
+def test_a_track_without_observations_stays_empty():
+    (refined,) = refine([Track('1', 'car', [], [], [])])
+    assert refined.boxes.shape == (0, 9)
+
+
+def test_tracks_are_equal_to_themselves_only():
+    track, _ = a_track()
+    twin = replace(track)
+    assert track != twin
+    assert len({track, twin}) == 2
+
+
+def test_other_objects_than_tracks_are_refused():
+    with pytest.raises(ShapeError, match=r"class Track, got <class 'dict'>"):
+        refine([{'track_id': '1'}])
 
 
 def test_tracks_without_valid_boxes_and_repeated_ids_are_refused():

@@ -9,7 +9,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.datasets import address_of, SceneRecording
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.items import ItemSource
-from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
+from boxreg_ros.io.transforms import move_to_frame, TransformTree
 from boxreg_ros.offline.job import jobs_of
 from boxreg_ros.structures import Sweep
 import layouts
@@ -116,7 +116,9 @@ def read(source, **options):
         assert isinstance(source, ItemSource)
         fixed_frame = source.choose_fixed_frame(tree)
         for item in source.items(tree, **options):
-            moved = to_fixed_frame(item.content, tree, fixed_frame)
+            content = item.content
+            T_fixed_item = tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
+            moved = move_to_frame(content, T_fixed_item, fixed_frame)
             (sweeps if isinstance(moved, Sweep) else boxes).append(moved)
         source.check_readable()
     return sweeps, boxes

@@ -3,7 +3,7 @@
 from boxreg_ros.cli import main
 from boxreg_ros.io.items import ItemSource
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.transforms import to_fixed_frame, TransformTree
+from boxreg_ros.io.transforms import move_to_frame, TransformTree
 from boxreg_ros.offline.labelled_recording import LabelledRecording
 from boxreg_ros.structures import Sweep
 import numpy as np
@@ -41,7 +41,9 @@ def read(source):
     with source:
         fixed_frame = source.choose_fixed_frame(tree)
         for item in source.items(tree):
-            moved = to_fixed_frame(item.content, tree, fixed_frame)
+            content = item.content
+            T_fixed_item = tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
+            moved = move_to_frame(content, T_fixed_item, fixed_frame)
             kinds.append((type(moved), moved.stamp_ns))
             if isinstance(moved, Sweep):
                 points.append(moved.points)
