@@ -580,7 +580,7 @@ def _cast(name: str, value: Any, default: Any) -> Any:
             return tuple(value)
     elif type(value) is type(default):
         return value
-    kind = 'list of text' if isinstance(default, tuple) else type(default).__name__
+    kind = 'a list such as [car, van]' if isinstance(default, tuple) else type(default).__name__
     raise ConfigError(f'{name}: expected {kind}, got {value!r}')
 
 

@@ -76,6 +76,10 @@ over a track, a part that changes slowly, wrong extents, and 2.4 % flipped headi
 """
 
 
+SUMMARY = ('input', 'smoothing only', 'ours, early', 'ours, final', 'ours, track')
+"""Methods of the first table: those that all recordings have."""
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Write the page or check it, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1] if __doc__ else None)
@@ -93,7 +97,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def page(store: Path) -> str:
     """Return the page for the measurements in a folder."""
-    parts = [INTRODUCTION]
+    parts = [INTRODUCTION, *_summary(store)]
     for kind, (title, meaning, render) in SECTIONS.items():
         stored = _measurements(store, kind)
         if stored:
@@ -109,6 +113,19 @@ def page(store: Path) -> str:
             parts.append(verdict.read_text(encoding='utf-8'))
     parts.append((store / 'dead_ends.md').read_text(encoding='utf-8'))
     return '\n'.join(parts)
+
+
+def _summary(store: Path) -> Iterable[str]:
+    """Yield the mean 3D IoU of the main methods on each recording, as a first table."""
+    rows = []
+    for data, document in _measurements(store, 'real'):
+        for methods in document['results'].values():
+            scores = [_number(methods[name]['iou_3d']) for name in SUMMARY]
+            rows.append([f'{_title(data)} ({methods["input"]["boxes"]})', *scores])
+    if rows:
+        yield '## In short\n'
+        yield 'Mean 3D IoU of each recording (number of true boxes); other scores are below.\n'
+        yield _table(['', *SUMMARY], rows) + '\n'
 
 
 def _measurements(store: Path, kind: str) -> list[tuple[str, Any]]:

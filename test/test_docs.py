@@ -80,7 +80,7 @@ def test_remedies_name_existing_sections():
 def commands_in(path):
     """Yield the lines of a page's code blocks that start boxreg, with the options of each."""
     for line in path.read_text(encoding='utf-8').splitlines():
-        if re.match(r'(    )?boxreg [a-z]', line):
+        if re.match(r' *boxreg [a-z]', line):
             yield line.strip()
 
 
@@ -89,6 +89,14 @@ def test_commands_are_valid(path):
     for command in commands_in(path):
         words = shlex.split(re.sub(r'\s#.*', '', command))[1:]
         parser(words[0]).parse_args(words)
+
+
+def test_every_extra_is_explained():
+    text = (DOCS / 'getting-started.md').read_text(encoding='utf-8')
+    explained = set(re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE))
+    _, _, setup = (ROOT / 'setup.py').read_text(encoding='utf-8').partition('extras_require')
+    extras = set(re.findall(r"^        '(\w+)': \[", setup, re.MULTILINE))
+    assert extras - {'interfaces', 'test'} == explained  # those two are for the tests here
 
 
 def test_readme_has_commands():

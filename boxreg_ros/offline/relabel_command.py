@@ -91,8 +91,8 @@ def _add_result_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--truth', type=Path, metavar='FILE',
-        help='true boxes that the report shows: CSV with the columns of boxes.csv, or a scene of '
-        'a data set',
+        help='with --report, true boxes that it shows: CSV with the columns of boxes.csv, or a '
+        'scene of a data set',
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, remedy_of
 from boxreg_ros.io.message_decoder import VISION_DEFINITIONS
 from boxreg_ros.rotations import matrix_from_rpy, quaternion_from_matrix
 from boxreg_ros.structures import BoxArray, Floats, LENGTH, ROLL, Sweep
@@ -118,7 +118,9 @@ def write_messages(
                     writer.write(topics[topic], received_ns, store.serialize_cdr(message, name))
             (bag / path.name).replace(path)
     except OSError as error:
-        raise RecordingError(f'{path}: cannot be written: {error}') from None
+        raise RecordingError(
+            f'{path}: cannot be written: {error.strerror}; {remedy_of(error)}'
+        ) from None
 
 
 class LidarMessages:

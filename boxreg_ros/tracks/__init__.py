@@ -1,1 +1,1 @@
-"""Post-processing of refined tracks: gaps are filled."""
+"""From refined tracks to whole ones: joined, pruned, filled and extended."""
