@@ -179,10 +179,9 @@ class Sweep:
 
 def _texts(name: str, values: Sequence[str]) -> tuple[str, ...]:
     """Return texts as a tuple; raise ShapeError for numbers, of which 0 is taken for no id."""
-    wrong = [value for value in values if not isinstance(value, str)]
-    if wrong or isinstance(values, str):
-        got = repr(wrong[0] if wrong else values)
-        raise ShapeError(f'{name}: expected a tuple with a text for each box, got {got}')
+    # The first stands for all: arrays of a thousand boxes are made several times per sweep.
+    if isinstance(values, str) or not all(isinstance(value, str) for value in values[:1]):
+        raise ShapeError(f'{name}: expected a tuple with a text for each box, got {values!r:.60}')
     return tuple(values)
 
 

@@ -52,8 +52,6 @@ RANGE, INTENSITY = 0, 1
 """Channels of a range image [m, without unit]."""
 READ_AHEAD_BYTES = 1 << 20
 """Bytes of a column that are read at once; a whole column of a segment has some 100 MB."""
-MAX_POSE_GAP_NS = 1000
-"""A pose belongs to a sweep of the same microsecond [ns]."""
 
 
 def scene_names(root: Path) -> list[str]:
@@ -113,7 +111,6 @@ class _Calibration(NamedTuple):
     """Name of a LiDAR, its pose (4, 4) in the vehicle, and its inclinations [rad]."""
 
     name: str
-
     T_vehicle_lidar: Floats
     inclinations: Floats | None
     min_inclination: float
