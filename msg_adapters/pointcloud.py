@@ -173,36 +173,11 @@ def _first(names: Sequence[str], fields: Mapping[str, Any]) -> str | None:
 
 def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     """Return a structured view (height, width) of the raw bytes, with these fields only."""
-    sizes = (msg.width, msg.height, msg.point_step, msg.row_step)
-    if min(sizes) < 0:
-        raise UnsupportedMessage(
-            f'PointCloud2: expected width, height, point_step and row_step of at least 0, got '
-            f'{", ".join(map(str, sizes))}'
-        )
     data = np.frombuffer(msg.data, np.uint8)
-    row_size = msg.width * msg.point_step
-    row_step = msg.row_step if msg.height > 1 else row_size
-    needed = (msg.height - 1) * row_step + row_size
-    if row_step < row_size or len(data) < needed:
-        raise UnsupportedMessage(
-            f'PointCloud2: {msg.height} x {msg.width} points of {msg.point_step} bytes in rows of '
-            f'{row_step}: expected at least {max(needed, msg.height * row_size)} bytes, got '
-            f'{len(data)}; the publisher fills in width, height, point_step or row_step wrongly'
-        )
+    row_step = _checked_row_step(msg, len(data))
     order = '>' if msg.is_bigendian else '<'
     for field in fields:
-        dtype = DTYPES.get(field.datatype)
-        if dtype is None or field.count > 1:
-            raise UnsupportedMessage(
-                f'PointCloud2: field {field.name!r}: expected one number of datatype 1 to 8, got '
-                f'{field.count} of datatype {field.datatype}'
-            )
-        end = field.offset + np.dtype(dtype).itemsize
-        if field.offset < 0 or end > msg.point_step:
-            raise UnsupportedMessage(
-                f'PointCloud2: field {field.name!r} ends at byte {end}: expected at most '
-                f'point_step, got {msg.point_step}'
-            )
+        _check_field(field, msg.point_step)
     layout = np.dtype(
         {
             'names': [field.name for field in fields],
@@ -214,6 +189,42 @@ def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     return np.ndarray(
         (msg.height, msg.width), layout, data.data, strides=(row_step, msg.point_step)
     )
+
+
+def _checked_row_step(msg: Any, num_bytes: int) -> int:
+    """Return the bytes from row to row; UnsupportedMessage if the sizes contradict each other."""
+    sizes = (msg.width, msg.height, msg.point_step, msg.row_step)
+    if min(sizes) < 0:
+        raise UnsupportedMessage(
+            f'PointCloud2: expected width, height, point_step and row_step of at least 0, got '
+            f'{", ".join(map(str, sizes))}'
+        )
+    row_size = msg.width * msg.point_step
+    row_step = msg.row_step if msg.height > 1 else row_size
+    needed = (msg.height - 1) * row_step + row_size
+    if row_step < row_size or num_bytes < needed:
+        raise UnsupportedMessage(
+            f'PointCloud2: {msg.height} x {msg.width} points of {msg.point_step} bytes in rows of '
+            f'{row_step}: expected at least {max(needed, msg.height * row_size)} bytes, got '
+            f'{num_bytes}; the publisher fills in width, height, point_step or row_step wrongly'
+        )
+    return int(row_step)
+
+
+def _check_field(field: Any, point_step: int) -> None:
+    """Raise UnsupportedMessage for a field that is no single number within a point."""
+    dtype = DTYPES.get(field.datatype)
+    if dtype is None or field.count > 1:
+        raise UnsupportedMessage(
+            f'PointCloud2: field {field.name!r}: expected one number of datatype 1 to 8, got '
+            f'{field.count} of datatype {field.datatype}'
+        )
+    end = field.offset + np.dtype(dtype).itemsize
+    if field.offset < 0 or end > point_step:
+        raise UnsupportedMessage(
+            f'PointCloud2: field {field.name!r} ends at byte {end}: expected at most '
+            f'point_step, got {point_step}'
+        )
 
 
 def _seconds(

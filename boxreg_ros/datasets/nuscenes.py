@@ -58,22 +58,13 @@ def open_scene(root: Path, name: str, lidars: Sequence[str]) -> Scene:
 
 
 def _scene(root: Path, tables: Path, scene: dict[str, Any], lidars: Sequence[str]) -> Scene:
+    """Return a scene of a row of the table ``scene``."""
     samples = {
         row['token']: row['timestamp'] * 1000
         for row in _rows(tables, 'sample')
         if row['scene_token'] == scene['token']
     }
-    channels = {
-        row['token']: row['channel']
-        for row in from_json(tables / 'sensor.json')
-        if row['modality'] == 'lidar'
-    }
-    channel = require_lidar(lidars, sorted(set(channels.values())))
-    calibrations = {
-        row['token']: pose_matrix(row)
-        for row in from_json(tables / 'calibrated_sensor.json')
-        if channels.get(row['sensor_token']) == channel
-    }
+    channel, calibrations = _lidar(tables, lidars)
     sweeps = [
         row
         for row in _rows(tables, 'sample_data')
@@ -104,6 +95,22 @@ def _scene(root: Path, tables: Path, scene: dict[str, Any], lidars: Sequence[str
         partial(frames_of, 'nuscenes', tables, frames) if has_annotations else None,
         without_boxes=str(annotations),
     )
+
+
+def _lidar(tables: Path, lidars: Sequence[str]) -> tuple[str, dict[str, Floats]]:
+    """Return the channel of the LiDAR, and its poses (4, 4) in the vehicle by their tokens."""
+    channels = {
+        row['token']: row['channel']
+        for row in from_json(tables / 'sensor.json')
+        if row['modality'] == 'lidar'
+    }
+    channel = require_lidar(lidars, sorted(set(channels.values())))
+    calibrations = {
+        row['token']: pose_matrix(row)
+        for row in from_json(tables / 'calibrated_sensor.json')
+        if channels.get(row['sensor_token']) == channel
+    }
+    return channel, calibrations
 
 
 def _sweep_files(root: Path, sweeps: list[dict[str, Any]]) -> Iterator[SweepFile]:

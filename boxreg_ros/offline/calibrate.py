@@ -277,13 +277,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Estimate, print a table, and write the settings."""
     config = config_from(args)
-    if args.output and (args.output.is_dir() or not args.output.parent.is_dir()):
-        raise ConfigError(
-            f'output {str(args.output)!r}: expected a file in a folder that is there, got '
-            f'{str(args.output if args.output.is_dir() else args.output.parent)!r}; choose another'
-        )
-    if args.output:  # may be the file of --config
-        spare_file(args.output, [*args.recordings, args.truth])
+    if args.output:
+        _check_output(args)
     truth = true_boxes(args.truth)
     recording = source_of(
         args.recordings,
@@ -320,6 +315,16 @@ def run(args: argparse.Namespace) -> int:
         write_settings(args.output, values, f'{args.truth.name} of {recording}')
         print(f'{args.output}: use it with boxreg relabel --config or the node --params-file')
     return 0
+
+
+def _check_output(args: argparse.Namespace) -> None:
+    """Refuse an output that cannot be written, or would replace an input but ``--config``."""
+    if args.output.is_dir() or not args.output.parent.is_dir():
+        raise ConfigError(
+            f'output {str(args.output)!r}: expected a file in a folder that is there, got '
+            f'{str(args.output if args.output.is_dir() else args.output.parent)!r}; choose another'
+        )
+    spare_file(args.output, [*args.recordings, args.truth])
 
 
 def _true_windows(drive: Drive, config: Config) -> list[Window]:
