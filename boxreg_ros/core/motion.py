@@ -23,7 +23,7 @@ UNKNOWN_SPEED_DEVIATION = 8.0
 TURN_RATE = 0.5
 """Standard deviation of an unknown turn rate [rad/s]; chosen: a bend of 20 m at 10 m/s."""
 MIN_TURN_SPEED = 1.0
-"""Slower objects are predicted straight ahead [m/s]; chosen: their heading says little."""
+"""Slower objects are predicted straight ahead [m/s]; chosen: their heading is uncertain."""
 
 
 @dataclass(frozen=True, slots=True)

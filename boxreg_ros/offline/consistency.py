@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from boxreg_ros.offline.box_scores import Matches
 
 DEFAULTS = Config()
-"""Settings that say which kind a class is of."""
+"""Settings that assign class names to kinds of objects."""
 CONSISTENCY_VARIABLES = ('along', 'across', 'up', 'yaw', 'length', 'width', 'height')
 RANGE_BINS = (0.0, 20.0, 40.0, math.inf)
 """Limits of the groups by distance from the sensor [m]."""
