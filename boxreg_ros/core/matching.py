@@ -7,6 +7,7 @@ from math import inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
+from boxreg_ros.errors import ShapeError
 from boxreg_ros.structures import BoxArray, Sweep
 
 
@@ -89,6 +90,8 @@ class StampMatcher:
                 self._used_ns.add(sweep.stamp_ns)
                 if sweep.is_dropped:
                     sweep = None
+                else:
+                    _check_frames(sweep, self._boxes[0])
             yield Pair(self._boxes.pop(0), sweep)
             self._discard_before(stamp_ns - self._reach_ns)
 
@@ -100,3 +103,12 @@ class StampMatcher:
             if stamp_ns not in self._used_ns:
                 self._counts['sweep_without_boxes'] += 1
             self._used_ns.discard(stamp_ns)
+
+
+def _check_frames(sweep: Sweep, boxes: BoxArray) -> None:
+    """Raise ShapeError if a sweep is in another frame than its boxes."""
+    if sweep.frame_id != boxes.frame_id:
+        raise ShapeError(
+            f'sweep at {sweep.stamp_ns} ns: expected the frame of its boxes, {boxes.frame_id!r}, '
+            f'got {sweep.frame_id!r}; bring both into one fixed frame'
+        )

@@ -5,6 +5,7 @@ from itertools import permutations
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.matching import StampMatcher
+from boxreg_ros.errors import ShapeError
 from boxreg_ros.structures import BoxArray, Sweep
 import numpy as np
 import pytest
@@ -201,3 +202,10 @@ def test_memory_is_bounded():
     assert [boxes for boxes, _ in pairs] == [100 * i for i in range(200)]
     assert [b for b, s in pairs if s is not None] == [9500, 9600, 9700, 9800, 9900]
     assert feed.counts == {'sweep_without_boxes': 95}
+
+
+def test_boxes_of_another_frame_than_their_sweep_are_refused():
+    matcher = StampMatcher(Config(), Counter())
+    matcher.add_sweep(Sweep(100, 'lidar', np.zeros((0, 3))))
+    with pytest.raises(ShapeError, match=r"frame of its boxes, 'odom', got 'lidar'; bring both"):
+        matcher.add_boxes(boxes(100))
