@@ -347,8 +347,8 @@ def _explained(error: OSError, folder: Path, has_begun: bool) -> RecordingError:
 def _deleted(folder: Path) -> RecordingError:
     return RecordingError(
         f'record_to {str(folder)!r}: expected a folder until the recording ends, got one that was '
-        f'deleted, with the labels in it; call ~/start_recording, and let nothing delete it '
-        f'meanwhile'
+        f'deleted or moved; call ~/start_recording, and boxreg recover for the labels in one that '
+        f'was moved'
     )
 
 
