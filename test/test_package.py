@@ -7,6 +7,7 @@ from pathlib import Path
 import re
 import shutil
 import signal
+import site
 import subprocess
 import sys
 import sysconfig
@@ -113,8 +114,8 @@ def new_environment(folder):
     """Make an environment with the packages of the running one, except boxreg_ros."""
     venv.create(folder, symlinks=True)
     packages = sysconfig.get_path('purelib', vars={'base': str(folder)})
-    own = sysconfig.get_path('purelib')
-    (Path(packages) / 'dependencies.pth').write_text(f'{own}\n')
+    # Those of the system too, where the running environment sees them.
+    (Path(packages) / 'dependencies.pth').write_text('\n'.join(site.getsitepackages()))
     return folder / 'bin'
 
 

@@ -376,7 +376,7 @@ def _checked(item: Setting, value: Any) -> Any:
     if kind is float and type(value) is int:
         value = float(value)
     if type(value) is not kind:
-        raise ConfigError(f'{item.name}: expected {kind.__name__}, got {value!r}')
+        raise ConfigError(f'{item.name}: expected {kind.__name__} ({item.meaning}), got {value!r}')
     if item.choices and value not in item.choices:
         raise ConfigError(f'{item.name}: expected one of {", ".join(item.choices)}, got {value!r}')
     if item.low is not None and item.high is not None and not item.low <= value <= item.high:

@@ -142,8 +142,9 @@ class RecorderProcess:
         if predecessor is not None:
             predecessor.has_ended.wait()
         process = subprocess.Popen(
-            [sys.executable, '-m', PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
+            [sys.executable, '-m', PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            process_group=0,  # the SIGINT of a terminal would end it before it ignores signals
+        )  # fmt: skip
         assert process.stdin is not None
         Thread(target=self._read_all, args=(process,), daemon=True).start()
         self._send_all(process.stdin)

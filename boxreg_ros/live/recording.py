@@ -128,7 +128,10 @@ class Recording:
         name = status.segment or 'waiting for final boxes'
         text = f'recording {name}, {1e-6 * status.rate:.1f} MB/s'
         left = status.seconds_left
-        return text if left is None else f'{text}, disk full in {left / 3600:.1f} h'
+        if left is None:
+            return text
+        remaining = f'{left / 60:.0f} min' if left < 3600 else f'{left / 3600:.1f} h'
+        return f'{text}, disk full in {remaining}'
 
     def show(self, markers: Publisher, frame_id: str) -> None:
         """Publish the state as a text above a sensor; once more to delete it."""

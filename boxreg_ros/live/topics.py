@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -14,7 +13,6 @@ from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.live.diagnostics import Health
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from msg_adapters import canonical
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -26,30 +24,21 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
 )
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 PATIENCE = 10.0
 """A topic without publishers or messages is reported this long after its subscription [s]."""
 MAX_QOS_DEPTH = 2**31 - 1
 """Longest queue; derived: DDS counts its samples by a signed integer of 32 bits."""
-
-
-def _depth_result(qos: QoSProfile) -> SetParametersResult:
-    """Return whether DDS can have a queue of the depth of a profile."""
-    is_possible = qos.history == HistoryPolicy.KEEP_ALL or 1 <= qos.depth <= MAX_QOS_DEPTH
-    reason = f'depth: expected 1 to {MAX_QOS_DEPTH}, got {qos.depth}'
-    return SetParametersResult(successful=is_possible, reason='' if is_possible else reason)
-
-
+QOS_POLICIES: dict[str, Any] = {
+    'history': HistoryPolicy,
+    'reliability': ReliabilityPolicy,
+    'durability': DurabilityPolicy,
+}
+"""Policies with named values that parameters may override."""
 QOS_OVERRIDES = QoSOverridingOptions(
-    (
-        QoSPolicyKind.HISTORY,
-        QoSPolicyKind.DEPTH,
-        QoSPolicyKind.RELIABILITY,
-        QoSPolicyKind.DURABILITY,
-    ),
-    callback=_depth_result,
+    [QoSPolicyKind[policy.upper()] for policy in (*QOS_POLICIES, 'depth')]
 )
 """Policies that parameters ``qos_overrides.TOPIC.ENTITY.POLICY`` may set."""
 INFINITE_NS = 9223372036854775807
@@ -205,11 +194,11 @@ class Topics:
         name = self._node.resolve_topic_name(topic)
         endpoint = Endpoint(topic, name, type_name, QoSProfile(depth=depth))
         events = PublisherEventCallbacks(incompatible_qos=self._on_incompatible_subscription)
-        with _checked_overrides(f'{name}.publisher'):
-            endpoint.entity = self._node.create_publisher(
-                kind, topic, endpoint.qos, event_callbacks=events,
-                qos_overriding_options=QOS_OVERRIDES,
-            )  # fmt: skip
+        _check_overrides(self._node, f'qos_overrides.{name}.publisher')
+        endpoint.entity = self._node.create_publisher(
+            kind, topic, endpoint.qos, event_callbacks=events,
+            qos_overriding_options=QOS_OVERRIDES,
+        )  # fmt: skip
         self._endpoints.append(endpoint)
         publisher: Publisher = endpoint.entity
         return publisher
@@ -297,12 +286,12 @@ class Topics:
         )
         if endpoint.entity is not None:
             self._node.destroy_subscription(endpoint.entity)
-        with _checked_overrides(f'{endpoint.name}.subscription'):
-            endpoint.entity = self._node.create_subscription(
-                kind, endpoint.topic, partial(self._on_message, endpoint), endpoint.qos,
-                event_callbacks=events, raw=endpoint.is_raw,
-                qos_overriding_options=QOS_OVERRIDES if endpoint.has_overrides else None,
-            )  # fmt: skip
+        _check_overrides(self._node, f'qos_overrides.{endpoint.name}.subscription')
+        endpoint.entity = self._node.create_subscription(
+            kind, endpoint.topic, partial(self._on_message, endpoint), endpoint.qos,
+            event_callbacks=events, raw=endpoint.is_raw,
+            qos_overriding_options=QOS_OVERRIDES if endpoint.has_overrides else None,
+        )  # fmt: skip
 
     def _on_message(self, endpoint: Endpoint, message: Any) -> None:
         assert endpoint.callback is not None  # only subscriptions have messages
@@ -477,16 +466,23 @@ def _described(endpoint: Endpoint) -> str:
     return f'{endpoint.name} [{endpoint.type_name}] {policies} {qos.depth}'
 
 
-@contextmanager
-def _checked_overrides(name: str) -> Iterator[None]:
-    """Name the QoS override that is wrong: rclpy checks their types by bare assertions."""
-    try:
-        yield
-    except InvalidQosOverridesError as error:
-        reason = str(error).partition('are not valid: ')[2]
-        raise ConfigError(f'qos_overrides.{name}.{reason}; correct it or leave it out') from None
-    except (AssertionError, AttributeError, RuntimeError, TypeError) as error:
-        raise ConfigError(
-            f'qos_overrides.{name}: expected a whole number for depth and policy names such as '
-            f'reliable for the others, got something else {error}'.rstrip()
-        ) from None
+def _check_overrides(node: Node, prefix: str) -> None:
+    """Refuse a wrong QoS override by name; rclpy refuses some by bare assertions."""
+    parameters: dict[str, Any] = node.get_parameters_by_prefix(prefix)  # wrong annotation in rclpy
+    for policy, parameter in parameters.items():
+        value = parameter.value
+        if policy == 'depth':
+            expected = f'a whole number from 1 to {MAX_QOS_DEPTH}'
+            is_possible = type(value) is int and 1 <= value <= MAX_QOS_DEPTH
+        elif policy in QOS_POLICIES:
+            names = [name.lower() for name in QOS_POLICIES[policy].__members__]
+            names.remove('unknown')
+            expected = f'one of {", ".join(names)}'
+            is_possible = str(value).lower() in names
+        else:
+            continue
+        if not is_possible:
+            raise ConfigError(
+                f'{prefix}.{policy}: expected {expected}, got {value!r}; correct it or leave it '
+                f'out'
+            )

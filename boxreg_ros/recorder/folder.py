@@ -32,8 +32,8 @@ def locked(folder: Path) -> Iterator[None]:
         file = (folder / LOCK).open('a+')
     except OSError as error:
         raise RecordingError(
-            f'{str(folder)!r}: expected a folder that can be written to, got: {error.strerror}; '
-            f'choose another, or change its owner or mode'
+            f'record_to {str(folder)!r}: expected a folder that can be written to, got: '
+            f'{error.strerror}; choose another, or change its owner or mode'
         ) from None
     with file:
         _lock(file, folder)
@@ -67,6 +67,6 @@ def _lock(file: IO[str], folder: Path) -> None:
     except BlockingIOError:
         file.seek(0)
         raise RecordingError(
-            f'{str(folder)!r}: expected a folder that nobody records into, got one in use by '
-            f'process {file.read().strip()}; choose another, or stop that recording'
+            f'record_to {str(folder)!r}: expected a folder that nobody records into, got one in '
+            f'use by process {file.read().strip()}; choose another, or stop that recording'
         ) from None

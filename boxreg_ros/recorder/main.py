@@ -124,11 +124,7 @@ class Recorder:
         self._collect()
         segment = self._segment
         if segment is not None and segment.is_deleted:
-            raise RecordingError(
-                f'record_to {str(self._folder)!r}: expected a folder until the recording ends, '
-                f'got one that was deleted, with the labels in it; call ~/start_recording, and '
-                f'let nothing delete it meanwhile'
-            )
+            raise _deleted(self._folder)
         open_bytes = 0 if segment is None else self._growth.measure(segment.files)
         size = self._written['size'] + open_bytes
         if segment is not None and self._limits_bytes and open_bytes >= self._limit:
@@ -305,7 +301,7 @@ def serve(source: IO[bytes], report: Callable[[Status], None]) -> None:
         if recorder is not None:
             recorder.abandon()
         if isinstance(error, OSError):
-            raise _explained(error, folder) from None
+            raise _explained(error, folder, recorder is not None) from None
         raise
 
 
@@ -325,21 +321,34 @@ def _record(recorder: Recorder, source: IO[bytes], report: Callable[[Status], No
             due = time.monotonic() + STATUS_PERIOD
 
 
-def _explained(error: OSError, folder: Path) -> RecordingError:
-    """Return what an error of the disk means for the recording."""
+def _explained(error: OSError, folder: Path, has_begun: bool) -> RecordingError:
+    """Return what an error of the disk means for a recording."""
     place = f'record_to {str(folder)!r}'
     if error.errno in DISK_ERRORS:
         return RecordingError(
             f'{place}: expected room for labels, got: {error.strerror}; free some space and call '
             f'~/start_recording, which completes the segment that was open'
         )
-    if not folder.exists():
+    if folder.is_file():
+        return RecordingError(f'{place}: expected a folder, got a file; choose another')
+    if folder.exists():
         return RecordingError(
-            f'{place}: expected a folder, got: {error.strerror}; it was deleted, or cannot be made'
+            f'{place}: expected a folder that can be written to, got: {error.strerror} '
+            f'({error.filename}); choose another, or change its owner or mode'
         )
+    if has_begun:
+        return _deleted(folder)
     return RecordingError(
-        f'{place}: expected a folder that can be written to, got: {error.strerror} '
-        f'({error.filename}); choose another, or change its owner or mode'
+        f'{place}: expected a folder that exists or can be made, got: {error.strerror}; choose '
+        f'another'
+    )
+
+
+def _deleted(folder: Path) -> RecordingError:
+    return RecordingError(
+        f'record_to {str(folder)!r}: expected a folder until the recording ends, got one that was '
+        f'deleted or moved; call ~/start_recording, and boxreg recover for the labels in one that '
+        f'was moved'
     )
 
 

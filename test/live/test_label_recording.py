@@ -2,6 +2,7 @@
 
 import csv
 from importlib.util import find_spec
+import os
 import time
 
 from boxreg_ros.cli import main
@@ -256,7 +257,8 @@ def test_two_nodes_another_clock_and_a_killed_node(tmp_path):
     folder = tmp_path / 'labels'
     with graph_in(tmp_path) as graph:
         robot = Robot(graph, path, record_to=folder)
-        graph.wait(lambda: (folder / '.lock').exists(), 'the recorder')
+        recorder = int((folder / '.lock').read_text())
+        assert os.getpgid(recorder) == recorder  # the SIGINT of a terminal does not reach it
         second = graph.start('-p', f'record_to:={folder}', '-r', '__node:=second')
         graph.wait(lambda: 'nobody records into, got one in use' in second.output(), 'an error')
         assert second.output().count('ERROR') == 1

@@ -108,6 +108,7 @@ def test_node_and_relabel_read_the_same_file(make_node, tmp_path):
         ('transform_timeout', -1.0, ('transform_timeout', '0', '-1')),
         ('backlog', 'x', ('backlog', 'float', 'x')),
         ('boxes_type', 3, ('boxes_type', 'str', '3')),
+        ('record_segment', 5, ('record_segment', 'a number with the unit s', 'got 5')),
         ('faces.learn', 1, ('faces.learn', 'bool', '1')),
     ],
 )

@@ -257,14 +257,21 @@ def test_recovery_says_what_it_did_and_what_it_expected(tmp_path, capsys):
 
 
 def test_two_recorders_do_not_share_a_folder(tmp_path):
-    with locked(tmp_path), pytest.raises(RecordingError, match='nobody records into'):
+    with (
+        locked(tmp_path),
+        pytest.raises(RecordingError, match=r'record_to .* nobody records into'),
+    ):
         record(settings_of(tmp_path), [final_boxes(0)])
     record(settings_of(tmp_path), [final_boxes(0)])
 
 
 def test_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / 'file').write_text('')
-    with pytest.raises(RecordingError, match=r'record_to .*file/labels.*Not a directory'):
+    with pytest.raises(RecordingError, match=r"record_to .*/file': expected a folder, got a file"):
+        record(settings_of(tmp_path / 'file'), [final_boxes(0)])
+    with pytest.raises(
+        RecordingError, match=r"file/labels': .*be made, got: Not a directory; cho"
+    ):
         record(settings_of(tmp_path / 'file' / 'labels'), [final_boxes(0)])
 
 
@@ -286,20 +293,22 @@ def test_full_disk_ends_the_recording_and_keeps_the_journal(tmp_path):
     assert stamps == list(range(len(stamps)))
 
 
-def test_deleted_folder_ends_the_recording(tmp_path):
+@pytest.mark.parametrize('changes', [{}, {'formats': ('sustechpoints',), 'with_points': True}])
+def test_deleted_folder_ends_the_recording(tmp_path, changes):
     folder = tmp_path / 'labels'
     recorder = start_recorder(folder)
-    pickle.dump(settings_of(folder), recorder.stdin)
+    pickle.dump(settings_of(folder, **changes), recorder.stdin)
     pickle.dump(final_boxes(0), recorder.stdin)
     recorder.stdin.flush()
     while not (folder / '.segment_000001.open' / 'journal.mcap').exists():
         time.sleep(0.01)
     subprocess.run(['rm', '-r', str(folder)], check=True)
     time.sleep(1.1)  # a status is due
-    output, _ = recorder.communicate(pickle.dumps(final_boxes(1)), timeout=30)
+    items = b''.join(map(pickle.dumps, (cloud(1), final_boxes(1))))
+    output, _ = recorder.communicate(items, timeout=30)
     assert recorder.returncode == 1
     error = last_status(output).error
-    assert 'deleted' in error and 'expected a folder' in error
+    assert 'expected a folder until the recording ends, got one that was deleted' in error
     assert not folder.exists()
 
 
