@@ -135,9 +135,12 @@ class Known(NamedTuple):
     def arrays(self) -> InputArrays:
         """Return margins, noise and population for the kernels."""
         deviation, correlation, offset, weight = map(_by_kind, self.noise)
+        gap_correction, occlusion_inset, range_inset = map(_by_kind, self.offsets)
+        median, slopes = self.population.slopes()
+        gap_variance, gap_tracks, gap_noise = map(_by_kind, self.scatter)
         return InputArrays(
-            deviation, correlation, offset, weight[:, 0], *map(_by_kind, self.offsets),
-            *self.population.slopes(), *map(_by_kind, self.scatter),
+            deviation, correlation, offset, weight[:, 0], gap_correction, occlusion_inset,
+            range_inset, median, slopes, gap_variance, gap_tracks, gap_noise,
         )  # fmt: skip
 
 
@@ -201,8 +204,11 @@ def expect(problem: Problem, known: Known) -> Expectation:
     usual_spread = problem.of_class('gap_spread') * (2 - 2 * constant[:, :1]).clamp(1)
     spread = usual_spread * size[:, FACE_AXIS]
     widened = deviation * widening[:, :6]
-    of_gaps = bias[:, :3] ** 2 + (mean / size * part / 2) ** 2
-    margins = _margin_error(problem, known.scatter, of_gaps, widened[:, :3] ** 2, usual_spread)
+    scatter = known.scatter.of(problem)
+    of_gaps = (bias[:, :3] ** 2 + (mean / size * part / 2) ** 2)[:, FACE_AXIS]
+    of_gaps = of_gaps + scatter.noise * widened[:, :3].square()[:, FACE_AXIS]
+    similarity = known.population.similarity(problem, mean)
+    margins = margin_spread(scatter, of_gaps, usual_spread.expand_as(spread), similarity)
     margins = margins * size[:, FACE_AXIS]
     # A pinned box has the true extents, and no bias: its pose is that of the object.
     has_pin = problem.pinned.any(1)[:, None]
@@ -218,22 +224,6 @@ def expect(problem: Problem, known: Known) -> Expectation:
     input_error = _at_least_prior(problem, input_error, deviations)
     error = torch.cat([input_error, margins], 1)
     return Expectation(shared, deviations, deviation, widened, unmodelled, error)
-
-
-def _margin_error(
-    problem: Problem, scatter: GapScatter, constant: Tensor, noise: Tensor, usual: Tensor
-) -> Tensor:
-    """
-    Return the deviation of the labelling margins of objects as large as cars, (B, 6) [m].
-
-    From the scatter of the gaps of all tracks of the kind. A gap has the errors of the input box:
-    variances (B, 3) of those that are `constant` over a track, and of those of one observation,
-    `noise`. `usual` (B, 1) is the deviation by the settings.
-
-    """
-    scatter = scatter.of(problem)
-    errors = constant[:, FACE_AXIS] + scatter.noise * noise[:, FACE_AXIS]
-    return margin_spread(scatter, errors, usual.expand_as(errors))
 
 
 def expectation_numbers() -> ExpectationNumbers:

@@ -58,7 +58,9 @@ def spread_quadrature() -> tuple[Floats, Floats]:
     return squares, np.exp(-squares / 2)
 
 
-def margin_spread(scatter: GapScatter, errors: Tensor, usual: Tensor) -> Tensor:
+def margin_spread(
+    scatter: GapScatter, errors: Tensor, usual: Tensor, similarity: Tensor
+) -> Tensor:
     """
     Return the posterior spread of the labelling margins between tracks (M18a) [m].
 
@@ -70,17 +72,21 @@ def margin_spread(scatter: GapScatter, errors: Tensor, usual: Tensor) -> Tensor:
         Variance of the gap of a track by errors of the input [m^2].
     usual : Tensor, shape (B, 6)
         Spread by the settings [m].
+    similarity : Tensor, shape (B, 1)
+        How like the other tracks each object is, 0 to 1: the gaps of cars say little of a tram's.
 
     Returns
     -------
     spread : Tensor, shape (B, 6)
-        The root of the posterior mean of its square.
+        The root of the posterior mean of its square, as far as objects are similar.
 
     """
     squares, weights = (torch.from_numpy(part).to(usual) for part in spread_quadrature())
-    squares = usual[..., None] ** 2 * squares  # (B, 6, Q)
+    prior = usual**2
+    squares = prior[..., None] * squares  # (B, 6, Q)
     total = errors[..., None] + squares
     degrees = (scatter.tracks[..., None] - 1).clamp(min=0)
     information = -0.5 * degrees * (total.log() + scatter.variance[..., None] / total)
     part = weights * (information - information.amax(-1, keepdim=True)).exp()
-    return ((part * squares).sum(-1) / part.sum(-1)).sqrt()
+    posterior = (part * squares).sum(-1) / part.sum(-1)
+    return torch.lerp(prior, posterior, similarity).sqrt()

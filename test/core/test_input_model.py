@@ -457,11 +457,11 @@ def test_scatter_of_gaps_is_that_between_tracks():
     np.testing.assert_array_equal(model.gap_scatter().tracks[1:], 0)  # of other kinds
 
 
-def spread_of(variance, tracks, errors, usual=0.05):
+def spread_of(variance, tracks, errors, usual=0.05, similarity=1.0):
     """Return the spread of margins [m] from gaps of this `variance` of errors of input [m^2]."""
     one = torch.ones(1, 6, dtype=D)
     scatter = GapScatter(variance * one, tracks * one, 0 * one)
-    (spread,) = margin_spread(scatter, errors * one, usual * one).unique()
+    (spread,) = margin_spread(scatter, errors * one, usual * one, similarity * one[:, :1]).unique()
     return float(spread)
 
 
@@ -480,6 +480,8 @@ def test_spread_of_margins_follows_the_scatter_of_the_gaps():
     # Few tracks, or errors far larger than margins, are little evidence.
     assert 0.04 < spread_of(0.04**2, 3, 0.06**2) < 0.05
     assert spread_of(0.3**2, 20, 0.3**2) == pytest.approx(0.05, rel=0.05)
+    # Of an object unlike the others they are none.
+    assert spread_of(0.04**2, 40, 0.06**2, similarity=0.0) == pytest.approx(0.05)
 
 
 def test_spread_of_margins_is_a_half_normal_posterior():
