@@ -204,12 +204,11 @@ def expect(problem: Problem, known: Known) -> Expectation:
     usual_spread = problem.of_class('gap_spread') * (2 - 2 * constant[:, :1]).clamp(1)
     spread = usual_spread * size[:, FACE_AXIS]
     widened = deviation * widening[:, :6]
+    constant_error = bias[:, :3] ** 2 + (mean / size * part / 2) ** 2
     scatter = known.scatter.of(problem)
-    of_gaps = (bias[:, :3] ** 2 + (mean / size * part / 2) ** 2)[:, FACE_AXIS]
-    of_gaps = of_gaps + scatter.noise * widened[:, :3].square()[:, FACE_AXIS]
+    of_gaps = constant_error[:, FACE_AXIS] + scatter.noise * widened[:, FACE_AXIS] ** 2
     similarity = known.population.similarity(problem, mean)
     margins = margin_spread(scatter, of_gaps, usual_spread.expand_as(spread), similarity)
-    margins = margins * size[:, FACE_AXIS]
     # A pinned box has the true extents, and no bias: its pose is that of the object.
     has_pin = problem.pinned.any(1)[:, None]
     extent_deviation = torch.where(has_pin, PINNED_EXTENT, extent * part)
@@ -222,7 +221,7 @@ def expect(problem: Problem, known: Known) -> Expectation:
     deviations = torch.cat([extent_deviation, bias, spread, pivot, one, sideslip], 1)
     input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
     input_error = _at_least_prior(problem, input_error, deviations)
-    error = torch.cat([input_error, margins], 1)
+    error = torch.cat([input_error, margins * size[:, FACE_AXIS]], 1)
     return Expectation(shared, deviations, deviation, widened, unmodelled, error)
 
 

@@ -73,7 +73,7 @@ def margin_spread(
     usual : Tensor, shape (B, 6)
         Spread by the settings [m].
     similarity : Tensor, shape (B, 1)
-        How like the other tracks each object is, 0 to 1: the gaps of cars say little of a tram's.
+        How like the other tracks each object is, 0 to 1: gaps of cars are no evidence for a tram.
 
     Returns
     -------
