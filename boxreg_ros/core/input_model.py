@@ -213,7 +213,7 @@ class InputModel:
         variance, tracks, noise = np.zeros((3, 6))
         for faces in FACE_GROUPS:
             means, counts = _means(known, faces)
-            if len(means):
+            if len(means) and self._estimates_margins:
                 variance[faces] = _clipped_variance(means)
                 tracks[faces] = len(means)
                 noise[faces] = (1 / counts).mean()
