@@ -201,36 +201,26 @@ class InputModel:
 
         if self._known_margins is None:
             for k, known in enumerate(self._margins_of_kinds):
-                self._margins_of_kinds[k] = known or (*self._offsets(k), *self._scatter(k))
+                self._margins_of_kinds[k] = known or self._margins_of(k)
             columns = zip(*self._margins_of_kinds, strict=True)
             parts = [torch.from_numpy(np.stack(column)) for column in columns]
             self._known_margins = FaceOffsets(*parts[:3]), GapScatter(*parts[3:])
         return self._known_margins
 
-    def _scatter(self, kind: int) -> tuple[Floats, Floats, Floats]:
-        """Return the columns of `GapScatter` for one kind, (6,) each."""
-        known = self._faces[kind].in_order[:, 0]
-        variance, tracks, noise = np.zeros((3, 6))
-        for faces in FACE_GROUPS:
-            means, counts = _means(known, faces)
-            if len(means) and self._estimates_margins:
-                variance[faces] = _clipped_variance(means)
-                tracks[faces] = len(means)
-                noise[faces] = (1 / counts).mean()
-        return variance, tracks, noise
-
-    def _offsets(self, kind: int) -> tuple[Floats, Floats, Floats]:
-        """Return the columns of `FaceOffsets` for one kind, (6,) each."""
+    def _margins_of(self, kind: int) -> tuple[Floats, ...]:
+        """Return the columns of `FaceOffsets` and of `GapScatter` for one kind, (6,) each."""
         known = self._faces[kind].in_order
         none = (0.0,) * len(FACE_GROUPS)
         deviations = GAP_DEVIATIONS[KINDS[kind]]
-        gaps = _pooled(known[:, 0], none, deviations)
-        occlusion_insets = _pooled(
-            self._estimates_margins * known[:, 1], self._occlusion_insets, deviations
-        )
+        of_gaps = _means_of_groups(known[:, 0])
+        gaps = _pooled(of_gaps, none, deviations)
         known[:, 2, 0] -= gaps * known[:, 2, 1]
-        range_insets = _pooled(known[:, 2], none, deviations)
-        return self._estimates_margins * gaps, occlusion_insets, range_insets
+        range_insets = _pooled(_means_of_groups(known[:, 2]), none, deviations)
+        used = known if self._estimates_margins else known[:0]
+        of_insets = _means_of_groups(used[:, 1])
+        occlusion_insets = _pooled(of_insets, self._occlusion_insets, deviations)
+        scatter = _scatter(of_gaps) * self._estimates_margins
+        return self._estimates_margins * gaps, occlusion_insets, range_insets, *scatter
 
     def gaps_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
         """Return gap corrections of some `faces` [m], one array per track that has any."""
@@ -266,12 +256,40 @@ class InputModel:
         return means
 
 
-def _pooled(known: Floats, expected: Sequence[float], deviations: Sequence[float]) -> Floats:
-    """Weigh the tracks' sums (n, 3, 6) of a quantity against its prior (M18), (6,)."""
+Means = list[tuple[Floats, Floats]]
+"""Of each of `FACE_GROUPS`: the means of all tracks, sorted, and their numbers of observations."""
+
+
+def _means_of_groups(known: Floats) -> Means:
+    """Return the means of a quantity by the tracks' sums (n, 3, 6)."""
+    found = []
+    for faces in FACE_GROUPS:
+        total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
+        is_known = count >= MIN_TRACK_OBSERVATIONS
+        means = total[is_known] / share[is_known]
+        order = np.argsort(means)
+        found.append((means[order], count[is_known][order]))
+    return found
+
+
+def _pooled(means: Means, expected: Sequence[float], deviations: Sequence[float]) -> Floats:
+    """Weigh the means of a quantity against its prior (M18), (6,)."""
     values = np.zeros(6)
-    for faces, prior, deviation in zip(FACE_GROUPS, expected, deviations, strict=True):
-        values[faces] = _posterior_mean(_means(known, faces)[0], prior, deviation)
+    parts = zip(FACE_GROUPS, means, expected, deviations, strict=True)
+    for faces, (of_tracks, _), prior, deviation in parts:
+        values[faces] = _posterior_mean(of_tracks, prior, deviation)
     return values
+
+
+def _scatter(means: Means) -> Floats:
+    """Return the columns of `GapScatter` for the means of one kind, (3, 6)."""
+    columns = np.zeros((3, 6))
+    for faces, (of_tracks, counts) in zip(FACE_GROUPS, means, strict=True):
+        if len(of_tracks):
+            columns[0, faces] = _clipped_variance(of_tracks)
+            columns[1, faces] = len(of_tracks)
+            columns[2, faces] = (1 / counts).mean()
+    return columns
 
 
 def _of_all_kinds(known: Sequence[TrackRows]) -> tuple[Floats, Ints]:
@@ -287,15 +305,6 @@ def _kept(
     of_kind = np.flatnonzero(is_of_kind)
     places, rows = known.seen([track_ids[i] for i in of_kind.tolist()])
     return of_kind[places], rows
-
-
-def _means(known: Floats, faces: Sequence[int]) -> tuple[Floats, Floats]:
-    """Return the means of some `faces` by the tracks' sums (n, 3, 6), sorted; their counts."""
-    total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
-    is_known = count >= MIN_TRACK_OBSERVATIONS
-    means = total[is_known] / share[is_known]
-    order = np.argsort(means)
-    return means[order], count[is_known][order]
 
 
 def _midmean(means: Floats) -> tuple[float, float]:
