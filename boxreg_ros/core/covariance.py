@@ -2,7 +2,7 @@
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import InverseBlocks, product
-from boxreg_ros.core.batch import BIAS, EXTENT, GAP, Posterior, Problem, SHARED, State
+from boxreg_ros.core.batch import EXTENT, GAP, Posterior, Problem, SHARED, State
 from boxreg_ros.core.expectation import Expectation
 from boxreg_ros.core.face_support import FaceObservations
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
@@ -43,10 +43,8 @@ simulated ones by less than 3 ms.
 HEADING_MODEL_DEVIATION = 0.01
 """Angle from the heading of a label to its surface [rad]. That of the setting `sideslip`: between
 those of the labels of PandaSet and of Argoverse 2."""
-INPUT_ERRORS = slice(EXTENT.start, BIAS.stop)
-"""Shared variables whose prior is the input: the extents and the bias of the poses."""
 UNDERRATED = slice(EXTENT.start, GAP.stop)
-"""Shared variables of (M28): those, and the labelling margins, for the errors of faces."""
+"""Shared variables of (M28): extents, bias and labelling margins."""
 
 
 def covariance_numbers() -> CovarianceNumbers:
@@ -71,6 +69,7 @@ def posterior(
     observations: FaceObservations,
     expected: Expectation,
     free: Tensor,
+    shared_weight: Tensor,
     inverse: InverseBlocks,
     config: Config,
 ) -> Posterior:
@@ -89,6 +88,8 @@ def posterior(
         Means and deviations of the last round.
     free : Tensor, shape (B, 6 N + 23)
         1 for variables that are estimated, 0 for those held fixed.
+    shared_weight : Tensor, shape (B, 23)
+        Weights of the shared variables (M22) in the last round.
     inverse : InverseBlocks
         Of the Gauss-Newton curvature of the last round.
     config : Config
@@ -96,10 +97,12 @@ def posterior(
 
     """
     R = rotation_from_rpy(state.pose[..., 3:])
-    estimated = free[:, -SHARED:][:, INPUT_ERRORS]
+    estimated = free[:, -SHARED:][:, UNDERRATED]
     distances = _face_distances(problem, state, expected, R, observations)
-    of_faces = _correlated_information(problem, observations.weight, distances, expected, config)
-    underrated = torch.cat([_underrated_information(expected, estimated), of_faces], 1)
+    underrated = estimated * _underrated_information(expected, shared_weight)
+    underrated[:, GAP] += _correlated_information(
+        problem, observations.weight, distances, expected, config
+    )
     columns = inverse.border[..., UNDERRATED]  # (B, N, 6, 15)
     poses = inverse.links + product(columns * underrated[:, None, None], columns.mT)
     shift = TIME_DEVIATION * _velocities(problem, state)
@@ -109,16 +112,17 @@ def posterior(
     return Posterior(poses, extents, distances)
 
 
-def _underrated_information(expected: Expectation, estimated: Tensor) -> Tensor:
+def _underrated_information(expected: Expectation, weight: Tensor) -> Tensor:
     """
-    Return w^2 (s^2 - 1 / w) of the input extents and biases, shape (B, 9) (M28).
+    Return w (s^2 / d^2 - 1) of extents, bias and margins, shape (B, 15) (M28).
 
-    With the weight w of their prior and the deviation s of their errors: the variance of the
-    gradient of their prior beyond the one that w claims. 0 where they are not `estimated`.
+    With the `weight` w (B, 23) and the deviation d of their prior, and the deviation s of their
+    errors: the variance of the gradient of the prior beyond the one that w claims. A margin whose
+    weight is lowered as that of an outlier has errors as much wider.
 
     """
-    claimed = expected.deviation[:, INPUT_ERRORS] ** 2
-    return estimated * (expected.input_error**2 - claimed) / claimed**2
+    claimed = expected.deviation[:, UNDERRATED] ** 2
+    return weight[:, UNDERRATED] * (expected.error**2 / claimed - 1)
 
 
 def _correlated_information(
@@ -201,7 +205,7 @@ def _extent_covariance(
     columns = covariance[:, EXTENT, UNDERRATED] * is_free[..., None]
     found = product(columns * underrated[:, None], columns.mT)
     found = found + covariance[:, EXTENT, EXTENT] * is_free[..., None] * is_free[:, None]
-    of_input = (1 - is_free) * expected.input_error[:, EXTENT] ** 2
+    of_input = (1 - is_free) * expected.error[:, EXTENT] ** 2
     return found + torch.diag_embed(of_input)
 
 

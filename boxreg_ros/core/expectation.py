@@ -23,6 +23,12 @@ from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.geometry import FACE_AXIS
 from boxreg_ros.core.input_noise import InputNoise, UNKNOWN_NOISE
 from boxreg_ros.core.kernels.arrays import ExpectationNumbers, InputArrays
+from boxreg_ros.core.margin_spread import (
+    GapScatter,
+    margin_spread,
+    spread_quadrature,
+    UNKNOWN_SCATTER,
+)
 from boxreg_ros.core.population import Population, POPULATION_RADIUS, UNKNOWN_POPULATION
 from boxreg_ros.structures import Floats
 import numpy as np
@@ -89,10 +95,10 @@ class Expectation(NamedTuple):
         The same, widened for the correlation of the errors of neighbours [m, rad].
     unmodelled_bias : Tensor, shape (B, 6)
         Deviation of the bias of windows with a pinned box, where no bias is estimated; else 0.
-    input_error : Tensor, shape (B, 9)
-        Deviation of the errors of the mean input extents and of the bias, as in `State`, as far as
-        these errors are known. At least `deviation`, which is smaller where extents or poses are
-        held near the input.
+    error : Tensor, shape (B, 15)
+        Deviation of the errors of the mean input extents, of the bias and of the labelling
+        margins, as in `State`, as far as these errors are known. Those of extents and bias are at
+        least `deviation`, which is smaller where extents or poses are held near the input.
 
     """
 
@@ -101,7 +107,7 @@ class Expectation(NamedTuple):
     pose_deviation: Tensor
     widened_deviation: Tensor
     unmodelled_bias: Tensor
-    input_error: Tensor
+    error: Tensor
 
 
 class Known(NamedTuple):
@@ -116,21 +122,25 @@ class Known(NamedTuple):
         Errors of poses and extents.
     population : Population
         Evidence of the points about extents.
+    scatter : GapScatter
+        How gaps differ between tracks.
 
     """
 
     offsets: FaceOffsets
     noise: InputNoise = UNKNOWN_NOISE
     population: Population = UNKNOWN_POPULATION
+    scatter: GapScatter = UNKNOWN_SCATTER
 
     def arrays(self) -> InputArrays:
         """Return margins, noise and population for the kernels."""
         deviation, correlation, offset, weight = map(_by_kind, self.noise)
         gap_correction, occlusion_inset, range_inset = map(_by_kind, self.offsets)
         median, slopes = self.population.slopes()
+        gap_variance, gap_tracks, gap_noise = map(_by_kind, self.scatter)
         return InputArrays(
             deviation, correlation, offset, weight[:, 0], gap_correction, occlusion_inset,
-            range_inset, median, slopes,
+            range_inset, median, slopes, gap_variance, gap_tracks, gap_noise,
         )  # fmt: skip
 
 
@@ -190,8 +200,15 @@ def expect(problem: Problem, known: Known) -> Expectation:
     extent = mean * known.population.factors(problem, mean, part)
 
     one = torch.ones_like(usual)
-    size = (mean / mean.new_tensor(LARGE_EXTENT)).clamp(min=1)[:, FACE_AXIS]
-    spread = problem.of_class('gap_spread') * size * (2 - 2 * constant[:, :1]).clamp(1)
+    size = (mean / mean.new_tensor(LARGE_EXTENT)).clamp(min=1)
+    usual_spread = problem.of_class('gap_spread') * (2 - 2 * constant[:, :1]).clamp(1)
+    spread = usual_spread * size[:, FACE_AXIS]
+    widened = deviation * widening[:, :6]
+    constant_error = bias[:, :3] ** 2 + (mean / size * part / 2) ** 2
+    scatter = known.scatter.of(problem)
+    of_gaps = constant_error[:, FACE_AXIS] + scatter.noise * widened[:, FACE_AXIS] ** 2
+    similarity = known.population.similarity(problem, mean)
+    margins = margin_spread(scatter, of_gaps, usual_spread.expand_as(spread), similarity)
     # A pinned box has the true extents, and no bias: its pose is that of the object.
     has_pin = problem.pinned.any(1)[:, None]
     extent_deviation = torch.where(has_pin, PINNED_EXTENT, extent * part)
@@ -203,18 +220,14 @@ def expect(problem: Problem, known: Known) -> Expectation:
     pivot = mean[:, :1] * PIVOT_DEVIATION
     deviations = torch.cat([extent_deviation, bias, spread, pivot, one, sideslip], 1)
     input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
-    return Expectation(
-        shared,
-        deviations,
-        deviation,
-        deviation * widening[:, :6],
-        unmodelled,
-        _at_least_prior(problem, input_error, deviations),
-    )
+    input_error = _at_least_prior(problem, input_error, deviations)
+    error = torch.cat([input_error, margins * size[:, FACE_AXIS]], 1)
+    return Expectation(shared, deviations, deviation, widened, unmodelled, error)
 
 
 def expectation_numbers() -> ExpectationNumbers:
     """Return the constants for the kernel."""
+    squares, weights = spread_quadrature()
     return ExpectationNumbers(
         low_noise_ratio=LOW_NOISE_RATIO,
         ratio_bounds=RATIO_BOUNDS,
@@ -229,6 +242,8 @@ def expectation_numbers() -> ExpectationNumbers:
         large_extent=LARGE_EXTENT,
         pinned_extent=PINNED_EXTENT,
         pivot_deviation=PIVOT_DEVIATION,
+        spread_squares=tuple(squares.tolist()),
+        spread_weights=tuple(weights.tolist()),
         constant_extent_errors=tuple(CONSTANT_EXTENT_ERRORS[kind] for kind in KINDS),
         estimated_kind=KINDS.index('vehicle'),
     )

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:  # a process that only keeps the model between two batches needs no torch
     from boxreg_ros.core.face_support import FaceObservations, FaceOffsets
     from boxreg_ros.core.input_noise import InputNoise
+    from boxreg_ros.core.margin_spread import GapScatter
     from boxreg_ros.core.population import Population
     from torch import Tensor
 
@@ -41,6 +42,9 @@ MIN_GAP_DEVIATION = 0.02
 MIDMEAN_FACTOR = 1.1
 """Error of the mean of the middle half over that of the mean. Derived: sqrt(1.2), the efficiency
 of the midmean of a Gaussian."""
+MAX_SCATTER = 3.0
+"""Gaps of tracks are clipped at this many robust deviations before their variance is taken, as
+residuals before their correlation."""
 MAX_FACE_DISTANCE = 0.5
 """No margin is estimated from points further than this from where they are expected [m]."""
 MIN_BOX_POINTS = 30
@@ -85,15 +89,16 @@ class InputModel:
         # `add_face_observations`; its last input residuals; its extent evidence.
         unknown = np.full((MAX_FITS_PER_TRACK, 9), np.nan)
         self._faces = [TrackRows(np.zeros((3, 3, 6)), MAX_TRACKS) for _ in KINDS]
-        self._offsets_of_kinds: list[tuple[Floats, ...] | None] = [None] * len(KINDS)
-        self._known_offsets: FaceOffsets | None = None  # of the present sums
+        # Columns of `FaceOffsets` and of `GapScatter` that follow from the present sums.
+        self._margins_of_kinds: list[tuple[Floats, ...] | None] = [None] * len(KINDS)
+        self._known_margins: tuple[FaceOffsets, GapScatter] | None = None
         self._residuals = [TrackRows(unknown, MAX_TRACKS) for _ in KINDS]
         self._evidence = [TrackRows(np.zeros((3, 3)), MAX_TRACKS) for _ in KINDS]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what was observed; margins that follow from it are computed again."""
         nothing: list[None] = [None] * len(KINDS)
-        return {**vars(self), '_known_offsets': None, '_offsets_of_kinds': nothing}
+        return {**vars(self), '_known_margins': None, '_margins_of_kinds': nothing}
 
     def add_face_observations(
         self,
@@ -148,9 +153,9 @@ class InputModel:
         shares = np.stack([np.ones_like(distance), occluded, distant])
         # (B, 3 quantities, 3 sums: value, count, share; 6 faces)
         sums = np.moveaxis(np.stack([values * counts, counts, shares * counts], 1).sum(3), 2, 0)
-        self._known_offsets = None
+        self._known_margins = None
         for k in set(kinds.tolist()):
-            self._offsets_of_kinds[k] = None
+            self._margins_of_kinds[k] = None
             rows, kept = _kept(self._faces[k], track_ids, kinds == k)
             self._faces[k].arrays[kept] += sums[rows]
 
@@ -183,28 +188,39 @@ class InputModel:
 
     def offsets(self) -> FaceOffsets:
         """Return the labelling margins and insets to expect of each kind."""
+        return self._margins()[0]
+
+    def gap_scatter(self) -> GapScatter:
+        """Return how the gaps of the tracks of each kind scatter."""
+        return self._margins()[1]
+
+    def _margins(self) -> tuple[FaceOffsets, GapScatter]:
         from boxreg_ros.core.face_support import FaceOffsets
+        from boxreg_ros.core.margin_spread import GapScatter
         import torch
 
-        if self._known_offsets is None:
-            for k, known in enumerate(self._offsets_of_kinds):
-                self._offsets_of_kinds[k] = known or self._offsets(k)
-            parts = map(np.stack, zip(*self._offsets_of_kinds, strict=True))
-            self._known_offsets = FaceOffsets(*map(torch.from_numpy, parts))
-        return self._known_offsets
+        if self._known_margins is None:
+            for k, known in enumerate(self._margins_of_kinds):
+                self._margins_of_kinds[k] = known or self._margins_of(k)
+            columns = zip(*self._margins_of_kinds, strict=True)
+            parts = [torch.from_numpy(np.stack(column)) for column in columns]
+            self._known_margins = FaceOffsets(*parts[:3]), GapScatter(*parts[3:])
+        return self._known_margins
 
-    def _offsets(self, kind: int) -> tuple[Floats, Floats, Floats]:
-        """Return the columns of `FaceOffsets` for one kind, (6,) each."""
+    def _margins_of(self, kind: int) -> tuple[Floats, ...]:
+        """Return the columns of `FaceOffsets` and of `GapScatter` for one kind, (6,) each."""
         known = self._faces[kind].in_order
         none = (0.0,) * len(FACE_GROUPS)
         deviations = GAP_DEVIATIONS[KINDS[kind]]
-        gaps = _pooled(known[:, 0], none, deviations)
-        occlusion_insets = _pooled(
-            self._estimates_margins * known[:, 1], self._occlusion_insets, deviations
-        )
+        of_gaps = _means_of_groups(known[:, 0])
+        gaps = _pooled(of_gaps, none, deviations)
         known[:, 2, 0] -= gaps * known[:, 2, 1]
-        range_insets = _pooled(known[:, 2], none, deviations)
-        return self._estimates_margins * gaps, occlusion_insets, range_insets
+        range_insets = _pooled(_means_of_groups(known[:, 2]), none, deviations)
+        used = known if self._estimates_margins else known[:0]
+        of_insets = _means_of_groups(used[:, 1])
+        occlusion_insets = _pooled(of_insets, self._occlusion_insets, deviations)
+        scatter = _scatter(of_gaps) * self._estimates_margins
+        return self._estimates_margins * gaps, occlusion_insets, range_insets, *scatter
 
     def gaps_of_tracks(self, faces: Sequence[int]) -> list[Floats]:
         """Return gap corrections of some `faces` [m], one array per track that has any."""
@@ -240,15 +256,40 @@ class InputModel:
         return means
 
 
-def _pooled(known: Floats, expected: Sequence[float], deviations: Sequence[float]) -> Floats:
-    """Weigh the tracks' sums (n, 3, 6) of a quantity against its prior (M18), (6,)."""
-    values = np.zeros(6)
-    for faces, prior, deviation in zip(FACE_GROUPS, expected, deviations, strict=True):
+Means = list[tuple[Floats, Floats]]
+"""Of each of `FACE_GROUPS`: the means of all tracks, sorted, and their numbers of observations."""
+
+
+def _means_of_groups(known: Floats) -> Means:
+    """Return the means of a quantity by the tracks' sums (n, 3, 6)."""
+    found = []
+    for faces in FACE_GROUPS:
         total, count, share = known[..., faces].swapaxes(0, 1).reshape(3, -1)
         is_known = count >= MIN_TRACK_OBSERVATIONS
-        means = np.sort(total[is_known] / share[is_known])
-        values[faces] = _posterior_mean(means, prior, deviation)
+        means = total[is_known] / share[is_known]
+        order = np.argsort(means)
+        found.append((means[order], count[is_known][order]))
+    return found
+
+
+def _pooled(means: Means, expected: Sequence[float], deviations: Sequence[float]) -> Floats:
+    """Weigh the means of a quantity against its prior (M18), (6,)."""
+    values = np.zeros(6)
+    parts = zip(FACE_GROUPS, means, expected, deviations, strict=True)
+    for faces, (of_tracks, _), prior, deviation in parts:
+        values[faces] = _posterior_mean(of_tracks, prior, deviation)
     return values
+
+
+def _scatter(means: Means) -> Floats:
+    """Return the columns of `GapScatter` for the means of one kind, (3, 6)."""
+    columns = np.zeros((3, 6))
+    for faces, (of_tracks, counts) in zip(FACE_GROUPS, means, strict=True):
+        if len(of_tracks):
+            columns[0, faces] = _clipped_variance(of_tracks)
+            columns[1, faces] = len(of_tracks)
+            columns[2, faces] = (1 / counts).mean()
+    return columns
 
 
 def _of_all_kinds(known: Sequence[TrackRows]) -> tuple[Floats, Ints]:
@@ -266,13 +307,26 @@ def _kept(
     return of_kind[places], rows
 
 
+def _midmean(means: Floats) -> tuple[float, float]:
+    """Return the mean of the middle half of sorted `means`, and their robust deviation."""
+    n = len(means)
+    spread = means[n - 1 - n // 4] - means[n // 4]
+    return float(means[n // 4 : n - n // 4].mean()), QUARTILES_TO_DEVIATION * float(spread)
+
+
+def _clipped_variance(means: Floats) -> float:
+    """Return the variance of sorted `means` about their midmean, without tails."""
+    middle, deviation = _midmean(means)
+    off = (means - middle).clip(-MAX_SCATTER * deviation, MAX_SCATTER * deviation)
+    return float((off**2).sum() / max(len(means) - 1, 1))
+
+
 def _posterior_mean(means: Floats, prior: float, deviation: float) -> float:
     """Weigh the midmean of sorted `means` against a prior with its deviation (M18)."""
     n = len(means)
     if n < MIN_TRACK_OBSERVATIONS:
         return prior
-    middle = means[n // 4 : n - n // 4].mean()
-    spread = means[n - 1 - n // 4] - means[n // 4]
-    error = MIDMEAN_FACTOR * (QUARTILES_TO_DEVIATION * spread + MIN_GAP_DEVIATION)
+    middle, spread = _midmean(means)
+    error = MIDMEAN_FACTOR * (spread + MIN_GAP_DEVIATION)
     weight = deviation**2 / (deviation**2 + error**2 / n)
     return float(prior + weight * (middle - prior))

@@ -52,6 +52,11 @@ class Population(NamedTuple):
         median, slopes = (torch.from_numpy(part).to(given)[problem.kind] for part in self.slopes())
         return _factor(median, slopes, given, error)
 
+    def similarity(self, problem: Problem, given: Tensor) -> Tensor:
+        """Return how like the tracks of its kind each window of `given` extents is, (B, 1)."""
+        median = torch.from_numpy(self.slopes()[0]).to(given)[problem.kind]
+        return _similarity(given.log() - median)
+
     def slopes(self) -> tuple[Floats, Floats]:
         """Return `population_slopes` by kind, shapes (K, 3) and (K, 3, 3); 0 without tracks."""
         evidence, kind = self.evidence.cpu().numpy(), self.kind.cpu().numpy()
@@ -114,5 +119,9 @@ def population_slopes(evidence: Floats) -> tuple[Floats, Floats]:
 def _factor(median: Tensor, slopes: Tensor, given: Tensor, error: Tensor) -> Tensor:
     """Return the factors (B, 3) of extents that are `given`, by `population_slopes`."""
     own = given.log() - median
-    similarity = 1 / (1 + (own / POPULATION_RADIUS).square().sum(1, keepdim=True))
-    return torch.exp(error**2 * (slopes @ (similarity * own)[..., None])[..., 0])
+    return torch.exp(error**2 * (slopes @ (_similarity(own) * own)[..., None])[..., 0])
+
+
+def _similarity(own: Tensor) -> Tensor:
+    """Return the weight (B, 1) of the population for extents whose logarithms are `own` off it."""
+    return 1 / (1 + (own / POPULATION_RADIUS).square().sum(1, keepdim=True))

@@ -251,7 +251,7 @@ def run_round_torch(batch: Round, plan: Plan, turn: int, config: Config, rows: T
         of_done = partial(select, rows=done)
         covariances = posterior(
             of_done(problem), of_done(found), of_done(observations), of_done(expected),
-            of_done(free), of_done(inverse), config,
+            of_done(free), of_done(_shared_weight(weighted)), of_done(inverse), config,
         )  # fmt: skip
         _write(covariances, solution.posterior, ended)
         if plan.marginalises and problem.length == config.window and solution.prior is not None:
@@ -297,6 +297,12 @@ def _weighted_terms(
         data = state.pose, wanted
         weighted.append(Term(terms.rigid_shape, information[:, :, None], data))
     return weighted
+
+
+def _shared_weight(weighted: list[Term]) -> Tensor:
+    """Return the weights of the shared variables (M22), shape (B, 23)."""
+    (weight,) = (term.weight for term in weighted if term.function is terms.shared_prior)
+    return weight[:, 0, 0].diagonal(dim1=1, dim2=2)
 
 
 def _prior_of_full(weighted: list[Term], found: State, problem: Problem) -> MarginalPrior:

@@ -74,7 +74,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     learns_extents = config.ingredients.population_extents
     noise = model.noise() if learns_noise and not plan.estimates_noise else UNKNOWN_NOISE
     population = model.population() if learns_extents else UNKNOWN_POPULATION
-    known = Known(model.offsets(), noise, population)
+    known = Known(model.offsets(), noise, population, model.gap_scatter())
     free = free_variables(problem, config)
     solution = start(problem, free, known.offsets, plan)
     every = torch.arange(len(free), device=free.device)

@@ -11,6 +11,7 @@ from boxreg_ros.core.input_noise import (
     MIN_OBSERVATIONS_FOR_NOISE,
     OBSERVATIONS_FOR_HALF_WEIGHT,
 )
+from boxreg_ros.core.margin_spread import GapScatter, margin_spread
 from boxreg_ros.core.population import Population, population_factor
 from boxreg_ros.core.smoothing import smoothed_angles
 import numpy as np
@@ -440,6 +441,57 @@ def test_margins_of_one_kind_do_not_change_those_of_others():
     show_faces(model, [str(i) for i in range(20)], -0.1, of_kind='pedestrian')
     for kind, known in (('vehicle', 0.05), ('cyclist', 0.0), ('pedestrian', -0.1)):
         np.testing.assert_allclose(offsets_of(model, kind).gap_correction, known, atol=0.01)
+
+
+def test_scatter_of_gaps_is_that_between_tracks():
+    # 40 tracks of 10 observations, both sides count. The mean of the middle half of +-1 cm is 0.
+    model = InputModel(FACES)
+    gaps = np.zeros((40, 6))
+    gaps[:, 2] = gaps[:, 3] = np.tile([-0.01, 0.01], 20)
+    gaps[0, 4] = 5.0  # of another object: not within reach of the face
+    show_faces(model, [str(i) for i in range(40)], gaps, n=10)
+    variance, tracks, noise = (part[0] for part in model.gap_scatter())
+    np.testing.assert_allclose(variance, np.array([0, 0, 80, 80, 0, 0]) / 79 * 1e-4, atol=1e-12)
+    np.testing.assert_array_equal(tracks, [80, 80, 80, 80, 39, 40])
+    np.testing.assert_allclose(noise, 0.1)
+    np.testing.assert_array_equal(model.gap_scatter().tracks[1:], 0)  # of other kinds
+
+
+def spread_of(variance, tracks, errors, usual=0.05, similarity=1.0):
+    """Return the spread of margins [m] from gaps of this `variance` of errors of input [m^2]."""
+    one = torch.ones(1, 6, dtype=D)
+    scatter = GapScatter(variance * one, tracks * one, 0 * one)
+    (spread,) = margin_spread(scatter, errors * one, usual * one, similarity * one[:, :1]).unique()
+    return float(spread)
+
+
+def test_spread_of_margins_follows_the_scatter_of_the_gaps():
+    # Of errors of 6 cm and margins that spread by 4 cm, seen in ever more tracks: from the spread
+    # of the settings to that one. Gaps that scatter no more than the input have equal margins.
+    both = 0.06**2 + 0.04**2
+    assert spread_of(both, 0, 0.06**2) == pytest.approx(0.05, rel=1e-4)
+    assert spread_of(both, 400, 0.06**2) == pytest.approx(0.04, abs=0.003)
+    spreads = [
+        spread_of(variance, 40, 0.06**2) for variance in (0.04**2, 0.06**2, 0.07**2, 0.1**2)
+    ]
+    assert spreads == sorted(spreads)
+    assert spreads[0] < 0.02
+    assert spreads[-1] > 0.07
+    # Few tracks, or errors far larger than margins, are little evidence.
+    assert 0.04 < spread_of(0.04**2, 3, 0.06**2) < 0.05
+    assert spread_of(0.3**2, 20, 0.3**2) == pytest.approx(0.05, rel=0.05)
+    # Of an object unlike the others they are none.
+    assert spread_of(0.04**2, 40, 0.06**2, similarity=0.0) == pytest.approx(0.05)
+
+
+def test_spread_of_margins_is_a_half_normal_posterior():
+    # The posterior mean of the square by numerical integration.
+    s = np.linspace(0, 0.5, 20_001)
+    total = 0.05**2 + s**2
+    log = -6 * (np.log(total) + 0.006 / total) - s**2 / 2 / 0.05**2
+    weight = np.exp(log - log.max())
+    known = np.sqrt((weight * s**2).sum() / weight.sum())
+    assert spread_of(0.006, 13, 0.05**2) == pytest.approx(known, rel=1e-4)
 
 
 def test_insets_are_expected_from_the_settings():

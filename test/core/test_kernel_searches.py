@@ -29,6 +29,7 @@ from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import estimate_noise_compiled, estimate_noise_torch, InputNoise
 from boxreg_ros.core.kernels import contiguous
 from boxreg_ros.core.kernels.arrays import ExpectedArrays, FaceArrays, PriorArrays
+from boxreg_ros.core.margin_spread import GapScatter
 from boxreg_ros.core.observation import own_points, own_points_numpy
 from boxreg_ros.core.population import Population
 from boxreg_ros.core.registration import register
@@ -115,6 +116,12 @@ def searched(case):
     return problem, State(pose, shared)
 
 
+# Spreads of margins as the settings have them, narrower and wider ones.
+SCATTER = GapScatter(
+    torch.tensor([0.0, 0.0, 1e-3, 1e-3, 0.02, 0.1], dtype=D) ** 2 + 3e-3,
+    torch.tensor([0.0, 0.0, 40.0, 40.0, 9.0, 200.0], dtype=D),
+    torch.full((6,), 0.05, dtype=D),
+)
 OFFSETS = FaceOffsets(
     torch.zeros(6, dtype=D),
     torch.tensor([0.3, 0.3, 0.2, 0.2, 0.0, 0.0], dtype=D),
@@ -244,7 +251,7 @@ PLANS = {
 
 def batch_of(problem, state, config):
     """Return what a round of a problem begins with."""
-    known = Known(OFFSETS)
+    known = Known(OFFSETS, scatter=SCATTER)
     free = free_variables(problem, config)
     state = State(*(part.clone() for part in state))
     prior = MarginalPrior(
@@ -329,7 +336,7 @@ def test_expectations_equal_those_of_torch(kind, seed):
     evidence = np.stack([extents, 50 * rng.normal(size=(20, 3)), rng.random((20, 3))], 1)
     population = Population(torch.from_numpy(evidence), torch.arange(20) % 2)
     offsets = FaceOffsets(*torch.from_numpy(0.1 * rng.normal(size=(3, 3, 6))))
-    known = Known(offsets, noise, population)
+    known = Known(offsets, noise, population, SCATTER)
     twins = expect(problem, known)
     found = ExpectedArrays(*(np.empty(part.shape[1:]) for part in twins))
     work = expectation.empty_expectation_work()

@@ -633,15 +633,17 @@ def normalised_errors(scenario, seeds):
     return np.mean(values)
 
 
-@pytest.mark.parametrize(('scenario', 'seeds'), [('street', range(2)), ('paper', range(5))])
-def test_covariances_are_consistent_with_the_errors(scenario, seeds, monkeypatch):
+@pytest.mark.parametrize(
+    ('scenario', 'seeds', 'least'), [('street', range(2), 0.65), ('paper', range(5), 0.55)]
+)
+def test_covariances_are_consistent_with_the_errors(scenario, seeds, least, monkeypatch):
     # 1 for a consistent covariance. Simulated labels have no errors of time and heading. Here it
-    # is still too large: the margins of simulated objects vary less than those of labels, and the
-    # one track of the paper's experiment does not show how large the constant errors of its input
-    # are, so that typical ones are assumed.
+    # is still too large: some 20 tracks do not exclude that margins vary by 3 cm, and the one
+    # track of the paper's experiment shows neither that nor how large the constant errors of its
+    # input are, so that typical ones are assumed.
     monkeypatch.setattr(covariance, 'TIME_DEVIATION', 0.0)
     monkeypatch.setattr(covariance, 'HEADING_MODEL_DEVIATION', 0.0)
-    assert 0.55 <= normalised_errors(scenario, seeds) <= 1.5
+    assert least <= normalised_errors(scenario, seeds) <= 1.5
 
 
 def test_track_estimates_beat_final_ones_at_half_the_rate():

@@ -357,7 +357,7 @@ def test_errors_of_the_input_by_hand():
         extent = problem.boxes[:, 0, 3:6] * kinds['extent'] * torch.hypot(constant, of_mean)
         bias = problem.of_class(*POSE_ERRORS) * torch.tensor([1, 1, 1, 1, 1, 0.5]) / 6
         known = size * torch.cat([extent, bias], 1)
-        np.testing.assert_allclose(expected.input_error, known, rtol=1e-9)
+        np.testing.assert_allclose(expected.error[:, :9], known, rtol=1e-9)
 
 
 def test_held_extents_have_the_constant_errors_of_a_published_detector():
@@ -367,7 +367,7 @@ def test_held_extents_have_the_constant_errors_of_a_published_detector():
     problem = problem._replace(kind=torch.tensor([KINDS.index('pedestrian')]))
     for size, constant in ((2.0, 2.0), (0.5, 1.0), (0.2, 0.5)):
         noise = InputNoise(torch.full((9,), size, dtype=D), weight=torch.tensor([1.0]))
-        found = expect(problem, Known(NO_OFFSETS, noise)).input_error[:, batch.EXTENT]
+        found = expect(problem, Known(NO_OFFSETS, noise)).error[:, batch.EXTENT]
         ratios = torch.tensor(CONSTANT_EXTENT_ERRORS['pedestrian'], dtype=D)
         usual = problem.boxes[:, 0, 3:6] * kinds['extent']
         known = usual * torch.hypot(constant * ratios, size / torch.tensor(6.0).sqrt())

@@ -73,7 +73,7 @@ class ExpectedArrays(NamedTuple):
     pose_deviation: Any
     widened_deviation: Any
     unmodelled_bias: Any
-    input_error: Any
+    error: Any
 
 
 class InputArrays(NamedTuple):
@@ -90,6 +90,8 @@ class InputArrays(NamedTuple):
         As in `boxreg_ros.core.face_support.FaceOffsets` [m].
     median, slopes : array, shapes (K, 3) and (K, 3, 3)
         Of the population of extents (M16); slopes are 0 where there is none.
+    gap_variance, gap_tracks, gap_noise : array, shape (K, 6)
+        As in `boxreg_ros.core.margin_spread.GapScatter`.
 
     """
 
@@ -102,6 +104,9 @@ class InputArrays(NamedTuple):
     range_inset: Any
     median: Any
     slopes: Any
+    gap_variance: Any
+    gap_tracks: Any
+    gap_noise: Any
 
 
 class ClassArrays(NamedTuple):
@@ -379,6 +384,8 @@ class ExpectationNumbers(NamedTuple):
     large_extent: tuple[float, ...]
     pinned_extent: float
     pivot_deviation: float
+    spread_squares: tuple[float, ...]
+    spread_weights: tuple[float, ...]
     constant_extent_errors: tuple[tuple[float, ...], ...]
     estimated_kind: int
 

@@ -124,7 +124,7 @@ def variance_of_mean(length, weight, numbers, work):
 
 @kernel
 def fill_information_of_faces(length, marginalised, weight, spread, numbers, work):
-    """Write the information of the labelling margins for the errors of faces (M28), (6,)."""
+    """Add the information of the labelling margins for the errors of faces (M28), (6,)."""
     of_mean = variance_of_mean(length, weight, numbers, work)
     for face in range(FACES):
         total, count, claimed = work.total[face], work.count[face], work.claimed[face]
@@ -137,15 +137,14 @@ def fill_information_of_faces(length, marginalised, weight, spread, numbers, wor
         variance = of_mean * (claimed + shown * (scatter - claimed)) - claimed
         total *= (length + marginalised) / length
         share = numbers.correlated_faces[face] / spread[face] ** 4
-        work.underrated[GAP + face] = variance / total * share if total > 0.0 else 0.0
+        work.underrated[GAP + face] += variance / total * share if total > 0.0 else 0.0
 
 
 @kernel
-def fill_information_of_input(deviation, error, free, underrated):
-    """Write the information of input extents and biases, (9,), beyond that of their prior."""
-    for s in range(GAP):
-        claimed = deviation[s] ** 2
-        underrated[s] = free[s] * (error[s] ** 2 - claimed) / claimed**2
+def fill_underrated_information(deviation, error, weight, free, underrated):
+    """Write the information of extents, bias and margins, (15,), beyond that of their prior."""
+    for s in range(UNDERRATED):
+        underrated[s] = free[s] * weight[s] * (error[s] ** 2 / deviation[s] ** 2 - 1)
 
 
 @kernel
@@ -188,8 +187,8 @@ def fill_extent_covariance(corner, free, error, underrated, found):
 
 @kernel
 def fill_posterior(
-    b, windows, poses, shared, row, faces, expected, shape, free, inverse, weights, numbers, work,
-    found,
+    b, windows, poses, shared, row, faces, expected, shape, free, shared_weight, inverse, weights,
+    numbers, work, found,
 ):  # fmt: skip
     """
     Write the covariances of window `b`, and the residuals of its faces.
@@ -212,6 +211,8 @@ def fill_posterior(
         How far its surface is from rigid [m].
     free : array, shape (6 N + 23,)
         1 for variables that are estimated, 0 for those held fixed.
+    shared_weight : array, shape (23,)
+        Weights of the shared variables (M22) in the last round.
     inverse : InverseArrays
         Blocks of its inverse curvature.
     weights : WeightNumbers
@@ -226,7 +227,7 @@ def fill_posterior(
     """
     length = windows.lengths[b]
     distances, free_shared = found.face_distances[b], free[6 * len(poses) :]
-    deviation, error = expected.deviation, expected.input_error
+    deviation, error = expected.deviation, expected.error
     for face in range(FACES):
         work.claimed[face] = face_deviation(face, shape, weights.face_deviations) ** 2
     fill_face_distances(
@@ -234,7 +235,7 @@ def fill_posterior(
     )
     weight = faces.weight[row]
     remove_means(length, weight, distances, numbers.min_weight, work)
-    fill_information_of_input(deviation, error, free_shared, work.underrated)
+    fill_underrated_information(deviation, error, shared_weight, free_shared, work.underrated)
     fill_information_of_faces(
         length, windows.marginalised_extents[b, 3], weight, deviation[GAP:], numbers, work
     )

@@ -6,7 +6,7 @@ and `evidence_of_extents` of `boxreg_ros.core.expectation`; the formulas are (M1
 
 """
 
-from math import exp, hypot, isfinite, log, sqrt
+from math import exp, hypot, inf, isfinite, log, sqrt
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.kernels.compile import kernel
@@ -103,14 +103,21 @@ def fill_ratios(b, windows, known, numbers, work):
 
 
 @kernel
+def population_distance(mean, median, radius):
+    """Return the squared distance of mean extents from those of the population of tracks."""
+    distance = 0.0
+    for m in range(SIZE):
+        distance += ((log(mean[m]) - median[m]) / radius) ** 2
+    return distance
+
+
+@kernel
 def population_factor(k, mean, part, median, slopes, radius):
     """Return expected over given extent `k`, by the population of tracks (M16)."""
-    distance, pull = 0.0, 0.0
+    pull = 0.0
     for m in range(SIZE):
-        own = log(mean[m]) - median[m]
-        distance += (own / radius) ** 2
-        pull += slopes[k, m] * own
-    return exp(part**2 * pull / (1 + distance))
+        pull += slopes[k, m] * (log(mean[m]) - median[m])
+    return exp(part**2 * pull / (1 + population_distance(mean, median, radius)))
 
 
 @kernel
@@ -147,11 +154,52 @@ def fill_expectation(b, windows, of_class, known, numbers, work, expected):
 
 
 @kernel
+def margin_variance(variance, tracks, errors, usual, numbers):
+    """Return the posterior variance of the margins of one face between tracks (M18a)."""
+    squares, weights = numbers.spread_squares, numbers.spread_weights
+    degrees = max(tracks - 1.0, 0.0)
+    most = -inf
+    for q in range(len(squares)):
+        total = errors + usual**2 * squares[q]
+        most = max(most, -0.5 * degrees * (log(total) + variance / total))
+    mean, norm = 0.0, 0.0
+    for q in range(len(squares)):
+        total = errors + usual**2 * squares[q]
+        information = -0.5 * degrees * (log(total) + variance / total)
+        part = weights[q] * exp(information - most)
+        mean += part * usual**2 * squares[q]
+        norm += part
+    return mean / norm
+
+
+@kernel
+def fill_margin_error(b, windows, of_class, known, numbers, work, expected):
+    """Write the deviations of the labelling margins of window `b` (M28), (6,)."""
+    kind, mean = windows.kind[b], work.mean
+    usual = of_class.gap_spread[b] * max(2 - 2 * work.constant[0], 1.0)
+    distance = population_distance(mean, known.median[kind], numbers.population_radius)
+    similarity = 1 / (1 + distance)
+    for face, twin in ((0, 1), (2, 3), (4, 4), (5, 5)):  # two faces of one kind share their tracks
+        k = face // 2
+        size = max(mean[k] / numbers.large_extent[k], 1.0)
+        bias = of_class.pose[b, k] * work.slow[k] * work.constant[k]
+        part = of_class.extent[b] * work.slow[POSE + k] * min(2 * work.constant[k], 1.0)
+        noise = known.gap_noise[kind, face] * expected.widened_deviation[k] ** 2
+        errors = bias**2 + (mean[k] / size * part / 2) ** 2 + noise
+        square = margin_variance(
+            known.gap_variance[kind, face], known.gap_tracks[kind, face], errors, usual, numbers
+        )
+        spread = sqrt(usual**2 + similarity * (square - usual**2))
+        expected.error[GAP + face] = spread * size
+        expected.error[GAP + twin] = spread * size
+
+
+@kernel
 def fill_input_error(b, windows, of_class, known, numbers, work, expected):
     """Write the deviations of the errors of mean extents and bias of window `b` (M28), (9,)."""
     kind = windows.kind[b]
     weight, slow = known.weight[kind], work.slow.max()
-    deviation, error, mean = expected.deviation, expected.input_error, work.mean
+    deviation, error, mean = expected.deviation, expected.error, work.mean
     count = windows.lengths[b] + windows.marginalised_extents[b, 3]
     for k in range(SIZE):
         j = POSE + k
@@ -198,6 +246,7 @@ def expect(b, windows, of_class, known, numbers, work, expected):
     fill_ratios(b, windows, known, numbers, work)
     fill_expectation(b, windows, of_class, known, numbers, work, expected)
     fill_input_error(b, windows, of_class, known, numbers, work, expected)
+    fill_margin_error(b, windows, of_class, known, numbers, work, expected)
 
 
 @kernel

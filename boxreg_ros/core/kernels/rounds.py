@@ -30,8 +30,8 @@ from boxreg_ros.core.kernels.normal_equations import (
     accumulate,
     ANCHOR,
     empty_scratch,
-    GAP,
     marginalise,
+    PIVOT,
     SHARED,
     SIDESLIP,
     unweighted_terms,
@@ -118,7 +118,7 @@ def empty_round_work(begin, end, windows, N, numbers):
         empty_scratch(N), empty_search(D, numbers.search.history), empty_covariance_work(N),
         ExpectedArrays(
             np.empty(SHARED), np.empty(SHARED), np.empty(POSE), np.empty(POSE), np.empty(POSE),
-            np.empty(GAP),
+            np.empty(PIVOT),
         ),
         FaceArrays(
             np.empty((1, N, 6, 4, 4)), np.empty((1, N, 6)), np.empty((1, N, 6)),
@@ -182,8 +182,8 @@ def run_window(b, windows, thinned, known, prior, every_free, of_class, numbers,
     if is_done:
         invert_poses(A, inverse.corner, inverse.poses, inverse.border)
         fill_posterior(
-            b, windows, poses, shared, 0, faces, expected, shape, free, inverse, numbers.weights,
-            numbers.covariance, work.covariance, solution.posterior,
+            b, windows, poses, shared, 0, faces, expected, shape, free, terms.W_shared, inverse,
+            numbers.weights, numbers.covariance, work.covariance, solution.posterior,
         )  # fmt: skip
         if len(solution.prior_state) and windows.lengths[b] == N:
             leave_prior(b, terms, work, solution)
