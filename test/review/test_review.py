@@ -246,7 +246,7 @@ def slowly_served(page, place):
     """Serve a page on loopback that pauses at a place; yield its address."""
 
     class Handler(BaseHTTPRequestHandler):
-        def do_GET(self):  # noqa: N802
+        def do_GET(self):
             self.send_response(200 if self.path == '/' else 404)
             self.send_header('Content-Type', 'text/html; charset=utf-8')
             self.end_headers()
