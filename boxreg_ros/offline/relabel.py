@@ -447,8 +447,8 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
         unused = summary['unused_decisions']
         names = ', '.join(unused[:MAX_NAMED])
         yield (
-            f'decisions: expected tracks and boxes of this recording, got {len(unused):,} without '
-            f'one, not used: {names}{", ..." if len(unused) > MAX_NAMED else ""}; give the '
+            f'decisions: expected those on tracks and boxes of this recording, got {len(unused):,} '
+            f'on others, not used: {names}{", ..." if len(unused) > MAX_NAMED else ""}; give the '
             f'decisions of this recording to --decisions'
         )
     if summary['frames_without_cloud']:
