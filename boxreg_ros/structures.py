@@ -275,8 +275,9 @@ class RefinedBoxes:
         Signed distance of the outermost points of each face (front, rear, left, right, top,
         bottom) from where they are expected, by the extents of the box and the labelling margins
         of other tracks, positive outside [m]; 0 without points.
-    outside : array, shape (n,)
-        Part of the points in and near the box, the road left out, that are outside of it.
+    near_points : array, shape (n, 2)
+        Number of points in the box, and of those near it but outside, the road left out; as far
+        as they are sampled.
 
     """
 
@@ -288,7 +289,7 @@ class RefinedBoxes:
     is_final: bool = True
     extent_covariances: Floats = field(default_factory=lambda: np.zeros((0, 3, 3)))
     face_distances: Floats = field(default_factory=lambda: np.zeros((0, 6)))
-    outside: Floats = field(default_factory=lambda: np.zeros(0))
+    near_points: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
     def __post_init__(self) -> None:
         """Complete the columns that label files and messages do not have."""
@@ -297,8 +298,8 @@ class RefinedBoxes:
             object.__setattr__(self, 'extent_covariances', np.tile(np.eye(3), (n, 1, 1)))
         if len(self.face_distances) != n:
             object.__setattr__(self, 'face_distances', np.zeros((n, 6)))
-        if len(self.outside) != n:
-            object.__setattr__(self, 'outside', np.zeros(n))
+        if len(self.near_points) != n:
+            object.__setattr__(self, 'near_points', np.zeros((n, 2), np.int64))
 
     def take(self, rows: Sequence[int]) -> 'RefinedBoxes':
         """Return the boxes `rows` only."""
@@ -311,5 +312,5 @@ class RefinedBoxes:
             self.is_final,
             self.extent_covariances[rows],
             self.face_distances[rows],
-            self.outside[rows],
+            self.near_points[rows],
         )

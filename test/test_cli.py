@@ -167,12 +167,30 @@ def test_fail_under_fails_and_keeps_the_result(tmp_path, capsys):
     command = ['relabel', recording, '-o', tmp_path / 'out', *QUICK, '--fail-under']
     status, _, err = boxreg(capsys, *command, '1.0', '--set', 'min_observations=6')
     assert status == 1
-    assert '--fail-under: expected at least 100.0% of the boxes refined, got ' in err
+    expected = '--fail-under: expected at least 100.0% of the boxes refined, got 0 of 10; '
+    assert expected in err
     assert (tmp_path / 'out' / 'review.csv').exists()
     assert boxreg(capsys, *command, '0.0')[0] == 0
     status, _, err = boxreg(capsys, *command, '90')
     assert status == 2
     assert "expected a part from 0 to 1, got '90'" in err
+
+
+def test_recordings_of_two_drives_are_said(tmp_path, capsys):
+    first, second = (
+        Drive(sweeps=5, start=(begin + 1_700_000_000) * 10**9).write(tmp_path / str(begin))
+        for begin in (0, 3600)
+    )
+    status, _, err = boxreg(capsys, 'relabel', first, second, '-o', tmp_path / 'out', *QUICK)
+    assert status == 0
+    (line,) = err.splitlines()
+    assert line == (
+        'boxreg: recordings: expected those of one drive, without pauses between them, got clouds '
+        'received at 1700000000.000 to 1700000000.400 s and 1700003600.000 to 1700003600.400 s; '
+        'tracks of the same id are one track: relabel drives one by one'
+    )
+    status, out, _ = boxreg(capsys, 'inspect', first, second)
+    assert 'warning: recordings: expected those of one drive' in out
 
 
 def test_the_same_recording_twice_is_refused(tmp_path, capsys):

@@ -468,7 +468,7 @@ class _PendingArray:
             covariances=np.tile(np.eye(6), (n, 1, 1)),
             extent_covariances=np.tile(np.eye(3), (n, 1, 1)),
             face_distances=np.zeros((n, 6)),
-            outside=np.zeros(n),
+            near_points=np.zeros((n, 2), np.int64),
         )
         estimated = [row for row, found in enumerate(self.estimates) if found is not None]
         tables, places = joined([found for found in self.estimates if found is not None])
@@ -487,7 +487,7 @@ class _PendingArray:
             is_final,
             columns.extent_covariances,
             columns.face_distances,
-            columns.outside,
+            columns.near_points,
         )
         return whole if is_returned.all() else whole.take(np.flatnonzero(is_returned).tolist())
 

@@ -151,8 +151,7 @@ def _accepted(
     reasons = np.select(failed, KEPT_REASONS, '')
     status = np.where(is_kept, KEPT, REFINED)
     found[..., :3] += base[:, None]
-    count = problem.counts.clamp(min=1).cpu().numpy()
-    outside = (1 - held / count).clip(0, 1)
+    near_points = np.stack([held, problem.counts.cpu().numpy() - held], -1)
     extent_covariances = np.repeat(extents[:, None], found.shape[1], axis=1)
     valid = problem.valid.cpu().numpy()
     for b, i in np.argwhere(valid & is_kept).tolist():
@@ -160,8 +159,8 @@ def _accepted(
         covariances[b, i] = np.eye(6)
         extent_covariances[b, i] = np.eye(3)
         distances[b, i] = 0.0
-        outside[b, i] = 0.0
-    columns = found, status, reasons, covariances, extent_covariances, distances, outside
+        near_points[b, i] = 0
+    columns = found, status, reasons, covariances, extent_covariances, distances, near_points
     table = Estimates(*(part[valid] for part in columns))
     ends = np.cumsum(valid.sum(1)).tolist()
     return list(map(Estimate, repeat(table), [0, *ends], ends, priors))

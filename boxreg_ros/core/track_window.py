@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.core.observation import Observation
-from boxreg_ros.structures import Floats
+from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from numpy.typing import NDArray
 
@@ -108,7 +108,7 @@ class Estimates(NamedTuple):
         Of x y z roll pitch yaw [m, rad]; the identity for kept boxes.
     extent_covariances : array, shape (n, 3, 3)
         Of length, width and height [m]; the identity for kept boxes.
-    face_distances, outside : array, shapes (n, 6) and (n,)
+    face_distances, near_points : array, shapes (n, 6) and (n, 2)
         As in `RefinedBoxes`.
 
     """
@@ -119,7 +119,7 @@ class Estimates(NamedTuple):
     covariances: Floats
     extent_covariances: Floats
     face_distances: Floats
-    outside: Floats
+    near_points: Ints
 
 
 class Estimate(NamedTuple):

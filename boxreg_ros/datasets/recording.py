@@ -113,6 +113,11 @@ class SceneRecording:
         return {}
 
     @property
+    def finding(self) -> str:
+        """Return what is unusual about the scene as a whole: nothing."""
+        return ''
+
+    @property
     def damages(self) -> list[Damage]:
         """Return the damages of files: none; sweeps that cannot be read are counted."""
         return []

@@ -89,6 +89,10 @@ class ItemSource(Protocol):
         """Return the topics that were recorded apart from the clouds, and by how much [s]."""
 
     @property
+    def finding(self) -> str:
+        """Return what is unusual about the source as a whole; empty if nothing is."""
+
+    @property
     def damages(self) -> list[Damage]:
         """Return the parts of the files that could not be read so far."""
 

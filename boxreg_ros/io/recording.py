@@ -257,6 +257,18 @@ class Recording:
         return {topic: late for topic, late in self._timeline.apart.items() if topic in used}
 
     @property
+    def finding(self) -> str:
+        """Return what is unusual about the recordings as a whole; empty if nothing is."""
+        parts = self._timeline.parts_ns
+        if len(parts) == 1:
+            return ''
+        spans = ' and '.join(f'{begin * 1e-9:.3f} to {end * 1e-9:.3f} s' for begin, end in parts)
+        return (
+            f'recordings: expected those of one drive, without pauses between them, got clouds '
+            f'received at {spans}; tracks of the same id are one track: relabel drives one by one'
+        )
+
+    @property
     def damages(self) -> list[Damage]:
         """Return the parts of the files that could not be read so far."""
         return self._reader.damages

@@ -67,6 +67,19 @@ class Timeline:
         used = [c for c in self._reader.connections if c.topic in topics and c.msgcount]
         return self._span([*self._clouds, *(c for c in used if not self._is_apart(c))])
 
+    @property
+    def parts_ns(self) -> list[tuple[int, int]]:
+        """Return begin and end of the clouds [ns]; several where files were recorded apart."""
+        first, *others = sorted(map(self._reader.span_ns, self._clouds))
+        parts = [first]
+        for begin_ns, end_ns in others:
+            last_begin_ns, last_end_ns = parts[-1]
+            if begin_ns - last_end_ns > APART_NS:
+                parts.append((begin_ns, end_ns))
+            else:
+                parts[-1] = last_begin_ns, max(last_end_ns, end_ns)
+        return parts
+
     def messages(
         self, connections: Collection[Connection], start_ns: int | None, end_ns: int | None
     ) -> Iterator[Record]:

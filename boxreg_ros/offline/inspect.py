@@ -315,8 +315,7 @@ def _summary(sample: _Sample) -> dict[str, Any]:
 
 def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[str]:
     """Yield the conditions that make results worse, one line each."""
-    if finding:
-        yield finding
+    yield from filter(None, (recording.finding, finding))
     if sample.without_id:
         yield f'{sample.without_id} boxes have no track id; --associate assigns them'
     for name, stamps in (('clouds', sample.sweeps), ('box arrays', sample.arrays)):

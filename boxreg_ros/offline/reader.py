@@ -199,7 +199,7 @@ class RecordingReader:
             recording.apart,
             recording.damages,
             recording.outside,
-            items.session.finding,
+            '; '.join(filter(None, (recording.finding, items.session.finding))),
             items.session.facts,
             self._clock.stages(),
         )

@@ -444,10 +444,11 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
         yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
     if summary['unused_decisions']:
-        names = ', '.join(summary['unused_decisions'][:MAX_NAMED])
+        unused = summary['unused_decisions']
+        names = ', '.join(unused[:MAX_NAMED])
         yield (
-            f'decisions: expected tracks and boxes of this recording, got '
-            f'{len(summary["unused_decisions"]):,} others, which are not used: {names}; give the '
+            f'decisions: expected those on tracks and boxes of this recording, got {len(unused):,} '
+            f'on others, not used: {names}{", ..." if len(unused) > MAX_NAMED else ""}; give the '
             f'decisions of this recording to --decisions'
         )
     if summary['frames_without_cloud']:
@@ -510,16 +511,16 @@ def _damage_line(damages: list[dict[str, Any]]) -> str:
 
 def has_failed(summary: dict[str, Any]) -> bool:
     """Return whether a run had boxes and refined none of them."""
-    return bool(summary['boxes_in']) and not _refined(summary)
+    return bool(summary['boxes_in']) and not num_refined(summary)
 
 
 def part_refined(summary: dict[str, Any]) -> float:
     """Return the part of the input boxes that were refined; 1 without boxes."""
     boxes = int(summary['boxes_in'])
-    return _refined(summary) / boxes if boxes else 1.0
+    return num_refined(summary) / boxes if boxes else 1.0
 
 
-def _refined(summary: dict[str, Any]) -> int:
+def num_refined(summary: dict[str, Any]) -> int:
     """Return the number of input boxes that were refined, by the points or by a person."""
     return int(sum(summary['status'].get(word, 0) for word in (REFINED, HUMAN)))
 
@@ -528,7 +529,7 @@ def _why_few_were_refined(summary: dict[str, Any]) -> str:
     """Return the most frequent reason why boxes were kept, its remedy, and both time ranges."""
     name, count = next(iter(summary['reasons'].items()))  # sorted by count
     reason = REASONS[name]
-    refined = _refined(summary)
+    refined = num_refined(summary)
     part = f'only {refined:,} of {summary["boxes_in"]:,} boxes were refined'
     if not refined:
         part = f'none of {summary["boxes_in"]:,} boxes was refined'

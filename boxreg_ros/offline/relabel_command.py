@@ -16,7 +16,7 @@ from boxreg_ros.offline.arguments import (
     lidars_from,
 )
 from boxreg_ros.offline.progress import Progress
-from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare
+from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare, SUMMARY
 
 if TYPE_CHECKING:
     from boxreg_ros.offline.request import Request
@@ -184,13 +184,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _status(summary: dict[str, Any], fail_under: float, is_strict: bool) -> int:
     """Return the exit status of a run; say on stderr if it misses ``--fail-under``."""
-    from boxreg_ros.offline.relabel import has_failed, is_complete, part_refined
+    from boxreg_ros.offline.relabel import has_failed, is_complete, num_refined, part_refined
 
-    part = part_refined(summary)
-    if part < fail_under:
+    if part_refined(summary) < fail_under:
         print(
             f'boxreg: --fail-under: expected at least {fail_under:.1%} of the boxes refined, got '
-            f'{part:.1%}; the results are kept, see "reasons" in summary.json',
+            f'{num_refined(summary):,} of {summary["boxes_in"]:,}; the results are kept, see '
+            f'"reasons" in {SUMMARY}',
             file=sys.stderr,
         )
         return FAILED

@@ -29,7 +29,7 @@ JOURNAL = 'journal.mcap'
 SETTINGS = 'settings'
 """Name of the metadata record with the settings of the label files."""
 RESULT_COLUMNS = (
-    *('num_points', 'covariances', 'extent_covariances', 'face_distances', 'outside'),
+    *('num_points', 'covariances', 'extent_covariances', 'face_distances', 'near_points'),
 )
 """Arrays of `RefinedBoxes` that are stored under their own names."""
 

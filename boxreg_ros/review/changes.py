@@ -45,7 +45,7 @@ class TrackChanges:
         refined.
     extent_deviations : array, shape (n, 3)
         Standard deviations of length, width and height [m]; NaN for boxes that are not refined.
-    face_distances, outside : array, shapes (n, 6) and (n,)
+    face_distances, near_points : array, shapes (n, 6) and (n, 2)
         As in `RefinedBoxes`.
     disagreement : array, shape (n,)
         1 - 3D IoU of the result with the early estimate; 0 where that is not known.
@@ -70,7 +70,7 @@ class TrackChanges:
     deviations: Floats
     extent_deviations: Floats
     face_distances: Floats
-    outside: Floats
+    near_points: Floats
     disagreement: Floats
     is_flipped: NDArray[np.bool_]
     status: NDArray[np.str_]
@@ -114,7 +114,7 @@ class Changes:
         # Id, class, status, reason, id in the input.
         self._names: list[tuple[str, str, str, str, str]] = []
         # Rows of given (9), boxes (9), deviations (4), extent deviations (3), face distances (6),
-        # part of the points outside (1), early estimates (9).
+        # near points (2), early estimates (9).
         self._numbers: list[Floats] = []
         self._counts: list[Ints] = []  # rows of stamp, number of points
 
@@ -153,7 +153,7 @@ class Changes:
                     deviations,
                     extent_deviations,
                     refined.face_distances,
-                    refined.outside,
+                    refined.near_points,
                     _refined_early(early, n),
                 ]
             )
@@ -165,10 +165,10 @@ class Changes:
 
     def tracks(self) -> list[TrackChanges]:
         """Return all tracks, by descending mean shift."""
-        numbers = np.concatenate([np.zeros((0, 41)), *self._numbers])
+        numbers = np.concatenate([np.zeros((0, 42)), *self._numbers])
         counts = np.concatenate([np.zeros((0, 2), np.int64), *self._counts])
-        given, boxes, deviations, extent_deviations, face_distances, outside, early = np.split(
-            numbers, [9, 18, 22, 25, 31, 32], axis=1
+        given, boxes, deviations, extent_deviations, face_distances, near_points, early = np.split(
+            numbers, [9, 18, 22, 25, 31, 33], axis=1
         )
         disagreement = _disagreement(boxes, early)
         errors = pose_errors(given, boxes)  # of the input, in the axes of the result
@@ -193,7 +193,7 @@ class Changes:
                     deviations=deviations[rows] + unknown,
                     extent_deviations=extent_deviations[rows] + unknown,
                     face_distances=face_distances[rows],
-                    outside=outside[rows, 0],
+                    near_points=near_points[rows],
                     disagreement=disagreement[rows],
                     is_flipped=errors.is_flipped[rows] & is_refined,
                     status=status,

@@ -60,7 +60,7 @@ FACE_PAIRS = ('ends', 'sides', 'top and bottom')
 MIN_SHOWN = 0.01
 """Smaller parts of a risk are no reason [m]; chosen: two decimals are shown."""
 FEW_POINTS = 10
-"""Boxes with fewer points are reported as such. Chosen."""
+"""Boxes with fewer points are reported as such, and weigh less than others. Chosen."""
 
 DEFAULTS = Config()
 """Settings of the classes. One object: to check its values takes 0.3 ms."""
@@ -107,7 +107,9 @@ class Usual(NamedTuple):
     @classmethod
     def of(cls, tracks: Sequence[TrackChanges]) -> Usual:
         """Return what is usual; classes of fewer than `MIN_COMPARED` tracks have no sizes."""
-        outside = [track.outside.mean() for track in tracks if track.is_refined.any()]
+        counts = np.array([track.near_points.sum(axis=0) for track in tracks]).reshape(-1, 2)
+        counts = counts[counts.sum(axis=1) > 0]
+        outside = counts[:, 1] / counts.sum(axis=1)
         usual = float(np.median(outside)) if len(outside) >= MIN_COMPARED else USUAL_OUTSIDE
         by_class: dict[str, list[Floats]] = {}
         for track in tracks:
@@ -133,8 +135,8 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     extent, nearly all of it at the unseen face of a pair. Its mean is how far the face is off its
     points, beyond what surfaces of its kind are off a rigid box; they are expected by the
     labelling margins of other tracks. Its mean magnitude is that of a folded normal variable. What
-    its mean adds to its deviation is a reason of its own. So is a disagreement between two
-    estimates beyond the loss that the deviations explain.
+    its mean adds to its deviation is a reason of its own. So are points left outside, and a
+    disagreement between two estimates, beyond the loss that these explain.
 
     """
     extents = _extents(track)
@@ -155,8 +157,10 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
         losses[f'uncertain {faces}'] = ONE_OF_PAIR * uncertain[:, pair].sum(axis=1)
         losses[f'{faces} off their points'] = (misfit - uncertain)[:, pair].sum(axis=1)
     expected = np.sum([losses[reason] for reason in losses if 'uncertain' in reason], axis=0)
+    explained = np.sum(list(losses.values()), axis=0)
+    left_outside = _left_outside(track, extents, usual.outside)
+    losses['points left outside'] = (left_outside - explained).clip(0)
     losses['estimates disagree'] = (track.disagreement - expected).clip(0)
-    losses['points left outside'] = _left_outside(track, extents, usual.outside)
     losses = {reason: np.where(is_refined, loss, 0.0) for reason, loss in losses.items()}
     is_kept = track.status == KEPT
     losses['kept as in the input'] = np.where(is_kept, KEPT_LOSS, 0.0)
@@ -222,11 +226,15 @@ def _left_outside(track: TrackChanges, extents: Floats, usual: float) -> Floats:
     Return the loss of 3D IoU that points outside of each box are evidence for, shape (n,).
 
     Of a box off its object, the part of the points that is outside is about the loss. The space
-    around a small object has more room for points of others: they count less. So do those beside a
-    box with few points: of an object that gives few, many near points are of others.
+    around a small object has more room for points of others: they count less. Few points near a
+    box are little evidence: their part is shrunk toward that of the track, which is shrunk toward
+    the `usual` one. So a box that is off an object with few points is found by all its boxes.
 
     """
-    excess = (track.outside - usual).clip(0) * track.num_points / (track.num_points + FEW_POINTS)
+    outside, total = track.near_points[:, 1], track.near_points.sum(axis=1)
+    of_track = (outside.sum() + FEW_POINTS * usual) / (total.sum() + FEW_POINTS)
+    part = (outside + FEW_POINTS * of_track) / (total + FEW_POINTS)
+    excess = (part - usual).clip(0)
     fill = (extents / (extents + 2 * NEAR_MARGIN)).prod(axis=1) / USUAL_FILL
     shift = excess * fill.clip(max=1.0)
     return np.asarray(2 * shift / (1 + shift))

@@ -49,6 +49,14 @@ async function inflate(base64) {
   return new Response(stream).text();
 }
 
+// While the page is read, an element may be missing or incomplete: whole is one that another follows.
+async function textOf(id) {
+  if (!$(id)?.nextSibling && document.readyState === 'loading') {
+    await new Promise(done => document.addEventListener('DOMContentLoaded', done, { once: true }));
+  }
+  return $(id).textContent;
+}
+
 // The page as it is now has been painted.
 function painted() { return new Promise(done => requestAnimationFrame(() => setTimeout(done))); }
 
@@ -90,10 +98,7 @@ function corners(box) {
 // A part of the file: the boxes and points of a track -------------------------------------------
 
 async function loadPart(index) {
-  if (!$('part-' + index) && document.readyState === 'loading') {
-    await new Promise(done => document.addEventListener('DOMContentLoaded', done, { once: true }));
-  }
-  const part = JSON.parse(await inflate($('part-' + index).textContent));
+  const part = JSON.parse(await inflate(await textOf('part-' + index)));
   const bytes = Uint8Array.from(atob(part.points), c => c.charCodeAt(0));
   part.points = new Int16Array(bytes.buffer);
   part.first = [0];
@@ -304,8 +309,7 @@ let plotly;
 function withPlotly() {
   plotly ??= (async () => {
     await painted();  // the script takes a second to start
-    if (!$('plotly')) await new Promise(done => document.addEventListener('DOMContentLoaded', done, { once: true }));
-    document.head.append(element('script', {}, await inflate($('plotly').textContent)));
+    document.head.append(element('script', {}, await inflate(await textOf('plotly'))));
     $('plotly').remove();
   })();
   return plotly;
@@ -876,4 +880,5 @@ async function main() {
   document.documentElement.dataset.ready = '';
 }
 
-main().catch(error => { fail(`This page failed: ${error.message}`); throw error; });
+addEventListener('unhandledrejection', event => fail(`This page failed: ${event.reason?.message ?? event.reason}`));
+main();

@@ -369,7 +369,7 @@ def _finished(
         registered.is_final,
         completed(registered.extent_covariances, np.eye(3)),
         completed(registered.face_distances, np.zeros(6)),
-        completed(registered.outside, np.zeros(n)),
+        completed(registered.near_points, np.zeros(2, np.int64)),
     )
 
 

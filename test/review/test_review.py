@@ -1,8 +1,11 @@
 """`boxreg review`: the page in a real browser, decisions.csv, and what a run makes of it."""
 
+from contextlib import contextmanager
 import csv
 from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
+from time import sleep
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import ConfigError, RecordingError
@@ -236,6 +239,40 @@ def test_foreign_and_broken_requests_write_nothing(result, headers, body, status
 
 
 # The page ----------------------------------------------------------------------------------------
+
+
+@contextmanager
+def slowly_served(page, place):
+    """Serve a page on loopback that pauses at a place; yield its address."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200 if self.path == '/' else 404)
+            self.send_header('Content-Type', 'text/html; charset=utf-8')
+            self.end_headers()
+            if self.path == '/':
+                self.wfile.write(page[:place])
+                sleep(3.0)
+                self.wfile.write(page[place:])
+
+        def log_message(self, *_):
+            """Print nothing."""
+
+    server = ThreadingHTTPServer(('127.0.0.1', 0), Handler)
+    Thread(target=server.serve_forever).start()
+    yield f'http://127.0.0.1:{server.server_port}/'
+    server.shutdown()
+    server.server_close()
+
+
+@NEEDS_BROWSER
+@pytest.mark.parametrize('half_read', ['part-0', 'plotly'])
+def test_page_waits_for_the_rest_of_what_is_half_read(result, half_read):
+    source = (result[1] / 'report.html').read_bytes()
+    place = source.index(b'</script>', source.index(f'id="{half_read}"'.encode())) - 100
+    with slowly_served(source, place) as url, opened_page(f'{url}#tracks', '404') as page:
+        page.evaluate('openTrack(0)')
+        page.wait_for_function('view.space && view.charts')
 
 
 @NEEDS_BROWSER

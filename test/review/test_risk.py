@@ -89,14 +89,36 @@ def test_extents_unlike_those_of_the_class_raise_the_risk():
     assert Usual.of(cars[1:]).sizes == {}  # too few tracks
 
 
-def test_points_outside_count_beyond_what_is_usual_and_by_the_points_inside():
+def near(inside, outside):
+    """Return the near points of one box."""
+    return {'near_points': np.array([[inside, outside]])}
+
+
+def test_points_outside_count_beyond_what_is_usual_and_by_their_number():
     reason = 'points left outside'
-    track = track_with(outside=np.array([0.3]))
-    fifty_points = 50 / (50 + 10)
+    track = track_with(1e-6, **near(70, 30))  # 4 boxes
+    of_track = (120 + 10 * 0.1) / (400 + 10)
+    part = (30 + 10 * of_track) / (100 + 10)
     fill = np.prod(np.array(CAR[3:6]) / (np.array(CAR[3:6]) + 1.2)) / 0.34
-    shift = (0.3 - 0.1) * fifty_points * fill
-    np.testing.assert_allclose(assess(track).parts[reason], 2 * shift / (1 + shift) * 4.5 / 2)
+    shift = (part - 0.1) * fill
+    loss = assess(track).parts[reason] / (4.5 / 2)
+    np.testing.assert_allclose(loss, 2 * shift / (1 + shift), atol=1e-5)
     assert assess(track, Usual(outside=0.3)).parts[reason].sum() == 0
+
+
+def test_a_box_off_its_object_is_found_by_the_few_points_of_all_its_boxes():
+    # One point of a parked car, outside of its box at each of 70 stamps.
+    reason = 'points left outside'
+    assert assess(track_with(n=70, **near(0, 1))).parts[reason].min() > 1.0
+    assert assess(track_with(n=1, **near(0, 1))).parts[reason].max() < 0.3
+    assert assess(track_with(n=70, **near(0, 0))).parts[reason].max() == 0.0
+
+
+def test_points_outside_that_other_reasons_explain_count_once():
+    distances = np.full((1, 6), 0.4)
+    off = assess(track_with(face_distances=distances)).track
+    both = assess(track_with(face_distances=distances, **near(90, 30)))
+    assert both.track == pytest.approx(off)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +126,7 @@ def test_points_outside_count_beyond_what_is_usual_and_by_the_points_inside():
     [
         {'deviation': 0.1},
         {'status': 'kept'},
-        {'outside': np.array([0.6])},
+        near(20, 30),
         {'face_distances': np.full((1, 6), 0.2)},
     ],
 )
