@@ -18,6 +18,8 @@ INSTALL := $(BIN)/python -m pip $(QUIET) $(BUILD) -c constraints.txt
 
 # Another ROS installation that the shell has sourced must not shadow the environment's packages.
 unexport PYTHONPATH AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# Containers often set it: every process would compile all its modules, torch alone for 1.2 s.
+unexport PYTHONDONTWRITEBYTECODE
 
 version := $(shell $(PYTHON) -c 'import platform; print(platform.python_version())')
 runtime := $(VENV)/.runtime-$(version)

@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 HEADER = 4
 """Bytes before the first field; alignment counts from there."""
+PADDING = 4
+"""Fewer bytes than this may follow the last field: a message ends on a multiple."""
 LITTLE_ENDIAN = 1
 """Second byte of the header, of the only encoding that is walked."""
 STEP_NUMBERS, STEP_TEXT, STEP_SEQUENCE, STEP_ITEMS, STEP_END = range(5)
@@ -45,9 +47,11 @@ class Layout:
     Parameters
     ----------
     kind : type
-        Class of the messages, of rclpy.
+        Class of the messages, of rclpy; or another object with its field types.
     paths : sequence of str
-        Fields to find, as ``items.pose.position.x``.
+        Fields to find, as ``items.pose.position.x``. All strings are found, too.
+    kind_of : callable
+        Returns the same of a type that a field has, as ``std_msgs/Header``.
 
     Raises
     ------
@@ -56,16 +60,20 @@ class Layout:
 
     """
 
-    def __init__(self, kind: Any, paths: Sequence[str]) -> None:
-        self._paths = tuple(paths)
+    def __init__(
+        self, kind: Any, paths: Sequence[str], kind_of: Callable[[str], Any] | None = None
+    ) -> None:
+        self._kind_of = kind_of or _class_of
         steps = list(self._steps_of(kind, ''))
+        self._texts = tuple(path for step, *_, path in steps if step == STEP_TEXT)
+        self._paths = tuple(dict.fromkeys((*paths, *self._texts)))
         missing = set(paths) - {path for *_, path in steps}
         if missing:
             raise UnsupportedMessage(
                 f'{kind.__name__}: expected the fields {", ".join(sorted(missing))}, got a '
                 f'definition without; install the current definition'
             )
-        columns = {path: number for number, path in enumerate(paths)}
+        columns = {path: number for number, path in enumerate(self._paths)}
         rows = [(step, size, count, columns.get(path, -1)) for step, size, count, path in steps]
         self._steps = np.array(rows, np.int64)  # (steps, [step, size, count, column])
 
@@ -79,13 +87,14 @@ class Layout:
         body[:size] = np.frombuffer(data, np.uint8, size, HEADER)
         counts = np.zeros(len(self._paths), np.int64)
         places = np.zeros((len(self._paths), 0, 2), np.int64)
-        if not walk_compiled(body, size, self._steps, counts, places):
+        end = walk_compiled(body, size, self._steps, counts, places)
+        if end < 0:
             return None
         places = np.zeros((len(self._paths), int(counts.max(initial=0)), 2), np.int64)
         counts[:] = 0
         walk_compiled(body, size, self._steps, counts, places)
         found = {path: places[i, : counts[i]] for i, path in enumerate(self._paths)}
-        return Fields(data, body, found)
+        return Fields(data, body, found, self._texts, int(end))
 
     def _steps_of(self, kind: Any, prefix: str) -> Iterator[tuple[int, int, int, str]]:
         """Yield step, size [bytes], count and path for all fields of a class."""
@@ -104,10 +113,7 @@ class Layout:
         if element == 'string':
             inner = [(STEP_TEXT, 1, 1, path)]
         elif '/' in element:
-            package, _, name = element.partition('/')
-            inner = list(
-                self._steps_of(getattr(import_module(f'{package}.msg'), name), f'{path}.')
-            )
+            inner = list(self._steps_of(self._kind_of(element), f'{path}.'))
         else:
             raise UnsupportedMessage(f'{path}: expected numbers, strings or messages, got {text}')
         if count == 1:
@@ -116,6 +122,12 @@ class Layout:
         yield STEP_ITEMS, len(inner), count, path
         yield from inner
         yield STEP_END, 0, 0, ''
+
+
+def _class_of(name: str) -> Any:
+    """Return the class of rclpy of a message type."""
+    package, _, kind = name.partition('/')
+    return getattr(import_module(f'{package}.msg'), kind)
 
 
 class Fields:
@@ -130,15 +142,43 @@ class Fields:
         The bytes after its header, filled up to a multiple of 8 with zeros.
     places : dict of str to array, shape (k, 2)
         Offset in `body` and count (numbers, letters, items) of each field, by path.
+    texts : tuple of str
+        Paths of all strings.
+    end : int
+        Where in `body` the last field ends.
 
     """
 
     def __init__(
-        self, data: bytes, body: NDArray[np.uint8], places: dict[str, NDArray[np.int64]]
+        self,
+        data: bytes,
+        body: NDArray[np.uint8],
+        places: dict[str, NDArray[np.int64]],
+        texts: tuple[str, ...],
+        end: int,
     ) -> None:
         self._data = data
         self._body = body
         self._places = places
+        self._texts = texts
+        self._end = end
+        self._strings: dict[str, list[bytes]] = {}  # by path, once they are asked for
+
+    def is_flawless(self) -> bool:
+        """Return whether all strings are of UTF-8 and end with a zero, and no bytes are left."""
+        if len(self._data) - HEADER - self._end >= PADDING:
+            return False
+        ends = np.concatenate([self._places[path].sum(1) - 1 for path in self._texts])
+        lengths = np.concatenate([self.counts(path) for path in self._texts])
+        if not lengths.all() or self._body[ends].any():
+            return False
+        try:
+            for path in self._texts:
+                for text in set(self._encoded(path)):
+                    text.decode()
+        except UnicodeDecodeError:
+            return False
+        return True
 
     def counts(self, path: str) -> NDArray[np.int64]:
         """Return how many elements (k,) a sequence or array has, for each item that it is in."""
@@ -156,7 +196,7 @@ class Fields:
 
     def texts(self, path: str) -> list[str]:
         """Return strings; bytes that are no UTF-8 are replaced."""
-        encoded = list(self._encoded(path))
+        encoded = self._encoded(path)
         decoded = {text: text.decode(errors='replace') for text in set(encoded)}
         return [decoded[text] for text in encoded]
 
@@ -168,11 +208,17 @@ class Fields:
         """Return the message with the numbers that were put."""
         return self._data[:HEADER] + self._body[: len(self._data) - HEADER].tobytes()
 
-    def _encoded(self, path: str) -> Iterator[bytes]:
-        data = self._data
-        for offset, length in self._places[path].tolist():
+    def _encoded(self, path: str) -> list[bytes]:
+        """Return strings without the zero that ends each."""
+        if path not in self._strings:
+            offset, length = self._places[path].T
             begin = HEADER + offset
-            yield data[begin : begin + max(length - 1, 0)]  # a zero ends each string
+            ends = (begin + np.maximum(length - 1, 0)).tolist()
+            data = self._data
+            self._strings[path] = [
+                data[first:end] for first, end in zip(begin.tolist(), ends, strict=True)
+            ]
+        return self._strings[path]
 
     def _index(self, path: str, dtype: str, width: int) -> NDArray[np.int64]:
         first = self._places[path][:, :1] // np.dtype(dtype).itemsize
@@ -181,7 +227,7 @@ class Fields:
 
 
 @cache
-def walker() -> Callable[..., bool] | None:
+def walker() -> Callable[..., int] | None:
     """
     Return `walk` compiled, or loaded from disk; None where numba does not work.
 
@@ -209,16 +255,16 @@ def walker() -> Callable[..., bool] | None:
     return compiled
 
 
-def _compiled(numba: Any) -> Callable[..., bool]:
+def _compiled(numba: Any) -> Callable[..., int]:
     """Compile `walk` at its first call; kept on disk where a folder can be written."""
     try:
-        compiled: Callable[..., bool] = numba.njit(walk, cache=True, nogil=True)
+        compiled: Callable[..., int] = numba.njit(walk, cache=True, nogil=True)
     except RuntimeError:
         compiled = numba.njit(walk, nogil=True)
     return compiled
 
 
-def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
+def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> int:
     """
     Walk through a message and note the places of fields.
 
@@ -237,8 +283,8 @@ def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
 
     Returns
     -------
-    bool
-        Whether the message has all fields.
+    int
+        Where the last field ends; -1 if the message lacks fields.
 
     """
     firsts = np.zeros(len(steps), np.int64)  # first repeated step, by depth
@@ -259,7 +305,7 @@ def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
         if step == STEP_TEXT or count < 0:
             position = (position + 3) // 4 * 4
             if position + 4 > size:
-                return False
+                return -1
             low = np.int64(body[position]) | np.int64(body[position + 1]) << 8
             high = np.int64(body[position + 2]) | np.int64(body[position + 3]) << 8
             count = low | high << 16
@@ -275,9 +321,9 @@ def walk(body: Any, size: int, steps: Any, counts: Any, places: Any) -> bool:
             begin = (position + width - 1) // width * width
             position = begin + width * count
             if position > size:
-                return False
+                return -1
         if column >= 0:
             if counts[column] < places.shape[1]:
                 places[column, counts[column]] = begin, count
             counts[column] += 1
-    return True
+    return position

@@ -1,5 +1,5 @@
 """
-Boxes of serialised messages, read and rewritten as arrays: the way of the live node.
+Boxes of serialised messages, read and rewritten as arrays.
 
 `BOX_FIELDS` states where each type has pose, size, id, class and score. The adapter of the family
 reads unusual messages (several frames in one message, another output frame, shapes that are no
@@ -113,6 +113,8 @@ class SerializedAdapter:
         Adapter of its messages.
     deserialize : callable
         Returns the message of bytes.
+    kind_of : callable, optional
+        As for `Layout`.
 
     Raises
     ------
@@ -122,7 +124,12 @@ class SerializedAdapter:
     """
 
     def __init__(
-        self, type_name: str, kind: Any, inner: Adapter, deserialize: Callable[[bytes, Any], Any]
+        self,
+        type_name: str,
+        kind: Any,
+        inner: Adapter,
+        deserialize: Callable[[bytes, Any], Any],
+        kind_of: Callable[[str], Any] | None = None,
     ) -> None:
         self._at = BOX_FIELDS[type_name]
         self._kind = kind
@@ -130,13 +137,22 @@ class SerializedAdapter:
         self._deserialize = deserialize
         at = self._at
         paths = (at.stamp, *at.frames, at.pose, at.size, at.covariance, *at.others)
-        self._layout = Layout(kind, [path for path in dict.fromkeys(paths) if path])
+        self._layout = Layout(kind, [path for path in dict.fromkeys(paths) if path], kind_of)
 
     def from_msg(self, msg: bytes) -> BoxArray:
         """Return the boxes of a message, see `Adapter`."""
         fields = self._ordinary(msg)
         if fields is None:
             return self._inner.from_msg(self._deserialize(msg, self._kind))
+        return self._boxes_of(fields)
+
+    def read_flawless(self, msg: bytes) -> BoxArray | None:
+        """Return the boxes of a message; None if a reader by objects may refuse it."""
+        fields = self._ordinary(msg)
+        return None if fields is None or not fields.is_flawless() else self._boxes_of(fields)
+
+    def _boxes_of(self, fields: Fields) -> BoxArray:
+        """Return the boxes of a message that arrays can represent."""
         at = self._at
         rows = self._rows(fields)
         boxes = poses.boxes_from(
@@ -247,12 +263,15 @@ RESULT_COVARIANCE = 'detections.results.pose.covariance'
 def _detection_labels(fields: Fields) -> Labels:
     """Return ids, and classes and scores of the hypotheses with the highest score."""
     classes = fields.texts('detections.results.hypothesis.class_id')
-    scores = fields.numbers('detections.results.hypothesis.score', '<f8')[:, 0].tolist()
+    scores = fields.numbers('detections.results.hypothesis.score', '<f8')[:, 0]
+    counts = fields.counts('detections.results')
+    if (counts == 1).all():
+        return fields.texts('detections.id'), classes, scores
     best = []
     end = 0
-    for count in fields.counts('detections.results').tolist():
+    for count in counts.tolist():
         begin, end = end, end + count
-        hypotheses = zip(classes[begin:end], scores[begin:end], strict=True)
+        hypotheses = zip(classes[begin:end], scores[begin:end].tolist(), strict=True)
         best.append(max(hypotheses, key=lambda item: item[1], default=('', 1.0)))
     found_scores = np.array([score for _, score in best])
     return fields.texts('detections.id'), [name for name, _ in best], found_scores

@@ -495,6 +495,60 @@ def test_a_run_that_is_interrupted_in_a_step_leaves_no_files(tmp_path, step):
     assert list((tmp_path / 'r').glob('*')) == []
 
 
+WRITER_THAT_FAILS = """
+import errno, os, signal, sys, threading, time
+from boxreg_ros.cli import command
+from boxreg_ros.labels import openlabel
+from boxreg_ros.offline.output import Sink
+when, ending = os.environ['WHEN'], os.environ['ENDING']
+leave, write = Sink.__exit__, openlabel.Writer.write
+is_at_the_end = threading.Event()
+def leave_noted(self, *failure):
+    assert len(self._background._waiting) > 1 or when == 'at once'
+    is_at_the_end.set()
+    leave(self, *failure)
+def fail(self, frame):
+    if when == 'at the end':
+        assert is_at_the_end.wait(30)
+        time.sleep(0.2)  # until the results are waited for
+    if ending == 'signal':
+        os.kill(os.getpid(), signal.SIGINT)
+        write(self, frame)
+    else:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), 'labels.json')
+Sink.__exit__, openlabel.Writer.write = leave_noted, fail
+command()
+"""
+
+
+@pytest.mark.parametrize('when, earlier', [('at once', False), ('at the end', True)])
+@pytest.mark.parametrize(
+    'ending, status, line',
+    [
+        ('error', 1, "[Errno 28] No space left on device: 'labels.json'; free some space on"),
+        ('signal', 130, 'interrupted; nothing was written'),
+    ],
+)
+def test_a_run_that_ends_while_results_wait_to_be_written(
+    tmp_path, ending, status, line, when, earlier
+):
+    # All results come at once, at the end of the recording; a thread writes them one by one.
+    recording = Drive(sweeps=40).write(tmp_path / 'drive')
+    out = tmp_path / 'r' / 'out'
+    if earlier:
+        assert cli.main(['relabel', str(recording), '-o', str(out), *QUICK]) == 0
+    before = {path.name: path.read_bytes() for path in out.glob('*.*')}
+    done = subprocess.run(
+        [sys.executable, '-c', WRITER_THAT_FAILS, 'relabel', recording, '-o', out, *QUICK],
+        cwd=ROOT, capture_output=True, text=True, timeout=60,
+        env=os.environ | {'WHEN': when, 'ENDING': ending},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (status, '')
+    assert done.stderr.startswith(f'boxreg: {line}') and done.stderr.count('\n') == 1
+    assert [path.name for path in (tmp_path / 'r').iterdir()] == ['out'] * earlier
+    assert {path.name: path.read_bytes() for path in out.glob('*.*')} == before
+
+
 def test_a_run_under_nohup_ignores_sighup(tmp_path):
     recording = Drive(sweeps=20).write(tmp_path / 'drive')
     command = ['nohup', sys.executable, '-m', 'boxreg_ros.cli', 'relabel', recording]

@@ -155,7 +155,7 @@ class Observation(NamedTuple):
     @property
     def stamp_ns(self) -> int:
         """Stamp of the box [ns]."""
-        return int(self.table.stamps_ns[self.row])
+        return int(self.table.stamps_ns.item(self.row))
 
     @property
     def box(self) -> Floats:
@@ -187,12 +187,12 @@ class Observation(NamedTuple):
     @property
     def num_points(self) -> int:
         """Sweep points inside the box."""
-        return int(self.table.num_points[self.row])
+        return int(self.table.num_points.item(self.row))
 
     @property
     def sight(self) -> float:
         """When the sweep saw the object, relative to the stamp [s]."""
-        return float(self.table.sights[self.row])
+        return float(self.table.sights.item(self.row))
 
 
 def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Observations:
@@ -421,18 +421,20 @@ def _thinned(own: OwnPoints, sweep: Sweep, n: int, config: Config) -> tuple[Ints
     most = config.sampling.points
     counts = np.bincount(own.owner, minlength=n)
     first = np.cumsum(counts) - counts
-    is_kept = np.ones(len(own.row), bool)
     if config.objective == 'paper':
+        is_kept = np.ones(len(own.row), bool)
         for box in np.flatnonzero(counts > most):
             part = slice(first[box], first[box] + counts[box])
             picks = farthest_point_sample(sweep.points[own.row[part]].astype(np.float64), most)
             is_kept[part] = False
             is_kept[first[box] + picks] = True
-    elif counts.max(initial=0) > most:
+        place = np.flatnonzero(is_kept)
+    else:
         stride = np.maximum(1, -(-counts // most))
-        place = np.arange(len(own.row)) - first[own.owner]
-        is_kept = place % stride[own.owner] == 0
-    return own.row[is_kept], own.owner[is_kept]
+        kept = -(-counts // stride)
+        step = _runs(np.zeros(n, int), kept)  # 0, 1, 2 ... of each box
+        place = np.repeat(first, kept) + step * np.repeat(stride, kept)
+    return own.row[place], own.owner[place]
 
 
 def _pairs(points: NDArray[np.floating], centers: Floats, reach: Floats) -> tuple[Ints, Ints]:

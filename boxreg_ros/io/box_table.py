@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 import csv
 from dataclasses import dataclass
+from functools import lru_cache
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -192,3 +194,11 @@ class BoxTable:
                     self.stamps_ns[i], self.frame_id, self.track_ids[i], self.class_names[i],
                     *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],
                 ])  # fmt: skip
+
+
+@lru_cache(1024)
+def cell(text: str) -> str:
+    """Return a text as one of several cells of a row of CSV: in quotes where it needs them."""
+    row = StringIO()
+    csv.writer(row, lineterminator='\n').writerow(('', text))
+    return row.getvalue()[1:-1]

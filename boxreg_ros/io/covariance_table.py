@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.errors import RecordingError, unreadable
+from boxreg_ros.io.box_table import cell
 from boxreg_ros.structures import Floats, KEPT, RefinedBoxes, X, Y
 import numpy as np
 
@@ -54,7 +55,6 @@ class CovarianceWriter:
     def __init__(self, path: Path) -> None:
         self._file = path.open('w', newline='', encoding='utf-8')
         self._file.write(','.join((*COVARIANCE_KEYS, *COVARIANCE_NUMBERS)) + '\n')
-        self._row_begins = csv.writer(self._file, lineterminator=',')
 
     def write(self, refined: RefinedBoxes, T_fixed_sensor: Floats | None) -> None:
         """Add a row for each box with an estimate: kept boxes have none."""
@@ -70,10 +70,12 @@ class CovarianceWriter:
             ]
         )
         rows = zip(refined.status, boxes.track_ids, distances, numbers.tolist(), strict=True)
-        for status, track_id, distance, row in rows:
-            if status != KEPT:
-                self._row_begins.writerow((boxes.stamp_ns, track_id, distance))
-                self._file.write(NUMBERS_FORMAT % tuple(row))
+        lines = [
+            f'{boxes.stamp_ns},{cell(track_id)},{distance},' + NUMBERS_FORMAT % tuple(row)
+            for status, track_id, distance, row in rows
+            if status != KEPT
+        ]
+        self._file.write(''.join(lines))
 
     def close(self) -> None:
         """Close the file."""

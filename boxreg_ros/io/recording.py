@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, cast, Self
+from typing import Any, cast, Self, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError, UnsupportedMessage
 from boxreg_ros.io.foxglove import encoded
@@ -18,6 +19,7 @@ from boxreg_ros.io.items import Item, LOOKAHEAD_NS, not_measured, Stage
 from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.motion import RecordedMotion
+from boxreg_ros.io.recorded_type import RecordedType
 from boxreg_ros.io.resync import Timeline
 from boxreg_ros.io.storage.files import is_ros1, part_of
 from boxreg_ros.io.storage.reader import Reader
@@ -29,6 +31,12 @@ from msg_adapters import adapter_for, clouds, pointcloud, poses
 from msg_adapters.convention import Convention, STANDARD
 from rosbags.interfaces import Connection
 from rosbags.typesys.store import Typestore
+
+if TYPE_CHECKING:
+    from msg_adapters.serialized import SerializedAdapter
+
+CDR_HEADER = b'\0\1'
+"""Begin of a message in little-endian CDR, of no other encoding."""
 
 
 class Recording:
@@ -92,6 +100,7 @@ class Recording:
         self._start, self._end = start, end
         self.outside = 0
         self._decoded_topics: set[str] = set()
+        self._array_adapter: SerializedAdapter | None = None
 
     def __enter__(self) -> Self:
         """Open all files and find the topics."""
@@ -201,6 +210,28 @@ class Recording:
                 item = self._item(record, with_intensities)
             if item is not None:
                 yield item
+
+    def read_boxes_as_arrays(self) -> None:
+        """
+        Read boxes by a compiled loop from now on, where their type and numba allow it.
+
+        They are the same. Messages that rosbags may refuse are left to it.
+
+        """
+        from msg_adapters.cdr import walker  # these take 10 ms, which most commands do not need
+        from msg_adapters.serialized import BOX_FIELDS, SerializedAdapter
+
+        kind = self.topics.get(self.boxes_topic, '')
+        if kind not in BOX_FIELDS or not self.is2 or walker() is None:
+            return
+        kind_of = partial(RecordedType, self.typestore)
+        deserialize = self._reader.deserialize
+        try:
+            self._array_adapter = SerializedAdapter(
+                kind, kind_of(kind), adapter_for(kind), deserialize, kind_of
+            )
+        except (KeyError, UnsupportedMessage):  # a definition is missing, or an older one
+            return
 
     def check_readable(self) -> None:
         """
@@ -380,6 +411,10 @@ class Recording:
     def _item(self, record: Record, with_intensities: bool) -> Item | None:
         """Return a message decoded; None, and counted, if it cannot be."""
         topic = record.connection.topic
+        boxes = self._boxes_as_arrays(record)
+        if boxes is not None:
+            self._decoded_topics.add(topic)
+            return Item(record.received_ns, boxes)
         try:
             message = self._decoder.message(record)
             content = self._content(topic, message)
@@ -394,6 +429,16 @@ class Recording:
             except UnsupportedMessage as error:
                 self._decoder.count_unreadable(topic, error)
         return Item(record.received_ns, content, intensities)
+
+    def _boxes_as_arrays(self, record: Record) -> BoxArray | None:
+        """Return the boxes of a flawless message; None for others, and for all by default."""
+        is_boxes = record.connection.topic == self.boxes_topic
+        if self._array_adapter is None or not is_boxes or record.data[:2] != CDR_HEADER:
+            return None
+        boxes = self._array_adapter.read_flawless(bytes(record.data))
+        if boxes is None or self._convention.is_standard:
+            return boxes
+        return self._convention.to_centers(boxes)
 
     def _content(self, topic: str, message: Any) -> Sweep | BoxArray:
         """Return the sweep or the boxes of a message; UnsupportedMessage if it has none."""

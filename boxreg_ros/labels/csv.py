@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import csv
 from pathlib import Path
 
-from boxreg_ros.io.box_table import BoxTable, COLUMNS
+from boxreg_ros.io.box_table import BoxTable, cell, COLUMNS
 from boxreg_ros.io.covariance_table import COVARIANCES, CovarianceWriter
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import refined_boxes
@@ -43,9 +43,7 @@ class Writer:
         self.dropped: Counter[str] = Counter()
         self._path = folder / 'boxes.csv'
         self._file = self._path.open('w', newline='', encoding='utf-8')
-        self._row_begins = csv.writer(self._file, lineterminator=',')
-        self._row_ends = csv.writer(self._file, lineterminator='\n')
-        self._row_ends.writerow(COLUMNS)
+        self._file.write(','.join(COLUMNS) + '\n')
         self._covariances = CovarianceWriter(folder / COVARIANCES)
         self._newest_ns: int | None = None
         self._is_sorted = True
@@ -67,13 +65,14 @@ class Writer:
                 boxes.boxes[:, LENGTH : HEIGHT + 1],
             ]
         )
-        names = zip(boxes.track_ids, boxes.class_names, strict=True)
-        ends = zip(refined.status, refined.num_points.tolist(), strict=True)
-        rows = zip(names, _texts(numbers), ends, strict=True)
-        for (track_id, class_name), texts, end in rows:
-            self._row_begins.writerow((stamp_ns, boxes.frame_id, track_id, class_name))
-            self._file.write(f'{texts},')
-            self._row_ends.writerow(end)
+        begin = f'{stamp_ns},{cell(boxes.frame_id)}'
+        columns = boxes.track_ids, boxes.class_names, _texts(numbers), refined.status
+        rows = zip(*columns, refined.num_points.tolist(), strict=True)
+        lines = [
+            f'{begin},{cell(track_id)},{cell(class_name)},{texts},{cell(status)},{num_points}\n'
+            for track_id, class_name, texts, status, num_points in rows
+        ]
+        self._file.write(''.join(lines))
 
     def close(self) -> None:
         """Close the file; sort it if boxes arrived late."""

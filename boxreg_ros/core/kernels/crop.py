@@ -68,19 +68,25 @@ def raster(centers, reach, side):
 
 @kernel
 def near_points(points, first, side):
-    """Return the points (3, M) in cells that boxes touch, with their cells."""
+    """
+    Return the points (3, M) in cells that boxes touch, with their cells.
+
+    The cells are found in a loop that is compiled to vector instructions, the points in one
+    without a branch: a quarter of them, in no order, would be mispredicted.
+
+    """
     near = np.empty(points.shape[1], np.int32)
     cells = np.empty(points.shape[1], np.int32)
     is_touched = np.empty(side * side, np.bool_)  # small enough for the processor's cache
     for cell in range(side * side):
         is_touched[cell] = first[cell + 1] > first[cell]
+    for i in range(points.shape[1]):
+        cells[i] = cell_of(metre(points[0, i]), metre(points[1, i]), np.int32(side))
     count = 0
     for i in range(points.shape[1]):
-        cell = cell_of(metre(points[0, i]), metre(points[1, i]), side)
-        if is_touched[cell]:
-            near[count] = i
-            cells[count] = cell
-            count += 1
+        near[count] = i
+        cells[count] = cells[i]
+        count += is_touched[cells[i]]
     return near[:count], cells[:count]
 
 
@@ -295,18 +301,17 @@ def own_points(points, centers, rotations, half, reach, numbers):
             w = abs(up) - half[box, 2]
             aside = max(u, v)
             deep = max(aside, w)
-            if deep < numbers.margin:
-                high = half[box, 2] + up
-                row[P], owner[P] = i, box
-                x[P], depth[P], height[P] = dx, deep, high
-                is_beside[P] = (
-                    (aside > numbers.road_gap)
-                    & (deep < numbers.road_width)
-                    & (abs(high) < numbers.road_range)
-                    & (max(abs(dx), abs(dy)) < square[box])
-                )
-                num_inside[box] += deep <= 0.0
-                P += 1
+            high = half[box, 2] + up
+            row[P], owner[P] = i, box
+            x[P], depth[P], height[P] = dx, deep, high
+            is_beside[P] = (
+                (aside > numbers.road_gap)
+                & (deep < numbers.road_width)
+                & (abs(high) < numbers.road_range)
+                & (max(abs(dx), abs(dy)) < square[box])
+            )
+            num_inside[box] += deep <= 0.0
+            P += deep < numbers.margin  # without a branch: the next pair replaces one too far
     least = least_depths(row[:P], depth[:P])
     road = np.full(n, np.nan)
     if numbers.has_road:
