@@ -445,11 +445,12 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
         yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
     if summary['unused_decisions']:
         unused = summary['unused_decisions']
-        names = ', '.join(unused[:MAX_NAMED])
+        named = [*unused[:MAX_NAMED], '...'] if len(unused) > MAX_NAMED else unused
+        names = ', '.join(named)
         yield (
-            f'decisions: expected those on tracks and boxes of this recording, got {len(unused):,} '
-            f'on others, not used: {names}{", ..." if len(unused) > MAX_NAMED else ""}; give the '
-            f'decisions of this recording to --decisions'
+            f'decisions: expected those on tracks and boxes of this recording, got '
+            f'{len(unused):,} on others, not used: {names}; give the decisions of this recording '
+            f'to --decisions'
         )
     if summary['frames_without_cloud']:
         yield (

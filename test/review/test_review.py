@@ -246,6 +246,8 @@ def slowly_served(page, place):
     """Serve a page on loopback that pauses at a place; yield its address."""
 
     class Handler(BaseHTTPRequestHandler):
+        """Sends the page in two parts."""
+
         def do_GET(self):
             self.send_response(200 if self.path == '/' else 404)
             self.send_header('Content-Type', 'text/html; charset=utf-8')
