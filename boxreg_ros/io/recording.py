@@ -35,7 +35,7 @@ from rosbags.typesys.store import Typestore
 if TYPE_CHECKING:
     from msg_adapters.serialized import SerializedAdapter
 
-CDR_HEADER = b'\0\1'
+CDR_BEGIN = b'\0\1'
 """Begin of a message in little-endian CDR, of no other encoding."""
 
 
@@ -433,7 +433,7 @@ class Recording:
     def _boxes_as_arrays(self, record: Record) -> BoxArray | None:
         """Return the boxes of a flawless message; None for others, and for all by default."""
         is_boxes = record.connection.topic == self.boxes_topic
-        if self._array_adapter is None or not is_boxes or record.data[:2] != CDR_HEADER:
+        if self._array_adapter is None or not is_boxes or record.data[:2] != CDR_BEGIN:
             return None
         boxes = self._array_adapter.read_flawless(bytes(record.data))
         if boxes is None or self._convention.is_standard:

@@ -298,9 +298,9 @@ def _read(request: Request, _: Receive, send: Send) -> None:
 def _messages(request: Request) -> Generator[Source | ReadItem | Findings]:
     """Yield the source of a recording, all its items, and the findings."""
     with request.recording() as recording:
-        if isinstance(recording, Recording) and recording.end_ns - recording.start_ns > LONG * 1e9:
-            recording.read_boxes_as_arrays()
         reading = RecordingReader(recording, request, Stopwatch())
         yield reading.source
+        if isinstance(recording, Recording) and reading.source.seconds > LONG:
+            recording.read_boxes_as_arrays()  # the main process goes on meanwhile
         yield from reading
         yield reading.findings()

@@ -5,6 +5,7 @@ from importlib import import_module
 import json
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.covariance_table import read_covariances
 from boxreg_ros.labels import FORMATS, LabelFrame, Provenance, writer_for
 from boxreg_ros.labels.files import to_json
 from boxreg_ros.structures import BoxArray, RefinedBoxes
@@ -68,6 +69,13 @@ def test_columns_and_golden_values(tmp_path):
     assert numbers == TILTED[:6]
     quaternion = [float(row[name]) for name in ('qx', 'qy', 'qz', 'qw')]
     np.testing.assert_allclose(quaternion, TILTED_XYZW, atol=1e-9)
+
+
+def test_names_of_any_characters_are_read_again(tmp_path):
+    names = ['', 'a,"b', 'two\nlines', ' blanks ', '"']
+    write('csv', tmp_path, [refined(1, names)])
+    assert [row['track_id'] for row in rows_of(tmp_path)] == names
+    assert list(read_covariances(tmp_path / 'covariances.csv')) == [(1, name) for name in names]
 
 
 def test_numbers_keep_their_full_precision(tmp_path):
