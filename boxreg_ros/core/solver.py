@@ -27,7 +27,7 @@ from boxreg_ros.core.input_noise import InputNoise, normalised_residuals, UNKNOW
 from boxreg_ros.core.kernels import compiled
 from boxreg_ros.core.population import UNKNOWN_POPULATION
 from boxreg_ros.core.rounds import Plan, Round, run_round
-from boxreg_ros.core.threads import mapped, num_workers
+from boxreg_ros.core.threads import mapped, num_workers, shared_between
 from boxreg_ros.structures import POSE
 import torch
 from torch import Tensor
@@ -79,21 +79,22 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     solution = start(problem, free, known.offsets, plan)
     every = torch.arange(len(free), device=free.device)
     rows, turn, points = every, 0, plan.coarse_points
-    while len(rows):
-        batch = Round(problem.thinned(points), solution, known, free)
-        work = partial(run_round, batch, plan, turn, config)
-        is_done = mapped(work, _split(rows, problem.length))
-        rows = rows[~torch.cat(is_done)]
-        turn += 1
-        if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
-            residuals = normalised_residuals(problem, solution.state)
-            noise = InputNoise.estimate_by_kind(residuals, problem.kind)
-            known = known._replace(noise=noise)
-        if plan.estimates_noise and learns_extents:
-            joined = population.joined(solution.extent_evidence, problem.kind)
-            known = known._replace(population=joined)
-        if not len(rows) and 2 * points <= problem.returns.width:
-            rows, points = every, inf  # settled on few points: once more with all
+    with shared_between(config.solver.threads):
+        while len(rows):
+            batch = Round(problem.thinned(points), solution, known, free)
+            work = partial(run_round, batch, plan, turn, config)
+            is_done = mapped(work, _split(rows, problem.length))
+            rows = rows[~torch.cat(is_done)]
+            turn += 1
+            if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
+                residuals = normalised_residuals(problem, solution.state)
+                noise = InputNoise.estimate_by_kind(residuals, problem.kind)
+                known = known._replace(noise=noise)
+            if plan.estimates_noise and learns_extents:
+                joined = population.joined(solution.extent_evidence, problem.kind)
+                known = known._replace(population=joined)
+            if not len(rows) and 2 * points <= problem.returns.width:
+                rows, points = every, inf  # settled on few points: once more with all
     return solution
 
 

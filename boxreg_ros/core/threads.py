@@ -26,9 +26,12 @@ def shared_between(workers: int) -> Iterator[None]:
     Let `mapped` use a number of threads, that of the caller included; 0: one per core.
 
     They end with the block: a process that is forked later would wait for threads that it does
-    not have. Each starts when it gets its first part.
+    not have. Each starts when it gets its first part. A block within another uses its threads.
 
     """
+    if _threads.get() is not None:
+        yield
+        return
     workers = workers or NUM_CORES
     with ThreadPoolExecutor(workers) as pool:
         token = _threads.set(_Threads(pool, workers))
