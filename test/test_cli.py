@@ -176,6 +176,15 @@ def test_fail_under_fails_and_keeps_the_result(tmp_path, capsys):
     assert "expected a part from 0 to 1, got '90'" in err
 
 
+def test_truth_without_a_report_is_said(tmp_path, capsys):
+    recording, truth = Drive(sweeps=5).write(tmp_path / 'drive'), tmp_path / 'truth.csv'
+    status, _, err = boxreg(
+        capsys, 'relabel', recording, '-o', tmp_path / 'out', *QUICK, '--truth', truth
+    )
+    assert status == 0
+    assert err == f'boxreg: --truth {truth}: not used without --report\n'
+
+
 def test_recordings_of_two_drives_are_said(tmp_path, capsys):
     first, second = (
         Drive(sweeps=5, start=(begin + 1_700_000_000) * 10**9).write(tmp_path / str(begin))

@@ -106,8 +106,8 @@ class StampMatcher:
 
 
 def _check_frames(sweep: Sweep, boxes: BoxArray) -> None:
-    """Raise ShapeError if a sweep is in another frame than its boxes."""
-    if sweep.frame_id != boxes.frame_id:
+    """Raise ShapeError if a sweep is in another frame than its boxes; '' is any frame."""
+    if sweep.frame_id != boxes.frame_id and sweep.frame_id and boxes.frame_id:
         raise ShapeError(
             f'sweep at {sweep.stamp_ns} ns: expected the frame of its boxes, {boxes.frame_id!r}, '
             f'got {sweep.frame_id!r}; bring both into one fixed frame'

@@ -176,6 +176,8 @@ def run(args: argparse.Namespace) -> int:
         spare(args.out, [args.config])
     with ProgressBar() as bar:
         summary = relabel(request, args.out, bar, args.resume)
+    if args.truth and not args.report:
+        print(f'boxreg: --truth {args.truth}: not used without --report', file=sys.stderr)
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))

@@ -86,11 +86,6 @@ class Request:
         self._check_boxes()
         self._check_part()
         check_options(self.formats, self.options)
-        if self.truth is not None and not self.report:
-            raise ConfigError(
-                'truth: expected with a report, which shows it, got it without; add --report, or '
-                'compare afterwards by boxreg evaluate'
-            )
         if self.report:
             from boxreg_ros.review.report import check_packages  # imports torch
 
