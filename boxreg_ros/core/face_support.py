@@ -12,8 +12,9 @@ from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, GAP, Problem, State
 from boxreg_ros.core.geometry import FACE_AXIS, FACE_SIGN, rotation_from_rpy
-from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels import compiled, contiguous
 from boxreg_ros.core.kernels.arrays import FaceArrays, FaceNumbers
+from boxreg_ros.core.threads import run
 import numpy as np
 import torch
 from torch import Tensor

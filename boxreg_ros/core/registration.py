@@ -22,12 +22,12 @@ from boxreg_ros.core.expectation import shared_without_population
 from boxreg_ros.core.face_support import motion_compensated, observe_faces, to_box_frame
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import residuals_at
-from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels import compiled, contiguous
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.rounds import COARSE_POINTS
 from boxreg_ros.core.smoothing import smoothed_angles
 from boxreg_ros.core.solver import solve
-from boxreg_ros.core.threads import one_torch_thread, shared_between
+from boxreg_ros.core.threads import one_torch_thread, run, shared_between
 from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.rotations import wrap_angle

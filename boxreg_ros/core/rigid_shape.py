@@ -8,8 +8,9 @@ The residual is (M4) of docs/method.md.
 from boxreg_ros.core.arrowhead import product
 from boxreg_ros.core.batch import EXTENT, Problem, State
 from boxreg_ros.core.face_support import motion_compensated, to_box_frame
-from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels import compiled, contiguous
 from boxreg_ros.core.kernels.arrays import ShapeNumbers
+from boxreg_ros.core.threads import run
 import numpy as np
 import torch
 from torch import Tensor

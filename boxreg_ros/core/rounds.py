@@ -37,7 +37,7 @@ from boxreg_ros.core.face_support import (
     FaceObservations,
     observe_faces,
 )
-from boxreg_ros.core.kernels import compiled, contiguous, run
+from boxreg_ros.core.kernels import compiled, contiguous
 from boxreg_ros.core.kernels.arrays import (
     PosteriorArrays,
     PriorArrays,
@@ -49,7 +49,7 @@ from boxreg_ros.core.lbfgs import minimize, select
 from boxreg_ros.core.prior import marginalise
 from boxreg_ros.core.rigid_shape import agreement, shape_numbers
 from boxreg_ros.core.terms import Objective, Term
-from boxreg_ros.core.threads import one_torch_thread
+from boxreg_ros.core.threads import one_torch_thread, run
 from boxreg_ros.core.weights import (
     prior_information,
     robustify_motion,

@@ -4,10 +4,13 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from itertools import pairwise
 from multiprocessing import cpu_count
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 NUM_CORES = cpu_count()
+MIN_WINDOWS_PER_THREAD = 4
+"""Fewest windows that a thread gets. Chosen: they take longer than handing them over, 0.1 ms."""
 
 
 class _Threads(NamedTuple):
@@ -54,6 +57,27 @@ def mapped(function: Callable[[_Part], _Result], parts: Sequence[_Part]) -> list
         return [function(part) for part in parts]
     others = [threads.pool.submit(function, part) for part in parts[1:]]
     return [function(parts[0]), *(other.result() for other in others)]
+
+
+def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
+    """
+    Run a kernel for a number of `windows`, shared between threads within `shared_between`.
+
+    No window depends on another: the results do not depend on the number of threads.
+
+    Parameters
+    ----------
+    kernel : callable
+        A kernel whose first arguments are the first window, and that after the last.
+    windows : int
+        Number of windows.
+    *arguments
+        The other arguments.
+
+    """
+    parts = max(1, min(num_workers(), windows // MIN_WINDOWS_PER_THREAD))
+    ends = [windows * part // parts for part in range(parts + 1)]
+    mapped(lambda span: kernel(*span, *arguments), list(pairwise(ends)))
 
 
 @contextmanager

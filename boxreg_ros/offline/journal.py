@@ -33,8 +33,8 @@ HEAD = struct.Struct('<QI')
 """Size [bytes] and CRC-32 of the record that follows."""
 TRUSTED_PACKAGES = ('boxreg_ros', 'numpy')
 TRUSTED_NAMES = (
-    'Estimate', 'Estimates', 'MarginalisationPrior', 'ndarray', 'dtype', 'scalar', '_reconstruct',
-    '_frombuffer',
+    'Estimate', 'Estimates', 'MarginalisationPrior', 'TrackRows', 'ndarray', 'dtype', 'scalar',
+    '_reconstruct', '_frombuffer',
 )  # fmt: skip
 """What a record may refer to: a pickle of other names could run any code."""
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scenes import drive, problem_of, track_of
 import torch
-from torch.nn.functional import pad
 
 D = torch.float64
 
@@ -50,7 +49,7 @@ def test_extent_covariances_are_symmetric_and_positive():
 def expectation(deviation, error):
     """Return an expectation of one window, its priors with `deviation`, off by `error` (9,)."""
     deviations = torch.full((1, SHARED), deviation, dtype=D)
-    errors = torch.tensor(error, dtype=D).expand(1, 9)
+    errors = torch.tensor([*error, *[deviation] * 6], dtype=D)[None]  # margins as claimed
     return Expectation(torch.zeros(1, SHARED), deviations, *torch.ones(3, 1, 6), errors)
 
 
@@ -58,9 +57,8 @@ def extent_variances(expected, is_free=1.0, measured=0.1):
     """Return the variances of extents that are each `measured` once with this deviation [m]."""
     information = expected.deviation**-2 + measured**-2
     inverse = torch.diag_embed(1 / information)
-    free = torch.full((1, 9), is_free, dtype=D)
-    underrated = covariance._underrated_information(expected, free)
-    underrated = pad(underrated, (0, 6))  # none of the margins
+    free = torch.full((1, 15), is_free, dtype=D)
+    underrated = free * covariance._underrated_information(expected, expected.deviation**-2)
     found = covariance._extent_covariance(expected, free, inverse, underrated)
     return found[0].diagonal().numpy()
 

@@ -9,14 +9,11 @@ is what the tests compare with. `compiled` decides which of them runs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
-from itertools import pairwise
 from types import ModuleType
 from typing import Any, NamedTuple, TYPE_CHECKING
 from warnings import warn
 
-from boxreg_ros.core.threads import mapped, num_workers
 import numpy as np
 
 if TYPE_CHECKING:  # not needed to crop
@@ -32,31 +29,6 @@ class Kernels(NamedTuple):
     noise: ModuleType
     rigid_shape: ModuleType
     rounds: ModuleType
-
-
-MIN_WINDOWS_PER_THREAD = 4
-"""Fewest windows that a thread gets. Chosen: they take longer than handing them over, 0.1 ms."""
-
-
-def run(kernel: Callable[..., Any], windows: int, *arguments: Any) -> None:
-    """
-    Run a kernel for a number of `windows`, shared between threads within `shared_between`.
-
-    No window depends on another: the results do not depend on the number of threads.
-
-    Parameters
-    ----------
-    kernel : callable
-        A kernel whose first arguments are the first window, and that after the last.
-    windows : int
-        Number of windows.
-    *arguments
-        The other arguments.
-
-    """
-    parts = max(1, min(num_workers(), windows // MIN_WINDOWS_PER_THREAD))
-    ends = [windows * part // parts for part in range(parts + 1)]
-    mapped(lambda span: kernel(*span, *arguments), list(pairwise(ends)))
 
 
 def contiguous(tensor: Tensor) -> Any:
