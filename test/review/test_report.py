@@ -265,11 +265,6 @@ def test_truth_of_another_drive_is_left_out_with_a_warning(tmp_path, capsys):
     assert not Page(out / 'report.html').data['has_truth']
 
 
-def test_truth_without_a_report_is_refused():
-    with pytest.raises(ConfigError, match='add --report'):
-        Request(recordings=(BAGS / 'street.mcap',), truth=BAGS / 'street_truth.csv')
-
-
 def test_risks_of_the_result_folder_are_shown(tmp_path):
     order = tmp_path / 'review.csv'
     order.write_text('rank,track_id,class_name,stamp_ns,risk_m,reasons\n1,7,car,12,0.25,far\n')
