@@ -87,6 +87,7 @@ format: $(tests) ## sort imports, fix what ruff can fix, format
 
 docs: $(tests) ## write the generated pages and build the documentation into out/site
 	$(BIN)/python docs/generate.py
+	$(BIN)/python docs/results.py
 	PYTHONPATH=test $(BIN)/python test/live/test_share.py
 	$(BIN)/mkdocs build --strict --quiet --site-dir out/site
 

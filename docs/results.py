@@ -1,12 +1,13 @@
 """
-Make `docs/results.md` from the measurements stored in `docs/results/`.
+Write the tables of `docs/results.md` and `docs/results/` from the stored measurements.
 
-    python docs/results.py            write the page
-    python docs/results.py --check    exit with status 1 if the page is not what would be written
+    python docs/results.py            write the pages
+    python docs/results.py --check    exit with status 1 if a page is not what would be written
 
 A measurement is the output of ``boxreg bench ... --json``, stored as ``KIND_DATA.json``, for
-example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a --json``. A text of the
-name ``KIND.md`` follows the tables of its kind.
+example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a --json``. The tables of
+a kind are in ``KIND.md`` beside it, between two marks; the text around the marks is written by
+hand. `docs/results.md` has the main figures of each kind.
 
 """
 
@@ -21,16 +22,18 @@ import sys
 from typing import Any
 
 from boxreg_ros.bench.ablation import INGREDIENTS, WHOLE
+from boxreg_ros.bench.speed.report import WANTED, WANTED_TICKS, WANTED_TIMES, WANTED_TRACKS
 from boxreg_ros.config import KINDS
 from boxreg_ros.offline.consistency import (
     CONSISTENCY_VARIABLES,
     CONSISTENT_NEES,
     SIGNIFICANT,
 )
+from generate import between_marks
 
 DOCS = Path(__file__).resolve().parent
 STORE = DOCS / 'results'
-PAGE = DOCS / 'results.md'
+OVERVIEW = DOCS / 'results.md'
 
 DATA = {
     'resim_3bffdcff': 'Real surfaces on a real drive, exact truth, detector noise',
@@ -39,93 +42,52 @@ DATA = {
     'kitti_raw_0001': 'KITTI raw 0001, human labels, detector noise',
     'street': 'The sample recording, simulated',
 }
-INTRODUCTION = """\
-# Results
-
-`docs/results.py` makes this page from the files in `docs/results/`. Each file is the output of the
-command above its table. No figure in a table is written by hand.
-
-Accuracy is measured against true boxes of vehicles with at least 100 points:
-
-- **BEV**, **3D**: mean intersection over union (IoU), from above and in space.
-- **R@0.5**, **R@0.7**, **R@0.8**: part of the true boxes with at least this 3D IoU.
-- **ATE**: mean error of the centre [m]. **ASE**: 1 - IoU after centre and heading are aligned.
-  **AOE**: mean error of yaw [rad].
-- **flips**: part of the boxes whose heading is off by more than a right angle.
-- **jitter**: mean second difference of the centre over time [m/s^2].
-
-Tables by class are of all true boxes with points, for classes with at least 20 of them.
-
-Tables of differences are of the mean IoU of two methods. The standard error is that of the tracks,
-whose boxes share their errors (cluster-robust). *ahead* is the number of tracks whose BEV IoU is
-not lower.
-
-The rows are methods. *early* is the estimate of the newest box of a sliding window, *final* that
-of the box `lag` observations before it, *track* that from the whole track:
-
-- **input**: the noisy boxes that every method starts from.
-- **smoothing**: a robust constant-velocity smoother that does not use the points; *smoothing only*
-  is that of whole tracks.
-- **L-shape per sweep**: a rectangle fitted to the points of each box, in each sweep alone.
-- **ICP on box points**: the points of each box aligned to points sampled on its visible faces.
-- **paper**: the objective of the paper (Eq. 4 to 8).
-- **ours**: the default objective.
-
-*Detector noise* has the error sizes measured for a published detector: a part that is constant
-over a track, a part that changes slowly, wrong extents, and 2.4 % flipped headings.
-"""
-
-
-SUMMARY = ('input', 'smoothing only', 'ours, early', 'ours, final', 'ours, track')
-"""Methods of the first table: those that all recordings have."""
+"""Title of each recording, in the order of the tables."""
+SHOWN_LOSS = 0.001
+"""Smaller changes of mean IoU are within the scatter of noise seeds."""
+MAIN_METHODS = (
+    'input', 'smoothing only', 'ICP on box points', 'paper, track',
+    'ours, early', 'ours, final', 'ours, track',
+)  # fmt: skip
+"""Methods of the overview: those that all recordings have."""
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Write the page or check it, and return the exit status."""
+    """Write the pages or check them, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1] if __doc__ else None)
     parser.add_argument('--check', action='store_true', help='write nothing; 1 if out of date')
     args = parser.parse_args(words)
-    text = page(STORE)
-    if not args.check:
-        PAGE.write_text(text, encoding='utf-8')
-        return 0
-    is_current = PAGE.is_file() and PAGE.read_text(encoding='utf-8') == text
-    if not is_current:
-        print(f'{PAGE}: is not made from {STORE}; run python docs/results.py', file=sys.stderr)
-    return 0 if is_current else 1
+    stale = [
+        (path, text)
+        for path, text in pages(STORE).items()
+        if path.read_text(encoding='utf-8') != text
+    ]
+    for path, text in stale:
+        if args.check:
+            print(f'{path}: stale; run python docs/results.py', file=sys.stderr)
+        else:
+            path.write_text(text, encoding='utf-8')
+    return 1 if args.check and stale else 0
 
 
-def page(store: Path) -> str:
-    """Return the page for the measurements in a folder."""
-    parts = [INTRODUCTION, *_summary(store)]
-    for kind, (title, meaning, render) in SECTIONS.items():
-        stored = _measurements(store, kind)
-        if stored:
-            parts += [f'## {title}\n', f'{meaning}\n']
-        for data, document in stored:
-            title = _title(data)
-            if title:
-                parts.append(f'### {title}\n')
-            parts.append(_origin(document))
-            parts += [f'{part}\n' for part in render(document['results'])]
-        verdict = store / f'{kind}.md'
-        if verdict.is_file():
-            parts.append(verdict.read_text(encoding='utf-8'))
-    parts.append((store / 'dead_ends.md').read_text(encoding='utf-8'))
-    return '\n'.join(parts)
+def pages(store: Path) -> dict[Path, str]:
+    """Return the text of each page for the measurements in a folder."""
+    generated = {OVERVIEW: _overview(store)}
+    for kind in TABLES:
+        generated[STORE / f'{kind}.md'] = _tables(store, kind)
+    return {path: between_marks(path, '\n'.join(parts)) for path, parts in generated.items()}
 
 
-def _summary(store: Path) -> Iterable[str]:
-    """Yield the mean 3D IoU of the main methods on each recording, as a first table."""
-    rows = []
-    for data, document in _measurements(store, 'real'):
-        for methods in document['results'].values():
-            scores = [_number(methods[name]['iou_3d']) for name in SUMMARY]
-            rows.append([f'{_title(data)} ({methods["input"]["boxes"]})', *scores])
-    if rows:
-        yield '## In short\n'
-        yield 'Mean 3D IoU of each recording (number of true boxes); other scores are below.\n'
-        yield _table(['', *SUMMARY], rows) + '\n'
+def _tables(store: Path, kind: str) -> Iterable[str]:
+    """Yield for each measurement of a kind its title, its command and its tables."""
+    if kind == 'ablation':
+        yield f'{_ingredients()}\n'
+    for data, document in _measurements(store, kind):
+        title = _title(data)
+        if title:
+            yield f'## {title}\n'
+        yield _origin(document)
+        yield from (f'{part}\n' for part in TABLES[kind](document['results']))
 
 
 def _measurements(store: Path, kind: str) -> list[tuple[str, Any]]:
@@ -134,8 +96,8 @@ def _measurements(store: Path, kind: str) -> list[tuple[str, Any]]:
         path.stem.removeprefix(kind).removeprefix('_'): path
         for path in sorted(store.glob(f'{kind}*.json'))
     }
-    names = [name for name in DATA if name in found]
-    names += [name for name in found if name not in DATA]
+    names = [name for data in DATA for name in found if name.startswith(data)]
+    names += [name for name in found if name not in names]
     return [(name, json.loads(found[name].read_text(encoding='utf-8'))) for name in names]
 
 
@@ -164,6 +126,164 @@ def _number(value: float | None, digits: int = 3) -> str:
 def _signed(value: float, digits: int) -> str:
     """Return a number with its sign, and zero without a minus."""
     return f'{round(value, digits) + 0.0:+.{digits}f}'
+
+
+def _overview(store: Path) -> Iterable[str]:
+    """Yield the main tables of `docs/results.md`."""
+    yield _table(['recording', 'content'], [[f'`{name}`', title] for name, title in DATA.items()])
+    yield ''
+    for section in (_mean_ious, _gains, _completion, _coverage, _ranking, _times):
+        yield from (f'{part}\n' for part in section(store))
+
+
+def _mean_ious(store: Path) -> Iterable[str]:
+    """Yield the mean 3D and BEV IoU of the main methods on each recording."""
+    yield '## Accuracy'
+    yield (
+        'Mean IoU on each recording (number of true boxes). '
+        '[Accuracy](results/real.md) has all scores and methods, '
+        '[Ablation](results/ablation.md) the loss without each ingredient.'
+    )
+    scored = [
+        (f'`{data}` ({methods["input"]["boxes"]})', methods)
+        for data, document in _measurements(store, 'real')
+        for methods in document['results'].values()
+    ]
+    for key, title in (('iou_3d', '3D IoU'), ('iou_bev', 'BEV IoU')):
+        rows = [
+            [name, *(_number(methods[method][key]) for method in MAIN_METHODS)]
+            for name, methods in scored
+        ]
+        yield _table([title, *MAIN_METHODS], rows)
+
+
+def _gains(store: Path) -> Iterable[str]:
+    """Yield the gain of 3D IoU of each class on the simulated streets."""
+    yield '## Classes'
+    yield (
+        'Mean 3D IoU minus that of the input and of smoothing, with standard errors over tracks. '
+        '[Gain of each class](results/kinds.md) has BEV IoU and the other recordings.'
+    )
+    ((_, document),) = [found for found in _measurements(store, 'kinds') if not _title(found[0])]
+    for drives, classes in document['results'].items():
+        rows = []
+        for name, methods in classes.items():
+            final, track = methods['ours, final'], methods['ours, track']
+            gains = (
+                final['input'], final['smoothing, final'], track['input'], track['smoothing only'],
+            )  # fmt: skip
+            boxes = track['input']['boxes']
+            rows.append([f'{name} ({boxes})', *(_with_error(gain, 'iou_3d') for gain in gains)])
+        columns = ('final - input', 'final - smoothing', 'track - input', 'track - smoothing')
+        yield _table([f'{drives}: class (boxes)', *columns], rows)
+
+
+def _completion(store: Path) -> Iterable[str]:
+    """Yield the scores of broken tracks, of completed ones, and of tracks never broken."""
+    yield '## Completed tracks'
+    yield (
+        'Scores of broken tracks as they are given, with `--complete`, and of the same tracks '
+        'refined before they were broken, which is the best that completion can restore. '
+        '[Completed tracks](results/tracks.md) has each step, ghosts, distant misses and the node.'
+    )
+    keys = ('recall', 'precision', 'ids_per_object', 'hota', 'idf1', 'added_iou')
+    rows = []
+    for data, document in _measurements(store, 'tracks'):
+        if data not in DATA:
+            continue  # with other breaks
+        for steps in document['results'].values():
+            unbroken, *_, completed = steps.values()
+            rows += [
+                [f'`{data}`: {name}', *(_number(scores[key]) for key in keys)]
+                for name, scores in (
+                    ('input', steps['input']), ('completed', completed), ('unbroken', unbroken),
+                )
+            ]  # fmt: skip
+    titles = ('recall', 'precision', 'ids per object', 'HOTA', 'IDF1', '3D IoU of added')
+    yield _table(['', *titles], rows)
+
+
+def _coverage(store: Path) -> Iterable[str]:
+    """Yield the part of the errors within two standard deviations, for each recording."""
+    yield '## Covariances'
+    yield (
+        'Part of the errors of whole tracks within two standard deviations; 0.95 is consistent. '
+        '[Covariances](results/covariance.md) has squared errors, the other estimates and classes.'
+    )
+    rows = []
+    for _, document in _measurements(store, 'covariance'):
+        for recording, estimates in document['results'].items():
+            coverage = estimates['track']['all']['coverage']
+            rows.append(
+                [f'`{recording}`', *(_number(coverage[key], 2) for key in CONSISTENCY_VARIABLES)]
+            )
+    yield _table(['', *CONSISTENCY_VARIABLES], rows)
+
+
+def _ranking(store: Path) -> Iterable[str]:
+    """Yield the share of bad tracks in the first fifth of each list, for each recording."""
+    yield '## Review list'
+    yield (
+        'Share of the worst tracks that are in the first fifth of the list: by risk, and by the '
+        'orders it is compared with. [Review list](results/review.md) has shorter parts of the '
+        'lists, and the gain of one corrected box.'
+    )
+    rows = []
+    for _, document in _measurements(store, 'review'):
+        for recording, inputs in document['results'].items():
+            for name, found in inputs.items():
+                shares = found['shares']
+                start = f'`{recording}`, {name} ({found["bad"]} of {found["tracks"]})'
+                rows.append([start, *(_number(share[-1], 2) for share in shares.values())])
+    yield _table(['', *shares], rows)
+
+
+def _times(store: Path) -> Iterable[str]:
+    """Yield the main figures of speed, memory and latency beside their aims."""
+    yield '## Speed'
+    yield (
+        'On two cores of a CPU. [Speed](results/speed.md) has all figures, '
+        '[The live node under load](results/load.md) latencies, [Scale](results/scale.md) '
+        'core-hours of a fleet.'
+    )
+    ((_, speed),) = _measurements(store, 'speed')
+    ((_, load),) = _measurements(store, 'load')
+    found = speed['results']
+    relabel, solver, ticks = found['relabel'], found['solver'], found['ticks']
+    crop, latency = found['crop'], load['results']['deadline']
+    times = solver['reference'] / solver['refine, track']
+    rows = [
+        [
+            '`boxreg relabel`: recorded time over run time',
+            f'{relabel["faster, long"]:.1f}',
+            f'at least {WANTED["faster, long"]:g}',
+        ],
+        [
+            '`boxreg relabel`: memory [MB]',
+            f'{relabel["memory, shared once"]:.0f}',
+            f'at most {WANTED["memory, shared once"]:g}',
+        ],
+        *(
+            [f'one sweep of {tracks} tracks [ms]', f'{ticks[tracks]:.1f}', f'at most {aim:g}']
+            for tracks, aim in WANTED_TICKS.items()
+        ),
+        ['tracks held at 10 Hz', str(found['held tracks']), f'at least {WANTED_TRACKS}'],
+        [
+            f'`refine`, per window [ms] (`torch.optim.LBFGS`: {solver["reference"]:.0f})',
+            f'{solver["refine, track"]:.2f}, {times:.0f} times faster',
+            f'at least {WANTED_TIMES:g} times',
+        ],
+        [
+            f'crop of a sweep [ms] (numpy, box by box: {crop["numpy, box by box"]:.0f})',
+            f'{crop["ours"]:.1f}',
+            '',
+        ],
+        *(
+            [f'node: latency of {tracks} tracks, p99 [ms]', f'{row["latency p99 [ms]"]:.0f}', '']
+            for tracks, row in latency.items()
+        ),
+    ]
+    yield _table(['', 'measured', 'aim'], rows)
 
 
 def _accuracy(results: Any) -> Iterable[str]:
@@ -230,7 +350,12 @@ def _difference(found: Any) -> Iterable[str]:
 def _gain(found: Any) -> Iterable[str]:
     """Yield both differences with their standard errors."""
     for key in ('iou_bev', 'iou_3d'):
-        yield f'{_signed(found[key], 4)} ± {_number(found[f"{key}_error"], 4)}'
+        yield _with_error(found, key)
+
+
+def _with_error(found: Any, key: str) -> str:
+    """Return a difference with its standard error."""
+    return f'{_signed(found[key], 4)} ± {_number(found[f"{key}_error"], 4)}'
 
 
 def _classes(measured: Any) -> str:
@@ -272,6 +397,12 @@ def _paper(results: Any) -> Iterable[str]:
         titles = (iou, *(f'{iou}, {part}' for part in ('first', 'last', 'full windows')))
         yield _table([f'mode: {mode}', *pose, *titles], rows)
         yield from _groups(measured, iou)
+
+
+def _ingredients() -> str:
+    """Return the table of the ingredients that are switched off."""
+    rows = [[name, item.meaning] for name, item in INGREDIENTS.items() if name != WHOLE]
+    return _table(['without', 'the change'], rows)
 
 
 def _ablation(results: Any) -> Iterable[str]:
@@ -444,6 +575,59 @@ def _consistent_cells(estimates: Any) -> str:
     )
 
 
+def _scale(results: Any) -> Iterable[str]:
+    """Yield the main figures with their meaning, and all figures."""
+    job, large, workers, fleet = (results[name] for name in ('job', 'large', 'workers', 'fleet'))
+    used = [workers[name]['cores_used'] for name in ('one', 'two')]
+    rows = [
+        (
+            'job.hours_per_core_hour',
+            f'{job["hours_per_core_hour"]:.2f}',
+            f'hours of recording; {_recording_size(job)}',
+        ),
+        ('job.peak_mb', f'{job["peak_mb"]:,.0f} MB', 'memory of the job'),
+        (
+            'workers.speedup',
+            f'{workers["speedup"]:.2f}',
+            f'two workers by one; they used {used[1]:.2f} cores and {used[0]:.2f}',
+        ),
+        (
+            'large.hours_per_core_hour',
+            f'{large["hours_per_core_hour"]:.2f}',
+            f'hours of recording; {_recording_size(large)}',
+        ),
+        ('large.peak_mb', f'{large["peak_mb"]:,.0f} MB', f'memory for {large["gb"]:.1f} GB'),
+        ('large.inspect_s', f'{large["inspect_s"]:.1f} s', '`boxreg inspect` of it'),
+        (
+            'fleet.core_hours',
+            f'{fleet["core_hours"]:,.0f}',
+            f'10,000 hours of recording as `{fleet["basis"]}`',
+        ),
+        (
+            'fleet.usd',
+            f'{fleet["usd"]:,.0f} USD',
+            f'the same, at {fleet["usd_per_core_hour"]:.2f} USD a core-hour',
+        ),
+        (
+            'fleet.hours',
+            f'{fleet["hours"]:.2f} h',
+            f'10,000 jobs on 500 cores; {fleet["least_hours"]:.2f} h without losses or idle cores',
+        ),
+        ('fleet.used', f'{fleet["used"]:.0%}', 'part of the time that the cores have jobs'),
+        ('fleet.lost', f'{fleet["lost"]:.2%}', 'part of the work that is done twice'),
+    ]
+    yield _table(['figure', 'value', 'of'], [[f'`{name}`', *cells] for name, *cells in rows])
+    yield from _figures(results)
+
+
+def _recording_size(measured: Any) -> str:
+    """Return the size of a recording."""
+    return (
+        f'{measured["recording_s"]:,.0f} s, {measured["sweeps"]:,} sweeps of '
+        f'{measured["points_per_sweep"]:,} points, {measured["boxes"]:,} boxes'
+    )
+
+
 def _load(results: Any) -> Iterable[str]:
     """Yield latency and accuracy by number of tracks, one table per way to treat overload."""
     for policy, rows in results.items():
@@ -462,138 +646,25 @@ def _flat(results: Any, prefix: str = '') -> Iterable[list[str]]:
             yield [f'{prefix}{name}', str(value)]
 
 
-SHOWN_LOSS = 0.001  # smaller changes of mean IoU are within the scatter of noise seeds
-
-SECTIONS: dict[str, tuple[str, str, Callable[[Any], Iterable[str]]]] = {
-    'real': (
-        'Recordings with known truth',
-        'Every method gets the same sweeps and the same boxes.',
-        _accuracy,
-    ),
-    'kinds': (
-        'Gain of each class',
-        'Mean IoU minus that of the input, and minus that of smoothing, of all true boxes with\n'
-        'points; standard errors over tracks, which is why the streets are pooled. Seed 0, the\n'
-        'sample, is none of them.',
-        _kinds_of_objects,
-    ),
-    'tracks': (
-        'Broken tracks made whole',
-        'All classes and all true boxes, whatever their number of points. 8 % of the boxes are\n'
-        'removed, and gaps of 3 to 8 sweeps; after half of the gaps the id is another one. The\n'
-        'first row is the registration of the tracks before they were broken, which completion\n'
-        'has to restore. Each other row has one step more. Recall and precision at a 3D IoU of\n'
-        '0.5, matched by overlap; HOTA and IDF1 by TrackEval. *added* is the number of added\n'
-        'boxes. With `--ghosts` there are boxes without an object; *ghosts rejected* is the part\n'
-        'of them that is rejected, *others rejected* the part of the boxes of objects. With\n'
-        '`--far-misses` the boxes are removed in runs, as often as the square of the distance,\n'
-        'like those of a detector that has too few points. `--coast` is the node: final boxes\n'
-        'without and with `coast`.',
-        _tracks,
-    ),
-    'paper': (
-        "The paper's experiment",
-        'Simulated after Eq. 10 with the noise of Table I. Mean absolute errors [m, rad], x\n'
-        'along and y across the vehicle; mean IoU: of all boxes, the first, the last, and\n'
-        'those from the first full window on. *held extents* is ours with the extents of the\n'
-        'input, which have no errors here: the paper does not estimate them either.',
-        _paper,
-    ),
-    'ablation': (
-        'Ablation',
-        'The method with one ingredient off. A positive loss means that the ingredient helps.\n\n'
-        + _table(
-            ['without', 'the change'],
-            [[name, item.meaning] for name, item in INGREDIENTS.items() if name != WHOLE],
-        ),
-        _ablation,
-    ),
-    'sensitivity': (
-        'Sensitivity',
-        'One setting or constant halved or doubled. A positive loss means that the default is '
-        'better.\nBoth runs are of earlier builds: some names have changed since.',
-        _sensitivity,
-    ),
-    'highway': (
-        'Fast objects',
-        'Mean 3D IoU on the same simulated highway (rolling shutter, trucks with trailers) at 5\n'
-        'and at 30 m/s. The boxes are where a vehicle was at the stamp of the sweep, or where it\n'
-        'was when the sensor saw it; which one is not given to the method.',
-        _highway,
-    ),
-    'lidars': (
-        'Several LiDARs',
-        'A simulated truck with four LiDARs at its corners, which turn a quarter of a period\n'
-        'apart: a topic per LiDAR (*corners*), a cloud concatenated in the\n'
-        'frame of the truck with its info message (*concatenated*), without it\n'
-        '(*concatenated-alone*), without it but with the names of its LiDARs\n'
-        '(*concatenated-named*), and a single LiDAR on the roof. Input boxes and truth are the\n'
-        'same.',
-        _lidars,
-    ),
-    'covariance': (
-        'Covariances',
-        'Two numbers per cell: the part of the errors within two standard deviations (0.95 is\n'
-        'consistent) and the mean squared error over variance (1 is consistent) with its\n'
-        'standard error over the tracks: all boxes of a track share its constant errors. Errors\n'
-        'are along the axes of the true boxes, without heading flips.',
-        _covariance,
-    ),
-    'review': (
-        'Review list',
-        'Share of the tracks with the worst 3D IoU that are in the first 1 %, 5 %, 10 % and 20 %\n'
-        'of a list, at least one track: the list by risk, by number of points, by standard\n'
-        'deviation, and a random one. Inputs: noisy boxes (*own boxes*), and true boxes with\n'
-        'errors planted in a fifth of the tracks. Then, in each of the worst tracks, the box\n'
-        'that the list names is pinned at the truth.',
-        _review,
-    ),
-    'report': (
-        'The report in a browser',
-        'Chromium without a window and without a GPU, on two cores. It draws by the processor,\n'
-        'as it does by itself where it finds no GPU, or by an emulated GPU (SwiftShader). *first\n'
-        'paint* is from the start of the page. The time slider is stepped once per frame, 120\n'
-        'times: *script* is the time that the page takes of a frame, the rest is the drawing of\n'
-        'the browser; the 3D view follows when the stepping pauses, where its drawing takes\n'
-        'longer than a frame. *late* frames were lost at 60 Hz.',
-        _figures,
-    ),
-    'speed': (
-        'Speed',
-        'Times in ms unless the name says otherwise. CUDA has not been run: the torch twins of\n'
-        'the kernels are tested on the CPU only. *solver: reference* is one fit of a window by\n'
-        'torch.optim.LBFGS; *IoU, error* is the standard error of the difference between its IoU\n'
-        'and ours.',
-        _figures,
-    ),
-    'load': (
-        'The live node under load',
-        'Latency from the later of cloud and boxes to the refined boxes, and mean 3D IoU of all\n'
-        'published boxes, kept ones included. With the default deadline (80 ms), tracks that the\n'
-        'solver has no time for are kept. *one window* solves one track per stamp: the latency\n'
-        'that no deadline can avoid. With a deadline of an hour, clouds are dropped.',
-        _load,
-    ),
-    'scale': (
-        'A fleet of drives',
-        '[Scale](scale.md) explains the figures. Where two workers used far less than two cores,\n'
-        'other programs had the rest, and their speedup is no measurement.',
-        _figures,
-    ),
-    'kills': (
-        'Labels while driving, killed',
-        'Box arrays that were published, and are in no segment after `boxreg recover`. Early\n'
-        'boxes become final 0.9 s later.',
-        _figures,
-    ),
-    'node': (
-        'The live node',
-        'Publisher, node and observer each a process, over DDS. *load* is the load average of a\n'
-        'machine with two cores: beyond 2, the processes wait for others. At 100 Hz an hour of a\n'
-        'sensor of 10 Hz takes six minutes; memory and handles show whether the node leaks.',
-        _figures,
-    ),
+TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
+    'real': _accuracy,
+    'kinds': _kinds_of_objects,
+    'tracks': _tracks,
+    'paper': _paper,
+    'ablation': _ablation,
+    'sensitivity': _sensitivity,
+    'highway': _highway,
+    'lidars': _lidars,
+    'covariance': _covariance,
+    'review': _review,
+    'report': _figures,
+    'speed': _figures,
+    'load': _load,
+    'scale': _scale,
+    'kills': _figures,
+    'node': _figures,
 }
+"""The tables of one measurement, for each kind of measurements."""
 
 
 if __name__ == '__main__':

@@ -8,6 +8,7 @@ import sys
 
 from boxreg_ros.cli import parser
 from boxreg_ros.reasons import REASONS
+import generate
 from paths import ROOT
 import pytest
 import yaml
@@ -21,27 +22,17 @@ def page_name(path):
     return str(path.relative_to(ROOT))
 
 
-def generator():
-    spec = importlib.util.spec_from_file_location('generate', DOCS / 'generate.py')
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-GENERATOR = generator()
-
-
-@pytest.mark.parametrize('page', GENERATOR.TABLES)
+@pytest.mark.parametrize('page', generate.TABLES)
 def test_generated_tables_match_the_code(page):
     text = (DOCS / page).read_text(encoding='utf-8')
-    assert text == GENERATOR.renewed(page), f'stale: run {GENERATOR.COMMAND}'
+    assert text == generate.renewed(page), f'stale: run {generate.COMMAND}'
 
 
 def test_generator_refuses_a_page_without_marks(tmp_path, monkeypatch):
-    monkeypatch.setattr(GENERATOR, 'DOCS', tmp_path)
+    monkeypatch.setattr(generate, 'DOCS', tmp_path)
     (tmp_path / 'parameters.md').write_text('# Parameters\n')
     with pytest.raises(ValueError, match=r'parameters\.md'):
-        GENERATOR.renewed('parameters.md')
+        generate.renewed('parameters.md')
 
 
 def test_every_counted_reason_is_explained():

@@ -2,7 +2,6 @@
 
 import base64
 from dataclasses import replace
-import importlib.util
 import io
 import json
 import re
@@ -19,19 +18,10 @@ import pytest
 
 Image = pytest.importorskip('PIL.Image')
 pytest.importorskip('matplotlib')
+figures = pytest.importorskip('figures')
 PAGES = [ROOT / 'README.md', BAGS / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 MAX_BYTES = 300_000
 """Largest size of a picture, so that pages load fast."""
-
-
-def figures_module():
-    spec = importlib.util.spec_from_file_location('figures', ROOT / 'docs' / 'figures.py')
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-FIGURES = figures_module()
 
 
 def shown_pictures(page):
@@ -55,7 +45,7 @@ def tiny(tmp_path_factory):
     simulate = ['simulate', '-o', recording, '--truth', truth, '--sweeps', '12']
     assert main([str(word) for word in simulate]) == 0
     options = ['--report', '--set', 'solver.rounds=1', '--set', 'sampling.points=64']
-    relabel = ['relabel', recording, '-o', folder / FIGURES.RESULT, *options]
+    relabel = ['relabel', recording, '-o', folder / figures.RESULT, *options]
     assert main([str(word) for word in relabel]) == 0
     return folder
 
@@ -63,15 +53,15 @@ def tiny(tmp_path_factory):
 @pytest.fixture(scope='module')
 def tracks(tiny):
     """Return the tracks of the tiny run before and after registration."""
-    refined = BoxTable.read(tiny / FIGURES.RESULT / 'boxes.csv')
+    refined = BoxTable.read(tiny / figures.RESULT / 'boxes.csv')
     drive = Drive.of(Recording([tiny / 'tiny.mcap']), refined)
-    return FIGURES.changes_of(drive.boxes, refined)
+    return figures.changes_of(drive.boxes, refined)
 
 
 def test_every_shown_picture_is_drawn():
     shown = {name for page in PAGES for name in shown_pictures(page)}
     assert shown
-    assert sorted(shown - set(FIGURES.PICTURES)) == [], 'add it to docs/figures.py'
+    assert sorted(shown - set(figures.PICTURES)) == [], 'add it to docs/figures.py'
 
 
 def test_every_stored_picture_is_drawn():
@@ -81,10 +71,10 @@ def test_every_stored_picture_is_drawn():
         for ending in ('png', 'jpg', 'jpeg', 'gif', 'svg', 'webp')
         for path in folder.rglob(f'*.{ending}')
     }
-    assert stored == set(FIGURES.PICTURES)
+    assert stored == set(figures.PICTURES)
 
 
-@pytest.mark.parametrize('name', FIGURES.PICTURES)
+@pytest.mark.parametrize('name', figures.PICTURES)
 def test_stored_pictures_are_sharp_and_small(name):
     path = ROOT / name
     assert path.stat().st_size < MAX_BYTES
@@ -101,7 +91,7 @@ def test_make_figures_draws_the_pictures():
 
 def test_car_picture_needs_no_browser(tiny, monkeypatch):
     monkeypatch.setenv('PATH', '')
-    png = FIGURES.car_picture(tiny / 'tiny.mcap', tiny / FIGURES.RESULT)
+    png = figures.car_picture(tiny / 'tiny.mcap', tiny / figures.RESULT)
     picture = Image.open(io.BytesIO(png))
     assert picture.width >= 1000
     half = pixels(picture)[:, : picture.width // 2]
@@ -112,12 +102,12 @@ def test_car_picture_needs_no_browser(tiny, monkeypatch):
 
 
 def test_car_picture_is_reproducible(tiny):
-    pictures = {FIGURES.car_picture(tiny / 'tiny.mcap', tiny / FIGURES.RESULT) for _ in range(2)}
+    pictures = {figures.car_picture(tiny / 'tiny.mcap', tiny / figures.RESULT) for _ in range(2)}
     assert len(pictures) == 1
 
 
 def test_changes_agree_with_the_report(tiny, tracks):
-    page = (tiny / FIGURES.RESULT / 'report.html').read_text(encoding='utf-8')
+    page = (tiny / figures.RESULT / 'report.html').read_text(encoding='utf-8')
     data = re.search(r'id="data">([^<]*)<', page)[1]
     rows = json.loads(zlib.decompress(base64.b64decode(data)))['tracks']
     shifts = {track.track_id: track.shift for track in tracks}
@@ -131,13 +121,13 @@ def test_most_shifted_vehicle_is_shown(tracks):
     is_vehicle = [track.class_name in ('car', 'van', 'truck') for track in tracks]
     assert not all(is_vehicle)
     vehicles = [track for track, is_one in zip(tracks, is_vehicle, strict=True) if is_one]
-    vehicles = [track for track in vehicles if len(track.status) >= FIGURES.MIN_BOXES]
-    shown = FIGURES.most_shifted_vehicle(tracks)
+    vehicles = [track for track in vehicles if len(track.status) >= figures.MIN_BOXES]
+    shown = figures.most_shifted_vehicle(tracks)
     assert shown.shift == max(track.shift for track in vehicles)
     others = [
         replace(track, class_name='pedestrian') if track is shown else track for track in tracks
     ]
-    second = FIGURES.most_shifted_vehicle(others)
+    second = figures.most_shifted_vehicle(others)
     assert second.track_id != shown.track_id
     assert second.shift <= shown.shift
 
@@ -146,7 +136,7 @@ def test_missing_browser_leaves_the_report_picture(tiny, tmp_path, monkeypatch, 
     monkeypatch.setenv('PATH', str(tmp_path))
     target = tmp_path / 'report.png'
     target.write_bytes(b'as before')
-    FIGURES.draw_report(tiny, target)
+    figures.draw_report(tiny, target)
     assert target.read_bytes() == b'as before'
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('report.png: not drawn again: ')
@@ -154,11 +144,11 @@ def test_missing_browser_leaves_the_report_picture(tiny, tmp_path, monkeypatch, 
 
 
 @pytest.mark.skipif(
-    not any(map(shutil.which, FIGURES.BROWSERS)), reason='no Chromium on PATH for a screenshot'
+    not any(map(shutil.which, figures.BROWSERS)), reason='no Chromium on PATH for a screenshot'
 )
 def test_report_picture_is_a_screenshot(tiny, tmp_path):
     target = tmp_path / 'report.png'
-    FIGURES.draw_report(tiny, target)
+    figures.draw_report(tiny, target)
     with Image.open(target) as picture:
-        assert picture.size == tuple(round(side * FIGURES.SCALE) for side in FIGURES.PAGE_SIZE)
+        assert picture.size == tuple(round(side * figures.SCALE) for side in figures.PAGE_SIZE)
         assert pixels(picture).std() > 5

@@ -88,7 +88,7 @@ def print_json(results: Any) -> None:
     Print the results of a sub-command as one JSON document.
 
     The document has three members: ``version`` of the package, ``command`` as it was typed, and
-    ``results``. NaN becomes ``null``. `docs/results.py` makes `docs/results.md` from such files.
+    ``results``. NaN becomes ``null``. `docs/results.py` writes its tables from such files.
 
     """
     command = shlex.join(['boxreg', *sys.argv[1:]])
