@@ -27,7 +27,7 @@ POSE_WIDTH, SIZE_WIDTH, COVARIANCE_WIDTH = 7, 3, 36
 HALF_TURN_SIGNS = np.tile([-1.0, -1.0, 1.0], 2)
 """Signs of the numbers of a twist or acceleration that is rotated by 180 degrees about z."""
 
-Labels = tuple[list[str], list[str], Floats]
+BoxLabels = tuple[list[str], list[str], Floats]
 """Ids, classes and scores of all boxes."""
 
 
@@ -89,7 +89,7 @@ class BoxFields:
     frames: tuple[str, ...]
     pose: str
     size: str
-    labels: Callable[[Fields], Labels]
+    labels: Callable[[Fields], BoxLabels]
     others: tuple[str, ...] = ()
     stamp: str = 'header.stamp.sec'
     covariance: str = ''
@@ -248,7 +248,7 @@ def _finite_or(new: Floats, old: Floats) -> Floats:
     return np.where(np.isfinite(new).all(1, keepdims=True), new, old)
 
 
-def _without_labels(fields: Fields) -> Labels:
+def _without_labels(fields: Fields) -> BoxLabels:
     """Return empty ids and classes, and the score 1."""
     n = len(fields.counts('boxes.center.position.x'))
     return [''] * n, [''] * n, np.ones(n)
@@ -260,7 +260,7 @@ RESULT_POSE = 'detections.results.pose.pose.position.x'
 RESULT_COVARIANCE = 'detections.results.pose.covariance'
 
 
-def _detection_labels(fields: Fields) -> Labels:
+def _detection_labels(fields: Fields) -> BoxLabels:
     """Return ids, and classes and scores of the hypotheses with the highest score."""
     classes = fields.texts('detections.results.hypothesis.class_id')
     scores = fields.numbers('detections.results.hypothesis.score', '<f8')[:, 0]
@@ -295,7 +295,7 @@ def _cubes(fields: Fields) -> NDArray[np.bool_]:
     return is_box
 
 
-def _marker_labels(fields: Fields) -> Labels:
+def _marker_labels(fields: Fields) -> BoxLabels:
     """Return ids and namespaces of the boxes."""
     rows = _cubes(fields)
     ids = [str(number) for number in fields.numbers('markers.id', '<i4')[rows, 0].tolist()]
@@ -317,7 +317,7 @@ AUTOWARE_FIELDS = (
 )  # fmt: skip
 
 
-def _autoware_labels(fields: Fields) -> Labels:
+def _autoware_labels(fields: Fields) -> BoxLabels:
     """Return the most probable classes and the probabilities of existence; no ids."""
     labels = fields.numbers('objects.classification.label', '|u1')[:, 0].tolist()
     probabilities = fields.numbers('objects.classification.probability', '<f4')[:, 0].tolist()
@@ -331,7 +331,7 @@ def _autoware_labels(fields: Fields) -> Labels:
     return [''] * len(scores), classes, scores
 
 
-def _tracked_labels(fields: Fields) -> Labels:
+def _tracked_labels(fields: Fields) -> BoxLabels:
     """Return the same with the UUIDs in hexadecimal."""
     _, classes, scores = _autoware_labels(fields)
     uuids = fields.numbers('objects.object_id.uuid', '|u1', 16)
@@ -398,7 +398,7 @@ def _has_boxes_only(fields: Fields) -> bool:
     return bool(is_box.all() and (fields.counts(DIMENSIONS) == SIZE_WIDTH).all())
 
 
-def _object_labels(fields: Fields) -> Labels:
+def _object_labels(fields: Fields) -> BoxLabels:
     """Return ids, and classes and certainties where an object is classified."""
     ids = [str(number) for number in fields.numbers('objects.id', '<u4')[:, 0].tolist()]
     is_known = fields.numbers('objects.object_classified', '|u1')[:, 0] != 0
@@ -417,7 +417,7 @@ def _has_one_cube_each(fields: Fields) -> bool:
     return bool((fields.counts('entities.cubes') == 1).all())
 
 
-def _entity_labels(fields: Fields) -> Labels:
+def _entity_labels(fields: Fields) -> BoxLabels:
     """Return ids, and classes and scores by the metadata."""
     keys = fields.texts('entities.metadata.key')
     lower = {key: key.lower() for key in set(keys)}
@@ -438,7 +438,7 @@ def _entity_labels(fields: Fields) -> Labels:
 # ---------------------------------------------------------------- jsk_recognition_msgs
 
 
-def _jsk_labels(fields: Fields) -> Labels:
+def _jsk_labels(fields: Fields) -> BoxLabels:
     """Return labels as classes, and values as scores; no ids."""
     classes = [str(label) for label in fields.numbers('boxes.label', '<u4')[:, 0].tolist()]
     scores = fields.numbers('boxes.value', '<f4')[:, 0].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Constants have one meaning: two modules that define the same name define the same value."""
+"""A name has one meaning in the package: constants have one value, classes one definition."""
 
 import ast
 from collections import defaultdict
@@ -24,6 +24,17 @@ def constants_of(path):
             for name, value in zip(names, values or [node.value] * len(names), strict=True):
                 if isinstance(name, ast.Name) and name.id.isupper():
                     yield name.id, ast.unparse(value)
+
+
+def test_a_class_of_one_name_is_defined_once():
+    found = defaultdict(list)
+    for folder in ('boxreg_ros', 'msg_adapters'):
+        for path in sorted((ROOT / folder).rglob('*.py')):
+            for node in ast.parse(path.read_text(encoding='utf-8')).body:
+                if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
+                    found[node.name].append(path.name)
+    del found['Writer']  # each label format has its own
+    assert {name: paths for name, paths in found.items() if len(paths) > 1} == {}
 
 
 def test_a_constant_of_one_name_has_one_value_in_the_package():

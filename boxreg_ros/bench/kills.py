@@ -40,7 +40,7 @@ STARTING_TIME = 120.0  # until the first final boxes [s]
 RUNNING_TIMES = (0.0, 5.0)  # bounds of the time from the first final boxes to the signal [s]
 
 
-class Loss(NamedTuple):
+class LostArrays(NamedTuple):
     """Numbers of box arrays that were published before a kill, as final or as early, and lost."""
 
     final: int
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     report: dict[str, float] = {'load before': os.getloadavg()[0]}
     for victim in VICTIMS:
         losses = [_killed(args, victim, rng.uniform(*RUNNING_TIMES)) for _ in range(args.kills)]
-        for kind, counts in zip(Loss._fields, zip(*losses, strict=True), strict=True):
+        for kind, counts in zip(LostArrays._fields, zip(*losses, strict=True), strict=True):
             name = f'{victim} killed: {kind} boxes lost'
             report[f'{name}, mean [s]'] = float(np.mean(counts)) / RATE
             report[f'{name}, most [s]'] = max(counts) / RATE
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _killed(args: argparse.Namespace, victim: str, seconds: float) -> Loss:
+def _killed(args: argparse.Namespace, victim: str, seconds: float) -> LostArrays:
     """Kill a process some time after the first final boxes; return what is lost."""
     scope = argparse.Namespace(
         tracks=args.tracks, points=args.points, rate=RATE, delay=0.05,
@@ -104,14 +104,14 @@ def _killed(args: argparse.Namespace, victim: str, seconds: float) -> Loss:
         stack.enter_context(process(publisher_command(scope, folder / 'sent'), folder / 'log'))
         _wait_for_finals(arrivals, folder / 'node.log')
         time.sleep(seconds)
-        published = {name: set(arrivals[name]) for name in Loss._fields}
+        published = {name: set(arrivals[name]) for name in LostArrays._fields}
         (recorder,) = children_of(node.pid)
         os.kill(recorder if victim == 'recorder' else node.pid, signal.SIGKILL)
         node.send_signal(signal.SIGINT)
         node.wait(timeout=30.0)
         labels = RecordedLabels(folder / 'labels', np.inf, args.points)
         _recover(labels, folder / 'labels')
-        return Loss(*(len(published[name] - labels.stamps) for name in Loss._fields))
+        return LostArrays(*(len(published[name] - labels.stamps) for name in LostArrays._fields))
 
 
 def _wait_for_finals(arrivals: dict[str, Any], log: Path) -> None:

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 
-class Measurement(NamedTuple):
+class SubCommand(NamedTuple):
     """Module that implements a sub-command, and its summary."""
 
     module: str
@@ -15,22 +15,22 @@ class Measurement(NamedTuple):
 
 
 MEASUREMENTS = {
-    'paper': Measurement('paper', "the paper's experiment: its Table I and two figures"),
-    'real': Measurement('accuracy', 'accuracy on recordings with known truth'),
-    'kinds': Measurement('kinds', 'what each class of objects gains, with standard errors'),
-    'tracks': Measurement('tracks', 'broken tracks before and after each completing step'),
-    'ablation': Measurement('ablation', 'accuracy without each ingredient of the method'),
-    'sensitivity': Measurement('sensitivity', 'accuracy with each setting halved and doubled'),
-    'highway': Measurement('highway', 'accuracy at 5 and at 30 m/s, with boxes of either time'),
-    'lidars': Measurement('lidars', 'accuracy on a truck with LiDARs at its corners'),
-    'covariance': Measurement('covariance', 'covariances against errors, by estimate and class'),
-    'review': Measurement('review', 'how early the review list shows the bad tracks'),
-    'report': Measurement('report', 'first paint and frame times of report.html'),
-    'speed': Measurement('speed.command', 'time per tick, per box and per window'),
-    'scale': Measurement('scale', 'core hours and memory per hour, and a simulated fleet'),
-    'load': Measurement('load', 'latency and accuracy of the live node by number of tracks'),
-    'node': Measurement('node', 'latency and memory of the live node, over DDS'),
-    'kills': Measurement('kills', 'what recorded labels lose when a process is killed'),
+    'paper': SubCommand('paper', "the paper's experiment: its Table I and two figures"),
+    'real': SubCommand('accuracy', 'accuracy on recordings with known truth'),
+    'kinds': SubCommand('kinds', 'what each class of objects gains, with standard errors'),
+    'tracks': SubCommand('tracks', 'broken tracks before and after each completing step'),
+    'ablation': SubCommand('ablation', 'accuracy without each ingredient of the method'),
+    'sensitivity': SubCommand('sensitivity', 'accuracy with each setting halved and doubled'),
+    'highway': SubCommand('highway', 'accuracy at 5 and at 30 m/s, with boxes of either time'),
+    'lidars': SubCommand('lidars', 'accuracy on a truck with LiDARs at its corners'),
+    'covariance': SubCommand('covariance', 'covariances against errors, by estimate and class'),
+    'review': SubCommand('review', 'how early the review list shows the bad tracks'),
+    'report': SubCommand('report', 'first paint and frame times of report.html'),
+    'speed': SubCommand('speed.command', 'time per tick, per box and per window'),
+    'scale': SubCommand('scale', 'core hours and memory per hour, and a simulated fleet'),
+    'load': SubCommand('load', 'latency and accuracy of the live node by number of tracks'),
+    'node': SubCommand('node', 'latency and memory of the live node, over DDS'),
+    'kills': SubCommand('kills', 'what recorded labels lose when a process is killed'),
 }
 
 

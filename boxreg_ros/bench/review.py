@@ -21,7 +21,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d, pose_errors, PoseErrors
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.session import register
+from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.offline.consistency import CONSISTENCY_VARIABLES
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.review.changes import Changes, median, TrackChanges
@@ -116,7 +116,7 @@ def refined_tracks(drive: Drive) -> list[TrackChanges]:
         if isinstance(item, BoxArray):
             item = replace(item, ticket=len(given))
             given[item.ticket] = item
-        results += register(registrar, item, restarts=False)
+        results += hand_to_registrar(registrar, item, restarts=False)
     for refined in [*results, *registrar.flush()]:
         changes.add(given[refined.boxes.ticket], refined)
     return changes.tracks()

@@ -20,7 +20,7 @@ from boxreg_ros.bench.common import add_json_argument, line, print_json, progres
 from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.session import register
+from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.offline.completion import completed, first_pass
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.overlap import overlaps
@@ -170,7 +170,7 @@ def _registered(items: Sequence[Sweep | BoxArray], config: Config) -> list[Refin
     registrar = BoxRegistrar(config)
     results: list[RefinedBoxes] = []
     for item in items:
-        results += register(registrar, item, restarts=False)
+        results += hand_to_registrar(registrar, item, restarts=False)
     results += registrar.flush()
     return [result for result in results if result.is_final]
 

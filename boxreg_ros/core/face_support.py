@@ -270,13 +270,13 @@ def observe_faces_torch(
     weight = weight / (1 + (range_inset / RANGE_INSET_HALF_WEIGHT) ** 2)
     weight[..., BOTTOM] = (problem.ground.isfinite() & problem.valid).to(weight)
     strips = STRIPS if config.ingredients.strips else 1
-    search = Search(points, inset, weight, config.faces.outermost / strips, strips)
+    search = FaceSearch(points, inset, weight, config.faces.outermost / strips, strips)
     found = outermost_points(problem, state, search)
     moments, distance, weight, num_points = found
     return FaceObservations(moments, distance, weight, inset, shares, num_points)
 
 
-class Search(NamedTuple):
+class FaceSearch(NamedTuple):
     """
     Inputs of the search for the outermost points of all faces, beside the boxes.
 
@@ -304,7 +304,7 @@ class Search(NamedTuple):
 Found = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def outermost_points(problem: Problem, state: State, search: Search) -> Found:
+def outermost_points(problem: Problem, state: State, search: FaceSearch) -> Found:
     """
     Find the outermost points in every strip of every face.
 

@@ -31,7 +31,7 @@ iteration in a round, as by default, none is used."""
 
 Function = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Metric = Callable[[Tensor, Tensor], Tensor]
-Pair = tuple[Tensor, Tensor, Tensor]
+CurvaturePair = tuple[Tensor, Tensor, Tensor]
 """A step s, the change y of the gradient over it, and 1 / s'y: (b, D), (b, D), (b,)."""
 
 
@@ -75,7 +75,7 @@ class _Search(NamedTuple):
     step: Tensor  # length to try next, in multiples of the direction
     has_moved: Tensor  # whether the last trial was accepted: a new direction is needed
     tries: Tensor  # of the present direction
-    pairs: list[Pair]
+    pairs: list[CurvaturePair]
 
 
 def minimize(
@@ -125,7 +125,7 @@ def minimize(
     gradient = torch.where(is_finite[:, None], gradient, 0.0)
     zeros = torch.zeros_like(rows)
     search = _Search(
-        rows, start, value, gradient, start, value, value, is_finite, zeros, list[Pair]()
+        rows, start, value, gradient, start, value, value, is_finite, zeros, list[CurvaturePair]()
     )
     for turn in range(iterations * MAX_BACKTRACKS):
         taken = best.iterations[search.rows]
@@ -215,7 +215,9 @@ def _after_trial(
     return search
 
 
-def _two_loop(gradient: Tensor, pairs: list[Pair], rows: Tensor, metric: Metric | None) -> Tensor:
+def _two_loop(
+    gradient: Tensor, pairs: list[CurvaturePair], rows: Tensor, metric: Metric | None
+) -> Tensor:
     """Return the inverse Hessian approximated by `pairs`, times `gradient`."""
     q = gradient
     alphas = []

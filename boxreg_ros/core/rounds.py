@@ -72,7 +72,7 @@ MOTION_TERMS = (terms.acceleration, terms.slip)
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SolverPlan:
     """
     How a batch is solved.
 
@@ -102,7 +102,7 @@ class Plan:
     marginalises: bool = False
 
     @classmethod
-    def choose(cls, config: Config, is_warm: bool) -> 'Plan':
+    def choose(cls, config: Config, is_warm: bool) -> 'SolverPlan':
         """
         Return the plan for windows that are warm: all but their newest box have been solved.
 
@@ -148,7 +148,7 @@ class Round(NamedTuple):
 
 
 @torch.inference_mode()
-def run_round(batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor) -> Tensor:
+def run_round(batch: Round, plan: SolverPlan, turn: int, config: Config, rows: Tensor) -> Tensor:
     """
     Take one round with the windows `rows` (b,), and write its end to the solution of the batch.
 
@@ -162,7 +162,7 @@ def run_round(batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor)
 
 
 def run_round_compiled(
-    batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor
+    batch: Round, plan: SolverPlan, turn: int, config: Config, rows: Tensor
 ) -> Tensor:
     """Take a round by the kernel."""
     problem, solution, known, free = batch
@@ -204,7 +204,7 @@ def _solution_arrays(solution: Solution, leaves_prior: bool) -> SolutionArrays:
     )
 
 
-def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
+def _search_numbers(plan: SolverPlan, turn: int, config: Config) -> SearchNumbers:
     return SearchNumbers(
         iterations=config.solver.iterations,
         history=lbfgs.HISTORY if config.solver.iterations > 1 else 0,
@@ -221,7 +221,9 @@ def _search_numbers(plan: Plan, turn: int, config: Config) -> SearchNumbers:
 
 
 @one_torch_thread()
-def run_round_torch(batch: Round, plan: Plan, turn: int, config: Config, rows: Tensor) -> Tensor:
+def run_round_torch(
+    batch: Round, plan: SolverPlan, turn: int, config: Config, rows: Tensor
+) -> Tensor:
     """Take a round by torch."""
     solution = batch.solution
     problem, state, free, log_extent = select(
@@ -265,12 +267,12 @@ def _write(parts: Iterable[Tensor], wholes: Iterable[Tensor], rows: Tensor) -> N
         whole[rows] = part
 
 
-def _is_smooth(plan: Plan, turn: int) -> bool:
+def _is_smooth(plan: SolverPlan, turn: int) -> bool:
     """Return whether motion terms are robust: at first a cold window moves as its noisy input."""
     return turn > 0 or plan.starts_from_fit
 
 
-def _uses_rigid_shape(plan: Plan, turn: int) -> bool:
+def _uses_rigid_shape(plan: SolverPlan, turn: int) -> bool:
     return turn > 0 and plan.uses_rigid_shape
 
 
@@ -279,7 +281,7 @@ def _weighted_terms(
     state: State,
     expected: Expectation,
     observations: FaceObservations,
-    plan: Plan,
+    plan: SolverPlan,
     turn: int,
     config: Config,
 ) -> list[Term]:

@@ -2,7 +2,7 @@
 The solver of the default objective: rounds of expectation, observation, weighting and L-BFGS.
 
 As in ICP, correspondences and weights are renewed in every round and held while the sum is
-minimised. How many rounds there are, and what they use, is a `Plan`, chosen once per batch.
+minimised. How many rounds there are, and what they use, is a `SolverPlan`, chosen once per batch.
 
 """
 
@@ -26,7 +26,7 @@ from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import InputNoise, normalised_residuals, UNKNOWN_NOISE
 from boxreg_ros.core.kernels import compiled
 from boxreg_ros.core.population import UNKNOWN_POPULATION
-from boxreg_ros.core.rounds import Plan, Round, run_round
+from boxreg_ros.core.rounds import Round, run_round, SolverPlan
 from boxreg_ros.core.threads import mapped, num_workers, shared_between
 from boxreg_ros.structures import POSE
 import torch
@@ -69,7 +69,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     other: threads share them.
 
     """
-    plan = Plan.choose(config, is_warm)
+    plan = SolverPlan.choose(config, is_warm)
     learns_noise = config.ingredients.noise_estimation
     learns_extents = config.ingredients.population_extents
     noise = model.noise() if learns_noise and not plan.estimates_noise else UNKNOWN_NOISE
@@ -98,7 +98,7 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     return solution
 
 
-def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: Plan) -> Solution:
+def start(problem: Problem, free: Tensor, offsets: FaceOffsets, plan: SolverPlan) -> Solution:
     """Return the state that the first round starts from, without covariances and prior."""
     pose = problem.start[..., POSE].contiguous()  # a copy
     shared = shared_without_population(problem, offsets)

@@ -3,7 +3,7 @@ What the live node sends to the recorder, a process of its own that writes the l
 
 The node starts ``python -m boxreg_ros.recorder.main`` and writes pickled objects of these classes
 to its standard input: `RecorderSettings` first, the end of the input last. The recorder writes
-`Status` to its standard output, one JSON object per line.
+`RecorderStatus` to its standard output, one JSON object per line.
 
 """
 
@@ -49,7 +49,7 @@ class RecorderSettings(NamedTuple):
     config: Config
 
 
-class Cloud(NamedTuple):
+class LabelCloud(NamedTuple):
     """
     A cloud that label files may need.
 
@@ -91,7 +91,7 @@ class Tick(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class RecorderStatus:
     """
     State of the recorder.
 

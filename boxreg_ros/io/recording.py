@@ -20,7 +20,7 @@ from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.message_decoder import malformed, MessageDecoder
 from boxreg_ros.io.motion import RecordedMotion
 from boxreg_ros.io.recorded_type import RecordedType
-from boxreg_ros.io.resync import Timeline
+from boxreg_ros.io.resync import MessageOrder
 from boxreg_ros.io.storage.files import is_ros1, part_of
 from boxreg_ros.io.storage.reader import Reader
 from boxreg_ros.io.storage.record import Bytes, Damage, Record
@@ -45,7 +45,7 @@ class Recording:
 
     Receive times only order the stream and select the part between `start` and `end`; stamps
     are those of the message headers. Topics that were recorded apart from the clouds are merged
-    by stamp, see `Timeline`. Use as a context manager; a copy can be opened again.
+    by stamp, see `MessageOrder`. Use as a context manager; a copy can be opened again.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class Recording:
     def _find_part(self) -> None:
         """Find the part that is read, and the motion in it."""
         topics = self._topics
-        self._timeline = Timeline(self._reader, self.points_topic, self._stamp_of)
+        self._timeline = MessageOrder(self._reader, self.points_topic, self._stamp_of)
         motion = (topics.transforms - topics.static_transforms) | topics.of((ODOMETRY_TYPE,))
         begin_ns, last_ns = self._timeline.span_ns(self.data_topics | motion)
         self.start_ns = begin_ns + round((self._start or 0.0) * 1e9)

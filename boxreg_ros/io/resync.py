@@ -30,7 +30,7 @@ A live detector is slower than its clouds by 0.1 to 0.5 s; that order is the ord
 StampOf = Callable[[Connection, Bytes], int | None]
 
 
-class Timeline:
+class MessageOrder:
     """
     Order messages by receive time, and those recorded apart from the clouds by stamp.
 

@@ -1,10 +1,10 @@
 """
-The way of sweeps and boxes to the registrar, the same for the live node and for recordings.
+Preparation of sweeps and boxes for the registrar, the same for the live node and for recordings.
 
-`JumpConfirmation` detects time jumps, a `Session` brings each item into the fixed frame, merges
-the clouds of several LiDARs, assigns ids where they are asked for and checks the poses of the
-boxes, and `register` hands the result to the registrar. The live node adds waiting for transforms
-and publishing; `boxreg relabel` adds reading and writing.
+`JumpConfirmation` detects time jumps. A `Session` brings each item into the fixed frame, merges
+the clouds of several LiDARs, assigns ids where they are asked for, and checks the poses of the
+boxes. `hand_to_registrar` adds the result to the registrar. The live node adds waiting for
+transforms and publishing; `boxreg relabel` adds reading and writing.
 
 """
 
@@ -290,7 +290,7 @@ class Session:
         return {'ids': 'by association', 'associated_tracks': self._tracker.count}
 
 
-def register(
+def hand_to_registrar(
     registrar: BoxRegistrar, moved: Sweep | BoxArray | None, restarts: bool
 ) -> list[RefinedBoxes]:
     """

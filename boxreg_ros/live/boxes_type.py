@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from boxreg_ros.errors import UnsupportedMessage
-from boxreg_ros.live.topics import import_message, PATIENCE, Problem, Topics
+from boxreg_ros.live.topics import import_message, NodeTopics, PATIENCE, TopicProblem
 from diagnostic_msgs.msg import DiagnosticStatus
 from msg_adapters import adapter_for, ADAPTERS
 from msg_adapters.convention import Convention
@@ -17,7 +17,7 @@ class BoxesTypeSearch:
 
     Parameters
     ----------
-    topics : Topics
+    topics : NodeTopics
         Reads the graph.
     name : str
         Resolved name of the topic, for problems.
@@ -26,7 +26,7 @@ class BoxesTypeSearch:
 
     """
 
-    def __init__(self, topics: Topics, name: str, convention: Convention) -> None:
+    def __init__(self, topics: NodeTopics, name: str, convention: Convention) -> None:
         self._topics = topics
         self._name = name
         self._convention = convention
@@ -50,7 +50,7 @@ class BoxesTypeSearch:
             self._chosen = readable[0]
         return self._chosen
 
-    def problems(self) -> list[Problem]:
+    def problems(self) -> list[TopicProblem]:
         """Return why no type could be chosen, or which other types the topic has beside it."""
         types = self._topics.types_published('boxes')
         readable, errors = self._sorted_out(types)
@@ -59,9 +59,9 @@ class BoxesTypeSearch:
             if not others or self._chosen not in types:
                 return []
             text = f'also has boxes of type {", ".join(others)}: set boxes_type if these are meant'
-            return [Problem(DiagnosticStatus.WARN, f'{self._name}: {text}')]
+            return [TopicProblem(DiagnosticStatus.WARN, f'{self._name}: {text}')]
         if errors and not readable:
-            return [Problem(DiagnosticStatus.ERROR, f'{self._name}: {errors[0]}')]
+            return [TopicProblem(DiagnosticStatus.ERROR, f'{self._name}: {errors[0]}')]
         if not types and time.monotonic() >= self._since + PATIENCE:
             return [self._topics.unpublished('boxes', set(ADAPTERS))]
         return []

@@ -15,14 +15,14 @@ from boxreg_ros.errors import TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars, MergedSweep, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.session import (
     covariances_to_write,
+    hand_to_registrar,
     is_placeholder,
     JumpConfirmation,
-    register,
     Session,
 )
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.live.budget import TickBudget
-from boxreg_ros.live.label_tap import LabelTap, Part
+from boxreg_ros.live.label_tap import CloudPart, LabelTap
 from boxreg_ros.structures import BoxArray, COASTED, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -317,12 +317,12 @@ class LiveRegistrar:
                 return []
             assert isinstance(moved, Sweep)
             assert admitted.T_fixed_item is not None
-            part = Part(item.message, content, admitted.T_fixed_item)
+            part = CloudPart(item.message, content, admitted.T_fixed_item)
             return self._register(self._session.merged(moved, part))
         if moved is not None:
             assert isinstance(moved, BoxArray) and admitted.T_fixed_item is not None
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
-        ready = self._outgoing(register(self._registrar, moved, restarts=False))
+        ready = self._outgoing(hand_to_registrar(self._registrar, moved, restarts=False))
         if moved is None:
             ready += self.passed_through(item.message, 'no_transform')
         return ready
@@ -337,7 +337,7 @@ class LiveRegistrar:
         ready: list[Outgoing] = []
         for sweep, parts in complete:
             self.tap.add_cloud(sweep, [part for part in parts if part is not None])
-            ready += self._outgoing(register(self._registrar, sweep, restarts=False))
+            ready += self._outgoing(hand_to_registrar(self._registrar, sweep, restarts=False))
         return ready
 
     def lose(self, stamp_ns: int, lidar: str = '') -> list[Outgoing]:

@@ -17,7 +17,7 @@ from boxreg_ros.structures import BoxArray, Floats, RefinedBoxes, Sweep
 import numpy as np
 
 
-class Part(NamedTuple):
+class CloudPart(NamedTuple):
     """A cloud of one LiDAR: its message, and its sweep in its own frame with the pose of that."""
 
     message: Any
@@ -55,7 +55,7 @@ class LabelTap:
         self._cloud_stamps = deque(maxlen=recorder.settings.config.queue)
         self._is_finishing = False
 
-    def add_cloud(self, whole: Sweep, parts: Sequence[Part]) -> None:
+    def add_cloud(self, whole: Sweep, parts: Sequence[CloudPart]) -> None:
         """Hand on a cloud in the fixed frame that was merged from parts, if it is recorded."""
         if not parts:  # lost
             return

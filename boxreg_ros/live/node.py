@@ -19,8 +19,8 @@ from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
-from boxreg_ros.live.recording import Recording
-from boxreg_ros.live.topics import import_message, Topics
+from boxreg_ros.live.recording import LabelRecording
+from boxreg_ros.live.topics import import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
 from msg_adapters import adapter_for, canonical, cdr
@@ -61,7 +61,7 @@ class BoxregNode(Node):
     ----------
     worker : Worker
         Registers boxes and publishes them in the thread of `run_worker`; made by `open_topics`.
-    recording : Recording
+    recording : LabelRecording
         Writes the final boxes as label files, where that is asked for.
 
     Raises
@@ -85,7 +85,7 @@ class BoxregNode(Node):
         self._health = Health(self.get_logger())
         config, options = self._settings
         self._inbox = Inbox(config.queue, max(1, len(options.lidars.topics)))
-        self.recording = Recording(self, self._inbox, self._health, lambda: self._settings)
+        self.recording = LabelRecording(self, self._inbox, self._health, lambda: self._settings)
         self._opened = ExitStack()
 
     def configure(self) -> None:
@@ -123,7 +123,7 @@ class BoxregNode(Node):
 
         """
         _, options = self._settings
-        self._topics = Topics(self, self._health)
+        self._topics = NodeTopics(self, self._health)
         self._opened.callback(self._topics.close)
         self._markers = self._topics.publish(
             'visualization_msgs/msg/MarkerArray', 'refined_markers', 10

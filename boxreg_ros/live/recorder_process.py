@@ -13,12 +13,12 @@ from typing import Any, IO, NamedTuple
 
 from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.label_feed import (
-    Cloud,
     FinalBoxes,
+    LabelCloud,
     PROGRAM,
     RecorderSettings,
+    RecorderStatus,
     Split,
-    Status,
     Tick,
 )
 from boxreg_ros.live.diagnostics import Health
@@ -45,7 +45,7 @@ class RawCloud(NamedTuple):
     Attributes
     ----------
     sweep, T_fixed_sweep, needed_from_ns
-        As of `Cloud`.
+        As of `LabelCloud`.
     messages : sequence of message
         The messages of the clouds that it was merged from, in the order of its points.
 
@@ -79,7 +79,7 @@ class RecorderProcess:
     ----------
     settings : RecorderSettings
         As given.
-    status : Status
+    status : RecorderStatus
         The newest from the recorder.
     has_ended : threading.Event
         Set when the recorder has ended.
@@ -95,7 +95,7 @@ class RecorderProcess:
         predecessor: RecorderProcess | None = None,
     ) -> None:
         self.settings = settings
-        self.status = Status()
+        self.status = RecorderStatus()
         self.has_ended = Event()
         self._health = health
         self._on_begin = on_begin
@@ -198,7 +198,7 @@ class RecorderProcess:
 
     def _take_status(self, line: bytes) -> None:
         if line:
-            self.status = Status(**json.loads(line))
+            self.status = RecorderStatus(**json.loads(line))
 
 
 def _kind(item: Any) -> str:
@@ -212,7 +212,7 @@ def _decoded(item: Any) -> Any:
     if not isinstance(item, RawCloud):
         return item
     sweep = Sweep(item.sweep.stamp_ns, item.sweep.frame_id, item.sweep.points)  # all it needs
-    return Cloud(sweep, item.T_fixed_sweep, _intensities(item.messages), item.needed_from_ns)
+    return LabelCloud(sweep, item.T_fixed_sweep, _intensities(item.messages), item.needed_from_ns)
 
 
 def _intensities(messages: Sequence[Any]) -> Floats | None:

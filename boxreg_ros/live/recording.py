@@ -33,7 +33,7 @@ The recorder completes it in any case; launch files send SIGTERM after 5 s.
 """
 
 
-class Recording:
+class LabelRecording:
     """
     Start, stop and split the recording of labels. Used by the thread of the executor only.
 

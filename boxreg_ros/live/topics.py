@@ -45,7 +45,7 @@ INFINITE_NS = 9223372036854775807
 """Value of an infinite duration in rmw [ns]."""
 
 
-class Problem(NamedTuple):
+class TopicProblem(NamedTuple):
     """Something that keeps messages from arriving; `level` is one of DiagnosticStatus."""
 
     level: bytes
@@ -109,7 +109,7 @@ class Endpoint:
         return self.callback is not None
 
 
-class Topics:
+class NodeTopics:
     """
     Creates subscriptions and publishers, and compares them with those of other nodes.
 
@@ -222,9 +222,9 @@ class Topics:
         """Return the message types that other nodes publish on a topic."""
         return {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)}
 
-    def problems(self) -> list[Problem]:
+    def problems(self) -> list[TopicProblem]:
         """Return the reasons why messages do not arrive now, on any topic of the node."""
-        found: list[Problem] = []
+        found: list[TopicProblem] = []
         for endpoint in self._endpoints:
             if endpoint.is_input:
                 peers = self._node.get_publishers_info_by_topic(endpoint.topic)
@@ -239,7 +239,7 @@ class Topics:
                 found += self._silence(endpoint, peers)
         return found
 
-    def report(self, name: str, further: list[Problem]) -> DiagnosticStatus:
+    def report(self, name: str, further: list[TopicProblem]) -> DiagnosticStatus:
         """
         Log new problems and return the state of all topics.
 
@@ -247,7 +247,7 @@ class Topics:
         ----------
         name : str
             Name of the status.
-        further : list of Problem
+        further : list of TopicProblem
             Problems found elsewhere.
 
         """
@@ -265,14 +265,14 @@ class Topics:
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
 
-    def unpublished(self, topic: str, type_names: set[str]) -> Problem:
+    def unpublished(self, topic: str, type_names: set[str]) -> TopicProblem:
         """Return the problem that nobody publishes a topic, with topics of the types wanted."""
         name = self._node.resolve_topic_name(topic)
         is_remapped = name != self._node.resolve_topic_name(topic, only_expand=True)
         candidates = self._published_topics(type_names)
         there = ', '.join(candidates) if candidates else 'none'
         remedy = 'check the remap' if is_remapped else f'start the publisher or remap {topic}'
-        return Problem(
+        return TopicProblem(
             DiagnosticStatus.WARN,
             f'{name}: nobody publishes it; published topics of a fitting type: {there}; {remedy}',
         )
@@ -313,7 +313,9 @@ class Topics:
     def _on_incompatible_subscription(self, event: Any) -> None:
         self._health.count('qos_incompatible')
 
-    def _silence(self, endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterator[Problem]:
+    def _silence(
+        self, endpoint: Endpoint, peers: list[TopicEndpointInfo]
+    ) -> Iterator[TopicProblem]:
         """Yield a problem if nothing was ever received on an endpoint that ought to have some."""
         is_remapped = endpoint.name != self._node.resolve_topic_name(
             endpoint.topic, only_expand=True
@@ -324,7 +326,7 @@ class Topics:
         if not peers:
             yield self.unpublished(endpoint.topic, {endpoint.type_name})
         elif any(peer.topic_type == endpoint.type_name for peer in peers):
-            yield Problem(
+            yield TopicProblem(
                 DiagnosticStatus.WARN,
                 f'{endpoint.name}: nothing received yet from {_nodes(peers)}; check that messages '
                 f'are sent, and shared memory and network in between',
@@ -344,7 +346,7 @@ class Topics:
             found |= {topic for topic, types in topics if type_names & set(types)}
         return sorted(found)
 
-    def _log(self, problem: Problem) -> None:
+    def _log(self, problem: TopicProblem) -> None:
         if problem.is_qos:
             self._health.is_due('qos_incompatible')  # this entry replaces the general one
         if problem.level == DiagnosticStatus.ERROR:
@@ -404,7 +406,7 @@ def _seconds(duration_ns: int) -> str:
     return 'infinite' if duration_ns >= INFINITE_NS else f'{1e-9 * duration_ns:g} s'
 
 
-def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterator[Problem]:
+def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterator[TopicProblem]:
     """Yield a problem for each policy for which an endpoint and a peer do not match."""
     for peer in peers:
         publisher, subscription = peer.qos_profile, endpoint.qos
@@ -425,14 +427,14 @@ def _qos_problems(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Iterato
                     f'qos_overrides.{endpoint.name}.publisher.{policy} to {requested}, or change '
                     f'the subscription'
                 )
-            yield Problem(DiagnosticStatus.ERROR, f'{endpoint.name}: {text}', is_qos=True)
+            yield TopicProblem(DiagnosticStatus.ERROR, f'{endpoint.name}: {text}', is_qos=True)
 
 
-def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Problem:
+def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicProblem:
     """Return the problem that other nodes use an endpoint's topic with another type."""
     types = ', '.join(sorted({peer.topic_type for peer in peers}))
     if not endpoint.is_input:
-        return Problem(
+        return TopicProblem(
             DiagnosticStatus.WARN,
             f'{endpoint.name}: {_nodes(peers)} subscribes with type {types}, this node publishes '
             f'{endpoint.type_name}; change the subscription',
@@ -440,7 +442,7 @@ def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> Problem
     remedy = f'remap {endpoint.topic} to a topic of the expected type'
     if endpoint.topic == 'boxes':
         remedy = 'set boxes_type, or restart the node if the type of the topic has changed'
-    return Problem(
+    return TopicProblem(
         DiagnosticStatus.ERROR,
         f'{endpoint.name}: expected messages of type {endpoint.type_name}, got {types} from '
         f'{_nodes(peers)}; {remedy}',

@@ -46,7 +46,7 @@ def add_recording_arguments(
     add_topic_arguments(parser)
     parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')
     parser.add_argument(
-        '--set', action='append', default=[], type=setting, metavar='KEY=VALUE',
+        '--set', action='append', default=[], type=key_value, metavar='KEY=VALUE',
         help='one setting, as in solver.rounds=2; overrides --config; can be repeated',
     )  # fmt: skip
 
@@ -144,7 +144,7 @@ def convention_from(args: argparse.Namespace, associate: bool = False) -> Conven
     return Convention(args.pose_reference, args.size_order, args.forward_axis, associate)
 
 
-def setting(text: str) -> tuple[str, Any]:
+def key_value(text: str) -> tuple[str, Any]:
     """
     Return name and value of ``KEY=VALUE``, the value parsed as YAML.
 

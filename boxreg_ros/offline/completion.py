@@ -11,7 +11,7 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.observation import crop
 from boxreg_ros.core.registrar import BoxRegistrar, Submit
-from boxreg_ros.io.session import register
+from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     BoxArray,
@@ -22,7 +22,7 @@ from boxreg_ros.structures import (
     ROLL,
     Sweep,
 )
-from boxreg_ros.tracks.complete import complete, Plan
+from boxreg_ros.tracks.complete import complete, CompletionPlan
 from boxreg_ros.tracks.track_steps import TrackSteps
 import numpy as np
 
@@ -108,9 +108,9 @@ class FirstPass(NamedTuple):
     results: list[list[RefinedBoxes]]
     num_points: list[list[Ints]]
 
-    def plan(self, fixed_frame: str, config: Config) -> Plan:
+    def plan(self, fixed_frame: str, config: Config) -> CompletionPlan:
         """Return what completes the tracks in the fixed frame; each part on its own."""
-        whole = Plan([], [])
+        whole = CompletionPlan([], [])
         for part in zip(self.given, self.results, self.num_points, strict=True):
             whole.append(complete(*part, fixed_frame, config))
         return whole
@@ -153,7 +153,7 @@ def first_pass(
             moved = replace(moved, ticket=sum(map(len, parts)))
             parts[-1].append(moved)
         counter.add(moved)
-        keep(register(registrar, moved, restarts))
+        keep(hand_to_registrar(registrar, moved, restarts))
     keep(registrar.flush())
     counter.finish()
     return FirstPass(
@@ -169,14 +169,14 @@ class Completion:
 
     Parameters
     ----------
-    plan : Plan
+    plan : CompletionPlan
         From the first pass over the same items.
     config : Config
         Settings.
 
     """
 
-    def __init__(self, plan: Plan, config: Config) -> None:
+    def __init__(self, plan: CompletionPlan, config: Config) -> None:
         self._plan = plan
         self._is_early = config.estimate == 'early'
         self._counter = PointCounter(config)
@@ -241,6 +241,6 @@ def completed(
     registrar = BoxRegistrar(config)
     for ticket, item in enumerate(items):
         moved = replace(item, ticket=ticket) if isinstance(item, BoxArray) else item
-        completion.add(register(registrar, completion.to_register(moved, False), False))
+        completion.add(hand_to_registrar(registrar, completion.to_register(moved, False), False))
     completion.add(registrar.flush())
     return completion.finished(), plan.tracks

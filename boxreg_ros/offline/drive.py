@@ -14,10 +14,10 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.recording import Recording
-from boxreg_ros.io.session import register
+from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.io.transforms import sweep_to_frame
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.simulation.scene import Scene
+from boxreg_ros.simulation.scene import SimulatedScene
 from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
@@ -60,7 +60,7 @@ class Drive:
     left_out: str = ''
 
     @classmethod
-    def from_scene(cls, scene: Scene) -> Drive:
+    def from_scene(cls, scene: SimulatedScene) -> Drive:
         """Return a simulated drive."""
         sweeps = zip(scene.sweeps, scene.T_fixed_sensor, strict=True)
         moved = tuple(sweep_to_frame(sweep, T, 'odom') for sweep, T in sweeps)
@@ -146,7 +146,7 @@ class Drive:
         results: list[RefinedBoxes] = []
         items: list[Sweep | BoxArray] = [*self.sweeps, *self.boxes]
         for item in sorted(items, key=lambda item: item.stamp_ns):
-            results += register(registrar, item, restarts=False)
+            results += hand_to_registrar(registrar, item, restarts=False)
         results += registrar.flush()
         found: dict[str, list[RefinedBoxes]] = {}
         for result in results:

@@ -158,7 +158,7 @@ class ObjectRecords:
         return f'{self._count:06d}'
 
 
-class Journal:
+class EstimateJournal:
     """
     Store estimates in the order their windows are submitted; use as a context manager.
 

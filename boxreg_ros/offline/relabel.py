@@ -24,7 +24,7 @@ from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MERGED, CLOUD_MISSING
-from boxreg_ros.io.session import register
+from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress
@@ -52,10 +52,10 @@ import yaml
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
     from boxreg_ros.offline.completion import Completion
-    from boxreg_ros.offline.journal import Journal
+    from boxreg_ros.offline.journal import EstimateJournal
     from boxreg_ros.review.changes import TrackChanges
     from boxreg_ros.review.track_points import PointCollector
-    from boxreg_ros.tracks.complete import Plan
+    from boxreg_ros.tracks.complete import CompletionPlan
 
 MAX_NAMED = 5
 """Most tracks that a warning names; chosen."""
@@ -83,7 +83,8 @@ def relabel(
         Shows the duration of the recording that has been read and its whole duration [s]. Both
         count once for each time that the recording is read: with completed tracks once more.
     resume : bool
-        Keep a journal of the run, and go on with that of an interrupted one; see `Journal`.
+        Keep a journal of the run, and go on with that of an interrupted one, see
+        `EstimateJournal`.
 
     Returns
     -------
@@ -140,16 +141,16 @@ def relabel(
 
 
 @contextmanager
-def _journal(out: Path, fingerprint: str) -> Iterator[Journal]:
+def _journal(out: Path, fingerprint: str) -> Iterator[EstimateJournal]:
     """Yield the journal of a run; while it is locked, other partial results are remains."""
-    from boxreg_ros.offline.journal import Journal, journal_path
+    from boxreg_ros.offline.journal import EstimateJournal, journal_path
 
-    with Journal(journal_path(out), fingerprint) as journal:
+    with EstimateJournal(journal_path(out), fingerprint) as journal:
         delete_remains(out)
         yield journal
 
 
-def _journaled(submit: Submit | None, journal: Journal | None) -> Submit | None:
+def _journaled(submit: Submit | None, journal: EstimateJournal | None) -> Submit | None:
     """Return `submit` with the estimates that a journal has."""
     from boxreg_ros.core.registrar import submit_locally
 
@@ -174,8 +175,8 @@ class _Passes:
 
 
 def _survey(
-    request: Request, clock: Stopwatch, progress: _Passes, journal: Journal | None
-) -> tuple[Plan | None, Completion | None]:
+    request: Request, clock: Stopwatch, progress: _Passes, journal: EstimateJournal | None
+) -> tuple[CompletionPlan | None, Completion | None]:
     """Register the recording a first time and plan its whole tracks; None without steps."""
     if not request.config.complete.steps:
         return None, None
@@ -211,7 +212,7 @@ def _register(
         with clock('registrar'):
             if completion is not None:
                 moved = completion.to_register(moved, item.restarts)
-            ready = register(registrar, moved, item.restarts)
+            ready = hand_to_registrar(registrar, moved, item.restarts)
         _take(ready, completion, sink)
     with clock('registrar'):
         ready = registrar.flush()
@@ -228,7 +229,7 @@ def _take(ready: list[RefinedBoxes], completion: Completion | None, sink: Sink) 
         completion.add(ready)
 
 
-def _completed(plan: Plan | None) -> dict[str, int]:
+def _completed(plan: CompletionPlan | None) -> dict[str, int]:
     """Return the numbers of tracks and boxes that each step changed; empty without steps."""
     if plan is None:
         return {}
@@ -245,7 +246,7 @@ def _completed(plan: Plan | None) -> dict[str, int]:
 
 
 def _write_tables(
-    folder: Path, tracks: Sequence[TrackChanges], config: Config, plan: Plan | None
+    folder: Path, tracks: Sequence[TrackChanges], config: Config, plan: CompletionPlan | None
 ) -> dict[str, dict[str, int]]:
     """Write the tables of tracks; return violations of rules ``before`` and ``after`` the run."""
     from boxreg_ros.review.rules import counts

@@ -34,7 +34,7 @@ RESULT_COLUMNS = (
 """Arrays of `RefinedBoxes` that are stored under their own names."""
 
 
-class Journal:
+class FrameJournal:
     """
     Append frames to a journal.
 

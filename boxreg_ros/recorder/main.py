@@ -18,7 +18,13 @@ import time
 from typing import Any, IO
 
 from boxreg_ros.errors import BoxregError, ConfigError, RecordingError
-from boxreg_ros.io.label_feed import Cloud, FinalBoxes, RecorderSettings, Split, Status
+from boxreg_ros.io.label_feed import (
+    FinalBoxes,
+    LabelCloud,
+    RecorderSettings,
+    RecorderStatus,
+    Split,
+)
 from boxreg_ros.io.transforms import TIME_JUMP
 from boxreg_ros.io.whole_files import DISK_ERRORS
 from boxreg_ros.labels import LabelFrame, module_of
@@ -81,12 +87,12 @@ class Recorder:
         self._thread = ThreadPoolExecutor(1)
         self._recovery: Future[int] | None = self._thread.submit(recover_all, cut_off)
         self._completions: deque[tuple[Segment, Future[None]]] = deque()
-        self._written: Counter[str] = Counter()  # by field of `Status`
+        self._written: Counter[str] = Counter()  # by field of `RecorderStatus`
         self._growth = Growth()
 
     def take(self, item: Any) -> None:
         """Write what the node has sent."""
-        if isinstance(item, Cloud):
+        if isinstance(item, LabelCloud):
             self._add_cloud(item)
         elif isinstance(item, FinalBoxes):
             self._write(item)
@@ -111,7 +117,7 @@ class Recorder:
             self._segment.abandon()
         shutil.rmtree(self._folder / CLOUDS, ignore_errors=True)
 
-    def status(self) -> Status:
+    def status(self) -> RecorderStatus:
         """
         Return the present state, and end a segment that has reached its size.
 
@@ -139,12 +145,12 @@ class Recorder:
             left_out=self._written['left_out'] + left_out,
         )
 
-    def _counted(self) -> Status:
+    def _counted(self) -> RecorderStatus:
         """Return a status with the counters only."""
         counts: dict[str, Any] = dict(self._written)
-        return Status(**counts)
+        return RecorderStatus(**counts)
 
-    def _add_cloud(self, cloud: Cloud) -> None:
+    def _add_cloud(self, cloud: LabelCloud) -> None:
         if self._spool is not None:
             self._spool.delete_before(cloud.needed_from_ns)
             self._spool.add(cloud.sweep, cloud.T_fixed_sweep, cloud.intensities)
@@ -276,7 +282,7 @@ def options_of(name: str) -> tuple[str, ...]:
     return module_of(name).FORMAT.options
 
 
-def serve(source: IO[bytes], report: Callable[[Status], None]) -> None:
+def serve(source: IO[bytes], report: Callable[[RecorderStatus], None]) -> None:
     """
     Record what arrives on `source`, until its end.
 
@@ -305,7 +311,9 @@ def serve(source: IO[bytes], report: Callable[[Status], None]) -> None:
         raise
 
 
-def _record(recorder: Recorder, source: IO[bytes], report: Callable[[Status], None]) -> None:
+def _record(
+    recorder: Recorder, source: IO[bytes], report: Callable[[RecorderStatus], None]
+) -> None:
     """Hand items on until the end of the input; report once per `STATUS_PERIOD`."""
     due = time.monotonic() + STATUS_PERIOD
     while True:
@@ -360,12 +368,12 @@ def main() -> int:
     try:
         serve(sys.stdin.buffer, _print)
     except BoxregError as error:
-        _print(Status(error=' '.join(str(error).split())))
+        _print(RecorderStatus(error=' '.join(str(error).split())))
         os._exit(1)  # the files that cannot be written would raise again when they are closed
     return 0
 
 
-def _print(status: Status) -> None:
+def _print(status: RecorderStatus) -> None:
     """Write a line of status; the node may have been killed."""
     with suppress(BrokenPipeError):
         sys.stdout.write(status.line())

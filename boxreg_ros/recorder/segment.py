@@ -17,7 +17,7 @@ from boxreg_ros.labels import LabelFrame, LabelOutput, Options, Provenance
 from boxreg_ros.labels.output import with_csv
 from boxreg_ros.labels.protocol import absolute
 from boxreg_ros.labels.segments import INDEX, IndexRow, read_index, write_index
-from boxreg_ros.recorder.journal import JOURNAL, Journal, read_journal
+from boxreg_ros.recorder.journal import FrameJournal, JOURNAL, read_journal
 import yaml
 
 LABEL_FILES = 'labels'
@@ -137,7 +137,7 @@ class Segment:
         self._open.mkdir()
         self.files = SegmentFiles(self._open, target, settings)
         # Last: a folder without a journal was never in use.
-        self._journal = Journal(self._open / JOURNAL, settings)
+        self._journal = FrameJournal(self._open / JOURNAL, settings)
 
     def write(self, frame: LabelFrame) -> None:
         """Write a frame to the journal, then to the label files."""

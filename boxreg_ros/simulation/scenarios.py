@@ -18,7 +18,7 @@ from boxreg_ros.simulation.raycast import (
     SWEEP_PERIOD,
     to_matrix,
 )
-from boxreg_ros.simulation.scene import boxes_of, is_near, make_scene, make_sweep, Scene
+from boxreg_ros.simulation.scene import boxes_of, is_near, make_scene, make_sweep, SimulatedScene
 from boxreg_ros.structures import Floats
 import numpy as np
 from numpy.typing import NDArray
@@ -46,16 +46,16 @@ PAPER_SPEED = 5.0  # [m/s]
 
 Rate = Callable[[Floats], NDArray[Any]]
 """A speed [m/s] or a yaw rate [rad/s] at times (G,) [s]."""
-Place = tuple[float, float, float]
+StartPose = tuple[float, float, float]
 """x, y [m] and yaw [rad]."""
 
 
-class Plan(NamedTuple):
+class ActorPlan(NamedTuple):
     """One road user of the street: class, shape, place at time 0, speed and yaw rate."""
 
     class_name: str
     shape: str
-    place: Place
+    place: StartPose
     speed: Rate
     yaw_rate: Rate
 
@@ -71,18 +71,24 @@ def constant(value: float) -> Rate:
 
 
 TRAFFIC = (
-    Plan('car', 'car', (28, -1.8, 0), lambda t: 7 - 2 * np.sin(t), zero),
-    Plan('car', 'suv', (62, 1.6, np.pi), constant(9), zero),
-    Plan('truck', 'truck', (74, 1.9, np.pi), constant(7), zero),
+    ActorPlan('car', 'car', (28, -1.8, 0), lambda t: 7 - 2 * np.sin(t), zero),
+    ActorPlan('car', 'suv', (62, 1.6, np.pi), constant(9), zero),
+    ActorPlan('truck', 'truck', (74, 1.9, np.pi), constant(7), zero),
     # Turns into a side street.
-    Plan('car', 'car', (16, -1.8, 0), lambda t: np.maximum(6 - t, 4.2),
-         lambda t: -0.6 * (np.abs(t - 3.1) < 1.3)),
+    ActorPlan(
+        'car', 'car', (16, -1.8, 0), lambda t: np.maximum(6 - t, 4.2),
+        lambda t: -0.6 * (np.abs(t - 3.1) < 1.3),
+    ),
     # Backs out of a parking space.
-    Plan('car', 'suv', (37, 11.5, np.pi / 2), lambda t: -1.3 * (t > 0.8),
-         lambda t: 0.25 * (t > 2)),
-    Plan('cyclist', 'cyclist', (47, 3.4, np.pi), constant(4.5), lambda t: 0.06 * np.sin(2 * t)),
-    Plan('pedestrian', 'pedestrian', (22, 7.2, np.pi), constant(1.3), zero),
-    Plan('pedestrian', 'pedestrian', (15, -6.9, 0), constant(1.5), lambda t: 0.1 * np.cos(t)),
+    ActorPlan(
+        'car', 'suv', (37, 11.5, np.pi / 2), lambda t: -1.3 * (t > 0.8),
+        lambda t: 0.25 * (t > 2),
+    ),
+    ActorPlan(
+        'cyclist', 'cyclist', (47, 3.4, np.pi), constant(4.5), lambda t: 0.06 * np.sin(2 * t)
+    ),
+    ActorPlan('pedestrian', 'pedestrian', (22, 7.2, np.pi), constant(1.3), zero),
+    ActorPlan('pedestrian', 'pedestrian', (15, -6.9, 0), constant(1.5), lambda t: 0.1 * np.cos(t)),
 )  # fmt: skip
 PARKED = (
     ('car', 7, -4.6), ('van', 13.2, -4.7), ('suv', 19, -4.6), ('car', 24.7, -4.7),
@@ -93,7 +99,7 @@ PARKED = (
 """Shape, x and y [m] of the parked rows."""
 
 
-def street(rng: np.random.Generator, sweeps: int | None) -> Scene:
+def street(rng: np.random.Generator, sweeps: int | None) -> SimulatedScene:
     """Return a street with parked rows and traffic in both directions."""
     count = sweeps or STREET_SWEEPS
     actors = street_actors(rng, count)
@@ -113,7 +119,7 @@ def street_actors(rng: np.random.Generator, count: int) -> list[Actor]:
             y + rng.normal(0, 0.1),
             np.pi * (y > 0) + rng.normal(0, 0.03),
         )
-        plans.append(Plan('car' if shape == 'suv' else shape, shape, place, zero, zero))
+        plans.append(ActorPlan('car' if shape == 'suv' else shape, shape, place, zero, zero))
     return [_actor(str(i + 1), plan, count, rng) for i, plan in enumerate(plans)]
 
 
@@ -133,7 +139,7 @@ def highway(
     sweeps: int | None,
     at_sight: bool = False,
     speed: float = HIGHWAY_SPEED,
-) -> Scene:
+) -> SimulatedScene:
     """
     Return a highway: every vehicle moves by metres while the sensor turns.
 
@@ -155,7 +161,7 @@ def highway(
     for i, (class_name, shape, x, y, ratio) in enumerate(HIGHWAY):
         behind = TRAILER_DISTANCE * np.sign(ratio) if class_name == 'trailer' else 0.0
         place = (x - behind, y, np.pi * (ratio < 0))
-        plan = Plan(class_name, shape, place, constant(abs(ratio) * speed), zero)
+        plan = ActorPlan(class_name, shape, place, constant(abs(ratio) * speed), zero)
         actors.append(_actor(str(i + 1), plan, count, rng))
     ego = drive(count * SWEEP_PERIOD, (0, 0, 0), constant(speed), zero)
     ego.poses[:, 2] = SENSOR_HEIGHT
@@ -163,7 +169,7 @@ def highway(
     return _scan(actors, ego, replace(sensor, stamp_at=1.0), count, rng, at_sight)
 
 
-def _actor(track_id: str, plan: Plan, count: int, rng: np.random.Generator) -> Actor:
+def _actor(track_id: str, plan: ActorPlan, count: int, rng: np.random.Generator) -> Actor:
     """Return a road user with a random size, on its path for `count` sweeps."""
     extent = np.array(EXTENTS[plan.shape]) * rng.uniform(0.95, 1.05, 3)
     is_vehicle = plan.class_name in ('car', 'van', 'truck', 'trailer')
@@ -173,7 +179,9 @@ def _actor(track_id: str, plan: Plan, count: int, rng: np.random.Generator) -> A
     return Actor(track_id, plan.class_name, plan.shape, extent, motion)
 
 
-def drive(duration: float, start: Place, speed: Rate, yaw_rate: Rate, axle: float = 0.0) -> Motion:
+def drive(
+    duration: float, start: StartPose, speed: Rate, yaw_rate: Rate, axle: float = 0.0
+) -> Motion:
     """
     Return the motion of a body on a plane whose rear axle does not slip sideways.
 
@@ -207,7 +215,7 @@ def _scan(
     count: int,
     rng: np.random.Generator,
     at_sight: bool = False,
-) -> Scene:
+) -> SimulatedScene:
     """Return the scene of `count` revolutions of a sensor on `ego`; `at_sight` as of `highway`."""
     parts = [body(actor.shape, actor.extent) for actor in actors]
     stamps = np.arange(count) * SWEEP_PERIOD
@@ -232,7 +240,7 @@ def _scan(
     )
 
 
-def paper(rng: np.random.Generator, sweeps: int | None, is_flat: bool) -> Scene:
+def paper(rng: np.random.Generator, sweeps: int | None, is_flat: bool) -> SimulatedScene:
     """
     Return the paper's experiment: an SUV, scanned from its side, on the path of Eq. 10.
 
@@ -297,7 +305,7 @@ def _occluded(points: Floats, extent: Floats, rng: np.random.Generator) -> NDArr
     return occluded
 
 
-SCENARIOS: dict[str, Callable[[np.random.Generator, int | None], Scene]] = {
+SCENARIOS: dict[str, Callable[[np.random.Generator, int | None], SimulatedScene]] = {
     'street': street,
     'highway': lambda rng, sweeps: highway(rng, sweeps),
     'highway-sight': lambda rng, sweeps: highway(rng, sweeps, at_sight=True),

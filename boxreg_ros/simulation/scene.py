@@ -23,7 +23,7 @@ MIN_RETURNS = 5  # an object with fewer is not detected
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class SimulatedScene:
     """
     A simulated scene.
 
@@ -99,7 +99,7 @@ def make_scene(
     noise: Noise,
     miss_probability: float,
     rng: np.random.Generator,
-) -> Scene:
+) -> SimulatedScene:
     """
     Return a scene with its truth and its detections.
 
@@ -110,9 +110,9 @@ def make_scene(
     true_boxes : array, shape (a, n, 9)
         Per actor and sweep, in the fixed frame.
     sweeps, owners : sequences of n
-        As in `Scene`.
+        As in `SimulatedScene`.
     T_fixed_sensor : array, shape (n, 4, 4)
-        As in `Scene`.
+        As in `SimulatedScene`.
     noise : callable
         Makes the noisy boxes of one track.
     miss_probability : float
@@ -140,7 +140,7 @@ def make_scene(
     table = BoxTable.from_arrays(truth, 'truth')
     table = replace(table, num_points=returns.T[is_in_sight.T].astype(np.int64))
     table.boxes[:, YAW] = wrap_angle(table.boxes[:, YAW])
-    return Scene(
+    return SimulatedScene(
         tuple(sweeps), tuple(owners), tuple(detections), T_fixed_sensor, table, tuple(actors)
     )
 

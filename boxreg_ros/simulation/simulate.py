@@ -19,7 +19,7 @@ from boxreg_ros.simulation.breaks import break_tracks
 from boxreg_ros.simulation.raycast import ROAD
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.scenarios import SCENARIOS
-from boxreg_ros.simulation.scene import FIXED_FRAME, Scene, SENSOR_FRAME
+from boxreg_ros.simulation.scene import FIXED_FRAME, SENSOR_FRAME, SimulatedScene
 from boxreg_ros.simulation.truck import truck_scene, TRUCK_SENSORS, write_truck
 from boxreg_ros.structures import Ints
 import numpy as np
@@ -28,7 +28,7 @@ BREAK_STREAM = 1
 """Random stream of the breaks, so that they do not depend on the number of draws before."""
 
 
-def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None) -> Scene:
+def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None) -> SimulatedScene:
     """
     Return a scene that depends on its arguments only.
 
@@ -56,13 +56,13 @@ def simulate(scenario: str = 'street', seed: int = 0, sweeps: int | None = None)
     return SCENARIOS[scenario](np.random.default_rng(seed), sweeps)
 
 
-def broken(scene: Scene, seed: int, ghosts: float = 0.0) -> Scene:
+def broken(scene: SimulatedScene, seed: int, ghosts: float = 0.0) -> SimulatedScene:
     """
     Return a scene whose detections are broken on purpose; its truth stays.
 
     Parameters
     ----------
-    scene : Scene
+    scene : SimulatedScene
         The scene.
     seed : int
         Of the breaks.

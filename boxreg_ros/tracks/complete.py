@@ -102,7 +102,7 @@ class _Extension:
 
 
 @dataclass(slots=True)
-class Plan:
+class CompletionPlan:
     """
     The completed tracks of a recording.
 
@@ -154,7 +154,7 @@ class Plan:
             )
         return finished
 
-    def append(self, other: Plan) -> None:
+    def append(self, other: CompletionPlan) -> None:
         """Append the plan of a later part of the recording."""
         offset = len(self.extensions)
         for array in other.arrays:
@@ -190,7 +190,7 @@ def complete(
     num_points: Sequence[Ints],
     fixed_frame: str,
     config: Config,
-) -> Plan:
+) -> CompletionPlan:
     """
     Plan the completed tracks of a recording.
 
@@ -209,13 +209,13 @@ def complete(
 
     Returns
     -------
-    plan : Plan
+    plan : CompletionPlan
         What to register in the second pass.
 
     """
     steps = config.complete
     tracks = tracklets_of(results, num_points, fixed_frame, config)
-    plan = Plan([PlannedArray([*a.track_ids], [*a.class_names]) for a in given], [])
+    plan = CompletionPlan([PlannedArray([*a.track_ids], [*a.class_names]) for a in given], [])
     if steps.prune:  # first: a duplicate could be stitched to its object
         tracks = _rejected(tracks, duplicates(tracks, config), 'duplicate', plan)
     ambiguous: list[tuple[str, str]] = []
@@ -239,7 +239,9 @@ def complete(
     return plan
 
 
-def _rejected(tracks: list[Tracklet], names: set[str], reason: str, plan: Plan) -> list[Tracklet]:
+def _rejected(
+    tracks: list[Tracklet], names: set[str], reason: str, plan: CompletionPlan
+) -> list[Tracklet]:
     """Reject the boxes of some tracks in the plan; return the other tracks."""
     for track in tracks:
         if track.track_id in names:
@@ -247,7 +249,7 @@ def _rejected(tracks: list[Tracklet], names: set[str], reason: str, plan: Plan) 
     return [track for track in tracks if track.track_id not in names]
 
 
-def _place(track: Tracklet, reason: str, plan: Plan) -> None:
+def _place(track: Tracklet, reason: str, plan: CompletionPlan) -> None:
     """Write id and class of a track to its input boxes; reject them where there is a reason."""
     steps = TrackSteps(track.track_id, track.class_name, track.fragments)
     for index, row in track.places:
@@ -273,7 +275,11 @@ def _array_of_stamp(given: Sequence[BoxArray], fixed_frame: str) -> dict[int, in
 
 
 def _add(
-    boxes: AddedBoxes, track: Tracklet, plan: Plan, array_of: dict[int, int], extension: int = -1
+    boxes: AddedBoxes,
+    track: Tracklet,
+    plan: CompletionPlan,
+    array_of: dict[int, int],
+    extension: int = -1,
 ) -> None:
     """Add boxes of a track to the arrays of their stamps."""
     for i, stamp_ns in enumerate(boxes.stamps_ns.tolist()):
@@ -293,7 +299,7 @@ def _add(
 def _extend(
     tracks: Sequence[Tracklet],
     stamps_ns: Ints,
-    plan: Plan,
+    plan: CompletionPlan,
     array_of: dict[int, int],
     config: Config,
 ) -> None:
@@ -315,7 +321,7 @@ def _extend(
             _add(free, track, plan, array_of, len(plan.extensions) - 1)
 
 
-def _note_ambiguous(plan: Plan, ambiguous: Sequence[tuple[str, str]]) -> None:
+def _note_ambiguous(plan: CompletionPlan, ambiguous: Sequence[tuple[str, str]]) -> None:
     """List pairs that were left alone at both of their tracks."""
     others: dict[str, list[str]] = {}
     for first, second in ambiguous:

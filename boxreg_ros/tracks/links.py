@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from boxreg_ros.structures import Floats
-from boxreg_ros.tracks.tracklet import joined, Tracklet
+from boxreg_ros.tracks.tracklet import joined_tracklets, Tracklet
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
@@ -76,5 +76,5 @@ def join_links(tracklets: list[Tracklet], pairs: list[tuple[int, int]]) -> list[
         while chain[-1] in successor:
             chain.append(successor[chain[-1]])
         parts = [tracklets[part] for part in chain]
-        whole.append(joined(parts) if len(parts) > 1 else parts[0])
+        whole.append(joined_tracklets(parts) if len(parts) > 1 else parts[0])
     return whole

@@ -90,7 +90,7 @@ class Tracklet:
         return config.class_config(self.class_name)
 
 
-def joined(tracklets: Sequence[Tracklet]) -> Tracklet:
+def joined_tracklets(tracklets: Sequence[Tracklet]) -> Tracklet:
     """Return tracklets of one object as one, under the id of the longest."""
     longest = max(tracklets, key=lambda tracklet: len(tracklet.stamps_ns))
     stamps_ns = np.concatenate([tracklet.stamps_ns for tracklet in tracklets])

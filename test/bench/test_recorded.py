@@ -3,7 +3,7 @@
 from boxreg_ros.bench.recorded import RecordedLabels
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
-from boxreg_ros.io.label_feed import Cloud, FinalBoxes, RecorderSettings
+from boxreg_ros.io.label_feed import FinalBoxes, LabelCloud, RecorderSettings
 from boxreg_ros.recorder.main import Recorder
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 import numpy as np
@@ -21,7 +21,7 @@ def record(folder, sweeps, points=POINTS):
     for k in sweeps:
         stamp_ns = k * PERIOD_NS
         cloud = np.ones((points, 3), np.float32)
-        recorder.take(Cloud(Sweep(stamp_ns, 'lidar', cloud), np.eye(4), None, stamp_ns))
+        recorder.take(LabelCloud(Sweep(stamp_ns, 'lidar', cloud), np.eye(4), None, stamp_ns))
         box = np.array([[1.0, 2, 3, 4, 2, 1.5, 0, 0, 0]])
         boxes = BoxArray(stamp_ns, 'odom', ('1',), ('car',), np.ones(1), box)
         refined = RefinedBoxes(boxes, ('refined',), ('',), np.ones(1, int), np.eye(6)[None])

@@ -35,10 +35,10 @@ from boxreg_ros.core.population import Population
 from boxreg_ros.core.registration import register
 from boxreg_ros.core.rounds import (
     MOTION_TERMS,
-    Plan,
     Round,
     run_round_compiled,
     run_round_torch,
+    SolverPlan,
 )
 from boxreg_ros.core.weights import robustify_motion, weigh, weight_numbers
 from boxreg_ros.structures import Sweep
@@ -242,10 +242,10 @@ def test_weights_equal_those_of_torch(kind, robust):
 
 
 PLANS = {
-    'warm': (Plan(1, np.inf, starts_from_fit=True, marginalises=True), 0),
-    'cold': (Plan(3, np.inf, marginalises=True), 0),
-    'cold, second round': (Plan(3, np.inf, marginalises=True), 1),
-    'whole track': (Plan(3, np.inf, uses_rigid_shape=True), 1),
+    'warm': (SolverPlan(1, np.inf, starts_from_fit=True, marginalises=True), 0),
+    'cold': (SolverPlan(3, np.inf, marginalises=True), 0),
+    'cold, second round': (SolverPlan(3, np.inf, marginalises=True), 1),
+    'whole track': (SolverPlan(3, np.inf, uses_rigid_shape=True), 1),
 }
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import TransformUnavailable
-from boxreg_ros.io.session import is_placeholder, JumpConfirmation, register, Session
+from boxreg_ros.io.session import hand_to_registrar, is_placeholder, JumpConfirmation, Session
 from boxreg_ros.offline.reader import RecordingReader
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
@@ -186,11 +186,11 @@ def findings_of(path):
 def test_register_flushes_and_resets_at_a_time_jump():
     registrar = BoxRegistrar(Config(estimate='final'))
     sweep = Sweep(START, 'map', np.zeros((0, 3)))
-    assert register(registrar, sweep, restarts=False) == []
-    assert len(register(registrar, array_of(START), restarts=False)) == 1  # early
+    assert hand_to_registrar(registrar, sweep, restarts=False) == []
+    assert len(hand_to_registrar(registrar, array_of(START), restarts=False)) == 1  # early
     earlier = START - 60 * SECOND
-    ready = register(registrar, array_of(earlier), restarts=True)
+    ready = hand_to_registrar(registrar, array_of(earlier), restarts=True)
     assert [(r.boxes.stamp_ns, r.is_final) for r in ready] == [(START, True)]
-    ready = register(registrar, replace(sweep, stamp_ns=earlier), restarts=False)
+    ready = hand_to_registrar(registrar, replace(sweep, stamp_ns=earlier), restarts=False)
     assert [r.reasons for r in ready] != [('late',)]
-    assert register(registrar, None, restarts=True)[-1].boxes.stamp_ns == earlier
+    assert hand_to_registrar(registrar, None, restarts=True)[-1].boxes.stamp_ns == earlier

@@ -14,7 +14,7 @@ import sys
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.offline.journal import Journal, journal_path
+from boxreg_ros.offline.journal import EstimateJournal, journal_path
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import whole_folder
@@ -60,7 +60,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
     tmp_path, request_of_drive, uninterrupted, monkeypatch
 ):
     out = tmp_path / 'out'
-    append = Journal._append
+    append = EstimateJournal._append
     solved = []
 
     def append_until(limit):
@@ -74,7 +74,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
 
     for limit in (3, 2, 1):  # the first record has the fingerprint
         solved.clear()
-        monkeypatch.setattr(Journal, '_append', append_until(limit))
+        monkeypatch.setattr(EstimateJournal, '_append', append_until(limit))
         with pytest.raises(Interruption):
             relabel(request_of_drive, out, resume=True)
         assert [path.name for path in tmp_path.iterdir()] == ['.out.journal']
@@ -83,7 +83,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
     journal.write_bytes(journal.read_bytes()[:-1])
     (tmp_path / '.out.0123.partial').mkdir()
     solved.clear()
-    monkeypatch.setattr(Journal, '_append', append_until(0))
+    monkeypatch.setattr(EstimateJournal, '_append', append_until(0))
     relabel(request_of_drive, out, resume=True)
     assert content_of(out) == uninterrupted
     assert solved
@@ -135,7 +135,7 @@ def test_other_estimates_and_both_passes_are_resumed(tmp_path, options, monkeypa
         with pytest.raises(Interruption):
             relabel(request, out, resume=True)
     appended = []
-    monkeypatch.setattr(Journal, '_append', lambda _, content: appended.append(content))
+    monkeypatch.setattr(EstimateJournal, '_append', lambda _, content: appended.append(content))
     relabel(request, out, resume=True)
     assert content_of(out) == content_of(tmp_path / 'whole')
     assert not appended
@@ -144,17 +144,17 @@ def test_other_estimates_and_both_passes_are_resumed(tmp_path, options, monkeypa
 def test_journals_of_others_are_not_used(tmp_path):
     path = tmp_path / '.out.journal'
     code = (
-        'import pathlib, sys; from boxreg_ros.offline.journal import Journal; '
-        'Journal(pathlib.Path(sys.argv[1]), "one").__enter__()'
+        'import pathlib, sys; from boxreg_ros.offline.journal import EstimateJournal; '
+        'EstimateJournal(pathlib.Path(sys.argv[1]), "one").__enter__()'
     )
-    with Journal(path, 'one'):
+    with EstimateJournal(path, 'one'):
         ran = subprocess.run([sys.executable, '-c', code, path], capture_output=True, text=True)
         assert 'expected no other run with the same output' in ran.stderr
-    with Journal(path, 'one') as journal, pytest.raises(Interruption):
+    with EstimateJournal(path, 'one') as journal, pytest.raises(Interruption):
         raise Interruption
-    with Journal(path, 'two') as journal:  # another request
+    with EstimateJournal(path, 'two') as journal:  # another request
         assert journal._recalled(0) is None
-    with Journal(path, 'one') as journal:
+    with EstimateJournal(path, 'one') as journal:
         journal._earlier = iter([pickle.dumps((0, [], {'x': print}))])
         with pytest.raises(RecordingError, match=r'got builtins\.print'):
             journal.journaled(None)([], None, None)

@@ -15,17 +15,17 @@ from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.label_feed import (
-    Cloud,
     FinalBoxes,
+    LabelCloud,
     PROGRAM,
     RecorderSettings,
+    RecorderStatus,
     Split,
-    Status,
 )
 from boxreg_ros.labels import frames_of, LabelFrame
 from boxreg_ros.labels.segments import read_index
 from boxreg_ros.recorder.folder import locked
-from boxreg_ros.recorder.journal import from_bytes, Journal, read_journal, to_bytes
+from boxreg_ros.recorder.journal import FrameJournal, from_bytes, read_journal, to_bytes
 from boxreg_ros.recorder.main import Recorder, segment_limit, serve
 from boxreg_ros.recorder.segment import journal_settings, Segment
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
@@ -61,7 +61,7 @@ def final_boxes(k, tracks=2):
 
 def cloud(k, points=50):
     sweep = Sweep(START + k * SECOND // 10, 'lidar', np.full((points, 3), k, np.float32))
-    return Cloud(sweep, T_FIXED_SENSOR, np.arange(points, dtype=float), sweep.stamp_ns)
+    return LabelCloud(sweep, T_FIXED_SENSOR, np.arange(points, dtype=float), sweep.stamp_ns)
 
 
 def record(settings, items):
@@ -88,7 +88,7 @@ def start_recorder(settings, **options):
 
 
 def last_status(output):
-    return Status(**json.loads(output.decode().splitlines()[-1]))
+    return RecorderStatus(**json.loads(output.decode().splitlines()[-1]))
 
 
 def test_a_frame_in_the_journal_is_what_was_written(tmp_path):
@@ -111,7 +111,7 @@ def test_a_frame_in_the_journal_is_what_was_written(tmp_path):
 @pytest.mark.parametrize('tail', [b'', b'\0' * 4096], ids=['cut off', 'zeros'])
 def test_every_complete_frame_of_a_journal_is_read(tmp_path, tail):
     path = tmp_path / 'journal.mcap'
-    journal = Journal(path, {'formats': 'csv'})
+    journal = FrameJournal(path, {'formats': 'csv'})
     ends = []
     for k in range(4):
         journal.add(LabelFrame(final_boxes(k).refined, 'odom', 'lidar'))

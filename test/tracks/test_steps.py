@@ -9,7 +9,7 @@ from boxreg_ros.tracks.motion import between, is_parked
 from boxreg_ros.tracks.prune import duplicates, ghosts
 from boxreg_ros.tracks.static import join_static
 from boxreg_ros.tracks.stitch import stitch
-from boxreg_ros.tracks.tracklet import joined, unused_id
+from boxreg_ros.tracks.tracklet import joined_tracklets, unused_id
 from drives import path, STEP_NS, tracklet
 import numpy as np
 import pytest
@@ -241,7 +241,7 @@ def test_joined_tracks_have_the_majority_class_and_the_longest_id():
         tracklet('b', boxes[5:12], 5),
         tracklet('c', boxes[13:19], 13, class_name='van'),
     ]
-    whole = joined(parts)
+    whole = joined_tracklets(parts)
     assert (whole.track_id, whole.class_name, whole.fragments) == ('b', 'van', 3)
     assert (np.diff(whole.stamps_ns) > 0).all()
     taken = {'7', '7_2'}

@@ -14,7 +14,7 @@ from boxreg_ros.core.expectation import expect, Known
 from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.geometry import FACE_AXIS
 from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.core.rounds import Plan, Round, run_round
+from boxreg_ros.core.rounds import Round, run_round, SolverPlan
 from boxreg_ros.core.solver import start
 from boxreg_ros.core.window import stack_windows
 import numpy as np
@@ -70,7 +70,7 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
     known = Known(InputModel(config.faces).offsets())
     state = State(problem.pose, expect(problem, known).shared)
     free = free_variables(problem, config)
-    plan = Plan.choose(config, is_warm=True)
+    plan = SolverPlan.choose(config, is_warm=True)
     solution = start(problem, free, known.offsets, plan)
     batch = Round(problem, solution, known, free)
     rows = torch.arange(count, device=free.device)

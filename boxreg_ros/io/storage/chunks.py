@@ -24,7 +24,7 @@ from boxreg_ros.io.storage.record import (
     shown,
     span_ns,
 )
-from boxreg_ros.io.storage.urls import ByteSource, source_of
+from boxreg_ros.io.storage.urls import byte_source_of, ByteSource
 from rosbags.interfaces import Connection
 
 BUFFER_BYTES = 256 * 2**20
@@ -98,7 +98,7 @@ class ChunkedFile(ABC):
     def __init__(self, path: Path, origin: Path | None = None) -> None:
         self.name = shown(path, origin)
         self._path = path
-        self._file = source_of(path)
+        self._file = byte_source_of(path)
         self.size = self._file.size
         self.connections: list[Connection] = []
         self.damages: list[Damage] = []

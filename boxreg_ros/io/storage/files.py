@@ -195,7 +195,7 @@ class Files:
             wanted = [c for c in file.connections if (id(c.owner), c.id) in shared]
             if wanted:
                 streams.append((file.start_time, file.messages(wanted, start, stop)))
-        for record in merged(streams):
+        for record in merged_streams(streams):
             connection = record.connection
             yield record._replace(connection=shared[id(connection.owner), connection.id])
 
@@ -217,7 +217,7 @@ class Files:
         }
 
 
-def merged(streams: Sequence[tuple[int, Iterator[Record]]]) -> Iterator[Record]:
+def merged_streams(streams: Sequence[tuple[int, Iterator[Record]]]) -> Iterator[Record]:
     """Merge streams by receive time; a stream is begun when its start time [ns] is reached."""
     ahead: list[tuple[int, int, Record | None]] = [
         (start_ns, i, None) for i, (start_ns, _) in enumerate(streams)

@@ -10,7 +10,7 @@ from typing import Any
 from boxreg_ros.errors import BoxregError, RecordingError, UnsupportedMessage
 from boxreg_ros.io.foxglove import decoder_of, FOXGLOVE_ENCODINGS, ros_type
 from boxreg_ros.io.storage.chunks import MAX_CHUNK_BYTES
-from boxreg_ros.io.storage.files import Files, merged, Part
+from boxreg_ros.io.storage.files import Files, merged_streams, Part
 from boxreg_ros.io.storage.record import Bytes, Damage, one_line, Record
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 from rosbags.serde import SerdeError
@@ -111,7 +111,7 @@ class Reader:
                     (file.start_time, _renamed(file.messages(own, start, stop), wanted))
                 )
         with readable(self._origin):  # no code of ours runs in the streams
-            yield from merged(streams)
+            yield from merged_streams(streams)
 
     def deserialize(self, data: Bytes, msgtype: str) -> Any:
         """

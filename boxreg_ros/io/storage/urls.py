@@ -148,7 +148,7 @@ def url_of(path: Path) -> str | None:
     return f'{match[1]}://{match[2]}' if match else None
 
 
-def source_of(path: Path) -> LocalFile | RemoteFile:
+def byte_source_of(path: Path) -> LocalFile | RemoteFile:
     """Return an open file."""
     return LocalFile(path) if url_of(path) is None else RemoteFile(path)
 
