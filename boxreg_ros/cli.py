@@ -148,25 +148,25 @@ def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
     def end(number: int, _: Any) -> None:
         if _is_importing_torch():
             os._exit(_fail(_ended_by(number), SIGNALLED + number))
-        for one in ours:  # a second signal must not interrupt the clean-up
+        for one in handled:  # a second signal must not interrupt the clean-up
             signal.signal(one, signal.SIG_IGN)
         raise _EndedBySignal(number)
 
     before = {one: signal.getsignal(one) for one in ENDING_SIGNALS}
     # A signal that is ignored stays so: nohup ignores SIGHUP.
-    ours = [one for one, handler in before.items() if handler == signal.SIG_DFL]
+    handled = [one for one, handler in before.items() if handler == signal.SIG_DFL]
     handles_interrupts = signal.getsignal(signal.SIGINT) == signal.default_int_handler
     if arguments[:1] == ['node'] or current_thread() is not main_thread():
-        ours = []  # the node handles signals itself; only the main thread may set handlers
+        handled = []  # the node handles signals itself; only the main thread may set handlers
         handles_interrupts = False
     try:
-        for one in ours:
+        for one in handled:
             signal.signal(one, end)
         if handles_interrupts:
             signal.signal(signal.SIGINT, interrupt)
         yield
     finally:
-        for one in ours:
+        for one in handled:
             signal.signal(one, before[one])
         if handles_interrupts:
             signal.signal(signal.SIGINT, signal.default_int_handler)

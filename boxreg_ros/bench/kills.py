@@ -1,8 +1,8 @@
 """
-`boxreg bench kills`: what a recording of labels loses when a process is killed.
+`boxreg bench kills`: boxes that a recording of labels loses when a process is killed.
 
 The node records labels and clouds from the publisher of `boxreg bench node`. After a random time
-the recorder, or the node itself, gets SIGKILL; `boxreg recover` then completes what was cut off.
+the recorder, or the node itself, gets SIGKILL; `boxreg recover` then completes the segment.
 Boxes are lost if they were published before that and are in no segment.
 
 """
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _killed(args: argparse.Namespace, victim: str, seconds: float) -> LostArrays:
-    """Kill a process some time after the first final boxes; return what is lost."""
+    """Kill a process some time after the first final boxes; return the boxes lost."""
     scope = argparse.Namespace(
         tracks=args.tracks, points=args.points, rate=RATE, delay=0.05,
         seconds=STARTING_TIME + RUNNING_TIMES[1],
@@ -126,7 +126,7 @@ def _wait_for_finals(arrivals: dict[str, Any], log: Path) -> None:
 
 
 def _recover(labels: RecordedLabels, folder: Path) -> None:
-    """Recover what was cut off, as soon as no recorder uses the folder; count what there is."""
+    """Recover cut-off segments, as soon as no recorder uses the folder; count the labels."""
     end = time.monotonic() + COMPLETION_TIME
     while labels.has_open_segment:
         done = subprocess.run([*BOXREG, 'recover', folder], capture_output=True, text=True)

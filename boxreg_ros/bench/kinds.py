@@ -1,5 +1,5 @@
 """
-`boxreg bench kinds`: what each class of objects gains, with standard errors over its tracks.
+`boxreg bench kinds`: gain of each class of objects, with standard errors over its tracks.
 
 On recordings with known truth, or on simulated streets, whose tracks are pooled: a recording has
 few pedestrians and cyclists, and the boxes of each share its errors.

@@ -17,7 +17,7 @@ class SubCommand(NamedTuple):
 MEASUREMENTS = {
     'paper': SubCommand('paper', "the paper's experiment: its Table I and two figures"),
     'real': SubCommand('accuracy', 'accuracy on recordings with known truth'),
-    'kinds': SubCommand('kinds', 'what each class of objects gains, with standard errors'),
+    'kinds': SubCommand('kinds', 'gain of each class of objects, with standard errors'),
     'tracks': SubCommand('tracks', 'broken tracks before and after each completing step'),
     'ablation': SubCommand('ablation', 'accuracy without each ingredient of the method'),
     'sensitivity': SubCommand('sensitivity', 'accuracy with each setting halved and doubled'),
@@ -30,7 +30,7 @@ MEASUREMENTS = {
     'scale': SubCommand('scale', 'core hours and memory per hour, and a simulated fleet'),
     'load': SubCommand('load', 'latency and accuracy of the live node by number of tracks'),
     'node': SubCommand('node', 'latency and memory of the live node, over DDS'),
-    'kills': SubCommand('kills', 'what recorded labels lose when a process is killed'),
+    'kills': SubCommand('kills', 'loss of recorded labels when a process is killed'),
 }
 
 

@@ -194,10 +194,7 @@ def publish(args: argparse.Namespace) -> None:
             struct.pack_into('<iI', cloud, CDR_HEADER, *stamp)
             to_points.publish(bytes(cloud))
             array = arrays[turn % len(arrays)]
-            for i, marker in enumerate(array.markers):
-                renewals = (turn + i * TRACK_LIFETIME // args.tracks) // TRACK_LIFETIME
-                marker.id = i + args.tracks * renewals
-                marker.header.stamp.sec, marker.header.stamp.nanosec = stamp
+            _set_ids_and_stamp(array, turn, stamp)
             message = serialize_message(array)  # 12 ms for 1,024 boxes, which a tracker spends
             _sleep_until(stamp_ns + round(args.delay * 1e9))
             moment_ns = time.monotonic_ns()
@@ -206,6 +203,15 @@ def publish(args: argparse.Namespace) -> None:
     time.sleep(1.0)  # the last messages are still under way
     node.destroy_node()
     rclpy.shutdown()
+
+
+def _set_ids_and_stamp(array: Any, turn: int, stamp: tuple[int, int]) -> None:
+    """Set the stamp of all markers of a sweep, and their ids, each new after `TRACK_LIFETIME`."""
+    tracks = len(array.markers)
+    for i, marker in enumerate(array.markers):
+        renewals = (turn + i * TRACK_LIFETIME // tracks) // TRACK_LIFETIME
+        marker.id = i + tracks * renewals
+        marker.header.stamp.sec, marker.header.stamp.nanosec = stamp
 
 
 def _sleep_until(moment_ns: int) -> None:
@@ -306,11 +312,7 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
             raise BoxregError(f'the publisher failed: {(folder / "sent.log").read_text()}')
         samples = samples or [vitals(node.pid)]
         sent = np.loadtxt(folder / 'sent', dtype=np.int64, ndmin=2)
-        begin = time.monotonic()
-        node.send_signal(signal.SIGINT)
-        node.wait(timeout=30.0)
-        shutdown_time = time.monotonic() - begin
-        time.sleep(0.5)
+        shutdown_time = _ended(node)
         log = (folder / 'node.log').read_text()
         recorded = recording(labels, args.record, sent) if args.record else {}
         if recorder_samples:
@@ -326,6 +328,16 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
         'counters': arrivals['counters'],
         **({'messages': _by_sweep(sent, arrivals, args.rate)} if keeps_messages else {}),
     }
+
+
+def _ended(node: subprocess.Popen[bytes]) -> float:
+    """End a node and wait for its last messages; return the time that it took to end [s]."""
+    begin = time.monotonic()
+    node.send_signal(signal.SIGINT)
+    node.wait(timeout=30.0)
+    seconds = time.monotonic() - begin
+    time.sleep(0.5)
+    return seconds
 
 
 def set_environment(transport: str) -> None:
@@ -345,7 +357,7 @@ def node_command(parameters: Sequence[str]) -> list[str]:
 
 
 def publisher_command(args: argparse.Namespace, log: Path) -> list[str]:
-    """Return the command of the publisher, which logs what it has sent."""
+    """Return the command of the publisher, which logs the box arrays sent."""
     names = ('tracks', 'points', 'rate', 'seconds', 'delay')
     options = [f'--{name}={getattr(args, name)}' for name in names]
     return [*BOXREG, 'bench', 'node', '--role=publish', f'--log={log}', *options]
@@ -412,12 +424,12 @@ def recording_parameters(formats: str | None, folder: Path) -> list[str]:
 
 def recording(labels: RecordedLabels, formats: str, sent: Any) -> dict[str, float]:
     """
-    Wait for the last segment; return what was recorded of the box arrays sent and their clouds.
+    Wait for the last segment; return the recorded parts of the box arrays sent and their clouds.
 
     Parameters
     ----------
     labels : RecordedLabels
-        What was recorded so far.
+        The segments recorded so far.
     formats : str
         As given to the recorder.
     sent : array, shape (n, 2)

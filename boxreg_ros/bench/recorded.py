@@ -16,7 +16,7 @@ XYZ_BYTES = 12
 
 class RecordedLabels:
     """
-    Count what is in each segment once it is whole; delete the oldest segments beyond a size.
+    Count the labels of each whole segment; delete the oldest segments beyond a size.
 
     A robot uploads its segments and deletes them: a long run needs no larger disk than a short
     one.

@@ -31,7 +31,7 @@ BROWSER_OPTIONS = ('--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-s
 """Root needs ``--no-sandbox``; the others draw WebGL without a GPU."""
 COMPOSITORS = {'processor': ('--disable-gpu-compositing',), 'emulated GPU': ()}
 """
-What puts the parts of the page together, and the options for it.
+Compositor that puts the parts of the page together, and the options for it.
 
 Chromium leaves that to the processor where it finds no GPU. The emulated GPU is SwiftShader, which
 the options for WebGL make it use for all of the page.

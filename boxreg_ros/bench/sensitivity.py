@@ -1,10 +1,10 @@
 """
-`boxreg bench sensitivity`: what accuracy loses when a setting or a constant is halved or doubled.
+`boxreg bench sensitivity`: loss of accuracy when a setting or a constant is halved or doubled.
 
-Settings are the numbers of `Config`. Constants are the numbers that stand in the source of the
-core as ``NAME = number`` or ``NAME = number, number`` at module level. Both are discovered, so a
-new one is measured without an entry here. To change a constant the packages are imported again
-from a source in which this one number is replaced; everything derived from it follows.
+Settings are the numbers of `Config`. Constants are the numbers that the modules of the core assign
+as ``NAME = number`` or ``NAME = number, number``. Both are discovered, so a new one is measured
+without an entry here. To change a constant the packages are imported again from a source in which
+this one number is replaced; everything derived from it follows.
 
 A number without effect on any data set should be removed, one that must be exact should be
 estimated from the data.
@@ -56,7 +56,7 @@ PAPER = 'paper'
 """The objective of the paper, and the group of settings that it alone reads."""
 
 SourcePlace = tuple[str, int, int]
-"""Where a number stands in a source: module, line and column."""
+"""Place of a number in a source: module, line and column."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Variation:
     default, value : int or float
         The number as it is and as it is for this run, within its bounds.
     place : SourcePlace, optional
-        Where a constant stands; None for settings.
+        Place of a constant; None for settings.
 
     """
 
@@ -87,7 +87,7 @@ class Variation:
 @dataclass(frozen=True, slots=True)
 class Measurement:
     """
-    What is measured.
+    Settings and scope of a measurement.
 
     Attributes
     ----------
@@ -201,7 +201,7 @@ def variations_of_constants(package: str = CORE) -> list[Variation]:
     Return every numeric constant of a package halved and doubled.
 
     A constant is a number, or one number of a tuple, that a module assigns to an upper-case name.
-    What is computed from others follows them and is not varied itself. A whole number that stands
+    A constant that is computed from others follows them and is not varied itself. A whole number
     inside an index expression, or from which another constant is computed, describes the layout
     of arrays and is left out.
 
@@ -516,7 +516,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """
-    Print what mean IoU loses by each variation.
+    Print the loss of mean IoU by each variation.
 
     Raises
     ------

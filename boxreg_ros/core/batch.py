@@ -89,7 +89,7 @@ class Returns:
 
     def padded(self, first: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """
-        Return points (B, N, M, 3), which are valid (B, N, M), and delays (B, N, M).
+        Return points (B, N, M, 3), their validity mask (B, N, M), and delays (B, N, M).
 
         `first` and `counts` (B, N) as in `Problem`. Padding comes last, at `PADDING_POSITION`.
 
@@ -167,17 +167,17 @@ class Problem(NamedTuple):
         return self.boxes.shape[1]
 
     def padded(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return points (B, N, M, 3), which are valid (B, N, M), and delays, see `Returns`."""
+        """Return points (B, N, M, 3), their validity mask (B, N, M), and delays, see `Returns`."""
         return self.returns.padded(self.first, self.counts)
 
     @property
     def points(self) -> Tensor:
-        """Return the returns minus the centre of their input box, padded, (B, N, M, 3) [m]."""
+        """Padded points minus the centre of their input box, shape (B, N, M, 3) [m]."""
         return self.padded()[0]
 
     @property
     def mask(self) -> Tensor:
-        """Which of the padded `points` are returns, shape (B, N, M)."""
+        """Validity of the padded `points`, shape (B, N, M)."""
         return self.padded()[1]
 
     def of_class(self, *names: str) -> Tensor:
@@ -367,7 +367,7 @@ class Solution(NamedTuple):
     posterior : Posterior
         Covariances of poses and extents, and residuals of the faces.
     prior : MarginalPrior or None
-        What full sliding windows leave to the next one; NaN for windows that leave nothing.
+        Marginalisation prior that full sliding windows leave to the next ones; NaN for others.
     marginalised_extents : Tensor or None, shape (B, 4)
         `Problem.marginalised_extents` of the next window.
     extent_evidence : Tensor, shape (B, 3, 3)

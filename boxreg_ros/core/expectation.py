@@ -110,9 +110,9 @@ class Expectation(NamedTuple):
     error: Tensor
 
 
-class Known(NamedTuple):
+class InputEstimates(NamedTuple):
     """
-    What is known of the input of a stream, see `InputModel`.
+    Estimated errors of the input of a stream, as `InputModel` has them.
 
     Attributes
     ----------
@@ -152,9 +152,9 @@ def _by_kind(part: Tensor) -> Floats:
     return values.astype(np.float64, copy=False)
 
 
-def expect(problem: Problem, known: Known) -> Expectation:
+def expect(problem: Problem, inputs: InputEstimates) -> Expectation:
     """
-    Return the expectation of a batch, given what is `known` of the input (M15).
+    Return the expectation of a batch by the estimated errors of its `inputs` (M15).
 
     Notes
     -----
@@ -168,61 +168,80 @@ def expect(problem: Problem, known: Known) -> Expectation:
     larger than cars, in proportion: of trams, and of machines with booms.
 
     """
-    valid = problem.valid
     usual = problem.of_class(*POSE_ERRORS)
-    usual_extent = problem.of_class('extent')
-    noise = known.noise.of(problem)
+    noise = inputs.noise.of(problem)
+    ratio = _deviation_ratio(noise)
+    correlation = _correlation(noise)
+    slow = _slow_part(problem, correlation)
+    constant = _constant_part(noise, ratio)
 
-    # Deviations: the expected ones, and by the weight of the noise the estimated ones.
-    ratio = noise.deviation[:, :6]
-    low_noise = (ratio / LOW_NOISE_RATIO).square().clamp(max=1.0)
-    ratio = (ratio * low_noise).clamp(*RATIO_BOUNDS)
-    ratio = (1 + noise.weight * (ratio**2 - 1)).sqrt()
+    # Poses: deviation, widened for its correlation, and bias.
     deviation = usual * ratio
-    correlation = noise.correlation - TYPICAL_CORRELATION
-    correlation = TYPICAL_CORRELATION + noise.weight * correlation
     widening = ((1 + correlation) / (1 - correlation)).sqrt()
-
-    # Bias: by the correlation over a fixed time, and by how large constant errors can be.
-    duration = (problem.times * valid).amax(1)
-    interval = (duration / (valid.sum(1) - 1).clamp(1))[:, None]
-    slow = correlation ** (CORRELATION_INTERVAL / interval) - WHITE_CORRELATION
-    slow = (slow / CORRELATION_SPAN).clamp(0.1, 1.0)
-    filtered = noise.offset[:, [0, 1, 6]].mean(1, keepdim=True)
-    filtered = (filtered / FILTERED_OFFSET).square()
-    filtered = noise.weight * filtered.clamp(max=MAX_FILTERED_BIAS)
-    constant = torch.cat([ratio[:, :3].maximum(filtered), ratio[:, 3:]], 1).clamp(0.1, 2.0)
+    widened = deviation * widening[:, :6]
     bias = usual * usual.new_tensor([1, 1, 1, 1, 1, YAW_BIAS]) * slow[:, :6] * constant
 
     # Extents: the mean of the input, corrected by the population.
     mean = mean_input_extents(problem)
-    part = usual_extent * slow[:, 6:] * (2 * constant[:, :3]).clamp(max=1)
-    extent = mean * known.population.factors(problem, mean, part)
+    part = problem.of_class('extent') * slow[:, 6:] * (2 * constant[:, :3]).clamp(max=1)
+    extent = mean * inputs.population.factors(problem, mean, part)
 
-    one = torch.ones_like(usual)
+    # Labelling margins: their spread by the settings, and as estimated from gaps.
     size = (mean / mean.new_tensor(LARGE_EXTENT)).clamp(min=1)
     usual_spread = problem.of_class('gap_spread') * (2 - 2 * constant[:, :1]).clamp(1)
     spread = usual_spread * size[:, FACE_AXIS]
-    widened = deviation * widening[:, :6]
     constant_error = bias[:, :3] ** 2 + (mean / size * part / 2) ** 2
-    scatter = known.scatter.of(problem)
-    of_gaps = constant_error[:, FACE_AXIS] + scatter.noise * widened[:, FACE_AXIS] ** 2
-    similarity = known.population.similarity(problem, mean)
-    margins = margin_spread(scatter, of_gaps, usual_spread.expand_as(spread), similarity)
+    scatter = inputs.scatter.of(problem)
+    gap_error = constant_error[:, FACE_AXIS] + scatter.noise * widened[:, FACE_AXIS] ** 2
+    similarity = inputs.population.similarity(problem, mean)
+    margins = margin_spread(scatter, gap_error, usual_spread.expand_as(spread), similarity)
+
     # A pinned box has the true extents, and no bias: its pose is that of the object.
     has_pin = problem.pinned.any(1)[:, None]
     extent_deviation = torch.where(has_pin, PINNED_EXTENT, extent * part)
     unmodelled = torch.where(has_pin, bias, 0.0)
     bias = torch.where(has_pin, PINNED_EXTENT, bias)
-    shared = shared_without_population(problem, known.offsets)
+    shared = shared_without_population(problem, inputs.offsets)
     shared[:, EXTENT] = torch.where(has_pin, mean, extent)
-    sideslip = problem.of_class('sideslip')
     pivot = mean[:, :1] * PIVOT_DEVIATION
-    deviations = torch.cat([extent_deviation, bias, spread, pivot, one, sideslip], 1)
+    anchor = torch.ones_like(usual)
+    sideslip = problem.of_class('sideslip')
+    deviations = torch.cat([extent_deviation, bias, spread, pivot, anchor, sideslip], 1)
     input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
     input_error = _at_least_prior(problem, input_error, deviations)
     error = torch.cat([input_error, margins * size[:, FACE_AXIS]], 1)
     return Expectation(shared, deviations, deviation, widened, unmodelled, error)
+
+
+def _deviation_ratio(noise: InputNoise) -> Tensor:
+    """Return the deviation of the input poses over the usual one, by its weight, (B, 6)."""
+    ratio = noise.deviation[:, :6]
+    low_noise = (ratio / LOW_NOISE_RATIO).square().clamp(max=1.0)
+    ratio = (ratio * low_noise).clamp(*RATIO_BOUNDS)
+    return (1 + noise.weight * (ratio**2 - 1)).sqrt()
+
+
+def _correlation(noise: InputNoise) -> Tensor:
+    """Return the correlation of the errors of consecutive observations, by its weight, (B, 9)."""
+    correlation = noise.correlation - TYPICAL_CORRELATION
+    return TYPICAL_CORRELATION + noise.weight * correlation
+
+
+def _slow_part(problem: Problem, correlation: Tensor) -> Tensor:
+    """Return the part of the errors that lasts beyond `CORRELATION_INTERVAL`, 0.1 to 1, (B, 9)."""
+    valid = problem.valid
+    duration = (problem.times * valid).amax(1)
+    interval = (duration / (valid.sum(1) - 1).clamp(1))[:, None]
+    slow = correlation ** (CORRELATION_INTERVAL / interval) - WHITE_CORRELATION
+    return (slow / CORRELATION_SPAN).clamp(0.1, 1.0)
+
+
+def _constant_part(noise: InputNoise, ratio: Tensor) -> Tensor:
+    """Return the largest constant error over the usual error, 0.1 to 2, (B, 6)."""
+    filtered = noise.offset[:, [0, 1, 6]].mean(1, keepdim=True)
+    filtered = (filtered / FILTERED_OFFSET).square()
+    filtered = noise.weight * filtered.clamp(max=MAX_FILTERED_BIAS)
+    return torch.cat([ratio[:, :3].maximum(filtered), ratio[:, 3:]], 1).clamp(0.1, 2.0)
 
 
 def expectation_numbers() -> ExpectationNumbers:
@@ -285,7 +304,7 @@ def shared_without_population(problem: Problem, offsets: FaceOffsets) -> Tensor:
     """
     Return the means of the shared variables, (B, 23), see `State`, without a population.
 
-    Given the margins of the input.
+    The labelling margins follow from `offsets`.
 
     """
     extent = mean_input_extents(problem)

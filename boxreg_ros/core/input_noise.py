@@ -122,9 +122,10 @@ class InputNoise(NamedTuple):
 
 def _removed_by_means(correlation: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
     """
-    Return what is lost when the mean of `n` autoregressive errors is subtracted from each.
+    Return the loss of variance when the mean of `n` autoregressive errors is subtracted.
 
-    Of their variance, and of the mean product of neighbours; both over the variance of an error.
+    The second value is the loss of the mean product of neighbours; both are over the variance of
+    an error.
 
     """
     c = correlation

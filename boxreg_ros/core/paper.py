@@ -16,7 +16,7 @@ from boxreg_ros.core.batch import (
     Solution,
     State,
 )
-from boxreg_ros.core.expectation import expect, Known
+from boxreg_ros.core.expectation import expect, InputEstimates
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
 from boxreg_ros.core.lbfgs import HISTORY, minimize, select
@@ -166,7 +166,7 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
     """
     settings = config.paper
     length = problem.length
-    shared = expect(problem, Known(FaceOffsets(*torch.zeros(3, 6)))).shared
+    shared = expect(problem, InputEstimates(FaceOffsets(*torch.zeros(3, 6)))).shared
     extent = shared[:, None, EXTENT].expand(-1, length, -1)
     free = free_variables(problem, config)[:, : 6 * length]
     x = problem.pose.flatten(1)

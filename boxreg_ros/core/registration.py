@@ -91,9 +91,9 @@ def _update_offsets(
     model: InputModel, windows: Sequence[Window], problem: Problem, config: Config
 ) -> None:
     """
-    Update the labelling margins with new observations, their faces as in the input boxes.
+    Update the labelling margins with the faces of new observations at their input boxes.
 
-    At smoothed angles, see `smoothed_angles`. `problem` has the `windows`.
+    The angles of the boxes are smoothed, see `smoothed_angles`. `problem` has the `windows`.
 
     """
     columns = [window.margin_columns() for window in windows]
@@ -135,7 +135,7 @@ def _accepted(
     """
     Return the estimate of each window in the fixed frame, after the acceptance tests.
 
-    `base` (B, 3) is what the centres of `problem` are relative to [m].
+    `base` (B, 3) is the origin of the centres of `problem` [m].
 
     """
     extents_of_boxes = _extents(problem, solution.state, config)
@@ -170,9 +170,9 @@ def _failed_tests(problem: Problem, is_finite: NDArray[np.bool_], held: Ints) ->
     """
     Return the acceptance tests that each refined box fails (M27), shape (3, B, N).
 
-    In the order of `KEPT_REASONS`: its window has points; box and covariance are finite and the
-    extent is positive; it holds nearly as many points as its input box, which the objective does
-    not ask for: `held` (B, N).
+    The tests, in the order of `KEPT_REASONS`: the window has points; box and covariance are finite
+    and the extent is positive; the refined box holds nearly as many points, `held` (B, N), as the
+    input box, which the objective does not require.
 
     """
     before = problem.counts.cpu().numpy()  # at most: counting those of the input boxes takes time

@@ -1,7 +1,8 @@
 """
 One round of the solver: face observations, weights, and one minimisation.
 
-By a kernel, one call for all windows, or by its torch twin, which is the reference of the tests.
+A kernel takes the round, in one call for all windows, or its torch twin, the reference of the
+tests.
 
 """
 
@@ -29,7 +30,7 @@ from boxreg_ros.core.expectation import (
     expect,
     Expectation,
     expectation_numbers,
-    Known,
+    InputEstimates,
     MIN_EXTENT_GAIN,
 )
 from boxreg_ros.core.face_support import (
@@ -121,7 +122,7 @@ class SolverPlan:
 
 class Round(NamedTuple):
     """
-    What all windows of a batch share in one round.
+    Data that all windows of a batch share in one round.
 
     Attributes
     ----------
@@ -129,8 +130,8 @@ class Round(NamedTuple):
         The windows, with the points of this round.
     solution : Solution
         Where the round begins; the round writes its end.
-    known : Known
-        What is known of the input.
+    inputs : InputEstimates
+        Estimated errors of the input.
     free : Tensor, shape (B, D)
         1 for variables that are estimated.
 
@@ -138,7 +139,7 @@ class Round(NamedTuple):
 
     problem: Problem
     solution: Solution
-    known: Known
+    inputs: InputEstimates
     free: Tensor
 
     @property
@@ -165,7 +166,7 @@ def run_round_compiled(
     batch: Round, plan: SolverPlan, turn: int, config: Config, rows: Tensor
 ) -> Tensor:
     """Take a round by the kernel."""
-    problem, solution, known, free = batch
+    problem, solution, inputs, free = batch
     kernels = compiled(free)
     assert kernels is not None
     numbers = RoundNumbers(
@@ -183,7 +184,7 @@ def run_round_compiled(
     is_done = np.empty(len(rows), bool)
     run(
         kernels.rounds.run_windows, len(rows), rows.numpy(), problem.arrays(),
-        problem.thinned(SHAPE_POINTS).arrays(), known.arrays(), prior, contiguous(free),
+        problem.thinned(SHAPE_POINTS).arrays(), inputs.arrays(), prior, contiguous(free),
         problem.class_arrays(), numbers,
         _solution_arrays(solution, plan.marginalises and config.window == problem.length), is_done,
     )  # fmt: skip
@@ -229,11 +230,11 @@ def run_round_torch(
     problem, state, free, log_extent = select(
         (batch.problem, batch.state, batch.free, solution.extent_evidence[:, 0]), rows
     )
-    expected = expect(problem, batch.known)
+    expected = expect(problem, batch.inputs)
     shared = state.shared.clone()
     shared[:, ANCHOR] = 0.0
     state = State(state.pose, shared)
-    observations = observe_faces(problem, state, batch.known.offsets, config)
+    observations = observe_faces(problem, state, batch.inputs.offsets, config)
     weighted = _weighted_terms(problem, state, expected, observations, plan, turn, config)
     x = state.pack()
     objective = Objective(weighted, x, problem.length, free)

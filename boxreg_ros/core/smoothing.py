@@ -11,9 +11,9 @@ def smoothed_angles(problem: Problem) -> Tensor:
     """
     Return roll, pitch and yaw of the start of the search, smoothed over time, (B, N, 3) [rad].
 
-    By the motion model alone: the noise, estimated from second differences, against the angular
-    accelerations of the class. The outermost points of a box with a wrong yaw are its corners,
-    further outside than its faces: margins are estimated at these angles.
+    They are smoothed by the motion model alone: noise, estimated from second differences, against
+    the angular accelerations of the class. Labelling margins are estimated at these angles: the
+    outermost points of a box with a wrong yaw are its corners, further outside than its faces.
 
     """
     angles = problem.start[..., ROLL:]

@@ -20,7 +20,7 @@ from boxreg_ros.core.batch import (
     Solution,
     State,
 )
-from boxreg_ros.core.expectation import Known, shared_without_population
+from boxreg_ros.core.expectation import InputEstimates, shared_without_population
 from boxreg_ros.core.face_support import FaceOffsets
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import InputNoise, normalised_residuals, UNKNOWN_NOISE
@@ -74,14 +74,14 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
     learns_extents = config.ingredients.population_extents
     noise = model.noise() if learns_noise and not plan.estimates_noise else UNKNOWN_NOISE
     population = model.population() if learns_extents else UNKNOWN_POPULATION
-    known = Known(model.offsets(), noise, population, model.gap_scatter())
+    inputs = InputEstimates(model.offsets(), noise, population, model.gap_scatter())
     free = free_variables(problem, config)
-    solution = start(problem, free, known.offsets, plan)
+    solution = start(problem, free, inputs.offsets, plan)
     every = torch.arange(len(free), device=free.device)
     rows, turn, points = every, 0, plan.coarse_points
     with shared_between(config.solver.threads):
         while len(rows):
-            batch = Round(problem.thinned(points), solution, known, free)
+            batch = Round(problem.thinned(points), solution, inputs, free)
             work = partial(run_round, batch, plan, turn, config)
             is_done = mapped(work, _split(rows, problem.length))
             rows = rows[~torch.cat(is_done)]
@@ -89,10 +89,10 @@ def solve(problem: Problem, config: Config, model: InputModel, is_warm: bool) ->
             if plan.estimates_noise and learns_noise and turn <= NOISE_ROUNDS:
                 residuals = normalised_residuals(problem, solution.state)
                 noise = InputNoise.estimate_by_kind(residuals, problem.kind)
-                known = known._replace(noise=noise)
+                inputs = inputs._replace(noise=noise)
             if plan.estimates_noise and learns_extents:
                 joined = population.joined(solution.extent_evidence, problem.kind)
-                known = known._replace(population=joined)
+                inputs = inputs._replace(population=joined)
             if not len(rows) and 2 * points <= problem.returns.width:
                 rows, points = every, inf  # settled on few points: once more with all
     return solution

@@ -1,4 +1,4 @@
-"""What is kept of each of many tracks, as rows of one array."""
+"""A table with one row for each of a limited number of tracks."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ import numpy as np
 
 class TrackRows:
     """
-    One array per track, for a limited number of tracks.
+    Keep one array per track, for a limited number of tracks.
 
     A new track takes the place of the one that was seen longest ago, but not of one that is seen
     together with it: where there are too many tracks at once, the first ones stay.
@@ -41,7 +41,7 @@ class TrackRows:
 
     def seen(self, track_ids: Sequence[str]) -> tuple[Ints, Ints]:
         """
-        Note that some different tracks are seen, and make room for the new ones.
+        Mark different tracks as seen now, and make rows for the new ones.
 
         Returns
         -------

@@ -1,5 +1,5 @@
 """
-What registration gets of a track, and what it returns: numpy, without the solver.
+Input and output of registration: the window of one track, and its estimate, in numpy.
 
 A process that collects windows for another one to solve imports no torch, which takes a second
 and 150 MB.

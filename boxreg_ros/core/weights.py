@@ -29,7 +29,7 @@ MOTION_OUTLIER = 3.0
 GAP_OUTLIER = 2.0
 """Deviation at which the prior of a labelling margin has weight 1/2, in standard deviations."""
 PIN_DEVIATIONS = (0.02, 0.02, 0.02, 0.005, 0.005, 0.005)
-"""Deviations of a pinned pose x y z [m] and roll pitch yaw [rad]; a person sees that much."""
+"""Deviations of a pinned pose x y z [m] and roll pitch yaw [rad]; a person corrects that well."""
 NEIGHBOUR_FACTOR = 3.0
 """Deviation from neighbours over error of the input. Derived roughly: white noise of deviation s
 makes an extrapolation from two neighbours err by sqrt(1 + 4 + 1) s = 2.4 s."""
@@ -167,12 +167,12 @@ def robustify_motion(term: Term, state: State) -> Term:
 
 def neighbour_deviation(problem: Problem, axes: Tensor) -> Tensor:
     """
-    Return how far each input pose is off the track of its neighbours (M19), shape (B, N, 6).
+    Return the deviation of each input pose from the track of its neighbours (M19), (B, N, 6).
 
-    Along `axes` [m, rad]. The smallest deviation from three predictions of constant velocity: by
-    the two poses before, the two after, and one on each side. All three contradict an outlier,
-    two at most any of its neighbours. It is divided by `NEIGHBOUR_FACTOR`, so that noise alone
-    gives no more than its own size.
+    It is the smallest deviation from three predictions of constant velocity: by the two poses
+    before, the two after, and one on each side, along `axes` [m, rad]. An outlier deviates from
+    all three, each of its neighbours from two at most. Division by `NEIGHBOUR_FACTOR` makes the
+    value for noise alone no larger than the noise.
 
     """
     time = problem.times.where(problem.valid, torch.nan)[..., None]
@@ -231,8 +231,9 @@ def _face_weights(
     """
     Return the weights of the faces (M20), shape (B, N, 6) [1/m^2].
 
-    The square of Cauchy's weight of their distance. And of how far the input box is off its track,
-    in metres: the points of a box there belong to another object.
+    A face is down-weighted by the square of Cauchy's weight, once of the distance of its points,
+    and once of the distance of the input box from its track [m]: the points of a box far off its
+    track belong to another object.
 
     """
     settings = config.faces
@@ -246,9 +247,9 @@ def _input_weights(
     residual: Tensor, off_track: Tensor, valid: Tensor, expected: Expectation, config: Config
 ) -> Tensor:
     """
-    Return the weights of the input poses (M21), shape (B, N, 6): Cauchy's.
+    Return the weights of the input poses (M21), shape (B, N, 6).
 
-    Of the input `residual` (B, N, 6) and of `off_track` (B, N, 6).
+    They are Cauchy's, of the sum of `residual` (B, N, 6) and `off_track` (B, N, 6).
 
     """
     outlier = INPUT_OUTLIER if config.ingredients.robust_weights else inf
@@ -331,8 +332,8 @@ def face_deviations(problem: Problem, config: Config) -> Tensor:
     """
     Return the deviation of one observation of each face, shape (B, 6) [m].
 
-    The outermost points of what is not rigid, legs and arms, are off its faces by `shape` at
-    least; the road is not.
+    Outermost points of non-rigid parts, such as legs and arms, deviate by `shape` or more from
+    the faces; the road does not.
 
     """
     shape = problem.of_class('shape')

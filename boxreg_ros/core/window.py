@@ -180,7 +180,7 @@ def _stack_observations(
 
 
 def _returns(seen: Observations, width: int, config: Config) -> Returns:
-    """Return the returns of all observations, delayed from their boxes."""
+    """Return the points of all observations, with delays relative to the time of their box."""
     delays = seen.delays
     if config.sampling.box_time == 'sight' and seen.sights.any():
         delays = delays - np.repeat(seen.sights.astype(np.float32), seen.counts)

@@ -1,4 +1,4 @@
-"""Files that several data sets share: clouds, and checks of what is missing."""
+"""Helpers of several data sets: read clouds, and check for missing files and LiDARs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """
-What both data sets of KITTI share: poses of the GPS/IMU unit (OXTS), clouds, exported poses.
+Helpers of both data sets of KITTI: poses of the GPS/IMU unit (OXTS), clouds, exported poses.
 
 OXTS states latitude and longitude [degrees], altitude [m], roll, pitch and yaw [rad] in the first
 six of its 30 columns. They become metres by a Mercator projection about the first latitude.

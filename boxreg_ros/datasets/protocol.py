@@ -25,7 +25,7 @@ class Dataset:
     folder : str
         Files and folders that are expected in the root folder.
     scene : str
-        What the name of a scene is.
+        Form of the name of a scene.
     labels : str
         Label format of its results for ``--labels``; '' for none.
     remedy : str

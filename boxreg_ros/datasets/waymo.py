@@ -1,10 +1,10 @@
 """
 Waymo (perception data set, version 2), as it is downloaded: one folder per component.
 
-Clouds are those of the LiDAR on the roof, both returns, or also of those at the front, the sides
-and the rear. Range images become points by the inclination of each row, the azimuth of each column
-and, for the LiDAR on the roof, the pose of the vehicle at each pixel, which the others lack; they
-are in the frame of the vehicle at the stamp. Rows are streamed: one sweep is in memory.
+Clouds are both returns of the LiDAR on the roof, and on request of the others, at the front, the
+sides and the rear. Range images become points by the inclination of each row, the azimuth of each
+column and, for the LiDAR on the roof alone, the pose of the vehicle at each pixel. Points are in
+the frame of the vehicle at the stamp. Rows are streamed: one sweep is in memory.
 
 """
 

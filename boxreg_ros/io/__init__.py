@@ -1,1 +1,1 @@
-"""Recordings, transforms and the way in that both drivers share."""
+"""Recordings, transforms, and the preparation of sweeps and boxes that both drivers share."""

@@ -60,7 +60,7 @@ class ItemSource(Protocol):
         Topics; `points_topic` is the first of several, `boxes_topic` is empty if the boxes are
         not from a topic.
     placement
-        Topics of several LiDARs and the frames of their sensors; knows the info messages of
+        Topics of several LiDARs and the frames of their sensors; holds the info messages of
         concatenated clouds once these have been read.
     start_ns, end_ns
         Part that is read, in receive time [ns].

@@ -1,5 +1,5 @@
 """
-What the live node sends to the recorder, a process of its own that writes the label files.
+Messages from the live node to the recorder, a process of its own that writes the label files.
 
 The node starts ``python -m boxreg_ros.recorder.main`` and writes pickled objects of these classes
 to its standard input: `RecorderSettings` first, the end of the input last. The recorder writes

@@ -267,7 +267,7 @@ def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tupl
 
 
 class MergedSweep(NamedTuple):
-    """A merged sweep, and what the caller gave with each of its clouds, in their order."""
+    """A merged sweep, and the `extra` objects of its clouds, in their order."""
 
     sweep: Sweep
     extras: tuple[Any, ...]
@@ -395,7 +395,7 @@ class SweepMerger:
         return self._pop(max(count, len(self._groups) - MAX_OPEN_GROUPS))
 
     def _awaited(self, group: _Group) -> list[str]:
-        """Return the topics that lack in a group and are not silent."""
+        """Return the topics without a cloud in a group that are not silent."""
         oldest_ns = group.first_ns - round(LIDAR_SILENCE * 1e9)
         return [
             topic

@@ -46,8 +46,8 @@ class Admitted(NamedTuple):
     T_fixed_item : array, shape (4, 4), or None
         Maps the frame of the item to the fixed frame.
     reason : str
-        ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; what is
-        missing to know the LiDARs of a cloud; else empty.
+        ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; the reason
+        why not all LiDARs of a cloud are known; else empty.
     detail : str
         The transform or message that is missing; empty if none is.
 
@@ -119,7 +119,7 @@ class JumpConfirmation(Generic[_T]):
 
 
 def _stream_of(content: Sweep | BoxArray) -> str:
-    """Return what stamps ascend within: the boxes, or the clouds of one LiDAR."""
+    """Return the name of a stream of ascending stamps: the boxes, or the clouds of one LiDAR."""
     return f'clouds {content.topic}' if isinstance(content, Sweep) else 'boxes'
 
 

@@ -41,7 +41,7 @@ class Format:
     sizes : str
         Order of the extents.
     rotation : str
-        Parameters of the orientation, and what of it is lost.
+        Parameters of the orientation, and the angles that are lost.
     files : str
         Files and folders that the writer creates, separated by commas. ``STAMP`` in the first
         stands for one file per frame. `registry.is_written` looks for the first.

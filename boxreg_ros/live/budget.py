@@ -40,11 +40,11 @@ would leave no time for solving in the `OVERRUNS` ticks after it."""
 
 class TickBudget:
     """
-    How many windows may be solved for a box array, so that it is published by its deadline.
+    Limit the windows that are solved for a box array, so that it is published by its deadline.
 
-    The registrar reads no clock; this object does for it. The time for windows is what is left of
-    the deadline after decoding and cropping, which have been done by then, less the time for
-    publishing, less a reserve for overruns. The times of a window and of publishing are the second
+    The registrar reads no clock; this object does for it. The time for windows is the deadline
+    less the time used by then, for decoding and cropping, less that for publishing, less a reserve
+    for overruns. The times of a window and of publishing are the second
     longest of `RECENT` ones, the reserve is the second largest overrun of `OVERRUNS` ticks: a
     single interruption of the process is ignored.
 
@@ -102,7 +102,7 @@ class TickBudget:
         planned_end = self._since + self.seconds - reserve
         time_left = planned_end - _second_longest(self._publishing_times) - self._clock()
         number = int(time_left / _second_longest(self._times)) - BATCH_OVERHEAD
-        if number > 0:  # else the tick is late whatever is planned
+        if number > 0:  # else the tick is late with any plan
             self._planned_end = planned_end
         return max(1, number)
 

@@ -266,7 +266,7 @@ class LiveRegistrar:
         return self._jumps.release()
 
     def is_ready(self, item: ReceivedMessage, now: float) -> bool:
-        """Return whether what a message needs has arrived or is not waited for."""
+        """Return whether a message waits for no transforms and no info message any more."""
         content = item.content
         if now >= item.received + self.transform_timeout or is_placeholder(content):
             return True

@@ -18,7 +18,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
     `BoxregNode` with the states of a managed node.
 
     ``configure`` takes the values of the parameters and warms up, ``activate`` creates topics and
-    services, ``deactivate`` publishes what is held and destroys them, ``cleanup`` forgets tracks
+    services, ``deactivate`` publishes the boxes held and destroys them, ``cleanup`` forgets tracks
     and transforms. A transition that an error prevents is refused and logged in one line.
 
     """
@@ -46,7 +46,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Publish what is held, then end topics and services."""
+        """Publish the boxes held, then end topics and services."""
         self._is_active = False
         self.worker.stop()
         self._drained.wait()
@@ -75,7 +75,7 @@ class BoxregLifecycleNode(LifecycleNodeMixin, BoxregNode):
             self._drained.set()
 
     def stop_worker(self) -> None:
-        """Make `run_worker` publish what is held, and return."""
+        """Make `run_worker` publish the boxes held, and return."""
         if self._is_active:
             self.worker.stop()
         self._activated.put(None)

@@ -161,7 +161,7 @@ class BoxregNode(Node):
             self.get_logger().info(f'waiting for the type of {name}; {self._topics.description()}')
 
     def close_topics(self) -> None:
-        """Destroy what `open_topics` has created; the worker has ended before."""
+        """Destroy topics, services and timers; the worker has ended before."""
         self._opened.close()
 
     def run_worker(self) -> None:
@@ -169,7 +169,7 @@ class BoxregNode(Node):
         self.worker.run()
 
     def stop_worker(self) -> None:
-        """Make `run_worker` publish what is held, and return."""
+        """Make `run_worker` publish the boxes held, and return."""
         self.worker.stop()
 
     # ------------------------------------------------------------ topics

@@ -59,14 +59,14 @@ class RawCloud(NamedTuple):
 
 class RecorderProcess:
     """
-    Start the recorder and send it what is put. Thread-safe; `put` never waits.
+    Start the recorder and send it the items put. Thread-safe; `put` never waits.
 
     Parameters
     ----------
     settings : RecorderSettings
         Settings of the recording.
     health : Health
-        Counts what is dropped because the queue is full.
+        Counts the items that are dropped because the queue is full.
     on_begin : callable
         Called once, from another thread, when the recorder is ready to write or has failed.
     on_end : callable
@@ -123,7 +123,7 @@ class RecorderProcess:
             )
 
     def finish(self) -> None:
-        """Let the recorder complete what was put, and end."""
+        """Let the recorder write the items that wait, and end."""
         with self._changed:
             self._is_finishing = True
             self._changed.notify()
@@ -138,7 +138,7 @@ class RecorderProcess:
         return {f'{kind} waiting': self._sizes[kind] for kind in CAPACITY}
 
     def _run(self, predecessor: RecorderProcess | None) -> None:
-        """Start the recorder and send it what is put."""
+        """Start the recorder and send it the items put."""
         if predecessor is not None:
             predecessor.has_ended.wait()
         process = subprocess.Popen(
@@ -150,7 +150,7 @@ class RecorderProcess:
         self._send_all(process.stdin)
 
     def _send_all(self, target: IO[bytes]) -> None:
-        """Send what is put, until `finish` or the end of the recorder."""
+        """Send the items put, until `finish` or the end of the recorder."""
         try:
             with target:
                 while True:

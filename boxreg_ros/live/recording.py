@@ -207,7 +207,7 @@ class LabelRecording:
 
 
 def _values_of(recorder: RecorderProcess) -> dict[str, object]:
-    """Return what /diagnostics states about a recorder."""
+    """Return the values of a recorder for /diagnostics."""
     status = recorder.status
     left = status.seconds_left
     return {

@@ -120,13 +120,13 @@ class Worker:
         self._logged_layouts: set[str] = set()
 
     def open_boxes(self, adapter: Adapter, early: Publisher, final: Publisher) -> None:
-        """Set what reads and writes boxes; to be called before boxes are subscribed to."""
+        """Set adapter and publishers of the boxes; to be called before they are subscribed to."""
         self._live.adapter = adapter
         self._early = early
         self._final = final
 
     def facts(self) -> dict[str, object]:
-        """Return what /diagnostics reports about the boxes beside the counters."""
+        """Return the facts about the boxes for /diagnostics, beside the counters."""
         return {**self._live.facts, 'deadline [ms]': f'{1e3 * self._budget.seconds:.0f}'}
 
     def stop(self) -> None:
@@ -195,7 +195,7 @@ class Worker:
                 self._publish(self._guarded(partial(self._confirm, item)))
 
     def _confirm(self, item: ReceivedMessage) -> list[Outgoing]:
-        """Queue a message for processing; return what a time jump before it releases."""
+        """Queue a message for processing; return the messages that a time jump releases."""
         confirmed, ready = self._live.confirm(item)
         self._confirmed.extend(confirmed)
         return ready
@@ -258,27 +258,34 @@ class Worker:
         self._publish(self._guarded(release))
 
     def _take_events(self) -> None:
+        """Handle all events of the inbox, in the order of their arrival."""
         for kind, content in self._inbox.take_events():
-            if kind == 'odom':
+            self._take_event(kind, content)
+        self.newest_transform_ns = self._live.tree.newest_ns()
+
+    def _take_event(self, kind: str, content: Any) -> None:
+        match kind:
+            case '/tf' | '/tf_static':
+                self._live.tree.add_transforms(content, is_static=kind == '/tf_static')
+            case 'odom':
                 self._live.tree.add_odometry(content)
-            elif kind == 'points_info':
+            case 'points_info':
                 self._take_info(content)
-            elif kind == 'lost':
+            case 'lost':
                 self._publish(self._guarded(partial(self._live.lose, *content)))
-            elif kind == 'reset':
+            case 'reset':
                 self._publish(self._guarded(self._live.reset))
-            elif kind == 'record':
+            case 'record':
                 self._live.tap.start(content)
-            elif kind == 'end_recording':
+            case 'end_recording':
                 self._live.tap.finish()
-            elif kind == 'settings':
+            case 'settings':
                 self._live.config, options = content
                 self._live.output_frame = options.output_frame.lstrip('/')
                 self._live.transform_timeout = options.transform_timeout
                 self._budget.deadline = options.deadline
-            else:
-                self._live.tree.add_transforms(content, is_static=kind == '/tf_static')
-        self.newest_transform_ns = self._live.tree.newest_ns()
+            case _:
+                raise ValueError(f'kind: expected that of an event, got {kind!r}')
 
     def _take_info(self, message: Any) -> None:
         try:
@@ -311,7 +318,7 @@ class Worker:
     def _guarded(
         self, task: Callable[[], list[Outgoing]], item: ReceivedMessage | None = None
     ) -> list[Outgoing]:
-        """Return what a task returns; after an error, all that is held, unrefined."""
+        """Return the messages of a task; after an error, all that are held, unrefined."""
         try:
             return task()
         except Exception as error:

@@ -18,7 +18,7 @@ RECORDINGS = (
     'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag, or a scene of a data set as in '
     'nuscenes:/data#scene-0061'
 )
-"""What a recording can be, for the help of options."""
+"""Kinds of recordings, for the help of options."""
 
 
 def add_recording_arguments(

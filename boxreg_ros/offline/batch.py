@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_machine_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add which machines do which drives, and what happens to those that hang or are killed."""
+    """Add the options of machines, and of drives that hang or are killed."""
     parser.add_argument(
         '--shard', type=_shard, default=(1, 1), metavar='I/N',
         help='do only every N-th drive, beginning with the I-th: one part per machine',

@@ -17,7 +17,7 @@ from typing import Any
 
 from boxreg_ros.config import Config, KINDS, Setting, settings
 from boxreg_ros.core.batch import EXTENT, State
-from boxreg_ros.core.expectation import expect, Known
+from boxreg_ros.core.expectation import expect, InputEstimates
 from boxreg_ros.core.face_support import FaceOffsets, observe_faces
 from boxreg_ros.core.input_model import FACE_GROUPS, InputModel, MAX_TRACKS
 from boxreg_ros.core.input_noise import (
@@ -169,7 +169,7 @@ def _errors_of_kind(
     half_turns = torch.tensor([2.0, 2.0, 1.0]) * torch.pi
     pose[..., 3:] += half_turns * ((problem.pose - pose)[..., 3:] / half_turns).round()
     no_offsets = FaceOffsets(*torch.zeros(3, 6))
-    extent = expect(true, Known(no_offsets)).shared
+    extent = expect(true, InputEstimates(no_offsets)).shared
     residuals = input_residuals(problem, State(pose, extent))
     # Without tracks whose boxes only repeat the one before.
     counts = residuals.isfinite().all(2).sum(1)
@@ -181,7 +181,9 @@ def _errors_of_kind(
         for name, value, spread in zip(ERRORS, values, spreads, strict=False):
             found[name] = Measured(float(value), spread, len(residuals))
     # A track has one extent: what counts is the error of its mean.
-    error = np.abs((expect(problem, Known(no_offsets)).shared / extent)[:, EXTENT].numpy() - 1)
+    error = np.abs(
+        (expect(problem, InputEstimates(no_offsets)).shared / extent)[:, EXTENT].numpy() - 1
+    )
     by_track = MAD_TO_DEVIATION * np.median(error, axis=1)
     spread = _deviation(by_track - np.median(by_track))
     found['extent'] = Measured(MAD_TO_DEVIATION * float(np.median(error)), spread, len(tracks))
@@ -357,7 +359,7 @@ def _model_of(windows: Sequence[Window], config: Config) -> InputModel:
     for rows in group_windows(windows, config):
         part = [windows[i] for i in rows]
         problem, _ = stack_windows(part, config)
-        state = State(problem.pose, expect(problem, Known(offsets)).shared)
+        state = State(problem.pose, expect(problem, InputEstimates(offsets)).shared)
         observations = observe_faces(problem, state, offsets, config)
         track_ids = [window.track_id for window in part]
         model.add_face_observations(track_ids, problem.kind, observations, problem.valid, offsets)

@@ -220,7 +220,7 @@ def completed(
     first: FirstPass | None = None,
 ) -> tuple[list[RefinedBoxes], list[TrackSteps]]:
     """
-    Return the completed tracks of a drive in memory, and what was done per track.
+    Return the completed tracks of a drive in memory, and the effects of the steps on each.
 
     Parameters
     ----------

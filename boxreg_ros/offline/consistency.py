@@ -1,4 +1,4 @@
-"""Are the covariances as large as the errors? Coverage and normalised squared errors (NEES)."""
+"""Consistency of covariances with errors: coverage and normalised squared errors (NEES)."""
 
 from __future__ import annotations
 

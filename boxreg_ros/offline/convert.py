@@ -75,7 +75,7 @@ class Conversion:
 
 @dataclass(slots=True)
 class _Unused:
-    """What of a recording was not used: the number of unreadable messages, and all in a line."""
+    """Number of unreadable messages of a recording, and a line on all that were not used."""
 
     unreadable: int = 0
     text: str = ''

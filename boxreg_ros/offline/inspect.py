@@ -214,7 +214,7 @@ def _pauses(parts: list[tuple[int, int]], begin_ns: int, rate: float) -> list[li
 
 @dataclass
 class _Sample:
-    """What the first messages of clouds and boxes show; `late` is receive time less stamp [ns]."""
+    """Figures of the first clouds and boxes; `late` is receive time less stamp [ns]."""
 
     sweeps: list[int] = field(default_factory=list)
     arrays: list[int] = field(default_factory=list)
@@ -247,7 +247,7 @@ class _Sample:
 
 
 def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
-    """Return what the first seconds of a recording show."""
+    """Return the figures of the first seconds of a recording."""
     from boxreg_ros.io.session import Session
 
     session = Session(convention, Config(), placement=recording.placement)

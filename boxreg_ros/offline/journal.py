@@ -36,7 +36,7 @@ TRUSTED_NAMES = (
     'Estimate', 'Estimates', 'MarginalisationPrior', 'TrackRows', 'ndarray', 'dtype', 'scalar',
     '_reconstruct', '_frombuffer',
 )  # fmt: skip
-"""What a record may refer to: a pickle of other names could run any code."""
+"""Names that a record may refer to: a pickle of others could run any code."""
 
 
 class Records(Protocol):
@@ -257,7 +257,7 @@ class _TrustedUnpickler(pickle.Unpickler):
     """Unpickle arrays and the classes of the core, nothing else."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return what a trusted name refers to."""
+        """Return the object of a trusted name."""
         if module.split('.')[0] in TRUSTED_PACKAGES and name in TRUSTED_NAMES:
             return super().find_class(module, name)
         raise RecordingError(

@@ -1,4 +1,4 @@
-"""Progress of a long run, for whoever displays it."""
+"""Progress of a long run, to be displayed by the caller."""
 
 from __future__ import annotations
 
@@ -10,4 +10,4 @@ class Progress:
         """Show that `done` of `total` seconds of the recording have been read."""
 
     def announce(self, activity: str) -> None:
-        """Show what the run waits for, until the next `show`."""
+        """Show the activity that the run waits for, until the next `show`."""

@@ -425,6 +425,20 @@ def closing_line(summary: dict[str, Any], out: Path) -> str:
 def notes(summary: dict[str, Any]) -> Iterator[str]:
     """Yield warnings about the input and the results, one line each."""
     yield from _input_notes(summary)
+    yield from _lidar_notes(summary)
+    yield from _label_notes(summary)
+    if summary['unknown_classes']:
+        names = ', '.join(repr(name) for name in summary['unknown_classes'])
+        yield (
+            f'unknown class names are treated as vehicles: {names} ({_sum(summary)} boxes); name '
+            f'them in vehicle.names, cyclist.names or pedestrian.names'
+        )
+    if part_refined(summary) < FEW_REFINED:
+        yield _why_few_were_refined(summary)
+
+
+def _lidar_notes(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield the clouds that were not used as those of their LiDARs, one line each."""
     for topic, counts in summary['lidars'].items():
         if counts.get(CLOUD_LATE) or counts.get(CLOUD_MISSING):
             yield (
@@ -441,6 +455,10 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
             f'the LiDARs of {clouds:,} clouds are not all known, the origin of their frame is '
             f'used; first: {summary["first_unplaced"]}'
         )
+
+
+def _label_notes(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield the boxes, decisions and clouds that label files lack, one line each."""
     for name, found in summary['left_out_of_labels'].items():
         reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
         yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
@@ -458,14 +476,6 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
             f'{summary["frames_without_cloud"]:,} of {summary["box_arrays"]:,} box arrays have no '
             f'cloud to write beside them'
         )
-    if summary['unknown_classes']:
-        names = ', '.join(repr(name) for name in summary['unknown_classes'])
-        yield (
-            f'unknown class names are treated as vehicles: {names} ({_sum(summary)} boxes); name '
-            f'them in vehicle.names, cyclist.names or pedestrian.names'
-        )
-    if part_refined(summary) < FEW_REFINED:
-        yield _why_few_were_refined(summary)
 
 
 def is_complete(summary: dict[str, Any]) -> bool:

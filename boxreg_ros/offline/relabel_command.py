@@ -1,4 +1,4 @@
-"""`boxreg relabel`: its command line. What takes long to import is imported when it runs."""
+"""`boxreg relabel`: its command line. Slow modules are imported when it runs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_input_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what is read besides the recording, and which part of it."""
+    """Add the options of inputs beside the recording, and of the part that is read."""
     parser.add_argument(
         '--labels', type=_labels_argument, metavar='FORMAT:PATH',
         help='read the boxes from label files instead of a topic',
@@ -57,7 +57,7 @@ def _add_input_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_track_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what is done to the tracks besides the refinement."""
+    """Add the options of the steps on tracks beside their refinement."""
     parser.add_argument(
         '--associate', action='store_true',
         help='replace the track ids of the input: associate boxes over time',
@@ -75,7 +75,7 @@ def _add_track_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_result_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what is written."""
+    """Add the options of the output."""
     parser.add_argument(
         '-o', '--out', type=Path, required=True,
         help='result folder; it is written completely or not at all',
@@ -97,7 +97,7 @@ def _add_result_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add how the run goes on and ends, and what it may use."""
+    """Add the options of resuming, of the exit status and of processes."""
     parser.add_argument(
         '--resume', action='store_true',
         help='go on with an interrupted run of the same request, files and settings; do nothing '
@@ -266,5 +266,5 @@ class ProgressBar(Progress):
         self._bar.update(max(0.0, done - self._bar.n))
 
     def announce(self, activity: str) -> None:
-        """Show what the run waits for beside the bar."""
+        """Show the activity that the run waits for beside the bar."""
         self._bar.set_description_str(f'({activity})')

@@ -187,6 +187,6 @@ class Request:
 
 
 def _parts_of(path: Path) -> tuple[Path, ...]:
-    """Return the files and folders that a path stands for: those of a scene, or itself."""
+    """Return the files and folders of a path: those of a scene, or the path itself."""
     address = address_of(path)
     return (path,) if address is None else scene_inputs(address)

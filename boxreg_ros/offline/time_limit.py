@@ -12,7 +12,7 @@ _T = TypeVar('_T')
 
 def within(seconds: float | None, call: Callable[[], _T]) -> _T:
     """
-    Return what a call returns, or raise what it raises.
+    Call a function, but wait for it no longer than a time limit.
 
     Parameters
     ----------

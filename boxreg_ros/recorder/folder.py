@@ -1,4 +1,4 @@
-"""Folder of a recording of labels: its lock, and recovery of what was cut off."""
+"""Folder of a recording of labels: its lock, and recovery of segments that were cut off."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 def recover_all(opened: Sequence[Path]) -> int:
     """
-    Make whole segments of those that were cut off in a locked folder.
+    Complete the segments of a locked folder that were cut off.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ class FrameJournal:
     path : Path
         New file.
     settings : mapping of str to str
-        Whatever recovery needs beside the frames.
+        Settings that recovery needs beside the frames.
 
     """
 

@@ -91,7 +91,7 @@ class Recorder:
         self._growth = Growth()
 
     def take(self, item: Any) -> None:
-        """Write what the node has sent."""
+        """Write an item that the node has sent."""
         if isinstance(item, LabelCloud):
             self._add_cloud(item)
         elif isinstance(item, FinalBoxes):
@@ -330,7 +330,7 @@ def _record(
 
 
 def _explained(error: OSError, folder: Path, has_begun: bool) -> RecordingError:
-    """Return what an error of the disk means for a recording."""
+    """Return the error of a recording for one of the disk, with its remedy."""
     place = f'record_to {str(folder)!r}'
     if error.errno in DISK_ERRORS:
         return RecordingError(

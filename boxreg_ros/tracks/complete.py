@@ -111,7 +111,7 @@ class CompletionPlan:
     arrays : list of PlannedArray
         One per box array of the input.
     tracks : list of TrackSteps
-        What was done per track; `extended` is known after `finished`.
+        Effects of the steps on each track; `extended` is known after `finished`.
 
     """
 
@@ -210,7 +210,7 @@ def complete(
     Returns
     -------
     plan : CompletionPlan
-        What to register in the second pass.
+        Boxes to register in the second pass.
 
     """
     steps = config.complete
@@ -342,7 +342,7 @@ def _finished(
     n = len(given.track_ids)
     taken = [row for row in range(n) if row not in array.rejected]
     kept = [i for i, is_kept in enumerate(keep) if is_kept]
-    rows = [len(taken) + i for i in kept]  # of the added boxes, in what was registered
+    rows = [len(taken) + i for i in kept]  # of the added boxes, among the registered ones
 
     def completed(values: NDArray[Any], of_rejected: NDArray[Any]) -> NDArray[Any]:
         column = np.broadcast_to(of_rejected, (n, *values.shape[1:])).astype(values.dtype)

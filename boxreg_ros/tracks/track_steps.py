@@ -8,7 +8,7 @@ from dataclasses import dataclass
 @dataclass(slots=True)
 class TrackSteps:
     """
-    What the steps did to one track.
+    Effects of the completing steps on one track.
 
     Attributes
     ----------

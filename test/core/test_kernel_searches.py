@@ -17,7 +17,7 @@ from boxreg_ros.core.batch import (
     Solution,
     State,
 )
-from boxreg_ros.core.expectation import expect, expectation_numbers, Known
+from boxreg_ros.core.expectation import expect, expectation_numbers, InputEstimates
 from boxreg_ros.core.face_support import (
     FaceOffsets,
     FAR,
@@ -173,7 +173,7 @@ def test_observed_faces_from_known_sensors_equal_those_of_torch(far, sensors):
 def weighed(problem, state, config):
     """Return the terms of each window by torch, and by the kernel, with robust motion."""
     observations = observe_faces_torch(problem, state, OFFSETS, config)
-    expected = expect(problem, Known(OFFSETS))
+    expected = expect(problem, InputEstimates(OFFSETS))
     known = [
         robustify_motion(term, state) if term.function in MOTION_TERMS else term
         for term in weigh(problem, state, observations, expected, config)
@@ -220,7 +220,7 @@ def drives(kind, N=12):
         },
     )  # fmt: skip
     pose = problem.pose + 0.05 * torch.from_numpy(rng.normal(size=(3, N, 6)))
-    shared = expect(problem, Known(OFFSETS)).shared
+    shared = expect(problem, InputEstimates(OFFSETS)).shared
     return problem, State(pose, shared + 0.02 * torch.from_numpy(rng.normal(size=shared.shape)))
 
 
@@ -251,7 +251,7 @@ PLANS = {
 
 def batch_of(problem, state, config):
     """Return what a round of a problem begins with."""
-    known = Known(OFFSETS, scatter=SCATTER)
+    known = InputEstimates(OFFSETS, scatter=SCATTER)
     free = free_variables(problem, config)
     state = State(*(part.clone() for part in state))
     prior = MarginalPrior(
@@ -336,7 +336,7 @@ def test_expectations_equal_those_of_torch(kind, seed):
     evidence = np.stack([extents, 50 * rng.normal(size=(20, 3)), rng.random((20, 3))], 1)
     population = Population(torch.from_numpy(evidence), torch.arange(20) % 2)
     offsets = FaceOffsets(*torch.from_numpy(0.1 * rng.normal(size=(3, 3, 6))))
-    known = Known(offsets, noise, population, SCATTER)
+    known = InputEstimates(offsets, noise, population, SCATTER)
     twins = expect(problem, known)
     found = ExpectedArrays(*(np.empty(part.shape[1:]) for part in twins))
     work = expectation.empty_expectation_work()

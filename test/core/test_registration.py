@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core import batch, paper, registration, rounds, solver, terms
 from boxreg_ros.core.batch import POSE_ERRORS, State
-from boxreg_ros.core.expectation import CONSTANT_EXTENT_ERRORS, expect, Known
+from boxreg_ros.core.expectation import CONSTANT_EXTENT_ERRORS, expect, InputEstimates
 from boxreg_ros.core.face_support import FaceOffsets, observe_faces
 from boxreg_ros.core.geometry import rotation_from_rpy
 from boxreg_ros.core.input_model import InputModel
@@ -234,7 +234,7 @@ def test_expectation_of_shared_variables_by_hand():
     kinds = {**dict(numbers(ALONE.vehicle)), **kinds}
     problem = problem_of(boxes, valid=valid, marginalised_extents=seen, class_numbers=kinds)
     gaps = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], dtype=D)  # beyond those of the classes
-    found = expect(problem, Known(FaceOffsets(gaps, *torch.zeros(2, 6)))).shared
+    found = expect(problem, InputEstimates(FaceOffsets(gaps, *torch.zeros(2, 6)))).shared
     known = np.zeros((2, batch.SHARED))
     known[:, batch.EXTENT] = [[4.3, 2.0, 1.5], [4.3, 2.0, 1.5]]
     known[:, batch.GAP] = [[1.1, 1.2, 3.3, 3.4, 5.5, 7.6], [2.1, 2.2, 4.3, 4.4, 6.5, 8.6]]
@@ -296,7 +296,7 @@ def test_parked_objects_by_speed_and_distance(speed, length, rests):
     valid = np.arange(length + 2) < length
     kinds = {name: torch.full((2,), value) for name, value in numbers(ALONE.vehicle)}
     problem = problem_of(many, valid=np.stack([valid] * 2), class_numbers=kinds)
-    expected = expect(problem, Known(NO_OFFSETS))
+    expected = expect(problem, InputEstimates(NO_OFFSETS))
     state = State(problem.pose, expected.shared)
     observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
     (rest,) = (
@@ -325,12 +325,12 @@ def test_expected_bias_by_hand(weight, fast, slow):
     times = torch.arange(6, dtype=D) * torch.tensor([[0.1], [0.5]], dtype=D)
     boxes = np.broadcast_to(drive(6), (2, 6, 9)).copy()
     problem = problem_of(boxes, times=times, class_numbers=kinds)
-    state = State(problem.pose, expect(problem, Known(NO_OFFSETS)).shared)
+    state = State(problem.pose, expect(problem, InputEstimates(NO_OFFSETS)).shared)
     observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
     error = problem.of_class(*POSE_ERRORS)
     deviation = torch.full((9,), 2.0, dtype=D)
     noise = InputNoise(deviation, torch.full((9,), 0.2, dtype=D), weight=torch.tensor([weight]))
-    expected = expect(problem, Known(NO_OFFSETS, noise))
+    expected = expect(problem, InputEstimates(NO_OFFSETS, noise))
     (information,) = (
         term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
         for term in weigh(problem, state, observations, expected, ALONE)
@@ -351,7 +351,7 @@ def test_errors_of_the_input_by_hand():
         deviation = torch.full((9,), size, dtype=D)
         correlation = torch.full((9,), 0.2, dtype=D)
         noise = InputNoise(deviation, correlation, weight=torch.tensor([1.0]))
-        expected = expect(problem, Known(NO_OFFSETS, noise))
+        expected = expect(problem, InputEstimates(NO_OFFSETS, noise))
         constant = torch.tensor(CONSTANT_EXTENT_ERRORS['vehicle'], dtype=D) / 6
         of_mean = torch.full((3,), 0.5, dtype=D)
         extent = problem.boxes[:, 0, 3:6] * kinds['extent'] * torch.hypot(constant, of_mean)
@@ -367,7 +367,7 @@ def test_held_extents_have_the_constant_errors_of_a_published_detector():
     problem = problem._replace(kind=torch.tensor([KINDS.index('pedestrian')]))
     for size, constant in ((2.0, 2.0), (0.5, 1.0), (0.2, 0.5)):
         noise = InputNoise(torch.full((9,), size, dtype=D), weight=torch.tensor([1.0]))
-        found = expect(problem, Known(NO_OFFSETS, noise)).error[:, batch.EXTENT]
+        found = expect(problem, InputEstimates(NO_OFFSETS, noise)).error[:, batch.EXTENT]
         ratios = torch.tensor(CONSTANT_EXTENT_ERRORS['pedestrian'], dtype=D)
         usual = problem.boxes[:, 0, 3:6] * kinds['extent']
         known = usual * torch.hypot(constant * ratios, size / torch.tensor(6.0).sqrt())
@@ -388,7 +388,7 @@ def test_expected_bias_of_low_noise_input_by_hand(offset, lasting):
     # positions and the extents from one half of the usual error on; not that of angles.
     kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
     problem = problem_of(drive(6)[None], class_numbers=kinds)
-    state = State(problem.pose, expect(problem, Known(NO_OFFSETS)).shared)
+    state = State(problem.pose, expect(problem, InputEstimates(NO_OFFSETS)).shared)
     observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
     error, extent = problem.of_class(*POSE_ERRORS), kinds['extent'][:, None]
     parts = torch.tensor([1.5, 0.5, 9, 9, 9, 9, 1, 9, 9], dtype=D)  # 1 on average, of three
@@ -398,7 +398,7 @@ def test_expected_bias_of_low_noise_input_by_hand(offset, lasting):
         parts * offset,
         torch.ones(1, dtype=D),
     )
-    expected = expect(problem, Known(NO_OFFSETS, noise))
+    expected = expect(problem, InputEstimates(NO_OFFSETS, noise))
     (weight,) = (
         term.weight[:, 0, 0].diagonal(dim1=1, dim2=2)
         for term in weigh(problem, state, observations, expected, ALONE)
@@ -421,7 +421,7 @@ def test_robust_prior_of_labelling_margins_by_hand():
     # (0.385 - 0.15) / 0.3 of its errors, and so for extents, half of which a face moves by.
     kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
     problem = problem_of(drive(3)[None], class_numbers=kinds)
-    expected = expect(problem, Known(NO_OFFSETS))
+    expected = expect(problem, InputEstimates(NO_OFFSETS))
     left, top = batch.GAP.start + 2, batch.GAP.start + 4
     observations = observe_faces(problem, State(problem.pose, expected.shared), NO_OFFSETS, ALONE)
     distance = torch.zeros(1, 3, 6, dtype=D)

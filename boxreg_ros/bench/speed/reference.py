@@ -15,7 +15,7 @@ from time import perf_counter
 from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
 from boxreg_ros.core.batch import EXTENT, free_variables, POSE_ERRORS, Problem, Solution, State
-from boxreg_ros.core.expectation import expect, Known
+from boxreg_ros.core.expectation import expect, InputEstimates
 from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.metrics import iou_3d
@@ -131,7 +131,7 @@ def _minimum(terms: Sequence[Term], start: Tensor, scale: Tensor, length: int) -
 
 def _deviations(problem: Problem, config: Config) -> Tensor:
     """Return the expected error of every variable, 1 where none is known; (1, 6 N + 23)."""
-    expected = expect(problem, Known(InputModel(config.faces).offsets()))
+    expected = expect(problem, InputEstimates(InputModel(config.faces).offsets()))
     pose = problem.of_class(*POSE_ERRORS).repeat(1, problem.length)
     deviations = torch.cat([pose, expected.deviation], 1)
     return torch.where(deviations > 0, deviations, 1.0)
@@ -140,14 +140,14 @@ def _deviations(problem: Problem, config: Config) -> Tensor:
 def _start(problem: Problem, config: Config) -> State:
     """Return the input boxes with the expected shared variables."""
     offsets = InputModel(config.faces).offsets()
-    return State(problem.pose.clone(), expect(problem, Known(offsets)).shared)
+    return State(problem.pose.clone(), expect(problem, InputEstimates(offsets)).shared)
 
 
 def _terms(problem: Problem, state: State, config: Config) -> list[Term]:
     """Return the weighted terms with correspondences at `state`."""
     offsets = InputModel(config.faces).offsets()
     observations = observe_faces(problem, state, offsets, config)
-    return weigh(problem, state, observations, expect(problem, Known(offsets)), config)
+    return weigh(problem, state, observations, expect(problem, InputEstimates(offsets)), config)
 
 
 def _value(problem: Problem, state: State, config: Config) -> float:

@@ -10,16 +10,16 @@ from boxreg_ros.bench.speed.streams import SWEEP_PERIOD
 import numpy as np
 
 WANTED = {'faster, long': 15.0, 'start': 1.5, 'help': 0.5, 'memory, shared once': 700.0}
-"""What `boxreg relabel` should reach: at least so many times as fast as the recording lasts, at
-most so many seconds and MB. Chosen."""
+"""Aims of `boxreg relabel`: at least so many times as fast as the recording lasts, at most so many
+seconds and MB. Chosen."""
 
 
 WANTED_TIMES = 150.0
-"""What `refine` should be faster than the reference. Chosen."""
+"""Aim of `refine`: so many times faster than the reference. Chosen."""
 WANTED_TICKS = {'8': 2.0, '64': 8.0, '512': 50.0}
-"""What a tick of so many tracks should take at most [ms]. Chosen."""
+"""Aim of a tick by number of tracks: at most so many ms. Chosen."""
 WANTED_TRACKS = 400
-"""Tracks that should be held at 10 Hz on two cores. Chosen."""
+"""Aim: so many tracks held at 10 Hz on two cores. Chosen."""
 
 
 def text(report: dict[str, Any]) -> str:
@@ -69,7 +69,7 @@ def _tick_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _crop_line(found: dict[str, Any]) -> str:
-    """Return the line of the crop and of what does the same."""
+    """Return the line of the crop, beside the same by other libraries."""
     ours, by_numpy, by_open3d = (
         found[name] for name in ('ours', 'numpy, box by box', 'Open3D, box by box')
     )

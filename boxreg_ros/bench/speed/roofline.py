@@ -10,7 +10,7 @@ from boxreg_ros.bench.speed.streams import make_windows, shortest
 from boxreg_ros.config import Config
 from boxreg_ros.core.arrowhead import LINK
 from boxreg_ros.core.batch import free_variables, SHARED, State
-from boxreg_ros.core.expectation import expect, Known
+from boxreg_ros.core.expectation import expect, InputEstimates
 from boxreg_ros.core.face_support import observe_faces
 from boxreg_ros.core.geometry import FACE_AXIS
 from boxreg_ros.core.input_model import InputModel
@@ -67,12 +67,12 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
     """Return function, bytes and operations of each stage of one round of `count` windows."""
     windows, _ = make_windows(count, config.window, 128, config)
     problem, _ = stack_windows(windows, config)
-    known = Known(InputModel(config.faces).offsets())
-    state = State(problem.pose, expect(problem, known).shared)
+    inputs = InputEstimates(InputModel(config.faces).offsets())
+    state = State(problem.pose, expect(problem, inputs).shared)
     free = free_variables(problem, config)
     plan = SolverPlan.choose(config, is_warm=True)
-    solution = start(problem, free, known.offsets, plan)
-    batch = Round(problem, solution, known, free)
+    solution = start(problem, free, inputs.offsets, plan)
+    batch = Round(problem, solution, inputs, free)
     rows = torch.arange(count, device=free.device)
     points = problem.returns.points
     size_of_points = float(points.numel() * points.element_size())
@@ -82,7 +82,7 @@ def _stages(config: Config, count: int) -> dict[str, tuple[Callable[[], object],
     size_of_posterior = 8.0 * poses * (LINK * LINK + len(FACE_AXIS))
     return {
         'face observations': (
-            lambda: observe_faces(problem, state, known.offsets, config),
+            lambda: observe_faces(problem, state, inputs.offsets, config),
             size_of_points,
             flops_of_points,
         ),

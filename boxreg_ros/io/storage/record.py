@@ -47,7 +47,7 @@ class Damage(NamedTuple):
     file : str
         File of the recording.
     reason : str
-        What is wrong with it.
+        Kind of the damage.
     first_byte, end_byte : int or None
         Byte range in the file; None where the format has none (rows of a database).
     start_ns, end_ns : int or None
@@ -125,7 +125,7 @@ def span_ns(spans: Collection[tuple[int, int]]) -> tuple[int, int]:
 
 
 def shown(path: Path, origin: Path | None) -> str:
-    """Return the file that a user knows: `path`, or what it was unpacked from."""
+    """Return the file to name in messages: `path`, or the file it was unpacked from."""
     return str(origin or path)
 
 

@@ -1,5 +1,5 @@
 """
-Files behind URLs: ``s3://``, ``gs://``, ``https://`` and whatever fsspec opens.
+Files behind URLs: ``s3://``, ``gs://``, ``https://`` and others that fsspec opens.
 
 A URL is carried as a `Path`, which has one slash in place of two behind the scheme. Files are read
 by ranges: what the index of a recording asks for, and some chunks ahead.
@@ -120,7 +120,7 @@ class RemoteFile:
                 self._fetch(first, end)
 
     def close(self) -> None:
-        """Cancel what is requested."""
+        """Cancel the open requests."""
         self._pool.shutdown(cancel_futures=True)
 
     def _fetch(self, first: int, end: int) -> Future[bytes]:
