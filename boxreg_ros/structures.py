@@ -276,8 +276,8 @@ class RefinedBoxes:
         bottom) from where they are expected, by the extents of the box and the labelling margins
         of other tracks, positive outside [m]; 0 without points.
     near_points : array, shape (n, 2)
-        Number of points in the box, and of those near it but outside, the road left out; as far
-        as they are sampled.
+        Numbers of sampled points inside the box, and near it but outside; points of the road do
+        not count.
 
     """
 

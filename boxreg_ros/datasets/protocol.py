@@ -25,7 +25,7 @@ class Dataset:
     folder : str
         Files and folders that are expected in the root folder.
     scene : str
-        Form of the name of a scene.
+        Example of the name of a scene, or a word for it.
     labels : str
         Label format of its results for ``--labels``; '' for none.
     remedy : str

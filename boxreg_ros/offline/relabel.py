@@ -429,8 +429,9 @@ def notes(summary: dict[str, Any]) -> Iterator[str]:
     yield from _label_notes(summary)
     if summary['unknown_classes']:
         names = ', '.join(repr(name) for name in summary['unknown_classes'])
+        boxes = sum(summary['unknown_classes'].values())
         yield (
-            f'unknown class names are treated as vehicles: {names} ({_sum(summary)} boxes); name '
+            f'unknown class names are treated as vehicles: {names} ({boxes:,} boxes); name '
             f'them in vehicle.names, cyclist.names or pedestrian.names'
         )
     if part_refined(summary) < FEW_REFINED:
@@ -558,10 +559,6 @@ def _time_range(first_ns: int, last_ns: int) -> str:
         date = datetime.fromtimestamp(first_ns * 1e-9, UTC).strftime('%Y-%m-%d')
         return f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s ({date})'
     return f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s'
-
-
-def _sum(summary: dict[str, Any]) -> str:
-    return f'{sum(summary["unknown_classes"].values()):,}'
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -16,8 +16,6 @@ from boxreg_ros.structures import BOX_EXTENT, Floats, X, Y
 from boxreg_ros.tracks.tracklet import Tracklet
 import numpy as np
 
-GHOST, DUPLICATE = 'ghost', 'duplicate'
-
 CONFIRMED_BOXES = 6
 """A track with so many boxes is not rejected; chosen: twice the three that trackers ask for."""
 CONTAINED = 0.5

@@ -266,16 +266,16 @@ def test_a_parked_vehicle_that_drives_off_is_not_held_there():
     boxes = drive(80, 0.0, 0.0)
     since = (np.arange(80) - 68).clip(0) / 10
     boxes[:, 0] += since**2  # 2 m/s^2 for 1.1 s
-    rests = parked(boxes)[0].numpy()
+    is_parked = parked(boxes)[0].numpy()
     # Middles of five boxes and the next five are 0.5 s apart: about step 72 by 0.7^2 - 0.2^2 =
     # 0.45 m, which is slower than 1 m/s, about step 73 by 0.8^2 - 0.3^2 = 0.55 m. So it drives
     # from step 73 on, and the zero-motion prior ends four steps before that.
-    np.testing.assert_array_equal(rests, np.arange(79) < 69)
-    np.testing.assert_array_equal(parked(boxes[::-1])[0], rests[::-1])
+    np.testing.assert_array_equal(is_parked, np.arange(79) < 69)
+    np.testing.assert_array_equal(parked(boxes[::-1])[0], is_parked[::-1])
 
 
 @pytest.mark.parametrize(
-    ('speed', 'length', 'rests'),
+    ('speed', 'length', 'is_parked'),
     [
         (0.0, 10, True),
         (0.28, 10, True),  # 0.25 m in 0.9 s
@@ -284,7 +284,7 @@ def test_a_parked_vehicle_that_drives_off_is_not_held_there():
         (0.2, 30, True),  # 0.58 m
     ],
 )
-def test_parked_objects_by_speed_and_distance(speed, length, rests):
+def test_parked_objects_by_speed_and_distance(speed, length, is_parked):
     # Slower than 0.3 m/s and moved less than 0.7 m. Of two windows the second is padded with
     # boxes far away, and errors that take turns do not make it move.
     boxes = drive(length, speed, 0.0)
@@ -305,7 +305,7 @@ def test_parked_objects_by_speed_and_distance(speed, length, rests):
         if term.function is terms.zero_motion
     )
     held = (rest.diagonal(dim1=-2, dim2=-1) > 0)[:, :, 0].all(-1)
-    np.testing.assert_array_equal(held, np.stack([valid[1:] & rests] * 2))
+    np.testing.assert_array_equal(held, np.stack([valid[1:] & is_parked] * 2))
 
 
 @pytest.mark.parametrize(

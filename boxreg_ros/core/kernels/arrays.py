@@ -1,5 +1,5 @@
 """
-What the kernels of one round take and write, as named tuples of arrays and numbers.
+Arguments and results of the kernels of one round, as named tuples of arrays and numbers.
 
 Letters of the shapes: B windows, N observations, P points of all observations of a batch. Only the
 first `lengths` observations of a window are read; the others are padding.
@@ -78,7 +78,7 @@ class ExpectedArrays(NamedTuple):
 
 class InputArrays(NamedTuple):
     """
-    What is known of the input of all tracks, one row for each of K kinds of objects.
+    Estimated errors of the input of all tracks, one row for each of K kinds of objects.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class ClassArrays(NamedTuple):
 
 class SolutionArrays(NamedTuple):
     """
-    State of a batch, where a round begins, and what it writes.
+    State of a batch: the start of a round, and its results.
 
     Attributes
     ----------

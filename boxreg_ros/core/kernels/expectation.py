@@ -23,12 +23,12 @@ import numpy as np
 POSE, SIZE = 6, 3
 """Numbers of a pose, and of an extent."""
 HEADING = 5
-"""Place of the yaw in a pose."""
+"""Index of the yaw in a pose."""
 
 
 class ExpectationWork(NamedTuple):
     """
-    What the input says about one window.
+    Intermediate values of the expectation of one window.
 
     Attributes
     ----------

@@ -502,7 +502,7 @@ def fill_dense(A, dense):
 @kernel
 def marginalise(x, gradient, A, mean, step, information):
     """
-    Write the quadratic form that stands for the oldest observation of one window (M13).
+    Write the quadratic form that replaces the oldest observation of one window (M13).
 
     In the next two poses and the shared variables: where they are (35,), the step from there to
     the minimum (35,), and the curvature (35, 35). The sums of the residuals of the oldest

@@ -1,7 +1,7 @@
 """
 One round of windows, in plain loops: expect, observe, weigh, sum up, factorise, minimise.
 
-The torch twin is `boxreg_ros.core.rounds.run_round_torch`. What a window works with stays in the
+The torch twin is `boxreg_ros.core.rounds.run_round_torch`. The arrays of a window stay in the
 processor's cache from one step to the next.
 
 """

@@ -24,7 +24,7 @@ import numpy as np
 BOTTOM = 5
 """The face that is observed by the road."""
 POSE = (0, 1, 2, 6, 7, 8)
-"""Where the pose stands in a box."""
+"""Indices of the pose in a box."""
 
 
 @kernel
@@ -95,7 +95,7 @@ def median_place(boxes, times, first, last):
 
 @kernel
 def fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked):
-    """Write whether the object rests from each box to the next (M25), (N - 1,)."""
+    """Write whether the object is parked from each box to the next (M25), (N - 1,)."""
     parked[:] = False
     if not is_parked(boxes, times, length, yaw_deviation, numbers):
         return
