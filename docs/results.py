@@ -114,8 +114,9 @@ def _origin(document: Any) -> str:
     return f'    $ {document["command"]}    # version {document["version"]}\n'
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ['---', *['---:'] * (len(header) - 1)], *rows]
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]], alignment: str = '---:') -> str:
+    """Return a table whose columns but the first have an alignment, by default to the right."""
+    lines = [header, ['---', *[alignment] * (len(header) - 1)], *rows]
     return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
 
 
@@ -130,7 +131,8 @@ def _signed(value: float, digits: int) -> str:
 
 def _overview(store: Path) -> Iterable[str]:
     """Yield the main tables of `docs/results.md`."""
-    yield _table(['recording', 'content'], [[f'`{name}`', title] for name, title in DATA.items()])
+    recordings = [[f'`{name}`', title] for name, title in DATA.items()]
+    yield _table(['recording', 'content'], recordings, '---')
     yield ''
     for section in (_mean_ious, _gains, _completion, _coverage, _ranking, _times):
         yield from (f'{part}\n' for part in section(store))
@@ -402,7 +404,7 @@ def _paper(results: Any) -> Iterable[str]:
 def _ingredients() -> str:
     """Return the table of the ingredients that are switched off."""
     rows = [[name, item.meaning] for name, item in INGREDIENTS.items() if name != WHOLE]
-    return _table(['without', 'the change'], rows)
+    return _table(['without', 'the change'], rows, '---')
 
 
 def _ablation(results: Any) -> Iterable[str]:
@@ -616,7 +618,8 @@ def _scale(results: Any) -> Iterable[str]:
         ('fleet.used', f'{fleet["used"]:.0%}', 'part of the time that the cores have jobs'),
         ('fleet.lost', f'{fleet["lost"]:.2%}', 'part of the work that is done twice'),
     ]
-    yield _table(['figure', 'value', 'of'], [[f'`{name}`', *cells] for name, *cells in rows])
+    named = [[f'`{name}`', *cells] for name, *cells in rows]
+    yield _table(['figure', 'value', 'of'], named, '---')
     yield from _figures(results)
 
 
