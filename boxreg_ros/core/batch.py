@@ -172,12 +172,12 @@ class Problem(NamedTuple):
 
     @property
     def points(self) -> Tensor:
-        """Padded points minus the centre of their input box, shape (B, N, M, 3) [m]."""
+        """Return the padded points minus the centre of their input box, (B, N, M, 3) [m]."""
         return self.padded()[0]
 
     @property
     def mask(self) -> Tensor:
-        """Validity of the padded `points`, shape (B, N, M)."""
+        """Return the validity of the padded `points`, shape (B, N, M)."""
         return self.padded()[1]
 
     def of_class(self, *names: str) -> Tensor:
