@@ -503,22 +503,27 @@ class Config:
         """
         try:
             values = yaml.safe_load(Path(path).read_text(encoding='utf-8')) or {}
-            if isinstance(values, dict):
-                inner = next(iter(values.values()), None)
-                if isinstance(inner, dict) and set(inner) == {'ros__parameters'}:
-                    values = inner['ros__parameters']
-                    if isinstance(values, dict):
-                        values = {
-                            key: value
-                            for key, value in values.items()
-                            if str(key).partition('.')[0] not in NODE_OPTIONS
-                        }
-            return cls.from_dict(values)
+            return cls.from_dict(_without_node_options(values))
         except OSError as error:
             raise ConfigError(f'config file {unreadable(path, error)}') from None
         except (ConfigError, *YAML_ERRORS) as error:
             reason = ' '.join(str(error).split())
             raise ConfigError(f'config file {str(path)!r}: {reason}') from None
+
+
+def _without_node_options(values: Any) -> Any:
+    """Return the settings of a ROS parameter file; other content unchanged."""
+    node = next(iter(values.values()), None) if isinstance(values, dict) else None
+    if not isinstance(node, dict) or set(node) != {'ros__parameters'}:
+        return values
+    parameters = node['ros__parameters']
+    if not isinstance(parameters, dict):
+        return parameters
+    return {
+        key: value
+        for key, value in parameters.items()
+        if str(key).partition('.')[0] not in NODE_OPTIONS
+    }
 
 
 def words_of(class_name: str) -> set[str]:

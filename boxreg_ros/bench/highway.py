@@ -10,7 +10,7 @@ find out which (`sampling.box_time`).
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
 from boxreg_ros.bench.methods import run_methods
@@ -47,13 +47,8 @@ def run(args: argparse.Namespace) -> int:
         for convention in CONVENTIONS:
             table: dict[str, dict[str, float]] = {}
             for speed in SPEEDS:
-                ious: dict[str, list[float]] = {}
-                for seed in range(args.seeds):
-                    for name, iou in measured(seed, args.sweeps, convention, speed):
-                        ious.setdefault(name, []).append(iou)
-                    bar.update()
-                for name, values in ious.items():
-                    table.setdefault(name, {})[f'{speed:g} m/s'] = float(np.mean(values))
+                for name, iou in _mean_ious(args, convention, speed, bar.update).items():
+                    table.setdefault(name, {})[f'{speed:g} m/s'] = iou
             results[convention] = table
     if args.json:
         print_json(results)
@@ -63,6 +58,18 @@ def run(args: argparse.Namespace) -> int:
         for name, found in table.items():
             print(line(name, list(found.values())))
     return 0
+
+
+def _mean_ious(
+    args: argparse.Namespace, convention: str, speed: float, done: Callable[[], object]
+) -> dict[str, float]:
+    """Return the mean 3D IoU of each method over all seeds; `done` is called after each seed."""
+    ious: dict[str, list[float]] = {}
+    for seed in range(args.seeds):
+        for name, iou in measured(seed, args.sweeps, convention, speed):
+            ious.setdefault(name, []).append(iou)
+        done()
+    return {name: float(np.mean(values)) for name, values in ious.items()}
 
 
 def measured(seed: int, sweeps: int, convention: str, speed: float) -> Iterator[tuple[str, float]]:
