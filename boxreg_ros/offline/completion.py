@@ -83,7 +83,7 @@ def points_above_road(sweep: Sweep, boxes: Floats) -> Ints:
     valid = np.flatnonzero(is_valid_box(boxes))
     if not len(valid):
         return counts
-    near = crop(sweep.points, boxes[valid], SIDE_MARGIN)
+    near = crop(sweep, boxes[valid], SIDE_MARGIN)
     up = matrix_from_rpy(boxes[valid, ROLL:])[:, :, 2]
     half_height = boxes[valid, 5] / 2
     height = (near.offset * up.T.take(near.owner, 1)).sum(0) + half_height.take(near.owner)

@@ -123,7 +123,7 @@ class PointCollector:
             rows = np.flatnonzero(is_valid_box(boxes.boxes))
             if sweep is None or not len(rows):
                 continue
-            near = crop(sweep.points, boxes.boxes[rows], GATHERED_MARGIN)
+            near = crop(sweep, boxes.boxes[rows], GATHERED_MARGIN)
             is_near = near.outside.max(0) < GATHERED_MARGIN
             owners = near.owner[is_near]
             offsets = to_millimetres(near.offset[:, is_near].T)
