@@ -451,11 +451,10 @@ class _PendingArray:
         self.num_points[rows] = table.num_points
         self.num_unsettled += len(rows)
         entries = []
-        for observation, row, (x, y, _, length) in zip(
-            seen, rows, table.boxes[:, : LENGTH + 1].tolist(), strict=True
-        ):
+        places = table.boxes[:, : LENGTH + 1].tolist()
+        for observation, row, place in zip(seen, rows, places, strict=True):
             self.reasons[row] = 'short_track'  # until there is an estimate
-            entries.append(_Entry(observation, _Place(stamp_ns, x, y, length), self, row))
+            entries.append(_Entry(observation, _Place(stamp_ns, *place), self, row))
         return entries
 
     def add_predicted(self, sighting: _Sighting) -> int:
@@ -514,11 +513,12 @@ class _PendingArray:
 
 
 class _Place(NamedTuple):
-    """Centre and length of an input box [m] as plain numbers, which id switches are found by."""
+    """Centre and length of an input box [m] as plain numbers, of which motion is computed."""
 
     stamp_ns: int
     x: float
     y: float
+    z: float
     length: float
 
 
@@ -693,10 +693,10 @@ def _input_velocities(sightings: list[_Sighting], boxes: Floats, stamp_ns: int) 
     velocities = np.zeros((len(boxes), 3))
     known = [row for row, sighting in enumerate(sightings) if sighting.track.entries]
     if known:
-        entries = [sightings[row].track.entries[-VELOCITY_OBSERVATIONS:][0] for row in known]
-        before = np.array([entry.observation.box for entry in entries])
-        elapsed = stamp_ns - np.array([entry.observation.stamp_ns for entry in entries])
-        velocities[known] = (boxes[known] - before)[:, X : Z + 1] / elapsed[:, None] * 1e9
+        before = [sightings[row].track.entries[-VELOCITY_OBSERVATIONS:][0].place for row in known]
+        elapsed = stamp_ns - np.array([place.stamp_ns for place in before])
+        centers = np.array([(place.x, place.y, place.z) for place in before])
+        velocities[known] = (boxes[known, X : Z + 1] - centers) / elapsed[:, None] * 1e9
     return velocities
 
 
