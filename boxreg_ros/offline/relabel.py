@@ -64,7 +64,7 @@ UNUSED_PREFIXES = ('sweep_', 'boxes_')
 NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
 
 FEW_REFINED = 0.5
-"""A run that refines a smaller part of its boxes says why."""
+"""Refined part of the boxes below which a run prints its most frequent reason. Chosen."""
 
 
 def relabel(
