@@ -38,6 +38,8 @@ def run(args: argparse.Namespace) -> int:
         print(f'decisions: {server.log_path}; Ctrl-C ends', flush=True)
         with suppress(KeyboardInterrupt):
             server.serve_forever()
+        if server.log_path.exists():
+            print(f'to apply them: boxreg relabel RECORDING -o NEW --decisions {server.log_path}')
     return 0
 
 

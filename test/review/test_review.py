@@ -289,6 +289,14 @@ def test_list_sorts_and_filters_and_shows_tags_as_text(result):
         assert tracks.first.locator('td').nth(2).inner_text() == SCRIPT
         page.select_option('#f-class', '=' + SCRIPT)
         assert tracks.count() == 1
+        page.click('#f-clear')
+        assert tracks.count() == 2
+        for column in page.locator('#rows th button').all():
+            assert column.get_attribute('title')
+        why = page.evaluate('causesOf(DATA.tracks[0])[0]')
+        page.select_option('#f-reason', why)
+        assert page.evaluate('view.shown.length') >= 1
+        page.click('#f-clear')
         page.fill('#f-text', 'nothing')
         assert tracks.count() == 0
         assert page.inner_text('#f-count') == '0 of 2 tracks'
@@ -363,6 +371,12 @@ def test_pin_and_re_solve_round_trip(result, tmp_path):
             page.mouse.down()
             page.mouse.move(middle[0], middle[1] - 10, steps=4)  # up
             page.mouse.up()
+            # A correction that is not saved is not left by mistake.
+            page.fill('#time', '2')
+            page.evaluate('openTrack(1 - view.track)')
+            assert page.evaluate('[view.row, view.edit !== null]') == [6, True]
+            assert 'not saved' in page.inner_text('#failure')
+            page.locator('#top').focus()
             page.keyboard.press('Enter')
             page.wait_for_selector('[data-do=unpin]')
     finally:
@@ -386,6 +400,61 @@ def test_pin_and_re_solve_round_trip(result, tmp_path):
     np.testing.assert_allclose(corrected.boxes[row], pin.box, atol=1e-3)
     with opened_page((again / 'report.html').as_uri() + f'#track=1&stamp={pin.stamp_ns}') as page:
         assert 'human' in page.inner_text('#clock')
+
+
+@NEEDS_BROWSER
+def test_a_box_is_decided_about_and_commented_on_beside_its_track(result):
+    server, url = served(result[1])
+    try:
+        with opened_page(url + '#track=1') as page:
+            page.keyboard.press('a')
+            page.wait_for_selector('[data-do=accept][aria-pressed=true]')
+            page.keyboard.press('Shift+U')
+            page.wait_for_selector('[data-do=unsure-box][aria-pressed=true]')
+            page.keyboard.press('Shift+C')
+            page.keyboard.type('hidden')
+            page.keyboard.press('Enter')
+            page.wait_for_function("view.part.stamps.some(s => decisionOf('1', s)?.comment)")
+            assert page.locator('[data-do=accept][aria-pressed=true]').count() == 1
+            selected = page.locator('#rows tr[aria-selected=true] .decision')
+            assert selected.inner_text() == 'accept, 1 box'
+            stamp = int(page.evaluate('view.part.stamps[view.row]'))
+        made = read_decisions(result[1] / DECISIONS)
+    finally:
+        server.shutdown()
+        (result[1] / DECISIONS).unlink()
+    assert [(one.stamp_ns, one.kind, one.comment) for one in made] == [
+        (None, 'accept', ''),
+        (stamp, 'unsure', ''),
+        (stamp, 'unsure', 'hidden'),
+    ]
+
+
+@NEEDS_BROWSER
+def test_decisions_can_be_listed_and_undone_from_another_track(result):
+    server, url = served(result[1])
+    try:
+        with opened_page(url + '#tracks') as page:
+            first, second = page.evaluate('DATA.tracks.map(track => track.id)')
+            page.keyboard.press('c')
+            page.keyboard.type('look')
+            page.keyboard.press('Enter')
+            page.wait_for_function('decisions.size === 1')
+            cells = page.locator('#rows .decision')
+            assert cells.all_inner_texts() == ['comment', '']
+            page.select_option('#f-decision', 'open')
+            assert page.inner_text('#f-count') == '1 of 2 tracks, 1 decided'
+            # The list has lost the open track: the next one is that which took its place.
+            page.locator('#top').focus()
+            page.keyboard.press('ArrowDown')
+            page.wait_for_function(f"DATA.tracks[view.track].id === '{second}'")
+            page.keyboard.press('z')
+            page.wait_for_function(f"DATA.tracks[view.track].id === '{first}'")
+            assert page.evaluate('decisions.size') == 0
+            page.click('#f-clear')
+    finally:
+        server.shutdown()
+        (result[1] / DECISIONS).unlink()
 
 
 @NEEDS_BROWSER
