@@ -132,7 +132,7 @@ class TrackPart:
             'interpolated': sum(status[word] for word in ADDED),
             'begin': (int(track.stamps_ns[0]) - begin_ns) * 1e-9,
             'seconds': float(track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
-            'points': median(track.num_points[is_input]),
+            'points': median(track.num_points),
             'refined': float(track.is_refined.sum() / boxes) if boxes else None,
             'status': dict(status),
             'reasons': dict(Counter(filter(None, track.reasons.tolist())).most_common()),

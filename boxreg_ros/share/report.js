@@ -11,6 +11,8 @@ const MIN_FACE_POINTS = 5;         // fewer points do not show where a face is
 const OUTER_PART = 0.1;            // of the points near a face are its outermost points
 const FRAME = 12;                  // time for the 3D view at 60 frames per second [ms]
 const PAUSE = 120;                 // between two steps of one who stops to look [ms]
+const ZOOM_STEP = 1.25;             // of a key
+const MAX_ZOOM = 10;               // a box of 5 m then shows 1 mm per pixel
 const CHANGED = {
   moved: ['moved more than 0.2 m', t => t.shift > 0.2],
   turned: ['turned more than 2°', t => t.turn > 2],
@@ -29,7 +31,7 @@ const MEANINGS = [                  // of words in the reasons of a risk
   ['few points', 'median of the points per box'],
 ];
 const view = { track: -1, part: null, row: 0, sort: 'rank', descending: false, shown: [], place: 0, mode: 'sweep',
-               space: false, charts: false, pending: false, edit: null, isMoved: false, playing: 0 };
+               space: false, charts: false, pending: false, edit: null, isMoved: false, playing: 0, zoom: 1 };
 const decisions = new Map();       // by track and stamp
 const decidedBoxes = new Map();    // their number by track
 const made = [];                   // what held before each decision, for undo
@@ -186,7 +188,7 @@ function columns() {
     ['risk', 'risk [m]', t => t.risk, t => number(t.risk), 'expected error: the shift of a car 4.5 m long, along its heading, that loses as much 3D IoU'],
     ['decision', 'decision', t => decidedOf(t), t => decidedOf(t), 'your decision, and the number of boxes with one of their own'],
     ['why', 'why', t => t.why, t => partsOf(t.why)[0] ?? '', 'the most unusual part of the risk; ends are front and rear'],
-    ['points', 'points', t => t.points, t => number(t.points, 0), 'median of the points inside the input boxes'],
+    ['points', 'points', t => t.points, t => number(t.points, 0), 'median of the points inside the boxes'],
     ['boxes', 'boxes', t => t.boxes, t => t.boxes + (t.interpolated ? ` + ${t.interpolated}` : ''), 'boxes of the input + boxes that were added'],
     ['rules', 'rules', t => rulesOf(t).length || null, t => rulesOf(t).join(', '), 'rules of boxreg check that the refined boxes violate'],
     ['iou', 'IoU', t => t.after.iou, t => `${number(t.before.iou, 3)} → ${number(t.after.iou, 3)}`, 'mean 3D IoU with the true boxes, input → refined'],
@@ -405,6 +407,7 @@ async function openTrack(index, stamp = null, row = null) {
     view.part = part;
     view.charts = false;
     view.limits = limitsOf(part);
+    view.zoom = 1;
     $('time').max = part.stamps.length - 1;
     row ??= part.num_points.indexOf(Math.max(...part.num_points));  // the object is seen best there
     drawTitle(track);
@@ -495,7 +498,7 @@ function limitsOf(part) {
 
 function drawViews() {
   const part = view.part;
-  if (!part.usable[view.row]) return;
+  if (!part.usable[view.row]) return drawNothing();
   const mode = $('mode').value;
   const cacheKey = mode === 'sweep' ? view.row : mode;
   if (view.cacheKey !== cacheKey || view.cachePart !== part) {
@@ -517,12 +520,22 @@ function drawViews() {
   fill($('legend'), ...view.lines.map(({ name, dash }) => element('span', {}, element('i', { style: `border-color: var(--${name}); border-top-style: ${dash.length ? (dash[0] > 3 ? 'dashed' : 'dotted') : 'solid'}` }), labels[name])));
 }
 
+// A box with numbers that are not finite has no place.
+function drawNothing() {
+  view.local = view.lines = [];
+  view.cacheKey = null;
+  drawFlat($('top'), 1);
+  drawFlat($('side'), 2);
+  drawSpace();
+  fill($('legend'), 'no valid box at this stamp');
+}
+
 // The top view (axis 1) or the side view (axis 2), heading to the right.
 function drawFlat(canvas, axis) {
   const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
   if (canvas.width !== Math.round(width * scale)) canvas.width = Math.round(width * scale);
   if (canvas.height !== Math.round(height * scale)) canvas.height = Math.round(height * scale);
-  const zoom = Math.min(width / (2 * view.limits[0]), height / (2 * view.limits[axis]));
+  const zoom = view.zoom * Math.min(width / (2 * view.limits[0]), height / (2 * view.limits[axis]));
   canvas.zoom = zoom;
   const at = point => [width / 2 + zoom * point[0], height / 2 - zoom * point[axis]];
   // Points are many small rectangles: the processor draws them sooner than a software GPU does.
@@ -564,6 +577,11 @@ function drawFlat(canvas, axis) {
     context.stroke();
   }
   context.setLineDash([]);
+}
+
+function zoomBy(factor) {
+  view.zoom = Math.max(1, Math.min(MAX_ZOOM, view.zoom * factor));
+  drawViews();
 }
 
 const EDGES = [0, 1, 2, 3, 0, 4, 5, 6, 7, 4, null, 1, 5, null, 2, 6, null, 3, 7];
@@ -781,6 +799,7 @@ async function undo() {
 function edit() {
   if (!IS_REVIEW) return;
   if (view.isPlaying) play();
+  if (!view.part.usable[view.row]) return fail('This box has numbers that are not finite: correct another box of the track.');
   const human = currentBoxes().find(([name]) => name === 'human');
   view.edit = (human ? human[1] : view.part.usable[view.row]).slice();
   view.isMoved = false;
@@ -842,6 +861,11 @@ function setUpDragging(canvas, axis) {
     else moveEdit(...[0, 1, 2].map(k => k === 0 || k === axis ? at[k] - grip.last[k] : 0));
     redrawEdit();
   };
+  canvas.addEventListener('wheel', event => {
+    if (!event.ctrlKey) return;  // the wheel alone scrolls the page
+    event.preventDefault();
+    zoomBy(event.deltaY < 0 ? ZOOM_STEP : 1 / ZOOM_STEP);
+  }, { passive: false });
   canvas.onpointerup = canvas.onpointercancel = () => { grip = null; };
 }
 
@@ -856,6 +880,8 @@ const KEYS = {
   ArrowDown: ['↓  ↑', 'next and previous track of the list', () => nextTrack(1)],
   ArrowUp: ['', '', () => nextTrack(-1)],
   g: ['g', 'go to the riskiest box of the track', () => step(nearestRow(DATA.tracks[view.track].riskiest))],
+  '+': ['+  −', 'zoom the top and side view; Ctrl with the wheel does too', () => zoomBy(ZOOM_STEP)],
+  '-': ['', '', () => zoomBy(1 / ZOOM_STEP)],
   m: ['m', 'points of this sweep, or of all sweeps in the refined or input boxes', () => { const mode = $('mode'); mode.selectedIndex = (mode.selectedIndex + 1) % 3; drawViews(); }],
   '/': ['/', 'search', () => $('f-text').focus()],
   '?': ['?', 'show the keys', () => $('help').showModal()],
@@ -904,7 +930,8 @@ function onKey(event) {
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   if (target.matches('button, a') && (name === ' ' || name === 'Enter')) return;
   if (event.key !== '?' && event.key !== '/' && ($('tracks').hidden || !view.part)) return;
-  const key = view.edit ? EDIT_KEYS[name] : KEYS[name] ?? (IS_REVIEW ? REVIEW_KEYS[name] : undefined);
+  const isZoom = name === '+' || name === '-';
+  const key = view.edit && !isZoom ? EDIT_KEYS[name] : KEYS[name] ?? (IS_REVIEW ? REVIEW_KEYS[name] : undefined);
   if (!key) return;
   event.preventDefault();
   key[2](view.edit ? (event.shiftKey ? 5 : 1) : event);

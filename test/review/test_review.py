@@ -327,6 +327,11 @@ def test_slider_keys_and_links_step_through_a_track(result):
         for mode in ('after', 'before', 'sweep'):
             page.keyboard.press('m')
             assert page.input_value('#mode') == mode
+        page.keyboard.press('+')
+        assert page.evaluate('view.zoom') == 1.25
+        page.keyboard.press('-')
+        page.evaluate('view.part.usable[4] = null; step(4, true)')
+        assert page.inner_text('#legend') == 'no valid box at this stamp'
         assert page.locator('#space canvas').count() > 0
         assert page.locator('#charts svg.main-svg').count() > 0
 
