@@ -253,19 +253,27 @@ function drawList() {
     return element('th', { class: TEXT.has(name) ? '' : 'n', 'aria-sort': isSorted ? (view.descending ? 'descending' : 'ascending') : null },
       element('button', { 'data-sort': name, title: meaning, onclick: () => sortBy(name) }, title + (isSorted ? (view.descending ? ' ▾' : ' ▴') : '')));
   })));
-  fill($('rows').querySelector('tbody'), ...view.shown.map(track => {
-    const row = element('tr', { class: 'link', 'data-track': track.index, 'aria-selected': String(track.index === view.track), onclick: () => openTrack(track.index) });
-    row.append(...found.map(([name, , , text]) => {
-      const shown = String(text(track));
-      return element('td', { class: TEXT.has(name) ? name : 'n', title: TEXT.has(name) ? (name === 'why' ? track.why : shown) : null }, shown);
-    }));
-    return row;
-  }));
+  const body = $('rows').querySelector('tbody'), lines = view.shown.map(track => lineOf(track, found));
+  const drawn = [...body.children];
+  // A decision seldom changes the list: a thousand lines need not be laid out again.
+  if (lines.length !== drawn.length || lines.some((line, k) => line !== drawn[k])) body.replaceChildren(...lines);
   const place = view.shown.findIndex(track => track.index === view.track);
   if (place >= 0) view.place = place;
   const decided = DATA.tracks.filter(track => decidedOf(track)).length;
   $('f-count').textContent = `${view.shown.length} of ${DATA.tracks.length} tracks` + (IS_REVIEW ? `, ${decided} decided` : '');
   $('f-clear').hidden = filters().every(input => input.value === input.defaultValue || (input.matches('select') && !input.value));
+}
+
+// The line of a track in the list; only its decision changes.
+function lineOf(track, found) {
+  track.line ??= element('tr', { class: 'link', 'data-track': track.index, 'aria-selected': String(track.index === view.track), onclick: () => openTrack(track.index) },
+    ...found.map(([name, , , text]) => {
+      const shown = String(text(track));
+      return element('td', { class: TEXT.has(name) ? name : 'n', title: TEXT.has(name) ? (name === 'why' ? track.why : shown) : null }, shown);
+    }));
+  const decision = track.line.querySelector('.decision');
+  if (decision) decision.textContent = decision.title = decidedOf(track);
+  return track.line;
 }
 
 const filters = () => [...document.querySelectorAll('.filters input, .filters select')];
@@ -397,11 +405,8 @@ async function openTrack(index, stamp = null, row = null) {
     view.track = index;
     view.place = Math.max(0, view.shown.indexOf(track));
     view.edit = null;
-    for (const line of $('rows').querySelectorAll('tbody tr')) {
-      const isOpen = Number(line.dataset.track) === index;
-      line.setAttribute('aria-selected', String(isOpen));
-      if (isOpen) line.scrollIntoView({ block: 'nearest' });
-    }
+    for (const one of DATA.tracks) one.line?.setAttribute('aria-selected', String(one === track));
+    track.line?.scrollIntoView({ block: 'nearest' });
     const part = await loadPart(index);
     if (view.track !== index) return;
     view.part = part;
@@ -1005,7 +1010,10 @@ async function main() {
   setUpKeys();
   setUpDragging($('top'), 1);
   setUpDragging($('side'), 2);
-  for (const one of ['overview', 'tracks', 'run']) $('tab-' + one).onclick = () => selectTab(one);
+  for (const one of ['overview', 'tracks', 'run']) $('tab-' + one).onclick = () => {
+    selectTab(one);
+    if (one === 'tracks') $('rows').focus({ preventScroll: true });  // Space plays, and does not press the tab again
+  };
   $('time').oninput = () => step(Number($('time').value));
   $('mode').onchange = drawViews;
   $('play').onclick = play;

@@ -327,6 +327,10 @@ def test_slider_keys_and_links_step_through_a_track(result):
         for mode in ('after', 'before', 'sweep'):
             page.keyboard.press('m')
             assert page.input_value('#mode') == mode
+        page.click('#tab-tracks')
+        page.keyboard.press(' ')
+        assert page.evaluate('view.isPlaying')
+        page.keyboard.press(' ')
         page.keyboard.press('+')
         assert page.evaluate('view.zoom') == 1.25
         page.keyboard.press('-')
