@@ -37,6 +37,7 @@ from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.review.decisions import DECISIONS
 from boxreg_ros.structures import (
+    BoxArray,
     COASTED,
     EXTENDED,
     HUMAN,
@@ -213,7 +214,9 @@ def _register(
         moved = with_ticket.moved
         with clock('registrar'):
             if completion is not None:
-                moved = completion.to_register(moved, item.restarts)
+                given, moved = moved, completion.to_register(moved, item.restarts)
+                if sink.points is not None and isinstance(given, BoxArray):
+                    sink.points.add(completion.added_boxes(given))
             ready = register(registrar, moved, item.restarts)
         _take(ready, completion, sink)
     with clock('registrar'):
