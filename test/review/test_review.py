@@ -4,6 +4,10 @@ from contextlib import contextmanager
 import csv
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+import shutil
+import signal
+import subprocess
+import sys
 from threading import Thread
 from time import sleep
 
@@ -208,6 +212,20 @@ def test_unfinished_result_is_refused(tmp_path, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     for word in ('expected', 'got', 'report.html', '--report'):
         assert word in line
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_ended_server_names_the_command_that_applies_its_decisions(result, tmp_path, number):
+    out = shutil.copytree(result[1], tmp_path / 'out')
+    DecisionLog(out / DECISIONS).append(Decision('1', None, 'reject'))
+    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(out), '--port', '0']
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        lines = [process.stdout.readline().decode() for _ in range(2)]
+        process.send_signal(number)
+        rest, errors = process.communicate(timeout=60)
+    assert 'http://127.0.0.1:' in lines[0]
+    assert f'--decisions {out / DECISIONS}' in rest.decode()
+    assert (process.returncode, errors) == (0, b'')
 
 
 def test_busy_port_is_refused(result):
