@@ -691,10 +691,10 @@ async function drawCharts() {
   view.charts = true;
   const tinted = (words, names) => words.map((word, k) => `<span style="color: ${colour(names[k])}">${word}</span>`).join(', ');
   const notes = {
-    risk: 'expected error of each box; click a point of any chart to go there',
+    risk: 'expected error of each box; click a point to go there',
     along: 'refined − input, in the axes of the box; band: ± 2σ',
     size: `${tinted(SIZES, SIZE_COLOURS)}; band: ± 2σ; dashed: input`,
-    faces: `outermost points − face (positive: outside): ${tinted(FACES.map((f, k) => '●■▲▼✕'[k] + ' ' + f), FACE_COLOURS)}`,
+    faces: `outermost points − face: ${tinted(FACES.map((f, k) => '●■▲▼✕'[k] + ' ' + f), FACE_COLOURS)}`,
   };
   const layout = { ...LAYOUT(), margin: { l: 56, r: 8, t: 16, b: 34 }, xaxis: { ...AXIS(), title: { text: 'time [s]' }, anchor: 'y' + chartNumber('faces') }, annotations: [] };
   const gap = 0.035;
