@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -163,7 +164,9 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
 def _imported(name: str) -> FormatModule:
     """Return the module of a format, whether or not the packages it needs are installed."""
     if name not in FORMATS:
-        raise ConfigError(f'format {name!r}: expected one of {", ".join(FORMATS)}')
+        similar = get_close_matches(name, FORMATS, 1)
+        meant = f'; did you mean {similar[0]}?' if similar else ''
+        raise ConfigError(f'format {name!r}: expected one of {", ".join(FORMATS)}{meant}')
     return cast(FormatModule, import_module(FORMATS[name]))
 
 

@@ -199,6 +199,10 @@ class Completion:
         self._counter.add(item)
         return item
 
+    def added_boxes(self, given: BoxArray) -> BoxArray:
+        """Return the boxes that the plan adds to an array, after `to_register` of it."""
+        return self._plan.arrays[self._index_of[given.ticket]].added_boxes(given)
+
     def add(self, ready: Iterable[RefinedBoxes]) -> None:
         """Hold results of the registrar."""
         for result in ready:

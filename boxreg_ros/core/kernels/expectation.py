@@ -28,7 +28,7 @@ HEADING = 5
 
 class ExpectationWork(NamedTuple):
     """
-    What the input says about one window.
+    Input model of one window.
 
     Attributes
     ----------

@@ -95,7 +95,7 @@ def median_place(boxes, times, first, last):
 
 @kernel
 def fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked):
-    """Write whether the object rests from each box to the next (M25), (N - 1,)."""
+    """Write whether the object is parked from each box to the next (M25), (N - 1,)."""
     parked[:] = False
     if not is_parked(boxes, times, length, yaw_deviation, numbers):
         return
