@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 import json
 import math
 from pathlib import Path
+from statistics import NormalDist
 import sys
 from typing import Any
 
@@ -34,6 +35,8 @@ from generate import between_marks
 DOCS = Path(__file__).resolve().parent
 STORE = DOCS / 'results'
 OVERVIEW = DOCS / 'results.md'
+MIN_TRACKS = 3
+"""Fewest tracks of a cell whose standard error is trusted."""
 
 DATA = {
     'resim_3bffdcff': 'Real surfaces on a real drive, exact truth, detector noise',
@@ -540,6 +543,7 @@ def _covariance(results: Any) -> Iterable[str]:
         variables = next(iter(next(iter(estimates.values())).values()))['nees']
         yield _table([recording, 'boxes of tracks', *variables], rows)
         yield _consistent_cells(estimates)
+    yield _cells_and_chance(results)
 
 
 def _consistent(group: Any) -> Iterable[str]:
@@ -549,15 +553,20 @@ def _consistent(group: Any) -> Iterable[str]:
         yield f'{group["coverage"][name]:.2f} / {nees:.1f}{spread}'
 
 
-def _consistent_cells(estimates: Any) -> str:
-    """Return how many cells of the kinds are consistent, and which are not."""
-    cells = [
+def _cells_of_kinds(estimates: Any) -> list[tuple[str, Any, str]]:
+    """Return the cells of the kinds along, across, up and in yaw: name, group and variable."""
+    return [
         (f'{estimate} {kind} {variable}', group, variable)
         for estimate, groups in estimates.items()
         for kind, group in groups.items()
         if kind in {f'{kind}s' for kind in KINDS}
         for variable in CONSISTENCY_VARIABLES[:4]
     ]
+
+
+def _consistent_cells(estimates: Any) -> str:
+    """Return how many cells of the kinds are consistent, and which are not."""
+    cells = _cells_of_kinds(estimates)
     low, high = CONSISTENT_NEES
     coverage = [group['coverage'][variable] for _, group, variable in cells]
     nees = [group['nees'][variable] for _, group, variable in cells]
@@ -574,6 +583,30 @@ def _consistent_cells(estimates: Any) -> str:
         f'{low:g} to {high:g} in {sum(low <= value <= high for value in nees)}, less in '
         f'{sum(value < low for value in nees)}, more in {sum(value > high for value in nees)}; '
         f'more by over {SIGNIFICANT:g} standard errors: {", ".join(overconfident) or "none"}.'
+    )
+
+
+def _cells_and_chance(results: Any) -> str:
+    """Return how many cells of all recordings are consistent, and what chance leaves of that."""
+    every = [cell for estimates in results.values() for cell in _cells_of_kinds(estimates)]
+    of_many = [
+        (group['nees'][variable], group['nees_error'][variable])
+        for _, group, variable in every
+        if group['tracks'] >= MIN_TRACKS
+    ]
+    low, high = CONSISTENT_NEES
+    exact = sum(
+        NormalDist(1.0, error / value).cdf(high) - NormalDist(1.0, error / value).cdf(low)
+        for value, error in of_many
+    )
+    return (
+        f'All recordings: {sum(low <= g["nees"][v] <= high for _, g, v in every)} of {len(every)} '
+        f'cells are {low:g} to {high:g}, of those with {MIN_TRACKS} tracks or more '
+        f'{sum(low <= value <= high for value, _ in of_many)} of {len(of_many)}. If all '
+        f'covariances were exact, and tracks differed as much, {exact:.0f} of these would be. '
+        f'Less by over {SIGNIFICANT:g} standard errors are '
+        f'{sum(low - value > SIGNIFICANT * error for value, error in of_many)}, more '
+        f'{sum(value - high > SIGNIFICANT * error for value, error in of_many)}.'
     )
 
 

@@ -7,9 +7,9 @@ points, those of the other are ahead of or behind them. docs/method.md (M12).
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from math import hypot
 from typing import Any
 
 from boxreg_ros.config import Config
@@ -58,7 +58,7 @@ def motion_to_sight(sweep: Sweep, boxes: Floats, velocities: Floats) -> Floats:
     moving = np.flatnonzero(most > MIN_MOTION)
     if not len(moving):
         return motion
-    near = crop(sweep.points, boxes[moving], SIGHT_MARGIN)
+    near = crop(sweep, boxes[moving], SIGHT_MARGIN)
     is_near = near.outside.max(0) < SIGHT_MARGIN
     rows, owner = near.row[is_near], near.owner[is_near]
     for i, box in enumerate(moving):
@@ -82,25 +82,30 @@ class BoxTimeEvidence:
     def __init__(self) -> None:
         self.votes = Counter[str]()
 
-    def add(self, seen: Observation, velocity: Floats) -> None:
+    def add(self, seen: Sequence[Observation], velocities: Floats) -> None:
         """
-        Compare a box with its points, moved to the time of sight and to the stamp.
+        Compare boxes with their points, moved to the time of sight and to the stamp.
 
         The points are on the surface of the object: near the faces of a box of their own time.
         Each is moved by its own delay, since two LiDARs may see an object at different times.
 
         Parameters
         ----------
-        seen : Observation
-            Of the box.
-        velocity : array, shape (3,)
-            Of the object [m/s].
+        seen : sequence of n Observation
+            Of the boxes, in one table.
+        velocities : array, shape (n or more, 3)
+            Of the objects [m/s].
 
         """
-        if not seen.sight:
+        if not seen:
             return
-        motion = velocity * seen.sight
-        if hypot(*motion.tolist()) < MIN_MOTION or len(seen.points) < MIN_VOTE_POINTS:
+        rows = [observation.row for observation in seen]
+        motions = velocities[: len(seen)] * seen[0].table.sights[rows, None]  # from the stamp [m]
+        for i in np.flatnonzero(np.linalg.norm(motions, axis=1) >= MIN_MOTION).tolist():
+            self._vote(seen[i], velocities[i], motions[i])
+
+    def _vote(self, seen: Observation, velocity: Floats, motion: Floats) -> None:
+        if len(seen.points) < MIN_VOTE_POINTS:
             return
         points = seen.points - np.outer(seen.delays, velocity)  # at the stamp
         at_stamp = _distance_from_faces(seen.box, points)

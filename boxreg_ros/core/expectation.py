@@ -71,6 +71,9 @@ times the ratios of standard to robust deviation, 1.28, 1.05 and 1.18; of cyclis
 and 0.047 m.
 
 """
+DETECTED = (0, 1, 2, 5, 6, 7, 8)
+"""Places of position, yaw and extents among the errors of the input. Detectors set roll and pitch
+to zero: their residuals are errors of the fit alone, whose correlation shows no constant ones."""
 PIVOT_DEVIATION = 0.25
 """Deviation of the pivot, as part of the length."""
 MIN_EXTENT_GAIN = 0.2
@@ -207,7 +210,8 @@ def expect(problem: Problem, inputs: InputEstimates) -> Expectation:
     anchor = torch.ones_like(usual)
     sideslip = problem.of_class('sideslip')
     deviations = torch.cat([extent_deviation, bias, spread, pivot, anchor, sideslip], 1)
-    input_error = _input_error(problem, noise, widening[:, 6:], slow.amax(1, keepdim=True))
+    slowest = slow[:, DETECTED].amax(1, keepdim=True)
+    input_error = _input_error(problem, noise, widening[:, 6:], slowest)
     input_error = _at_least_prior(problem, input_error, deviations)
     error = torch.cat([input_error, margins * size[:, FACE_AXIS]], 1)
     return Expectation(shared, deviations, deviation, widened, unmodelled, error)

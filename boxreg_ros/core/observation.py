@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.kernels import load
-from boxreg_ros.core.kernels.arrays import CropNumbers
+from boxreg_ros.core.kernels.arrays import CropNumbers, ShapeArrays
 from boxreg_ros.core.tables import column
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Floats, Ints, ROLL, Sweep, YAW
@@ -207,7 +207,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
     Parameters
     ----------
     sweep : Sweep
-        In the fixed frame.
+        In the fixed frame; its points may be in their own, see `Sweep.T_frame_points`.
     boxes : array, shape (n, 9)
         Valid boxes in the fixed frame, at the stamp of the sweep.
     stamp_ns : int
@@ -227,7 +227,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
     own = find(sweep, boxes, config)
     rows, owner = _thinned(own, sweep, n, config)
 
-    points = (sweep.points.T.take(rows, 1) - centers.T.take(owner, 1)).T.astype(np.float32, 'C')
+    points = _offsets(sweep, centers, rows, owner).T.astype(np.float32, 'C')
     counts = np.bincount(owner, minlength=n)
     delays = np.zeros(len(rows), np.float32)
     sights = np.zeros(n)
@@ -248,6 +248,16 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
         sights=sights,
         is_pinned=np.zeros(n, bool),
     )
+
+
+def _offsets(sweep: Sweep, centers: Floats, rows: Ints, owner: Ints) -> Floats:
+    """Return points minus the `centers` (n, 3) of their boxes, axes of the frame, (3, P) [m]."""
+    at_points, turn = _among_points(sweep, centers)
+    offset = sweep.points.T.take(rows, 1) - at_points.T.take(owner, 1)
+    if sweep.T_frame_points is None:
+        return offset
+    x, y, z = offset
+    return np.stack([a * x + b * y + c * z for a, b, c in turn])
 
 
 def _origins(sweep: Sweep, rows: Ints, owner: Ints, centers: Floats) -> Floats:
@@ -328,14 +338,15 @@ def own_points(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
         min_road_points=MIN_ROAD_POINTS,
     )
     columns = np.ascontiguousarray(sweep.points.T)
-    return OwnPoints(*kernels.crop.own_points(columns, *_shapes(boxes, numbers.margin), numbers))
+    shapes = _shapes(sweep, boxes, numbers.margin)
+    return OwnPoints(*kernels.crop.own_points(columns, shapes, numbers))
 
 
 def own_points_numpy(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
     """Return the same as `own_points`, by numpy."""
     n = len(boxes)
     half = boxes[:, 3:6] / 2
-    near = crop_numpy(sweep.points, boxes, max(ROAD_SEARCH_WIDTH, config.sampling.margin))
+    near = crop_numpy(sweep, boxes, max(ROAD_SEARCH_WIDTH, config.sampling.margin))
     depth = near.outside.max(0)  # of the face the point is least inside of, (P,)
     up = matrix_from_rpy(boxes[:, ROLL:])[:, :, 2]
     # Above the bottom of the box, along its z axis: also valid on a slope. (P,)
@@ -354,15 +365,29 @@ def own_points_numpy(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
     return OwnPoints(near.row[own], near.owner[own], road, num_inside)
 
 
-def _shapes(boxes: Floats, margin: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return centres, rotations, half extents and half upright bounding boxes of `boxes`."""
+def _among_points(sweep: Sweep, centers: Floats) -> tuple[Floats, Floats]:
+    """
+    Return `centers` (n, 3) in the frame of the points, and what turns offsets back, (3, 3).
+
+    Boxes are brought to the points: they are fewer.
+
+    """
+    if sweep.T_frame_points is None:
+        return centers.copy(), np.eye(3)
+    R, t = sweep.T_frame_points[:3, :3], sweep.T_frame_points[:3, 3]
+    return (centers - t) @ R, R.copy()
+
+
+def _shapes(sweep: Sweep, boxes: Floats, margin: float) -> ShapeArrays:
+    """Return what the kernels need of `boxes` (n, 9) to find the points within `margin`."""
+    centers, turn = _among_points(sweep, boxes[:, :3])
     R = matrix_from_rpy(boxes[:, ROLL:])  # (n, 3, 3)
     half = boxes[:, 3:6] / 2
-    reach = (np.abs(R) @ (half + margin)[..., None])[..., 0]
-    return boxes[:, :3].copy(), R, half, reach
+    reach = (np.abs(turn.T @ R) @ (half + margin)[..., None])[..., 0]
+    return ShapeArrays(centers, turn, R, half, reach)
 
 
-def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
+def crop(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
     """
     Return all pairs of a point and a box within `margin` of each other.
 
@@ -370,10 +395,10 @@ def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
 
     Parameters
     ----------
-    points : array, shape (M, 3)
-        Points of a sweep [m].
+    sweep : Sweep
+        In the frame of the boxes.
     boxes : array, shape (n, 9)
-        Valid boxes in the frame of the points.
+        Valid boxes.
     margin : float
         Distance from the faces of the box [m].
 
@@ -385,22 +410,22 @@ def crop(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
     """
     kernels = load()
     if kernels is None:
-        return crop_numpy(points, boxes, margin)
-    columns = np.ascontiguousarray(points.T)
-    row, owner, offset, outside = kernels.crop.crop(columns, *_shapes(boxes, margin), margin)
+        return crop_numpy(sweep, boxes, margin)
+    columns = np.ascontiguousarray(sweep.points.T)
+    row, owner, offset, outside = kernels.crop.crop(columns, _shapes(sweep, boxes, margin), margin)
     order = np.argsort(owner, kind='stable')
     return Crop(row[order], owner[order], offset[order].T, outside[order].T)
 
 
-def crop_numpy(points: NDArray[np.floating], boxes: Floats, margin: float) -> Crop:
+def crop_numpy(sweep: Sweep, boxes: Floats, margin: float) -> Crop:
     """Return the same as `crop`, and some more pairs, by numpy."""
-    _, R, half, reach = _shapes(boxes, margin)
-    index, owner = _pairs(points, boxes[:, :2], reach[:, :2])
-    offset = points.T.take(index, 1).astype(np.float64) - boxes[:, :3].T.take(owner, 1)
+    shapes = _shapes(sweep, boxes, margin)
+    index, owner = _pairs(sweep.points, shapes.centers[:, :2], shapes.reach[:, :2])
+    offset = _offsets(sweep, boxes[:, :3], index, owner)
     outside = np.empty_like(offset)
-    for axes, part in zip(R, _slices(owner, len(boxes)), strict=True):
+    for axes, part in zip(shapes.rotations, _slices(owner, len(boxes)), strict=True):
         np.matmul(axes.T, offset[:, part], out=outside[:, part])
-    np.subtract(np.abs(outside, out=outside), half.T.take(owner, 1), out=outside)
+    np.subtract(np.abs(outside, out=outside), shapes.half.T.take(owner, 1), out=outside)
     return Crop(index, owner, offset, outside)
 
 

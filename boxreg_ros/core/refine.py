@@ -254,13 +254,12 @@ def _box_array(stamp_ns: int, tracks: Sequence[Track], places: Sequence[_Place])
         tuple(tracks[place.track].class_name for place in places),
         np.ones(len(places)),
         np.array([tracks[index].boxes[row] for index, row in places]),
-        pinned=np.array([_pins(tracks[index])[row] for index, row in places]),
+        pinned=np.array([_is_pinned(tracks[index], row) for index, row in places]),
     )
 
 
-def _pins(track: Track) -> NDArray[np.bool_]:
-    """Return which boxes of a track are pinned, (N,)."""
-    return np.zeros(len(track.boxes), bool) if track.pinned is None else track.pinned
+def _is_pinned(track: Track, row: int) -> bool:
+    return track.pinned is not None and bool(track.pinned[row])
 
 
 def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> RefinedTrack:
@@ -283,7 +282,7 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
         )
         for row in np.flatnonzero(~is_valid):
             status[row] = INTERPOLATED
-    for row in np.flatnonzero(_pins(track)):
+    for row in np.flatnonzero(track.pinned) if track.pinned is not None else ():
         boxes[row] = track.boxes[row]
         status[row], reasons[row] = HUMAN, ''
     columns = tuple(status), tuple(reasons), covariances, extents

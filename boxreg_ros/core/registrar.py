@@ -17,7 +17,7 @@ from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.support import is_owned, MIN_HITS, points_inside, points_to_confirm
-from boxreg_ros.core.tables import column, joined
+from boxreg_ros.core.tables import by_table, column, joined
 from boxreg_ros.core.track_window import (
     Estimate,
     Estimates,
@@ -32,6 +32,7 @@ from boxreg_ros.structures import (
     Floats,
     is_valid_box,
     KEPT,
+    LENGTH,
     REFINED,
     RefinedBoxes,
     Sweep,
@@ -248,17 +249,21 @@ class BoxRegistrar:
             # A box that is not confirmed owns no points.
             self.counts['coast_unconfirmed'] += len(coasting) - len(confirmed)
             seen, velocities = self._seen([*given, *confirmed], boxes, sweep)
-        for sighting, observation, velocity in zip(given, seen, velocities, strict=False):
-            self.box_time.add(observation, velocity)
+        self.box_time.add(seen[: len(given)], velocities)
+        rows = [sighting.row for sighting in given]
+        rows += [array.add_predicted(sighting) for sighting in confirmed]
+        entries = array.add_observations(seen, rows)
+        for sighting, entry in zip(given, entries, strict=False):
             track = sighting.track
-            track.add(observation, array, sighting.row)
+            track.entries.append(entry)
+            track.detected_ns = boxes.stamp_ns
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
                 self._tracks[track.track_id] = successor
-        for sighting, observation in zip(confirmed, seen[len(given) :], strict=True):
-            row = array.add_predicted(sighting)
-            sighting.track.add(observation, array, row, is_predicted=True)
+        for sighting, entry in zip(confirmed, entries[len(given) :], strict=True):
+            entry.is_predicted = True
+            sighting.track.entries.append(entry)
 
     def _coasting(self, array: _PendingArray) -> list[_Sighting]:
         """Return the predicted boxes of the tracks that have no box in `array`."""
@@ -437,6 +442,21 @@ class _PendingArray:
             if is_valid[row]:
                 known.add(track_id)
 
+    def add_observations(self, seen: Sequence[Observation], rows: Sequence[int]) -> list[_Entry]:
+        """Return the entries of n boxes in `rows`, which then wait for their estimates."""
+        if not seen:
+            return []
+        table = seen[0].table
+        stamp_ns = self.input.stamp_ns
+        self.num_points[rows] = table.num_points
+        self.num_unsettled += len(rows)
+        entries = []
+        places = table.boxes[:, : LENGTH + 1].tolist()
+        for observation, row, place in zip(seen, rows, places, strict=True):
+            self.reasons[row] = 'short_track'  # until there is an estimate
+            entries.append(_Entry(observation, _Place(stamp_ns, *place), self, row))
+        return entries
+
     def add_predicted(self, sighting: _Sighting) -> int:
         """Add the predicted box of a track; return its row."""
         given = self.input
@@ -470,11 +490,11 @@ class _PendingArray:
             face_distances=np.zeros((n, 6)),
             near_points=np.zeros((n, 2), np.int64),
         )
-        estimated = [row for row, found in enumerate(self.estimates) if found is not None]
-        tables, places = joined([found for found in self.estimates if found is not None])
-        if estimated:
-            for name, values in columns._asdict().items():
-                values[estimated] = column(tables, name)[places]
+        known = {row: found for row, found in enumerate(self.estimates) if found is not None}
+        estimated = np.array([*known], int)
+        for table, places, rows in by_table([*known.values()]):
+            for values, estimates in zip(columns, table, strict=True):
+                values[estimated[places]] = estimates[rows]
         is_returned = columns.status == REFINED
         is_returned[: self.num_given] = True
         columns.status[self.num_given :] = COASTED
@@ -493,11 +513,12 @@ class _PendingArray:
 
 
 class _Place(NamedTuple):
-    """Centre and length of an input box [m] as plain numbers, which id switches are found by."""
+    """Centre and length of an input box [m] as plain numbers, of which motion is computed."""
 
     stamp_ns: int
     x: float
     y: float
+    z: float
     length: float
 
 
@@ -555,7 +576,7 @@ class _Track:
     @property
     def newest_ns(self) -> int:
         """Stamp of the newest observation [ns]."""
-        return self.entries[-1].observation.stamp_ns
+        return self.entries[-1].place.stamp_ns
 
     def is_in(self, array: _PendingArray) -> bool:
         """Return whether the newest observation is of `array`."""
@@ -576,19 +597,6 @@ class _Track:
             newest.estimate = newest.observation
         excess = max(0, len(self.entries) - length)
         del self.entries[PRIOR_POSES : PRIOR_POSES + excess]
-
-    def add(
-        self, seen: Observation, array: _PendingArray, row: int, is_predicted: bool = False
-    ) -> None:
-        """Add an observation of a box in a row of `array`, which then waits for its estimate."""
-        array.num_points[row] = seen.num_points
-        array.reasons[row] = 'short_track'  # until there is an estimate
-        array.num_unsettled += 1
-        x, y, _, length, *_ = seen.box.tolist()
-        place = _Place(seen.stamp_ns, x, y, length)
-        self.entries.append(_Entry(seen, place, array, row, is_predicted))
-        if not is_predicted:
-            self.detected_ns = seen.stamp_ns
 
     def coasts(self, stamp_ns: int, config: Config) -> bool:
         """Return whether a box may be predicted at a stamp without a detection."""
@@ -615,12 +623,12 @@ class _Track:
         of the object and `ID_SWITCH_SPEED`. A single one may be an outlier.
 
         """
-        recent = [entry.place for entry in self.entries[-ID_SWITCH_OBSERVATIONS:]]
+        recent = self.entries[-ID_SWITCH_OBSERVATIONS:]
         if len(recent) < ID_SWITCH_OBSERVATIONS - 1:
             return None
-        first, latest = recent[0], recent[-3]
+        first, latest = recent[0].place, recent[-3].place
         duration_ns = latest.stamp_ns - first.stamp_ns
-        for place in recent[-2:]:
+        for place in (recent[-1].place, recent[-2].place):
             elapsed_ns = place.stamp_ns - latest.stamp_ns
             part = elapsed_ns / duration_ns
             x = latest.x + part * (latest.x - first.x)
@@ -685,10 +693,10 @@ def _input_velocities(sightings: list[_Sighting], boxes: Floats, stamp_ns: int) 
     velocities = np.zeros((len(boxes), 3))
     known = [row for row, sighting in enumerate(sightings) if sighting.track.entries]
     if known:
-        entries = [sightings[row].track.entries[-VELOCITY_OBSERVATIONS:][0] for row in known]
-        before = np.array([entry.observation.box for entry in entries])
-        elapsed = stamp_ns - np.array([entry.observation.stamp_ns for entry in entries])
-        velocities[known] = (boxes[known] - before)[:, X : Z + 1] / elapsed[:, None] * 1e9
+        before = [sightings[row].track.entries[-VELOCITY_OBSERVATIONS:][0].place for row in known]
+        elapsed = stamp_ns - np.array([place.stamp_ns for place in before])
+        centers = np.array([(place.x, place.y, place.z) for place in before])
+        velocities[known] = (boxes[known, X : Z + 1] - centers) / elapsed[:, None] * 1e9
     return velocities
 
 

@@ -37,6 +37,16 @@ def joined(items: Sequence[tuple[Any, int]]) -> tuple[list[Any], Ints]:
     return list(of_id.values()), np.array([first[id(table)] + row for table, row in items], int)
 
 
+def by_table(items: Sequence[tuple[Any, int]]) -> list[tuple[Any, list[int], list[int]]]:
+    """Return each table of some items, the places of its items among them, and their rows."""
+    found: dict[int, tuple[Any, list[int], list[int]]] = {}
+    for place, (table, row) in enumerate(items):
+        _, places, rows = found.setdefault(id(table), (table, [], []))
+        places.append(place)
+        rows.append(row)
+    return list(found.values())
+
+
 def column(tables: Sequence[Any], name: str) -> Any:
     """Return the field `name` of the concatenation of `tables`; of one table, no copy."""
     parts = [getattr(table, name) for table in tables]

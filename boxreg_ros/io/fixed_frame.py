@@ -184,7 +184,7 @@ class FixedFrameItems:
             return StoredCloud(given, item.T_fixed_item, item.items[0].intensities)
         T_fixed_frame = self.pose_of(frame_id, moved.stamp_ns)
         if T_fixed_frame is not None:
-            moved = sweep_to_frame(moved, inverse(T_fixed_frame), frame_id)
+            moved = sweep_to_frame(moved, inverse(T_fixed_frame), frame_id).in_frame()
         intensities = [part.intensities for part in item.items]
         known = [values for values in intensities if values is not None]
         whole = np.concatenate(known) if len(known) == len(item.items) else None

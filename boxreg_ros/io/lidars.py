@@ -211,7 +211,7 @@ class SensorPlacement:
             return sweep, 'sensor_without_transform', str(error)
         if len(frames) == 1:
             return replace(sweep, origin=origins[0]), '', ''
-        return _with_sensors(sweep, origins, _nearest(sweep.points, origins)), '', ''
+        return _with_sensors(sweep, origins, _nearest(sweep.in_frame().points, origins)), '', ''
 
 
 def _positions(sensors: Sequence[tuple[str, int]], sweep: Sweep, tree: TransformTree) -> Floats:
@@ -457,13 +457,14 @@ def merged(sweeps: Sequence[Sweep]) -> Sweep:
     stacked = np.concatenate(origins)
     return replace(
         sweeps[0],
-        points=np.concatenate([sweep.points.T for sweep in sweeps], axis=1).T,
+        points=np.concatenate([sweep.in_frame().points.T for sweep in sweeps], axis=1).T,
         times=times,
         origin=stacked.mean(axis=0),
         origins=stacked,
         sensors=np.concatenate(sensors),
         topic='',
         rows=None,
+        T_frame_points=None,
     )
 
 

@@ -87,7 +87,7 @@ class PoseCheck:
         if self._sweep is None or self._boxes is None:
             return
         if abs(self._sweep.stamp_ns - self._boxes.stamp_ns) <= self._tolerance_ns:
-            self._count(self._sweep.points, self._boxes)
+            self._count(self._sweep.in_frame().points, self._boxes)
             self._sweep = self._boxes = None
             if len(self._counts) >= DECISIVE_BOXES:
                 self.finding = self._result()

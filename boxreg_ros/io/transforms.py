@@ -47,11 +47,6 @@ Number of frames that starts the search for those not updated for `BUFFER_DURATI
 A vehicle has tens of frames; trackers that publish a frame per object add some every second.
 
 """
-FLOAT32_RANGE = 4096.0
-"""Nearer to the origin, float32 coordinates are 0.25 mm apart or less [m]: 2**(12 - 24) m."""
-BLOCK_POINTS = 2**15
-"""Points that are moved at a time. Swept: in blocks of 2^12, 2^15 and 2^20 a sweep of 130,000
-points takes 1.2, 0.6 and 0.8 ms."""
 
 
 class TimeJumpDetector:
@@ -292,6 +287,8 @@ class _Edge:
         self._jump_detector = TimeJumpDetector()
         self._was_forgotten = False
         self._last_added: tuple[int, Floats] | None = None
+        # A cloud, its boxes and its label files ask for the same stamp.
+        self._last_found: tuple[int, Floats] | None = None
 
     def add(self, stamp_ns: int, pose: tuple[float, ...]) -> None:
         """Add x y z qx qy qz qw; a second one of the same stamp replaces the first."""
@@ -299,6 +296,7 @@ class _Edge:
         if not np.isfinite(values).all() or not np.any(values[3:]):
             return  # no pose; the error of a lookup has the stamps that are known
         self._last_added = stamp_ns, values
+        self._last_found = None
         if self._jump_detector.has_jumped(stamp_ns):
             self._forget()
             self._was_forgotten = True
@@ -326,6 +324,7 @@ class _Edge:
     def _forget(self) -> None:
         self.stamps.clear()
         self._poses.clear()
+        self._last_found = None
 
     def is_older(self, stamp_ns: int) -> bool:
         return not self.is_static and bool(self.stamps) and self.stamps[-1] < stamp_ns
@@ -337,6 +336,11 @@ class _Edge:
 
     def at(self, stamp_ns: int, max_extrapolation_ns: int) -> Floats:
         """Return ``T_parent_child`` at a stamp."""
+        if self._last_found is None or self._last_found[0] != stamp_ns:
+            self._last_found = stamp_ns, self._at(stamp_ns, max_extrapolation_ns)
+        return self._last_found[1]
+
+    def _at(self, stamp_ns: int, max_extrapolation_ns: int) -> Floats:
         stamps = self.stamps
         if not stamps:
             cause = 'all poses are NaN or have no orientation; check its publisher'
@@ -388,27 +392,20 @@ def interpolated(first: Floats, second: Floats, share: float) -> Floats:
 
 def sweep_to_frame(sweep: Sweep, T_frame_sweep: Floats, frame_id: str) -> Sweep:
     """
-    Return the sweep, points and positions of the sensors, in another frame.
+    Return the sweep in another frame.
 
-    float32 points stay float32 while the sensor is within `FLOAT32_RANGE` of the origin of the
-    frame; farther away (a map in UTM) they become float64.
+    The positions of the sensors are moved; of the points, only `T_frame_points` changes.
 
     """
     R = T_frame_sweep[:3, :3]
     t = T_frame_sweep[:3, 3]
-    is_near = np.abs(t).max() < FLOAT32_RANGE
-    kind = sweep.points.dtype if is_near else np.dtype(np.float64)
-    columns = sweep.points.T
-    moved = np.empty(columns.shape, kind)
-    # Not R @: BLAS starts threads of its own. A block stays in the cache for all its sums.
-    for first in range(0, columns.shape[1], BLOCK_POINTS):
-        block = slice(first, first + BLOCK_POINTS)
-        x, y, z = columns[:, block].astype(kind, copy=False)
-        for (a, b, c), offset, row in zip(R.astype(kind), t.astype(kind), moved, strict=True):
-            np.add(a * x + b * y + c * z, offset, out=row[block])
-    origins = None if sweep.origins is None else sweep.origins @ R.T + t
+    known = sweep.T_frame_points
     return replace(
-        sweep, frame_id=frame_id, points=moved.T, origin=R @ sweep.origin + t, origins=origins
+        sweep,
+        frame_id=frame_id,
+        origin=R @ sweep.origin + t,
+        origins=None if sweep.origins is None else sweep.origins @ R.T + t,
+        T_frame_points=T_frame_sweep if known is None else T_frame_sweep @ known,
     )
 
 

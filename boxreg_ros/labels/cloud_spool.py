@@ -91,7 +91,8 @@ class Spool:
             sweep = Sweep(nearest, own_frame, columns['points'], columns.get('times'))
             intensities = columns.get('intensities')
         if (nearest, own_frame) != (stamp_ns, frame_id):
-            sweep = sweep_to_frame(sweep, inverse(T_fixed_frame) @ T_fixed_sweep, frame_id)
+            T_frame_sweep = inverse(T_fixed_frame) @ T_fixed_sweep
+            sweep = sweep_to_frame(sweep, T_frame_sweep, frame_id).in_frame()
         return sweep, intensities
 
     def with_cloud(self, frame: LabelFrame) -> LabelFrame:

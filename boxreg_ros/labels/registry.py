@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import cast
 
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.labels.camera import Camera
 from boxreg_ros.labels.protocol import (
     FormatModule,
     LabelFrame,
@@ -72,13 +74,13 @@ def can_read(name: str) -> bool:
 
 def check_options(names: Sequence[str], options: Options) -> None:
     """
-    Refuse options that none of the formats `names` uses.
+    Refuse options that none of the formats `names` uses, and the lack of those that one needs.
 
     Raises
     ------
     ConfigError
-        If an option is not used; the message lists the formats that use it. Also as
-        `module_of`.
+        If an option is not used; the message lists the formats that use it. If the camera that a
+        format needs is not given or cannot be read. Also as `module_of`.
 
     """
     used = {option for name in names for option in module_of(name).FORMAT.options}
@@ -89,6 +91,9 @@ def check_options(names: Sequence[str], options: Options) -> None:
                 f'--{option.replace("_", "-")}: expected a format that uses it '
                 f'({", ".join(able)}), got {", ".join(names)}; add one, or leave it out'
             )
+    for name in names:
+        if 'camera' in module_of(name).FORMAT.options:
+            Camera.read(options.camera, f'format {name}')
 
 
 def writer_for(
@@ -159,7 +164,9 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
 def _imported(name: str) -> FormatModule:
     """Return the module of a format, whether or not the packages it needs are installed."""
     if name not in FORMATS:
-        raise ConfigError(f'format {name!r}: expected one of {", ".join(FORMATS)}')
+        similar = get_close_matches(name, FORMATS, 1)
+        meant = f'; did you mean {similar[0]}?' if similar else ''
+        raise ConfigError(f'format {name!r}: expected one of {", ".join(FORMATS)}{meant}')
     return cast(FormatModule, import_module(FORMATS[name]))
 
 

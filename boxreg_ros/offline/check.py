@@ -12,7 +12,7 @@ from typing import Any
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.review.rules import RULES, violations
-from boxreg_ros.review.rules.protocol import LabelTrack, Violation
+from boxreg_ros.review.rules.protocol import ERROR, LabelTrack, Violation, WARNING
 from boxreg_ros.structures import BoxArray, Floats, Ints
 import numpy as np
 
@@ -75,9 +75,14 @@ def _print(tracks: list[LabelTrack], found: dict[str, list[Violation]]) -> None:
         for item in items:
             print(f'  track {item.track_id} at {item.stamp_ns}: {item.text}')
     boxes = sum(len(track.boxes) for track in tracks)
-    total = sum(map(len, found.values()))
-    kinds = f'{len(found)} of {len(RULES)} rules violated' if found else 'no rule violated'
-    print(f'{len(tracks):,} tracks, {boxes:,} boxes: {kinds}, {total:,} findings')
+    kinds = 'no rule violated'
+    if found:
+        total: Counter[str] = Counter()
+        for name, items in found.items():
+            total[RULES[name].severity] += len(items)
+        counts = ', '.join(f'{word}s: {total[word]:,}' for word in (ERROR, WARNING))
+        kinds = f'{len(found)} of {len(RULES)} rules violated; {counts}'
+    print(f'{len(tracks):,} tracks, {boxes:,} boxes: {kinds}')
 
 
 def _tracks(source: str, config: Config) -> list[LabelTrack]:

@@ -83,7 +83,7 @@ def points_above_road(sweep: Sweep, boxes: Floats) -> Ints:
     valid = np.flatnonzero(is_valid_box(boxes))
     if not len(valid):
         return counts
-    near = crop(sweep.points, boxes[valid], SIDE_MARGIN)
+    near = crop(sweep, boxes[valid], SIDE_MARGIN)
     up = matrix_from_rpy(boxes[valid, ROLL:])[:, :, 2]
     half_height = boxes[valid, 5] / 2
     height = (near.offset * up.T.take(near.owner, 1)).sum(0) + half_height.take(near.owner)
@@ -198,6 +198,10 @@ class Completion:
             self._to_register.append(item)
         self._counter.add(item)
         return item
+
+    def added_boxes(self, given: BoxArray) -> BoxArray:
+        """Return the boxes that the plan adds to an array, after `to_register` of it."""
+        return self._plan.arrays[self._index_of[given.ticket]].added_boxes(given)
 
     def add(self, ready: Iterable[RefinedBoxes]) -> None:
         """Hold results of the registrar."""

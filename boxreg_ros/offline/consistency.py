@@ -114,15 +114,19 @@ def table(groups: Mapping[str, Consistency]) -> str:
     """Return the groups as a text table: coverage, then NEES, of each variable."""
     width = max(len(name) for name in groups)
     titles = ''.join(f'{name:>14}' for name in CONSISTENCY_VARIABLES)
-    lines = [' ' * width + f'{"boxes":>8}{"tracks":>8}{titles}']
+    columns = f'{"cover":>7}{"NEES":>6} ' * len(CONSISTENCY_VARIABLES)
+    lines = [
+        ' ' * width + f'{"boxes":>8}{"tracks":>8}{titles}',
+        ' ' * (width + 16) + columns.rstrip(),
+    ]
     for name, group in groups.items():
         cells = ''.join(_cell(group, variable) for variable in CONSISTENCY_VARIABLES)
         lines.append(f'{name:{width}}{group.boxes:8d}{group.tracks:8d}{cells}')
     low, high = CONSISTENT_NEES
     lines.append(
-        'part of the errors within 2 sigma (0.95 is consistent), mean of squared error over '
-        f'variance (1 is consistent;\n* out of {low:g} to {high:g} by more than {SIGNIFICANT:g} '
-        f'standard errors over the tracks)'
+        'cover: part of the errors within 2 sigma (0.95 is consistent); NEES: mean of squared '
+        f'error over variance (1 is consistent;\n* out of {low:g} to {high:g} by more than '
+        f'{SIGNIFICANT:g} standard errors over the tracks)'
     )
     return '\n'.join(lines)
 

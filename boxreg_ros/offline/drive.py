@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from boxreg_ros.config import Config
@@ -156,6 +156,7 @@ class Drive:
 
     def tracks(self) -> list[Track]:
         """Return the boxes as tracks, with the points around each."""
+        moved = replace(self, sweeps=tuple(sweep.in_frame() for sweep in self.sweeps))
         rows: dict[str, list[tuple[BoxArray, int]]] = {}
         for array in self.boxes:
             for i, track_id in enumerate(array.track_ids):
@@ -164,7 +165,7 @@ class Drive:
         for track_id, places in rows.items():
             boxes = np.array([array.boxes[i] for array, i in places])
             stamps = np.array([array.stamp_ns for array, _ in places])
-            near = self.sweeps_at(stamps)
+            near = moved.sweeps_at(stamps)
             rows_near = [_nearby(sweep, box) for sweep, box in zip(near, boxes, strict=True)]
             pairs = list(zip(near, rows_near, strict=True))
             points = [sweep.points[nearby] for sweep, nearby in pairs]

@@ -9,7 +9,7 @@ step of `Config.complete`, the recording is read twice and its tracks are comple
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import asdict
 from datetime import datetime, UTC
@@ -37,6 +37,7 @@ from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
 from boxreg_ros.review.decisions import DECISIONS
 from boxreg_ros.structures import (
+    BoxArray,
     COASTED,
     EXTENDED,
     HUMAN,
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
     from boxreg_ros.offline.completion import Completion
     from boxreg_ros.offline.journal import EstimateJournal
     from boxreg_ros.review.changes import TrackChanges
+    from boxreg_ros.review.rules.protocol import Violation
+    from boxreg_ros.review.tables import TrackRow
     from boxreg_ros.review.track_points import PointCollector
     from boxreg_ros.tracks.complete import CompletionPlan
 
@@ -64,7 +67,7 @@ UNUSED_PREFIXES = ('sweep_', 'boxes_')
 NO_BOXES = 'no boxes in this part of the recording: nothing was refined; see --start and --end'
 
 FEW_REFINED = 0.5
-"""A run that refines a smaller part of its boxes says why."""
+"""Refined part of the boxes below which a run prints its most frequent reason. Chosen."""
 
 
 def relabel(
@@ -128,10 +131,11 @@ def relabel(
             summary |= {'fingerprint': fingerprint, 'seconds': clock.seconds()}
             tracks = sink.changes.tracks()
             with clock('write'):
-                summary['rules'] = _write_tables(folder, tracks, request.config, plan)
+                rows = _write_tables(folder, tracks, plan)
+                summary['rules'], violated = _checked(tracks, request.config)
             if sink.points is not None:
                 sink.points.settle(registrar.box_time.resolved(request.config))
-                _report(folder, out, request, summary, tracks, sink.points, clock)
+                _report(folder, out, request, summary, rows, violated, sink.points, clock)
             if request.decisions is not None:
                 copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
@@ -211,7 +215,9 @@ def _register(
         moved = with_ticket.moved
         with clock('registrar'):
             if completion is not None:
-                moved = completion.to_register(moved, item.restarts)
+                given, moved = moved, completion.to_register(moved, item.restarts)
+                if sink.points is not None and isinstance(given, BoxArray):
+                    sink.points.add(completion.added_boxes(given))
             ready = hand_to_registrar(registrar, moved, item.restarts)
         _take(ready, completion, sink)
     with clock('registrar'):
@@ -246,24 +252,34 @@ def _completed(plan: CompletionPlan | None) -> dict[str, int]:
 
 
 def _write_tables(
-    folder: Path, tracks: Sequence[TrackChanges], config: Config, plan: CompletionPlan | None
-) -> dict[str, dict[str, int]]:
-    """Write the tables of tracks; return violations of rules ``before`` and ``after`` the run."""
-    from boxreg_ros.review.rules import counts
-    from boxreg_ros.review.rules.protocol import LabelTrack
+    folder: Path, tracks: Sequence[TrackChanges], plan: CompletionPlan | None
+) -> list[TrackRow]:
+    """Write the tables of tracks; return their rows, largest risk first."""
     from boxreg_ros.review.tables import assessed, write_tables
 
+    rows = assessed(tracks)
     if plan is None:
-        write_tables(folder, assessed(tracks))
+        write_tables(folder, rows)
     else:
-        write_tables(folder, assessed(tracks), STEP_COLUMNS, step_cells(plan.tracks))
+        write_tables(folder, rows, STEP_COLUMNS, step_cells(plan.tracks))
+    return rows
+
+
+def _checked(
+    tracks: Sequence[TrackChanges], config: Config
+) -> tuple[dict[str, dict[str, int]], dict[str, list[Violation]]]:
+    """Return the number of violations of each rule, ``before`` and ``after``, and those after."""
+    from boxreg_ros.review.rules import counts, violations
+    from boxreg_ros.review.rules.protocol import LabelTrack
+
     before = []
     after = []
     for track in tracks:
         names = track.track_id, track.class_name, config, track.stamps_ns
         before.append(LabelTrack.of(*names, track.given, track.num_points))
         after.append(LabelTrack.of(*names, track.boxes, track.num_points))
-    return {'before': counts(before), 'after': counts(after)}
+    found = violations(after)
+    return {'before': counts(violations(before)), 'after': counts(found)}, found
 
 
 def _report(
@@ -271,7 +287,8 @@ def _report(
     out: Path,
     request: Request,
     summary: dict[str, Any],
-    tracks: Sequence[TrackChanges],
+    rows: Sequence[TrackRow],
+    violated: Mapping[str, Sequence[Violation]],
     points: PointCollector,
     clock: Stopwatch,
 ) -> None:
@@ -279,9 +296,9 @@ def _report(
     from boxreg_ros.review.report import write_report
 
     with clock('report'):
-        truth = _truth(request, tracks, summary)
+        truth = _truth(request, [row.track for row in rows], summary)
         line = closing_line(summary, out)
-        write_report(folder, line, summary, request.config, tracks, points, truth)
+        write_report(folder, line, summary, request.config, rows, violated, points, truth)
     summary['seconds'] = clock.seconds()
 
 

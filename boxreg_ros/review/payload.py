@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
-from math import isfinite
 from typing import Any, NamedTuple
 import zlib
 
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.review.changes import median, TrackChanges
 from boxreg_ros.review.quality import ious, quality
+from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.review.track_points import PointCollector, to_millimetres
 from boxreg_ros.structures import ADDED, BOX_EXTENT, Floats, X, Y, Z
 import numpy as np
@@ -26,6 +26,8 @@ PATH_POINTS = 40
 """Points of the line of a track on the map; chosen."""
 DECIMALS = 4
 """Decimals of metres and radians: a tenth of a millimetre."""
+RISK_DECIMALS = 3
+"""Decimals of risks [m], as in ``review.csv``."""
 COMPRESSION = 3
 """Level of zlib; measured: level 6 saves 9 % of the file and takes twice as long."""
 
@@ -89,8 +91,8 @@ class TrackPart:
 
     Parameters
     ----------
-    track : TrackChanges
-        The track.
+    row : TrackRow
+        The track and its risk.
     collector : PointCollector
         The points of the recording.
     truth : TrackTruth
@@ -103,16 +105,19 @@ class TrackPart:
 
     """
 
-    def __init__(self, track: TrackChanges, collector: PointCollector, truth: TrackTruth) -> None:
+    def __init__(self, row: TrackRow, collector: PointCollector, truth: TrackTruth) -> None:
+        track = row.track
         self._track = track
+        self._risk = row.risk
+        self._why = row.reasons
         self._truth = truth
         self._sensor = collector.sensor_at(track.stamps_ns)
         self._points = collector.points_of(track)
         self.before = quality(track, track.given, self._points, truth.iou_before)
         self.after = quality(track, track.boxes, self._points, truth.iou_after)
 
-    def row(self, begin_ns: int, risk: Mapping[str, str]) -> dict[str, Any]:
-        """Return the row of the list; `risk` is the row of ``review.csv``, empty without."""
+    def row(self, begin_ns: int) -> dict[str, Any]:
+        """Return the row of the list."""
         track = self._track
         status = Counter(track.status.tolist())
         is_input = ~np.isin(track.status, ADDED)
@@ -127,7 +132,7 @@ class TrackPart:
             'interpolated': sum(status[word] for word in ADDED),
             'begin': (int(track.stamps_ns[0]) - begin_ns) * 1e-9,
             'seconds': float(track.stamps_ns[-1] - track.stamps_ns[0]) * 1e-9,
-            'points': median(track.num_points[is_input]),
+            'points': median(track.num_points),
             'refined': float(track.is_refined.sum() / boxes) if boxes else None,
             'status': dict(status),
             'reasons': dict(Counter(filter(None, track.reasons.tolist())).most_common()),
@@ -141,8 +146,9 @@ class TrackPart:
             'after': asdict(self.after),
             'path': np.round(track.boxes[picks][:, [X, Y]], 2),
             'rows': picks,
-            'risk': _number(risk.get('risk_m', '')),
-            'why': risk.get('reasons', ''),
+            'risk': round(self._risk.track, RISK_DECIMALS),
+            'riskiest': str(track.stamps_ns[int(np.argmax(self._risk.boxes))]),
+            'why': self._why,
         }
 
     def part(self, begin_ns: int, max_points: int) -> dict[str, Any]:
@@ -169,6 +175,8 @@ class TrackPart:
             'flipped': track.is_flipped.tolist(),
             'change': np.round(track.change, DECIMALS),
             'deviations': np.round(track.deviations, DECIMALS),
+            'extent_deviations': np.round(track.extent_deviations, DECIMALS),
+            'risk': np.round(self._risk.boxes, RISK_DECIMALS),
             'num_points': track.num_points,
             'counts': [len(points) for points in shown],
             'points': b64encode(every.astype('<i2').tobytes()).decode('ascii'),
@@ -183,11 +191,3 @@ def _moved(boxes: Floats, origin: Floats) -> Floats:
 
 def _median_extents(boxes: Floats) -> list[float]:
     return [median(values) for values in boxes[:, BOX_EXTENT].T]
-
-
-def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if isfinite(value) else None

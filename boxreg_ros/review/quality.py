@@ -92,15 +92,17 @@ def _filled_cells(track: TrackChanges, boxes: Floats, points: list[Floats]) -> i
     Return the number of cubes of edge `CELL` that the points of all sweeps fill.
 
     In the frame of their boxes, those with a corrected heading turned first. Points near the
-    lower face are left out: they may be road.
+    lower face are left out: they may be road. So are those of boxes that are not known both before
+    and after.
 
     """
+    is_both = np.asarray(np.isfinite(np.hstack([track.given, track.boxes])).all(axis=1))
     R = matrix_from_rpy(np.nan_to_num(boxes[:, ROLL:]))
     if boxes is track.given:
         R[track.is_flipped, :, :2] *= -1  # x and y axes
     local = [np.zeros((0, 3))]
     for row, fixed in enumerate(points):
-        if len(fixed):
+        if len(fixed) and is_both[row]:
             local.append((fixed - boxes[row, : Z + 1]) @ R[row])
     every = np.concatenate(local)
     floor = GROUND_CLEARANCE - median(track.boxes[:, HEIGHT]) / 2

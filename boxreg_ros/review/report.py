@@ -9,8 +9,7 @@ compressed and decompressed when the track is opened. `boxreg review` serves the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-import csv
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib import import_module
 import os
@@ -26,13 +25,13 @@ from boxreg_ros.review.changes import mean, TrackChanges
 from boxreg_ros.review.payload import as_json, compressed, points_per_box, TrackPart, true_boxes
 from boxreg_ros.review.quality import CELL, Quality
 from boxreg_ros.review.rules import RULES
-from boxreg_ros.review.rules.protocol import Rule
+from boxreg_ros.review.rules.protocol import Rule, Violation
+from boxreg_ros.review.tables import TrackRow
 from boxreg_ros.review.track_points import PointCollector
 from boxreg_ros.structures import HUMAN, REFINED
 import numpy as np
 
 REPORT = 'report.html'
-REVIEW = 'review.csv'
 PACKAGES = ('jinja2', 'plotly')
 SHARE = Path(__file__).parents[1] / 'share'
 TEMPLATE = 'report.html.j2'
@@ -65,7 +64,8 @@ def write_report(
     line: str,
     summary: Mapping[str, Any],
     config: Config,
-    tracks: Sequence[TrackChanges],
+    found: Sequence[TrackRow],
+    violated: Mapping[str, Sequence[Violation]],
     points: PointCollector,
     truth: BoxTable | None = None,
 ) -> None:
@@ -75,31 +75,33 @@ def write_report(
     Parameters
     ----------
     folder : Path
-        Result folder. The risks and the order of its ``review.csv`` are shown, if it has one.
+        Result folder.
     line : str
         The closing line of the run.
     summary : mapping
         Content of ``summary.json``.
     config : Config
         Settings of the run.
-    tracks : sequence of TrackChanges
-        All tracks, in the order of the list.
+    found : sequence of TrackRow
+        All tracks with their risks, in the order of the list.
+    violated : mapping of str to sequence of Violation
+        What violates each rule after the run, by its id.
     points : PointCollector
         The points of the recording.
     truth : BoxTable, optional
         True boxes in the fixed frame, by the same stamps and track ids.
 
     """
+    tracks = [row.track for row in found]
     begin_ns = min((int(track.stamps_ns[0]) for track in tracks), default=0)
     max_points = points_per_box(sum(len(track.stamps_ns) for track in tracks))
-    review = list(_rows_of(folder / REVIEW))
-    risks = {row['track_id']: row for row in review}
+    violations = _by_track(violated)
     rows = []
     parts = []
     qualities = []
-    for track, true in zip(tracks, true_boxes(tracks, truth), strict=True):
-        part = TrackPart(track, points, true)
-        rows.append(part.row(begin_ns, risks.get(track.track_id, {})))
+    for row, true in zip(found, true_boxes(tracks, truth), strict=True):
+        part = TrackPart(row, points, true)
+        rows.append(part.row(begin_ns) | {'rules': violations.get(row.track.track_id, [])})
         parts.append(compressed(as_json(part.part(begin_ns, max_points))))
         qualities.append((part.before, part.after))
     stride = 1 + len(points.origins) // MAX_MAP_SENSOR
@@ -108,9 +110,7 @@ def write_report(
         'frame': summary['fixed_frame'],
         'cell': CELL,
         'has_truth': truth is not None,
-        'has_risk': bool(risks),
         'tracks': rows,
-        'review': review,
         'sensor': np.round(points.origins[::stride, :2], 2),
         'total': [_total([pair[k] for pair in qualities]) for k in range(2)],
     }
@@ -173,11 +173,13 @@ def _total(qualities: Sequence[Quality]) -> dict[str, Any]:
     return total
 
 
-def _rows_of(path: Path) -> Iterator[dict[str, str]]:
-    """Yield the rows of a CSV file; none if it does not exist."""
-    if path.exists():
-        with open(path, newline='', encoding='utf-8') as file:
-            yield from csv.DictReader(file)
+def _by_track(violated: Mapping[str, Sequence[Violation]]) -> dict[str, list[tuple[str, ...]]]:
+    """Return the violations of each track: rule, stamp and text."""
+    found: dict[str, list[tuple[str, ...]]] = {}
+    for rule_id, violations in violated.items():
+        for one in violations:
+            found.setdefault(one.track_id, []).append((rule_id, str(one.stamp_ns), one.text))
+    return found
 
 
 def _plotly_script() -> bytes:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.review.changes import TrackChanges
-from boxreg_ros.structures import BOX_EXTENT, Floats, KEPT, LENGTH, WIDTH, X, Y, YAW
+from boxreg_ros.structures import ADDED, BOX_EXTENT, Floats, KEPT, LENGTH, WIDTH, X, Y, YAW
 import numpy as np
 from scipy.special import erf
 
@@ -136,7 +136,8 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     points, beyond what surfaces of its kind are off a rigid box; they are expected by the
     labelling margins of other tracks. Its mean magnitude is that of a folded normal variable. What
     its mean adds to its deviation is a reason of its own. So are points left outside, and a
-    disagreement between two estimates, beyond the loss that these explain.
+    disagreement between two estimates, beyond the loss that these explain. There is no input to
+    judge an added box by: it has the mean risk of the other boxes of its track.
 
     """
     extents = _extents(track)
@@ -166,6 +167,7 @@ def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
     losses['kept as in the input'] = np.where(is_kept, KEPT_LOSS, 0.0)
     losses['size unlike its class'] = _unlike(track, extents, usual)
     losses['id switch'] = np.full(len(is_kept), SWITCH_LOSS * _has_id_switch(track))
+    losses = {reason: _with_added(loss, track) for reason, loss in losses.items()}
     parts = {reason: np.nan_to_num(loss) * REFERENCE_LENGTH / 2 for reason, loss in losses.items()}
     total = np.sum(list(parts.values()), axis=0)
     return Risk(total.clip(max=MAX_LOSS * REFERENCE_LENGTH / 2), parts)
@@ -199,6 +201,14 @@ def reasons_of(track: TrackChanges, risk: Risk, typical: Mapping[str, float]) ->
     kept = Counter(filter(None, track.reasons.tolist()))
     words += [f'{count} kept: {name}' for name, count in kept.most_common(2)]
     return '; '.join(words)
+
+
+def _with_added(losses: Floats, track: TrackChanges) -> Floats:
+    """Return `losses` (n,) with the mean of the others for boxes that the input does not have."""
+    is_added = np.isin(track.status, ADDED)
+    if is_added.all():
+        return losses
+    return np.where(is_added, losses[~is_added].mean(), losses)
 
 
 def _extents(track: TrackChanges) -> Floats:

@@ -8,6 +8,7 @@ from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import json
 from pathlib import Path
+import signal
 from threading import Lock
 from typing import Any
 
@@ -32,12 +33,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until interrupted."""
+    """Serve until interrupted, or ended by a signal: each decision is saved already."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
+            signal.signal(number, signal.default_int_handler)
     with review_server(args.out, args.port) as server:
-        print(f'http://{HOST}:{server.server_port}/', flush=True)
-        print(f'decisions: {server.log_path}; Ctrl-C ends', flush=True)
         with suppress(KeyboardInterrupt):
+            print(f'http://{HOST}:{server.server_port}/', flush=True)
+            print(f'decisions: {server.log_path}; Ctrl-C ends', flush=True)
             server.serve_forever()
+        if server.log_path.exists():
+            print(f'to apply them: boxreg relabel RECORDING -o NEW --decisions {server.log_path}')
     return 0
 
 

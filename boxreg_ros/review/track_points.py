@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 SHOWN_MARGIN = 0.6
 """Points up to this far outside a box are shown [m]; chosen."""
 GATHERED_MARGIN = 1.6
-"""Points up to this far outside an input box are gathered [m]: a refined box may be 1 m off it."""
+"""Points up to this far outside a box are gathered [m]: a refined box may be 1 m off it."""
 GATHERED_POINTS = 400
 """Most points gathered of one box; derived: 100,000 boxes take 240 MB."""
 MILLIMETRES = 1000.0
@@ -41,7 +41,7 @@ class _Gathered(NamedTuple):
 
 class PointCollector:
     """
-    Gather the points around the input boxes while a recording is read.
+    Gather the points around the input boxes, and around added ones, while a recording is read.
 
     The recording is read once: points are gathered before the boxes are refined.
 
@@ -88,12 +88,13 @@ class PointCollector:
         In the fixed frame, motion-compensated to the stamp of the box.
 
         """
-        is_known = np.asarray(np.isfinite(np.hstack([track.given, track.boxes])).all(axis=1))
-        both = np.stack([track.given, track.boxes])
+        is_known = np.asarray(np.isfinite(track.boxes).all(axis=1))
+        given = np.where(np.isfinite(track.given), track.given, track.boxes)  # of added boxes
+        both = np.stack([given, track.boxes])
         R = matrix_from_rpy(np.where(is_known[:, None], both[..., ROLL:], 0.0))
         points = []
         for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
-            found = self._gathered.get((stamp_ns, track.input_ids[row]))
+            found = self._gathered.get((stamp_ns, track.input_ids[row] or track.track_id))
             if found is None or not is_known[row]:
                 points.append(np.zeros((0, 3)))
                 continue
@@ -123,7 +124,7 @@ class PointCollector:
             rows = np.flatnonzero(is_valid_box(boxes.boxes))
             if sweep is None or not len(rows):
                 continue
-            near = crop(sweep.points, boxes.boxes[rows], GATHERED_MARGIN)
+            near = crop(sweep, boxes.boxes[rows], GATHERED_MARGIN)
             is_near = near.outside.max(0) < GATHERED_MARGIN
             owners = near.owner[is_near]
             offsets = to_millimetres(near.offset[:, is_near].T)

@@ -11,6 +11,8 @@ const MIN_FACE_POINTS = 5;         // fewer points do not show where a face is
 const OUTER_PART = 0.1;            // of the points near a face are its outermost points
 const FRAME = 12;                  // time for the 3D view at 60 frames per second [ms]
 const PAUSE = 120;                 // between two steps of one who stops to look [ms]
+const ZOOM_STEP = 1.25;             // of a key
+const MAX_ZOOM = 10;               // a box of 5 m then shows 1 mm per pixel
 const CHANGED = {
   moved: ['moved more than 0.2 m', t => t.shift > 0.2],
   turned: ['turned more than 2°', t => t.turn > 2],
@@ -18,10 +20,21 @@ const CHANGED = {
   resized: ['resized more than 0.2 m', t => t.resized > 0.2],
 };
 let DATA;
-const view = { track: -1, part: null, row: 0, sort: 'rank', descending: false, shown: [], mode: 'sweep',
-               space: false, charts: false, pending: false, edit: null, playing: 0 };
+const MEANINGS = [                  // of words in the reasons of a risk
+  ['uncertain', 'expected error by the standard deviations of the estimate'],
+  ['off their points', 'the outermost points of these faces are not where the estimate expects them'],
+  ['points left outside', 'more of the points near the box are outside of it than in other tracks'],
+  ['estimates disagree', 'the early and the final estimate overlap less than their deviations explain'],
+  ['size unlike its class', 'extents more than two deviations off the median of the class'],
+  ['id switch', 'the track jumps by more than half an extent: it may go on with another object'],
+  ['kept as in the input', 'the input box was returned unchanged'],
+  ['few points', 'median of the points per box'],
+];
+const view = { track: -1, part: null, row: 0, sort: 'rank', descending: false, shown: [], place: 0, mode: 'sweep',
+               space: false, charts: false, pending: false, edit: null, isMoved: false, playing: 0, zoom: 1 };
 const decisions = new Map();       // by track and stamp
-const undone = [];
+const decidedBoxes = new Map();    // their number by track
+const made = [];                   // what held before each decision, for undo
 
 // Small helpers ---------------------------------------------------------------------------------
 
@@ -161,32 +174,45 @@ function faceResiduals(part, row, box) {
 
 const decisionOf = (id, stamp = '') => decisions.get(keyOf(id, stamp));
 const sumOf = counts => Object.entries(counts).map(([name, count]) => `${name} ${count}`).join(', ');
+const partsOf = why => why.split('; ').filter(Boolean);
+// The reasons of a risk without their figures; how many boxes were kept is no reason of a risk.
+const causesOf = track => partsOf(track.why).filter(part => !/^\d+ kept: /.test(part)).map(part => part.split(' (')[0]);
+const rulesOf = track => [...new Set(track.rules.map(([name]) => name))];
 
+// Name, title, value to sort by, text, meaning.
 function columns() {
   const all = [
-    ['rank', '#', t => t.rank, t => t.rank === Infinity ? '' : t.rank],
-    ['id', 'track', t => t.id, t => t.id || 'no id'],
-    ['class', 'class', t => t.class, t => t.class],
-    ['risk', 'risk [m]', t => t.risk, t => number(t.risk)],
-    ['why', 'why', t => t.why, t => t.why],
-    ['decision', 'decision', t => decisionOf(t.id)?.decision ?? '', t => decisionOf(t.id)?.decision ?? ''],
-    ['boxes', 'boxes', t => t.boxes, t => t.boxes + (t.interpolated ? ` + ${t.interpolated}` : '')],
-    ['points', 'points', t => t.points, t => number(t.points, 0)],
-    ['refined', 'refined', t => t.refined, t => isKnown(t.refined) ? number(100 * t.refined, 0) + ' %' : '–'],
-    ['shift', 'shift [m]', t => t.shift, t => number(t.shift)],
-    ['turn', 'turn [°]', t => t.turn, t => number(t.turn, 1)],
-    ['resized', 'size [m]', t => t.resized, t => number(t.resized)],
-    ['flips', 'flips', t => t.flips, t => t.flips || ''],
-    ['deviation', 'σ [m]', t => t.deviation, t => number(t.deviation)],
-    ['sharper', 'cells', t => t.sharper, t => isKnown(t.sharper) ? number(t.sharper, 0) + ' %' : '–'],
-    ['iou', 'IoU', t => t.after.iou, t => `${number(t.before.iou, 3)} → ${number(t.after.iou, 3)}`],
-    ['reasons', 'kept because', t => sumOf(t.reasons), t => sumOf(t.reasons)],
+    ['rank', '#', t => t.rank, t => t.rank, 'place in review.csv: largest risk first'],
+    ['id', 'track', t => t.id, t => t.id || 'no id', 'track id'],
+    ['class', 'class', t => t.class, t => t.class, 'class name of the input'],
+    ['risk', 'risk [m]', t => t.risk, t => number(t.risk), 'expected error: the shift of a car 4.5 m long, along its heading, that loses as much 3D IoU'],
+    ['decision', 'decision', t => decidedOf(t), t => decidedOf(t), 'your decision, and the number of boxes with one of their own'],
+    ['why', 'why', t => t.why, t => partsOf(t.why)[0] ?? '', 'the most unusual part of the risk; ends are front and rear'],
+    ['points', 'points', t => t.points, t => number(t.points, 0), 'median of the points inside the boxes'],
+    ['boxes', 'boxes', t => t.boxes, t => t.boxes + (t.interpolated ? ` + ${t.interpolated}` : ''), 'boxes of the input + boxes that were added'],
+    ['rules', 'rules', t => rulesOf(t).length || null, t => rulesOf(t).join(', '), 'rules of boxreg check that the refined boxes violate'],
+    ['iou', 'IoU', t => t.after.iou, t => `${number(t.before.iou, 3)} → ${number(t.after.iou, 3)}`, 'mean 3D IoU with the true boxes, input → refined'],
+    ['refined', 'refined', t => t.refined, t => isKnown(t.refined) ? number(100 * t.refined, 0) + ' %' : '–', 'part of the input boxes that were refined'],
+    ['shift', 'moved [m]', t => t.shift, t => number(t.shift), 'mean distance between input and refined centres'],
+    ['turn', 'turned [°]', t => t.turn, t => number(t.turn, 1), 'mean yaw change, without flips'],
+    ['resized', 'resized [m]', t => t.resized, t => number(t.resized), 'largest change of the median length, width or height'],
+    ['flips', 'flips', t => t.flips, t => t.flips || '', 'boxes whose heading was turned by 180°'],
+    ['deviation', 'σ [m]', t => t.deviation, t => number(t.deviation), 'median horizontal standard deviation of the centres'],
+    ['sharper', 'cells [%]', t => t.sharper, t => number(t.sharper, 0), `change of the number of cells of ${DATA.cell} m that the points of all sweeps fill: negative is sharper`],
+    ['reasons', 'kept because', t => sumOf(t.reasons), t => sumOf(t.reasons), 'reasons of the input boxes that were returned unchanged'],
   ];
-  const hidden = new Set([...(DATA.has_risk ? [] : ['risk', 'why']), ...(DATA.has_truth ? [] : ['iou']), ...(IS_REVIEW ? [] : ['decision'])]);
-  if (!DATA.review.length) hidden.add('rank');
+  const hidden = new Set([...(DATA.has_truth ? [] : ['iou']), ...(IS_REVIEW ? [] : ['decision'])]);
   return all.filter(([name]) => !hidden.has(name));
 }
-const TEXT = new Set(['id', 'class', 'why', 'decision', 'reasons']);
+const TEXT = new Set(['id', 'class', 'why', 'decision', 'rules', 'reasons']);
+
+// The decision about a track, and how many of its boxes have one.
+function decidedOf(track) {
+  const own = decisionOf(track.id);
+  const word = own?.decision === 'none' ? 'comment' : own?.decision;
+  const boxes = decidedBoxes.get(track.id) ?? 0;
+  return [word, boxes ? `${boxes} ${boxes === 1 ? 'box' : 'boxes'}` : ''].filter(Boolean).join(', ');
+}
 
 function compare(a, b) {
   if (typeof a === 'string') return a.localeCompare(b, 'en', { numeric: true });
@@ -197,19 +223,22 @@ function compare(a, b) {
 
 function isShown(track) {
   const text = $('f-text').value.trim().toLowerCase();
-  const [name, status, reason, change, decision] = ['class', 'status', 'reason', 'change', 'decision'].map(f => $('f-' + f).value);
+  const [name, status, reason, rule, change, decision] = ['class', 'status', 'reason', 'rule', 'change', 'decision'].map(f => $('f-' + f).value);
   if (text && !track.id.toLowerCase().includes(text) && !track.class.toLowerCase().includes(text)) return false;
   if (name && track.class !== name.slice(1)) return false;
   if (status && !(status in track.status)) return false;
-  if (reason && !(reason in track.reasons)) return false;
+  if (reason && !causesOf(track).includes(reason) && !(reason in track.reasons)) return false;
+  if (rule && !rulesOf(track).includes(rule)) return false;
   if (change && !CHANGED[change][1](track)) return false;
   if ((track.points ?? 0) < Number($('f-points').value)) return false;
   if (Number($('f-risk').value) > 0 && !(track.risk >= Number($('f-risk').value))) return false;
-  const made = decisionOf(track.id)?.decision ?? '';
-  return !decision || (decision === 'open' ? !made : made === decision);
+  const decided = decidedOf(track);
+  return !decision || (decision === 'open' ? !decided : decided.includes(decision));
 }
 
 function drawList() {
+  decidedBoxes.clear();
+  for (const { track_id: id, stamp_ns: stamp } of decisions.values()) if (stamp) decidedBoxes.set(id, (decidedBoxes.get(id) ?? 0) + 1);
   const found = columns();
   const [, , value] = found.find(([name]) => name === view.sort) ?? found[0];
   view.shown = DATA.tracks.filter(isShown);
@@ -219,20 +248,39 @@ function drawList() {
     const missing = typeof x !== 'string' && (!isKnown(x) || !isKnown(y));
     return (missing ? 1 : sign) * compare(x, y) || a.index - b.index;
   });
-  fill($('rows').querySelector('thead'), element('tr', {}, ...found.map(([name, title]) => {
+  fill($('rows').querySelector('thead'), element('tr', {}, ...found.map(([name, title, , , meaning]) => {
     const isSorted = name === view.sort;
     return element('th', { class: TEXT.has(name) ? '' : 'n', 'aria-sort': isSorted ? (view.descending ? 'descending' : 'ascending') : null },
-      element('button', { 'data-sort': name, onclick: () => sortBy(name) }, title + (isSorted ? (view.descending ? ' ▾' : ' ▴') : '')));
+      element('button', { 'data-sort': name, title: meaning, onclick: () => sortBy(name) }, title + (isSorted ? (view.descending ? ' ▾' : ' ▴') : '')));
   })));
-  fill($('rows').querySelector('tbody'), ...view.shown.map(track => {
-    const row = element('tr', { class: 'link', 'data-track': track.index, 'aria-selected': String(track.index === view.track), onclick: () => openTrack(track.index) });
-    row.append(...found.map(([name, , , text]) => {
+  const body = $('rows').querySelector('tbody'), lines = view.shown.map(track => lineOf(track, found));
+  const drawn = [...body.children];
+  // A decision seldom changes the list: a thousand lines need not be laid out again.
+  if (lines.length !== drawn.length || lines.some((line, k) => line !== drawn[k])) body.replaceChildren(...lines);
+  const place = view.shown.findIndex(track => track.index === view.track);
+  if (place >= 0) view.place = place;
+  const decided = DATA.tracks.filter(track => decidedOf(track)).length;
+  $('f-count').textContent = `${view.shown.length} of ${DATA.tracks.length} tracks` + (IS_REVIEW ? `, ${decided} decided` : '');
+  $('f-clear').hidden = filters().every(input => input.value === input.defaultValue || (input.matches('select') && !input.value));
+}
+
+// The line of a track in the list; only its decision changes.
+function lineOf(track, found) {
+  track.line ??= element('tr', { class: 'link', 'data-track': track.index, 'aria-selected': String(track.index === view.track), onclick: () => openTrack(track.index) },
+    ...found.map(([name, , , text]) => {
       const shown = String(text(track));
-      return element('td', { class: TEXT.has(name) ? '' : 'n', title: name === 'why' || name === 'reasons' ? shown : null }, shown);
+      return element('td', { class: TEXT.has(name) ? name : 'n', title: TEXT.has(name) ? (name === 'why' ? track.why : shown) : null }, shown);
     }));
-    return row;
-  }));
-  $('f-count').textContent = `${view.shown.length} of ${DATA.tracks.length} tracks`;
+  const decision = track.line.querySelector('.decision');
+  if (decision) decision.textContent = decision.title = decidedOf(track);
+  return track.line;
+}
+
+const filters = () => [...document.querySelectorAll('.filters input, .filters select')];
+
+function clearFilters() {
+  for (const input of filters()) input.value = input.matches('select') ? '' : input.defaultValue;
+  drawList();
 }
 
 function sortBy(name) {
@@ -246,24 +294,21 @@ function options(id, first, entries) {
 }
 
 function setUpList() {
-  const rank = new Map();
-  DATA.review.forEach((row, k) => { if (!rank.has(row.track_id)) rank.set(row.track_id, Number(row.rank) || k + 1); });
   DATA.tracks.forEach((track, index) => {
     track.index = index;
-    track.rank = rank.get(track.id) ?? Infinity;
+    track.rank = index + 1;
     track.sharper = track.before.cells ? 100 * (track.after.cells / track.before.cells - 1) : null;
   });
   const every = key => [...new Set(DATA.tracks.flatMap(track => key(track)))].sort();
   options('f-class', 'any class', every(t => [t.class]).map(name => ['=' + name, name]));
   options('f-status', 'any status', every(t => Object.keys(t.status)).map(name => [name, name]));
-  options('f-reason', 'any reason', every(t => Object.keys(t.reasons)).map(name => [name, name]));
+  options('f-reason', 'any reason', [...every(causesOf).map(name => [name, name]), ...every(t => Object.keys(t.reasons)).map(name => [name, 'kept: ' + name])]);
+  options('f-rule', 'any rule', every(rulesOf).map(name => [name, name]));
   options('f-change', 'any change', Object.entries(CHANGED).map(([name, [text]]) => [name, text]));
-  options('f-decision', 'any decision', [['open', 'no decision'], ['accept', 'accepted'], ['reject', 'rejected'], ['unsure', 'unsure']]);
+  options('f-decision', 'any decision', [['open', 'no decision'], ['accept', 'accepted'], ['reject', 'rejected'], ['unsure', 'unsure'], ['comment', 'comment only'], ['box', 'boxes decided']]);
   $('f-decision').hidden = !IS_REVIEW;
-  $('f-risk-label').hidden = !DATA.has_risk;
-  for (const input of document.querySelectorAll('.filters input, .filters select')) input.oninput = drawList;
-  view.sort = DATA.review.length ? 'rank' : 'shift';
-  view.descending = !DATA.review.length;
+  for (const input of filters()) input.oninput = drawList;
+  $('f-clear').onclick = clearFilters;
   drawList();
 }
 
@@ -287,15 +332,18 @@ function drawOverview() {
       return element('tr', {}, element('td', {}, title), ...[a, b].map(v => element('td', { class: 'n' }, isKnown(v) ? number(scale * v, digits) + unit : '–')),
         element('td', { class: 'n ' + (part ? (isBetter ? 'better' : 'worse') : '') }, part === null ? '' : (part > 0 ? '+' : '') + number(part, 0) + ' %'));
     }));
-  const byId = new Map(DATA.tracks.map(track => [track.id, track]));
-  const first = DATA.review.length
-    ? DATA.review.slice(0, 12).filter(row => byId.has(row.track_id)).map(row => [byId.get(row.track_id), `${number(Number(row.risk_m))} m`, row.reasons, row.stamp_ns])
-    : [...DATA.tracks].filter(t => isKnown(t.shift) && t.boxes >= 10).sort((a, b) => b.shift - a.shift).slice(0, 12)
-        .map(t => [t, `${number(t.shift)} m`, [`${number(t.turn, 1)}° turned`, `${number(t.resized)} m resized`, t.flips ? `${t.flips} flips` : ''].filter(Boolean).join(', '), '']);
-  $('first-note').textContent = DATA.review.length ? 'By risk: the expected error of the refined boxes.' : 'By mean shift of the refined boxes, of tracks with 10 boxes or more.';
-  fill($('first'), element('tr', {}, ...['track', 'class', DATA.review.length ? 'risk' : 'shift', 'why'].map(t => element('th', {}, t))),
-    ...first.map(([track, value, why, stamp]) => element('tr', { class: 'link', onclick: () => openTrack(track.index, stamp) },
-      element('td', {}, element('a', { href: hashOf(track.id, stamp) }, track.id || 'no id')), element('td', {}, track.class), element('td', { class: 'n' }, value), element('td', {}, why))));
+  fill($('first'), element('tr', {}, ...['track', 'class', 'risk', 'why'].map(t => element('th', {}, t))),
+    ...DATA.tracks.slice(0, 12).map(track => element('tr', { class: 'link', onclick: () => openTrack(track.index, track.riskiest) },
+      element('td', {}, element('a', { href: hashOf(track.id, track.riskiest) }, track.id || 'no id')), element('td', {}, track.class),
+      element('td', { class: 'n' }, `${number(track.risk)} m`), element('td', {}, ...reasonsOf(track)))));
+}
+
+// The reasons of a risk, each with its meaning as a tooltip.
+function reasonsOf(track) {
+  return partsOf(track.why).flatMap((part, k) => {
+    const meaning = MEANINGS.find(([word]) => part.includes(word))?.[1];
+    return [k ? '; ' : '', element('span', { title: meaning ?? null }, part)];
+  });
 }
 
 const LAYOUT = () => ({
@@ -324,7 +372,7 @@ async function drawMap() {
     }
     lines.x.push(null); lines.y.push(null); lines.customdata.push([track.index, 0]); lines.text.push('');
   }
-  const risky = DATA.has_risk ? DATA.tracks.filter(t => isKnown(t.risk) && t.path.length) : [];
+  const risky = DATA.tracks.filter(t => isKnown(t.risk) && t.path.length);
   const names = DATA.tracks.filter(t => t.path.length);
   const middle = track => track.path[track.path.length >> 1];
   await Plotly.newPlot('map', [
@@ -353,18 +401,18 @@ async function openTrack(index, stamp = null, row = null) {
   showTab('tracks');
   const track = DATA.tracks[index];
   if (index !== view.track) {
+    if (isCorrecting()) return;
     view.track = index;
+    view.place = Math.max(0, view.shown.indexOf(track));
     view.edit = null;
-    for (const line of $('rows').querySelectorAll('tbody tr')) {
-      const isOpen = Number(line.dataset.track) === index;
-      line.setAttribute('aria-selected', String(isOpen));
-      if (isOpen) line.scrollIntoView({ block: 'nearest' });
-    }
+    for (const one of DATA.tracks) one.line?.setAttribute('aria-selected', String(one === track));
+    track.line?.scrollIntoView({ block: 'nearest' });
     const part = await loadPart(index);
     if (view.track !== index) return;
     view.part = part;
     view.charts = false;
     view.limits = limitsOf(part);
+    view.zoom = 1;
     $('time').max = part.stamps.length - 1;
     row ??= part.num_points.indexOf(Math.max(...part.num_points));  // the object is seen best there
     drawTitle(track);
@@ -386,23 +434,46 @@ function nearestRow(stamp) {
 
 function drawTitle(track) {
   const facts = [`${track.boxes} boxes in ${number(track.seconds, 1)} s`, `${number(track.points, 0)} points (median)`,
-    `shift ${number(track.shift)} m`, `turn ${number(track.turn, 1)}°`, track.flips ? `${track.flips} heading ${track.flips === 1 ? 'flip' : 'flips'} corrected` : '',
+    `moved ${number(track.shift)} m`, `turned ${number(track.turn, 1)}°`, track.flips ? `${track.flips} heading ${track.flips === 1 ? 'flip' : 'flips'} corrected` : '',
     `extents ${track.extents.map(e => e.map(v => number(v)).join(' × ')).join(' → ')} m`,
-    isKnown(track.after.iou) ? `3D IoU ${number(track.before.iou, 3)} → ${number(track.after.iou, 3)}` : '',
-    isKnown(track.risk) ? `risk ${number(track.risk)} m: ${track.why}` : '', sumOf(track.reasons)];
-  fill($('title'), element('b', {}, track.id || 'no id'), element('span', {}, track.class), element('span', { class: 'grey' }, facts.filter(Boolean).join(' · ')));
+    isKnown(track.after.iou) ? `3D IoU ${number(track.before.iou, 3)} → ${number(track.after.iou, 3)}` : '', sumOf(track.reasons)];
+  const violations = track.rules.map(([rule, stamp, text]) => element('a', { href: hashOf(track.id, stamp) }, `${rule}: ${text}`));
+  fill($('title'), element('b', {}, track.id || 'no id'), element('span', {}, track.class),
+    element('span', {}, `risk ${number(track.risk)} m: `, ...reasonsOf(track), ' · ', element('a', { href: hashOf(track.id, track.riskiest), title: 'key g' }, 'riskiest box')),
+    ...violations, element('span', { class: 'grey' }, facts.filter(Boolean).join(' · ')));
+}
+
+// A correction that is neither pinned nor discarded is not left.
+function isCorrecting() {
+  if (!view.edit || !view.isMoved) return false;
+  fail('The correction of this box is not saved: Enter pins it, Escape discards it.');
+  return true;
+}
+
+function discard() {
+  view.edit = null;
+  view.isMoved = false;
+  $('failure').hidden = true;
+  step(view.row, true);
 }
 
 function step(row, isNew = false) {
   const part = view.part;
   row = Math.max(0, Math.min(part.stamps.length - 1, row));
   if (row === view.row && !isNew) return;
+  if (row !== view.row && isCorrecting()) {
+    $('time').value = view.row;
+    return;
+  }
   if (row !== view.row) view.edit = null;
   view.row = row;
   $('time').value = row;
-  const status = part.status[row] + (part.reasons[row] ? ` (${part.reasons[row]})` : '');
   const mark = decisionOf(DATA.tracks[view.track].id, part.stamps[row]);
-  $('clock').textContent = `${row + 1}/${part.stamps.length} · ${number(part.times[row], 2)} s · ${status} · ${part.num_points[row]} points${isKnown(part.iou[1][row]) ? ` · IoU ${number(part.iou[0][row])} → ${number(part.iou[1][row])}` : ''}${mark ? ' · ' + mark.decision : ''}`;
+  const facts = [`${row + 1}/${part.stamps.length}`, `${number(part.times[row], 2)} s`, part.status[row] + (part.reasons[row] ? ` (${part.reasons[row]})` : ''),
+    mark ? (mark.decision === 'none' ? mark.comment : mark.decision) : '', `${part.num_points[row]} points`, `risk ${number(part.risk[row])} m`,
+    isKnown(part.iou[1][row]) ? `IoU ${number(part.iou[0][row])} → ${number(part.iou[1][row])}` : ''];
+  $('clock').textContent = facts.filter(Boolean).join(' · ');
+  $('clock').title = `${$('clock').textContent} · stamp ${part.stamps[row]} ns`;
   clearTimeout(view.hashTimer);  // browsers limit how often the address may change
   view.hashTimer = setTimeout(() => history.replaceState(null, '', hashOf(DATA.tracks[view.track].id, part.stamps[view.row])), 200);
   drawViews();
@@ -432,7 +503,7 @@ function limitsOf(part) {
 
 function drawViews() {
   const part = view.part;
-  if (!part.usable[view.row]) return;
+  if (!part.usable[view.row]) return drawNothing();
   const mode = $('mode').value;
   const cacheKey = mode === 'sweep' ? view.row : mode;
   if (view.cacheKey !== cacheKey || view.cachePart !== part) {
@@ -454,12 +525,22 @@ function drawViews() {
   fill($('legend'), ...view.lines.map(({ name, dash }) => element('span', {}, element('i', { style: `border-color: var(--${name}); border-top-style: ${dash.length ? (dash[0] > 3 ? 'dashed' : 'dotted') : 'solid'}` }), labels[name])));
 }
 
+// A box with numbers that are not finite has no place.
+function drawNothing() {
+  view.local = view.lines = [];
+  view.cacheKey = null;
+  drawFlat($('top'), 1);
+  drawFlat($('side'), 2);
+  drawSpace();
+  fill($('legend'), 'no valid box at this stamp');
+}
+
 // The top view (axis 1) or the side view (axis 2), heading to the right.
 function drawFlat(canvas, axis) {
   const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
   if (canvas.width !== Math.round(width * scale)) canvas.width = Math.round(width * scale);
   if (canvas.height !== Math.round(height * scale)) canvas.height = Math.round(height * scale);
-  const zoom = Math.min(width / (2 * view.limits[0]), height / (2 * view.limits[axis]));
+  const zoom = view.zoom * Math.min(width / (2 * view.limits[0]), height / (2 * view.limits[axis]));
   canvas.zoom = zoom;
   const at = point => [width / 2 + zoom * point[0], height / 2 - zoom * point[axis]];
   // Points are many small rectangles: the processor draws them sooner than a software GPU does.
@@ -501,6 +582,11 @@ function drawFlat(canvas, axis) {
     context.stroke();
   }
   context.setLineDash([]);
+}
+
+function zoomBy(factor) {
+  view.zoom = Math.max(1, Math.min(MAX_ZOOM, view.zoom * factor));
+  drawViews();
 }
 
 const EDGES = [0, 1, 2, 3, 0, 4, 5, 6, 7, 4, null, 1, 5, null, 2, 6, null, 3, 7];
@@ -550,33 +636,52 @@ async function drawSpace() {
   view.pending = false;
 }
 
+// From top to bottom: name, unit, height.
+const CHARTS = [['risk', 'm', 1], ['along', 'm', 1], ['across', 'm', 1], ['up', 'm', 1], ['yaw', '°', 1], ['size', 'm', 1.3], ['faces', 'm', 1.5]];
+const SIZES = ['length', 'width', 'height'];
+const SIZE_COLOURS = ['refined', 'truth', 'human'];
+const FACE_COLOURS = ['refined', 'input', 'truth', 'human', 'points'];
+
+// The number of a chart behind the name of an axis: the first one has none.
+function chartNumber(name) {
+  const at = CHARTS.findIndex(([one]) => one === name);
+  return at ? at + 1 : '';
+}
+
+// The area between two curves over time, where both are known.
+function band(part, axes, name, low, high) {
+  const known = part.times.map((_, i) => i).filter(i => isKnown(low[i]) && isKnown(high[i]));
+  return { ...axes, x: [...known, ...known.toReversed()].map(i => part.times[i]), y: [...known.map(i => high[i]), ...known.toReversed().map(i => low[i])],
+           fill: 'toself', fillcolor: colour(name) + '33', line: { width: 0 }, mode: 'lines', hoverinfo: 'skip' };
+}
+
 function chartTraces() {
   const part = view.part;
   const traces = [];
   const degrees = 180 / Math.PI;
-  ['along', 'across', 'up', 'yaw'].forEach((_, k) => {
+  traces.push({ xaxis: 'x', yaxis: 'y' + chartNumber('risk'), name: 'risk', x: part.times, y: part.risk, mode: 'lines+markers', line: { width: 1 }, marker: { size: 4, color: colour('input') } });
+  ['along', 'across', 'up', 'yaw'].forEach((axis, k) => {
     const scale = k === 3 ? degrees : 1;
-    const axes = { xaxis: 'x', yaxis: 'y' + (k ? k + 1 : '') };
-    const band = part.deviations.map(d => d[k] === null ? null : 2 * scale * d[k]);
-    const known = part.times.map((_, i) => i).filter(i => band[i] !== null);
-    traces.push({ ...axes, x: [...known, ...known.toReversed()].map(i => part.times[i]), y: [...known.map(i => band[i]), ...known.toReversed().map(i => -band[i])],
-                  fill: 'toself', fillcolor: colour('refined') + '33', line: { width: 0 }, mode: 'lines', hoverinfo: 'skip' });
+    const axes = { xaxis: 'x', yaxis: 'y' + chartNumber(axis) };
+    const reach = part.deviations.map(d => d[k] === null ? null : 2 * scale * d[k]);
+    traces.push(band(part, axes, 'refined', reach.map(r => r === null ? null : -r), reach));
     for (const [name, shape, is] of [['refined', 'circle', s => s === 'refined'], ['input', 'x', s => s === 'kept'], ['human', 'diamond', s => s === 'human']]) {
       const rows = part.times.map((_, i) => i).filter(i => is(part.status[i]));
       traces.push({ ...axes, name: name === 'input' ? 'kept' : name, x: rows.map(i => part.times[i]), y: rows.map(i => part.change[i][k] === null ? null : scale * part.change[i][k]),
                     mode: name === 'refined' ? 'lines+markers' : 'markers', line: { width: 1 }, marker: { size: 4, symbol: shape, color: colour(name) } });
     }
   });
-  const sizes = ['refined', 'truth', 'human'];
-  ['length', 'width', 'height'].forEach((name, k) => {
-    const axes = { xaxis: 'x', yaxis: 'y5', x: part.times, mode: 'lines', name };
-    traces.push({ ...axes, y: part.given.map(box => box[3 + k]), line: { color: colour('input'), dash: 'dash', width: 1.2 } });
-    traces.push({ ...axes, y: part.boxes.map(box => box[3 + k]), line: { color: colour(sizes[k]), width: 1.8 } });
+  SIZES.forEach((name, k) => {
+    const axes = { xaxis: 'x', yaxis: 'y' + chartNumber('size') };
+    const line = { ...axes, x: part.times, mode: 'lines', name };
+    const size = part.boxes.map(box => box[3 + k]), reach = part.extent_deviations.map(d => d[k] === null ? null : 2 * d[k]);
+    traces.push(band(part, axes, SIZE_COLOURS[k], size.map((v, i) => reach[i] === null ? null : v - reach[i]), size.map((v, i) => reach[i] === null ? null : v + reach[i])));
+    traces.push({ ...line, y: part.given.map(box => box[3 + k]), line: { color: colour('input'), dash: 'dash', width: 1.2 } });
+    traces.push({ ...line, y: size, line: { color: colour(SIZE_COLOURS[k]), width: 1.8 } });
   });
   const marks = ['circle', 'square', 'triangle-up', 'triangle-down', 'x'];
-  const tints = ['refined', 'input', 'truth', 'human', 'points'];
-  FACES.forEach((face, k) => traces.push({ xaxis: 'x', yaxis: 'y6', name: face, x: part.times, y: part.residuals.map(r => r[k]), mode: 'lines+markers',
-                                           line: { width: 1, color: colour(tints[k]) }, marker: { size: 4, symbol: marks[k], color: colour(tints[k]) } }));
+  FACES.forEach((face, k) => traces.push({ xaxis: 'x', yaxis: 'y' + chartNumber('faces'), name: face, x: part.times, y: part.residuals.map(r => r[k]), mode: 'lines+markers',
+                                           line: { width: 1, color: colour(FACE_COLOURS[k]) }, marker: { size: 4, symbol: marks[k], color: colour(FACE_COLOURS[k]) } }));
   return traces;
 }
 
@@ -584,18 +689,23 @@ async function drawCharts() {
   await withPlotly();
   if (!view.part || view.charts || $('tracks').hidden) return;
   view.charts = true;
-  const titles = ['along [m]', 'across [m]', 'up [m]', 'yaw [°]', 'size [m]', 'faces [m]'];
-  const notes = ['refined − input; band: ± 2σ', '', '', '', 'length, width, height; dashed: input', `points − face: ${FACES.map((f, k) => f + ' ' + '●■▲▼✕'[k]).join(' ')}`];
-  const layout = { ...LAYOUT(), margin: { l: 56, r: 8, t: 16, b: 34 }, xaxis: { ...AXIS(), title: { text: 'time [s]' }, anchor: 'y6' }, annotations: [] };
-  const heights = [1, 1, 1, 1, 1.3, 1.5], gap = 0.035;
-  const unit = (1 - gap * 5) / heights.reduce((a, b) => a + b);
+  const tinted = (words, names) => words.map((word, k) => `<span style="color: ${colour(names[k])}">${word}</span>`).join(', ');
+  const notes = {
+    risk: 'expected error of each box; click a point to go there',
+    along: 'refined − input, in the axes of the box; band: ± 2σ',
+    size: `${tinted(SIZES, SIZE_COLOURS)}; band: ± 2σ; dashed: input`,
+    faces: `outermost points − face: ${tinted(FACES.map((f, k) => '●■▲▼✕'[k] + ' ' + f), FACE_COLOURS)}`,
+  };
+  const layout = { ...LAYOUT(), margin: { l: 56, r: 8, t: 16, b: 34 }, xaxis: { ...AXIS(), title: { text: 'time [s]' }, anchor: 'y' + chartNumber('faces') }, annotations: [] };
+  const gap = 0.035;
+  const unit = (1 - gap * (CHARTS.length - 1)) / CHARTS.reduce((sum, [, , height]) => sum + height, 0);
   let top = 1;
-  titles.forEach((text, k) => {
-    const bottom = Math.max(0, top - unit * heights[k]);
-    layout['yaxis' + (k ? k + 1 : '')] = { ...AXIS(), domain: [bottom, top], title: { text }, nticks: 4, fixedrange: true };
-    if (notes[k]) layout.annotations.push({ text: notes[k], xref: 'paper', yref: 'paper', x: 0, y: top, xanchor: 'left', yanchor: 'bottom', showarrow: false, font: { size: 10, color: colour('grey') } });
+  for (const [name, unitName, height] of CHARTS) {
+    const bottom = Math.max(0, top - unit * height);
+    layout['yaxis' + chartNumber(name)] = { ...AXIS(), domain: [bottom, top], title: { text: `${name} [${unitName}]` }, nticks: 6, fixedrange: true, ...(name === 'risk' ? { rangemode: 'tozero' } : {}) };
+    if (notes[name]) layout.annotations.push({ text: notes[name], xref: 'paper', yref: 'paper', x: 0, y: top, xanchor: 'left', yanchor: 'bottom', showarrow: false, font: { size: 10, color: colour('grey') } });
     top = bottom - gap;
-  });
+  }
   await Plotly.react('charts', chartTraces(), layout, CONFIG);
   $('charts').removeAllListeners?.('plotly_click');
   $('charts').on('plotly_click', event => { const row = view.part.times.indexOf(event.points[0].x); if (row >= 0) step(row); });
@@ -614,6 +724,7 @@ function drawCursor() {
 }
 
 function play() {
+  if (!view.isPlaying && isCorrecting()) return;
   cancelAnimationFrame(view.playing);
   view.isPlaying = !view.isPlaying;
   $('play').textContent = view.isPlaying ? '⏸' : '▶';
@@ -634,20 +745,26 @@ function play() {
 // Decisions -------------------------------------------------------------------------------------
 
 function drawDecisions() {
-  const track = DATA.tracks[view.track], stamp = view.part.stamps[view.row];
-  const made = decisionOf(track.id), own = decisionOf(track.id, stamp);
+  if (document.activeElement?.id.startsWith('comment')) return;
+  const stamp = view.part.stamps[view.row];
+  const own = decisionOf(DATA.tracks[view.track].id, stamp);
   const button = (name, text, title, onclick, isPressed = null) => element('button', { 'data-do': name, title, onclick, 'aria-pressed': isPressed === null ? null : String(isPressed) }, text);
-  const judge = (decision, text, key) => button(decision, text, `${text} the track (${key})`, () => decide(decision), made?.decision === decision);
-  const isFocused = document.activeElement?.id === 'comment';
-  if (isFocused) return;
-  fill($('decide'), judge('accept', 'Accept', 'a'), judge('reject', 'Reject', 'r'), judge('unsure', 'Unsure', 'u'), element('span', { class: 'gap' }),
-    button('reject-box', 'Reject box', 'Keep the input box here (x)', () => decide('reject', stamp), own?.decision === 'reject'),
-    view.edit ? button('pin', 'Pin box', 'Save this box (Enter)', pin) : button('edit', own?.decision === 'pin' ? 'Edit pin' : 'Edit box', 'Correct this box (e)', edit),
-    view.edit ? button('cancel', 'Cancel', 'Discard this correction (Escape)', () => { view.edit = null; step(view.row, true); }) : (own?.decision === 'pin' ? button('unpin', 'Unpin', 'Remove the pin', () => decide('none', stamp)) : null),
-    button('undo', 'Undo', 'Undo the last decision (z)', undo),
-    element('input', { id: 'comment', placeholder: 'Comment on the track (c)', 'aria-label': 'Comment', onchange: event => decide(made?.decision ?? 'unsure', '', event.target.value) }));
-  $('comment').value = made?.comment ?? '';
+  fill($('decide-track'), element('span', {}, 'Track'), ...judgements('', ''), button('undo', 'Undo', 'Undo the last decision, of any track (z)', undo));
+  fill($('decide-box'), element('span', {}, 'Box'), ...judgements('-box', stamp),
+    view.edit ? button('pin', 'Pin', 'Save this box (Enter)', pin) : button('edit', own?.decision === 'pin' ? 'Edit pin' : 'Edit', 'Correct this box (e)', edit),
+    view.edit ? button('cancel', 'Cancel', 'Discard this correction (Escape)', discard) : (own?.decision === 'pin' ? button('unpin', 'Unpin', 'Remove the pin', () => decide('none', stamp)) : null));
   $('detail').classList.toggle('editing', Boolean(view.edit));
+
+  // The buttons and the comment for the track, or for the box of a stamp.
+  function judgements(suffix, stamp) {
+    const what = stamp ? 'this box' : 'the track', shift = stamp ? 'Shift ' : '';
+    const held = decisionOf(DATA.tracks[view.track].id, stamp);
+    const judge = (decision, text, effect) => button(decision + suffix, text, `${text} ${what}${effect} (${shift}${decision[0]})`, () => decide(decision, stamp), held?.decision === decision);
+    const comment = element('input', { id: 'comment' + suffix, placeholder: `Comment on ${what} (${shift}c)`, 'aria-label': `Comment on ${what}`,
+      onchange: event => decide(held?.decision ?? 'none', stamp, event.target.value, held?.box ?? null) });
+    comment.value = held?.comment ?? '';
+    return [judge('accept', 'Accept', ''), judge('reject', 'Reject', ': keep the input'), judge('unsure', 'Unsure', ''), comment];
+  }
 }
 
 async function send(row) {
@@ -674,18 +791,23 @@ async function decide(decision, stamp = '', comment = null, box = null) {
   const id = DATA.tracks[view.track].id;
   const before = decisionOf(id, stamp) ?? { track_id: id, stamp_ns: stamp, decision: 'none', comment: '', box: null };
   if (comment === null && before.decision === decision && decision !== 'pin') decision = 'none';
-  if (await store({ track_id: id, stamp_ns: stamp, decision, comment: comment ?? before.comment, box })) undone.push(before);
+  if (await store({ track_id: id, stamp_ns: stamp, decision, comment: comment ?? before.comment, box })) made.push(before);
 }
 
 async function undo() {
-  const before = undone.at(-1);
-  if (before && await store(before)) undone.pop();
+  const before = made.at(-1);
+  if (!before || isCorrecting() || !await store(before)) return;
+  made.pop();
+  openTrack(DATA.tracks.findIndex(track => track.id === before.track_id), before.stamp_ns || null);
 }
 
 function edit() {
   if (!IS_REVIEW) return;
+  if (view.isPlaying) play();
+  if (!view.part.usable[view.row]) return fail('This box has numbers that are not finite: correct another box of the track.');
   const human = currentBoxes().find(([name]) => name === 'human');
   view.edit = (human ? human[1] : view.part.usable[view.row]).slice();
+  view.isMoved = false;
   $('mode').value = 'sweep';
   step(view.row, true);
   $('top').focus({ preventScroll: true });
@@ -695,6 +817,8 @@ async function pin() {
   const { origin, stamps } = view.part;
   const box = view.edit.map((v, k) => k < 3 ? v + origin[k] : v);
   view.edit = null;
+  view.isMoved = false;
+  $('failure').hidden = true;
   await decide('pin', stamps[view.row], null, box);
 }
 
@@ -714,7 +838,7 @@ function resizeEdit(axis, sign, by) {
   moveEdit(...shift);
 }
 
-function redrawEdit() { if (!view.redraw) view.redraw = requestAnimationFrame(() => { view.redraw = 0; if (view.edit) drawViews(); }); }
+function redrawEdit() { view.isMoved = true; if (!view.redraw) view.redraw = requestAnimationFrame(() => { view.redraw = 0; if (view.edit) drawViews(); }); }
 
 function setUpDragging(canvas, axis) {
   let grip = null;
@@ -742,6 +866,11 @@ function setUpDragging(canvas, axis) {
     else moveEdit(...[0, 1, 2].map(k => k === 0 || k === axis ? at[k] - grip.last[k] : 0));
     redrawEdit();
   };
+  canvas.addEventListener('wheel', event => {
+    if (!event.ctrlKey) return;  // the wheel alone scrolls the page
+    event.preventDefault();
+    zoomBy(event.deltaY < 0 ? ZOOM_STEP : 1 / ZOOM_STEP);
+  }, { passive: false });
   canvas.onpointerup = canvas.onpointercancel = () => { grip = null; };
 }
 
@@ -755,24 +884,27 @@ const KEYS = {
   ' ': ['Space', 'play or pause', play],
   ArrowDown: ['↓  ↑', 'next and previous track of the list', () => nextTrack(1)],
   ArrowUp: ['', '', () => nextTrack(-1)],
+  g: ['g', 'go to the riskiest box of the track', () => step(nearestRow(DATA.tracks[view.track].riskiest))],
+  '+': ['+  −', 'zoom the top and side view; Ctrl with the wheel does too', () => zoomBy(ZOOM_STEP)],
+  '-': ['', '', () => zoomBy(1 / ZOOM_STEP)],
   m: ['m', 'points of this sweep, or of all sweeps in the refined or input boxes', () => { const mode = $('mode'); mode.selectedIndex = (mode.selectedIndex + 1) % 3; drawViews(); }],
   '/': ['/', 'search', () => $('f-text').focus()],
   '?': ['?', 'show the keys', () => $('help').showModal()],
 };
+const stampOf = event => event.shiftKey ? view.part.stamps[view.row] : '';
 const REVIEW_KEYS = {
-  a: ['a', 'accept the track', () => decide('accept')],
-  r: ['r', 'reject the track: its input boxes are kept', () => decide('reject')],
-  u: ['u', 'unsure', () => decide('unsure')],
-  x: ['x', 'reject this box', () => decide('reject', view.part.stamps[view.row])],
-  c: ['c', 'comment on the track', () => $('comment').focus()],
+  a: ['a', 'accept the track; with Shift this box', event => decide('accept', stampOf(event))],
+  r: ['r', 'reject the track: its input boxes are kept; with Shift this box', event => decide('reject', stampOf(event))],
+  u: ['u', 'unsure about the track; with Shift about this box', event => decide('unsure', stampOf(event))],
+  c: ['c', 'comment on the track; with Shift on this box', event => $(event.shiftKey ? 'comment-box' : 'comment').focus()],
   e: ['e', 'correct this box', edit],
   z: ['z', 'undo the last decision', undo],
 };
 const EDIT_KEYS = {
-  ArrowUp: ['↑  ↓', 'move 2 cm along; with Shift 10 cm', n => moveEdit(n * STEP, 0, 0)],
-  ArrowDown: ['', '', n => moveEdit(-n * STEP, 0, 0)],
-  ArrowLeft: ['←  →', 'move across', n => moveEdit(0, n * STEP, 0)],
-  ArrowRight: ['', '', n => moveEdit(0, -n * STEP, 0)],
+  ArrowRight: ['←  →', 'move 2 cm along, as in the views; with Shift 10 cm', n => moveEdit(n * STEP, 0, 0)],
+  ArrowLeft: ['', '', n => moveEdit(-n * STEP, 0, 0)],
+  ArrowUp: ['↑  ↓', 'move across, as in the top view', n => moveEdit(0, n * STEP, 0)],
+  ArrowDown: ['', '', n => moveEdit(0, -n * STEP, 0)],
   PageUp: ['PgUp  PgDn', 'move up and down', n => moveEdit(0, 0, n * STEP)],
   PageDown: ['', '', n => moveEdit(0, 0, -n * STEP)],
   '[': ['[  ]', 'turn by 0.5°', n => { view.edit[8] += n * TURN; redrawEdit(); }],
@@ -782,12 +914,14 @@ const EDIT_KEYS = {
   w: ['', '', n => resizeEdit(1, 1, n > 1 ? -STEP : STEP)],
   h: ['', '', n => resizeEdit(2, 1, n > 1 ? -STEP : STEP)],
   Enter: ['Enter', 'pin the box', pin],
-  Escape: ['Escape', 'discard the correction', () => { view.edit = null; step(view.row, true); }],
+  Escape: ['Escape', 'discard the correction', discard],
 };
 
 function nextTrack(by) {
   const at = view.shown.findIndex(track => track.index === view.track);
-  const next = view.shown[Math.max(0, Math.min(view.shown.length - 1, at + by))];
+  // A track that a filter has removed, as by its decision, leaves its place to the next one.
+  const wanted = at < 0 ? view.place + Math.min(by, 0) : at + by;
+  const next = view.shown[Math.max(0, Math.min(view.shown.length - 1, wanted))];
   if (next) openTrack(next.index);
 }
 
@@ -801,7 +935,8 @@ function onKey(event) {
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   if (target.matches('button, a') && (name === ' ' || name === 'Enter')) return;
   if (event.key !== '?' && event.key !== '/' && ($('tracks').hidden || !view.part)) return;
-  const key = view.edit ? EDIT_KEYS[name] : KEYS[name] ?? (IS_REVIEW ? REVIEW_KEYS[name] : undefined);
+  const isZoom = name === '+' || name === '-';
+  const key = view.edit && !isZoom ? EDIT_KEYS[name] : KEYS[name] ?? (IS_REVIEW ? REVIEW_KEYS[name] : undefined);
   if (!key) return;
   event.preventDefault();
   key[2](view.edit ? (event.shiftKey ? 5 : 1) : event);
@@ -829,6 +964,12 @@ async function followHash() {
   const hash = location.hash.slice(1);
   if (['overview', 'run', 'tracks'].includes(hash)) return selectTab(hash);
   const wanted = new URLSearchParams(hash);
+  if (wanted.has('rule')) {
+    clearFilters();
+    $('f-rule').value = wanted.get('rule');
+    drawList();
+    return openTrack((view.shown[0] ?? DATA.tracks[0]).index);
+  }
   if (!wanted.has('track')) return showTab('overview');
   const track = DATA.tracks.find(one => one.id === wanted.get('track'));
   if (!track) {
@@ -869,7 +1010,10 @@ async function main() {
   setUpKeys();
   setUpDragging($('top'), 1);
   setUpDragging($('side'), 2);
-  for (const one of ['overview', 'tracks', 'run']) $('tab-' + one).onclick = () => selectTab(one);
+  for (const one of ['overview', 'tracks', 'run']) $('tab-' + one).onclick = () => {
+    selectTab(one);
+    if (one === 'tracks') $('rows').focus({ preventScroll: true });  // Space plays, and does not press the tab again
+  };
   $('time').oninput = () => step(Number($('time').value));
   $('mode').onchange = drawViews;
   $('play').onclick = play;

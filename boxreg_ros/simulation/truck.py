@@ -220,7 +220,7 @@ def _in_base(clouds: Sequence[Sweep], ego: Motion) -> list[Sweep]:
     for cloud in clouds:
         T_fixed_base = _base_at(ego, cloud.stamp_ns)
         T = T_base_fixed @ T_fixed_base @ _translation(every[cloud.frame_id])
-        moved.append(sweep_to_frame(cloud, T, BASE_FRAME))
+        moved.append(sweep_to_frame(cloud, T, BASE_FRAME).in_frame())
     return moved
 
 

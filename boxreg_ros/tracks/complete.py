@@ -91,6 +91,12 @@ class PlannedArray:
             pinned=pinned,
         )
 
+    def added_boxes(self, given: BoxArray) -> BoxArray:
+        """Return the boxes that are added to an array."""
+        registered = self.to_register(given)
+        count = len(registered.track_ids)
+        return registered.take(range(count - len(self.added), count))
+
 
 @dataclass(frozen=True, slots=True)
 class _Extension:

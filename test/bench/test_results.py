@@ -77,3 +77,19 @@ def test_every_accuracy_table_shows_the_baselines(path):
     (methods,) = json.loads(path.read_text(encoding='utf-8'))['results'].values()
     rows = {'input', 'smoothing only', 'ICP on box points', 'paper, track', 'ours, track'}
     assert rows <= methods.keys()
+
+
+def test_cells_within_chance_by_hand():
+    # Tracks scatter little in the first kind, so that exact covariances would be in the band, but
+    # along it is far below and up far above. In the second kind exact ones would be above 1.5,
+    # one deviation off, in 16 % and below 0.7 in 27 %. The third has too few tracks to say.
+    nees = {'along': 0.2, 'across': 1.0, 'up': 3.0, 'yaw': 1.0}
+    groups = {
+        kind: {'tracks': tracks, 'nees': nees, 'nees_error': {v: e * nees[v] for v in nees}}
+        for kind, tracks, e in (('vehicles', 9, 0.01), ('cyclists', 3, 0.5), ('pedestrians', 2, 1))
+    }
+    said = results._cells_and_chance({'drive': {'track': groups}})
+    assert '6 of 12 cells are 0.7 to 1.5' in said
+    assert 'with 3 tracks or more 4 of 8' in said
+    assert f'{4 + 4 * (1 - 0.159 - 0.274):.0f} of these would be' in said
+    assert 'standard errors are 2, more 1.' in said

@@ -62,18 +62,18 @@ def test_points_on_the_faces_decide(known):
         boxes=BOX, points=found.points[1:], delays=found.delays[1:], sights=found.sight
     )
     for _ in range(MIN_VOTES):
-        evidence.add(found, 0.1 * velocity)  # slow
-        evidence.add(few, velocity)
+        evidence.add([found], 0.1 * velocity[None])  # slow
+        evidence.add([few], velocity[None])
     assert not evidence.votes
     for _ in range(MIN_VOTES):
-        evidence.add(found, velocity)
+        evidence.add([found], velocity[None])
     assert evidence.votes == {known: MIN_VOTES}
     assert evidence.resolved(Config()).sampling.box_time == known
     other = 'sight' if known == 'stamp' else 'stamp'
     config = Config().updated({'sampling.box_time': other})
     assert evidence.resolved(config) == config
     for _ in range(MIN_VOTES):  # as many for the other: undecided
-        evidence.add(seen(other, velocity, -0.04), velocity)
+        evidence.add([seen(other, velocity, -0.04)], velocity[None])
     assert evidence.decided() == 'unknown'
 
 
@@ -83,7 +83,7 @@ def test_points_of_two_lidars_are_compared_at_their_own_times(known):
     evidence = BoxTimeEvidence()
     velocity = np.array([10.0, 0, 0])
     delays = np.repeat([0.0, 0.05], MIN_VOTE_POINTS // 2)
-    evidence.add(seen(known, velocity, delays), velocity)
+    evidence.add([seen(known, velocity, delays)], velocity[None])
     assert evidence.votes == {known: 1}
 
 

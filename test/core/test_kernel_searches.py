@@ -1,6 +1,6 @@
 """The compiled searches against their torch twins, fallbacks, and independence of windows."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 import os
 import shutil
 import subprocess
@@ -41,6 +41,7 @@ from boxreg_ros.core.rounds import (
     SolverPlan,
 )
 from boxreg_ros.core.weights import robustify_motion, weigh, weight_numbers
+from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import Sweep
 import numpy as np
 from paths import ROOT
@@ -370,7 +371,8 @@ def test_noise_equals_that_of_torch(kind):
 
 @pytest.mark.parametrize('road', [True, False])
 @pytest.mark.parametrize('ownership', [True, False])
-def test_points_of_boxes_equal_those_of_numpy(road, ownership):
+@pytest.mark.parametrize('has_pose', [True, False])
+def test_points_of_boxes_equal_those_of_numpy(road, ownership, has_pose):
     # Boxes that overlap, lie apart, and share cells of the raster; a road under some of them.
     rng = np.random.default_rng(8)
     boxes = np.zeros((12, 9))
@@ -380,6 +382,12 @@ def test_points_of_boxes_equal_those_of_numpy(road, ownership):
     points = rng.uniform(-6, 6, (20_000, 3)) + boxes[rng.integers(0, 12, 20_000), :3]
     points[::2, 2] = -0.8 + 0.02 * rng.normal(size=10_000)
     sweep = Sweep(0, 'odom', points.astype(np.float32))
+    if has_pose:  # points in the frame of a tilted sensor
+        T = np.eye(4)
+        T[:3, :3] = matrix_from_rpy([0.05, -0.1, 2.5])
+        T[:3, 3] = [3.0, -2.0, 1.5]
+        points = (points - T[:3, 3]) @ T[:3, :3]
+        sweep = replace(sweep, points=points.astype(np.float32), T_frame_points=T)
     config = Config().updated({'ingredients.road': road, 'ingredients.point_ownership': ownership})
     found, known = own_points(sweep, boxes, config), own_points_numpy(sweep, boxes, config)
     np.testing.assert_array_equal(found.row, known.row)

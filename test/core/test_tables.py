@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from boxreg_ros.core.tables import column, joined
+from boxreg_ros.core.tables import by_table, column, joined
 import numpy as np
 
 
@@ -22,6 +22,14 @@ def test_rows_keep_their_order_and_may_repeat():
     assert rows.tolist() == [2, 3, 0, 2]
     assert column(tables, 'values')[rows].tolist() == [5, 1, 3, 5]
     assert column(tables, 'names')[rows].tolist() == ['e', 'a', 'c', 'e']
+
+
+def test_items_are_grouped_by_table():
+    groups = by_table([(SECOND, 2), (FIRST, 0), (SECOND, 0)])
+    assert [(id(table), places, rows) for table, places, rows in groups] == [
+        (id(SECOND), [0, 2], [2, 0]),
+        (id(FIRST), [1], [0]),
+    ]
 
 
 def test_one_table_is_not_copied():

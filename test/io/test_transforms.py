@@ -213,7 +213,7 @@ def test_the_fixed_frame_is_the_root_of_the_moving_frames():
 def test_points_and_sensor_origin_of_a_sweep_are_transformed():
     points = np.array([[1, 0, 0], [0, 2, 0]], np.float32)
     sweep = Sweep(S, 'lidar', points, times=np.array([0.0, 0.1]))
-    moved = sweep_to_frame(sweep, rigid((10, 20, 1), LEFT), 'odom')
+    moved = sweep_to_frame(sweep, rigid((10, 20, 1), LEFT), 'odom').in_frame()
     assert (moved.stamp_ns, moved.frame_id, moved.points.dtype) == (S, 'odom', np.float32)
     np.testing.assert_allclose(moved.points, [[10, 21, 1], [8, 20, 1]], atol=1e-5)
     np.testing.assert_allclose(moved.origin, [10, 20, 1])
@@ -221,9 +221,21 @@ def test_points_and_sensor_origin_of_a_sweep_are_transformed():
     np.testing.assert_array_equal(sweep.points, points)
 
 
+def test_points_of_a_sweep_stay_where_they_are_until_they_are_asked_for():
+    # A quarter turn to the left twice maps (1, 2, 3) to (-1, -2, 3); the shifts (1, 0, 0), turned
+    # to (0, 1, 0), and (0, 0, 5) are added.
+    sweep = Sweep(S, 'lidar', np.array([[1.0, 2.0, 3.0]], np.float32))
+    once = sweep_to_frame(sweep, rigid((1, 0, 0), LEFT), 'base')
+    twice = sweep_to_frame(once, rigid((0, 0, 5), LEFT), 'odom')
+    assert twice.points is sweep.points
+    np.testing.assert_allclose(twice.in_frame().points, [[-1, -1, 8]], atol=1e-6)
+    assert twice.in_frame().T_frame_points is None
+    assert sweep.in_frame() is sweep
+
+
 def test_sweep_far_from_the_origin_keeps_its_resolution():
     sweep = Sweep(S, 'lidar', np.array([[0.001, 0.002, 0.003]], np.float32))
-    moved = sweep_to_frame(sweep, rigid((500_000, 5_400_000, 0)), 'map')
+    moved = sweep_to_frame(sweep, rigid((500_000, 5_400_000, 0)), 'map').in_frame()
     np.testing.assert_allclose(moved.points, [[500_000.001, 5_400_000.002, 0.003]], atol=1e-8)
 
 

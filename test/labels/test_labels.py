@@ -183,7 +183,7 @@ def test_openlabel_lists_all_coordinate_systems(tmp_path):
 
 
 def test_formats_state_all_conventions():
-    with pytest.raises(ConfigError, match=r"'kiti': expected one of csv, "):
+    with pytest.raises(ConfigError, match=r"'kiti': expected one of csv, .*did you mean kitti\?"):
         writer_for('kiti', None, Provenance())
     for name in FORMATS:
         conventions = import_module(FORMATS[name]).FORMAT

@@ -30,7 +30,9 @@ def test_check_prints_violations_and_fails_with_strict_only(tmp_path, capsys):
     path = tmp_path / 'boxes.csv'
     flipped_table(path)
     assert main(['check', str(path)]) == 0
-    assert 'track 7 at 500000000: turns by 180 degrees' in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert 'track 7 at 500000000: turns by 180 degrees' in out
+    assert out.endswith('1 of 11 rules violated; errors: 1, warnings: 0\n')
     assert main(['check', str(path), '--strict', '--json']) == 1
     report = json.loads(capsys.readouterr().out)
     assert report['boxes'] == 10
@@ -81,7 +83,12 @@ def test_evaluate_prints_coverage_and_nees(tmp_path, capsys):
     error = np.std([1, 1, 1, 25], ddof=1) / 2
     assert found['all']['nees_error']['along'] == pytest.approx(error)
     assert main(['evaluate', *paths]) == 0
-    assert 'part of the errors within 2 sigma' in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert 'part of the errors within 2 sigma' in out
+    title, columns, first = out.splitlines()[out.splitlines().index('') + 2 :][:3]
+    assert title.split()[2:4] == ['along', 'across']
+    assert columns.split() == ['cover', 'NEES'] * 7
+    assert first.split()[3:5] == ['0.75', '7.00']
 
 
 def test_nees_counts_tracks_and_marks_what_is_no_chance(tmp_path, capsys):

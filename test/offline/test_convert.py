@@ -273,6 +273,11 @@ def test_errors_are_printed_in_one_line(tmp_path, drive, capsys, arguments, stat
     assert not (tmp_path / 'out').exists()
 
 
+def test_a_missing_camera_is_refused_before_a_recording_is_read(tmp_path):
+    with pytest.raises(ConfigError, match='format kitti needs the calibration of a camera'):
+        Request((tmp_path / 'missing.mcap',), formats=('kitti',))
+
+
 def test_formats_command_lists_all_formats(capsys):
     assert cli.main(['formats']) == 0
     text = capsys.readouterr().out

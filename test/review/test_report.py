@@ -1,6 +1,8 @@
 """`boxreg relabel --report`: one self-contained page with the numbers of the run."""
 
 import base64
+from collections import Counter
+import csv
 from dataclasses import replace
 from html.parser import HTMLParser
 import json
@@ -18,6 +20,8 @@ from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.quality import quality
 from boxreg_ros.review.report import write_report
 from boxreg_ros.review.rules import RULES
+from boxreg_ros.review.rules.protocol import Violation
+from boxreg_ros.review.tables import assessed
 from boxreg_ros.review.track_points import PointCollector
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
@@ -102,8 +106,14 @@ def test_numbers_agree_with_the_summary(street):
     rows = page.data['tracks']
     assert sum(row['boxes'] for row in rows) == summary['boxes_in']
     assert sum(row['flips'] for row in rows) == summary['heading_flips'] > 0
-    shifts = [row['shift'] for row in rows]
-    assert shifts == sorted(shifts, reverse=True)
+    with open(out / 'review.csv', newline='', encoding='utf-8') as file:
+        review = list(csv.DictReader(file))
+    assert [row['id'] for row in rows] == [row['track_id'] for row in review]
+    assert [row['risk'] for row in rows] == [float(row['risk_m']) for row in review]
+    assert [row['riskiest'] for row in rows] == [row['stamp_ns'] for row in review]
+    assert [row['why'] for row in rows] == [row['reasons'] for row in review]
+    violated = Counter(rule for row in rows for rule, *_ in row['rules'])
+    assert violated == +Counter(summary['rules']['after'])
     for name, count in summary['reasons'].items():
         assert f'{name} {count}' in page.text
     for name, before in summary['rules']['before'].items():
@@ -186,6 +196,9 @@ def test_unusual_boxes_are_counted_and_escaped(tmp_path):
     assert page.rows[SCRIPT]['class'] == '<b>$car$</b>'
     assert page.rows['1']['boxes'] == 16
     assert page.rows['1']['interpolated'] == 2
+    part = page.part('1')
+    shown = zip(part['status'], part['counts'], strict=True)
+    assert [count > 10 for word, count in shown if word == 'interpolated'] == [True, True]
     assert page.rows['flat']['shift'] is None
     assert sum(row['boxes'] for row in page.rows.values()) == summary['boxes_in']
     assert page.text.count('First missing transform') == 1
@@ -265,17 +278,19 @@ def test_truth_of_another_drive_is_left_out_with_a_warning(tmp_path, capsys):
     assert not Page(out / 'report.html').data['has_truth']
 
 
-def test_risks_of_the_result_folder_are_shown(tmp_path):
-    order = tmp_path / 'review.csv'
-    order.write_text('rank,track_id,class_name,stamp_ns,risk_m,reasons\n1,7,car,12,0.25,far\n')
+def test_risks_and_violations_of_each_track_are_shown(tmp_path):
     truth = drive(12)
-    write_report(
-        tmp_path, 'done', SUMMARY, Config(), changes_of(truth, truth), PointCollector(Config())
-    )
+    (found,) = assessed(changes_of(truth, truth))
+    violated = {'jump': [Violation('7', 12, 'centre 3 m off'), Violation('8', 12, 'another')]}
+    points = PointCollector(Config())
+    write_report(tmp_path, 'done', SUMMARY, Config(), [found], violated, points)
     page = Page(tmp_path / 'report.html')
-    assert page.rows['7']['risk'] == 0.25
-    assert page.rows['7']['why'] == 'far'
-    assert page.data['review'][0]['stamp_ns'] == '12'
+    assert page.rows['7']['rules'] == [['jump', '12', 'centre 3 m off']]
+    assert page.rows['7']['why'] == found.reasons
+    assert page.rows['7']['risk'] == pytest.approx(found.risk.track, abs=1e-3)
+    part = page.part('7')
+    np.testing.assert_allclose(part['risk'], found.risk.boxes, atol=1e-3)
+    assert page.rows['7']['riskiest'] == part['stamps'][np.argmax(found.risk.boxes)]
 
 
 # Known values ------------------------------------------------------------------------------------

@@ -4,6 +4,10 @@ from contextlib import contextmanager
 import csv
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+import shutil
+import signal
+import subprocess
+import sys
 from threading import Thread
 from time import sleep
 
@@ -210,6 +214,20 @@ def test_unfinished_result_is_refused(tmp_path, capsys):
         assert word in line
 
 
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_ended_server_names_the_command_that_applies_its_decisions(result, tmp_path, number):
+    out = shutil.copytree(result[1], tmp_path / 'out')
+    DecisionLog(out / DECISIONS).append(Decision('1', None, 'reject'))
+    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(out), '--port', '0']
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        lines = [process.stdout.readline().decode() for _ in range(2)]
+        process.send_signal(number)
+        rest, errors = process.communicate(timeout=60)
+    assert 'http://127.0.0.1:' in lines[0]
+    assert f'--decisions {out / DECISIONS}' in rest.decode()
+    assert (process.returncode, errors) == (0, b'')
+
+
 def test_busy_port_is_refused(result):
     server, _ = served(result[1])
     with pytest.raises(ConfigError, match=r'expected a free one, got .* --port'):
@@ -289,6 +307,14 @@ def test_list_sorts_and_filters_and_shows_tags_as_text(result):
         assert tracks.first.locator('td').nth(2).inner_text() == SCRIPT
         page.select_option('#f-class', '=' + SCRIPT)
         assert tracks.count() == 1
+        page.click('#f-clear')
+        assert tracks.count() == 2
+        for column in page.locator('#rows th button').all():
+            assert column.get_attribute('title')
+        why = page.evaluate('causesOf(DATA.tracks[0])[0]')
+        page.select_option('#f-reason', why)
+        assert page.evaluate('view.shown.length') >= 1
+        page.click('#f-clear')
         page.fill('#f-text', 'nothing')
         assert tracks.count() == 0
         assert page.inner_text('#f-count') == '0 of 2 tracks'
@@ -319,6 +345,15 @@ def test_slider_keys_and_links_step_through_a_track(result):
         for mode in ('after', 'before', 'sweep'):
             page.keyboard.press('m')
             assert page.input_value('#mode') == mode
+        page.click('#tab-tracks')
+        page.keyboard.press(' ')
+        assert page.evaluate('view.isPlaying')
+        page.keyboard.press(' ')
+        page.keyboard.press('+')
+        assert page.evaluate('view.zoom') == 1.25
+        page.keyboard.press('-')
+        page.evaluate('view.part.usable[4] = null; step(4, true)')
+        assert page.inner_text('#legend') == 'no valid box at this stamp'
         assert page.locator('#space canvas').count() > 0
         assert page.locator('#charts svg.main-svg').count() > 0
 
@@ -363,6 +398,12 @@ def test_pin_and_re_solve_round_trip(result, tmp_path):
             page.mouse.down()
             page.mouse.move(middle[0], middle[1] - 10, steps=4)  # up
             page.mouse.up()
+            # A correction that is not saved is not left by mistake.
+            page.fill('#time', '2')
+            page.evaluate('openTrack(1 - view.track)')
+            assert page.evaluate('[view.row, view.edit !== null]') == [6, True]
+            assert 'not saved' in page.inner_text('#failure')
+            page.locator('#top').focus()
             page.keyboard.press('Enter')
             page.wait_for_selector('[data-do=unpin]')
     finally:
@@ -386,6 +427,61 @@ def test_pin_and_re_solve_round_trip(result, tmp_path):
     np.testing.assert_allclose(corrected.boxes[row], pin.box, atol=1e-3)
     with opened_page((again / 'report.html').as_uri() + f'#track=1&stamp={pin.stamp_ns}') as page:
         assert 'human' in page.inner_text('#clock')
+
+
+@NEEDS_BROWSER
+def test_a_box_is_decided_about_and_commented_on_beside_its_track(result):
+    server, url = served(result[1])
+    try:
+        with opened_page(url + '#track=1') as page:
+            page.keyboard.press('a')
+            page.wait_for_selector('[data-do=accept][aria-pressed=true]')
+            page.keyboard.press('Shift+U')
+            page.wait_for_selector('[data-do=unsure-box][aria-pressed=true]')
+            page.keyboard.press('Shift+C')
+            page.keyboard.type('hidden')
+            page.keyboard.press('Enter')
+            page.wait_for_function("view.part.stamps.some(s => decisionOf('1', s)?.comment)")
+            assert page.locator('[data-do=accept][aria-pressed=true]').count() == 1
+            selected = page.locator('#rows tr[aria-selected=true] .decision')
+            assert selected.inner_text() == 'accept, 1 box'
+            stamp = int(page.evaluate('view.part.stamps[view.row]'))
+        made = read_decisions(result[1] / DECISIONS)
+    finally:
+        server.shutdown()
+        (result[1] / DECISIONS).unlink()
+    assert [(one.stamp_ns, one.kind, one.comment) for one in made] == [
+        (None, 'accept', ''),
+        (stamp, 'unsure', ''),
+        (stamp, 'unsure', 'hidden'),
+    ]
+
+
+@NEEDS_BROWSER
+def test_decisions_can_be_listed_and_undone_from_another_track(result):
+    server, url = served(result[1])
+    try:
+        with opened_page(url + '#tracks') as page:
+            first, second = page.evaluate('DATA.tracks.map(track => track.id)')
+            page.keyboard.press('c')
+            page.keyboard.type('look')
+            page.keyboard.press('Enter')
+            page.wait_for_function('decisions.size === 1')
+            cells = page.locator('#rows .decision')
+            assert cells.all_inner_texts() == ['comment', '']
+            page.select_option('#f-decision', 'open')
+            assert page.inner_text('#f-count') == '1 of 2 tracks, 1 decided'
+            # The list has lost the open track: the next one is that which took its place.
+            page.locator('#top').focus()
+            page.keyboard.press('ArrowDown')
+            page.wait_for_function(f"DATA.tracks[view.track].id === '{second}'")
+            page.keyboard.press('z')
+            page.wait_for_function(f"DATA.tracks[view.track].id === '{first}'")
+            assert page.evaluate('decisions.size') == 0
+            page.click('#f-clear')
+    finally:
+        server.shutdown()
+        (result[1] / DECISIONS).unlink()
 
 
 @NEEDS_BROWSER

@@ -144,6 +144,22 @@ def test_an_id_switch_raises_the_risk_and_steady_motion_does_not():
         assert assess(track_with(n=8, boxes=switched)).parts['id switch'].all()
 
 
+def test_added_boxes_have_the_risk_of_the_others_of_their_track():
+    changes = Changes('odom')
+    for i, status in enumerate(('refined', 'interpolated', 'refined', 'extended')):
+        array = BoxArray(i * 10**8, 'odom', ('1',), ('car',), np.ones(1), np.array([CAR]))
+        variance = (0.02 * (i + 1)) ** 2
+        covariances = variance * np.eye(6)[None]
+        spread = {'extent_covariances': variance * np.eye(3)[None]}
+        columns = (status,), ('',), np.array([50]), covariances
+        changes.add(array, RefinedBoxes(array, *columns, **spread))
+    (track,) = changes.tracks()
+    risk = assess(track)
+    assert risk.boxes[0] < risk.boxes[2]
+    np.testing.assert_allclose(risk.boxes[[1, 3]], risk.boxes[[0, 2]].mean())
+    assert risk.track == pytest.approx(risk.boxes[[0, 2]].mean())
+
+
 def test_tables_list_the_riskiest_track_first(tmp_path):
     rows = assessed([track_with(0.02), track_with(0.3), track_with(0.1)])
     write_tables(tmp_path, rows)

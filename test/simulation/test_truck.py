@@ -29,7 +29,7 @@ def merged_sweeps(path, lidars):
         for item in recording.items(session.tree):
             if isinstance(item.content, Sweep):
                 found += session.merged(session.admit(item.content).moved)
-    return [part.sweep for part in found]
+    return [part.sweep.in_frame() for part in found]
 
 
 def test_topics_and_concatenated_clouds_with_info_are_the_same_sweep(scene, tmp_path):

@@ -13,7 +13,7 @@ from boxreg_ros.core.observation import observe
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, sweep_to_frame
 from boxreg_ros.rotations import matrix_from_rpy
-from boxreg_ros.structures import ROLL
+from boxreg_ros.structures import ROLL, Sweep
 from msg_adapters import pointcloud
 import numpy as np
 
@@ -68,6 +68,7 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
     ((_, _, cloud, boxes),) = traffic(tracks, points, 1)
     margin = config.sampling.margin
     rotations = matrix_from_rpy(boxes.boxes[:, ROLL:])
+    sweep = Sweep(0, 'lidar', cloud)
 
     def one_by_one() -> None:
         for box, R in zip(boxes.boxes, rotations, strict=True):
@@ -75,7 +76,7 @@ def crop(config: Config, tracks: int, points: int) -> dict[str, Any]:
             cloud[(local < box[3:6] / 2 + margin).all(1)]
 
     def ours() -> None:
-        index, owner, _, outside = sampling.crop(cloud, boxes.boxes, margin)
+        index, owner, _, outside = sampling.crop(sweep, boxes.boxes, margin)
         is_in = outside.max(0) < margin
         cloud.take(index[is_in], 0), owner[is_in]
 

@@ -413,6 +413,32 @@ class NoiseNumbers(NamedTuple):
     min_power: float
 
 
+class ShapeArrays(NamedTuple):
+    """
+    Boxes as the kernels find points near them.
+
+    Attributes
+    ----------
+    centers : array, shape (n, 3)
+        In the frame of the points [m].
+    turn : array, shape (3, 3)
+        Rotation from the frame of the points to that of the boxes.
+    rotations : array, shape (n, 3, 3)
+        From the axes of each box to the frame of the boxes.
+    half : array, shape (n, 3)
+        Half the extents [m].
+    reach : array, shape (n, 3)
+        Half the bounding boxes along the axes of the points, with a margin [m].
+
+    """
+
+    centers: Any
+    turn: Any
+    rotations: Any
+    half: Any
+    reach: Any
+
+
 class CropNumbers(NamedTuple):
     """Constants and settings of `boxreg_ros.core.observation`; there they are described."""
 

@@ -43,7 +43,7 @@ def kernel(function: _F) -> _F:
         if function.__name__ == FIRST_KERNEL:
             warn(
                 f'numba cache: expected a folder that can be written, got {error}; every process '
-                f'compiles the solver again, which takes some seconds: set NUMBA_CACHE_DIR',
+                f'compiles the solver again, for about a minute: set NUMBA_CACHE_DIR',
                 RuntimeWarning,
                 stacklevel=2,
             )

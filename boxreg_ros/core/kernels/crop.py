@@ -91,13 +91,13 @@ def near_points(points, first, side):
 
 
 @kernel
-def candidates(points, centers, reach):
+def candidates(points, shapes):
     """
     Return the pairs of a point and a box that touches its cell, cell by cell.
 
     Parameters
     ----------
-    points, centers, reach : array
+    points, shapes
         As for `crop`.
 
     Returns
@@ -111,7 +111,7 @@ def candidates(points, centers, reach):
 
     """
     side = side_of(points.shape[1])
-    first, boxes = raster(centers, reach, side)
+    first, boxes = raster(shapes.centers, shapes.reach, side)
     near, cells = near_points(points, first, side)
     count = 0
     for cell in cells:
@@ -120,7 +120,20 @@ def candidates(points, centers, reach):
 
 
 @kernel
-def crop(points, centers, rotations, half, reach, margin):
+def offset_of(points, i, shapes, box):
+    """Return point `i` minus the centre of a box, along the axes of the frame [m]."""
+    dx = points[0, i] - shapes.centers[box, 0]
+    dy = points[1, i] - shapes.centers[box, 1]
+    dz = points[2, i] - shapes.centers[box, 2]
+    turn = shapes.turn
+    x = turn[0, 0] * dx + turn[0, 1] * dy + turn[0, 2] * dz
+    y = turn[1, 0] * dx + turn[1, 1] * dy + turn[1, 2] * dz
+    z = turn[2, 0] * dx + turn[2, 1] * dy + turn[2, 2] * dz
+    return x, y, z
+
+
+@kernel
+def crop(points, shapes, margin):
     """
     Find the pairs of a point and a box within `margin` of each other, ascending by point.
 
@@ -128,10 +141,8 @@ def crop(points, centers, rotations, half, reach, margin):
     ----------
     points : array, shape (3, M)
         Coordinates [m].
-    centers, rotations, half : array, shapes (n, 3), (n, 3, 3) and (n, 3)
-        Boxes.
-    reach : array, shape (n, 3)
-        Half the upright bounding boxes, `margin` included [m].
+    shapes : ShapeArrays
+        Boxes, with bounding boxes that include the margin.
     margin : float
         Distance from the faces of the box [m].
 
@@ -143,7 +154,8 @@ def crop(points, centers, rotations, half, reach, margin):
         Point minus centre, and distance outside of the faces [m].
 
     """
-    near, cells, first, boxes, capacity = candidates(points, centers, reach)
+    near, cells, first, boxes, capacity = candidates(points, shapes)
+    half = shapes.half
     row = np.empty(capacity, np.int64)
     owner = np.empty(capacity, np.int64)
     offset = np.empty((capacity, 3))
@@ -153,10 +165,8 @@ def crop(points, centers, rotations, half, reach, margin):
         i = near[k]
         for place in range(first[cells[k]], first[cells[k] + 1]):
             box = boxes[place]
-            x = points[0, i] - centers[box, 0]
-            y = points[1, i] - centers[box, 1]
-            z = points[2, i] - centers[box, 2]
-            R = rotations[box]
+            x, y, z = offset_of(points, i, shapes, box)
+            R = shapes.rotations[box]
             u = abs(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) - half[box, 0]
             v = abs(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) - half[box, 1]
             w = abs(R[0, 2] * x + R[1, 2] * y + R[2, 2] * z) - half[box, 2]
@@ -256,13 +266,13 @@ def sorted_by_x(owner, x, n):
 
 
 @kernel
-def own_points(points, centers, rotations, half, reach, numbers):
+def own_points(points, shapes, numbers):
     """
     Find the points that belong to each box, and the height of the road beside it.
 
     Parameters
     ----------
-    points, centers, rotations, half, reach : array
+    points, shapes
         As for `crop`, with the margin `numbers.margin`.
     numbers : CropNumbers
         Constants and settings.
@@ -277,8 +287,9 @@ def own_points(points, centers, rotations, half, reach, numbers):
         Points inside each box.
 
     """
+    half = shapes.half
     n = len(half)
-    near, cells, first, boxes, capacity = candidates(points, centers, reach)
+    near, cells, first, boxes, capacity = candidates(points, shapes)
     row = np.empty(capacity, np.int32)
     owner = np.empty(capacity, np.int32)
     x = np.empty(capacity)
@@ -291,10 +302,8 @@ def own_points(points, centers, rotations, half, reach, numbers):
     for k in range(len(near)):
         for place in range(first[cells[k]], first[cells[k] + 1]):
             i, box = near[k], boxes[place]
-            dx = points[0, i] - centers[box, 0]
-            dy = points[1, i] - centers[box, 1]
-            dz = points[2, i] - centers[box, 2]
-            R = rotations[box]
+            dx, dy, dz = offset_of(points, i, shapes, box)
+            R = shapes.rotations[box]
             up = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
             u = abs(R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) - half[box, 0]
             v = abs(R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) - half[box, 1]

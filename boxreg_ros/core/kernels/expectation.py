@@ -22,8 +22,8 @@ import numpy as np
 
 POSE, SIZE = 6, 3
 """Numbers of a pose, and of an extent."""
-HEADING = 5
-"""Index of the yaw in a pose."""
+ROLL, HEADING = 3, 5
+"""Indices of roll and yaw in a pose."""
 
 
 class ExpectationWork(NamedTuple):
@@ -198,7 +198,8 @@ def fill_margin_error(b, windows, of_class, known, numbers, work, expected):
 def fill_input_error(b, windows, of_class, known, numbers, work, expected):
     """Write the deviations of the errors of mean extents and bias of window `b` (M28), (9,)."""
     kind = windows.kind[b]
-    weight, slow = known.weight[kind], work.slow.max()
+    weight = known.weight[kind]
+    slow = max(work.slow[:ROLL].max(), work.slow[HEADING:].max())  # without roll and pitch
     deviation, error, mean = expected.deviation, expected.error, work.mean
     count = windows.lengths[b] + windows.marginalised_extents[b, 3]
     for k in range(SIZE):

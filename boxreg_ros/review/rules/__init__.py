@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from boxreg_ros.review.rules import (
     backward,
@@ -46,7 +46,6 @@ def violations(tracks: Sequence[LabelTrack]) -> dict[str, list[Violation]]:
     return {name: items for name, items in found.items() if items}
 
 
-def counts(tracks: Sequence[LabelTrack]) -> dict[str, int]:
+def counts(found: Mapping[str, Sequence[Violation]]) -> dict[str, int]:
     """Return the number of violations of every rule, by its id."""
-    found = violations(tracks)
     return {name: len(found.get(name, ())) for name in RULES}

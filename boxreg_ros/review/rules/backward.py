@@ -13,6 +13,7 @@ MIN_SPEED = 2.0
 MIN_PART = 0.5
 """Part of the steps that are backward at least. Chosen."""
 MIN_STEPS = 5
+"""Fewest steps of a track. Chosen: half a second at 10 Hz; noise of single boxes is no motion."""
 
 
 def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:

@@ -9,7 +9,7 @@ from boxreg_ros.review.rules.protocol import LabelTrack, Rule, Violation, WARNIN
 MIN_POINTS_IN_VIEW = 50
 """Fewest points of an object in view. Chosen: boxes with fewer may be lost by a detector."""
 MIN_TIME_LEFT = 1.0
-"""Shortest time from the end of the track to that of the recording [s]."""
+"""Shortest time from the end of the track to that of the labels [s]. Chosen: gaps are shorter."""
 
 
 def find(tracks: Sequence[LabelTrack]) -> Iterator[Violation]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 NEIGHBOURHOOD = 15.0
 """Boxes within this distance share their ground [m]. Chosen: 1 m off at a slope of 7 %."""
 MIN_NEIGHBOURS = 3
+"""Fewest boxes around. Derived: the median of three is not moved by one that is off."""
 MAX_OFFSET = 1.0
 """Largest distance of the bottom of a box from the median of its neighbours [m]. Chosen."""
 
