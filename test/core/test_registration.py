@@ -310,15 +310,15 @@ def test_parked_objects_by_speed_and_distance(speed, length, rests):
 
 @pytest.mark.parametrize(
     ('interval', 'speed', 'shown'),
-    [(0.1, 0.25, 0.0), (1.0, 0.14, 0.0), (1.0, 0.16, 0.16**2 - 0.026 * 1.385 / 0.615 / 17.5)],
+    [(0.1, 0.25, 0.0), (0.5, 0.1, 0.0), (0.5, 0.12, 0.12**2 - 0.026 * 1.385 / 0.615 / 35.75)],
 )
 def test_parked_objects_drift_as_fast_as_their_input_shows(interval, speed, shown):
     # The noise of the input is .14 m and .08 m, with a total variance of .026, widened as errors
-    # are correlated by .385. The times of six boxes at 1 Hz have 17.5 s^2 about their mean: noise
-    # alone gives a slope of .058 m/s. 2.6 times as much, .152 m/s, is beyond chance.
+    # are correlated by .385. The times of twelve boxes at 2 Hz have 143 / 4 s^2 about their mean:
+    # noise alone gives a slope of .040 m/s. 2.6 times as much, .106 m/s, is beyond chance.
     kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
-    times = interval * torch.arange(6, dtype=D)[None]
-    boxes = np.repeat(drive(1)[None], 6, axis=1)
+    times = interval * torch.arange(12, dtype=D)[None]
+    boxes = np.repeat(drive(1)[None], 12, axis=1)
     boxes[0, :, 1] += speed * times[0].numpy()
     problem = problem_of(boxes, times=times, class_numbers=kinds)
     expected = expect(problem, Known(NO_OFFSETS))
