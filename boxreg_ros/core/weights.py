@@ -49,6 +49,10 @@ DRIVING_REACH = 4
 """Steps before and after one where the object drives that are not held at rest either."""
 DRIFT_RATIOS = (1.0, 1.0, 0.5, 0.15, 0.15, 0.15)
 """Deviation of the steps of a parked box in x y z [m] and roll pitch yaw [rad], over `drift`."""
+DRIFT_GATE = 6.9
+"""The input of a parked object shows a velocity if its square is this many times what the noise
+explains. Derived: half the 99.9 % quantile of chi-square with 2 degrees of freedom, whose mean is
+2."""
 
 
 def weigh(
@@ -144,6 +148,7 @@ def weight_numbers(config: Config, is_smooth: bool) -> WeightNumbers:
         face_outlier=config.faces.outlier,
         face_deviations=_rigid_face_deviations(config.faces),
         drift_ratios=DRIFT_RATIOS,
+        drift_gate=DRIFT_GATE,
         is_robust=is_smooth and ingredients.robust_motion,
         pin_deviations=PIN_DEVIATIONS,
     )
@@ -186,6 +191,26 @@ def neighbour_deviation(problem: Problem, axes: Tensor) -> Tensor:
     return least / NEIGHBOUR_FACTOR
 
 
+def _input_rates(problem: Problem) -> tuple[Tensor, Tensor]:
+    """
+    Return the slopes of x, y and yaw of the input over time, by linear regression.
+
+    Returns
+    -------
+    rate : Tensor, shape (B, 3)
+        [m/s, rad/s].
+    power : Tensor, shape (B,)
+        Sum of squares of the times about their mean [s^2].
+
+    """
+    valid = problem.valid.to(problem.times)
+    t = problem.times
+    centred = (t - (t * valid).sum(1, keepdim=True) / valid.sum(1, keepdim=True)) * valid
+    power = (centred * t).sum(1)
+    x_y_yaw = problem.boxes[..., [0, 1, YAW]]
+    return (centred[..., None] * x_y_yaw).sum(1) / power[:, None], power
+
+
 def parked_steps(problem: Problem, yaw_deviation: Tensor) -> Tensor:
     """
     Return 1 for the steps (B, N - 1) of parked objects, else 0 (M25).
@@ -197,10 +222,7 @@ def parked_steps(problem: Problem, yaw_deviation: Tensor) -> Tensor:
     """
     valid = problem.valid.to(problem.times)
     t = problem.times
-    # Linear regression of x, y and yaw over time.
-    centred = (t - (t * valid).sum(1, keepdim=True) / valid.sum(1, keepdim=True)) * valid
-    x_y_yaw = problem.boxes[..., [0, 1, YAW]]
-    rate = (centred[..., None] * x_y_yaw).sum(1) / (centred * t).sum(1)[:, None]
+    rate, _ = _input_rates(problem)
     duration = (t * valid).amax(1)
     speed = rate[:, :2].square().sum(1).sqrt()
 
@@ -322,10 +344,22 @@ def _acceleration_weights(problem: Problem, to_body: Tensor, valid: Tensor) -> T
 
 
 def _zero_motion_weights(problem: Problem, expected: Expectation) -> Tensor:
-    """Return the weights of the steps of parked objects (M25), shape (B, N - 1, 6)."""
+    """
+    Return the weights of the steps of parked objects (M25), shape (B, N - 1, 6).
+
+    Where the fixed frame drifts, or labels in it, parked objects have a velocity. If it shows, its
+    square is that of the input less the part that the noise of the input explains.
+
+    """
     yaw_deviation = expected.pose_deviation[:, 5]
     deviation = problem.of_class('drift') * yaw_deviation.new_tensor(DRIFT_RATIOS)
-    return deviation[:, None] ** -2 * parked_steps(problem, yaw_deviation)[..., None]
+    rate, power = _input_rates(problem)
+    noise = expected.widened_deviation[:, :2].square().sum(1) / power
+    squared_speed = rate[:, :2].square().sum(1)
+    squared_speed = torch.where(squared_speed > DRIFT_GATE * noise, squared_speed - noise, 0.0)
+    variance = (deviation**2)[:, None].repeat(1, problem.length - 1, 1)
+    variance[..., :2] += (squared_speed[:, None] * problem.times.diff(dim=1) ** 2)[..., None]
+    return parked_steps(problem, yaw_deviation)[..., None] / variance
 
 
 def face_deviations(problem: Problem, config: Config) -> Tensor:

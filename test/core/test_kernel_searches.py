@@ -229,6 +229,9 @@ def drives(kind, N=12):
 @pytest.mark.parametrize('robust', [True, False])
 def test_weights_equal_those_of_torch(kind, robust):
     problem, state = drives(kind, {'two boxes': 4, 'drives off': 24}.get(kind, 12))
+    if kind == 'still':  # but for a drift of one of two, at uneven times
+        problem.times[:, 6:] += 2.0
+        problem.boxes[0, :, 0] += 0.2 * problem.times[0]
     config = Config().updated({'ingredients.robust_weights': robust})
     pairs = weighed(problem, state, config)
     for known, found in pairs:

@@ -309,6 +309,32 @@ def test_parked_objects_by_speed_and_distance(speed, length, is_parked):
 
 
 @pytest.mark.parametrize(
+    ('interval', 'speed', 'shown'),
+    [(0.1, 0.25, 0.0), (0.5, 0.1, 0.0), (0.5, 0.12, 0.12**2 - 0.026 * 1.385 / 0.615 / 35.75)],
+)
+def test_parked_objects_drift_as_fast_as_their_input_shows(interval, speed, shown):
+    # The noise of the input is .14 m and .08 m, with a total variance of .026, widened as errors
+    # are correlated by .385. The times of twelve boxes at 2 Hz have 143 / 4 s^2 about their mean:
+    # noise alone gives a slope of .040 m/s. 2.6 times as much, .106 m/s, is beyond chance.
+    kinds = {name: torch.full((1,), value, dtype=D) for name, value in numbers(ALONE.vehicle)}
+    times = interval * torch.arange(12, dtype=D)[None]
+    boxes = np.repeat(drive(1)[None], 12, axis=1)
+    boxes[0, :, 1] += speed * times[0].numpy()
+    problem = problem_of(boxes, times=times, class_numbers=kinds)
+    expected = expect(problem, Known(NO_OFFSETS))
+    state = State(problem.pose, expected.shared)
+    observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
+    (weight,) = (
+        term.weight
+        for term in weigh(problem, state, observations, expected, ALONE)
+        if term.function is terms.zero_motion
+    )
+    deviation = weight.diagonal(dim1=-2, dim2=-1)[0, :, 0] ** -0.5
+    np.testing.assert_allclose(deviation[:, :2], np.hypot(0.02, interval * shown**0.5))
+    np.testing.assert_allclose(deviation[:, 2], 0.01)
+
+
+@pytest.mark.parametrize(
     ('weight', 'fast', 'slow'),
     [
         (0.0, 0.235 / 0.3, 1.0),

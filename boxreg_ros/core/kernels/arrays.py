@@ -321,6 +321,7 @@ class WeightNumbers(NamedTuple):
     face_outlier: float
     face_deviations: tuple[float, ...]
     drift_ratios: tuple[float, ...]
+    drift_gate: float
     is_robust: bool
     pin_deviations: tuple[float, ...]
 

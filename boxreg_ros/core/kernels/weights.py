@@ -57,21 +57,34 @@ def fill_neighbour_deviation(boxes, times, length, axes, numbers, off_track):
 
 
 @kernel
-def is_parked(boxes, times, length, yaw_deviation, numbers):
-    """Return whether an object is parked over its window (M25)."""
+def fill_rates(boxes, times, length, rate):
+    """
+    Write the slopes of x, y and yaw over time by linear regression, (3,) [m/s, rad/s].
+
+    Return the sum of squares of the times about their mean [s^2].
+
+    """
     mean = 0.0
     for n in range(length):
         mean += times[n] / length
     x_y_yaw = (0, 1, 8)
-    rate = np.zeros(3)
+    rate[:] = 0.0
     power = 0.0
     for n in range(length):
         for k in range(3):
             rate[k] += (times[n] - mean) * boxes[n, x_y_yaw[k]]
         power += (times[n] - mean) * times[n]
+    for k in range(3):
+        rate[k] /= power
+    return power
+
+
+@kernel
+def is_parked(boxes, times, length, rate, yaw_deviation, numbers):
+    """Return whether an object is parked over its window (M25)."""
     duration = times[length - 1]
-    speed = hypot(rate[0], rate[1]) / abs(power)
-    turned = abs(rate[2] / power) * duration / yaw_deviation
+    speed = hypot(rate[0], rate[1])
+    turned = abs(rate[2]) * duration / yaw_deviation
     x = lower_median(boxes[:length, 0].copy())
     y = lower_median(boxes[:length, 1].copy())
     distance = np.empty(length)
@@ -94,10 +107,10 @@ def median_place(boxes, times, first, last):
 
 
 @kernel
-def fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked):
+def fill_parked_steps(boxes, times, length, rate, yaw_deviation, numbers, parked):
     """Write whether the object is parked from each box to the next (M25), (N - 1,)."""
     parked[:] = False
-    if not is_parked(boxes, times, length, yaw_deviation, numbers):
+    if not is_parked(boxes, times, length, rate, yaw_deviation, numbers):
         return
     parked[: length - 1] = True
     span, reach = numbers.driving_span, numbers.driving_reach
@@ -200,14 +213,18 @@ def fill_acceleration_weights(deviation, length, terms):
 
 
 @kernel
-def fill_motion_weights(length, parked, slip, drift, numbers, terms):
+def fill_motion_weights(times, length, parked, slip, drift, squared_speed, numbers, terms):
     """Write the weights of slip and, where the object is parked, of zero motion (M25)."""
     for n in range(length - 1):
+        seconds = times[n + 1] - times[n]
         for k in range(2):
             terms.W_slip[n, k] = 1 / slip[k] ** 2
         for k in range(6):
             if parked[n]:
-                terms.W_zero_motion[n, k] = 1 / (drift * numbers.drift_ratios[k]) ** 2
+                variance = (drift * numbers.drift_ratios[k]) ** 2
+                if k < 2:
+                    variance += squared_speed * seconds**2
+                terms.W_zero_motion[n, k] = 1 / variance
 
 
 @kernel
@@ -308,7 +325,14 @@ def weigh(b, windows, poses, shared, row, faces, expected, of_class, numbers, te
     fill_shared_weights(shared, expected.deviation, distance, face_weight, length, numbers, terms)
     fill_acceleration_weights(of_class.acceleration[b], length, terms)
     yaw_deviation = max(deviation[5], of_class.pose[b, 5])
-    fill_parked_steps(boxes, times, length, yaw_deviation, numbers, parked)
-    fill_motion_weights(length, parked, of_class.slip[b], of_class.drift[b], numbers, terms)
+    rate = np.empty(3)
+    power = fill_rates(boxes, times, length, rate)
+    fill_parked_steps(boxes, times, length, rate, yaw_deviation, numbers, parked)
+    squared_speed = rate[0] ** 2 + rate[1] ** 2
+    noise = (widened[0] ** 2 + widened[1] ** 2) / power
+    shown = squared_speed - noise if squared_speed > numbers.drift_gate * noise else 0.0
+    fill_motion_weights(
+        times, length, parked, of_class.slip[b], of_class.drift[b], shown, numbers, terms
+    )
     if numbers.is_robust:
         robustify_motion(poses, shared, length, numbers.motion_outlier, terms)
