@@ -321,7 +321,7 @@ def test_parked_objects_drift_as_fast_as_their_input_shows(interval, speed, show
     boxes = np.repeat(drive(1)[None], 12, axis=1)
     boxes[0, :, 1] += speed * times[0].numpy()
     problem = problem_of(boxes, times=times, class_numbers=kinds)
-    expected = expect(problem, Known(NO_OFFSETS))
+    expected = expect(problem, InputEstimates(NO_OFFSETS))
     state = State(problem.pose, expected.shared)
     observations = observe_faces(problem, state, NO_OFFSETS, ALONE)
     (weight,) = (
