@@ -4,41 +4,22 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import accumulate, chain
-from math import dist, inf
+from math import inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
-from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation, Observations, observe
-from boxreg_ros.core.support import is_owned, MIN_HITS, points_inside, points_to_confirm
-from boxreg_ros.core.tables import by_table, column, joined
-from boxreg_ros.core.track_window import (
-    Estimate,
-    Estimates,
-    MarginalisationPrior,
-    PRIOR_POSES,
-    Window,
-)
+from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
+from boxreg_ros.core.support import is_owned, points_inside
+from boxreg_ros.core.tables import column, joined
+from boxreg_ros.core.track_window import Estimate, Window
 from boxreg_ros.errors import ConfigError
-from boxreg_ros.structures import (
-    BoxArray,
-    COASTED,
-    Floats,
-    is_valid_box,
-    KEPT,
-    LENGTH,
-    REFINED,
-    RefinedBoxes,
-    Sweep,
-    X,
-    Z,
-)
+from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
 
 GetEstimates = Callable[[], list[Estimate | None]]
@@ -52,23 +33,6 @@ CPU = 'cpu'
 """The device that torch has everywhere: it is not imported to check that."""
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
-ID_SWITCH_OBSERVATIONS = 6
-"""
-Observations that an id switch is detected from, at least one less; chosen.
-
-The last two are tested against the velocity of those before.
-
-"""
-ID_SWITCH_SPEED = 10.0
-"""
-Least deviation from constant velocity that is an id switch [m/s].
-
-Derived: within the 0.2 s of two observations no road user changes its velocity by 10 m/s, which
-is 50 m/s^2.
-
-"""
-
-
 UNKNOWN_COVARIANCE = np.full((6, 6), inf)
 """Covariance of a track without an estimate."""
 
@@ -161,10 +125,10 @@ class BoxRegistrar:
         self._matcher = StampMatcher(config, self.counts)
         self._input_model = InputModel(config.faces)
         self.box_time = BoxTimeEvidence()
-        self._pending = deque[_PendingArray]()
+        self._pending = deque[PendingArray]()
         self._newest_ns = -inf
-        self._tracks: dict[str, _Track] = {}
-        self._ended_tracks: list[_Track] = []
+        self._tracks: dict[str, ObservedTrack] = {}
+        self._ended_tracks: list[ObservedTrack] = []
         self._arrays_since_solve = 0
         self._submitted: list[_SubmittedTrack] = []
         self._get_estimates: GetEstimates = list
@@ -210,10 +174,10 @@ class BoxRegistrar:
                 self._settle_after_lag()
             yield from self._pop_settled()
 
-    def _open(self, pair: Pair) -> _PendingArray:
+    def _open(self, pair: Pair) -> PendingArray:
         """Make a box array pending: its valid boxes become observations of their tracks."""
         boxes, sweep = pair
-        array = _PendingArray(boxes)
+        array = PendingArray(boxes)
         self._pending.append(array)
         reason = ''
         if boxes.stamp_ns < self._newest_ns:
@@ -231,15 +195,15 @@ class BoxRegistrar:
             self._observe(array, sweep)
         return array
 
-    def _observe(self, array: _PendingArray, sweep: Sweep) -> None:
+    def _observe(self, array: PendingArray, sweep: Sweep) -> None:
         """Add an observation to the track of each box that has no reason not to be refined."""
         boxes = array.input
         given = []
         for row, track_id in enumerate(boxes.track_ids):
             if not array.reasons[row]:
                 if track_id not in self._tracks:
-                    self._tracks[track_id] = _Track(track_id, boxes.class_names[row])
-                given.append(_Sighting(self._tracks[track_id], boxes.boxes[row], row))
+                    self._tracks[track_id] = ObservedTrack(track_id, boxes.class_names[row])
+                given.append(BoxToObserve(self._tracks[track_id], boxes.boxes[row], row))
         coasting = self._coasting(array)
         if not (given or coasting):
             return
@@ -250,22 +214,22 @@ class BoxRegistrar:
             self.counts['coast_unconfirmed'] += len(coasting) - len(confirmed)
             seen, velocities = self._seen([*given, *confirmed], boxes, sweep)
         self.box_time.add(seen[: len(given)], velocities)
-        rows = [sighting.row for sighting in given]
-        rows += [array.add_predicted(sighting) for sighting in confirmed]
+        rows = [item.row for item in given]
+        rows += [array.add_predicted(item) for item in confirmed]
         entries = array.add_observations(seen, rows)
-        for sighting, entry in zip(given, entries, strict=False):
-            track = sighting.track
+        for item, entry in zip(given, entries, strict=False):
+            track = item.track
             track.entries.append(entry)
             track.detected_ns = boxes.stamp_ns
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
                 self._tracks[track.track_id] = successor
-        for sighting, entry in zip(confirmed, entries[len(given) :], strict=True):
+        for item, entry in zip(confirmed, entries[len(given) :], strict=True):
             entry.is_predicted = True
-            sighting.track.entries.append(entry)
+            item.track.entries.append(entry)
 
-    def _coasting(self, array: _PendingArray) -> list[_Sighting]:
+    def _coasting(self, array: PendingArray) -> list[BoxToObserve]:
         """Return the predicted boxes of the tracks that have no box in `array`."""
         if not (self.config.coasts and array.is_observed):
             return []
@@ -281,21 +245,21 @@ class BoxRegistrar:
                 self.counts['coast_unconfirmed'] += 1
                 continue
             others = np.vstack([others, box])
-            found.append(_Sighting(track, box))
+            found.append(BoxToObserve(track, box))
         return found
 
     def _seen(
-        self, sightings: list[_Sighting], given: BoxArray, sweep: Sweep
+        self, to_observe: list[BoxToObserve], given: BoxArray, sweep: Sweep
     ) -> tuple[list[Observation], Floats]:
         """Return the observation of each box at the stamp of `given`, and their velocities."""
         stamp_ns = given.stamp_ns
-        boxes = np.array([sighting.box for sighting in sightings])
+        boxes = np.array([item.box for item in to_observe])
         at_sweep = boxes.copy()
         offset = (sweep.stamp_ns - stamp_ns) * 1e-9  # [s]
         velocities = np.zeros((len(boxes), 3))
         motion = velocities
         if offset or sweep.times is not None:
-            velocities = _input_velocities(sightings, boxes, stamp_ns)
+            velocities = _input_velocities(to_observe, boxes, stamp_ns)
             # The points are relative to the box: motion-compensated to the stamp of the box.
             at_sweep[:, X : Z + 1] += offset * velocities
             if self.config.sampling.deskew:
@@ -304,7 +268,7 @@ class BoxRegistrar:
         if offset or motion.any():
             table = table.relative_to(boxes, motion / 2)
         if given.pinned is not None:
-            pinned = [sighting.row >= 0 and given.pinned[sighting.row] for sighting in sightings]
+            pinned = [item.row >= 0 and given.pinned[item.row] for item in to_observe]
             table = table._replace(is_pinned=np.array(pinned))
         return [Observation(table, row) for row in range(len(boxes))], velocities
 
@@ -333,7 +297,7 @@ class BoxRegistrar:
             tracks = self._tracks.values()
             self._solve([track for track in tracks if len(track.entries) > full // 2])
 
-    def _within_budget(self, tracks: list[_Track]) -> list[_Track]:
+    def _within_budget(self, tracks: list[ObservedTrack]) -> list[ObservedTrack]:
         """Return the tracks to solve now; the others are carried to the next box array."""
         if self._budget is None:
             return tracks
@@ -354,7 +318,7 @@ class BoxRegistrar:
                 entry.settle()
         del self._ended_tracks[limit:]
 
-    def _solve(self, tracks: list[_Track]) -> None:
+    def _solve(self, tracks: list[ObservedTrack]) -> None:
         """Submit the windows of `tracks` and of ended tracks, after collecting those before."""
         self._collect()
         ended = self._ended_tracks
@@ -393,265 +357,7 @@ class BoxRegistrar:
             yield refined
 
 
-class _PendingArray:
-    """
-    A box array that is not yet returned, with the present estimate of each box.
-
-    Attributes
-    ----------
-    input : BoxArray
-        As added, followed by the predicted boxes of tracks that have none here.
-    num_given : int
-        Boxes that were added.
-    reasons : list of str
-        Why each box is kept as long as it has no estimate.
-    num_points : array, shape (n,)
-        As in `RefinedBoxes`.
-    estimates : list of n pairs or None
-        Estimates of the windows that each box was last in, and its row there.
-    num_unsettled : int
-        Boxes whose estimate may still change; the array is settled at 0 or less.
-    is_observed : bool
-        True where a sweep was found and the array is in order.
-
-    """
-
-    def __init__(self, boxes: BoxArray) -> None:
-        n = len(boxes.track_ids)
-        self.input = boxes
-        self.reasons = [''] * n
-        self.num_points = np.zeros(n, int)
-        self.estimates: list[tuple[Estimates, int] | None] = [None] * n
-        self.num_given = n
-        self.num_unsettled = 0
-        self.is_observed = False
-
-    def set_reasons(self, reason: str) -> None:
-        """Set the reason of each box that cannot be refined; `reason`, if any, holds for all."""
-        known = set[str]()
-        is_valid = is_valid_box(self.input.boxes)
-        for row, track_id in enumerate(self.input.track_ids):
-            if not is_valid[row]:
-                self.reasons[row] = 'invalid_box'
-            elif not track_id:
-                self.reasons[row] = 'no_track_id'
-            elif track_id in known:
-                self.reasons[row] = 'duplicate_track_id'
-            else:
-                self.reasons[row] = reason
-            if is_valid[row]:
-                known.add(track_id)
-
-    def add_observations(self, seen: Sequence[Observation], rows: Sequence[int]) -> list[_Entry]:
-        """Return the entries of n boxes in `rows`, which then wait for their estimates."""
-        if not seen:
-            return []
-        table = seen[0].table
-        stamp_ns = self.input.stamp_ns
-        self.num_points[rows] = table.num_points
-        self.num_unsettled += len(rows)
-        entries = []
-        places = table.boxes[:, : LENGTH + 1].tolist()
-        for observation, row, place in zip(seen, rows, places, strict=True):
-            self.reasons[row] = 'short_track'  # until there is an estimate
-            entries.append(_Entry(observation, _Place(stamp_ns, *place), self, row))
-        return entries
-
-    def add_predicted(self, sighting: _Sighting) -> int:
-        """Add the predicted box of a track; return its row."""
-        given = self.input
-        self.input = replace(
-            given,
-            track_ids=(*given.track_ids, sighting.track.track_id),
-            class_names=(*given.class_names, sighting.track.class_name),
-            scores=np.append(given.scores, 0.0),
-            boxes=np.vstack([given.boxes, sighting.box]),
-            pinned=None if given.pinned is None else np.append(given.pinned, False),
-        )
-        self.reasons.append('')
-        self.num_points = np.append(self.num_points, 0)
-        self.estimates.append(None)
-        return len(self.estimates) - 1
-
-    def result(self, is_final: bool) -> RefinedBoxes:
-        """
-        Return the present estimates as copies; without an estimate, the input box.
-
-        Of the predicted boxes, those that are refined.
-
-        """
-        n = len(self.estimates)
-        columns = Estimates(
-            boxes=self.input.boxes.copy(),
-            status=np.full(n, KEPT, object),
-            reasons=np.array(self.reasons, object),
-            covariances=np.tile(np.eye(6), (n, 1, 1)),
-            extent_covariances=np.tile(np.eye(3), (n, 1, 1)),
-            face_distances=np.zeros((n, 6)),
-            near_points=np.zeros((n, 2), np.int64),
-        )
-        known = {row: found for row, found in enumerate(self.estimates) if found is not None}
-        estimated = np.array([*known], int)
-        for table, places, rows in by_table([*known.values()]):
-            for values, estimates in zip(columns, table, strict=True):
-                values[estimated[places]] = estimates[rows]
-        is_returned = columns.status == REFINED
-        is_returned[: self.num_given] = True
-        columns.status[self.num_given :] = COASTED
-        whole = RefinedBoxes(
-            replace(self.input, boxes=columns.boxes),
-            tuple(columns.status.tolist()),
-            tuple(columns.reasons.tolist()),
-            self.num_points.copy(),
-            columns.covariances,
-            is_final,
-            columns.extent_covariances,
-            columns.face_distances,
-            columns.near_points,
-        )
-        return whole if is_returned.all() else whole.take(np.flatnonzero(is_returned).tolist())
-
-
-class _Place(NamedTuple):
-    """Centre and length of an input box [m] as plain numbers, of which motion is computed."""
-
-    stamp_ns: int
-    x: float
-    y: float
-    z: float
-    length: float
-
-
-@dataclass(slots=True)
-class _Entry:
-    """
-    An observation of a track, and the row of the box array its estimate is written to.
-
-    `estimate` is a row of a table with `boxes`, which the next window starts from.
-
-    """
-
-    observation: Observation
-    place: _Place
-    array: _PendingArray
-    row: int
-    is_predicted: bool = False
-    estimate: tuple[Estimates | Observations, int] | None = None
-    is_settled: bool = False
-
-    def settle(self) -> None:
-        """Let the estimate in the box array change no more."""
-        if not self.is_settled:
-            self.array.num_unsettled -= 1
-        self.is_settled = True
-
-
-@dataclass(eq=False, slots=True)
-class _Track:
-    """
-    The observations of a track that windows still need, oldest first.
-
-    Attributes
-    ----------
-    covariance : array, shape (6, 6), or None
-        Of the newest estimate.
-    num_carried : int
-        Newest observations that were in no window yet, because the budget was used up.
-    detected_ns : int
-        Stamp of the last detection [ns].
-    least_points : float
-        Points inside a predicted box that confirm it, known after the first missed detection.
-
-    """
-
-    track_id: str
-    class_name: str
-    entries: list[_Entry] = field(default_factory=list)
-    prior: MarginalisationPrior | None = None
-    covariance: Floats | None = None
-    num_carried: int = 0
-    detected_ns: int = 0
-    least_points: float = inf
-
-    @property
-    def newest_ns(self) -> int:
-        """Stamp of the newest observation [ns]."""
-        return self.entries[-1].place.stamp_ns
-
-    def is_in(self, array: _PendingArray) -> bool:
-        """Return whether the newest observation is of `array`."""
-        return self.entries[-1].array is array
-
-    def carry(self, length: int) -> None:
-        """
-        Leave the newest observation to a later window, which then starts from its input box.
-
-        At most `length` observations are held. Those in excess are removed behind the two oldest,
-        which the marginalisation prior refers to.
-
-        """
-        self.num_carried += 1
-        before, newest = self.entries[-2:]
-        newest.array.reasons[newest.row] = 'budget'
-        if before.estimate is not None:  # else the track is cold: its first window is to come
-            newest.estimate = newest.observation
-        excess = max(0, len(self.entries) - length)
-        del self.entries[PRIOR_POSES : PRIOR_POSES + excess]
-
-    def coasts(self, stamp_ns: int, config: Config) -> bool:
-        """Return whether a box may be predicted at a stamp without a detection."""
-        if stamp_ns > self.detected_ns + round(config.coast * 1e9):
-            return False
-        detected = [entry.observation for entry in self.entries if not entry.is_predicted]
-        if not self.entries[-1].is_predicted and len(detected) >= MIN_HITS:
-            self.least_points = points_to_confirm(detected)
-        return self.least_points < inf
-
-    def predicted(self, stamp_ns: int, config: Config) -> Floats:
-        """Return the box (9,) at a stamp by the motion of the newest estimates."""
-        stamps_ns = np.array([entry.observation.stamp_ns for entry in self.entries])
-        tables, rows = joined([entry.estimate or entry.observation for entry in self.entries])
-        boxes = column(tables, 'boxes')[rows]
-        motion = motion_at(stamps_ns, boxes, -1, config.class_config(self.class_name))
-        return motion.predict(stamp_ns)
-
-    def split_at_id_switch(self) -> _Track | None:
-        """
-        Move the last two observations to a new track if they are of another object.
-
-        They are if both are farther from the constant velocity prediction than half the length
-        of the object and `ID_SWITCH_SPEED`. A single one may be an outlier.
-
-        """
-        recent = self.entries[-ID_SWITCH_OBSERVATIONS:]
-        if len(recent) < ID_SWITCH_OBSERVATIONS - 1:
-            return None
-        first, latest = recent[0].place, recent[-3].place
-        duration_ns = latest.stamp_ns - first.stamp_ns
-        for place in (recent[-1].place, recent[-2].place):
-            elapsed_ns = place.stamp_ns - latest.stamp_ns
-            part = elapsed_ns / duration_ns
-            x = latest.x + part * (latest.x - first.x)
-            y = latest.y + part * (latest.y - first.y)
-            gate = latest.length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
-            if dist((place.x, place.y), (x, y)) < gate:
-                return None
-        moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
-        del self.entries[-2:]
-        return _Track(self.track_id, self.class_name, moved, detected_ns=self.detected_ns)
-
-    def write(self, estimate: Estimate, entries: list[_Entry]) -> None:
-        """Pass the estimate of the window of `entries` to the box arrays that are not settled."""
-        self.prior = estimate.prior
-        self.covariance = estimate.covariances[-1]
-        self.num_carried = 0
-        for row, entry in enumerate(entries, estimate.begin):
-            entry.estimate = found = estimate.table, row
-            if not entry.is_settled:
-                entry.array.estimates[entry.row] = found
-
-
-def _windows(tracks: Sequence[_Track]) -> list[Window]:
+def _windows(tracks: Sequence[ObservedTrack]) -> list[Window]:
     """Return for each track the window of all observations that it holds."""
     known = [[e.estimate for e in track.entries if e.estimate is not None] for track in tracks]
     tables, rows = joined(list(chain.from_iterable(known)))
@@ -668,15 +374,7 @@ def _windows(tracks: Sequence[_Track]) -> list[Window]:
     return windows
 
 
-class _Sighting(NamedTuple):
-    """A box that is to be observed: in a row of its array, or predicted."""
-
-    track: _Track
-    box: Floats
-    row: int = -1
-
-
-def _by_urgency(tracks: list[_Track]) -> list[_Track]:
+def _by_urgency(tracks: list[ObservedTrack]) -> list[ObservedTrack]:
     """Return tracks ordered by the gain of solving them, highest gain first."""
     carried = np.array([track.num_carried for track in tracks])
     known = [track.covariance for track in tracks]
@@ -688,33 +386,33 @@ def _by_urgency(tracks: list[_Track]) -> list[_Track]:
     return [tracks[i] for i in np.lexsort((distances, -variances, -carried)).tolist()]
 
 
-def _input_velocities(sightings: list[_Sighting], boxes: Floats, stamp_ns: int) -> Floats:
+def _input_velocities(to_observe: list[BoxToObserve], boxes: Floats, stamp_ns: int) -> Floats:
     """Return the mean velocities (n, 3) of the input centres up to the new `boxes` [m/s]."""
     velocities = np.zeros((len(boxes), 3))
-    known = [row for row, sighting in enumerate(sightings) if sighting.track.entries]
+    known = [row for row, item in enumerate(to_observe) if item.track.entries]
     if known:
-        before = [sightings[row].track.entries[-VELOCITY_OBSERVATIONS:][0].place for row in known]
+        before = [to_observe[row].track.entries[-VELOCITY_OBSERVATIONS:][0].place for row in known]
         elapsed = stamp_ns - np.array([place.stamp_ns for place in before])
         centers = np.array([(place.x, place.y, place.z) for place in before])
         velocities[known] = (boxes[known, X : Z + 1] - centers) / elapsed[:, None] * 1e9
     return velocities
 
 
-def _confirmed(coasting: list[_Sighting], seen: list[Observation]) -> list[_Sighting]:
+def _confirmed(coasting: list[BoxToObserve], seen: list[Observation]) -> list[BoxToObserve]:
     """Return those of the predicted boxes that have enough points."""
     inside = points_inside(seen)
     return [
-        sighting
-        for sighting, count in zip(coasting, inside.tolist(), strict=True)
-        if count >= sighting.track.least_points
+        item
+        for item, count in zip(coasting, inside.tolist(), strict=True)
+        if count >= item.track.least_points
     ]
 
 
 class _SubmittedTrack(NamedTuple):
     """A track with the observations of its submitted window."""
 
-    track: _Track
-    entries: list[_Entry]
+    track: ObservedTrack
+    entries: list[PendingBox]
     is_ended: bool
 
 

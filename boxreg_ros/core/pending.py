@@ -1,0 +1,315 @@
+"""
+What a registrar holds until it is settled: box arrays, and the observations of each track.
+
+Both refer to each other: an estimate of a track is written to the box arrays of its observations.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from math import dist, inf
+from typing import NamedTuple
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.motion import motion_at
+from boxreg_ros.core.observation import Observation, Observations
+from boxreg_ros.core.support import MIN_HITS, points_to_confirm
+from boxreg_ros.core.tables import by_table, column, joined
+from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, PRIOR_POSES
+from boxreg_ros.structures import (
+    BoxArray,
+    COASTED,
+    Floats,
+    is_valid_box,
+    KEPT,
+    LENGTH,
+    REFINED,
+    RefinedBoxes,
+)
+import numpy as np
+
+ID_SWITCH_OBSERVATIONS = 6
+"""
+Observations that an id switch is detected from, at least one less; chosen.
+
+The last two are tested against the velocity of those before.
+
+"""
+ID_SWITCH_SPEED = 10.0
+"""
+Least deviation from constant velocity that is an id switch [m/s].
+
+Derived: within the 0.2 s of two observations no road user changes its velocity by 10 m/s, which
+is 50 m/s^2.
+
+"""
+
+
+class BoxToObserve(NamedTuple):
+    """A box that is to be observed: in a row of its array, or predicted."""
+
+    track: ObservedTrack
+    box: Floats
+    row: int = -1
+
+
+class PendingArray:
+    """
+    A box array that is not yet returned, with the present estimate of each box.
+
+    Attributes
+    ----------
+    input : BoxArray
+        As added, followed by the predicted boxes of tracks that have none here.
+    num_given : int
+        Boxes that were added.
+    reasons : list of str
+        Why each box is kept as long as it has no estimate.
+    num_points : array, shape (n,)
+        As in `RefinedBoxes`.
+    estimates : list of n pairs or None
+        Estimates of the windows that each box was last in, and its row there.
+    num_unsettled : int
+        Boxes whose estimate may still change; the array is settled at 0 or less.
+    is_observed : bool
+        True where a sweep was found and the array is in order.
+
+    """
+
+    def __init__(self, boxes: BoxArray) -> None:
+        n = len(boxes.track_ids)
+        self.input = boxes
+        self.reasons = [''] * n
+        self.num_points = np.zeros(n, int)
+        self.estimates: list[tuple[Estimates, int] | None] = [None] * n
+        self.num_given = n
+        self.num_unsettled = 0
+        self.is_observed = False
+
+    def set_reasons(self, reason: str) -> None:
+        """Set the reason of each box that cannot be refined; `reason`, if any, holds for all."""
+        known = set[str]()
+        is_valid = is_valid_box(self.input.boxes)
+        for row, track_id in enumerate(self.input.track_ids):
+            if not is_valid[row]:
+                self.reasons[row] = 'invalid_box'
+            elif not track_id:
+                self.reasons[row] = 'no_track_id'
+            elif track_id in known:
+                self.reasons[row] = 'duplicate_track_id'
+            else:
+                self.reasons[row] = reason
+            if is_valid[row]:
+                known.add(track_id)
+
+    def add_observations(
+        self, seen: Sequence[Observation], rows: Sequence[int]
+    ) -> list[PendingBox]:
+        """Return the entries of n boxes in `rows`, which then wait for their estimates."""
+        if not seen:
+            return []
+        table = seen[0].table
+        stamp_ns = self.input.stamp_ns
+        self.num_points[rows] = table.num_points
+        self.num_unsettled += len(rows)
+        entries = []
+        places = table.boxes[:, : LENGTH + 1].tolist()
+        for observation, row, place in zip(seen, rows, places, strict=True):
+            self.reasons[row] = 'short_track'  # until there is an estimate
+            entries.append(PendingBox(observation, InputPlace(stamp_ns, *place), self, row))
+        return entries
+
+    def add_predicted(self, item: BoxToObserve) -> int:
+        """Add the predicted box of a track; return its row."""
+        given = self.input
+        self.input = replace(
+            given,
+            track_ids=(*given.track_ids, item.track.track_id),
+            class_names=(*given.class_names, item.track.class_name),
+            scores=np.append(given.scores, 0.0),
+            boxes=np.vstack([given.boxes, item.box]),
+            pinned=None if given.pinned is None else np.append(given.pinned, False),
+        )
+        self.reasons.append('')
+        self.num_points = np.append(self.num_points, 0)
+        self.estimates.append(None)
+        return len(self.estimates) - 1
+
+    def result(self, is_final: bool) -> RefinedBoxes:
+        """
+        Return the present estimates as copies; without an estimate, the input box.
+
+        Of the predicted boxes, those that are refined.
+
+        """
+        n = len(self.estimates)
+        columns = Estimates(
+            boxes=self.input.boxes.copy(),
+            status=np.full(n, KEPT, object),
+            reasons=np.array(self.reasons, object),
+            covariances=np.tile(np.eye(6), (n, 1, 1)),
+            extent_covariances=np.tile(np.eye(3), (n, 1, 1)),
+            face_distances=np.zeros((n, 6)),
+            near_points=np.zeros((n, 2), np.int64),
+        )
+        known = {row: found for row, found in enumerate(self.estimates) if found is not None}
+        estimated = np.array([*known], int)
+        for table, places, rows in by_table([*known.values()]):
+            for values, estimates in zip(columns, table, strict=True):
+                values[estimated[places]] = estimates[rows]
+        is_returned = columns.status == REFINED
+        is_returned[: self.num_given] = True
+        columns.status[self.num_given :] = COASTED
+        whole = RefinedBoxes(
+            replace(self.input, boxes=columns.boxes),
+            tuple(columns.status.tolist()),
+            tuple(columns.reasons.tolist()),
+            self.num_points.copy(),
+            columns.covariances,
+            is_final,
+            columns.extent_covariances,
+            columns.face_distances,
+            columns.near_points,
+        )
+        return whole if is_returned.all() else whole.take(np.flatnonzero(is_returned).tolist())
+
+
+class InputPlace(NamedTuple):
+    """Centre and length of an input box [m] as plain numbers, of which motion is computed."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    z: float
+    length: float
+
+
+@dataclass(slots=True)
+class PendingBox:
+    """
+    An observation of a track, and the row of the box array its estimate is written to.
+
+    `estimate` is a row of a table with `boxes`, which the next window starts from.
+
+    """
+
+    observation: Observation
+    place: InputPlace
+    array: PendingArray
+    row: int
+    is_predicted: bool = False
+    estimate: tuple[Estimates | Observations, int] | None = None
+    is_settled: bool = False
+
+    def settle(self) -> None:
+        """Let the estimate in the box array change no more."""
+        if not self.is_settled:
+            self.array.num_unsettled -= 1
+        self.is_settled = True
+
+
+@dataclass(eq=False, slots=True)
+class ObservedTrack:
+    """
+    The observations of a track that windows still need, oldest first.
+
+    Attributes
+    ----------
+    covariance : array, shape (6, 6), or None
+        Of the newest estimate.
+    num_carried : int
+        Newest observations that were in no window yet, because the budget was used up.
+    detected_ns : int
+        Stamp of the last detection [ns].
+    least_points : float
+        Points inside a predicted box that confirm it, known after the first missed detection.
+
+    """
+
+    track_id: str
+    class_name: str
+    entries: list[PendingBox] = field(default_factory=list)
+    prior: MarginalisationPrior | None = None
+    covariance: Floats | None = None
+    num_carried: int = 0
+    detected_ns: int = 0
+    least_points: float = inf
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest observation [ns]."""
+        return self.entries[-1].place.stamp_ns
+
+    def is_in(self, array: PendingArray) -> bool:
+        """Return whether the newest observation is of `array`."""
+        return self.entries[-1].array is array
+
+    def carry(self, length: int) -> None:
+        """
+        Leave the newest observation to a later window, which then starts from its input box.
+
+        At most `length` observations are held. Those in excess are removed behind the two oldest,
+        which the marginalisation prior refers to.
+
+        """
+        self.num_carried += 1
+        before, newest = self.entries[-2:]
+        newest.array.reasons[newest.row] = 'budget'
+        if before.estimate is not None:  # else the track is cold: its first window is to come
+            newest.estimate = newest.observation
+        excess = max(0, len(self.entries) - length)
+        del self.entries[PRIOR_POSES : PRIOR_POSES + excess]
+
+    def coasts(self, stamp_ns: int, config: Config) -> bool:
+        """Return whether a box may be predicted at a stamp without a detection."""
+        if stamp_ns > self.detected_ns + round(config.coast * 1e9):
+            return False
+        detected = [entry.observation for entry in self.entries if not entry.is_predicted]
+        if not self.entries[-1].is_predicted and len(detected) >= MIN_HITS:
+            self.least_points = points_to_confirm(detected)
+        return self.least_points < inf
+
+    def predicted(self, stamp_ns: int, config: Config) -> Floats:
+        """Return the box (9,) at a stamp by the motion of the newest estimates."""
+        stamps_ns = np.array([entry.observation.stamp_ns for entry in self.entries])
+        tables, rows = joined([entry.estimate or entry.observation for entry in self.entries])
+        boxes = column(tables, 'boxes')[rows]
+        motion = motion_at(stamps_ns, boxes, -1, config.class_config(self.class_name))
+        return motion.predict(stamp_ns)
+
+    def split_at_id_switch(self) -> ObservedTrack | None:
+        """
+        Move the last two observations to a new track if they are of another object.
+
+        They are if both are farther from the constant velocity prediction than half the length
+        of the object and `ID_SWITCH_SPEED`. A single one may be an outlier.
+
+        """
+        recent = self.entries[-ID_SWITCH_OBSERVATIONS:]
+        if len(recent) < ID_SWITCH_OBSERVATIONS - 1:
+            return None
+        first, latest = recent[0].place, recent[-3].place
+        duration_ns = latest.stamp_ns - first.stamp_ns
+        for place in (recent[-1].place, recent[-2].place):
+            elapsed_ns = place.stamp_ns - latest.stamp_ns
+            part = elapsed_ns / duration_ns
+            x = latest.x + part * (latest.x - first.x)
+            y = latest.y + part * (latest.y - first.y)
+            gate = latest.length / 2 + ID_SWITCH_SPEED * elapsed_ns * 1e-9
+            if dist((place.x, place.y), (x, y)) < gate:
+                return None
+        moved = [replace(entry, estimate=None) for entry in self.entries[-2:]]
+        del self.entries[-2:]
+        return ObservedTrack(self.track_id, self.class_name, moved, detected_ns=self.detected_ns)
+
+    def write(self, estimate: Estimate, entries: list[PendingBox]) -> None:
+        """Pass the estimate of the window of `entries` to the box arrays that are not settled."""
+        self.prior = estimate.prior
+        self.covariance = estimate.covariances[-1]
+        self.num_carried = 0
+        for row, entry in enumerate(entries, estimate.begin):
+            entry.estimate = found = estimate.table, row
+            if not entry.is_settled:
+                entry.array.estimates[entry.row] = found
