@@ -119,7 +119,10 @@ def read(source, **options):
             content = item.content
             T_fixed_item = tree.lookup(fixed_frame, content.frame_id, content.stamp_ns)
             moved = move_to_frame(content, T_fixed_item, fixed_frame)
-            (sweeps if isinstance(moved, Sweep) else boxes).append(moved)
+            if isinstance(moved, Sweep):
+                sweeps.append(moved.in_frame())
+            else:
+                boxes.append(moved)
         source.check_readable()
     return sweeps, boxes
 
