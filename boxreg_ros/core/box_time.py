@@ -93,14 +93,14 @@ class BoxTimeEvidence:
         ----------
         seen : sequence of n Observation
             Of the boxes, in one table.
-        velocities : array, shape (n or more, 3)
+        velocities : array, shape (n, 3)
             Of the objects [m/s].
 
         """
         if not seen:
             return
         rows = [observation.row for observation in seen]
-        motions = velocities[: len(seen)] * seen[0].table.sights[rows, None]  # from the stamp [m]
+        motions = velocities * seen[0].table.sights[rows, None]  # from the stamp [m]
         for i in np.flatnonzero(np.linalg.norm(motions, axis=1) >= MIN_MOTION).tolist():
             self._vote(seen[i], velocities[i], motions[i])
 

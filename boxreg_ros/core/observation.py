@@ -251,7 +251,7 @@ def observe(sweep: Sweep, boxes: Floats, stamp_ns: int, config: Config) -> Obser
 
 
 def _offsets(sweep: Sweep, centers: Floats, rows: Ints, owner: Ints) -> Floats:
-    """Return points minus the `centers` (n, 3) of their boxes, axes of the frame, (3, P) [m]."""
+    """Return points minus the `centers` (n, 3) of their boxes, axes of the sweep, (3, P) [m]."""
     at_points, turn = _among_points(sweep, centers)
     offset = sweep.points.T.take(rows, 1) - at_points.T.take(owner, 1)
     if sweep.T_frame_points is None:
@@ -367,9 +367,10 @@ def own_points_numpy(sweep: Sweep, boxes: Floats, config: Config) -> OwnPoints:
 
 def _among_points(sweep: Sweep, centers: Floats) -> tuple[Floats, Floats]:
     """
-    Return `centers` (n, 3) in the frame of the points, and what turns offsets back, (3, 3).
+    Return `centers` (n, 3) in the frame of the points, and the rotation of that frame, (3, 3).
 
-    Boxes are brought to the points: they are fewer.
+    The rotation maps offsets from the frame of the points to that of the sweep. Boxes are brought
+    to the points, since they are fewer.
 
     """
     if sweep.T_frame_points is None:
@@ -379,7 +380,7 @@ def _among_points(sweep: Sweep, centers: Floats) -> tuple[Floats, Floats]:
 
 
 def _shapes(sweep: Sweep, boxes: Floats, margin: float) -> ShapeArrays:
-    """Return what the kernels need of `boxes` (n, 9) to find the points within `margin`."""
+    """Return `boxes` (n, 9) for the kernels that find the points within `margin` of them."""
     centers, turn = _among_points(sweep, boxes[:, :3])
     R = matrix_from_rpy(boxes[:, ROLL:])  # (n, 3, 3)
     half = boxes[:, 3:6] / 2

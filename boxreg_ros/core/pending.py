@@ -1,7 +1,7 @@
 """
-What a registrar holds until it is settled: box arrays, and the observations of each track.
+Box arrays and observations of tracks that a registrar holds until they are settled.
 
-Both refer to each other: an estimate of a track is written to the box arrays of its observations.
+They refer to each other: an estimate of a track is written to the box arrays of its observations.
 
 """
 
@@ -107,7 +107,7 @@ class PendingArray:
     def add_observations(
         self, seen: Sequence[Observation], rows: Sequence[int]
     ) -> list[PendingBox]:
-        """Return the entries of n boxes in `rows`, which then wait for their estimates."""
+        """Add observations of the boxes in `rows`, which then wait for their estimates."""
         if not seen:
             return []
         table = seen[0].table

@@ -213,7 +213,7 @@ class BoxRegistrar:
             # A box that is not confirmed owns no points.
             self.counts['coast_unconfirmed'] += len(coasting) - len(confirmed)
             seen, velocities = self._seen([*given, *confirmed], boxes, sweep)
-        self.box_time.add(seen[: len(given)], velocities)
+        self.box_time.add(seen[: len(given)], velocities[: len(given)])
         rows = [item.row for item in given]
         rows += [array.add_predicted(item) for item in confirmed]
         entries = array.add_observations(seen, rows)
