@@ -20,7 +20,6 @@ from boxreg_ros.labels.registry import (
     check_options,
     FORMATS,
     frames_of,
-    is_written,
     module_of,
     writer_for,
 )
@@ -31,7 +30,6 @@ __all__ = [
     'Format',
     'FORMATS',
     'frames_of',
-    'is_written',
     'LabelFrame',
     'LabelOutput',
     'LabelWriter',

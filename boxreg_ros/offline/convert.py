@@ -7,7 +7,6 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from boxreg_ros.offline.arguments import (
     lidars_from,
 )
 from boxreg_ros.offline.labelled_recording import label_frame_of
-from boxreg_ros.offline.result_folder import SUMMARY, whole_folder
+from boxreg_ros.offline.result_folder import claimed, whole_folder, write_summary
 from boxreg_ros.offline.sources import source_of
 from boxreg_ros.structures import BoxArray, Sweep
 
@@ -113,7 +112,7 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
     counts: Counter[str] = Counter()
     unused = _Unused()
     inputs = (request.source, *request.recordings, request.options.camera)
-    with whole_folder(out, inputs) as folder:
+    with claimed(out), whole_folder(out, inputs) as folder:
         writers = {
             name: writer_for(name, folder, provenance, request.options)
             for name in request.target_formats
@@ -140,7 +139,7 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
             'versions': {'boxreg_ros': __version__},
             'fingerprint': hashlib.sha256(repr((__version__, request)).encode()).hexdigest(),
         }
-        (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+        write_summary(folder, summary)
     return summary
 
 

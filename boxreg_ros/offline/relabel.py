@@ -10,11 +10,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, ExitStack, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from datetime import datetime, UTC
 from importlib.metadata import version
-import json
 from pathlib import Path
 import platform
 from shutil import copyfile
@@ -30,7 +29,7 @@ from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader, ReadItem
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import CONFIG, delete_remains, SUMMARY, whole_folder, writing
+from boxreg_ros.offline.result_folder import claimed, CONFIG, SUMMARY, whole_folder, write_summary
 from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
@@ -53,7 +52,7 @@ import yaml
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
     from boxreg_ros.offline.completion import Completion
-    from boxreg_ros.offline.journal import EstimateJournal
+    from boxreg_ros.offline.resume import EstimateJournal
     from boxreg_ros.review.changes import TrackChanges
     from boxreg_ros.review.rules.protocol import Violation
     from boxreg_ros.review.tables import TrackRow
@@ -106,7 +105,7 @@ def relabel(
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
     shown = _Passes(progress, 1 + bool(request.config.complete.steps))
-    with writing(out), ExitStack() as workers:
+    with claimed(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
         plan, completion = _survey(request, clock, shown, journal)
         receive = workers.enter_context(reader(request))
@@ -140,18 +139,15 @@ def relabel(
                 copyfile(request.decisions, folder / DECISIONS)  # a review goes on from there
             settings = yaml.safe_dump(asdict(request.config), sort_keys=False)
             (folder / CONFIG).write_text(settings, encoding='utf-8')
-            (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+            write_summary(folder, summary)
     return summary
 
 
-@contextmanager
-def _journal(out: Path, fingerprint: str) -> Iterator[EstimateJournal]:
-    """Yield the journal of a run; while it is locked, other partial results are remains."""
-    from boxreg_ros.offline.journal import EstimateJournal, journal_path
+def _journal(out: Path, fingerprint: str) -> EstimateJournal:
+    """Return the journal of a run, not yet open."""
+    from boxreg_ros.offline.resume import EstimateJournal, journal_path
 
-    with EstimateJournal(journal_path(out), fingerprint) as journal:
-        delete_remains(out)
-        yield journal
+    return EstimateJournal(journal_path(out), fingerprint)
 
 
 def _journaled(submit: Submit | None, journal: EstimateJournal | None) -> Submit | None:

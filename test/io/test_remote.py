@@ -9,12 +9,12 @@ from threading import Thread
 
 from boxreg_ros.cli import main
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.journal import ObjectJournal
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage import urls
 from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.storage.urls import RemoteFile, url_of
 from boxreg_ros.io.transforms import TransformTree
-from boxreg_ros.offline.journal import EstimateJournal
 from mcap.reader import make_reader
 from mcap_files import rewritten
 import numpy as np
@@ -238,7 +238,7 @@ def test_an_interrupted_run_goes_on_from_the_journal_in_the_store(tmp_path, stor
     recording = Drive(sweeps=60).write(tmp_path / 'drive')
     command = ['relabel', str(recording), '--set=track_window=16', *QUICK, '--resume', '-o']
     local = tmp_path / 'local'
-    append = EstimateJournal._append
+    append = ObjectJournal.append
     appended = []
 
     def append_until(limit):
@@ -249,7 +249,7 @@ def test_an_interrupted_run_goes_on_from_the_journal_in_the_store(tmp_path, stor
                 raise KeyboardInterrupt
 
         appended.clear()
-        monkeypatch.setattr(EstimateJournal, '_append', limited)
+        monkeypatch.setattr(ObjectJournal, 'append', limited)
 
     append_until(None)
     assert main([*command, str(local)]) == 0

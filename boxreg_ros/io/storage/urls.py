@@ -9,7 +9,7 @@ by ranges: what the index of a recording asks for, and some chunks ahead.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 import os
@@ -32,6 +32,8 @@ ANSWER_SECONDS = 60.0
 CAUSES = 'check the address, the network and the credentials'
 REFUSED_STATUS = (401, 403)
 """Answers of HTTP to wrong or missing credentials."""
+UPLOAD = '.upload'
+"""File in a folder that is being uploaded, or whose upload was interrupted."""
 
 
 class Entry(NamedTuple):
@@ -214,10 +216,9 @@ def write_bytes(path: Path, content: bytes) -> None:
         system.pipe_file(name, content)
 
 
-def delete_files(path: Path) -> None:
-    """Delete all files below a folder behind a URL."""
+def delete_files(path: Path, names: Iterable[str]) -> None:
+    """Delete some files of a folder behind a URL."""
     system, name = _system_of(path)
-    names = names_of(path)
     with _answers(path):
         for one in names:
             system.rm_file(f'{name}/{one}')
@@ -225,13 +226,20 @@ def delete_files(path: Path) -> None:
 
 def names_of(path: Path) -> list[str]:
     """Return the names of all files below a folder behind a URL; none if it does not exist."""
+    return list(sizes_of(path))
+
+
+def sizes_of(path: Path) -> dict[str, int]:
+    """Return names and sizes [bytes] of all files below a folder behind a URL."""
     system, name = _system_of(path)
     with _answers(path):
-        found = system.find(name, **_limit(system))
-    return [str(one).removeprefix(name).lstrip('/') for one in found]
+        found = system.find(name, detail=True, **_limit(system))
+    return {
+        str(one).removeprefix(name).lstrip('/'): int(about['size']) for one, about in found.items()
+    }
 
 
-def upload(folder: Path, target: Path, last: str) -> None:
+def upload(folder: Path, target: Path, last: str, advanced: Callable[[], None]) -> None:
     """
     Replace a folder behind a URL by one of this machine.
 
@@ -241,18 +249,24 @@ def upload(folder: Path, target: Path, last: str) -> None:
         Source and URL.
     last : str
         File that marks a whole result: it is deleted first, and written when all others are.
+        `UPLOAD` is there from before the first change until then.
+    advanced : callable
+        Called after each file.
 
     """
     system, name = _system_of(target)
     files = {str(file.relative_to(folder)) for file in folder.rglob('*') if file.is_file()}
+    write_bytes(target / UPLOAD, b'')
     old = names_of(target)
     with _answers(target):
         if last in old:
             system.rm_file(f'{name}/{last}')
-        for file in sorted(set(old) - files - {last}):
+        for file in sorted(set(old) - files - {last, UPLOAD}):
             system.rm_file(f'{name}/{file}')
         for file in sorted(files, key=lambda file: (file == last, file)):
             system.put_file(str(folder / file), f'{name}/{file}')
+            advanced()
+        system.rm_file(f'{name}/{UPLOAD}')
 
 
 def _limit(system: Any) -> dict[str, float]:
