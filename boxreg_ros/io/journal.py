@@ -97,8 +97,8 @@ class FileJournal:
         except sqlite3.DatabaseError as error:
             self.close()
             raise RecordingError(
-                f'{self.path}: expected a journal of boxreg, got a file that cannot be read: {error}; '
-                f'delete it to begin again'
+                f'{self.path}: expected a journal of boxreg, got another file: {error}; delete it '
+                f'to begin again'
             ) from None
 
     def records(self) -> Iterator[Any]:
@@ -198,9 +198,7 @@ class ObjectJournal:
 
     def append(self, item: Any) -> None:
         """Write the file of an object; it appears whole."""
-        write_bytes(
-            self.path / _name(self._count), pickle.dumps(item, pickle.HIGHEST_PROTOCOL)
-        )
+        write_bytes(self.path / _name(self._count), pickle.dumps(item, pickle.HIGHEST_PROTOCOL))
         self._count += 1
 
     def delete(self) -> None:

@@ -1,4 +1,4 @@
-"""Progress of a long run, to be displayed by the caller, and its signs of life for `boxreg batch`."""
+"""Progress of a long run, to be displayed by the caller and watched by `boxreg batch`."""
 
 from __future__ import annotations
 

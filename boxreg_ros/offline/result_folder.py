@@ -15,7 +15,7 @@ from typing import Any
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.lock import locked
-from boxreg_ros.io.storage.urls import names_of, read_text, sizes_of, upload, UPLOAD, url_of
+from boxreg_ros.io.storage.urls import names_of, read_text, sizes_of, UPLOAD, upload, url_of
 from boxreg_ros.io.whole_files import DISK_ERRORS, store
 from boxreg_ros.offline.progress import advanced
 
@@ -39,13 +39,19 @@ def earlier_summary(out: Path) -> dict[str, Any] | None:
 
 
 def whole_summary(out: Path) -> dict[str, Any] | None:
-    """Return the summary of an earlier run; None if there is none, or a file of it is not whole."""
+    """
+    Return the summary of an earlier run; None without one, or if a file is missing or empty.
+
+    Files that someone has changed since count as whole.
+
+    """
     summary = earlier_summary(out)
     if summary is None:
         return None
     found = _sizes(out) if url_of(out) is None else sizes_of(out)
     listed = summary.get(FILES, {}).items()
-    return summary if all(found.get(name) == about['size'] for name, about in listed) else None
+    lost = any(about['size'] and not found.get(name) for name, about in listed)
+    return None if lost else summary
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
@@ -224,11 +230,10 @@ def _other_files(out: Path) -> RecordingError:
 
 
 def _changed_since(out: Path) -> str | None:
-    """Return the name of a file in a result that is not what the summary states."""
+    """Return the name of a file in a result whose content is not what the summary states."""
     listed = (earlier_summary(out) or {}).get(FILES, {})
     for name, size in _sizes(out).items():
-        known = listed.get(name)
-        if known is None or known['size'] != size or known['sha256'] != _digest(out / name):
+        if size and listed.get(name) != {'size': size, 'sha256': _digest(out / name)}:
             return name
     return None
 

@@ -13,7 +13,7 @@ from boxreg_ros.recorder.segment import recover
 
 LOCK = '.lock'
 DAMAGED = '.damaged'
-"""Suffix of the folder of a segment whose journal cannot be read, in place of that of an open one."""
+"""Suffix of the folder of a segment whose journal cannot be read."""
 
 
 class Recovery(NamedTuple):

@@ -29,9 +29,8 @@ def run(args: argparse.Namespace) -> int:
         recovery = recover_all(open_segments(folder))
     rows = read_index(folder)
     boxes = sum(row.boxes for row in rows)
-    print(
-        f'{folder}: {recovery.recovered} segments recovered; {boxes:,} boxes in {len(rows)} segments'
-    )
+    recovered = f'{recovery.recovered} segments recovered'
+    print(f'{folder}: {recovered}; {boxes:,} boxes in {len(rows)} segments')
     for path in recovery.damaged:
         print(f'boxreg: {path}: its journal cannot be read; delete it', file=sys.stderr)
     return 1 if recovery.damaged else 0

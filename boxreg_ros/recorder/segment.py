@@ -10,7 +10,6 @@ import re
 import shutil
 
 from boxreg_ros.config import Config
-from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.journal import FileJournal
 from boxreg_ros.io.label_feed import RecorderSettings
 from boxreg_ros.io.whole_files import store

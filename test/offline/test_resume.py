@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 import random
 import resource
+import shutil
 import subprocess
 import sys
 
@@ -14,10 +15,10 @@ from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.journal import FileJournal
-from boxreg_ros.offline.resume import EstimateJournal, journal_path
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import whole_folder
+from boxreg_ros.offline.result_folder import claimed, whole_folder, whole_summary
+from boxreg_ros.offline.resume import EstimateJournal, journal_path
 from preloaded import BOXREG, PreloadedProcess
 import pytest
 from ros_messages import Drive
@@ -143,17 +144,46 @@ def test_other_estimates_and_both_passes_are_resumed(tmp_path, options, monkeypa
 
 def test_a_journal_of_another_request_is_not_used(tmp_path):
     path = tmp_path / '.out.journal'
-    with EstimateJournal(path, 'one') as journal, pytest.raises(Interruption):
+    with pytest.raises(Interruption), EstimateJournal(path, 'one') as journal:
         journal._store((0, [], {}))
         raise Interruption
     with pytest.raises(Interruption), EstimateJournal(path, 'one'):
         raise Interruption  # refused, before anything was recalled
-    with EstimateJournal(path, 'one') as journal, pytest.raises(Interruption):
+    with pytest.raises(Interruption), EstimateJournal(path, 'one') as journal:
         assert journal._recalled(0) == ([], {})
         raise Interruption
     with EstimateJournal(path, 'two') as journal:
         assert journal._recalled(0) is None
     assert not path.exists()
+
+
+def test_a_result_is_judged_by_its_content_and_not_by_its_times(tmp_path):
+    recording = Drive(sweeps=6).write(tmp_path / 'drive')
+    request = Request((recording,), formats=('csv',), config=Config(**SETTINGS))
+    relabel(request, tmp_path / 'first')
+    out = tmp_path / 'copy'
+    shutil.copytree(tmp_path / 'first', out, copy_function=shutil.copyfile)  # newer files
+    os.utime(out / 'summary.json', (0, 0))  # the clock has stepped back
+    relabel(request, out)
+    assert content_of(out) == content_of(tmp_path / 'first')
+    # A file that a power cut has emptied is made again; one that was edited is kept.
+    os.truncate(out / 'boxes.csv', 0)
+    assert whole_summary(out) is None
+    relabel(request, out)
+    assert whole_summary(out) is not None
+    boxes = (out / 'boxes.csv').read_text()
+    (out / 'boxes.csv').write_text(boxes.replace('car', 'bus'))
+    os.utime(out / 'boxes.csv', (0, 0))
+    with pytest.raises(RecordingError, match=r"one with 'boxes\.csv' changed or added since"):
+        relabel(request, out)
+    assert 'bus' in (out / 'boxes.csv').read_text()
+    # Killed between the two renames of a replacement: the earlier result has its name again.
+    (out / 'boxes.csv').write_text(boxes)
+    out.rename(tmp_path / '.copy.earlier')
+    with claimed(out):
+        assert (out / 'boxes.csv').read_text() == boxes
+    relabel(request, out)
+    assert not [path.name for path in tmp_path.iterdir() if path.name.startswith('.')]
 
 
 def test_file_size_limit_is_an_error_and_leaves_nothing(tmp_path, request_of_drive):
