@@ -20,9 +20,8 @@ from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.consistency import Consistency, consistency, table
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import REFINED, RefinedBoxes
-import numpy as np
-
 from measure import print_json
+import numpy as np
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -17,9 +17,8 @@ from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.scenarios import highway
-import numpy as np
-
 from measure import print_json
+import numpy as np
 
 SPEEDS = (5.0, 30.0)
 """Of the vehicle with the sensor [m/s]; the others drive 0.83 to 1.33 times as fast."""

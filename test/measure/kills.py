@@ -21,8 +21,6 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.bench.common import add_json_argument, BOXREG
 from boxreg_ros.errors import BoxregError
-import numpy as np
-
 from measure import print_json
 from measure.node import (
     children_of,
@@ -35,6 +33,7 @@ from measure.node import (
     set_environment,
 )
 from measure.recorded import RecordedLabels
+import numpy as np
 
 VICTIMS = ('recorder', 'node')
 RATE = 10.0  # of the sensor [Hz]

@@ -22,9 +22,8 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
-import numpy as np
-
 from measure import print_json
+import numpy as np
 
 COMPARED = ('smoothing', 'ours')
 FIRST_SEED = 1

@@ -24,9 +24,8 @@ from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, write_truck
-import numpy as np
-
 from measure import print_json
+import numpy as np
 
 CLASSES = ('car', 'van', 'truck')
 WAYS = {

@@ -14,11 +14,10 @@ import argparse
 
 from boxreg_ros.bench.common import add_json_argument
 from boxreg_ros.core.metrics import iou_3d
-from msg_adapters import markers
-import numpy as np
-
 from measure import print_json
 from measure.node import BOX_ERRORS, CIRCLE_PERIOD, measure, true_boxes
+from msg_adapters import markers
+import numpy as np
 
 POLICIES = {
     'deadline': [],

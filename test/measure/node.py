@@ -27,12 +27,12 @@ from boxreg_ros.bench.common import add_json_argument, BOXREG
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.labels import module_of
 from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
-import numpy as np
-
 from measure import MEASURE, print_json
 from measure.recorded import RecordedLabels
+import numpy as np
+from paths import SHARE
 
-PROFILE = Path(__file__).parents[1] / 'share' / 'fastdds.xml'
+PROFILE = SHARE / 'fastdds.xml'
 CIRCLE_PERIOD = 5.0  # time until a car is back where it began [s]
 TRACK_LIFETIME = 200  # sweeps until a track gets a new id
 STARTUP_TIME = 5.0  # not measured at the beginning [s]

@@ -17,9 +17,8 @@ import sys
 
 from boxreg_ros.bench.common import BOXREG
 from boxreg_ros.errors import RecordingError
-from paths import ROOT
-
 from measure import MEASURE, PROGRAM
+from paths import ROOT
 
 STORE = ROOT / 'docs' / 'results'
 

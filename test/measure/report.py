@@ -23,9 +23,8 @@ from boxreg_ros.bench.speed.recordings import write_traffic
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.review.report import REPORT
 from browser import launched
-import numpy as np
-
 from measure import print_json
+import numpy as np
 
 COMPOSITORS = {'processor': ('--disable-gpu-compositing',), 'emulated GPU': ()}
 """

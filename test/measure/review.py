@@ -29,9 +29,8 @@ from boxreg_ros.review.decisions import Corrections, Decision
 from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
-import numpy as np
-
 from measure import print_json
+import numpy as np
 
 CUTS = (0.01, 0.05, 0.1, 0.2)
 """Parts of the list that a person looks at."""

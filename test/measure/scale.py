@@ -30,10 +30,9 @@ from boxreg_ros.offline.job_process import JobRunner
 from boxreg_ros.structures import Floats
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from measure import print_json
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
-
-from measure import print_json
 
 OPTIONS = ('--formats=csv', '--workers=1')
 FLEET_JOBS = 10_000

@@ -44,10 +44,9 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import BoxArray
+from measure import print_json
 import numpy as np
 import torch
-
-from measure import print_json
 
 FACTORS = (0.5, 2.0)
 CORE = 'boxreg_ros.core'

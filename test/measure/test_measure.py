@@ -12,15 +12,14 @@ from boxreg_ros.review.changes import Changes
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
-import numpy as np
-import pytest
-from ros_messages import Drive as RecordedDrive
-from ros_messages import SECOND
-
 import measure
 from measure import renew, scale
 from measure.review import _without_constant_error, with_pins
 from measure.tracks import ONE_LABEL, rows_with_one_label, scores_by_kind
+import numpy as np
+import pytest
+from ros_messages import Drive as RecordedDrive
+from ros_messages import SECOND
 
 
 @pytest.fixture(scope='module')

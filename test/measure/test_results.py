@@ -5,12 +5,11 @@ import re
 import shutil
 
 from boxreg_ros.config import Config
+import measure
+from measure.sensitivity import variations_of_constants
 from paths import ROOT
 import pytest
 import results
-
-import measure
-from measure.sensitivity import variations_of_constants
 
 STORE = ROOT / 'docs' / 'results'
 STORED = sorted(STORE.glob('*.json'))

@@ -8,8 +8,6 @@ from boxreg_ros.core import arrowhead
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
-import pytest
-
 from measure.sensitivity import (
     changed_constant,
     kinds_of,
@@ -20,6 +18,7 @@ from measure.sensitivity import (
     variations_of_constants,
     variations_of_settings,
 )
+import pytest
 
 TRACK = Measurement(Config(estimate='track'), 'track', 50, ['car', 'van', 'truck'])
 SOURCE = """

@@ -28,9 +28,8 @@ from boxreg_ros.offline.track_scores import track_scores, TrackScores
 from boxreg_ros.review.rules.overlap import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
 from boxreg_ros.structures import BoxArray, Ints, RefinedBoxes, REJECTED, Sweep
-import numpy as np
-
 from measure import print_json
+import numpy as np
 
 TITLES = ('recall', 'prec.', 'ids/obj', 'HOTA', 'IDF1', 'added', '3D added', 'ghosts', 'lost')
 ONE_LABEL = 'with one label'
