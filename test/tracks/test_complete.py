@@ -6,7 +6,6 @@ from dataclasses import replace
 import json
 
 from boxreg_ros import cli
-from boxreg_ros.bench.tracks import broken, table_of
 from boxreg_ros.config import COMPLETE_STEPS, Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
@@ -17,6 +16,7 @@ from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import ADDED, Sweep
 from drives import ALL_STEPS, complete, drive, only, path, steps_of
+from measure.tracks import broken, table_of
 import numpy as np
 import pytest
 from relabel_results import rows_of
