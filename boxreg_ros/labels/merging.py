@@ -8,6 +8,7 @@ from dataclasses import replace
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels.protocol import LabelFrame
+from boxreg_ros.structures import HUMAN, is_valid_box
 
 
 class LabelMerger:
@@ -15,7 +16,8 @@ class LabelMerger:
     Yield the boxes of a stamp after the sweep of that stamp, or the next one.
 
     Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and
-    move with the recording; the others are taken in the frame that the labels name.
+    move with the recording; the others are taken in the frame that the labels name. Boxes of the
+    status ``human`` are pinned.
 
     Parameters
     ----------
@@ -87,6 +89,9 @@ def _item(frame: LabelFrame, received_ns: int, tree: TransformTree, sensor_frame
     is_sensor = frame.sensor_frame != '' and boxes.frame_id == frame.sensor_frame
     if is_sensor and not tree.connects(boxes.frame_id, sensor_frame):
         boxes = replace(boxes, frame_id=sensor_frame)
+    if HUMAN in placed.refined.status:
+        is_human = [status == HUMAN for status in placed.refined.status]
+        boxes = replace(boxes, pinned=is_human & is_valid_box(boxes.boxes))
     return Item(received_ns, boxes, refined=replace(placed.refined, boxes=boxes))
 
 
