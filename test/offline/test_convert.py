@@ -135,6 +135,20 @@ def test_labels_outside_of_the_requested_part_are_counted(tmp_path, drive):
     assert summary['labels']['boxes_outside_part'] == 8
 
 
+@pytest.mark.parametrize('apart', [-(10**18), 10**18, -(10**10), 10**10])
+def test_labels_of_another_drive_are_refused(tmp_path, drive, apart):
+    recording, table = drive
+    labels = BoxTable.read(table)
+    replace(labels, stamps_ns=labels.stamps_ns + apart).write(table)
+    request = Request((recording,), config=QUICK, labels=('csv', table))
+    with pytest.raises(RecordingError, match=r'clouds of .* \(2023-11-14\): another drive\?'):
+        relabel(request, tmp_path / 'out')
+    assert not (tmp_path / 'out').exists()
+    part = Request((recording,), config=QUICK, labels=('csv', table), end=0.3)
+    if abs(apart) < 10**12:
+        assert relabel(part, tmp_path / 'out')['labels']['boxes_outside_part'] == 14
+
+
 def module_packages(name):
     return import_module(FORMATS[name]).FORMAT.packages
 
