@@ -4,10 +4,10 @@ Write the tables of `docs/results.md` and `docs/results/` from the stored measur
     python docs/results.py            write the pages
     python docs/results.py --check    exit with status 1 if a page is not what would be written
 
-A measurement is the output of ``boxreg bench ... --json``, stored as ``KIND_DATA.json``, for
-example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a --json``. The tables of
-a kind are in ``KIND.md`` beside it, between two marks; the text around the marks is written by
-hand. `docs/results.md` has the main figures of each kind.
+A measurement is the output of ``boxreg bench`` or of ``test/measure``, stored as
+``KIND_DATA.json``, for example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a
+--json``. The tables of a kind are in ``KIND.md`` beside it, between two marks; the text around the
+marks is written by hand. `docs/results.md` has the main figures of each kind.
 
 """
 
