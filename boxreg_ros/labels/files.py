@@ -145,7 +145,8 @@ def following(path: Path, what: str) -> Iterator[None]:
     except OSError as error:
         raise RecordingError(unreadable(path, error)) from None
     except (AttributeError, LookupError, TypeError, ValueError) as error:
-        raise RecordingError(f'{path}: expected {what}: {type(error).__name__} {error}') from None
+        text = f'{type(error).__name__} {error}'
+        raise RecordingError(f'{path}: expected {what}: {text}; write it again') from None
 
 
 def write_provenance(folder: Path, content: Mapping[str, Any]) -> None:
