@@ -13,7 +13,7 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
-from boxreg_ros.offline.arguments import add_topic_arguments, convention_from, lidars_from
+from boxreg_ros.offline.arguments import add_options, TOPICS, topics_from, words_of
 from boxreg_ros.offline.box_scores import (
     by_overlap,
     groups,
@@ -24,6 +24,7 @@ from boxreg_ros.offline.box_scores import (
 )
 from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import earlier_summary
 from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.track_scores import (
@@ -57,11 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='compare only true boxes whose class name contains one of these words, as in '
         'car,van,truck',
     )  # fmt: skip
-    add_topic_arguments(parser)
-    parser.add_argument(
-        '--fixed-frame', metavar='FRAME',
-        help='frame to compare in, for a recording (default: as for boxreg relabel)',
-    )  # fmt: skip
+    add_options(parser, Request, *TOPICS, 'fixed_frame')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
 
@@ -138,20 +135,19 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
     source: Path = args.predicted
     if (source / 'boxes.csv').is_file():
         source = source / 'boxes.csv'
-    topics = {'boxes': args.boxes, 'odometry': args.odometry}
-    convention = convention_from(args)
     if source.suffix == '.csv':
-        if any(topics.values()) or args.points or args.fixed_frame or not convention.is_standard:
+        unused = words_of(args, Request, *TOPICS, 'fixed_frame')
+        if unused:
             raise ConfigError(
-                f'--points, --boxes, --odometry, --fixed-frame, {convention}: expected with a '
-                f'recording only, got the table {str(source)!r}; leave them out'
+                f'{" ".join(unused)}: expected with a recording only, got the table '
+                f'{str(source)!r}; leave them out'
             )
         found = _table_in_frame(BoxTable.read_frames(source), frame_id)
         return found.rows(np.array([status != REJECTED for status in found.status], bool))
     from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
     from boxreg_ros.offline.sources import source_of
 
-    recording = source_of([source], lidars_from(args), convention=convention, **topics)
+    recording = source_of([source], **topics_from(args))
     arrays, others = input_boxes(recording, args.fixed_frame)
     if others:
         _warn(others)

@@ -215,10 +215,6 @@ def test_command_line(tmp_path, capsys):
     assert cli.main(['evaluate', out, str(tmp_path / 'street_truth.csv'), '--json']) == 0
     tracks = json.loads(capsys.readouterr().out)['tracks']
     assert tracks['added'] > 10
-    with pytest.raises(SystemExit) as status:
-        cli.main(['relabel', str(recording), '-o', out, '--bridge', '1.0'])
-    assert status.value.code == 2
-    assert '--bridge: was removed; use --complete' in capsys.readouterr().err
 
 
 def test_estimates_of_the_node_can_be_completed():
