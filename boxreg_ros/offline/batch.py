@@ -13,15 +13,22 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
 from contextlib import contextmanager, ExitStack
-import json
+from dataclasses import fields, replace
 from pathlib import Path
 import sys
 from typing import Any
 
+from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import url_of
-from boxreg_ros.offline.arguments import add_recording_arguments, config_from, lidar_options
+from boxreg_ros.offline.arguments import (
+    add_options,
+    add_recordings,
+    Settings,
+    values_of,
+    words_of,
+)
 from boxreg_ros.offline.batch_results import (
     FAILED,
     Result,
@@ -31,24 +38,28 @@ from boxreg_ros.offline.batch_results import (
 )
 from boxreg_ros.offline.job import Job, jobs_of
 from boxreg_ros.offline.job_process import JobRunner, read_states
+from boxreg_ros.offline.relabel_command import Demands
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import writing
 
 ENGINES = ('local', 'ray')
 TIMEOUT = 1800.0
 """Chosen: the longest step, the last windows of a drive of an hour, takes some minutes [s]."""
 MEMORY = 2.0
-"""Three times the memory measured for sweeps of 150,000 points (docs/results/scale.md) [GB]."""
+"""Three times the memory measured for 150,000 points (docs/results/speed.md#scale) [GB]."""
+DRIVE_SETTINGS = tuple(one.name for one in fields(Settings) if one.name != 'workers')
+"""Options of `Settings` that a drive takes; ``--workers`` is the number of drives here."""
 REQUESTS = 16
 """Sizes of files that are asked for at a time; chosen: servers answer each in some 0.1 s."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg batch`."""
-    add_recording_arguments(
-        parser,
-        'each is one drive; also a pattern in quotes, or a .txt or .lst file of drives',
-        '*',
-    )
+    several = 'each is one drive; also a pattern in quotes, or a .txt or .lst file of drives'
+    add_recordings(parser, several, '*')
+    add_options(parser, Request, formats=('csv',))
+    add_options(parser, Settings, *DRIVE_SETTINGS)
+    add_options(parser, Demands)
     parser.add_argument(
         '-o', '--out', type=Path, required=True, help='folder with one result folder per drive'
     )
@@ -56,14 +67,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--workers', type=int, default=1, metavar='N',
         help='drives that are relabelled at a time, each on one core (default: %(default)s)',
     )  # fmt: skip
-    parser.add_argument(
-        '--formats', default='csv', metavar='NAME,...',
-        help='label formats to write, see `boxreg formats` (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument('--report', action='store_true', help='write report.html for each drive')
-    parser.add_argument(
-        '--strict', action='store_true', help='a drive that cannot be read completely has failed'
-    )
     _add_machine_arguments(parser)
 
 
@@ -148,7 +151,13 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(
             '--address: expected with --engine ray, got it without; add --engine ray'
         )
-    config_from(args)
+    options = values_of(args, Request) | {'report': False}  # to check that imports torch
+    Request((), config=_config(args), **options)
+
+
+def _config(args: argparse.Namespace) -> Config:
+    """Return the settings of all drives."""
+    return replace(Settings(**values_of(args, Settings)), workers=None).effective()
 
 
 def _results(jobs: Sequence[Job], args: argparse.Namespace) -> list[Result]:
@@ -160,10 +169,13 @@ def _results(jobs: Sequence[Job], args: argparse.Namespace) -> list[Result]:
     with ThreadPoolExecutor(REQUESTS) as pool:
         sizes = dict(zip(jobs, pool.map(Job.size, jobs), strict=True))
     by_size = sorted(jobs, key=lambda job: -sizes[job])  # no large one is left to the end
-    out = args.out if url_of(args.out) else args.out.absolute()
-    options = (*_options(args), '--workers=1')  # the drives share the cores; results are the same
     runner = JobRunner(
-        out, options, str(config_from(args)), args.retries, args.timeout, round(args.memory * 1e9)
+        args.out if url_of(args.out) else args.out.absolute(),
+        tuple(options_of_drives(args)),
+        str(_config(args)),
+        args.retries,
+        args.timeout,
+        round(args.memory * 1e9),
     )
     results = {}
     failed = 0
@@ -201,17 +213,11 @@ def _ended(
             raise
 
 
-def _options(args: argparse.Namespace) -> list[str]:
+def options_of_drives(args: argparse.Namespace) -> list[str]:
     """Return the options of `boxreg relabel` for every drive."""
-    options = ['--formats', args.formats, *lidar_options(args)]
-    for name in ('boxes', 'odometry', 'pose_reference', 'size_order', 'forward_axis'):
-        value = getattr(args, name)
-        if value is not None:
-            options.append(f'--{name.replace("_", "-")}={value}')
-    if args.config is not None:
-        options.append(f'--config={args.config}')
-    options += [f'--set={key}={json.dumps(value)}' for key, value in args.set]
-    return options + [f'--{name}' for name in ('report', 'strict') if getattr(args, name)]
+    options = words_of(args, Request) + words_of(args, Settings, *DRIVE_SETTINGS)
+    options += words_of(args, Demands)
+    return [*options, '--workers=1']  # the drives share the cores; results are the same
 
 
 def _shard(text: str) -> tuple[int, int]:

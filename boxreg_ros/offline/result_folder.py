@@ -10,13 +10,12 @@ import json
 import os
 from pathlib import Path
 import shutil
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.lock import locked
 from boxreg_ros.io.storage.urls import names_of, read_text, sizes_of, UPLOAD, upload, url_of
-from boxreg_ros.io.whole_files import DISK_ERRORS, store
+from boxreg_ros.io.whole_files import DISK_ERRORS, store, temporary_folder
 from boxreg_ros.offline.progress import advanced
 
 REFUSED_ERRORS = (
@@ -175,9 +174,9 @@ def _uploaded_folder(out: Path) -> Iterator[Path]:
         names = names_of(out)
         if names and UPLOAD not in names:
             raise _other_files(out)
-    with TemporaryDirectory() as folder:
-        yield Path(folder)
-        upload(Path(folder), out, SUMMARY, advanced)
+    with temporary_folder() as folder:
+        yield folder
+        upload(folder, out, SUMMARY, advanced)
 
 
 @contextmanager
