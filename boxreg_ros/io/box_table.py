@@ -21,6 +21,9 @@ COLUMNS = (
     'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height', 'status', 'num_points',
 )  # fmt: skip
 
+UTF_16_MARKS = (b'\xff\xfe', b'\xfe\xff')
+"""A file of UTF-16 begins so, as spreadsheets write it."""
+
 
 @dataclass(frozen=True, slots=True)
 class BoxTable:
@@ -113,12 +116,17 @@ class BoxTable:
                 if missing:
                     raise RecordingError(
                         f'{path}: not a table of boxes, columns missing: {", ".join(missing)}; '
-                        f'expected those of boxes.csv; add them, or give another file'
+                        f'{_remedy_of_columns(reader.fieldnames)}'
                     )
                 rows = [(reader.line_num, row) for row in reader]
         except OSError as error:
             raise RecordingError(unreadable(path, error)) from None
-        except (UnicodeDecodeError, csv.Error) as error:
+        except UnicodeDecodeError as error:
+            got = 'UTF-16' if error.object[:2] in UTF_16_MARKS else str(error)
+            raise RecordingError(
+                f'{path}: cannot be read as CSV: expected UTF-8, got {got}; save it as CSV UTF-8'
+            ) from None
+        except csv.Error as error:
             raise RecordingError(
                 f'{path}: cannot be read as CSV: {error}; give a table like boxes.csv'
             ) from None
@@ -194,6 +202,14 @@ class BoxTable:
                     self.stamps_ns[i], self.frame_id, self.track_ids[i], self.class_names[i],
                     *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],
                 ])  # fmt: skip
+
+
+def _remedy_of_columns(names: Sequence[str] | None) -> str:
+    """Return what to do about a table that lacks columns, from the names that it has."""
+    for mark, word in ((';', 'semicolons'), ('\t', 'tabs')):
+        if mark in ''.join(names or ()):
+            return f'its columns are separated by {word}: save it with commas between them'
+    return 'expected those of boxes.csv; add them, or give another file'
 
 
 @lru_cache(1024)

@@ -169,6 +169,8 @@ def test_table_survives_the_round_trip(tmp_path):
     [
         ('stamp_ns,x\n1,2\n', 'columns missing: frame_id'),
         ('', 'columns missing: stamp_ns'),
+        (';'.join(COLUMNS) + '\n', 'separated by semicolons: save it with commas'),
+        ('\t'.join(COLUMNS) + '\n', 'separated by tabs: save it with commas'),
         (','.join(COLUMNS) + '\n' + ','.join(['1'] * 6 + ['far'] + ['1'] * 10),
          'line 2, column y: expected a number, got far'),
         (','.join(COLUMNS) + '\n1,odom,1\n', 'line 2, column num_points: .*got nothing'),
@@ -186,7 +188,12 @@ def test_malformed_table_is_refused(tmp_path, text, message):
 
 def test_absent_or_binary_table_is_refused(tmp_path):
     (tmp_path / 'binary.csv').write_bytes(bytes(range(256)))
-    for name, reason in (('absent.csv', 'read: No such file'), ('binary.csv', 'read as CSV')):
+    (tmp_path / 'wide.csv').write_text(','.join(COLUMNS), encoding='utf-16')
+    for name, reason in (
+        ('absent.csv', 'read: No such file'),
+        ('binary.csv', 'read as CSV'),
+        ('wide.csv', 'read as CSV: expected UTF-8, got UTF-16; save it as CSV UTF-8'),
+    ):
         with pytest.raises(RecordingError, match=f'cannot be {reason}'):
             BoxTable.read(tmp_path / name)
 
