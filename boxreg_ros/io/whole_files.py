@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all, and the errors of a disk without room."""
+"""Files that appear complete or not at all, temporary ones, and errors of a full disk."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import errno
 from io import StringIO
 import os
 from pathlib import Path
+from tempfile import gettempdir, TemporaryDirectory
 from typing import TextIO
 from uuid import uuid4
 
+from boxreg_ros.errors import TransferError
 from boxreg_ros.io.storage.urls import url_of, write_text
 
 DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -32,6 +34,42 @@ def written_whole(path: Path) -> Iterator[TextIO]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder(content: str) -> Iterator[Path]:
+    """
+    Yield a folder for temporary files; an open file in it stays readable when it is deleted.
+
+    Parameters
+    ----------
+    content : str
+        What is written to it, for the error.
+
+    Raises
+    ------
+    TransferError
+        If its disk is full.
+
+    """
+    try:
+        with TemporaryDirectory() as folder:
+            yield Path(folder)
+    except OSError as error:
+        # Without a temporary folder that can be written, tempfile raises a FileNotFoundError.
+        if error.errno not in DISK_ERRORS and 'temporary directory' not in str(error):
+            raise
+        raise TransferError(
+            f'temporary files: expected room for {content} in {_temporary_place()}, got: '
+            f'{error.strerror}; free some space, or set TMPDIR to a folder on another disk'
+        ) from None
+
+
+def _temporary_place() -> str:
+    try:
+        return repr(gettempdir())
+    except OSError:
+        return "'TMPDIR'"
 
 
 def store(paths: Iterable[Path]) -> None:
