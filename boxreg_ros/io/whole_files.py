@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all, temporary ones, and errors of a full disk."""
+"""Files that appear complete or not at all, and the errors of a disk without room."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import errno
 from io import StringIO
 import os
 from pathlib import Path
-from tempfile import gettempdir, TemporaryDirectory
+import tempfile
 from typing import TextIO
 from uuid import uuid4
 
@@ -37,39 +37,28 @@ def written_whole(path: Path) -> Iterator[TextIO]:
 
 
 @contextmanager
-def temporary_folder(content: str) -> Iterator[Path]:
+def temporary_folder() -> Iterator[Path]:
     """
-    Yield a folder for temporary files; an open file in it stays readable when it is deleted.
-
-    Parameters
-    ----------
-    content : str
-        What is written to it, for the error.
+    Yield a folder on the disk of temporary files, which is deleted at the end.
 
     Raises
     ------
     TransferError
-        If its disk is full.
+        If that disk is full.
 
     """
     try:
-        with TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as folder:
             yield Path(folder)
     except OSError as error:
-        # Without a temporary folder that can be written, tempfile raises a FileNotFoundError.
+        # Where no folder has room for a file, tempfile raises a FileNotFoundError.
         if error.errno not in DISK_ERRORS and 'temporary directory' not in str(error):
             raise
+        place = tempfile.tempdir or os.environ.get('TMPDIR', '/tmp')
         raise TransferError(
-            f'temporary files: expected room for {content} in {_temporary_place()}, got: '
-            f'{error.strerror}; free some space, or set TMPDIR to a folder on another disk'
+            f'temporary files in {place}: expected room for a copy, got: {error.strerror}; free '
+            f'some space there, or set TMPDIR to a folder on another disk'
         ) from None
-
-
-def _temporary_place() -> str:
-    try:
-        return repr(gettempdir())
-    except OSError:
-        return "'TMPDIR'"
 
 
 def store(paths: Iterable[Path]) -> None:

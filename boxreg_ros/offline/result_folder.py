@@ -114,7 +114,7 @@ def _uploaded_folder(out: Path) -> Iterator[Path]:
     """Yield a folder of this machine that is uploaded to the URL `out` on success."""
     if earlier_summary(out) is None and names_of(out):
         raise _other_files(out)
-    with temporary_folder('the results') as folder:
+    with temporary_folder() as folder:
         yield folder
         upload(folder, out, SUMMARY)
 

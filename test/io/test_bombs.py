@@ -148,8 +148,8 @@ def test_a_full_disk_of_temporary_files_is_named(tmp_path, whole, monkeypatch):
     folder = tmp_path / 'drive'
     folder.mkdir()
     (folder / 'a.mcap').write_bytes(whole.read_bytes())
-    path = folder / 'b.mcap.zstd'
-    path.write_bytes(zstandard.ZstdCompressor().compress(whole.read_bytes()))
+    packed = zstandard.ZstdCompressor().compress(whole.read_bytes())
+    (folder / 'b.mcap.zstd').write_bytes(packed)
     monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
@@ -158,7 +158,22 @@ def test_a_full_disk_of_temporary_files_is_named(tmp_path, whole, monkeypatch):
             Files(part_of(folder))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert str(caught.value).startswith(
-        f'temporary files: expected room for the content of {path} in {str(tmp_path)!r}, got: '
-    )
+    assert str(caught.value).startswith(f'temporary files in {tmp_path}: expected room')
     assert 'TMPDIR' in str(caught.value)
+
+
+def test_a_file_that_cannot_be_opened_is_no_damage(tmp_path, whole):
+    """Of the second file nothing is known: the limit of open files is reached before it."""
+    folder = tmp_path / 'drive'
+    folder.mkdir()
+    for name in ('a', 'b'):
+        (folder / f'{name}.mcap').write_bytes(whole.read_bytes())
+    part = part_of(folder)
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with open('/dev/null') as newest:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (newest.fileno() + 2, limits[1]))
+        try:
+            with pytest.raises(TransferError, match='raise the limit of open files'):
+                Files(part)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)

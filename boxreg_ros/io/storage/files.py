@@ -121,7 +121,7 @@ def opened(path: Path) -> StorageFile:
         raise TransferError(unreadable(path, error)) from None
     if path.suffix not in COMPRESSED:
         return opener(path, None)
-    with temporary_folder(f'the content of {path}') as folder:
+    with temporary_folder() as folder:
         return _opened_compressed(path, folder, opener, path)
 
 
@@ -129,7 +129,7 @@ def _opened_remote(path: Path, opener: Opener) -> StorageFile:
     """Open a file behind a URL: MCAP by ranges, a copy of other formats."""
     if opener is McapFile and path.suffix not in COMPRESSED:
         return opener(path, None)
-    with temporary_folder(f'a copy of {url_of(path)}') as folder:
+    with temporary_folder() as folder:
         copy = folder / path.name
         download(path, copy)
         if path.suffix in COMPRESSED:

@@ -248,7 +248,8 @@ class McapFile(ChunkedFile):
             raise RecordingError('expected a summary of its checksum')
         found = []
         chunks = []
-        for opcode, content in _split(memoryview(summary)):
+        for opcode, begin, end in _places_in(summary):
+            content = summary[begin:end]
             if opcode == Opcode.CHUNK_INDEX:
                 chunks.append(_indexed_chunk(content))
             elif opcode in SUMMARY_RECORDS:
@@ -374,22 +375,25 @@ class McapFile(ChunkedFile):
             self._channels.setdefault(record.id, record)
 
     def _unpack(self, chunk: Chunk, stored: bytes) -> list[StoredMessage]:
-        content = _content(stored) if chunk.is_compressible else stored
+        content = memoryview(_content(stored) if chunk.is_compressible else stored)
         found = []
-        for number, (opcode, body) in enumerate(_split(memoryview(content))):
-            if number == MAX_RECORDS:
-                raise RecordingError(f'more than {MAX_RECORDS} records')
+        for opcode, begin, end in _places_in(content, MAX_RECORDS):
             if opcode == Opcode.MESSAGE:
-                channel, sequence, received_ns, published_ns = MESSAGE_HEAD.unpack_from(body)
-                data = body[MESSAGE_HEAD.size :]
+                if begin + MESSAGE_HEAD.size > end:
+                    raise RecordingError(f'a message of {end - begin} bytes')
+                channel, sequence, received_ns, published_ns = MESSAGE_HEAD.unpack_from(
+                    content, begin
+                )
+                data = content[begin + MESSAGE_HEAD.size : end]
                 found.append(StoredMessage(channel, received_ns, data, published_ns, sequence))
             elif opcode in DEFINITIONS and not self.is_indexed:
-                self._add_definition(_read(DEFINITIONS[opcode].read, body))
+                self._add_definition(_read(DEFINITIONS[opcode].read, content[begin:end]))
         return found
 
 
-def _split(content: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Yield operation code and content of the records in a summary or a chunk."""
+def _places_in(content: Bytes, limit: int | None = None) -> list[tuple[int, int, int]]:
+    """Return operation code, begin and end of the records in a summary or a chunk."""
+    places = []
     begin = 0
     while begin < len(content):
         opcode, length = RECORD_HEAD.unpack_from(content, begin)
@@ -397,8 +401,11 @@ def _split(content: memoryview) -> Iterator[tuple[int, memoryview]]:
         end = begin + length
         if not opcode or end > len(content):
             raise RecordingError(f'no record: operation code {opcode}, {length} bytes')
-        yield opcode, content[begin:end]
+        if len(places) == limit:
+            raise RecordingError(f'more than {limit} records')
+        places.append((opcode, begin, end))
         begin = end
+    return places
 
 
 def _read(read: Callable[[ReadDataStream], Any], content: Bytes) -> Any:
@@ -406,7 +413,7 @@ def _read(read: Callable[[ReadDataStream], Any], content: Bytes) -> Any:
     return read(ReadDataStream(BytesIO(content)))
 
 
-def _indexed_chunk(content: memoryview) -> Chunk:
+def _indexed_chunk(content: bytes) -> Chunk:
     """Return the chunk of a chunk index; without counts if its messages have no index."""
     start_ns, last_ns, first_byte, length, offsets_size = INDEX_HEAD.unpack_from(content)
     offsets = content[INDEX_HEAD.size : INDEX_HEAD.size + offsets_size]

@@ -290,7 +290,7 @@ def _opened(path: Path, name: str) -> sqlite3.Connection:
     """Open a database that is not changed; one with a write-ahead log as a merged copy."""
     log = path.with_name(path.name + WAL_SUFFIX)
     if log.exists() and log.stat().st_size:
-        with temporary_folder(f'a copy of {name}') as folder:
+        with temporary_folder() as folder:
             copy = folder / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(log, copy.with_name(log.name))
