@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Sequence
 import csv
 from dataclasses import dataclass
@@ -20,9 +21,9 @@ COLUMNS = (
     'stamp_ns', 'frame_id', 'track_id', 'class_name', 'score', 'x', 'y', 'z',
     'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height', 'status', 'num_points',
 )  # fmt: skip
-
-UTF_16_MARKS = (b'\xff\xfe', b'\xfe\xff')
-"""A file of UTF-16 begins so, as spreadsheets write it."""
+UTF_16_MARKS = BOM_UTF16_LE, BOM_UTF16_BE
+EXPORTS = {'\0': 'UTF-16', ';': 'semicolons', '\t': 'tabs'}
+"""What a header has that a spreadsheet has exported in another form, and the name of the form."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,21 +113,22 @@ class BoxTable:
         try:
             with open(path, newline='', encoding='utf-8-sig') as file:  # spreadsheets add a BOM
                 reader = csv.DictReader(file)
-                missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+                names = reader.fieldnames or ()
+                missing = [name for name in COLUMNS if name not in names]
                 if missing:
+                    for mark, found in EXPORTS.items():
+                        if mark in ''.join(names):
+                            raise _exported(path, found)
                     raise RecordingError(
                         f'{path}: not a table of boxes, columns missing: {", ".join(missing)}; '
-                        f'{_remedy_of_columns(reader.fieldnames)}'
+                        f'expected those of boxes.csv; add them, or give another file'
                     )
                 rows = [(reader.line_num, row) for row in reader]
         except OSError as error:
             raise RecordingError(unreadable(path, error)) from None
-        except UnicodeDecodeError as error:
-            got = 'UTF-16' if error.object[:2] in UTF_16_MARKS else str(error)
-            raise RecordingError(
-                f'{path}: cannot be read as CSV: expected UTF-8, got {got}; save it as CSV UTF-8'
-            ) from None
-        except csv.Error as error:
+        except (UnicodeDecodeError, csv.Error) as error:
+            if isinstance(error, UnicodeDecodeError) and error.object.startswith(UTF_16_MARKS):
+                raise _exported(path, 'UTF-16') from None
             raise RecordingError(
                 f'{path}: cannot be read as CSV: {error}; give a table like boxes.csv'
             ) from None
@@ -204,12 +206,12 @@ class BoxTable:
                 ])  # fmt: skip
 
 
-def _remedy_of_columns(names: Sequence[str] | None) -> str:
-    """Return what to do about a table that lacks columns, from the names that it has."""
-    for mark, word in ((';', 'semicolons'), ('\t', 'tabs')):
-        if mark in ''.join(names or ()):
-            return f'its columns are separated by {word}: save it with commas between them'
-    return 'expected those of boxes.csv; add them, or give another file'
+def _exported(path: str | Path, found: str) -> RecordingError:
+    """Return the error of a table that a spreadsheet has exported in another form."""
+    return RecordingError(
+        f'{path}: expected a table in UTF-8 with commas, got {found}, as spreadsheets export it; '
+        f'save it as "CSV UTF-8 (comma delimited)", with points in the numbers'
+    )
 
 
 @lru_cache(1024)
