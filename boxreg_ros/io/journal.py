@@ -16,7 +16,7 @@ from itertools import count
 from pathlib import Path
 import pickle
 import sqlite3
-from typing import Any, Protocol
+from typing import Any
 import zlib
 
 from boxreg_ros.errors import RecordingError
@@ -38,32 +38,11 @@ SETUP = (
     'CREATE TABLE IF NOT EXISTS record '
     '(number INTEGER PRIMARY KEY, crc INTEGER NOT NULL, content BLOB NOT NULL)',
 )
-LOG_SUFFIX = '-wal'
-"""Of the file that SQLite writes beside the journal."""
 
 
-class Journal(Protocol):
-    """Objects in the order in which they were added; the caller keeps other processes out."""
-
-    def records(self) -> Iterator[Any]:
-        """Yield all objects, up to the first that is missing or damaged."""
-
-    def cut(self, kept: int) -> int:
-        """Delete all but the first `kept` objects; return how many are left."""
-
-    def append(self, item: Any) -> None:
-        """Add an object behind all others."""
-
-    def delete(self) -> None:
-        """Delete the journal and close it."""
-
-    def close(self) -> None:
-        """Close the journal."""
-
-
-class FileJournal:
+class Journal:
     """
-    A journal in a file of this machine; see `Journal`.
+    A journal in a file of this machine; the caller keeps other processes out.
 
     Parameters
     ----------
@@ -81,38 +60,28 @@ class FileJournal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._log = path.with_name(path.name + LOG_SUFFIX)
+        self._log = path.with_name(f'{path.name}-wal')  # the name that SQLite gives it
+        self._count = 0
         self._open()
-
-    def _open(self) -> None:
-        # Autocommit; the recorder closes its segments in a second thread.
-        self._database = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
-        try:
-            for statement in SETUP:
-                self._database.execute(statement)
-            (self._count,) = self._database.execute('SELECT count(*) FROM record').fetchone()
-        except sqlite3.OperationalError as error:
-            self.close()
-            raise self._system_error(error, b'') from None
-        except sqlite3.DatabaseError as error:
-            self.close()
-            raise RecordingError(
-                f'{self.path}: expected a journal of boxreg, got another file: {error}; delete it '
-                f'to begin again'
-            ) from None
 
     def records(self) -> Iterator[Any]:
         """Yield all objects, up to the first that is missing or damaged."""
         for number in count():
+            content = self._content(number)
+            if content is None:
+                return
             try:
-                crc, content = self._database.execute(
-                    'SELECT crc, content FROM record WHERE number = ?', (number,)
-                ).fetchone() or (0, None)
-            except sqlite3.DatabaseError:
-                return
-            if not isinstance(content, bytes) or zlib.crc32(content) != crc:
-                return
-            yield _loaded(content, self.path)
+                yield _TrustedUnpickler(BytesIO(content)).load()
+            except Exception as error:  # of another version, or not ours: of any class
+                raise RecordingError(
+                    f'{self.path}: expected arrays and estimates of this version, got {error}; '
+                    f'delete it to begin again'
+                ) from None
+
+    def append(self, item: Any) -> None:
+        """Add an object behind all others; it survives the end of this process."""
+        self._add(pickle.dumps(item, pickle.HIGHEST_PROTOCOL))
+        self._count += 1
 
     def cut(self, kept: int) -> int:
         """Delete all but the first `kept` objects; return how many are left."""
@@ -122,22 +91,11 @@ class FileJournal:
         except sqlite3.DatabaseError as error:
             answer = str(error)
         if answer != 'ok':  # nothing can be added to a damaged file
+            kept = 0
             self.delete()
             self._open()
-            return 0
         self._count = kept
         return kept
-
-    def append(self, item: Any) -> None:
-        """Add an object behind all others; it survives the end of this process."""
-        content = pickle.dumps(item, pickle.HIGHEST_PROTOCOL)
-        try:
-            self._database.execute(
-                'INSERT INTO record VALUES (?, ?, ?)', (self._count, zlib.crc32(content), content)
-            )
-        except sqlite3.OperationalError as error:
-            raise self._system_error(error, content) from None
-        self._count += 1
 
     def sync(self) -> None:
         """Wait until all objects are on the disk itself, where they survive a power cut."""
@@ -150,56 +108,74 @@ class FileJournal:
 
     def delete(self) -> None:
         """Delete the journal and close it."""
-        self.path.unlink(missing_ok=True)  # first: SQLite then does not tidy up the file
-        self._log.unlink(missing_ok=True)
+        self._unlink()  # first: SQLite then does not tidy up the file
         self.close()
 
     def close(self) -> None:
         """Close the journal."""
         self._database.close()
 
+    def _open(self) -> None:
+        # Autocommit; the recorder closes its segments in a second thread.
+        self._database = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
+        try:
+            for statement in SETUP:
+                self._database.execute(statement)
+        except sqlite3.DatabaseError as error:
+            self.close()
+            if isinstance(error, sqlite3.OperationalError):
+                raise self._system_error(error, b'') from None
+            raise RecordingError(
+                f'{self.path}: expected a journal of boxreg, got another file: {error}; delete it '
+                f'to begin again'
+            ) from None
+
+    def _content(self, number: int) -> bytes | None:
+        """Return an object as bytes; None if it is missing or damaged."""
+        try:
+            crc, content = self._database.execute(
+                'SELECT crc, content FROM record WHERE number = ?', (number,)
+            ).fetchone() or (0, None)
+        except sqlite3.DatabaseError:
+            return None
+        is_whole = isinstance(content, bytes) and zlib.crc32(content) == crc
+        return content if is_whole else None
+
+    def _add(self, content: bytes) -> None:
+        row = self._count, zlib.crc32(content), content
+        try:
+            self._database.execute('INSERT INTO record VALUES (?, ?, ?)', row)
+        except sqlite3.OperationalError as error:
+            raise self._system_error(error, content) from None
+
     def _system_error(self, error: sqlite3.Error, content: bytes) -> OSError:
         """Return the error of the system behind one of SQLite: the same write has it again."""
         try:
-            if self._log.exists():
-                with self._log.open('ab') as file:  # ignored there: it has no checksum
-                    file.write(content)
-            else:
-                self.path.open('r+b').close()
+            with (self._log if self._log.exists() else self.path).open('ab') as file:
+                file.write(content)  # ignored there: it has no checksum
         except OSError as reason:
             return reason
         return OSError(errno.EIO, str(error), str(self.path))
 
+    def _unlink(self) -> None:
+        self.path.unlink(missing_ok=True)
+        self._log.unlink(missing_ok=True)
 
-class ObjectJournal:
+
+class ObjectJournal(Journal):
     """
-    A journal in a folder behind a URL, one file per object; see `Journal`.
+    A journal in a folder behind a URL, one file per object.
 
     Object stores have no locks: a second run with the same output is not noticed. It adds the
     same objects, because the registrar is deterministic.
 
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._count = len(names_of(path))
-
-    def records(self) -> Iterator[Any]:
-        """Yield all objects."""
-        for number in range(self._count):
-            yield _loaded(read_bytes(self.path / _name(number)), self.path)
-
     def cut(self, kept: int) -> int:
         """Delete all but the first `kept` objects; return how many are left."""
-        if kept < self._count:
-            delete_files(self.path, [_name(number) for number in range(kept, self._count)])
+        delete_files(self.path, [_name(number) for number in range(kept, self._count)])
         self._count = kept
         return kept
-
-    def append(self, item: Any) -> None:
-        """Write the file of an object; it appears whole."""
-        write_bytes(self.path / _name(self._count), pickle.dumps(item, pickle.HIGHEST_PROTOCOL))
-        self._count += 1
 
     def delete(self) -> None:
         """Delete all files of the folder, which is gone then."""
@@ -208,22 +184,25 @@ class ObjectJournal:
     def close(self) -> None:
         """Do nothing: nothing is open."""
 
+    def _open(self) -> None:
+        self._count = len(names_of(self.path))
+
+    def _content(self, number: int) -> bytes | None:
+        return read_bytes(self.path / _name(number)) if number < self._count else None
+
+    def _add(self, content: bytes) -> None:
+        write_bytes(self.path / _name(self._count), content)
+
 
 def opened_journal(path: Path) -> Journal:
     """Return the journal at a path or URL; one that cannot be read is begun again."""
     if url_of(path) is not None:
         return ObjectJournal(path)
     try:
-        return FileJournal(path)
+        return Journal(path)
     except RecordingError:
-        delete_journal(path)
-        return FileJournal(path)
-
-
-def delete_journal(path: Path) -> None:
-    """Delete the files of a journal of this machine."""
-    for file in (path, path.with_name(path.name + LOG_SUFFIX)):
-        file.unlink(missing_ok=True)
+        path.unlink()
+        return Journal(path)  # SQLite deletes the log of another file
 
 
 class _TrustedUnpickler(pickle.Unpickler):
@@ -234,17 +213,6 @@ class _TrustedUnpickler(pickle.Unpickler):
         if module.split('.')[0] in TRUSTED_PACKAGES and name in TRUSTED_NAMES:
             return super().find_class(module, name)
         raise pickle.UnpicklingError(f'{module}.{name}')
-
-
-def _loaded(content: bytes, path: Path) -> Any:
-    """Return the object of a whole record."""
-    try:
-        return _TrustedUnpickler(BytesIO(content)).load()
-    except Exception as error:  # of another version, or no journal of ours: of any class
-        raise RecordingError(
-            f'{path}: expected arrays and estimates of this version, got {error}; delete it to '
-            f'begin again'
-        ) from None
 
 
 def _name(number: int) -> str:

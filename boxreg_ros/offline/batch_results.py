@@ -1,27 +1,38 @@
-"""The results over all drives of `boxreg batch`: index, summary and report, of shards or all."""
+"""The results over all drives of `boxreg batch`: index, summary and page, of shards or all."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import csv
 from dataclasses import dataclass, fields
+from html import escape
 from io import StringIO
 import json
 from pathlib import Path
 import re
 from typing import Any
+from urllib.parse import quote
 
 from boxreg_ros import __version__
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.urls import names_of, read_text, url_of
 from boxreg_ros.io.whole_files import written_whole
-from boxreg_ros.offline.batch_report import write_batch_report
 from boxreg_ros.offline.result_folder import SUMMARY
 
 FAILED = 'failed'
 DONE = 'done'
 UP_TO_DATE = 'up to date'
 COUNTS = ('sweeps', 'boxes_in', 'refined', 'kept', 'damages')
+REVIEW = 'review.csv'
+RISK = 'risk_m'
+MAX_LISTED_TRACKS = 100
+"""Tracks in the report; a page of more is not read."""
+UNLISTED = ('key', 'exit_status')
+"""Columns of the index that the report leaves out."""
+PAGE_STYLE = (
+    'body{font-family:sans-serif;margin:2em}table{border-collapse:collapse}'
+    'td,th{border:1px solid #ccc;padding:.2em .5em;text-align:left}.failed{background:#fdd}'
+)
 SHARD_INDEX = re.compile(r'index\.(\d+)-of-(\d+)\.csv')
 
 
@@ -116,7 +127,7 @@ def write_results(out: Path, rows: Sequence[dict[str, Any]], shard: str = '') ->
     with written_whole(out / f'{stem}{shard}.{suffix}') as file:
         file.write(json.dumps(merged, indent=2) + '\n')
     with written_whole(out / f'report{shard}.html') as file:
-        write_batch_report(file, out, rows)
+        file.write(_page(rows, _riskiest(out, [row['drive'] for row in rows])))
 
 
 def rows_of_shards(out: Path) -> list[dict[str, Any]]:
@@ -155,3 +166,45 @@ def rows_of_shards(out: Path) -> list[dict[str, Any]]:
 
 def _listed(numbers: Iterable[int]) -> str:
     return ', '.join(map(str, sorted(numbers))) or 'none'
+
+
+def _riskiest(out: Path, drives: Iterable[str]) -> list[dict[str, Any]]:
+    """Return the rows of all reviews with the largest risk, those first."""
+    found: list[tuple[float, dict[str, Any]]] = []
+    for drive in drives:
+        try:
+            text = read_text(out / drive / REVIEW)
+        except OSError:  # the drive has failed
+            continue
+        for row in csv.DictReader(text.splitlines()):
+            try:
+                found.append((float(row[RISK]), {'drive': drive, **row}))
+            except (KeyError, TypeError, ValueError):
+                continue  # a review without this column has no order
+    found.sort(key=lambda item: -item[0])
+    return [row for _, row in found[:MAX_LISTED_TRACKS]]
+
+
+def _page(drives: Sequence[dict[str, Any]], tracks: Sequence[dict[str, Any]]) -> str:
+    """Return the report: the tracks to look at first, then all drives."""
+    shown = [{name: row[name] for name in row if name not in UNLISTED} for row in drives]
+    first = f'<h2>Tracks to look at first</h2>{_table(tracks)}' if tracks else ''
+    return (
+        f'<!doctype html><meta charset="utf-8"><title>boxreg</title><style>{PAGE_STYLE}</style>'
+        f'<h1>{len(drives):,} drives</h1>{first}<h2>Drives</h2>{_table(shown)}'
+    )
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return rows as a table of HTML; those of drives that have failed are coloured."""
+    names = list(rows[0]) if rows else []
+    lines = [''.join(f'<th>{escape(str(name))}' for name in names)]
+    lines += [''.join(f'<td>{_cell(name, row.get(name))}' for name in names) for row in rows]
+    kinds = ['', *(row.get('status') for row in rows)]
+    body = ''.join(f'<tr class="{k}">{line}' for k, line in zip(kinds, lines, strict=True))
+    return f'<table>{body}</table>'
+
+
+def _cell(name: str, value: Any) -> str:
+    text = escape('' if value is None else str(value))
+    return f'<a href="{quote(str(value))}/">{text}</a>' if name == 'drive' else text

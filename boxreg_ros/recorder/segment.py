@@ -10,7 +10,7 @@ import re
 import shutil
 
 from boxreg_ros.config import Config
-from boxreg_ros.io.journal import FileJournal
+from boxreg_ros.io.journal import Journal
 from boxreg_ros.io.label_feed import RecorderSettings
 from boxreg_ros.io.whole_files import store
 from boxreg_ros.labels import LabelFrame, LabelOutput, Options, Provenance
@@ -138,7 +138,7 @@ class Segment:
         self._open.mkdir()
         self.files = SegmentFiles(self._open, target, settings)
         # Last: a folder without a journal was never in use.
-        self._journal = FileJournal(self._open / JOURNAL)
+        self._journal = Journal(self._open / JOURNAL)
         self._journal.append(dict(settings))
 
     def write(self, frame: LabelFrame) -> None:
@@ -230,7 +230,7 @@ def recover(opened: Path) -> int:
 
 def _rebuild(opened: Path, target: Path) -> int:
     """Write the frames of a journal as a segment; return their number."""
-    journal = FileJournal(opened / JOURNAL)
+    journal = Journal(opened / JOURNAL)
     try:
         records = journal.records()
         settings = next(records, None)

@@ -8,7 +8,7 @@ import sys
 import zlib
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.journal import FileJournal, opened_journal
+from boxreg_ros.io.journal import Journal, opened_journal
 from boxreg_ros.io.lock import locked
 import pytest
 
@@ -20,7 +20,7 @@ ITEMS = [f'{i}' * 40 * i for i in range(12)]
 def journal(request, tmp_path):
     """Return the files of a journal of `ITEMS`: of a process that was killed, or has ended."""
     path = tmp_path / 'journal'
-    journal = FileJournal(path)
+    journal = Journal(path)
     for item in ITEMS:
         journal.append(item)
     if request.param == 'closed':
@@ -63,7 +63,7 @@ def test_every_cut_and_zero_pages_leave_the_whole_objects(journal):
 
 def test_any_other_byte_ends_the_journal_and_nothing_else_is_unpickled(tmp_path):
     path = tmp_path / 'journal'
-    journal = FileJournal(path)
+    journal = Journal(path)
     for item in ITEMS:
         journal.append(item)
     content = pickle.dumps(print)

@@ -14,7 +14,9 @@ import sys
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.journal import FileJournal
+from boxreg_ros.io.journal import Journal
+from boxreg_ros.offline.job import jobs_of
+from boxreg_ros.offline.job_process import JobRunner
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import claimed, whole_folder, whole_summary
@@ -62,7 +64,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
     tmp_path, request_of_drive, uninterrupted, monkeypatch
 ):
     out = tmp_path / 'out'
-    append = FileJournal.append
+    append = Journal.append
     solved = []
 
     def append_until(limit):
@@ -76,7 +78,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
 
     for limit in (3, 2, 1):  # the first record has the fingerprint
         solved.clear()
-        monkeypatch.setattr(FileJournal, 'append', append_until(limit))
+        monkeypatch.setattr(Journal, 'append', append_until(limit))
         with pytest.raises(Interruption):
             relabel(request_of_drive, out, resume=True)
         assert [path.name for path in tmp_path.iterdir()] == ['.out.journal']
@@ -85,7 +87,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(
     os.truncate(journal, journal.stat().st_size // 2)
     (tmp_path / '.out.partial').mkdir()
     solved.clear()
-    monkeypatch.setattr(FileJournal, 'append', append_until(0))
+    monkeypatch.setattr(Journal, 'append', append_until(0))
     relabel(request_of_drive, out, resume=True)
     assert content_of(out) == uninterrupted
     assert solved
@@ -137,7 +139,7 @@ def test_other_estimates_and_both_passes_are_resumed(tmp_path, options, monkeypa
         with pytest.raises(Interruption):
             relabel(request, out, resume=True)
     appended = []
-    monkeypatch.setattr(FileJournal, 'append', lambda _, content: appended.append(content))
+    monkeypatch.setattr(Journal, 'append', lambda _, content: appended.append(content))
     relabel(request, out, resume=True)
     assert content_of(out) == content_of(tmp_path / 'whole')
     assert not appended
@@ -185,6 +187,41 @@ def test_a_result_is_judged_by_its_content_and_not_by_its_times(tmp_path):
         assert (out / 'boxes.csv').read_text() == boxes
     relabel(request, out)
     assert not [path.name for path in tmp_path.iterdir() if path.name.startswith('.')]
+
+
+def test_a_result_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    """After a power cut the folder is whole or not there: all of it is synced, then renamed."""
+    events = []
+
+    def noted(name, call, place):
+        def note(*arguments):
+            result = call(*arguments)
+            events.append((name, place(*arguments)))
+            return result
+
+        return note
+
+    def place_of(descriptor, *_):
+        return Path(f'/proc/self/fd/{descriptor}').resolve()
+
+    monkeypatch.setattr('os.fsync', noted('sync', os.fsync, place_of))
+    monkeypatch.setattr('os.replace', noted('rename', os.replace, lambda _, new: Path(new)))
+    recording = Drive(sweeps=6).write(tmp_path / 'drive')
+    out = tmp_path / 'results' / 'one'
+    (job,) = jobs_of([recording])
+    config = [f'--set={name}={value}' for name, value in SETTINGS.items()]
+    relabel(Request((recording,), formats=('csv', 'openlabel'), config=Config(**SETTINGS)), out)
+    renamed = events.index(('rename', out))
+    synced = {path for name, path in events[:renamed] if name == 'sync'}
+    partial = out.with_name('.one.partial')
+    assert synced >= {partial, *(partial / path.relative_to(out) for path in out.rglob('*'))}
+    assert ('sync', out.parent) in events[renamed:]
+    # Likewise the key that says that a drive is done.
+    state = out.parent / 'jobs' / 'drive.json'
+    assert JobRunner(out.parent, tuple(config), '')(job).is_done
+    renamed = events.index(('rename', state))
+    assert events[renamed - 1][1].name.startswith('.drive.json.')
+    assert events[renamed + 1] == ('sync', state.parent)
 
 
 def test_file_size_limit_is_an_error_and_leaves_nothing(tmp_path, request_of_drive):

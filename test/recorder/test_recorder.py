@@ -15,7 +15,7 @@ import time
 from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.journal import FileJournal
+from boxreg_ros.io.journal import Journal
 from boxreg_ros.io.label_feed import (
     FinalBoxes,
     LabelCloud,
@@ -99,7 +99,7 @@ def test_a_frame_in_the_journal_is_what_was_written(tmp_path):
         final.refined, 'odom', 'lidar', T_FIXED_SENSOR, sweep, np.arange(4.0), np.eye(4)
     )
     without = LabelFrame(final_boxes(4, tracks=0).refined, 'odom', 'lidar')
-    journal = FileJournal(tmp_path / 'journal')
+    journal = Journal(tmp_path / 'journal')
     for frame in (with_cloud, without):
         journal.append(frame)
     for back, frame in zip(journal.records(), (with_cloud, without), strict=True):
