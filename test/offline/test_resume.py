@@ -135,7 +135,7 @@ def test_other_estimates_and_both_passes_are_resumed(tmp_path, options, monkeypa
         raise Interruption
 
     with monkeypatch.context() as patched:
-        patched.setattr('boxreg_ros.offline.relabel._write_tables', fail)
+        patched.setattr('boxreg_ros.offline.relabel.write_track_tables', fail)
         with pytest.raises(Interruption):
             relabel(request, out, resume=True)
     appended = []
