@@ -7,6 +7,7 @@ import sqlite3
 import struct
 import subprocess
 import sys
+import time
 
 from boxreg_ros.errors import TransferError
 from boxreg_ros.io.storage.files import Files, opened, part_of
@@ -177,3 +178,18 @@ def test_a_file_that_cannot_be_opened_is_no_damage(tmp_path, whole):
                 Files(part)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_many_damages_take_time_in_proportion(tmp_path):
+    count = 30_000
+    path = database(
+        tmp_path / 'drive',
+        'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data);'
+        f'WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < {count}) '
+        'INSERT INTO messages SELECT i, (SELECT min(id) FROM topics), i, NULL FROM n',
+    )
+    begin = time.process_time()
+    with closing(opened(path)) as file:
+        assert not list(file.messages(file.connections, None, None))
+        assert len(file.damages) == count
+    assert time.process_time() - begin < 5  # comparing each with all takes minutes

@@ -72,6 +72,10 @@ class Damage(NamedTuple):
         return f'{self.file}: {", ".join(parts)}'
 
 
+Damages = dict[Damage, None]
+"""In the order in which they were found; each once, however often the part was read."""
+
+
 class StorageFile(Protocol):
     """
     One open file of a recording, or several that belong together.
@@ -82,7 +86,7 @@ class StorageFile(Protocol):
         Topics with types and numbers of messages.
     start_time, end_time : int
         Receive times of the first message and behind the last [ns].
-    damages : list of Damage
+    damages : Damages
         Known so far: some are found while messages are read.
 
     """
@@ -90,7 +94,7 @@ class StorageFile(Protocol):
     connections: list[Connection]
     start_time: int
     end_time: int
-    damages: list[Damage]
+    damages: Damages
 
     def messages(
         self, connections: Collection[Connection], start: int | None, stop: int | None
@@ -110,12 +114,6 @@ class Definition(NamedTuple):
     schema: tuple[str, str, bytes] | None
     encoding: str
     metadata: tuple[tuple[str, str], ...]
-
-
-def note(damages: list[Damage], damage: Damage) -> None:
-    """Add a damage once: a part of a file may be read several times."""
-    if damage not in damages:
-        damages.append(damage)
 
 
 def span_ns(spans: Collection[tuple[int, int]]) -> tuple[int, int]:
