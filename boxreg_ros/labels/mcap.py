@@ -20,14 +20,14 @@ from functools import partial
 from heapq import merge
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.io.markers import MarkerBoard
 from boxreg_ros.io.session import covariances_to_write
 from boxreg_ros.io.storage.files import opened
 from boxreg_ros.io.storage.mcap import McapFile
-from boxreg_ros.io.storage.record import Bytes, Definition
+from boxreg_ros.io.storage.record import Definition
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.structures import ADDED, BoxArray, RefinedBoxes
@@ -87,7 +87,7 @@ class RawMessage(NamedTuple):
     log_time: int
     publish_time: int
     sequence: int
-    data: Bytes
+    data: bytes
 
 
 class Writer:
@@ -235,9 +235,8 @@ class Writer:
             self._channels[key] = self._writer.register_channel(
                 raw.topic, raw.encoding, schema_id, dict(raw.metadata)
             )
-        data = cast(bytes, raw.data)  # the writer takes views, too
         self._writer.add_message(
-            self._channels[key], raw.log_time, data, raw.publish_time, raw.sequence
+            self._channels[key], raw.log_time, raw.data, raw.publish_time, raw.sequence
         )
 
     def _schema_id(self, schema: tuple[str, str, bytes] | None) -> int:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from boxreg_ros.io.storage.record import (
-    Bytes,
     Damage,
     Damages,
     one_line,
@@ -83,7 +82,7 @@ class StoredMessage(NamedTuple):
 
     connection_id: int
     received_ns: int
-    data: Bytes
+    data: bytes | memoryview
     published_ns: int
     sequence: int
 
@@ -129,15 +128,14 @@ class ChunkedFile(ABC):
 
         def load(chunk: Chunk) -> list[Record]:
             read_ahead(chunk)
-            records = [
+            return [
                 Record(
-                    wanted[message.connection_id], message.received_ns, message.data,
+                    wanted[message.connection_id], message.received_ns, bytes(message.data),
                     message.published_ns, message.sequence,
                 )
                 for message in self._messages_of(chunk)
                 if message.connection_id in wanted and _is_within(message.received_ns, start, stop)
             ]  # fmt: skip
-            return _without_chunk(records)
 
         chunks = [
             chunk
@@ -276,14 +274,6 @@ def _merged(
             heappush(waiting, (held[i][positions[i]].received_ns, i))
         else:
             del held[i], sizes[i]
-
-
-def _without_chunk(records: list[Record]) -> list[Record]:
-    """Return messages whose memory is theirs: as copies, where views would hold much beside."""
-    views = [record.data for record in records if isinstance(record.data, memoryview)]
-    if not views or 2 * sum(map(len, views)) > views[0].obj.__sizeof__():
-        return records
-    return [record._replace(data=bytes(record.data)) for record in records]
 
 
 def _is_within(time_ns: int, start: int | None, stop: int | None) -> bool:

@@ -1,10 +1,9 @@
 """
 MCAP files: read by their index, or scanned record by record where the index is missing or damaged.
 
-Definitions, attachments and metadata are parsed by the mcap library. Its readers stop at the first
-error, unpack what a chunk holds and not what it claims, and copy a message three times. Here a
-damaged chunk is left out and noted, after a damaged record the next plausible chunk is searched
-for, and messages are views of their chunk.
+The mcap library parses the summary, definitions, attachments and metadata. Its readers stop at the
+first error, and unpack what a chunk holds and not what it claims. Here a damaged chunk is left out
+and noted, and after a damaged record the next plausible chunk is searched for.
 
 """
 
@@ -28,7 +27,7 @@ from boxreg_ros.io.storage.chunks import (
     MAX_RECORDS,
     StoredMessage,
 )
-from boxreg_ros.io.storage.record import Bytes, Definition, one_line
+from boxreg_ros.io.storage.record import Definition, one_line
 from lz4.frame import LZ4FrameDecompressor
 from mcap import records
 from mcap.data_stream import ReadDataStream
@@ -386,7 +385,7 @@ def _places_in(content: memoryview) -> list[tuple[int, int, int]]:
     return places
 
 
-def _read(read: Callable[[ReadDataStream], Any], content: Bytes) -> Any:
+def _read(read: Callable[[ReadDataStream], Any], content: bytes | memoryview) -> Any:
     """Return a record that the library parses."""
     return read(ReadDataStream(BytesIO(content)))
 
@@ -418,10 +417,10 @@ def _chunk_head(record: bytes, size: int) -> _ChunkHead:
     return _ChunkHead(start_ns, last_ns, content_size, checksum, compression, begin, stored)
 
 
-def _content(record: bytes) -> Bytes:
+def _content(record: bytes) -> bytes | memoryview:
     """Return the content of a chunk; RecordingError if it is not what the chunk claims."""
     head = _chunk_head(record, len(record))
-    content: Bytes = memoryview(record)[head.begin : head.begin + head.stored]
+    content: bytes | memoryview = memoryview(record)[head.begin : head.begin + head.stored]
     # Not a byte more than claimed is unpacked: a few bytes may be compressed from any number.
     if head.compression == 'zstd':
         claimed = zstandard.frame_content_size(content)

@@ -8,8 +8,6 @@ from typing import NamedTuple, Protocol
 
 from rosbags.interfaces import Connection
 
-Bytes = bytes | memoryview
-"""An encoded message; a view keeps the chunk that it is a part of."""
 NO_MESSAGES_NS = (2**63 - 1, 0)
 """Begin and end of a file without messages, as in rosbags [ns]."""
 
@@ -24,7 +22,7 @@ class Record(NamedTuple):
         Topic and type; its `owner` is the file.
     received_ns : int
         When it was received [ns].
-    data : bytes or memoryview
+    data : bytes
         Encoded message.
     published_ns, sequence : int
         Of MCAP files; equal to `received_ns`, and 0, for other files.
@@ -33,7 +31,7 @@ class Record(NamedTuple):
 
     connection: Connection
     received_ns: int
-    data: Bytes
+    data: bytes
     published_ns: int = 0
     sequence: int = 0
 
