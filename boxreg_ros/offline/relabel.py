@@ -133,6 +133,10 @@ def relabel(
             with clock('write'):
                 rows = _write_tables(folder, tracks, plan)
                 summary['rules'], violated = _checked(tracks, request.config)
+            if request.needs_point_labels:
+                with clock('points'):
+                    summary['points'] = _label_points(folder, request, tracks, sink, registrar)
+                summary['seconds'] = clock.seconds()
             if sink.points is not None:
                 sink.points.settle(registrar.box_time.resolved(request.config))
                 _report(folder, out, request, summary, rows, violated, sink.points, clock)
@@ -280,6 +284,21 @@ def _checked(
         after.append(LabelTrack.of(*names, track.boxes, track.num_points))
     found = violations(after)
     return {'before': counts(violations(before)), 'after': counts(found)}, found
+
+
+def _label_points(
+    folder: Path,
+    request: Request,
+    tracks: Sequence[TrackChanges],
+    sink: Sink,
+    registrar: BoxRegistrar,
+) -> dict[str, Any]:
+    """Label the points of the recording by the boxes of its tracks; return their numbers."""
+    from boxreg_ros.offline.point_products import Boxes, write_point_products
+
+    config = registrar.box_time.resolved(request.config)
+    boxes = Boxes(tracks, sink.array_stamps_ns, config, registrar.margins())
+    return write_point_products(folder, request, boxes)
 
 
 def _report(
