@@ -57,9 +57,9 @@ def nuscenes(folder, version):
 
 def lidarseg(folder, version):
     """Return the points of each category of each sample, and of each panoptic instance."""
+    import numpy as np
     from nuscenes.nuscenes import NuScenes
     from nuscenes.utils.data_io import load_bin_file, panoptic_to_lidarseg
-    import numpy as np
 
     data = NuScenes(version, folder, verbose=False)
     names = data.lidarseg_idx2name_mapping
@@ -74,8 +74,8 @@ def lidarseg(folder, version):
         (found, number), (instances, points) = counts
         samples.append({
             'timestamp': sweep['timestamp'],
-            'categories': {names[i]: n for i, n in zip(found.tolist(), number.tolist())},
-            'instances': dict(zip(instances.tolist(), points.tolist())),
+            'categories': dict(zip(map(names.get, found.tolist()), number.tolist(), strict=True)),
+            'instances': dict(zip(instances.tolist(), points.tolist(), strict=True)),
             'size': Path(folder, sweep['filename']).stat().st_size,
         })  # fmt: skip
     return samples

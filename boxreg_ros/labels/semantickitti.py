@@ -101,10 +101,9 @@ def numbers_of(points: PointLabels) -> tuple[Ints, Ints]:
     `MAX_INSTANCE`.
 
     """
-    moves = points.moves.astype(int)
     of_tracks = [
-        class_of(track.class_name)[moving]
-        for track, moving in zip(points.tracks, moves, strict=True)
+        class_of(track.class_name, bool(moves))
+        for track, moves in zip(points.tracks, points.moves, strict=True)
     ]
     # The last two entries are those of the track numbers -2 and -1.
     assert (UNKNOWN, BACKGROUND) == (-2, -1)
@@ -114,10 +113,10 @@ def numbers_of(points: PointLabels) -> tuple[Ints, Ints]:
     return classes[points.track], instances[points.track]
 
 
-def class_of(class_name: str) -> tuple[int, int]:
-    """Return the classes of objects of this name that never move, and that do."""
+def class_of(class_name: str, moves: bool) -> int:
+    """Return the class of objects of this name, that move at some time or never."""
     words = words_of(class_name)
     for names, still, moving in CLASSES:
         if not words.isdisjoint(names):
-            return still, moving
-    return OTHER_VEHICLE
+            return moving if moves else still
+    return OTHER_VEHICLE[moves]

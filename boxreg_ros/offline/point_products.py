@@ -175,14 +175,15 @@ class _Products:
             self._counts['sweeps_without_transform'] += 1
             return
         labels = labeller.label(sweep)
-        self._count(labels, labeller.knows(sweep.stamp_ns))
+        is_known = labeller.knows(sweep.stamp_ns)
+        self._count(labels, is_known)
         self._write_formats(item, items, sensor_frame, labeller, labels)
         if self._maps:
-            self._accumulate(sweep, labels, labeller.knows(sweep.stamp_ns))
+            self._accumulate(sweep, labels, is_known)
         if 'object' in self._request.clouds:
             self._collect_objects(labels)
         if self._copies:
-            self._store(item, items, sweep, labels)
+            self._store(item, items, sweep, labels, is_known)
 
     def close(self) -> None:
         """Complete the files, and copy the recording."""
@@ -270,9 +271,19 @@ class _Products:
             cloud.add(labels.local[of_points == row])
 
     def _store(
-        self, item: MovedItem, items: FixedFrameItems, sweep: Sweep, labels: PointLabels
+        self,
+        item: MovedItem,
+        items: FixedFrameItems,
+        sweep: Sweep,
+        labels: PointLabels,
+        is_known: bool,
     ) -> None:
-        """Store the labels of each cloud of a sweep until its message is copied."""
+        """
+        Store the labels of each cloud of a sweep until its message is copied.
+
+        Clouds of a sweep without boxes are copied whole: what moves in them is not known.
+
+        """
         classes, instances = numbers_of(labels)
         codes = np.zeros(len(labels.track), np.uint8)
         codes[labels.motion == MOVING] = MOVING_CODE
@@ -282,7 +293,7 @@ class _Products:
             'label': classes.astype(np.uint16),
             'instance': instances.astype(np.uint16),
             'moving': codes,
-            **{name: _is_kept(labels, name) for name in self._request.maps},
+            **{name: _is_kept(labels, name) | (not is_known) for name in self._request.maps},
         }
         if self._request.undistort:
             moves = labels.motion[labels.rows] == MOVING
