@@ -92,9 +92,11 @@ setup(
             'hypothesis',
             'ijson>=3.2',
             'jinja2',
+            'latex2mathml',
             'matplotlib',
             'mcap-protobuf-support',
             'mcap-ros2-support',
+            'mermaidx',
             'mkdocs-material',
             'moto[s3]',
             'mypy',
@@ -114,6 +116,7 @@ setup(
             'shapely',
             'small-gicp',
             'trackeval>=1.3,<2',
+            'ziamath',
         ],
         # What test/build_interfaces.py builds message types with.
         'interfaces': [
