@@ -71,6 +71,11 @@ REASONS = {
         'not written beside the labels: the recorder, or its disk, is slower than the data',
         REDUCE_RECORDING,
     ),
+    'static_unchanged': Reason(
+        'cloud',
+        'published on `static_points` unchanged, because its boxes were late or missing',
+        'enlarge `static_points_wait`, or see the reasons of late boxes',
+    ),
     'points_lost': Reason('cloud', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
     'boxes_lost': Reason('message', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
     'sweep_without_transform': Reason(

@@ -111,7 +111,8 @@ class PointLabels(NamedTuple):
     track : array, shape (M,)
         Row of the track that each point is on, `BACKGROUND` or `UNKNOWN`.
     motion : array, shape (M,)
-        Motion of its object; `UNKNOWN_MOTION` for points on none.
+        Motion of its object, or of the one that an unknown point is next to; `UNKNOWN_MOTION` for
+        points on none.
     rows : array, shape (L,)
         Rows of the points on an object, ascending.
     local : array, shape (L, 3)
@@ -135,8 +136,9 @@ class PointLabels(NamedTuple):
 
     @property
     def is_dynamic(self) -> Mask:
-        """Return which points are on a moving object, or may be, (M,)."""
-        is_dynamic: Mask = (self.motion == MOVING) | (self.track == UNKNOWN)
+        """Return which points are on an object that moves now or later, or may be, (M,)."""
+        is_dynamic: Mask = (self.motion == MOVING) | (self.motion == STOOD)
+        is_dynamic |= (self.track == UNKNOWN) & (self.motion != PARKED)
         return is_dynamic
 
 
@@ -188,6 +190,7 @@ class PointLabeller:
         band = np.where(objects.is_certain, BAND, UNCERTAIN_BAND)
         is_unknown = (excess < band[owner]) & ((excess > 0) | objects.is_lost[owner])
         track[row[is_unknown]] = UNKNOWN
+        motion[row[is_unknown]] = objects.motion[owner[is_unknown]]
         is_on = np.flatnonzero((excess <= 0) & ~objects.is_lost[owner])
         deepest_last = is_on[np.argsort(-excess[is_on], kind='stable')]
         chosen = np.full(M, -1)

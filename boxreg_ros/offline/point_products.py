@@ -213,7 +213,9 @@ class _Products:
         self._counts['sweeps_without_boxes'] += not is_known
         self._counts['points'] += len(labels.track)
         self._counts['points_on_objects'] += len(labels.rows)
-        self._counts['points_on_moving'] += int((labels.motion == MOVING).sum())
+        is_on = labels.track >= 0
+        self._counts['points_on_moving'] += int((is_on & (labels.motion == MOVING)).sum())
+        self._counts['points_dynamic'] += int(labels.is_dynamic.sum())
         self._counts['points_unknown'] += int((labels.track == UNKNOWN).sum())
 
     def _write_formats(

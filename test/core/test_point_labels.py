@@ -120,7 +120,8 @@ def test_between_two_boxes_a_moving_object_is_unknown_and_a_parked_one_is_not():
     parked = track_of([0.0, 6.0], 'b', stamps=stamps)
     found = labelled([moves, parked], point, middle, arrays=stamps)
     assert found.track.tolist() == [UNKNOWN, 1]
-    assert found.motion.tolist() == [UNKNOWN_MOTION, PARKED]
+    assert found.motion.tolist() == [MOVING, PARKED]
+    assert found.is_dynamic.tolist() == [True, False]
 
 
 def test_clouds_without_times_are_labelled_at_their_stamp():

@@ -256,7 +256,7 @@ def test_clouds_of_several_lidars_are_copied_each_on_its_topic(tmp_path):
         assert [cloud.dtype for cloud in after] == [cloud.dtype for cloud in before]
         dropped += sum(map(len, before)) - sum(map(len, after))
     counts = json.loads((out / 'summary.json').read_text())['points']
-    assert dropped == counts['points_on_moving'] + counts['points_unknown'] > 0
+    assert dropped == counts['points_dynamic'] > 0
 
 
 def test_formats_of_points_are_of_relabel_alone(tmp_path):
