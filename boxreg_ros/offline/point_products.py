@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 import shutil
-from typing import Any, NamedTuple
+from typing import Any, TYPE_CHECKING
 
-from boxreg_ros.config import Config, KINDS
+from boxreg_ros.config import KINDS
 from boxreg_ros.core.point_labels import (
     BACKGROUND,
     MOVING,
@@ -55,6 +55,9 @@ from msg_adapters.poses import stamp_ns as stamp_ns_of
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    from boxreg_ros.core.registrar import BoxRegistrar
+
 CLOUDS_FOLDER = 'clouds'
 SPOOL_FOLDER = '.points'
 MAP_VOXEL, OBJECT_VOXEL = 0.1, 0.02
@@ -66,32 +69,28 @@ Edit = Callable[[Any, 'Ints | None', Any], Any]
 """Returns a cloud of a message, the rows of its finite points, and the labels of these."""
 
 
-class Boxes(NamedTuple):
-    """
-    The results that points are labelled by.
-
-    Attributes
-    ----------
-    tracks : sequence of TrackChanges
-        Of the run.
-    array_stamps_ns : sequence of int
-        Stamps of all box arrays [ns].
-    config : Config
-        Settings of the run, with the time of the boxes as it was estimated.
-    margins : array, shape (K, 6)
-        Labelling margin of each face, of each of `KINDS` [m].
-
-    """
-
-    tracks: Sequence[TrackChanges]
-    array_stamps_ns: Sequence[int]
-    config: Config
-    margins: Floats
-
-
-def write_point_products(folder: Path, request: Request, boxes: Boxes) -> dict[str, Any]:
+def write_point_products(
+    folder: Path,
+    request: Request,
+    tracks: Sequence[TrackChanges],
+    array_stamps_ns: Sequence[int],
+    registrar: BoxRegistrar,
+) -> dict[str, Any]:
     """
     Write the formats and clouds that a request asks for.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the results.
+    request : Request
+        Of the run.
+    tracks : sequence of TrackChanges
+        Results of the run.
+    array_stamps_ns : sequence of int
+        Stamps of all box arrays [ns].
+    registrar : BoxRegistrar
+        That of the run: its labelling margins and the time of its boxes are used.
 
     Returns
     -------
@@ -104,12 +103,12 @@ def write_point_products(folder: Path, request: Request, boxes: Boxes) -> dict[s
         If a recording is to be copied that is none, or whose clouds are no PointCloud2.
 
     """
-    tracks = object_tracks(boxes.tracks)
-    kinds = [KINDS.index(boxes.config.kind(track.class_name)) for track in tracks]
-    margins = boxes.margins[kinds].reshape(-1, 6)
-    stamps_ns = np.array(boxes.array_stamps_ns, np.int64)
-    labeller = PointLabeller(tracks, stamps_ns, boxes.config, margins)
-    products = _Products(folder, request, boxes.config)
+    config = registrar.box_time.resolved(request.config)
+    objects = object_tracks(tracks)
+    kinds = [KINDS.index(config.kind(one.class_name)) for one in objects]
+    margins = registrar.margins()[kinds].reshape(-1, 6)
+    labeller = PointLabeller(objects, np.array(array_stamps_ns, np.int64), config, margins)
+    products = _Products(folder, request)
     with request.recording() as recording:
         items = FixedFrameItems(recording, request.config, request.convention, request.fixed_frame)
         sensor_frame = label_frame_of(
@@ -142,7 +141,7 @@ def object_tracks(tracks: Sequence[TrackChanges]) -> list[ObjectTrack]:
 class _Products:
     """The files that are written while sweeps are labelled, and the copies after them."""
 
-    def __init__(self, folder: Path, request: Request, config: Config) -> None:
+    def __init__(self, folder: Path, request: Request) -> None:
         self._folder = folder
         self._request = request
         self._provenance = Provenance.of(request.recordings, request.config)

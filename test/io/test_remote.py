@@ -163,7 +163,7 @@ def test_recordings_over_http_give_the_same_boxes(tmp_path, whole):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(urls, 'RETRY_SECONDS', (0.01, 0.01))
+    monkeypatch.setattr(urls, 'REPEAT_SECONDS', (0.01, 0.01))
 
 
 @pytest.mark.parametrize('fault', ['error', 'cut', 'short'])

@@ -228,7 +228,7 @@ def test_sweeps_without_boxes_are_unknown_and_copied_unchanged(scene, recording,
     )  # fmt: skip
     assert request.box_formats == ()
     summary = relabel(request, tmp_path / 'out')
-    unknown = summary['points']['sweeps_without_boxes']
+    unknown = summary.points['sweeps_without_boxes']
     assert unknown == half
     folder = tmp_path / 'out' / 'semantickitti' / 'sequences' / '00' / 'labels'
     last = np.fromfile(folder / f'{SWEEPS - 1:06d}.label', '<u4')

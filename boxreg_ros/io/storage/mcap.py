@@ -248,8 +248,8 @@ class McapFile(ChunkedFile):
             raise RecordingError('expected a summary of its checksum')
         found = []
         chunks = []
-        for opcode, begin, end in _places_in(summary):
-            content = summary[begin:end]
+        for opcode, first, last in _places_in(summary):
+            content = summary[first:last]
             if opcode == Opcode.CHUNK_INDEX:
                 chunks.append(_indexed_chunk(content))
             elif opcode in SUMMARY_RECORDS:
@@ -393,7 +393,7 @@ class McapFile(ChunkedFile):
 
 def _places_in(content: Bytes, limit: int | None = None) -> list[tuple[int, int, int]]:
     """Return operation code, begin and end of the records in a summary or a chunk."""
-    places = []
+    places: list[tuple[int, int, int]] = []
     begin = 0
     while begin < len(content):
         opcode, length = RECORD_HEAD.unpack_from(content, begin)

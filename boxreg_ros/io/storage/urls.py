@@ -32,7 +32,7 @@ READERS = 4
 """Requests at a time; chosen: object stores send some 50 MB/s each."""
 ANSWER_SECONDS = 60.0
 """Longest time for an answer [s]: 256 kB/s for the largest range, and ten times a slow listing."""
-RETRY_SECONDS = (0.5, 2.0, 8.0)
+REPEAT_SECONDS = (0.5, 2.0, 8.0)
 """Waiting times before a request is repeated [s]: servers restart, or limit the rate."""
 DOWNLOAD_BYTES = 2**23
 """Size of the ranges in which a whole file is copied."""
@@ -337,7 +337,7 @@ def _answer_of(path: Path, request: Callable[[], _T], missing_is_error: bool = T
 
     """
     begin = time.monotonic()
-    for seconds in (*RETRY_SECONDS, None):
+    for seconds in (*REPEAT_SECONDS, None):
         try:
             return request()
         except TransferError:
