@@ -89,6 +89,12 @@ class Reason(StrEnum):
         'not written beside the labels: the recorder, or its disk, is slower than the data',
         REDUCE_RECORDING,
     )
+    STATIC_UNCHANGED = (
+        'static_unchanged',
+        'cloud',
+        'published on `static_points` unchanged, because its boxes were late or missing',
+        'enlarge `static_points_wait`, or see the reasons of late boxes',
+    )
     POINTS_LOST = (
         'points_lost',
         'cloud',

@@ -20,6 +20,7 @@ from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, RefinedB
 import numpy as np
 
 if TYPE_CHECKING:
+    from boxreg_ros.core.point_labels import PointLabels
     from boxreg_ros.io.recording import Recording
     from boxreg_ros.labels.camera import Camera
 
@@ -51,6 +52,8 @@ class Format:
         Packages of pip that are needed beyond those of boxreg_ros itself.
     options : tuple of str
         Fields of `Options` that the writer uses.
+    has_points : bool
+        Whether it labels points; such a format is written by ``boxreg relabel`` alone.
 
     """
 
@@ -63,6 +66,7 @@ class Format:
     files: str
     packages: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
+    has_points: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +89,8 @@ class LabelFrame:
         Intensities of its points in the unit of the sensor; None if it has none.
     T_fixed_given : array, shape (4, 4), or None
         Pose of the frame of the input boxes; None if unknown.
+    points : PointLabels or None
+        Labels of the points of `sweep`, for formats of points.
 
     """
 
@@ -95,6 +101,7 @@ class LabelFrame:
     sweep: Sweep | None = None
     intensities: Floats | None = None
     T_fixed_given: Floats | None = None
+    points: PointLabels | None = None
 
     def boxes_in(self, frame: str, dropped: Counter[str]) -> tuple[Ints, Floats]:
         """

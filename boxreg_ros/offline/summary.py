@@ -85,6 +85,8 @@ class Summary:
         Time of each stage [s].
     rules : dict
         Violations of each rule before and after the run.
+    points : dict
+        Sweeps and points by their label; empty where points are not labelled.
 
     """
 
@@ -124,6 +126,7 @@ class Summary:
     fingerprint: str = ''
     seconds: dict[str, float] = field(default_factory=dict)
     rules: dict[str, dict[str, int]] = field(default_factory=dict)
+    points: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(
