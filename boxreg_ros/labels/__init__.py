@@ -22,6 +22,7 @@ from boxreg_ros.labels.registry import (
     FORMATS,
     frames_of,
     import_format,
+    labels_points,
     module_of,
     writer_for,
 )
@@ -33,6 +34,7 @@ __all__ = [
     'FORMATS',
     'frames_of',
     'import_format',
+    'labels_points',
     'LabelFrame',
     'LabelOutput',
     'LabelWriter',
