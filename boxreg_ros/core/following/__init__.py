@@ -1,0 +1,1 @@
+"""Following an object through the points: compiled loops over the points of one object."""
