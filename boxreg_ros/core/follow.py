@@ -14,7 +14,7 @@ NOISE = {  # acceleration, angular acceleration, slip, turning
 CLEAR = {'vehicle': 0.25, 'cyclist': 0.2, 'pedestrian': 0.2}
 Z_NOISE = 0.1  # m/sqrt(s)
 MAX_SPEED = {'vehicle': 40.0, 'cyclist': 12.0, 'pedestrian': 3.0}
-P = dict(min_points=5, share=0.5, sig_lon=0.35, sig_yaw=0.12, rms=0.07, jump=16.0, hold=1.5, refind_cov=0.25)
+P = dict(min_points=5, share=0.5, sig_lon=0.35, sig_yaw=0.12, rms=0.07, jump=16.0, road=0.05, hold=1.5, refind_cov=0.25)
 
 
 class Obj:
@@ -30,6 +30,9 @@ class Obj:
         dims = (2 * np.ceil((self.half + 0.6) / CELL) + 2).astype(int)
         self.map = (np.zeros(dims, np.int32), np.zeros((20000, 10)), np.zeros((20000, 3)), np.zeros(1, np.int64))
         self.seeds = seeds
+        heights = [reg.road_below(self.near(f, self.pose_of(b), 0.4), self.pose_of(b), self.tilt, self.half) for f, b in seeds]
+        heights = [h for h in heights if np.isfinite(h)]
+        self.road = np.clip(np.mean(heights), -0.15, 0.15) if heights else 0.0
         for f, b in seeds:
             self.add(f, self.pose_of(b))
 
@@ -75,16 +78,16 @@ class Obj:
                     continue
                 p, H, st = self.register(pts, start, start, info, 6)
                 total += self.score(st)
-            scores.append(total - 0.002 * abs(v))
+            scores.append(total / len(around) - self.speed_cost(v))
         order = np.argsort(scores)[::-1][:8]
-        best, chosen = -1, 0.0
+        best, chosen = -np.inf, 0.0
         for k in order:
-            total = 0
+            total, weight = 0.0, 1e-9
             v_out = []
             for sign in (1, -1):
                 state, cov = self.initial(pose, speeds[k])
                 z = pose[2]
-                for m in range(1, 4):
+                for m in range(1, 6):
                     g = f + sign * m
                     if not 0 <= g < len(self.t):
                         break
@@ -92,17 +95,22 @@ class Obj:
                     prior, info4 = self.prior(state, cov, z, 0.02)
                     pts = self.near(g, prior)
                     p, H, st = self.register(pts, prior, prior, info4, 8)
-                    total += self.score(st) / m
+                    d = p - prior
+                    total += (self.score(st) - 0.02 * min(d @ info4 @ d, 10.0)) / m
+                    weight += 1 / m
                     state, cov = motion.update(state, cov, p[[0, 1, 3]], np.linalg.inv(H + info4)[np.ix_([0, 1, 3], [0, 1, 3])])
                 v_out.append(state[3])
-            total -= 0.004 * abs(speeds[k])
+            total = total / weight - self.speed_cost(speeds[k])
             if total > best:
                 best, chosen = total, np.mean(v_out)
         return chosen, best
 
+    def speed_cost(self, v):
+        return 0.03 * (abs(v) > 0.7) + 0.1 * (v < -0.7) + 0.002 * abs(v)
+
     def score(self, st):
         inside, fitting, rms, cover, beside = st
-        share = fitting / max(inside, 1)
+        share = fitting / max(inside + beside, 1)
         return 2 * share * cover / max(share + cover, 1e-9) if inside >= 3 else 0.0
 
     def initial(self, pose, speed, sigma=1.0):
@@ -137,7 +145,12 @@ class Obj:
                 reason = 'lost'
                 break
             prior, info = self.prior(state, cov, z, zvar)
-            pts = self.near(g, prior, 0.5 if pending else 0.0)
+            pts = self.near(g, prior, 0.5)
+            h = reg.road_below(pts, prior, self.tilt, self.half)
+            if np.isfinite(h):
+                w = 1 / P['road'] ** 2
+                prior[2] += (h - self.road) * w / (info[2, 2] + w)
+                info[2, 2] += w
             best = self.register(pts, prior, prior, info)
             if pending:  # search along the heading
                 sig = np.sqrt(cov[0, 0] + cov[1, 1])

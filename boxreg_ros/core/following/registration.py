@@ -18,7 +18,7 @@ OUTSIDE_DEVIATION = 0.15
 """Of points outside of the box [m]."""
 TOLERANCE = 0.1
 """Points less far outside are not [m]."""
-MOST = 60.0
+MOST = 30.0
 """Evidence of one sweep, in points: more points of one surface are not independent."""
 
 
@@ -187,3 +187,27 @@ def in_box(points, pose, tilt, half, clearance, margin):
             found[count] = q
             count += 1
     return found[:count]
+
+
+@kernel
+def road_below(points, pose, tilt, half):
+    """Return the height of the road above the bottom of a box; NaN without points of it [m]."""
+    c, s = np.cos(pose[3]), np.sin(pose[3])
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    heights = np.empty(len(points))
+    count = 0
+    for n in range(len(points)):
+        q = R.T @ (points[n] - pose[:3])
+        out = max(abs(q[0]) - half[0], abs(q[1]) - half[1])
+        height = q[2] + half[2]
+        if 0.05 < out < 1.0 and abs(height) < 0.6:
+            heights[count] = height
+            count += 1
+    if count < 5:
+        return np.nan
+    ordered = np.sort(heights[:count])
+    low = ordered[int(0.1 * count)]
+    middle = ordered[int(0.3 * count)]
+    if ordered[int(0.6 * count)] - low > 0.15:
+        return np.nan
+    return middle
