@@ -14,7 +14,7 @@ NOISE = {  # acceleration, angular acceleration, slip, turning
 CLEAR = {'vehicle': 0.25, 'cyclist': 0.2, 'pedestrian': 0.2}
 Z_NOISE = 0.1  # m/sqrt(s)
 MAX_SPEED = {'vehicle': 40.0, 'cyclist': 12.0, 'pedestrian': 3.0}
-P = dict(min_points=5, share=0.5, sig_lon=0.35, sig_yaw=0.12, rms=0.07, jump=16.0, road=0.05, hold=1.5, refind_cov=0.25)
+P = dict(min_points=5, share=0.5, sig_lon=0.35, sig_yaw=0.12, rms=0.07, seen=0.3, jump=16.0, road=0.05, hold=1.5, refind_cov=0.25)
 
 
 class Obj:
@@ -47,7 +47,7 @@ class Obj:
     def add(self, f, pose, pts=None):
         pts = self.near(f, pose) if pts is None else pts
         q = reg.in_box(pts, pose, self.tilt, self.half, self.clear, 0.1)
-        surface.insert(q, *self.map)
+        surface.insert(q, self.half, *self.map)
         return len(q)
 
     def register(self, pts, start, prior, info, its=12):
@@ -109,7 +109,7 @@ class Obj:
         return 0.03 * (abs(v) > 0.7) + 0.1 * (v < -0.7) + 0.002 * abs(v)
 
     def score(self, st):
-        inside, fitting, rms, cover, beside = st
+        inside, fitting, rms, cover, beside, matched = st
         share = fitting / max(inside + beside, 1)
         return 2 * share * cover / max(share + cover, 1e-9) if inside >= 3 else 0.0
 
@@ -167,8 +167,9 @@ class Obj:
             sy = np.sqrt(post[3, 3])
             d = p - prior
             jump = d @ info @ d
-            share = st[1] / max(st[0], 1)
-            ok = st[0] >= P['min_points'] and share >= P['share'] and sl < P['sig_lon'] and sy < P['sig_yaw'] and jump < P['jump'] and st[2] < P['rms']
+            share = st[1] / max(st[5], 1)
+            seen = st[5] / max(st[0], 1)
+            ok = st[1] >= P['min_points'] and seen > P['seen'] and share >= P['share'] and sl < P['sig_lon'] and sy < P['sig_yaw'] and jump < P['jump'] and st[2] < P['rms']
             if pending and ok:
                 ok = st[3] > P['refind_cov'] * 0.2 and share > 0.6
             log.append((g, st[0], share, st[2], st[3], st[4], sl, sy, jump, len(pending), *p))

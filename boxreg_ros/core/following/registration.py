@@ -124,7 +124,7 @@ def fit(points, pose, tilt, half, clearance, surface):
     c, s = np.cos(pose[3]), np.sin(pose[3])
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
     hit = np.zeros(used[0], np.bool_)
-    inside, fitting, squares, beside = 0.0, 0.0, 0.0, 0.0
+    inside, fitting, squares, beside, matched = 0.0, 0.0, 0.0, 0.0, 0.0
     for n in range(len(points)):
         dx = points[n, 0] - pose[0]
         dy = points[n, 1] - pose[1]
@@ -144,6 +144,7 @@ def fit(points, pose, tilt, half, clearance, surface):
         if slot < 0:
             continue
         hit[slot] = True
+        matched += 1
         count = moments[slot, 0]
         nx, ny, nz = normals[slot]
         r = (
@@ -155,7 +156,7 @@ def fit(points, pose, tilt, half, clearance, surface):
             fitting += 1
             squares += r * r
     rms = np.sqrt(squares / max(fitting, 1.0))
-    return np.array([inside, fitting, rms, hit.sum() / max(1.0, used[0]), beside])
+    return np.array([inside, fitting, rms, hit.sum() / max(1.0, used[0]), beside, matched])
 
 
 @kernel

@@ -33,7 +33,7 @@ def cell_of(x, y, z, slots):
 
 
 @kernel
-def insert(points, slots, moments, normals, used):
+def insert(points, half, slots, moments, normals, used):
     """Add points (n, 3) of the box frame to a map; update the normals of their cells."""
     touched = np.zeros(len(moments), np.bool_)
     for n in range(len(points)):
@@ -55,11 +55,11 @@ def insert(points, slots, moments, normals, used):
     for slot in range(used[0]):
         if touched[slot]:
             mean = moments[slot, 1:4] / moments[slot, 0]
-            normals[slot] = normal_at(mean, slots, moments)
+            normals[slot] = normal_at(mean, half, slots, moments)
 
 
 @kernel
-def normal_at(mean, slots, moments):
+def normal_at(mean, half, slots, moments):
     """
     Return the normal of the points in the 27 cells around a place (3,); zeros for too few.
 
@@ -67,6 +67,10 @@ def normal_at(mean, slots, moments):
 
     """
     none = np.zeros(3)
+    if half[0] - abs(mean[0]) < half[1] - abs(mean[1]):
+        none[0] = np.sign(mean[0])
+    else:
+        none[1] = np.sign(mean[1])
     i, j, k = cell_of(mean[0], mean[1], mean[2], slots)
     total = np.zeros(10)
     for a in range(i - 1, i + 2):
