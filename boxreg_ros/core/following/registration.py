@@ -212,3 +212,18 @@ def road_below(points, pose, tilt, half):
     if ordered[int(0.6 * count)] - low > 0.15:
         return np.nan
     return middle
+
+
+@kernel
+def outside(points, pose, tilt, half):
+    """Return the points (n, 3) that are not in a box."""
+    c, s = np.cos(pose[3]), np.sin(pose[3])
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt
+    found = np.empty((len(points), 3))
+    count = 0
+    for n in range(len(points)):
+        q = R.T @ (points[n] - pose[:3])
+        if (np.abs(q) > half).any():
+            found[count] = points[n]
+            count += 1
+    return found[:count]

@@ -14,6 +14,8 @@ CELL = 0.15
 """Side of a cell [m]."""
 FULL = 60
 """A cell takes no more points than this."""
+RIM = 0.6
+"""A map reaches this far outside of the box [m]."""
 LINE = 0.02
 """A neighbourhood with less spread in its second direction is a line [m]."""
 FLAT = 0.05
@@ -124,3 +126,14 @@ def nearest(x, y, z, slots, moments, limit):
                     best = squared
                     found = slot
     return found
+
+
+def empty(half, cells):
+    """Return a map without points for a box with `half` extents (3,)."""
+    sides = (2 * np.ceil((half + RIM) / CELL) + 2).astype(np.int64)
+    return (
+        np.zeros(sides, np.int32),
+        np.zeros((cells, 10)),
+        np.zeros((cells, 3)),
+        np.zeros(1, np.int64),
+    )
