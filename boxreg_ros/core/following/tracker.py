@@ -51,6 +51,9 @@ MIN_FIT_TO_LEARN = 0.7
 MIN_FIT_AGAIN = 0.6
 """Part of the points that fit, to find an object again after a loss."""
 
+MIN_SCORE_AGAIN = 0.5
+"""And of their score before the loss, as a running mean."""
+
 HOLD, HOLD_PARKED = 2.0, 5.0
 """An object that is not found for so long is lost [s]."""
 YOUNG = 1.0
@@ -241,11 +244,14 @@ class Follower:
         times = self._sweeps.times
         way = Way({}, set(), ARRIVED)
         first = last_seen = times[row]
+        usual = _score(self._fit(self._near(row, pose), pose))
         while row != stop:
             row += sign
             state = self._predicted(state, times[row] - times[row - sign])
             is_lost = abs(times[row - sign] - last_seen) > 0
             found = self._find(row, state, is_lost)
+            if is_lost and not found.reason and found.score < MIN_SCORE_AGAIN * usual:
+                found = found._replace(reason='no_fit')
             if found.reason:
                 if not is_lost and abs(last_seen - first) < YOUNG:
                     state.covariance[3, 3] += SPEED_AFTER_LOSS**2
@@ -261,6 +267,7 @@ class Follower:
             way.poses[row] = found.pose
             way.seen.add(row)
             last_seen = times[row]
+            usual += (found.score - usual) / 5
             if found.part > MIN_FIT_TO_LEARN:
                 points = self._near(row, found.pose)
                 self._learn(points, found.pose)
