@@ -81,6 +81,7 @@ class Sink:
         self._fixed_frame = source.fixed_frame
         self._sensor_frame = source.sensor_frame
         self._writes_early = request.config.estimate == 'early'
+        self._has_keyframes = request.keyframes
         self._clock = clock
         self._config = request.config
         self.time_ranges: dict[str, tuple[int, int]] = {}
@@ -196,6 +197,8 @@ class Sink:
             self._last_ticket += 1
             self._order.expect(slot, self._last_ticket)
             moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
+            if self._has_keyframes:
+                moved = replace(moved, pinned=np.ones(count, bool))
             item = item._replace(moved=moved)
         elif count:
             result = kept(given, 'no_transform')
