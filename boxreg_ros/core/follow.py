@@ -13,6 +13,7 @@ from boxreg_ros.core.following.tracker import (
     END_OF_SWEEPS,
     Follower,
     Owned,
+    Points,
     POSE4,
     Seeds,
     Sweeps,
@@ -149,12 +150,12 @@ def ascending(points: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def follow_points(
     stamps_ns: Ints,
-    points: Sequence[NDArray[np.floating]],
+    points: Points,
     seeds: Sequence[BoxArray],
     config: Config,
 ) -> list[FollowedTrack]:
     """Follow as `follow` does, without the solve; `points` are those of `ascending`."""
-    times = (stamps_ns - stamps_ns[:1]) * 1e-9
+    times = (stamps_ns - stamps_ns[:1]).astype(np.float64) * 1e-9
     sweeps = Sweeps(times, points)
     objects = [_placed(name, rows, stamps_ns) for name, rows in _by_track(seeds).items()]
     owned = Owned()
@@ -290,7 +291,7 @@ def _supported(way: Way) -> Iterator[int]:
 def _boxes(rows: Ints, poses: Floats, seeds: Seeds) -> Floats:
     """Return boxes (N, 9) of poses (N, 4), with roll and pitch of the nearest seed."""
     nearest = np.abs(rows[:, None] - seeds.rows).argmin(1)
-    boxes = seeds.boxes[nearest].copy()
+    boxes: Floats = seeds.boxes[nearest].copy()
     boxes[:, BOX_EXTENT] = seeds.boxes[:, BOX_EXTENT].mean(0)
     boxes[:, POSE4] = poses
     boxes[:, YAW] = wrap_angle(boxes[:, YAW])
@@ -331,6 +332,8 @@ def _nearby(points: NDArray[np.floating], box: Floats) -> NDArray[np.floating]:
     """Return the points, which ascend by x, within `NEARBY` of a box."""
     reach = np.hypot(box[LENGTH], box[WIDTH]) / 2 + NEARBY
     first, last = np.searchsorted(points[:, 0], [box[0] - reach, box[0] + reach])
-    part = points[first:last]
-    near = (np.abs(part[:, 1] - box[1]) < reach) & (np.abs(part[:, 2] - box[2]) < box[5] / 2 + NEARBY)
-    return part[near]
+    part: NDArray[np.floating] = points[first:last]
+    near = (np.abs(part[:, 1] - box[1]) < reach) & (
+        np.abs(part[:, 2] - box[2]) < box[5] / 2 + NEARBY
+    )
+    return np.asarray(part[near])

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 POINT = np.dtype((np.float32, 3))
 
 
-class SweepStore(Sequence[NDArray[np.float32]]):
+class SweepStore:
     """
     The points of sweeps in a temporary file: a drive has more of them than fit the memory.
 
@@ -56,7 +56,7 @@ class SweepStore(Sequence[NDArray[np.float32]]):
         """Return the number of sweeps."""
         return len(self.stamps_ns)
 
-    def __getitem__(self, row: Any) -> NDArray[np.float32]:
+    def __getitem__(self, row: int, /) -> NDArray[np.float32]:
         """Return the points (M, 3) of a sweep, ascending by x."""
         first, last = self._ends[row], self._ends[row + 1]
         if first == last:

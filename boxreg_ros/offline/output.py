@@ -192,11 +192,14 @@ class Sink:
         for name, boxes in Counter(given.class_names).items():
             if not self._config.knows_class(name):
                 self.unknown_classes[name] += boxes
-        if isinstance(item.moved, BoxArray):
-            slot = Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
+        moved = item.moved
+        if isinstance(moved, BoxArray):
+            if self._has_keyframes:  # soft: evidence may move those that files call pinned
+                moved = replace(moved, pinned=None)
             self._last_ticket += 1
+            slot = Slot(moved, item.T_fixed_sensor, item.T_fixed_given)
             self._order.expect(slot, self._last_ticket)
-            moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
+            moved = replace(self.corrections.pinned(moved), ticket=self._last_ticket)
             if self._has_keyframes:
                 moved = replace(moved, pinned=np.ones(count, bool))
             item = item._replace(moved=moved)

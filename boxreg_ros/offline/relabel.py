@@ -25,8 +25,8 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MERGED, CLOUD_MISSING
 from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.io.storage.record import Damage
-from boxreg_ros.offline.every_sweep import Arrivals, with_empty_arrays
 from boxreg_ros.io.times import time_range
+from boxreg_ros.offline.every_sweep import Arrivals, with_empty_arrays
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader, ReadItem

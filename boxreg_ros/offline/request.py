@@ -85,7 +85,7 @@ class Request:
     )
     keyframes: bool = option(
         False,
-        'the boxes are a person\'s, at some sweeps only: none is rejected or renamed, and each '
+        "the boxes are a person's, at some sweeps only: none is rejected or renamed, and each "
         'object gets a box at every sweep, beyond its first and last keyframe as long as points '
         'support it',
     )

@@ -1,1 +1,1 @@
-"""Following an object through the points: compiled loops over the points of one object."""
+"""Following one object through sweeps, from boxes of a person."""

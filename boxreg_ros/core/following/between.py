@@ -37,7 +37,9 @@ def between(follower: Follower, times: Floats, seeds: Seeds, first: int) -> tupl
     part = (times[rows] - times[start]) / (times[stop] - times[start])
     poses = seeds.boxes[:, POSE4]
     forwards = _closed(follower.way(first, 1, stop), rows, part, poses[first + 1])
-    backwards = _closed(follower.way(first + 1, -1, start), rows[::-1], 1 - part[::-1], poses[first])
+    backwards = _closed(
+        follower.way(first + 1, -1, start), rows[::-1], 1 - part[::-1], poses[first]
+    )
     if backwards is not None:
         backwards = backwards[::-1]
     lines = list(_lines(times, seeds, first, rows))

@@ -8,12 +8,12 @@ two seeds there are two ways; each is tested where it arrives at the other seed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Self
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol, Self
 
-from boxreg_ros.core.following import motion, registration, surface
-from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
-from boxreg_ros.structures import BOX_EXTENT, Floats, HEIGHT, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
+from boxreg_ros.core.following.kernels import motion, registration, surface
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import BOX_EXTENT, Floats, Ints, LENGTH, PITCH, ROLL, WIDTH, YAW
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,6 +68,8 @@ MAX_GAP = 0.3
 MAX_GAP_YAW = 0.15
 """And if its heading differs by less [rad]."""
 
+NEAR_SEEDS = 1.5
+"""Seeds nearer in time give the speed [s]; chosen: acceleration changes it by less than 3 m/s."""
 SEARCH_SWEEPS = 5
 """Sweeps in each direction that a start speed is tested with."""
 SPEEDS_TESTED = 8
@@ -76,7 +78,10 @@ START_INFORMATION = np.diag(np.array([0.5, 0.5, 0.1, 0.05]) ** -2.0)
 """Of the starts of a search for the speed: x y z [m] and yaw [rad]."""
 MARGIN_LEARNT = 0.1
 """Points so far outside of the box are part of its surface [m]."""
+MAX_POINTS = 400
+"""A sweep with more points around a box is thinned; swept: the poses are as good."""
 MAX_CELLS = 20_000
+"""Of a surface: those of a bus of 12 m at 0.15 m."""
 
 ARRIVED, END_OF_SWEEPS = 'arrived', 'end_of_sweeps'
 REASONS = ('few_points', 'no_fit', 'uncertain', 'jump')
@@ -97,11 +102,18 @@ KINDS = {
 }
 
 
+class Points(Protocol):
+    """The points (M, 3) of each sweep, ascending by x."""
+
+    def __getitem__(self, row: int, /) -> NDArray[np.floating]:
+        """Return the points of a sweep."""
+
+
 class Sweeps(NamedTuple):
-    """Times (S,) of sweeps [s], and their points (M, 3), ascending by x, in one frame."""
+    """Times (S,) of sweeps [s], and their points, all in one frame."""
 
     times: Floats
-    points: Sequence[NDArray[np.floating]]
+    points: Points
 
 
 class Seeds(NamedTuple):
@@ -172,7 +184,7 @@ class _State(NamedTuple):
         full = np.zeros((4, 4))
         full[PLANAR] = self.covariance[:3, :3]
         full[2, 2] = self.z_variance
-        return np.linalg.inv(full)
+        return np.asarray(np.linalg.inv(full), np.float64)
 
     @property
     def is_parked(self) -> bool:
@@ -310,8 +322,9 @@ class Follower:
     def _registered(
         self, points: Floats, start: Floats, prior: Floats, information: Floats, steps: int = 12
     ) -> _Found:
+        thinned = np.ascontiguousarray(points[:: 1 + len(points) // MAX_POINTS])
         pose, of_points, fit = registration.register(
-            points, start, prior, information, self._tilt, self._half, self._kind.clearance,
+            thinned, start, prior, information, self._tilt, self._half, self._kind.clearance,
             self._surface, steps,
         )  # fmt: skip
         covariance = np.linalg.inv(of_points + information)
@@ -320,6 +333,20 @@ class Follower:
         return _Found(pose, covariance, fit, _reason(pose, covariance, fit, jump))
 
     def _start_speed(self, seed: int) -> float:
+        """Return the speed at a seed [m/s]: by its neighbours in time, or searched."""
+        rows = self._seeds.rows
+        times = self._sweeps.times
+        near = [i for i in (seed - 1, seed + 1) if 0 <= i < len(rows)]
+        near = [i for i in near if abs(times[rows[i]] - times[rows[seed]]) < NEAR_SEEDS]
+        if not near:
+            return self._searched_speed(seed)
+        first, last = min(*near, seed), max(*near, seed)
+        travel = self._seeds.boxes[last, :2] - self._seeds.boxes[first, :2]
+        yaw = self._seeds.boxes[seed, YAW]
+        forward = travel @ [np.cos(yaw), np.sin(yaw)]
+        return float(forward / (times[rows[last]] - times[rows[first]]))
+
+    def _searched_speed(self, seed: int) -> float:
         """Return the speed at a seed by which the sweeps around it fit best [m/s]."""
         row = int(self._seeds.rows[seed])
         pose = self._seeds.boxes[seed, POSE4]
@@ -359,7 +386,8 @@ class Follower:
                 prior, information = state.pose, state.information
                 found = self._registered(self._near(other, prior), prior, prior, information, 8)
                 step = found.pose - prior
-                total += (found.score - 0.02 * min(step @ information @ step, 10.0)) / count
+                jump = float(step @ information @ step)
+                total += (found.score - 0.02 * min(jump, 10.0)) / count
                 weights += 1 / count
                 planar, covariance = motion.update(
                     state.planar, state.covariance, found.pose[[0, 1, 3]], found.covariance[PLANAR]
@@ -382,7 +410,8 @@ class Follower:
         for other in self._owned.others(row, pose, self._half):
             tilt = matrix_from_rpy(np.append(other[[ROLL, PITCH]], 0.0))
             points = registration.outside(points, other[POSE4], tilt, other[BOX_EXTENT] / 2)
-        return points
+        near: Floats = points
+        return near
 
     def _learn(self, points: Floats, pose: Floats) -> int:
         """Add the points in the box to the surface; return their number."""

@@ -1,6 +1,6 @@
 """Registration of the points of one sweep to the surface of one object."""
 
-from boxreg_ros.core.following.surface import nearest
+from boxreg_ros.core.following.kernels.surface import nearest
 from boxreg_ros.core.kernels.compile import kernel
 import numpy as np
 
@@ -35,7 +35,7 @@ def register(points, start, prior, information, tilt, half, clearance, surface, 
     that fit the surface, root mean square of their distance, parts of the surface that they hit.
 
     """
-    slots, moments, normals, used = surface
+    slots, moments, normals, _ = surface
     pose = start.copy()
     H = np.zeros((4, 4))
     for _ in range(iterations):

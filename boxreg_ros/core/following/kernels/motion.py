@@ -73,7 +73,9 @@ def update(state, covariance, pose, pose_covariance):
     follow by their regression on the pose.
 
     """
-    gain = covariance[:, :3] @ np.linalg.inv(covariance[:3, :3])  # (5, 3)
+    gain = np.ascontiguousarray(covariance[:, :3]) @ np.linalg.inv(
+        covariance[:3, :3].copy()
+    )  # (5, 3)
     step = pose - state[:3]
     out = state + gain @ step
     change = covariance[:3, :3] - pose_covariance
