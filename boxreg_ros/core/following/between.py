@@ -18,7 +18,7 @@ from boxreg_ros.structures import Floats, Ints
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-MIN_TRAVEL = 1.0
+MIN_CURVED_TRAVEL = 1.0
 """Boxes nearer to each other are joined by a line: their headings are no tangents [m]."""
 
 
@@ -90,7 +90,7 @@ def _lines(times: Floats, seeds: Seeds, first: int, rows: Ints) -> Iterator[Floa
     part = (wanted - at[first]) / (at[first + 1] - at[first])
     yield ends[0] + part[:, None] * (ends[1] - ends[0])
     travel = ends[1, :2] - ends[0, :2]
-    if np.linalg.norm(travel) < MIN_TRAVEL:
+    if np.linalg.norm(travel) < MIN_CURVED_TRAVEL:
         return
     if len(at) > 2:
         yield CubicSpline(at, poses)(wanted)

@@ -30,7 +30,7 @@ CLIMB = 0.1
 """The height of a box changes by this in a second, as a random walk [m]; chosen."""
 STOPPED = 0.3
 """Slower objects count as parked where they are held through an occlusion [m/s]."""
-PIVOT = 0.25
+REAR_AXLE = 0.25
 """Distance of the rear axle of a vehicle behind its centre, as part of the length."""
 
 # A pose is accepted if all of these hold.
@@ -78,16 +78,15 @@ START_INFORMATION = np.diag(np.array([0.5, 0.5, 0.1, 0.05]) ** -2.0)
 """Of the starts of a search for the speed: x y z [m] and yaw [rad]."""
 MARGIN_LEARNT = 0.1
 """Points so far outside of the box are part of its surface [m]."""
-MAX_POINTS = 400
+MAX_SWEEP_POINTS = 400
 """A sweep with more points around a box is thinned; swept: the poses are as good."""
 MAX_CELLS = 20_000
 """Of a surface: those of a bus of 12 m at 0.15 m."""
 
 ARRIVED, END_OF_SWEEPS = 'arrived', 'end_of_sweeps'
-REASONS = ('few_points', 'no_fit', 'uncertain', 'jump')
 
 
-class Kind(NamedTuple):
+class KindOfMotion(NamedTuple):
     """Motion of a kind of object: densities of `motion.predict`, speed [m/s], road [m]."""
 
     noise: Floats
@@ -95,10 +94,10 @@ class Kind(NamedTuple):
     clearance: float
 
 
-KINDS = {
-    'vehicle': Kind(np.array([1.0, 0.1, 0.004, 1e-4]), 40.0, 0.25),
-    'cyclist': Kind(np.array([1.0, 0.4, 0.01, 1e-3]), 12.0, 0.2),
-    'pedestrian': Kind(np.array([0.6, 0.4, 0.02, 5e-3]), 3.0, 0.2),
+MOTIONS = {
+    'vehicle': KindOfMotion(np.array([1.0, 0.1, 0.004, 1e-4]), 40.0, 0.25),
+    'cyclist': KindOfMotion(np.array([1.0, 0.4, 0.01, 1e-3]), 12.0, 0.2),
+    'pedestrian': KindOfMotion(np.array([0.6, 0.4, 0.02, 5e-3]), 3.0, 0.2),
 }
 
 
@@ -134,7 +133,7 @@ class Way(NamedTuple):
     seen : set of int
         Rows where points support the pose; it is predicted in the others.
     reason : str
-        Why it ends: `ARRIVED`, `END_OF_SWEEPS`, or one of `REASONS`.
+        Why it ends: `ARRIVED`, `END_OF_SWEEPS`, or `_reason`.
 
     """
 
@@ -225,7 +224,7 @@ class Follower:
     seeds : Seeds
         Of the object, one or more.
     kind : str
-        One of `KINDS`.
+        One of `MOTIONS`.
     owned : Owned
         Boxes of other objects.
 
@@ -234,11 +233,11 @@ class Follower:
     def __init__(self, sweeps: Sweeps, seeds: Seeds, kind: str, owned: Owned) -> None:
         self._sweeps = sweeps
         self._seeds = seeds
-        self._kind = KINDS[kind]
+        self._kind = MOTIONS[kind]
         self._owned = owned
         self._half = seeds.boxes[:, BOX_EXTENT].mean(0) / 2
         self._tilt = matrix_from_rpy(np.append(seeds.boxes[0, [ROLL, PITCH]], 0.0))
-        self._pivot = PIVOT * 2 * self._half[0] if kind == 'vehicle' else 0.0
+        self._pivot = REAR_AXLE * 2 * self._half[0] if kind == 'vehicle' else 0.0
         self._surface = surface.empty(self._half, MAX_CELLS)
         self._road = np.nan
         self.num_points = 0
@@ -322,7 +321,7 @@ class Follower:
     def _registered(
         self, points: Floats, start: Floats, prior: Floats, information: Floats, steps: int = 12
     ) -> _Found:
-        thinned = np.ascontiguousarray(points[:: 1 + len(points) // MAX_POINTS])
+        thinned = np.ascontiguousarray(points[:: 1 + len(points) // MAX_SWEEP_POINTS])
         pose, of_points, fit = registration.register(
             thinned, start, prior, information, self._tilt, self._half, self._kind.clearance,
             self._surface, steps,

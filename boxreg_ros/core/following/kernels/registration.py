@@ -16,7 +16,7 @@ MARGIN = 0.4
 """Points up to this far outside of the box are used [m]."""
 OUTSIDE_DEVIATION = 0.15
 """Of points outside of the box [m]."""
-TOLERANCE = 0.1
+OUTSIDE_TOLERANCE = 0.1
 """Points less far outside are not [m]."""
 MOST = 30.0
 """Evidence of one sweep, in points: more points of one surface are not independent."""
@@ -91,7 +91,7 @@ def _system(points, pose, tilt, half, clearance, slots, moments, normals):
         else:
             out_x = abs(x) - half[0]
             out_y = abs(y) - half[1]
-            r = max(out_x, out_y) - TOLERANCE
+            r = max(out_x, out_y) - OUTSIDE_TOLERANCE
             if r <= 0 or z > half[2]:
                 continue
             nx, ny, nz = 0.0, 0.0, 0.0
@@ -99,7 +99,7 @@ def _system(points, pose, tilt, half, clearance, slots, moments, normals):
                 nx = np.sign(x)
             else:
                 ny = np.sign(y)
-            w = (1 - min(1.0, r / (MARGIN - TOLERANCE)) ** 2) ** 2 / OUTSIDE_DEVIATION**2
+            w = (1 - min(1.0, r / (MARGIN - OUTSIDE_TOLERANCE)) ** 2) ** 2 / OUTSIDE_DEVIATION**2
             n_outside += 1
         wx = R[0, 0] * nx + R[0, 1] * ny + R[0, 2] * nz
         wy = R[1, 0] * nx + R[1, 1] * ny + R[1, 2] * nz
@@ -132,10 +132,10 @@ def fit(points, pose, tilt, half, clearance, surface):
         x = R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz
         y = R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz
         z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
-        if z < clearance - half[2] or z > half[2] + TOLERANCE:
+        if z < clearance - half[2] or z > half[2] + OUTSIDE_TOLERANCE:
             continue
         out = max(abs(x) - half[0], abs(y) - half[1])
-        if out > TOLERANCE:
+        if out > OUTSIDE_TOLERANCE:
             if out < MARGIN:
                 beside += 1
             continue

@@ -10,7 +10,7 @@ or 0; `moments` (S, 10) the count, the sums of x y z and of xx xy xz yy yz zz of
 from boxreg_ros.core.kernels.compile import kernel
 import numpy as np
 
-CELL = 0.15
+SURFACE_CELL = 0.15
 """Side of a cell [m]."""
 FULL = 60
 """A cell takes no more points than this."""
@@ -26,9 +26,9 @@ FLAT = 0.05
 def cell_of(x, y, z, slots):
     """Return the indices of the cell at a place of the box frame; i = -1 outside of the map."""
     nx, ny, nz = slots.shape
-    i = int(np.floor(x / CELL)) + nx // 2
-    j = int(np.floor(y / CELL)) + ny // 2
-    k = int(np.floor(z / CELL)) + nz // 2
+    i = int(np.floor(x / SURFACE_CELL)) + nx // 2
+    j = int(np.floor(y / SURFACE_CELL)) + ny // 2
+    k = int(np.floor(z / SURFACE_CELL)) + nz // 2
     if i < 1 or j < 1 or k < 1 or i >= nx - 1 or j >= ny - 1 or k >= nz - 1:
         return -1, -1, -1
     return i, j, k
@@ -130,7 +130,7 @@ def nearest(x, y, z, slots, moments, limit):
 
 def empty(half, cells):
     """Return a map without points for a box with `half` extents (3,)."""
-    sides = (2 * np.ceil((half + RIM) / CELL) + 2).astype(np.int64)
+    sides = (2 * np.ceil((half + RIM) / SURFACE_CELL) + 2).astype(np.int64)
     return (
         np.zeros(sides, np.int32),
         np.zeros((cells, 10)),
