@@ -9,7 +9,8 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems, input_boxes
 from boxreg_ros.labels import FORMATS, frames_of, Options
-from boxreg_ros.offline.convert import Conversion, convert
+from boxreg_ros.labels.registry import labels_points
+from boxreg_ros.offline.convert import convert
 from boxreg_ros.offline.formats import FORMAT_COLUMNS, rows
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.sources import source_of
@@ -24,7 +25,10 @@ R_rect: 1 0 0 0 1 0 0 0 1
 Tr_velo_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
 """
 
-WITH_STATUS = tuple(sorted(set(FORMATS) - {'kitti', 'tracklets', 'mcap'}))
+NO_STATUS = {'kitti', 'tracklets', 'mcap'}
+WITH_STATUS = tuple(
+    sorted(name for name in FORMATS if not labels_points(name) and name not in NO_STATUS)
+)
 """Formats that can say that a person has placed a box."""
 
 
@@ -42,6 +46,10 @@ def drive(tmp_path):
     table = tmp_path / 'input.csv'
     BoxTable.from_arrays(input_boxes(source_of([recording]))[0]).write(table)
     return recording, table
+
+
+def conversion(table, formats, options, recordings=()):
+    return Request(recordings, labels=('csv', table), formats=formats, options=options)
 
 
 def assert_same_boxes(found, expected, atol):
@@ -65,9 +73,9 @@ def test_labels_are_refined_like_boxes_of_a_topic(tmp_path, drive):
     relabel(Request((recording,), config=QUICK), tmp_path / 'topic')
     request = Request((recording,), config=QUICK, labels=('csv', table))
     summary = relabel(request, tmp_path / 'labels')
-    assert summary['labels'] == {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0}
-    assert summary['topics']['boxes'] is None
-    assert (summary['boxes_in'], summary['status']['refined']) == (14, 14)
+    assert summary.labels == {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0}
+    assert summary.topics['boxes'] is None
+    assert (summary.boxes_in, summary.status['refined']) == (14, 14)
     assert_same_boxes(rows_of(tmp_path / 'labels'), rows_of(tmp_path / 'topic'), 1e-5)
 
 
@@ -78,7 +86,7 @@ def test_labels_with_other_frame_names_are_refined_alike(tmp_path, drive, camera
         pytest.importorskip(package)
     recording, table = drive
     options = Options(camera=camera if name == 'kitti' else None)
-    asked = Conversion(table, 'csv', (name,), options, (recording,))
+    asked = conversion(table, (name,), options, (recording,))
     convert(asked, tmp_path / 'made')
     folder = tmp_path / 'made' / name
     if (folder / 'boxreg.json').exists():
@@ -100,7 +108,7 @@ def test_boxes_of_a_person_stay_as_they_are(tmp_path, drive):
     status[6] = status[7] = 'human'
     replace(corrected, status=tuple(status)).write(table)
     options = Options(with_points=True)
-    convert(Conversion(table, 'csv', WITH_STATUS, options, (recording,)), tmp_path / 'made')
+    convert(conversion(table, WITH_STATUS, options, (recording,)), tmp_path / 'made')
     for name in WITH_STATUS:
         labels = (name, tmp_path / 'made' / ('boxes.csv' if name == 'csv' else name))
         with source_of([recording], labels=labels) as source:
@@ -121,7 +129,7 @@ def test_labels_of_a_recording_without_boxes(tmp_path, drive):
     bare = Drive(sweeps=7)
     bare.items = [item for item in bare.items if item[0] != '/boxes']
     request = Request((bare.write(tmp_path / 'bare'),), config=QUICK, labels=('csv', table))
-    assert relabel(request, tmp_path / 'out')['boxes_out'] == 14
+    assert relabel(request, tmp_path / 'out').boxes_out == 14
 
 
 def test_labels_outside_of_the_requested_part_are_counted(tmp_path, drive):
@@ -132,7 +140,7 @@ def test_labels_outside_of_the_requested_part_are_counted(tmp_path, drive):
     stamps = {int(row['stamp_ns']) for row in rows_of(tmp_path / 'out')}
     first = min(int(row['stamp_ns']) for row in rows_of_table(table))
     assert {round((stamp - first) / SECOND, 1) for stamp in stamps} == {0.2, 0.3, 0.4}
-    assert summary['labels']['boxes_outside_part'] == 8
+    assert summary.labels['boxes_outside_part'] == 8
 
 
 @pytest.mark.parametrize('apart', [-(10**18), 10**18, -(10**10), 10**10])
@@ -146,7 +154,7 @@ def test_labels_of_another_drive_are_refused(tmp_path, drive, apart):
     assert not (tmp_path / 'out').exists()
     part = Request((recording,), config=QUICK, labels=('csv', table), end=0.3)
     if abs(apart) < 10**12:
-        assert relabel(part, tmp_path / 'out')['labels']['boxes_outside_part'] == 14
+        assert relabel(part, tmp_path / 'out').labels['boxes_outside_part'] == 14
 
 
 def module_packages(name):
@@ -163,7 +171,7 @@ def test_labels_without_transform_are_kept_with_the_reason(tmp_path, drive):
     text = table.read_text().replace(',odom,', ',mars,')
     table.write_text(text)
     request = Request((recording,), config=QUICK, labels=('csv', table))
-    assert relabel(request, tmp_path / 'out')['reasons'] == {'no_transform': 14}
+    assert relabel(request, tmp_path / 'out').reasons == {'no_transform': 14}
 
 
 def test_label_frame_other_than_the_sensor(tmp_path, drive):
@@ -237,7 +245,7 @@ def test_convert_with_poses_and_clouds_of_a_recording(tmp_path, drive, camera):
     recording, table = drive
     options = Options(with_points=True, camera=camera)
     wanted = ('kitti', 'nuscenes', 'argoverse2', 'csv')
-    asked = Conversion(table, 'csv', wanted, options, (recording,))
+    asked = conversion(table, wanted, options, (recording,))
     summary = convert(asked, tmp_path / 'out')
     out = tmp_path / 'out'
     assert sorted(item.name for item in out.iterdir()) == [
@@ -253,10 +261,10 @@ def test_convert_with_poses_and_clouds_of_a_recording(tmp_path, drive, camera):
 def test_convert_without_poses_is_refused(tmp_path, drive, camera):
     _, table = drive
     with pytest.raises(RecordingError, match=r"'kitti' can represent none of .* give --recording"):
-        convert(Conversion(table, 'csv', ('kitti',), Options(camera=camera)), tmp_path / 'out')
+        convert(conversion(table, ('kitti',), Options(camera=camera)), tmp_path / 'out')
     assert not (tmp_path / 'out').exists()
     with pytest.raises(ConfigError, match='give it with --recording'):
-        convert(Conversion(table, 'csv', ('csv',), Options(with_points=True)), tmp_path / 'out')
+        convert(conversion(table, ('sustechpoints',), Options(with_points=True)), tmp_path / 'out')
 
 
 def test_convert_skips_unreadable_clouds(tmp_path, drive, capsys):

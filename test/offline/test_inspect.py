@@ -4,6 +4,7 @@ import json
 import shlex
 
 from boxreg_ros.cli import main
+from paths import ROOT
 import pytest
 from ros_messages import Drive, SECOND, START, write_recording
 
@@ -18,7 +19,9 @@ def test_contents_and_the_command_to_run(tmp_path, capsys, storage):
     path = Drive(sweeps=12).write(tmp_path / 'drive', storage)
     status, facts = facts_of(capsys, path)
     assert status == 0
-    assert facts['command'] == shlex.join(['boxreg', 'relabel', str(path), '-o', 'out/drive'])
+    pytest.importorskip('plotly')
+    words = ['boxreg', 'relabel', str(path), '-o', 'out/drive', '--complete', '--report']
+    assert facts['command'] == shlex.join(words)
     assert facts['seconds'] == pytest.approx(1.1, abs=1e-6)
     topics = {entry['topic']: entry for entry in facts['topics']}
     assert topics['/points']['messages'] == 12
@@ -34,6 +37,13 @@ def test_contents_and_the_command_to_run(tmp_path, capsys, storage):
     assert sample['sweep_period_s'] == pytest.approx(0.1)
     assert sample['stamp_offset_s'] == 0
     assert facts['damage'] == facts['warnings'] == facts['problems'] == []
+
+
+def test_the_command_is_that_of_the_readme(capsys, monkeypatch):
+    pytest.importorskip('plotly')
+    monkeypatch.chdir(ROOT)
+    _, facts = facts_of(capsys, 'bags/street.mcap')
+    assert f'    {facts["command"]}\n' in (ROOT / 'README.md').read_text(encoding='utf-8')
 
 
 def test_why_no_command_can_be_run(tmp_path, capsys):
@@ -67,7 +77,7 @@ def test_warnings_gaps_and_damage(tmp_path, capsys):
     assert 'damage: ' in out and 'interrupted' in out
     assert 'warning: 60 boxes have no track id' in out
     assert 'away from the nearest cloud' in out
-    assert out.splitlines()[-1].endswith('--associate')
+    assert ' --associate --complete' in out.splitlines()[-1]
 
 
 @pytest.mark.parametrize('storage', ['rosbag1', 'sqlite3'])
