@@ -41,7 +41,7 @@ MOVING_SPEED = 0.3
 MOVING_DISTANCE = 0.35
 """Least distance that an object moves within the boxes that state its speed [m]: 3 deviations."""
 MOVING_DEVIATIONS = 5.0
-"""Least speed in standard errors: boxes that jump once, as when an estimate settles, do not move."""
+"""Least speed in standard errors: boxes that jump once, as estimates that settle, do not move."""
 MOTION_SECONDS = 1.0
 """The speed is that of the boxes within a span of this time [s]."""
 MIN_MOTION_SECONDS = 0.25
