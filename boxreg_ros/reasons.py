@@ -25,7 +25,8 @@ class Reason(NamedTuple):
 
 REDUCE_LOAD = (
     'compare the latencies in `/diagnostics`; lower `window`, `solver.rounds` or '
-    '`sampling.points`, publish fewer boxes, or use more CPU cores (`solver.threads`)'
+    '`sampling.points`, publish fewer boxes, use more CPU cores (`solver.threads`), or give the '
+    'node cores of its own, see "Priority and cores"'
 )
 REDUCE_RECORDING = (
     'record to a faster disk, fewer `record_formats`, or without clouds (`record_points:=false`)'
@@ -160,7 +161,10 @@ REASONS = {
         'give each object an id of its own',
     ),
     'invalid_box': Reason(
-        'box', 'contains NaN, infinity or an extent that is not positive', 'check the detector'
+        'box',
+        'contains NaN, infinity, an extent that is not positive, or a quaternion that is not of '
+        'unit length, such as one of zeros',
+        'check the detector; without rotation a quaternion is x=0 y=0 z=0 w=1',
     ),
     'not_finite': Reason(
         'box',
@@ -170,7 +174,8 @@ REASONS = {
     'budget': Reason(
         'box',
         'not solved before `deadline`: other tracks came first; its track is solved at a later '
-        'stamp, which refines the final box too if that is within `lag`',
+        'stamp, which refines the final box too if that is within `lag`. More than 1 % of the '
+        'final boxes are a WARN',
     ),
     'coast_unconfirmed': Reason(
         'predicted box',

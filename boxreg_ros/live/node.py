@@ -194,17 +194,10 @@ class BoxregNode(Node):
         """Subscribe to odometry and transforms."""
         qos = QoSProfile(depth=ODOMETRY_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._topics.subscribe('nav_msgs/msg/Odometry', 'odom', self._on_odometry, qos)
-        try:
-            from tf2_ros import TransformListener
-        except ImportError:
-            self._subscribe_to_transforms()
-        else:
-            self._listener = TransformListener(_TransformsToInbox(self._inbox), self)
-            self._opened.callback(self._listener.unregister)
-            self.get_logger().debug('transforms are received by tf2_ros')
+        self._subscribe_to_transforms()
 
     def _subscribe_to_transforms(self) -> None:
-        """Subscribe to /tf and /tf_static with the QoS of tf2_ros, where it is not installed."""
+        """Subscribe to /tf and /tf_static with the QoS of tf2_ros."""
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         try:
             for topic, qos in (('/tf', QoSProfile(depth=100)), ('/tf_static', latched)):
@@ -335,16 +328,3 @@ class BoxregNode(Node):
         self._diagnostics.publish(message)
         if self._markers.get_subscription_count() and self.worker.cloud_frame:
             self.recording.show(self._markers, self.worker.cloud_frame)
-
-
-class _TransformsToInbox:
-    """The part of a tf2 buffer that `tf2_ros.TransformListener` writes to."""
-
-    def __init__(self, inbox: Inbox) -> None:
-        self._inbox = inbox
-
-    def set_transform(self, transform: Any, authority: str) -> None:
-        self._inbox.put_event('/tf', [transform])
-
-    def set_transform_static(self, transform: Any, authority: str) -> None:
-        self._inbox.put_event('/tf_static', [transform])
