@@ -72,6 +72,12 @@ REASONS = {
         'not written beside the labels: the recorder, or its disk, is slower than the data',
         REDUCE_RECORDING,
     ),
+    'recorder_restarted': Reason(
+        'restart',
+        'the recorder of labels was ended from outside, for want of memory for example, and '
+        'started again; its segment was completed, box arrays under way to it may be lost',
+        'give the machine more memory, or record fewer `record_formats`',
+    ),
     'points_lost': Reason('cloud', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
     'boxes_lost': Reason('message', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
     'sweep_without_transform': Reason(

@@ -118,7 +118,9 @@ class TickBudget:
         self._owed = min(needed, BATCH_OVERHEAD)
         number = 0
         if self._times:
-            reserve = max(0.0, min(LARGEST_RESERVE * self.seconds, _second_longest(self._overruns)))
+            reserve = max(
+                0.0, min(LARGEST_RESERVE * self.seconds, _second_longest(self._overruns))
+            )
             planned_end = self._since + self.seconds - reserve
             time_left = planned_end - _second_longest(self._publishing_times) - self._clock()
             number = int(time_left / _second_longest(self._times)) - BATCH_OVERHEAD

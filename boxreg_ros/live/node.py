@@ -19,6 +19,7 @@ from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar
 from boxreg_ros.live.inbox import Inbox
 from boxreg_ros.live.params import changed, declare, parameters_yaml, reals_from_integers
+from boxreg_ros.live.recorder_process import check_recording
 from boxreg_ros.live.recording import LabelRecording
 from boxreg_ros.live.topics import import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
@@ -43,6 +44,8 @@ STATUS_PERIOD = 1.0
 """Time between two messages on /diagnostics [s]."""
 ODOMETRY_DEPTH = 50
 """Queue size of `odom`: a second at the rate of common odometry sources."""
+CHECKED_BY_RECORDER = ('record_formats', 'record_camera')
+"""Parameters whose values are known to the recorder alone."""
 FINALS_MARGIN = 10
 """Queue size of the boxes beyond what may be published at once at the end."""
 
@@ -123,6 +126,7 @@ class BoxregNode(Node):
 
         """
         _, options = self._settings
+        self._refuse_loop()
         self._topics = NodeTopics(self, self._health)
         self._opened.callback(self._topics.close)
         self._markers = self._topics.publish(
@@ -173,6 +177,16 @@ class BoxregNode(Node):
         self.worker.stop()
 
     # ------------------------------------------------------------ topics
+
+    def _refuse_loop(self) -> None:
+        """Raise ConfigError if the node would take its own output for its input."""
+        name = self.resolve_topic_name('boxes')
+        for output in ('refined_boxes', 'refined_boxes_final'):
+            if self.resolve_topic_name(output) == name:
+                raise ConfigError(
+                    f'boxes: expected the topic of a tracker, got {name!r}, where this node '
+                    f'publishes {output}; correct the remap'
+                )
 
     def _subscribe_to_points(self, points_type: str, lidars: Lidars) -> None:
         """Subscribe to the clouds of all LiDARs, and to the info on concatenated ones."""
@@ -279,7 +293,9 @@ class BoxregNode(Node):
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
-            changed(*self._settings, parameters)
+            _, options = changed(*self._settings, parameters)
+            if {parameter.name for parameter in parameters} & set(CHECKED_BY_RECORDER):
+                check_recording(options.record_camera, options.record_formats)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -219,7 +219,7 @@ class NodeTopics:
         return f'subscribed to {"; ".join(subscribed)}. Publishing {"; ".join(published)}'
 
     def types_published(self, topic: str) -> set[str]:
-        """Return the message types that are published on a topic, those of refined boxes excluded."""
+        """Return the message types that are published on a topic, but for refined boxes."""
         publishers = self._node.get_publishers_info_by_topic(topic)
         return {p.topic_type for p in publishers if not self._refines(*_node_of(p))}
 

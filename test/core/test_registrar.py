@@ -578,7 +578,7 @@ def test_a_tenth_of_the_windows_refines_every_final_box():
         asked.append(needed)
         return needed
 
-    results, registrar = fed_within(least, cars, window=10, lag=9, max_gap=0.3)
+    results, _ = fed_within(least, cars, window=10, lag=9, max_gap=0.3)
     assert max(asked[10:]) <= 2 + 1  # of 12 windows, and that of the ended track
     within = finals(results)[2:-10]
     reasons = [reason for result in within for reason in result.reasons]

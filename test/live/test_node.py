@@ -450,6 +450,8 @@ def refused(tmp_path_factory):
         'policy': ['--ros-args', '-p', 'qos_overrides./odom.subscription.reliability:=yes'],
         'deadline': ['--ros-args', '-p', 'deadline:=0'],
         'list': ['--ros-args', '-p', 'vehicle.names:=[]'],
+        'loop': ['--ros-args', '-r', 'boxes:=refined_boxes'],
+        'segment': ['--ros-args', '-p', 'record_segment:=1 week'],
     }
     folder = tmp_path_factory.mktemp('refused')
     started = {
@@ -473,6 +475,8 @@ def refused(tmp_path_factory):
         ('policy', 2, ('qos_overrides./odom.subscription.reliability', 'best_effort', 'got True')),
         ('deadline', 2, ('deadline', 'more than 0 s', 'got 0')),
         ('list', 2, ('vehicle.names', "['']")),
+        ('loop', 2, ('boxes', "'/refined_boxes'", 'correct the remap')),
+        ('segment', 2, ('record_segment', "'1 week'", '60 s')),
     ],
 )
 def test_invalid_arguments_are_reported_in_one_line(refused, case, status, words):
