@@ -168,9 +168,9 @@ REASONS = {
     ),
     'invalid_box': Reason(
         'box',
-        'contains NaN, infinity, an extent that is not positive, or a quaternion that is not of '
-        'unit length, such as one of zeros',
-        'check the detector; without rotation a quaternion is x=0 y=0 z=0 w=1',
+        'contains NaN or infinity, an extent that is not positive or above 1 km, a position '
+        'beyond 30,000 km, or a quaternion that is not of unit length, such as one of zeros',
+        'check the detector, and its units; without rotation a quaternion is x=0 y=0 z=0 w=1',
     ),
     'not_finite': Reason(
         'box',

@@ -8,9 +8,11 @@ import errno
 from io import StringIO
 import os
 from pathlib import Path
+from tempfile import gettempdir, TemporaryDirectory
 from typing import TextIO
 from uuid import uuid4
 
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.urls import url_of, write_text
 
 DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -32,6 +34,30 @@ def written_whole(path: Path) -> Iterator[TextIO]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """
+    Yield a folder on the disk of temporary files, which is deleted at the end.
+
+    Raises
+    ------
+    RecordingError
+        If that disk is full.
+
+    """
+    with TemporaryDirectory() as folder:
+        try:
+            yield Path(folder)
+        except OSError as error:
+            if error.errno not in DISK_ERRORS:
+                raise
+            raise RecordingError(
+                f'temporary files in {gettempdir()}: expected room for a copy, got: '
+                f'{error.strerror}; free some space there, or set TMPDIR to a folder on another '
+                f'disk'
+            ) from None
 
 
 def store(paths: Iterable[Path]) -> None:

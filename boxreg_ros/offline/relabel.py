@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, ExitStack, suppress
+from contextlib import contextmanager, ExitStack
 from dataclasses import asdict
-from datetime import datetime, UTC
 from importlib.metadata import version
 import json
 from pathlib import Path
@@ -26,6 +25,7 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MERGED, CLOUD_MISSING
 from boxreg_ros.io.session import hand_to_registrar
 from boxreg_ros.io.storage.record import Damage
+from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.reader import Findings, ReadAhead, reader, ReadItem
@@ -42,6 +42,7 @@ from boxreg_ros.structures import (
     EXTENDED,
     HUMAN,
     INTERPOLATED,
+    Ints,
     KEPT,
     REFINED,
     RefinedBoxes,
@@ -308,8 +309,6 @@ def _truth(
     """Return the true boxes for the report; None, with a warning, where they do not fit."""
     if request.truth is None:
         return None
-    from boxreg_ros.offline.evaluate import time_range
-
     truth = true_boxes(request.truth)
     stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
     names = {track.track_id for track in tracks}
@@ -317,7 +316,7 @@ def _truth(
     if truth.frame_id != summary['fixed_frame']:
         problem = f'frame {summary["fixed_frame"]!r}, got {truth.frame_id!r}'
     elif len(stamps) and not np.isin(stamps, truth.stamps_ns).any():
-        problem = f'boxes of {time_range(stamps)}, got {time_range(truth.stamps_ns)}'
+        problem = f'boxes of {_range_of(stamps)}, got {_range_of(truth.stamps_ns)}'
     elif names.isdisjoint(truth.track_ids):
         problem = f'tracks {sorted(names)[:MAX_NAMED]}, got {truth.track_ids[:MAX_NAMED]}'
     if not problem:
@@ -328,6 +327,10 @@ def _truth(
     )
     summary['warning'] = '; '.join(filter(None, (summary['warning'], line)))
     return None
+
+
+def _range_of(stamps_ns: Ints) -> str:
+    return time_range(int(stamps_ns.min()), int(stamps_ns.max()))
 
 
 def _summary(
@@ -566,16 +569,8 @@ def _why_few_were_refined(summary: dict[str, Any]) -> str:
     line = f'{part}; most frequent reason: {name} ({count:,} boxes): {reason.meaning}'
     if reason.remedy:
         line += f'; remedy: {reason.remedy}'
-    ranges = [f'{name} {_time_range(*r)}' for name, r in sorted(summary['time_ranges'].items())]
+    ranges = [f'{name} {time_range(*r)}' for name, r in sorted(summary['time_ranges'].items())]
     return f'{line}; time ranges: {", ".join(ranges)}'
-
-
-def _time_range(first_ns: int, last_ns: int) -> str:
-    """Return two stamps as seconds with the date of the first."""
-    with suppress(OverflowError, ValueError, OSError):
-        date = datetime.fromtimestamp(first_ns * 1e-9, UTC).strftime('%Y-%m-%d')
-        return f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s ({date})'
-    return f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s'
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import json
 
 from boxreg_ros import cli
-from boxreg_ros.bench.tracks import broken, table_of
 from boxreg_ros.config import COMPLETE_STEPS, Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
@@ -17,6 +16,7 @@ from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import ADDED, Sweep
 from drives import ALL_STEPS, complete, drive, only, path, steps_of
+from measure.tracks import broken, table_of
 import numpy as np
 import pytest
 from relabel_results import rows_of
@@ -215,10 +215,6 @@ def test_command_line(tmp_path, capsys):
     assert cli.main(['evaluate', out, str(tmp_path / 'street_truth.csv'), '--json']) == 0
     tracks = json.loads(capsys.readouterr().out)['tracks']
     assert tracks['added'] > 10
-    with pytest.raises(SystemExit) as status:
-        cli.main(['relabel', str(recording), '-o', out, '--bridge', '1.0'])
-    assert status.value.code == 2
-    assert '--bridge: was removed; use --complete' in capsys.readouterr().err
 
 
 def test_estimates_of_the_node_can_be_completed():

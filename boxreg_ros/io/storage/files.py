@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, ExitStack
 from heapq import heapify, heappop, heapreplace
 from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from boxreg_ros.config import YAML_ERRORS
@@ -16,6 +15,7 @@ from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, Stor
 from boxreg_ros.io.storage.rosbag1 import Rosbag1File
 from boxreg_ros.io.storage.sqlite import SqliteFile
 from boxreg_ros.io.storage.urls import download, entries_of, entry_of, url_of
+from boxreg_ros.io.whole_files import temporary_folder
 from mcap.records import Schema
 from rosbags.interfaces import Connection
 import yaml
@@ -109,8 +109,8 @@ def opened(path: Path) -> StorageFile:
         raise RecordingError(unreadable(path, error)) from None
     if path.suffix not in COMPRESSED:
         return opener(path, None)
-    with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
-        plain = Path(folder, path.stem)
+    with temporary_folder() as folder:  # an open file stays readable when it is deleted
+        plain = folder / path.stem
         damage = _unpack(path, plain)
         file = opener(plain, path)
     if damage is not None:
@@ -122,8 +122,8 @@ def _opened_remote(path: Path, opener: Callable[[Path, Path | None], StorageFile
     """Open a file behind a URL: MCAP by ranges, a copy of other formats."""
     if opener is McapFile and path.suffix not in COMPRESSED:
         return opener(path, None)
-    with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
-        copy = Path(folder, path.name)
+    with temporary_folder() as folder:  # an open file stays readable when it is deleted
+        copy = folder / path.name
         download(path, copy)
         return opened(copy)
 

@@ -14,12 +14,12 @@ from contextlib import closing, suppress
 from pathlib import Path
 import shutil
 import sqlite3
-from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.storage.record import Damage, NO_MESSAGES_NS, note, one_line, Record, shown
+from boxreg_ros.io.whole_files import temporary_folder
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -258,8 +258,8 @@ def _opened(path: Path) -> sqlite3.Connection:
     """Open a database that is not changed; one with a write-ahead log as a merged copy."""
     log = path.with_name(path.name + WAL_SUFFIX)
     if log.exists() and log.stat().st_size:
-        with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
-            copy = Path(folder, path.name)
+        with temporary_folder() as folder:  # an open file stays readable when it is deleted
+            copy = folder / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(log, copy.with_name(log.name))
             with closing(sqlite3.connect(copy)) as database:

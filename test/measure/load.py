@@ -1,7 +1,7 @@
 """
-`boxreg bench load`: latency and accuracy of the live node by number of tracks.
+`measure load`: latency and accuracy of the live node by number of tracks.
 
-Each number of tracks runs three times, as in `boxreg bench node`: with the default deadline; with
+Each number of tracks runs three times, as in `measure node`: with the default deadline; with
 one window per stamp, which is the work that no deadline can avoid; and with a deadline of an hour,
 where the node drops clouds instead. The IoU is that of all published boxes, kept ones included, to
 the true boxes of the publisher.
@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import argparse
 
-from boxreg_ros.bench.common import add_json_argument, print_json
-from boxreg_ros.bench.node import BOX_ERRORS, CIRCLE_PERIOD, measure, true_boxes
+from boxreg_ros.bench.common import add_json_argument
 from boxreg_ros.core.metrics import iou_3d
+from measure import print_json
+from measure.node import BOX_ERRORS, CIRCLE_PERIOD, measure, true_boxes
 from msg_adapters import markers
 import numpy as np
 
@@ -29,7 +30,7 @@ SHOWN = ('latency p50 [ms]', 'latency p99 [ms]', 'early IoU', 'final IoU', 'clou
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench load`."""
+    """Declare the options of `measure load`."""
     parser.add_argument(
         '--tracks', type=int, nargs='+', default=[16, 64, 256, 1024], metavar='N',
         help='default: 16 64 256 1024',

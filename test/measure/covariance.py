@@ -1,5 +1,5 @@
 """
-`boxreg bench covariance`: the sizes of covariances against those of the errors.
+`measure covariance`: the sizes of covariances against those of the errors.
 
 Of early, final and track estimates, for every class, along the axes of the true boxes.
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
-from boxreg_ros.bench.common import add_json_argument, print_json, progress_bar
+from boxreg_ros.bench.common import add_json_argument, progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance
@@ -20,11 +20,12 @@ from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.consistency import Consistency, consistency, table
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import REFINED, RefinedBoxes
+from measure import print_json
 import numpy as np
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench covariance`."""
+    """Declare the options of `measure covariance`."""
     parser.add_argument(
         'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
     )

@@ -1,11 +1,14 @@
 """The sensitivity measurement: numbers are found, changed for one run, and restored."""
 
 from importlib import import_module
-import json
 import sys
 
-from boxreg_ros import cli
-from boxreg_ros.bench.sensitivity import (
+from boxreg_ros.config import Config
+from boxreg_ros.core import arrowhead
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.simulation.simulate import simulate
+from measure.sensitivity import (
     changed_constant,
     kinds_of,
     losses,
@@ -15,13 +18,6 @@ from boxreg_ros.bench.sensitivity import (
     variations_of_constants,
     variations_of_settings,
 )
-from boxreg_ros.config import Config
-from boxreg_ros.core import arrowhead
-from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.offline.drive import Drive
-from boxreg_ros.simulation.recorder import write_recording
-from boxreg_ros.simulation.simulate import simulate
-import numpy as np
 import pytest
 
 TRACK = Measurement(Config(estimate='track'), 'track', 50, ['car', 'van', 'truck'])
@@ -169,41 +165,3 @@ def test_losses_are_sorted_and_exact(drive):
     assert found[1].volume > 0.005
     assert found[1].volume == pytest.approx(baseline.iou_3d - outcomes[1][0].iou_3d)
     assert found[2].volume == found[2].bev == 0
-
-
-@pytest.fixture(scope='module')
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('drive')
-    scene = simulate('street', seed=3, sweeps=8)
-    intensities = [np.zeros(len(owner)) for owner in scene.owners]
-    write_recording(
-        folder / 'recording.mcap', scene.sweeps, intensities, scene.detections,
-        scene.T_fixed_sensor, 'odom',
-    )  # fmt: skip
-    scene.truth.write(folder / 'truth.csv')
-    return folder
-
-
-def test_command_prints_every_chosen_number(folder, capsys):
-    words = ['bench', 'sensitivity', str(folder), '--min-points', '50', '--workers', '1']
-    assert cli.main([*words, '--only', 'faces.sides', 'queue']) == 0
-    text = capsys.readouterr().out
-    assert text.count('faces.sides ') == text.count('queue ') == 2
-    assert 'estimate track' in text
-    assert cli.main([*words, '--only', 'queue', '--json']) == 0
-    results = json.loads(capsys.readouterr().out)['results']
-    assert [loss['volume'] for loss in results['losses']] == [0, 0]
-    assert 0.6 < results['baseline'][str(folder)]['iou_3d'] < 1
-
-
-def test_the_objective_of_the_paper_has_its_own_settings(folder, capsys):
-    assert cli.main(['bench', 'sensitivity', str(folder), '--only', 'paper.closeness']) == 2
-    assert 'paper.closeness: matches none of' in capsys.readouterr().err
-    found = variations_of_settings(Config(objective='paper'), ['vehicle'])
-    assert {'paper.closeness', 'paper.smoothness'} <= {item.name for item in found}
-
-
-def test_command_refuses_unknown_names(folder, capsys):
-    assert cli.main(['bench', 'sensitivity', str(folder), '--only', 'nothing.*']) == 2
-    assert 'matches none of' in capsys.readouterr().err
-    assert cli.main(['bench', 'sensitivity', str(folder), '--workers', '0']) == 2

@@ -1,5 +1,5 @@
 """
-`boxreg bench scale`: core hours and memory per hour of recording, and a fleet of jobs.
+`measure scale`: core hours and memory per hour of recording, and a fleet of jobs.
 
 The drives are copies of one recording, and run by `boxreg batch` itself. A large recording is its
 repetition. The fleet is simulated with the measured time: jobs of random length, stragglers, and
@@ -23,13 +23,14 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG, print_json
+from boxreg_ros.bench.common import add_json_argument, BOXREG
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.offline.job import JOB_FAILED, jobs_of
 from boxreg_ros.offline.job_process import JobRunner
 from boxreg_ros.structures import Floats
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from measure import print_json
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
@@ -75,7 +76,7 @@ class Fleet:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench scale`."""
+    """Declare the options of `measure scale`."""
     parser.add_argument('recording', type=Path, metavar='RECORDING', help='MCAP file of ROS 2')
     parser.add_argument(
         '--drives', type=int, default=4, metavar='N',

@@ -4,8 +4,9 @@ import json
 import re
 import shutil
 
-from boxreg_ros.bench.sensitivity import variations_of_constants
 from boxreg_ros.config import Config
+import measure
+from measure.sensitivity import variations_of_constants
 from paths import ROOT
 import pytest
 import results
@@ -65,8 +66,9 @@ def test_numbers_without_an_effect_exist():
 def test_stored_measurement_names_version_and_command(path):
     document = json.loads(path.read_text(encoding='utf-8'))
     kind = path.stem.partition('_')[0]
-    assert document['command'].startswith(f'boxreg bench {kind}')
-    anywhere = document['command'].replace('out/bench', '').replace('bags/', '')
+    program = measure.PROGRAM if kind in measure.MEASUREMENTS else 'boxreg bench'
+    assert document['command'].startswith(f'{program} {kind}')
+    anywhere = document['command'].removeprefix(program).replace('bags/', '')
     assert '/' not in anywhere  # no path of one machine
     assert document['version']
     assert kind in results.TABLES

@@ -1,5 +1,5 @@
 """
-`boxreg bench lidars`: accuracy on a truck with LiDARs at its corners.
+`measure lidars`: accuracy on a truck with LiDARs at its corners.
 
 The same drives are recorded in four ways: a topic per LiDAR, a concatenated cloud with its info
 message, the concatenated cloud alone, and a single LiDAR on the roof. The concatenated cloud alone
@@ -14,7 +14,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
+from boxreg_ros.bench.common import add_json_argument, line, progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import input_boxes
@@ -24,6 +24,7 @@ from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.relabel import relabel
 from boxreg_ros.offline.request import Request
 from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, write_truck
+from measure import print_json
 import numpy as np
 
 CLASSES = ('car', 'van', 'truck')
@@ -40,7 +41,7 @@ MIN_POINTS = 100
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench lidars`."""
+    """Declare the options of `measure lidars`."""
     parser.add_argument(
         '--seeds', type=int, default=3, metavar='N', help='number of drives (default: 3)'
     )

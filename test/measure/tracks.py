@@ -1,5 +1,5 @@
 """
-`boxreg bench tracks`: broken tracks before and after each step of ``relabel --complete``.
+`measure tracks`: broken tracks before and after each step of ``relabel --complete``.
 
 The tracks of each recording are broken by the same rules as in ``boxreg simulate --break``. All
 rows of a table have the same sweeps and the same broken boxes; each row has one step more. The
@@ -16,7 +16,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
+from boxreg_ros.bench.common import add_json_argument, line, progress_bar
 from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.box_table import BoxTable
@@ -28,6 +28,7 @@ from boxreg_ros.offline.track_scores import track_scores, TrackScores
 from boxreg_ros.review.rules.overlap import DUPLICATE_IOU
 from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
 from boxreg_ros.structures import BoxArray, Ints, RefinedBoxes, REJECTED, Sweep
+from measure import print_json
 import numpy as np
 
 TITLES = ('recall', 'prec.', 'ids/obj', 'HOTA', 'IDF1', 'added', '3D added', 'ghosts', 'lost')
@@ -61,7 +62,7 @@ class Row:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench tracks`."""
+    """Declare the options of `measure tracks`."""
     parser.add_argument(
         'data', nargs='+', type=Path, metavar='FOLDER',
         help='folder with one recording and truth.csv in the columns of boxes.csv',

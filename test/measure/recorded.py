@@ -1,4 +1,4 @@
-"""Labels that the node records during `boxreg bench node`: checked, counted, and deleted."""
+"""Labels that the node records during `measure node`: checked, counted, and deleted."""
 
 from __future__ import annotations
 

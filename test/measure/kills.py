@@ -1,7 +1,7 @@
 """
-`boxreg bench kills`: boxes that a recording of labels loses when a process is killed.
+`measure kills`: boxes that a recording of labels loses when a process is killed.
 
-The node records labels and clouds from the publisher of `boxreg bench node`. After a random time
+The node records labels and clouds from the publisher of `measure node`. After a random time
 the recorder, or the node itself, gets SIGKILL; `boxreg recover` then completes the segment.
 Boxes are lost if they were published before that and are in no segment.
 
@@ -19,8 +19,10 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any, NamedTuple
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG, print_json
-from boxreg_ros.bench.node import (
+from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.errors import BoxregError
+from measure import print_json
+from measure.node import (
     children_of,
     COMPLETION_TIME,
     node_command,
@@ -30,8 +32,7 @@ from boxreg_ros.bench.node import (
     recording_parameters,
     set_environment,
 )
-from boxreg_ros.bench.recorded import RecordedLabels
-from boxreg_ros.errors import BoxregError
+from measure.recorded import RecordedLabels
 import numpy as np
 
 VICTIMS = ('recorder', 'node')
@@ -48,7 +49,7 @@ class LostArrays(NamedTuple):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench kills`."""
+    """Declare the options of `measure kills`."""
     parser.add_argument(
         '--kills', type=int, default=10, metavar='N', help='of each process (default: 10)'
     )

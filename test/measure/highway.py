@@ -1,5 +1,5 @@
 """
-`boxreg bench highway`: the same highway at two speeds, with boxes of either time.
+`measure highway`: the same highway at two speeds, with boxes of either time.
 
 At 30 m/s every vehicle moves by 3 m while the sensor turns. The boxes of a detector are where a
 vehicle was at the stamp of the sweep, or where it was when the sensor saw it; the method has to
@@ -12,11 +12,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 
-from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
+from boxreg_ros.bench.common import add_json_argument, line, progress_bar
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.scenarios import highway
+from measure import print_json
 import numpy as np
 
 SPEEDS = (5.0, 30.0)
@@ -29,7 +30,7 @@ MIN_SEEN_POINTS = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench highway`."""
+    """Declare the options of `measure highway`."""
     parser.add_argument(
         '--seeds', type=int, default=3, metavar='N', help='number of drives (default: 3)'
     )

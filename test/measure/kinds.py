@@ -1,5 +1,5 @@
 """
-`boxreg bench kinds`: gain of each class of objects, with standard errors over its tracks.
+`measure kinds`: gain of each class of objects, with standard errors over its tracks.
 
 On recordings with known truth, or on simulated streets, whose tracks are pooled: a recording has
 few pedestrians and cyclists, and the boxes of each share its errors.
@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES, print_comparison
-from boxreg_ros.bench.common import add_json_argument, print_json, progress_bar
+from boxreg_ros.bench.common import add_json_argument, progress_bar
 from boxreg_ros.bench.differences import Difference, paired, PairedBoxes, REFERENCE_METHODS
 from boxreg_ros.bench.methods import run_methods
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import match
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.simulation.simulate import simulate
+from measure import print_json
 import numpy as np
 
 COMPARED = ('smoothing', 'ours')
@@ -35,7 +36,7 @@ Differences = dict[str, dict[str, dict[str, Difference]]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench kinds`."""
+    """Declare the options of `measure kinds`."""
     parser.add_argument(
         'data', type=Path, nargs='*', metavar='DATA',
         help='folder: one recording and truth.csv (default: simulated streets)',

@@ -1,5 +1,5 @@
 """
-`boxreg bench review`: how early the review list shows the bad tracks.
+`measure review`: how early the review list shows the bad tracks.
 
 Bad tracks are those with the worst mean 3D IoU against the truth. Two inputs of each recording
 are refined: its own boxes, and its true boxes with errors planted in some tracks. Then one box of
@@ -16,7 +16,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, line, print_json, progress_bar
+from boxreg_ros.bench.common import add_json_argument, line, progress_bar
 from boxreg_ros.config import Config
 from boxreg_ros.core.metrics import iou_3d, pose_errors, PoseErrors
 from boxreg_ros.core.registrar import BoxRegistrar
@@ -29,6 +29,7 @@ from boxreg_ros.review.decisions import Corrections, Decision
 from boxreg_ros.review.risk import assess, Usual
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, ROLL, Sweep, X, YAW, Z
+from measure import print_json
 import numpy as np
 
 CUTS = (0.01, 0.05, 0.1, 0.2)
@@ -42,7 +43,7 @@ SEED = 0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench review`."""
+    """Declare the options of `measure review`."""
     parser.add_argument(
         'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
     )

@@ -1,5 +1,5 @@
 """
-`boxreg bench node`: latency and memory of the live node under load, over DDS.
+`measure node`: latency and memory of the live node under load, over DDS.
 
 Publisher, node and observer each run in a process of their own. The publisher simulates cars that
 drive in circles around a sensor; track ids are renewed as in traffic. Latency is the time from
@@ -23,14 +23,16 @@ from threading import Thread
 import time
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG, print_json
-from boxreg_ros.bench.recorded import RecordedLabels
+from boxreg_ros.bench.common import add_json_argument, BOXREG
 from boxreg_ros.errors import BoxregError, ConfigError
 from boxreg_ros.labels import module_of
 from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
+from measure import MEASURE, print_json
+from measure.recorded import RecordedLabels
 import numpy as np
+from paths import SHARE
 
-PROFILE = Path(__file__).parents[1] / 'share' / 'fastdds.xml'
+PROFILE = SHARE / 'fastdds.xml'
 CIRCLE_PERIOD = 5.0  # time until a car is back where it began [s]
 TRACK_LIFETIME = 200  # sweeps until a track gets a new id
 STARTUP_TIME = 5.0  # not measured at the beginning [s]
@@ -49,7 +51,7 @@ SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench node`."""
+    """Declare the options of `measure node`."""
     parser.add_argument('--tracks', type=int, default=64, metavar='N', help='default: 64')
     parser.add_argument(
         '--points', type=int, default=130_000, metavar='N', help='per sweep (default: 130000)'
@@ -281,7 +283,7 @@ def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str,
     Parameters
     ----------
     args : Namespace
-        Options of `boxreg bench node`.
+        Options of `measure node`.
     keeps_messages : bool
         Whether the report has ``messages`` as well: for early and final boxes, each serialised
         message by its sweep, after `STARTUP_TIME`.
@@ -360,7 +362,7 @@ def publisher_command(args: argparse.Namespace, log: Path) -> list[str]:
     """Return the command of the publisher, which logs the box arrays sent."""
     names = ('tracks', 'points', 'rate', 'seconds', 'delay')
     options = [f'--{name}={getattr(args, name)}' for name in names]
-    return [*BOXREG, 'bench', 'node', '--role=publish', f'--log={log}', *options]
+    return [*MEASURE, 'node', '--role=publish', f'--log={log}', *options]
 
 
 def _by_sweep(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, dict[int, bytes]]:

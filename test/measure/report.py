@@ -1,5 +1,5 @@
 """
-`boxreg bench report`: how soon `report.html` is painted, and how smoothly it steps.
+`measure report`: how soon `report.html` is painted, and how smoothly it steps.
 
 Each report is opened in a headless Chromium and draws without a GPU in two ways: by the processor,
 as Chromium does by itself on a machine without a GPU, and by an emulated GPU, which is an upper
@@ -10,25 +10,22 @@ limit of the frame times. Beside them are those of a page with one changing numb
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
-import shutil
 import subprocess
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from boxreg_ros.bench.common import add_json_argument, BOXREG, print_json
+from boxreg_ros.bench.common import add_json_argument, BOXREG
 from boxreg_ros.bench.speed.recordings import write_traffic
-from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.review.report import REPORT
+from browser import launched
+from measure import print_json
 import numpy as np
 
-BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
-BROWSER_OPTIONS = ('--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
-"""Root needs ``--no-sandbox``; the others draw WebGL without a GPU."""
 COMPOSITORS = {'processor': ('--disable-gpu-compositing',), 'emulated GPU': ()}
 """
 Compositor that puts the parts of the page together, and the options for it.
@@ -81,7 +78,7 @@ FIRST_PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startT
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench report`."""
+    """Declare the options of `measure report`."""
     parser.add_argument(
         'recordings', type=Path, nargs='*', metavar='RECORDING',
         help='recordings whose reports are measured',
@@ -158,14 +155,17 @@ def measure(recording: Path, out: Path, *options: str) -> dict[str, Any]:
     }
 
 
-def _stepped(page: Path, options: Sequence[str]) -> dict[str, float]:
+def _stepped(report: Path, options: Sequence[str]) -> dict[str, float]:
     """Return the time of the first paint of a page, and the times of its steps."""
-    with opened(page.as_uri(), options) as browser:
-        paint = browser.wait_for_function(FIRST_PAINT, polling=100).json_value()
-        browser.evaluate('openTrack(DATA.tracks.findIndex(track => track.boxes > 1))')
-        browser.wait_for_function('view.space && view.charts', timeout=120_000)
-        browser.evaluate(STEPPING, WARM_UP_STEPS)
-        starts, scripts = browser.evaluate(STEPPING, STEPS)
+    with launched(*options) as browser:
+        page = browser.new_page(viewport=VIEWPORT)
+        page.goto(report.as_uri())
+        page.wait_for_selector('html[data-ready]', timeout=120_000)
+        paint = page.wait_for_function(FIRST_PAINT, polling=100).json_value()
+        page.evaluate('openTrack(DATA.tracks.findIndex(track => track.boxes > 1))')
+        page.wait_for_function('view.space && view.charts', timeout=120_000)
+        page.evaluate(STEPPING, WARM_UP_STEPS)
+        starts, scripts = page.evaluate(STEPPING, STEPS)
     frames = np.diff(starts)
     return {
         'first paint [ms]': paint,
@@ -179,49 +179,8 @@ def _stepped(page: Path, options: Sequence[str]) -> dict[str, float]:
 
 def _reference_frame(options: Sequence[str]) -> float:
     """Return the median time of a frame of a page with one changing number [ms]."""
-    with _browser(options) as browser:
+    with launched(*options) as browser:
         page = browser.new_page(viewport=VIEWPORT)
         page.set_content('<body></body>')
         starts = page.evaluate(CHANGING_TEXT, STEPS)
     return float(np.median(np.diff(starts)))
-
-
-@contextmanager
-def opened(url: str, options: Sequence[str]) -> Iterator[Any]:
-    """
-    Yield a page of a headless browser, with some `options`, when its script is ready.
-
-    Raises
-    ------
-    ConfigError
-        If the browser or the package that drives it is not installed.
-
-    """
-    with _browser(options) as browser:
-        page = browser.new_page(viewport=VIEWPORT)
-        page.goto(url)
-        page.wait_for_selector('html[data-ready]', timeout=120_000)
-        yield page
-
-
-@contextmanager
-def _browser(options: Sequence[str]) -> Iterator[Any]:
-    """Yield a headless Chromium with some `options` beside `BROWSER_OPTIONS`."""
-    executable = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if executable is None:
-        raise ConfigError(
-            f'browser: expected one of {", ".join(BROWSERS)} on PATH, got none; apt install '
-            f'chromium'
-        )
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError as error:
-        raise ConfigError(
-            f'bench report needs playwright: pip install playwright ({error})'
-        ) from None
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=executable, args=[*BROWSER_OPTIONS, *options]
-        )
-        yield browser
-        browser.close()

@@ -1,5 +1,5 @@
 """
-`boxreg bench sensitivity`: loss of accuracy when a setting or a constant is halved or doubled.
+`measure sensitivity`: loss of accuracy when a setting or a constant is halved or doubled.
 
 Settings are the numbers of `Config`. Constants are the numbers that the modules of the core assign
 as ``NAME = number`` or ``NAME = number, number``. Both are discovered, so a new one is measured
@@ -37,7 +37,6 @@ from boxreg_ros.bench.common import (
     add_scope_arguments,
     class_words,
     line,
-    print_json,
     progress_bar,
 )
 from boxreg_ros.config import Config, KINDS, Setting
@@ -45,6 +44,7 @@ from boxreg_ros.errors import ConfigError
 from boxreg_ros.offline.box_scores import match, summarise
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.structures import BoxArray
+from measure import print_json
 import numpy as np
 import torch
 
@@ -495,7 +495,7 @@ def losses(
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `boxreg bench sensitivity`."""
+    """Declare the options of `measure sensitivity`."""
     add_scope_arguments(parser)
     add_estimate_argument(parser)
     parser.add_argument(
