@@ -10,6 +10,7 @@ import time
 from typing import Any
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
+from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.warm_up import warm_up
 from boxreg_ros.io.whole_files import written_whole
@@ -102,8 +103,9 @@ class BoxregNode(Node):
 
         """
         config, options = self._settings
-        warm_up(config)
-        cdr.walker()
+        with announced_compilation(self.get_logger().info):
+            warm_up(config)
+            cdr.walker()
         self._budget = TickBudget(options.deadline)
         warm_up(config, self._budget.submit)  # once more, timed without imports and compilation
         self._live = LiveRegistrar(
