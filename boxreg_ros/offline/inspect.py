@@ -13,6 +13,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from itertools import pairwise
 import json
 from pathlib import Path
@@ -42,6 +43,8 @@ SAMPLE_SECONDS = 3.0
 """Part of the recording whose messages are read [s]; chosen: 30 sweeps at 10 Hz take 0.25 s."""
 SAMPLE_ITEMS = 60
 """Clouds and box arrays that are read at most: those of this time at 10 Hz."""
+REPORT_PACKAGES = ('jinja2', 'plotly')
+"""Without them ``--report`` is not proposed; those that a plain installation lacks."""
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
 
@@ -383,6 +386,9 @@ def _command(args: argparse.Namespace, facts: dict[str, Any]) -> str:
     words += words_of(args, Request, *TOPICS)
     if facts['sample']['boxes_without_id']:
         words.append('--associate')
+    words.append('--complete')
+    if all(map(find_spec, REPORT_PACKAGES)):
+        words.append('--report')
     return shlex.join(words)
 
 
