@@ -8,11 +8,11 @@ import errno
 from io import StringIO
 import os
 from pathlib import Path
-from tempfile import gettempdir, TemporaryDirectory
+import tempfile
 from typing import TextIO
 from uuid import uuid4
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import TransferError
 from boxreg_ros.io.storage.urls import url_of, write_text
 
 DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -43,21 +43,22 @@ def temporary_folder() -> Iterator[Path]:
 
     Raises
     ------
-    RecordingError
+    TransferError
         If that disk is full.
 
     """
-    with TemporaryDirectory() as folder:
-        try:
+    try:
+        with tempfile.TemporaryDirectory() as folder:
             yield Path(folder)
-        except OSError as error:
-            if error.errno not in DISK_ERRORS:
-                raise
-            raise RecordingError(
-                f'temporary files in {gettempdir()}: expected room for a copy, got: '
-                f'{error.strerror}; free some space there, or set TMPDIR to a folder on another '
-                f'disk'
-            ) from None
+    except OSError as error:
+        # Where no folder has room for a file, tempfile raises a FileNotFoundError.
+        if error.errno not in DISK_ERRORS and 'temporary directory' not in str(error):
+            raise
+        place = tempfile.tempdir or os.environ.get('TMPDIR', '/tmp')
+        raise TransferError(
+            f'temporary files in {place}: expected room for a copy, got: {error.strerror}; free '
+            f'some space there, or set TMPDIR to a folder on another disk'
+        ) from None
 
 
 def store(paths: Iterable[Path]) -> None:

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 import sys
-from typing import Any, Self
+from typing import Any, Self, TYPE_CHECKING
 
 from boxreg_ros.offline.arguments import (
     add_options,
@@ -19,6 +19,9 @@ from boxreg_ros.offline.progress import Progress
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare, SUMMARY
 from boxreg_ros.options import option
+
+if TYPE_CHECKING:
+    from boxreg_ros.offline.summary import Summary
 
 DONE = 0
 FAILED = 1
@@ -76,14 +79,16 @@ def run(args: argparse.Namespace) -> int:
     Status 1 also if the recording has boxes and none was refined; the result is kept.
 
     """
-    from boxreg_ros.offline.relabel import closing_line, notes, relabel
+    from boxreg_ros.offline.notes import closing_line, notes
+    from boxreg_ros.offline.relabel import relabel
+    from boxreg_ros.offline.summary import Summary
 
     request = request_from(args)
     demands = Demands(**values_of(args, Demands))
     earlier = earlier_summary(args.out)
     if args.resume and earlier and _is_complete(earlier, request, args.out):
         print(f'{args.out}: up to date, made from the same files with the same settings')
-        return _status(earlier, demands)
+        return _status(Summary.from_json(earlier), demands)
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
     with ProgressBar() as bar:
@@ -96,21 +101,19 @@ def run(args: argparse.Namespace) -> int:
     return _status(summary, demands)
 
 
-def _status(summary: dict[str, Any], demands: Demands) -> int:
+def _status(summary: Summary, demands: Demands) -> int:
     """Return the exit status of a run; say on stderr if it misses ``--fail-under``."""
-    from boxreg_ros.offline.relabel import has_failed, is_complete, num_refined, part_refined
-
-    if part_refined(summary) < demands.fail_under:
+    if summary.part_refined < demands.fail_under:
         print(
             f'boxreg: --fail-under: expected at least {demands.fail_under:.1%} of the boxes '
-            f'refined, got {num_refined(summary):,} of {summary["boxes_in"]:,}; the results are '
+            f'refined, got {summary.num_refined:,} of {summary.boxes_in:,}; the results are '
             f'kept, see "reasons" in {SUMMARY}',
             file=sys.stderr,
         )
         return FAILED
-    if demands.strict and not is_complete(summary):
+    if demands.strict and not summary.is_complete:
         return FAILED
-    return FAILED if has_failed(summary) else DONE
+    return FAILED if summary.has_failed else DONE
 
 
 def _is_complete(earlier: dict[str, Any], request: Request, out: Path) -> bool:

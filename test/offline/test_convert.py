@@ -65,9 +65,9 @@ def test_labels_are_refined_like_boxes_of_a_topic(tmp_path, drive):
     relabel(Request((recording,), config=QUICK), tmp_path / 'topic')
     request = Request((recording,), config=QUICK, labels=('csv', table))
     summary = relabel(request, tmp_path / 'labels')
-    assert summary['labels'] == {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0}
-    assert summary['topics']['boxes'] is None
-    assert (summary['boxes_in'], summary['status']['refined']) == (14, 14)
+    assert summary.labels == {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0}
+    assert summary.topics['boxes'] is None
+    assert (summary.boxes_in, summary.status['refined']) == (14, 14)
     assert_same_boxes(rows_of(tmp_path / 'labels'), rows_of(tmp_path / 'topic'), 1e-5)
 
 
@@ -121,7 +121,7 @@ def test_labels_of_a_recording_without_boxes(tmp_path, drive):
     bare = Drive(sweeps=7)
     bare.items = [item for item in bare.items if item[0] != '/boxes']
     request = Request((bare.write(tmp_path / 'bare'),), config=QUICK, labels=('csv', table))
-    assert relabel(request, tmp_path / 'out')['boxes_out'] == 14
+    assert relabel(request, tmp_path / 'out').boxes_out == 14
 
 
 def test_labels_outside_of_the_requested_part_are_counted(tmp_path, drive):
@@ -132,7 +132,7 @@ def test_labels_outside_of_the_requested_part_are_counted(tmp_path, drive):
     stamps = {int(row['stamp_ns']) for row in rows_of(tmp_path / 'out')}
     first = min(int(row['stamp_ns']) for row in rows_of_table(table))
     assert {round((stamp - first) / SECOND, 1) for stamp in stamps} == {0.2, 0.3, 0.4}
-    assert summary['labels']['boxes_outside_part'] == 8
+    assert summary.labels['boxes_outside_part'] == 8
 
 
 @pytest.mark.parametrize('apart', [-(10**18), 10**18, -(10**10), 10**10])
@@ -146,7 +146,7 @@ def test_labels_of_another_drive_are_refused(tmp_path, drive, apart):
     assert not (tmp_path / 'out').exists()
     part = Request((recording,), config=QUICK, labels=('csv', table), end=0.3)
     if abs(apart) < 10**12:
-        assert relabel(part, tmp_path / 'out')['labels']['boxes_outside_part'] == 14
+        assert relabel(part, tmp_path / 'out').labels['boxes_outside_part'] == 14
 
 
 def module_packages(name):
@@ -163,7 +163,7 @@ def test_labels_without_transform_are_kept_with_the_reason(tmp_path, drive):
     text = table.read_text().replace(',odom,', ',mars,')
     table.write_text(text)
     request = Request((recording,), config=QUICK, labels=('csv', table))
-    assert relabel(request, tmp_path / 'out')['reasons'] == {'no_transform': 14}
+    assert relabel(request, tmp_path / 'out').reasons == {'no_transform': 14}
 
 
 def test_label_frame_other_than_the_sensor(tmp_path, drive):

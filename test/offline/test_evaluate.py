@@ -184,6 +184,17 @@ def test_malformed_table_is_refused(tmp_path, text, message):
         BoxTable.read(tmp_path / 'boxes.csv')
 
 
+@pytest.mark.parametrize(('mark', 'encoding', 'found'), [
+    (',', 'utf-16', 'UTF-16'), (',', 'utf-16-be', 'UTF-16'), (';', 'utf-8-sig', 'semicolons'),
+    ('\t', 'utf-16', 'UTF-16'), ('\t', 'utf-8', 'tabs'),
+])  # fmt: skip
+def test_other_exports_of_spreadsheets_are_named(tmp_path, mark, encoding, found):
+    path = tmp_path / 'boxes.csv'
+    path.write_text(mark.join(COLUMNS) + '\n' + mark.join('1' * 17), encoding=encoding)
+    with pytest.raises(RecordingError, match=f'got {found}, .*save it as "CSV UTF-8'):
+        BoxTable.read(path)
+
+
 def test_absent_or_binary_table_is_refused(tmp_path):
     (tmp_path / 'binary.csv').write_bytes(bytes(range(256)))
     for name, reason in (('absent.csv', 'read: No such file'), ('binary.csv', 'read as CSV')):
