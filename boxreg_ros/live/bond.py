@@ -11,7 +11,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 TOPIC = 'bond'
-TYPE = 'bond/msg/Status'
+STATUS_TYPE = 'bond/msg/Status'
 PERIOD = 0.1
 """Time between two heartbeats [s]; that of the nodes of Nav2."""
 TIMEOUT = 4.0
@@ -51,7 +51,7 @@ class Bond:
     def offered_by(cls, node: Node) -> Bond | None:
         """Return a new bond; None, with a log entry, where its message type is not installed."""
         try:
-            kind = import_message(TYPE)
+            kind = import_message(STATUS_TYPE)
         except UnsupportedMessage as error:
             node.get_logger().info(f'no bond, set bond_timeout of a manager to 0.0: {error}')
             return None

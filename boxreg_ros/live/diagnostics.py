@@ -21,7 +21,7 @@ REASONS_WITHOUT_CLOUDS = ('no_transform', 'no_sweep')
 """Reasons that boxes get when no cloud arrives at all."""
 RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')
 """Counters that are also reported as a rate."""
-NO_TIME = 'budget'
+BUDGET = 'budget'
 """Reason of final boxes that the solver had no time for."""
 LEAST_SHARE = 0.01
 """Part of the final boxes without time that is worth a warning; chosen: fewer are a hiccup."""
@@ -139,7 +139,7 @@ class Health:
         values |= {key: str(value) for key, value in facts.items()}
         values |= {key: str(number) for key, number in sorted(counts.items())}
         late = _budget_text(recent)
-        if late and self.is_due(NO_TIME):
+        if late and self.is_due(BUDGET):
             self._logger.warning(late)
         level, message = _level_and_message(recent)
         return DiagnosticStatus(
@@ -199,10 +199,10 @@ def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
 
 def _budget_text(recent: Counter[str]) -> str:
     """Return the warning of final boxes without time, with their share; '' for few or none."""
-    share = recent[NO_TIME] / max(1, recent['refined'] + recent['kept'])
+    share = recent[BUDGET] / max(1, recent['refined'] + recent['kept'])
     if share < LEAST_SHARE:
         return ''
-    return f'{NO_TIME}: no time to refine {share:.0%} of the final boxes; {REDUCE_LOAD}'
+    return f'{BUDGET}: no time to refine {share:.0%} of the final boxes; {REDUCE_LOAD}'
 
 
 def _level_and_message_of(worst: str, recent: Counter[str]) -> tuple[bytes, str]:

@@ -15,7 +15,7 @@ from boxreg_ros.io.compilation import announced_compilation
 from boxreg_ros.io.warm_up import warm_up
 from msg_adapters import cdr
 
-ESTIMATES = ('final', 'track')
+COMPILED_ESTIMATES = ('final', 'track')
 """Those of the node and of `boxreg relabel`; an early estimate is part of the final one."""
 MODES = ('3d', 'bev')
 
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
 def _compile() -> int:
     """Register with each estimate and mode; return the number of functions compiled."""
     with announced_compilation(lambda text: print(text, file=sys.stderr)) as done:
-        for estimate, mode in product(ESTIMATES, MODES):
+        for estimate, mode in product(COMPILED_ESTIMATES, MODES):
             warm_up(Config.from_dict({'estimate': estimate, 'mode': mode}))
         cdr.walker()
     return done.functions
@@ -61,5 +61,5 @@ def _place() -> str:
     """Return the folder that numba keeps compiled functions in."""
     import numba
 
-    folder: str = numba.config.CACHE_DIR
+    folder: str = vars(numba.config)['CACHE_DIR']  # set from the environment, at run time
     return folder or f'{Path(__file__).parents[1]}, beside its sources'
