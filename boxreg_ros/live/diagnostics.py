@@ -8,7 +8,7 @@ from threading import Lock
 import time
 import traceback
 
-from boxreg_ros.reasons import FAULTS, REASONS, REDUCE_LOAD
+from boxreg_ros.reasons import FAULTS, Reason, REDUCE_LOAD
 from boxreg_ros.structures import REFINED
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -17,12 +17,10 @@ LOG_PERIOD = 10.0
 """The same reason is logged at most once in this time [s]."""
 WAITING = 'waiting'
 """Name of the log entry with the inputs that the node waits for."""
-REASONS_WITHOUT_CLOUDS = ('no_transform', 'no_sweep')
+REASONS_WITHOUT_CLOUDS = (Reason.NO_TRANSFORM, Reason.NO_SWEEP)
 """Reasons that boxes get when no cloud arrives at all."""
 RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')
 """Counters that are also reported as a rate."""
-BUDGET = 'budget'
-"""Reason of final boxes that the solver had no time for."""
 LEAST_SHARE = 0.01
 """Part of the final boxes without time that is worth a warning; chosen: fewer are a hiccup."""
 LATENCY_QUANTILES = (('median', 0.5), ('p99', 0.99), ('most', 1.0))
@@ -50,6 +48,7 @@ class Health:
         self._logged: Counter[str] = Counter()
         self._logged_at = {WAITING: time.monotonic()}
         self._latencies: list[float] = []
+        self._static: list[tuple[float, float]] = []
         self._since = time.monotonic()
 
     def count(self, name: str, number: int = 1) -> None:
@@ -67,7 +66,12 @@ class Health:
         with self._lock:
             self._latencies.append(seconds)
 
-    def report(self, reason: str, text: str, number: int = 1) -> None:
+    def add_static(self, seconds: float, cpu: float) -> None:
+        """Record latency and CPU time of a cloud without moving objects [s]."""
+        with self._lock:
+            self._static.append((seconds, cpu))
+
+    def report(self, reason: Reason, text: str, number: int = 1) -> None:
         """Count a reason and log the text, at most once per `LOG_PERIOD` and reason."""
         self.count(reason, number)
         if self.is_due(reason):
@@ -75,7 +79,7 @@ class Health:
 
     def report_failure(self, error: Exception) -> None:
         """Count an internal error as ``failed``; its traceback goes to the debug log."""
-        self.report('failed', f'{type(error).__name__}: {error}')
+        self.report(Reason.FAILED, f'{type(error).__name__}: {error}')
         self._logger.debug(''.join(traceback.format_exception(error)))
 
     def is_due(self, reason: str) -> bool:
@@ -93,10 +97,10 @@ class Health:
         with self._lock:
             counts = self._counts + self._core_counts
             unlogged = counts - self._logged
-        for name, reason in REASONS.items():
-            if unlogged[name] and reason.remedy and self.is_due(name):
-                text = f'{name} ({unlogged[name]} more): {reason.meaning}; {reason.remedy}'
-                self._log(name, text)
+        for reason in Reason:
+            if unlogged[reason] and reason.remedy and self.is_due(reason):
+                text = f'{reason} ({unlogged[reason]} more): {reason.meaning}; {reason.remedy}'
+                self._log(reason, text)
 
     def log_waiting(self, fixed_frame: str) -> None:
         """
@@ -132,14 +136,18 @@ class Health:
             self._reported = counts
             latencies = sorted(self._latencies)
             self._latencies = []
+            static = self._static
+            self._static = []
             period = max(now - self._since, 1e-3)
             self._since = now
         values = {f'{rate} [Hz]': f'{recent[rate] / period:.1f}' for rate in RATES}
-        values |= _latency_values(latencies)
+        values |= _latency_values('latency', latencies)
+        values |= _latency_values('static_points latency', sorted(wait for wait, _ in static))
+        values |= _latency_values('static_points CPU', sorted(cpu for _, cpu in static))
         values |= {key: str(value) for key, value in facts.items()}
         values |= {key: str(number) for key, number in sorted(counts.items())}
         late = _budget_text(recent)
-        if late and self.is_due(BUDGET):
+        if late and self.is_due(Reason.BUDGET):
             self._logger.warning(late)
         level, message = _level_and_message(recent)
         return DiagnosticStatus(
@@ -161,26 +169,26 @@ def _awaited(counts: Mapping[str, int], fixed_frame: str) -> str:
         return f'messages on {" and ".join(missing)}'
     if not fixed_frame:
         return 'transforms from the frame of the clouds to a fixed frame'
-    reasons = [name for name, reason in REASONS.items() if reason.unit == 'box']
+    reasons = [reason for reason in Reason if reason.unit == 'box']
     why = max(reasons, key=lambda name: counts.get(name, 0))
     if not counts.get(why):
         return 'enough observations of a track'
-    return f'boxes that can be refined; so far most often {why}: {REASONS[why].meaning}'
+    return f'boxes that can be refined; so far most often {why}: {why.meaning}'
 
 
-def _latency_values(latencies: list[float]) -> dict[str, str]:
-    """Return quantiles of sorted latencies; nothing if there are none."""
+def _latency_values(what: str, latencies: list[float]) -> dict[str, str]:
+    """Return quantiles of sorted times [s]; nothing if there are none."""
     values = {}
     for name, share in LATENCY_QUANTILES:
         if latencies:
             row = min(int(share * len(latencies)), len(latencies) - 1)
-            values[f'latency {name} [ms]'] = f'{1e3 * latencies[row]:.1f}'
+            values[f'{what} {name} [ms]'] = f'{1e3 * latencies[row]:.1f}'
     return values
 
 
 def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
     """Return level and message of the counters of one status period."""
-    worst = next((name for name, why in REASONS.items() if recent[name] and why.remedy), None)
+    worst = next((one for one in Reason if recent[one] and one.remedy), None)
     if worst is not None:
         return _level_and_message_of(worst, recent)
     missing = [name for name in ('points', 'boxes') if not recent[f'{name}_received']]
@@ -190,26 +198,26 @@ def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
     if late:
         return DiagnosticStatus.WARN, late
     if recent['kept'] and not recent['refined']:
-        box_reasons = [name for name, reason in REASONS.items() if reason.unit == 'box']
+        box_reasons = [reason for reason in Reason if reason.unit == 'box']
         why = max(box_reasons, key=lambda name: recent[name])
-        text = f'no box was refined; most often {why}: {REASONS[why].meaning}'
+        text = f'no box was refined; most often {why}: {why.meaning}'
         return DiagnosticStatus.WARN, text
     return DiagnosticStatus.OK, 'refining'
 
 
 def _budget_text(recent: Counter[str]) -> str:
     """Return the warning of final boxes without time, with their share; '' for few or none."""
-    share = recent[BUDGET] / max(1, recent['refined'] + recent['kept'])
+    share = recent[Reason.BUDGET] / max(1, recent['refined'] + recent['kept'])
     if share < LEAST_SHARE:
         return ''
-    return f'{BUDGET}: no time to refine {share:.0%} of the final boxes; {REDUCE_LOAD}'
+    return f'{Reason.BUDGET}: no time to refine {share:.0%} of the final boxes; {REDUCE_LOAD}'
 
 
-def _level_and_message_of(worst: str, recent: Counter[str]) -> tuple[bytes, str]:
+def _level_and_message_of(worst: Reason, recent: Counter[str]) -> tuple[bytes, str]:
     """Return level and message where `worst` is the gravest reason of the period."""
     is_idle = bool(recent['boxes_received']) and not recent['refined']
     level = DiagnosticStatus.ERROR if is_idle or worst in FAULTS else DiagnosticStatus.WARN
-    text = f'{worst}: {REASONS[worst].meaning}; {REASONS[worst].remedy}'
+    text = f'{worst}: {worst.meaning}; {worst.remedy}'
     if worst in REASONS_WITHOUT_CLOUDS and not recent['points_received']:
         text = 'nothing received on points'
     if is_idle:

@@ -24,6 +24,7 @@ from boxreg_ros.io.label_feed import (
     Tick,
 )
 from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.reasons import REASONS
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, pointcloud
 import numpy as np
@@ -167,7 +168,7 @@ class RecorderProcess:
                 self._changed.notify()
         if is_full:
             self._health.report(
-                f'{kind}_unrecorded', 'the recorder, or its disk, is slower than the data'
+                REASONS[f'{kind}_unrecorded'], 'the recorder, or its disk, is slower than the data'
             )
 
     def finish(self) -> None:
@@ -193,7 +194,7 @@ class RecorderProcess:
         while self._is_to_start_again(exit_status):
             lost = self._arrays_sent - (self.status.frames - self._before.frames)
             self._health.report(
-                'recorder_restarted',
+                Reason.RECORDER_RESTARTED,
                 f'the recorder ended with exit status {exit_status} and is started again, which '
                 f'completes its segment; up to {lost} box arrays under way to it may be lost',
             )

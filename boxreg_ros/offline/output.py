@@ -15,6 +15,7 @@ from boxreg_ros.offline.background import Background
 from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.reasons import Reason
 from boxreg_ros.review.decisions import Corrections, read_decisions
 from boxreg_ros.structures import (
     ADDED,
@@ -72,6 +73,8 @@ class Sink:
         Boxes before and after, for the report and the tables of tracks.
     corrections : Corrections
         Rejected tracks and pinned boxes.
+    array_stamps_ns : list of int
+        Stamps of all box arrays [ns].
     points : PointCollector or None
         Points around the input boxes, for the report.
 
@@ -92,7 +95,7 @@ class Sink:
         recording = request.recording()
         bags = recording if isinstance(recording, Recording) else None
         options = replace(request.options, recording=bags)
-        self._output = LabelOutput(folder, request.formats, provenance, options)
+        self._output = LabelOutput(folder, request.box_formats, provenance, options)
         self.corrections = Corrections(
             read_decisions(request.decisions) if request.decisions is not None else ()
         )
@@ -108,6 +111,7 @@ class Sink:
         self._order = StampOrder()
         self._early: dict[object, RefinedBoxes] = {}  # by ticket, until the final estimate is
         self._last_ticket = 0
+        self.array_stamps_ns: list[int] = []
         self.boxes_in = 0
         self.boxes_out = 0
         self.status: Counter[str] = Counter()
@@ -188,6 +192,7 @@ class Sink:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
+        self.array_stamps_ns.append(given.stamp_ns)
         for name, boxes in Counter(given.class_names).items():
             if not self._config.knows_class(name):
                 self.unknown_classes[name] += boxes
@@ -198,7 +203,7 @@ class Sink:
             moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
             item = item._replace(moved=moved)
         elif count:
-            result = kept(given, 'no_transform')
+            result = kept(given, Reason.NO_TRANSFORM)
             self._order.expect(Slot(given, item.T_fixed_sensor, item.T_fixed_given, result))
         return item
 
