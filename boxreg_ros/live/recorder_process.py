@@ -24,7 +24,7 @@ from boxreg_ros.io.label_feed import (
     Tick,
 )
 from boxreg_ros.live.diagnostics import Health
-from boxreg_ros.reasons import REASONS
+from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, pointcloud
 import numpy as np
