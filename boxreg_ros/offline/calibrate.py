@@ -30,18 +30,18 @@ from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.track_window import Window
 from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.arguments import (
     add_options,
     add_recordings,
-    config_from,
+    request_from,
     Settings,
     TOPICS,
-    topics_from,
 )
 from boxreg_ros.offline.drive import Drive
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import spare_file
-from boxreg_ros.offline.sources import source_of, true_boxes
+from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.structures import Floats, is_valid_box
 import numpy as np
 import torch
@@ -244,8 +244,8 @@ def write_settings(path: Path, values: Mapping[str, Any], origin: str) -> None:
         inner[last] = value
     text = yaml.safe_dump({'/**': {'ros__parameters': nested}}, sort_keys=False)
     text = f'# boxreg calibrate, {origin}\n{text}'
-    # `origin` has file names, which may not be valid text.
-    path.write_text(text, encoding='utf-8', errors='backslashreplace')
+    with written_whole(path) as file:  # `origin` has file names, which may not be valid text
+        file.write(text.encode(errors='backslashreplace').decode())
 
 
 def table(measured: Mapping[str, Measured], config: Config) -> list[str]:
@@ -283,11 +283,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate, print a table, and write the settings."""
-    config = config_from(args)
+    request = request_from(args)
+    config = request.config
     if args.output:
         _check_output(args)
     truth = true_boxes(args.truth)
-    recording = source_of(args.recordings, **topics_from(args))
+    recording = request.recording()
     recording.has_boxes = not args.no_boxes
     drive = Drive.of(recording, truth, config.tolerance, config)
     if drive.left_out:
