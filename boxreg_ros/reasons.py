@@ -117,6 +117,7 @@ REASONS = {
     'rejected': Reason(
         'box', 'a person rejected the refined box or its track in `boxreg review`', ''
     ),
+    'deleted': Reason('box', 'rejected: a person deleted the box or its track in `boxreg review`'),
     'no_sweep': Reason(
         'box',
         'no cloud within `tolerance` or `reach` of its stamp',

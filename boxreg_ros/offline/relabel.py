@@ -35,7 +35,8 @@ from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.tracks_table import step_cells, STEP_COLUMNS
 from boxreg_ros.reasons import REASONS
-from boxreg_ros.review.decisions import DECISIONS
+from boxreg_ros.review.corrections import Corrections
+from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.structures import (
     BoxArray,
     COASTED,
@@ -52,7 +53,7 @@ import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
-    from boxreg_ros.offline.completion import Completion
+    from boxreg_ros.offline.completion import Completion, Moved
     from boxreg_ros.offline.journal import EstimateJournal
     from boxreg_ros.review.changes import TrackChanges
     from boxreg_ros.review.rules.protocol import Violation
@@ -108,7 +109,8 @@ def relabel(
     shown = _Passes(progress, 1 + bool(request.config.complete.steps))
     with writing(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
-        plan, completion = _survey(request, clock, shown, journal)
+        corrections = _corrections(request)
+        plan, completion = _survey(request, clock, shown, journal, corrections)
         receive = workers.enter_context(reader(request))
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
@@ -122,9 +124,10 @@ def relabel(
         )
         registrar = BoxRegistrar(request.config, _journaled(submit, journal))
         with whole_folder(out, request.inputs()) as folder:
-            with Sink(folder, request, recording.source, clock) as sink:
+            with Sink(folder, request, recording.source, clock, corrections) as sink:
                 _register(recording, registrar, completion, sink, clock, shown)
             summary = _summary(request, recording, registrar, sink)
+            summary['unused_decisions'] = corrections.unused()
             summary['complete'] = _completed(plan)
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
@@ -178,8 +181,17 @@ class _Passes:
         self._done += 1
 
 
+def _corrections(request: Request) -> Corrections:
+    """Return the decisions of a person; none without a file of them."""
+    return Corrections(() if request.decisions is None else read_decisions(request.decisions))
+
+
 def _survey(
-    request: Request, clock: Stopwatch, progress: _Passes, journal: EstimateJournal | None
+    request: Request,
+    clock: Stopwatch,
+    progress: _Passes,
+    journal: EstimateJournal | None,
+    corrections: Corrections,
 ) -> tuple[CompletionPlan | None, Completion | None]:
     """Register the recording a first time and plan its whole tracks; None without steps."""
     if not request.config.complete.steps:
@@ -194,11 +206,19 @@ def _survey(
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.progress.announce)
         )
-        items = ((item.moved, item.restarts) for item in progress.each(recording))
+        items = (
+            (_corrected(item.moved, corrections), item.restarts)
+            for item in progress.each(recording)
+        )
         submit = _journaled(submit, journal)
         first = first_pass(items, request.config, submit)
         plan = first.plan(recording.source.fixed_frame, request.config)
         return plan, Completion(plan, request.config)
+
+
+def _corrected(item: Moved, corrections: Corrections) -> Moved:
+    """Return boxes as they are to be registered; sweeps as they are."""
+    return corrections.to_register(item) if isinstance(item, BoxArray) else item
 
 
 def _register(
@@ -343,6 +363,8 @@ def _summary(
     findings = recording.findings
     return {
         'recordings': [str(path) for path in request.recordings],
+        'command': list(request.command),
+        'folder': str(Path.cwd()),
         'topics': source.topics,
         'labels': _labels(request, findings.outside),
         'fixed_frame': source.fixed_frame,
@@ -370,7 +392,6 @@ def _summary(
         'warning': findings.warning or ('' if sink.boxes_in else NO_BOXES),
         **findings.facts,
         'left_out_of_labels': sink.left_out(),
-        'unused_decisions': sink.corrections.unused(),
         'frames_without_cloud': sink.without_cloud,
         'versions': _versions(),
     }

@@ -226,6 +226,7 @@ def _request(args: argparse.Namespace) -> Request:
         report=args.report,
         truth=args.truth,
         decisions=args.decisions,
+        command=tuple(args.arguments),
     )
 
 

@@ -53,6 +53,8 @@ class Request:
         Also write ``report.html``.
     decisions : Path or None
         Decisions of `boxreg review`: rejected tracks and pinned boxes.
+    command : tuple of str
+        Arguments of `boxreg` that describe the request; empty if it was made in another way.
     truth : Path or None
         True boxes that the report shows: the columns of ``boxes.csv``, or the address of a scene.
 
@@ -79,6 +81,7 @@ class Request:
     report: bool = False
     truth: Path | None = None
     decisions: Path | None = None
+    command: tuple[str, ...] = field(default=(), repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the options."""
