@@ -15,7 +15,7 @@ from typing import Any
 import anyio
 from boxreg_ros.errors import BoxregError, RecordingError
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS
-from boxreg_ros.review.report import REPORT
+from boxreg_ros.review.report import PAGE_VERSION, REPORT
 from boxreg_ros.review.solve import ReportParts
 import numpy as np
 import orjson
@@ -35,8 +35,10 @@ BODY_SECONDS = 20.0
 POLL_SECONDS = 0.25
 """Another program may append to the file: the time until its decisions are seen; chosen."""
 STAMP = re.compile(r'-?[0-9]{1,19}')
-MARK = b'<html lang="en"', b'<html lang="en" data-review'
-"""The page offers decisions where its root element has this attribute."""
+MARK = f'<html lang="en" data-page="{PAGE_VERSION}"'.encode()
+"""Begins a page of this version, which offers decisions where ``data-review`` follows."""
+MARK_WITHIN = 1000
+"""Bytes of the page that have it."""
 HEADERS = {
     'Cache-Control': 'no-store',
     'X-Content-Type-Options': 'nosniff',
@@ -141,6 +143,11 @@ class _Review:
 
     def __init__(self, out: Path, who: str, is_ending: Callable[[], bool]) -> None:
         self._page = (out / REPORT).read_bytes()
+        if MARK not in self._page[:MARK_WITHIN]:
+            raise RecordingError(
+                f'{out / REPORT}: expected a report of this version, got one of another; run '
+                f'boxreg relabel RECORDING -o NEW --report with the same options'
+            )
         self._parts = ReportParts(out, self._page)
         self._summary = orjson.loads((out / 'summary.json').read_bytes())
         self._frame_id: str = self._summary['fixed_frame']
@@ -155,7 +162,7 @@ class _Review:
     async def page(self, _: Request) -> Response:
         """Return the page; its scripts alone may run."""
         nonce = secrets.token_urlsafe(16)
-        page = self._page.replace(*MARK, 1)
+        page = self._page.replace(MARK, MARK + b' data-review', 1)
         page = page.replace(b'\n<script>', f'\n<script nonce="{nonce}">'.encode())
         policy = {'Content-Security-Policy': POLICY.format(nonce=nonce)}
         return Response(page, media_type='text/html', headers=policy)

@@ -39,6 +39,8 @@ from boxreg_ros.structures import HUMAN, REFINED
 import numpy as np
 
 REPORT = 'report.html'
+PAGE_VERSION = 2
+"""Of the data and the requests of the page: `boxreg review` serves this one alone."""
 PACKAGES = ('jinja2', 'plotly')
 PAGE = Path(__file__).parent / 'page'
 TEMPLATE = 'report.html.j2'
@@ -153,7 +155,13 @@ def _page(**content: Any) -> str:
     parts = [(PAGE / f'{name}.js').read_text(encoding='utf-8') for name in SCRIPTS]
     script = _as_markup('\n'.join(parts))
     template = environment.get_template(TEMPLATE)
-    return template.render(css=css, script=script, plotly=compressed(_plotly_script()), **content)
+    return template.render(
+        css=css,
+        script=script,
+        plotly=compressed(_plotly_script()),
+        version=PAGE_VERSION,
+        **content,
+    )
 
 
 def _of_summary(summary: Mapping[str, Any]) -> dict[str, Any]:

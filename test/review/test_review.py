@@ -304,6 +304,14 @@ def test_unfinished_result_is_refused(tmp_path, capsys):
         assert word in line
 
 
+def test_report_of_another_version_is_refused(result, tmp_path):
+    out = shutil.copytree(result[1], tmp_path / 'out')
+    page = (out / 'report.html').read_text(encoding='utf-8')
+    (out / 'report.html').write_text(page.replace(' data-page="2"', ''), encoding='utf-8')
+    with pytest.raises(RecordingError, match='expected a report of this version, got one of'):
+        review_server(out, 0)
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_ended_server_names_the_command_that_applies_its_decisions(result, tmp_path, number):
     out = shutil.copytree(result[1], tmp_path / 'out')
@@ -586,7 +594,7 @@ def test_pin_and_re_solve_round_trip(result, tmp_path):
             page.wait_for_selector('[data-do=accept][aria-pressed=true]')
             page.fill('#comment', SCRIPT)
             page.keyboard.press('Enter')
-            page.wait_for_function('judgementOf(TRACKS[view.track])?.comment')
+            page.wait_for_function('judgementOf(current())?.comment')
             page.evaluate('step(6)')
             page.keyboard.press('e')
             before = page.evaluate('view.edit.slice()')
@@ -675,9 +683,9 @@ def test_decisions_can_be_listed_and_undone_from_another_track(result):
             # The list has lost the open track: the next one is that which took its place.
             page.locator('#top').focus()
             page.keyboard.press('ArrowDown')
-            page.wait_for_function(f"TRACKS[view.track].id === '{second}'")
+            page.wait_for_function(f"current().id === '{second}'")
             page.keyboard.press('z')
-            page.wait_for_function(f"TRACKS[view.track].id === '{first}'")
+            page.wait_for_function(f"current().id === '{first}'")
             assert page.evaluate('log.held.size') == 0
             page.click('#f-clear')
     finally:

@@ -8,7 +8,8 @@ const NONCE = document.currentScript.nonce;
 const IS_REVIEW = document.documentElement.hasAttribute('data-review');
 let DATA;                          // the report: tracks of the run, largest risk first
 let TRACKS = [];                   // tracks as decided: split, joined, renamed
-const view = { track: -1, part: null, row: 0, mark: null, sort: 'rank', descending: false, shown: [], place: 0,
+// The line `track` is selected; `open` is the track whose `part` is shown.
+const view = { track: -1, open: null, part: null, row: 0, mark: null, sort: 'rank', descending: false, shown: [], place: 0,
                space: false, charts: false, pending: false, edit: null, isMoved: false, playing: 0,
                zoom: 1, center: [0, 0, 0], around: [], solved: null };
 

@@ -2,7 +2,7 @@
 
 const MAX_GAP = 5;                 // between two tracks that may be one object [s]
 const MAX_PROPOSALS = 8;
-const current = () => TRACKS[view.track];
+const current = () => view.open;
 const boxAt = row => current().members()[row];
 const heldOf = scope => log.held.get(scopeKey('judgement', scope));
 const pinOf = row => { const found = heldOf(scopeOfBox(boxAt(row))); return found?.decision === 'pin' ? found : null; };
@@ -39,13 +39,20 @@ function chosenScopes(isBox) {
 // The rows of a topic that hold for any of some boxes.
 const heldOver = (topic, boxes) => [...new Set(boxes.flatMap(([s, k]) => covering(topic, inputOf(s, k), stampOf(s, k))))];
 
+// Decide, about the marked boxes once.
+async function decideAbout(rows) {
+  const isDone = await decide(rows);
+  if (isDone && view.mark !== null) mark();
+  return isDone;
+}
+
 async function judge(kind, isBox) {
   const held = isBox ? judgementOfBox() : judgementOf(current());
   if (held?.decision === kind && (!isBox || view.mark === null)) {
     const rows = isBox ? [held] : heldOver('judgement', current().members()).filter(isOfTrack);
     return decide(rows.map(row => ({ ...takenBack(row), comment: row.comment })));
   }
-  return decide(chosenScopes(isBox).map(scope => rowOf(scope, kind, { comment: heldOf(scope)?.comment ?? '' })));
+  return decideAbout(chosenScopes(isBox).map(scope => rowOf(scope, kind, { comment: heldOf(scope)?.comment ?? '' })));
 }
 
 async function comment(isBox, text) {
@@ -69,7 +76,7 @@ async function acceptAndGoOn() {
 async function remove(isBox) {
   if (isCorrecting()) return;
   const deleted = scopes => scopes.map(scope => rowOf(scope, 'delete'));
-  if (isBox ? !isDeleted(...boxAt(view.row)) : !isGone(current())) return decide(deleted(chosenScopes(isBox)));
+  if (isBox ? !isDeleted(...boxAt(view.row)) : !isGone(current())) return decideAbout(deleted(chosenScopes(isBox)));
   const restored = isBox ? [boxAt(view.row)] : current().members();
   const held = heldOver('deletion', restored);
   // A restored box may be one of a range: the others of it stay deleted.
@@ -126,7 +133,7 @@ async function reclass() {
   const names = [...new Set(TRACKS.map(track => track.class))].sort();
   const name = await ask('Class of the track', '', names.map(one => [one, one]), names, current().class);
   if (!name || name === current().class) return;
-  return decide(chosenScopes(view.mark !== null).map(scope => rowOf(scope, 'reclass', { value: name })));
+  return decideAbout(chosenScopes(view.mark !== null).map(scope => rowOf(scope, 'reclass', { value: name })));
 }
 
 // Ask for a text; null if the person gives none.

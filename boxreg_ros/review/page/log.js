@@ -50,14 +50,16 @@ async function post(path, content) {
 // Write rows to the file, all or none; whether that was done.
 async function store(rows) {
   let found;
+  const answered = post('decisions', { seen: log.count, rows: rows.map(row => ({ ...row, who: log.who })) });
+  log.answered = answered.catch(() => {});
   try {
-    found = await post('decisions', { seen: log.count, rows: rows.map(row => ({ ...row, who: log.who })) });
+    found = await answered;
   } catch (error) {
     fail(`The decision was not saved: ${error.message}. Check that boxreg review still runs, then decide again.`);
     return false;
   }
   $('failure').hidden = true;
-  showDecisions(receive(found));
+  await showDecisions(receive(found));
   if (found.message) fail(found.message);
   return !found.message;
 }
@@ -81,7 +83,8 @@ async function undo() {
 // Decisions of other tabs and other people, as they are made.
 function listen() {
   const source = new EventSource('events?seen=' + log.count);
-  source.onmessage = event => {
+  source.onmessage = async event => {
+    await log.answered;  // decisions of this tab are not those of another
     const fresh = receive(JSON.parse(event.data));
     if (!fresh) return;
     const other = fresh.at(-1);
@@ -91,9 +94,9 @@ function listen() {
 }
 
 // Decisions about ids change the list of tracks.
-function showDecisions(fresh) {
+async function showDecisions(fresh) {
   if (!fresh) return;
-  if (fresh.some(row => TOPIC_OF[row.decision] !== 'judgement')) rebuildTracks();
+  if (fresh.some(row => TOPIC_OF[row.decision] !== 'judgement')) await rebuildTracks();
   drawList();
   if (view.part) step(view.row, true);
 }

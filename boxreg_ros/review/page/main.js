@@ -8,21 +8,22 @@ function hashOf(id, stamp) {
 async function openTrack(index, stamp = null, row = null, isLinked = false) {
   showTab('tracks');
   const track = TRACKS[index];
-  if (index !== view.track) {
+  if (track !== view.open) {
     if (isCorrecting()) return;
-    const isNew = view.opened !== track.id;
-    clearTimeout(view.hashTimer);
-    if (isNew && !isLinked) history.pushState(null, '', hashOf(track.id, stamp));
-    view.opened = track.id;
     view.track = index;
     view.place = Math.max(0, view.shown.indexOf(track));
-    view.edit = view.mark = view.solved = null;
     selectLine();
     const part = await loadTrack(track);
     if (TRACKS[view.track] !== track) return;
+    clearTimeout(view.hashTimer);
+    const isNew = view.open?.id !== track.id;
+    if (isNew && !isLinked) history.pushState(null, '', hashOf(track.id, stamp));
+    view.open = track;
     view.part = part;
     view.charts = false;
+    view.edit = view.solved = null;
     if (isNew) {
+      view.mark = null;
       view.limits = limitsOf(part);
       view.zoom = 1;
       view.center = [0, 0, 0];
@@ -32,7 +33,7 @@ async function openTrack(index, stamp = null, row = null, isLinked = false) {
     row ??= part.num_points.indexOf(Math.max(...part.num_points));  // the object is seen best there
     drawTitle(track);
     loadAround(track).then(found => {
-      if (TRACKS[view.track] !== track) return;
+      if (view.open !== track) return;
       view.around = found;
       drawViews();
     });

@@ -59,14 +59,14 @@ function trackOf(id, pieces, index) {
 }
 
 // The track that is open stays open, by the box that is shown.
-function rebuildTracks() {
-  const shown = TRACKS[view.track]?.members()[view.row];
+async function rebuildTracks() {
+  const shown = view.open?.members()[view.row];
   TRACKS = buildTracks();
   if (!shown) return;
   const [s, k] = shown;
   const index = TRACKS.findIndex(track => track.members().some(([t, l]) => t === s && l === k));
   view.track = -1;
-  if (index >= 0) return openTrack(index, null, TRACKS[index].members().findIndex(([t, l]) => t === s && l === k));
+  if (index >= 0) await openTrack(index, null, TRACKS[index].members().findIndex(([t, l]) => t === s && l === k));
 }
 
 // Decisions are about ids and stamps of the input: the fewest scopes that are just these boxes.
