@@ -161,7 +161,10 @@ REASONS = {
         'give each object an id of its own',
     ),
     'invalid_box': Reason(
-        'box', 'contains NaN, infinity or an extent that is not positive', 'check the detector'
+        'box',
+        'contains NaN or infinity, an extent that is not positive or above 1 km, or a position '
+        'beyond 30,000 km',
+        'check the detector, and its units',
     ),
     'not_finite': Reason(
         'box',

@@ -151,6 +151,17 @@ def intensities(msg: Any) -> Floats | None:
     return np.nan_to_num(values, posinf=0, neginf=0)
 
 
+def bytes_of(data: Any) -> Any:
+    """
+    Return what numpy can read of a field of bytes.
+
+    A message of ROS 2 Lyrical may hold them in the memory of a device, as an object with
+    ``to_bytes`` and without the buffer protocol.
+
+    """
+    return data.to_bytes() if hasattr(data, 'to_bytes') else data
+
+
 def _fields(msg: Any) -> dict[str, Any]:
     """Return the fields of a message by name; x, y and z are among them."""
     fields = {field.name: field for field in msg.fields}
@@ -173,7 +184,7 @@ def _first(names: Sequence[str], fields: Mapping[str, Any]) -> str | None:
 
 def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     """Return a structured view (height, width) of the raw bytes, with these fields only."""
-    data = np.frombuffer(msg.data, np.uint8)
+    data = np.frombuffer(bytes_of(msg.data), np.uint8)
     row_step = _checked_row_step(msg, len(data))
     order = '>' if msg.is_bigendian else '<'
     for field in fields:

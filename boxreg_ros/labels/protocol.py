@@ -14,6 +14,7 @@ from typing import Protocol, TYPE_CHECKING
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.options import option
 from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, RefinedBoxes, Sweep
 import numpy as np
 
@@ -222,9 +223,18 @@ class Options:
 
     """
 
-    with_points: bool = False
-    camera: Path | None = None
-    swap_axes: bool = False
+    with_points: bool = option(
+        False, 'also write the point clouds that a label format stores beside its labels'
+    )
+    camera: Path | None = option(
+        None,
+        'camera calibration, for formats with image coordinates',
+        metavar='FILE',
+        parse=Path,
+    )
+    swap_axes: bool = option(
+        False, 'write the extents in the order that Datumaro and CVAT display them'
+    )
     recording: Recording | None = None
 
 

@@ -72,6 +72,8 @@ class Sink:
         Boxes by class name, of the names that no group of settings has.
     changes : Changes
         Boxes before and after, for the report and the tables of tracks.
+    corrections : Corrections
+        The decisions of a person.
     points : PointCollector or None
         Points around the input boxes, for the report.
 
@@ -100,7 +102,7 @@ class Sink:
         bags = recording if isinstance(recording, Recording) else None
         options = replace(request.options, recording=bags)
         self._output = LabelOutput(folder, request.formats, provenance, options)
-        self._corrections = corrections
+        self.corrections = corrections
         # These import numba, after the fork of the reader.
         from boxreg_ros.review.changes import Changes
         from boxreg_ros.review.track_points import PointCollector
@@ -148,7 +150,7 @@ class Sink:
             slot = self._order.waiting_for(ticket)
             if slot is None:  # its early result has been taken
                 continue
-            result = self._corrections.apply(slot.boxes, refined)
+            result = self.corrections.apply(slot.boxes, refined)
             if refined.is_final or self._writes_early:
                 self._order.take(ticket, result)
             else:
@@ -202,12 +204,12 @@ class Sink:
             slot = Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
             self._last_ticket += 1
             self._order.expect(slot, self._last_ticket)
-            to_register = self._corrections.to_register(item.moved)
+            to_register = self.corrections.to_register(item.moved)
             moved = replace(to_register, ticket=self._last_ticket)
             item = item._replace(moved=moved)
         elif count:
-            left = kept(self._corrections.to_register(given, with_pins=False), 'no_transform')
-            result = self._corrections.apply(given, left)
+            left = kept(self.corrections.to_register(given, with_pins=False), 'no_transform')
+            result = self.corrections.apply(given, left)
             self._order.expect(Slot(given, item.T_fixed_sensor, item.T_fixed_given, result))
         return item
 

@@ -19,6 +19,7 @@ from boxreg_ros.structures import (
     REJECTED,
 )
 import numpy as np
+from numpy.typing import NDArray
 
 REJECTED_BY_PERSON = 'rejected'
 """Reason of boxes that are kept because a person rejected the refined ones."""
@@ -29,7 +30,7 @@ WITHOUT_EFFECT = ('accept', 'unsure', 'none')
 
 class Corrections:
     """
-    The decisions of a person as a run applies them.
+    The decisions of a person as a run applies them; boxes can be pinned already.
 
     Deleted boxes are not registered; ids, classes and pinned boxes are those of the decisions
     before any step of the run; rejected boxes are as in the input again after it.
@@ -77,15 +78,17 @@ class Corrections:
         if not with_pins:
             return renamed
         boxes = renamed.boxes.copy()
-        was_pinned = given.pinned if given.pinned is not None else np.zeros(len(given.boxes), bool)
-        pinned = was_pinned[rows]
+        pinned = _is_pinned(given)[rows]
         for i, row in enumerate(rows):
             if not pinned[i]:
                 boxes[i, BOX_EXTENT] = self._extents.get(
                     renamed.track_ids[i], boxes[i, BOX_EXTENT]
                 )
             found = self._judgement(given.track_ids[row], given.stamp_ns)
-            if found is None or found.kind != 'pin' or found.box is None:
+            if found is None:
+                continue
+            if found.kind != 'pin' or found.box is None:
+                pinned[i] = pinned[i] and found.kind != 'reject'
                 continue
             if found.frame_id != given.frame_id:
                 raise RecordingError(
@@ -109,7 +112,8 @@ class Corrections:
             The result for the boxes of `to_register`, in their order, and for added ones.
 
         """
-        if not self._of_track:
+        is_pinned = _is_pinned(given)
+        if not (self._of_track or is_pinned.any()):
             return refined
         refined = self._with_deleted(given, refined)
         boxes = refined.boxes.boxes.copy()
@@ -120,15 +124,19 @@ class Corrections:
             if status[row] == KEPT:
                 boxes[row] = given.boxes[row]  # without the extents of a pin
             found = self._judgement(track_id, given.stamp_ns)
-            if found is None or reasons[row] == DELETED:
+            kind = found.kind if found is not None else 'none'
+            if reasons[row] == DELETED:
                 continue
-            if found.kind == 'pin' and found.frame_id == given.frame_id:
+            if found is not None and kind == 'pin' and found.frame_id == given.frame_id:
                 boxes[row] = found.box
                 status[row], reasons[row] = HUMAN, ''
-            elif found.kind == 'reject':
+            elif kind == 'reject':
                 boxes[row] = given.boxes[row]
                 status[row], reasons[row] = KEPT, REJECTED_BY_PERSON
                 covariances[row] = np.eye(6)
+            elif is_pinned[row]:
+                boxes[row] = given.boxes[row]
+                status[row], reasons[row] = HUMAN, ''
         return replace(
             refined,
             boxes=replace(refined.boxes, boxes=boxes, pinned=None),
@@ -204,6 +212,13 @@ class Corrections:
                 new_id = renames[-1].value if renames else track_id
                 by_track.setdefault(new_id, []).append(one.box[BOX_EXTENT])
         return {track_id: np.mean(extents, axis=0) for track_id, extents in by_track.items()}
+
+
+def _is_pinned(boxes: BoxArray) -> NDArray[np.bool_]:
+    """Return which boxes of an array (n,) are pinned already, as those of label files."""
+    if boxes.pinned is None:
+        return np.zeros(len(boxes.track_ids), bool)
+    return boxes.pinned
 
 
 def _closeness(decision: Decision) -> int:
