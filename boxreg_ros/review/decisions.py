@@ -30,14 +30,14 @@ DECISIONS = 'decisions.csv'
 VERSION = 2
 VERSION_LINE = '# boxreg decisions '
 """Begins the first line, before the version. Files of version 1 do not have it."""
-TOPICS: Mapping[str, tuple[str, ...]] = {
+KINDS_OF_TOPIC: Mapping[str, tuple[str, ...]] = {
     'judgement': ('accept', 'reject', 'unsure', 'pin', 'none'),
     'deletion': ('delete', 'restore'),
     'id': ('rename',),
     'class': ('reclass',),
 }
 """Kinds of decisions by topic: a decision replaces those of its topic about the same boxes."""
-TOPIC_OF = {kind: topic for topic, kinds in TOPICS.items() for kind in kinds}
+TOPIC_OF = {kind: topic for topic, kinds in KINDS_OF_TOPIC.items() for kind in kinds}
 PINNED_BOX_COLUMNS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height')
 FIRST_COLUMNS = ('track_id', 'stamp_ns', 'decision', 'comment', 'frame_id', *PINNED_BOX_COLUMNS)
 """Those of version 1."""
@@ -135,7 +135,7 @@ class Decision:
 
     @property
     def topic(self) -> str:
-        """Return the topic of the decision, one of `TOPICS`."""
+        """Return the topic of the decision, one of `KINDS_OF_TOPIC`."""
         return TOPIC_OF[self.kind]
 
     @property

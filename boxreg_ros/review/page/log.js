@@ -47,8 +47,8 @@ async function post(path, content) {
   throw new Error(await response.text());
 }
 
-// Write rows to the file, all or none; whether that was done.
-async function store(rows) {
+// Write rows to the file, all or none, and note them for undo; whether that was done.
+async function store(rows, note) {
   let found;
   const answered = post('decisions', { seen: log.count, rows: rows.map(row => ({ ...row, who: log.who })) });
   log.answered = answered.catch(() => {});
@@ -59,6 +59,7 @@ async function store(rows) {
     return false;
   }
   $('failure').hidden = true;
+  if (!found.message) note();
   await showDecisions(receive(found));
   if (found.message) fail(found.message);
   return !found.message;
@@ -66,15 +67,12 @@ async function store(rows) {
 
 async function decide(rows) {
   const before = rows.map(row => log.held.get(keyOf(row)) ?? takenBack(row));
-  const isDone = await store(rows);
-  if (isDone) log.made.push(before);
-  return isDone;
+  return store(rows, () => log.made.push(before));
 }
 
 async function undo() {
   const before = log.made.at(-1);
-  if (!before || isCorrecting() || !await store(before)) return;
-  log.made.pop();
+  if (!before || isCorrecting() || !await store(before, () => log.made.pop())) return;
   const [{ track_id: input, stamp_ns: stamp }] = before;
   const index = TRACKS.findIndex(track => track.members().some(([s, k]) => inputOf(s, k) === input && (!stamp || stampOf(s, k) === stamp)));
   if (index >= 0) openTrack(index, stamp || null);
