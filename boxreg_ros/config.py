@@ -26,7 +26,8 @@ YAML_ERRORS = (yaml.YAMLError, ValueError, RecursionError)
 NODE_OPTIONS = (
     *('boxes_type', 'points', 'points_type', 'time_unit', 'sensor_frames', 'points_info'),
     *('pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
-    *('output_frame', 'transform_timeout', 'deadline', 'backlog', 'config_file', 'record_to'),
+    *('output_frame', 'transform_timeout', 'deadline', 'backlog', 'static_points'),
+    *('static_points_wait', 'config_file', 'record_to'),
     *('record_formats', 'record_points', 'record_segment', 'record_camera'),
     *('use_sim_time', 'start_type_description_service', 'qos_overrides'),
 )

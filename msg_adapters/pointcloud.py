@@ -123,6 +123,13 @@ def finite_rows(msg: Any) -> Ints | None:
     return None if is_finite.all() else np.flatnonzero(is_finite)
 
 
+def positions(msg: Any) -> Floats:
+    """Return x, y and z of all points of a cloud, (height * width, 3), not finite ones too."""
+    fields = _fields(msg)
+    table = _table(msg, [fields[key] for key in 'xyz'])
+    return np.column_stack([table[key].reshape(-1).astype(np.float64) for key in 'xyz'])
+
+
 def intensities(msg: Any) -> Floats | None:
     """
     Return the intensities of the points, in the unit of the sensor.

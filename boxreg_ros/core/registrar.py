@@ -9,7 +9,7 @@ from itertools import accumulate, chain
 from math import inf
 from typing import NamedTuple
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
@@ -19,6 +19,7 @@ from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import column, joined
 from boxreg_ros.core.track_window import Estimate, Window
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
 
@@ -162,6 +163,15 @@ class BoxRegistrar:
             array.num_unsettled = 0
         return [*ready, *self._pop_settled()]
 
+    def margins(self) -> Floats:
+        """Return the labelling margin of each face, of each of `KINDS`, (K, 6) [m]."""
+        from boxreg_ros.core.batch import FACE_GAPS  # imports torch
+
+        kinds = [getattr(self.config, kind) for kind in KINDS]
+        of_settings = np.array([[getattr(kind, name) for name in FACE_GAPS] for kind in kinds])
+        margins: Floats = of_settings + self._input_model.offsets().gap_correction.numpy()
+        return margins
+
     def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
         for pair in pairs:
             array = self._open(pair)
@@ -181,14 +191,14 @@ class BoxRegistrar:
         self._pending.append(array)
         reason = ''
         if boxes.stamp_ns < self._newest_ns:
-            reason = 'late'
+            reason = Reason.LATE
         elif boxes.stamp_ns == self._newest_ns:
-            reason = 'duplicate_stamp'
+            reason = Reason.DUPLICATE_STAMP
         self._newest_ns = max(boxes.stamp_ns, self._newest_ns)
         array.is_observed = sweep is not None and not reason
         if sweep is None:
-            self.counts['boxes_without_sweep'] += 1
-            reason = reason or 'no_sweep'
+            self.counts[Reason.BOXES_WITHOUT_SWEEP] += 1
+            reason = reason or Reason.NO_SWEEP
         array.set_reasons(reason)
         self._end_silent_tracks(boxes.stamp_ns)
         if sweep is not None:
@@ -211,7 +221,7 @@ class BoxRegistrar:
         confirmed = _confirmed(coasting, seen[len(given) :])
         if len(confirmed) < len(coasting):
             # A box that is not confirmed owns no points.
-            self.counts['coast_unconfirmed'] += len(coasting) - len(confirmed)
+            self.counts[Reason.COAST_UNCONFIRMED] += len(coasting) - len(confirmed)
             seen, velocities = self._seen([*given, *confirmed], boxes, sweep)
         self.box_time.add(seen[: len(given)], velocities[: len(given)])
         rows = [item.row for item in given]
@@ -242,7 +252,7 @@ class BoxRegistrar:
                 continue
             box = track.predicted(boxes.stamp_ns, self.config)
             if is_owned(box, others):
-                self.counts['coast_unconfirmed'] += 1
+                self.counts[Reason.COAST_UNCONFIRMED] += 1
                 continue
             others = np.vstack([others, box])
             found.append(BoxToObserve(track, box))

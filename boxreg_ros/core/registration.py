@@ -30,6 +30,7 @@ from boxreg_ros.core.solver import solve
 from boxreg_ros.core.threads import one_torch_thread, run, shared_between
 from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.core.window import group_windows, stack_windows
+from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, KEPT, REFINED
 import numpy as np
@@ -43,7 +44,7 @@ MIN_HELD_PART = 0.5
 MAX_LOST_POINTS = 3
 HELD_MARGIN = 0.05
 """Points up to this far outside a box count as held by it [m]. Chosen."""
-KEPT_REASONS = ('no_points', 'not_finite', 'no_gain')
+KEPT_REASONS = (Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN)
 """Why a box is kept, in the order of `_failed_tests`."""
 
 

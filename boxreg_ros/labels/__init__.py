@@ -23,6 +23,7 @@ from boxreg_ros.labels.registry import (
     frames_of,
     import_format,
     is_written,
+    labels_points,
     module_of,
     writer_for,
 )
@@ -35,6 +36,7 @@ __all__ = [
     'frames_of',
     'import_format',
     'is_written',
+    'labels_points',
     'LabelFrame',
     'LabelOutput',
     'LabelWriter',

@@ -15,10 +15,12 @@ from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.options import option
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, RefinedBoxes, Sweep
 import numpy as np
 
 if TYPE_CHECKING:
+    from boxreg_ros.core.point_labels import PointLabels
     from boxreg_ros.io.recording import Recording
     from boxreg_ros.labels.camera import Camera
 
@@ -50,6 +52,8 @@ class Format:
         Packages of pip that are needed beyond those of boxreg_ros itself.
     options : tuple of str
         Fields of `Options` that the writer uses.
+    has_points : bool
+        Whether it labels points; such a format is written by ``boxreg relabel`` alone.
 
     """
 
@@ -62,6 +66,7 @@ class Format:
     files: str
     packages: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
+    has_points: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +89,8 @@ class LabelFrame:
         Intensities of its points in the unit of the sensor; None if it has none.
     T_fixed_given : array, shape (4, 4), or None
         Pose of the frame of the input boxes; None if unknown.
+    points : PointLabels or None
+        Labels of the points of `sweep`, for formats of points.
 
     """
 
@@ -94,6 +101,7 @@ class LabelFrame:
     sweep: Sweep | None = None
     intensities: Floats | None = None
     T_fixed_given: Floats | None = None
+    points: PointLabels | None = None
 
     def boxes_in(self, frame: str, dropped: Counter[str]) -> tuple[Ints, Floats]:
         """
@@ -117,13 +125,13 @@ class LabelFrame:
         """
         boxes = self.refined.boxes
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
-        dropped['invalid_box'] += len(boxes.boxes) - len(rows)
+        dropped[Reason.INVALID_BOX] += len(boxes.boxes) - len(rows)
         target = self.fixed_frame if frame == 'fixed' else self.sensor_frame
         if boxes.frame_id == target:
             return rows, boxes.boxes[rows]
         is_known = boxes.frame_id in (self.fixed_frame, self.sensor_frame)
         if self.T_fixed_sensor is None or not is_known:
-            dropped['no_transform'] += len(rows)
+            dropped[Reason.NO_TRANSFORM] += len(rows)
             return rows[:0], boxes.boxes[:0]
         return rows, _boxes_moved(boxes, self.T_fixed_sensor, frame, target).boxes[rows]
 

@@ -39,6 +39,8 @@ BUILT_IN = {
     'supervisely': 'boxreg_ros.labels.supervisely',
     'xtreme1': 'boxreg_ros.labels.xtreme1',
     'mcap': 'boxreg_ros.labels.mcap',
+    'semantickitti': 'boxreg_ros.labels.semantickitti',
+    'lidarseg': 'boxreg_ros.labels.lidarseg',
 }
 GROUP = 'boxreg_ros.labels'
 """Entry points of this group are formats of other packages: ``name = package.module``."""
@@ -78,6 +80,11 @@ def can_read(name: str) -> bool:
     return hasattr(import_format(name), 'read')
 
 
+def labels_points(name: str) -> bool:
+    """Return whether a format labels points and not boxes."""
+    return module_of(name).FORMAT.has_points
+
+
 def check_options(names: Sequence[str], options: Options) -> None:
     """
     Refuse options that none of the formats `names` uses, and the lack of those that one needs.
@@ -86,9 +93,15 @@ def check_options(names: Sequence[str], options: Options) -> None:
     ------
     ConfigError
         If an option is not used; the message lists the formats that use it. If the camera that a
-        format needs is not given or cannot be read. Also as `module_of`.
+        format needs is not given or cannot be read, or a format labels points. Also as
+        `module_of`.
 
     """
+    for name in filter(labels_points, names):
+        raise ConfigError(
+            f'format {name!r} labels the points of clouds: expected formats of boxes; write it '
+            f'by boxreg relabel --label-points'
+        )
     used = {option for name in names for option in module_of(name).FORMAT.options}
     for option in COMMAND_LINE_OPTIONS:
         if getattr(options, option) and option not in used:

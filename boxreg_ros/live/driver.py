@@ -23,6 +23,8 @@ from boxreg_ros.io.session import (
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.label_tap import CloudPart, LabelTap
+from boxreg_ros.live.static_points import StaticPoints
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, COASTED, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -148,6 +150,9 @@ class LiveRegistrar:
         Topics of the clouds and frames of the LiDARs.
     budget : TickBudget, optional
         Limits the windows that are solved for a box array. Default: all are solved.
+    static_patience : float, optional
+        How long a cloud without moving objects waits for its boxes [s]. Default: no such clouds
+        are made.
 
     Attributes
     ----------
@@ -159,6 +164,8 @@ class LiveRegistrar:
         As above; may change.
     tap : LabelTap
         Records labels, once it has a recorder.
+    static_points : StaticPoints or None
+        Makes clouds without moving objects, if they are asked for.
 
     """
 
@@ -168,10 +175,11 @@ class LiveRegistrar:
         fixed_frame: str,
         output_frame: str,
         transform_timeout: float,
-        trouble: Callable[[str, str, int], None],
+        trouble: Callable[[Reason, str, int], None],
         convention: Convention = STANDARD,
         lidars: Lidars = SINGLE_LIDAR,
         budget: TickBudget | None = None,
+        static_patience: float | None = None,
     ) -> None:
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
@@ -184,6 +192,9 @@ class LiveRegistrar:
         self._registrar = BoxRegistrar(config)
         if budget is not None:
             self._registrar = BoxRegistrar(config, budget.submit, budget.windows)
+        self.static_points: StaticPoints | None = None
+        if static_patience is not None:
+            self.static_points = StaticPoints(static_patience, self._registrar)
         self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
         self._detections: dict[str, _Detection] = {}  # by track id, while tracks may coast
@@ -249,7 +260,7 @@ class LiveRegistrar:
             return confirmed, []
         stamp_ns = confirmed[0].content.stamp_ns
         self._trouble(
-            'time_jump',
+            Reason.TIME_JUMP,
             f'expected stamps of one clock, got some that went back to {stamp_ns} ns; tracks '
             f'start anew: unless a recording is played in a loop, let one clock set all stamps',
             1,
@@ -317,14 +328,14 @@ class LiveRegistrar:
                 return []
             assert isinstance(moved, Sweep)
             assert admitted.T_fixed_item is not None
-            part = CloudPart(item.message, content, admitted.T_fixed_item)
+            part = CloudPart(item.message, content, admitted.T_fixed_item, item.received)
             return self._register(self._session.merged(moved, part))
         if moved is not None:
             assert isinstance(moved, BoxArray) and admitted.T_fixed_item is not None
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
         ready = self._outgoing(hand_to_registrar(self._registrar, moved, restarts=False))
         if moved is None:
-            ready += self.passed_through(item.message, 'no_transform')
+            ready += self.passed_through(item.message, Reason.NO_TRANSFORM)
         return ready
 
     def _note_unknown(self, sweep: Sweep) -> None:
@@ -336,7 +347,10 @@ class LiveRegistrar:
         """Register sweeps; return the messages that are ready to be published."""
         ready: list[Outgoing] = []
         for sweep, parts in complete:
-            self.tap.add_cloud(sweep, [part for part in parts if part is not None])
+            clouds = [part for part in parts if part is not None]
+            self.tap.add_cloud(sweep, clouds)
+            if self.static_points is not None:
+                self.static_points.add_cloud(sweep, clouds)
             ready += self._outgoing(hand_to_registrar(self._registrar, sweep, restarts=False))
         return ready
 
@@ -398,6 +412,8 @@ class LiveRegistrar:
         """Forget everything but the transforms; return everything that is held."""
         ready = self.flush()
         self._detections = {}
+        if self.static_points is not None:
+            self.static_points.reset()
         self._registrar.reset()
         self._session.restart()
         return ready
@@ -417,12 +433,14 @@ class LiveRegistrar:
             Messages made before the error, and all that are held, passed through.
 
         """
+        if self.static_points is not None:
+            self.static_points.reset()
         self._registrar.reset()
         self._session.restart()
         self._detections = {}
         held = list(self._held)
         self._held.clear()
-        self.tap.keep_all('failed')
+        self.tap.keep_all(Reason.FAILED)
         ready = self._made
         self._made = []
         for waiting in held:
@@ -431,7 +449,7 @@ class LiveRegistrar:
             ready += self.last(waiting.message)
         is_held = item is None or any(waiting.message is item.message for waiting in held)
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
-            ready += self.passed_through(item.message, 'failed')
+            ready += self.passed_through(item.message, Reason.FAILED)
         return ready
 
     def passed_through(self, message: Any, reason: str = '') -> list[Outgoing]:
@@ -459,7 +477,7 @@ class LiveRegistrar:
         return []
 
     def _report_missing_transform(
-        self, content: Sweep | BoxArray, reason: str, detail: str
+        self, content: Sweep | BoxArray, reason: Reason, detail: str
     ) -> None:
         """Report a sweep, or the boxes of an array, that no transform is known for."""
         count = 1 if isinstance(content, Sweep) else len(content.track_ids)
@@ -479,13 +497,13 @@ class LiveRegistrar:
                     self.output_frame, self.fixed_frame, content.stamp_ns
                 )
             except TransformUnavailable as error:
-                self._report_missing_transform(content, 'no_transform', str(error))
+                self._report_missing_transform(content, Reason.NO_TRANSFORM, str(error))
                 return None
             T_output_item = T_output_fixed @ T_fixed_item
             given = boxes_to_frame(content, T_output_item, self.output_frame)
         self._last_boxes = item.received
         if self._session.finding:
-            self._trouble('pose_reference', self._session.finding, 1)
+            self._trouble(Reason.POSE_REFERENCE, self._session.finding, 1)
         pending = _Pending(
             item.message, replace(given, track_ids=moved.track_ids), item.received,
             T_output_fixed, T_output_item, moved.track_ids != content.track_ids,
@@ -522,6 +540,8 @@ class LiveRegistrar:
             pending = refined.boxes.ticket
             assert isinstance(pending, _Pending)
             self._made.append(self._message_of(refined, pending))
+            if self.static_points is not None and not pending.is_early_out:
+                self.static_points.add_boxes(refined)
             pending.is_early_out = True
             self.tap.take(refined)
             if refined.is_final:

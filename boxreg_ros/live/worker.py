@@ -17,7 +17,7 @@ from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
 from boxreg_ros.live.inbox import Inbox, Message
-from boxreg_ros.reasons import REASONS
+from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import Adapter
 from msg_adapters.clouds import header_of
@@ -34,7 +34,7 @@ IDLE_PERIOD = 1.0
 """Longest pause while nothing is held [s]."""
 BOXES_PATIENCE = 10.0
 """Boxes wait for the solver this many times longer than clouds before they pass through."""
-NO_TIME = 'boxes_queue_full'
+NO_TIME = Reason.BOXES_QUEUE_FULL
 """Reason of boxes that the solver has no time for."""
 FULL_COLLECTION_PERIOD = 60.0
 """
@@ -113,6 +113,7 @@ class Worker:
         self._fully_collected_at = time.monotonic()
         self._board = MarkerBoard()
         self._markers = markers
+        self._static: Publisher | None = None
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         self._stopping = Event()
@@ -124,6 +125,10 @@ class Worker:
         self._live.adapter = adapter
         self._early = early
         self._final = final
+
+    def open_static_points(self, publisher: Publisher) -> None:
+        """Set the publisher of clouds without moving objects."""
+        self._static = publisher
 
     def facts(self) -> dict[str, object]:
         """Return the facts about the boxes for /diagnostics, beside the counters."""
@@ -143,6 +148,7 @@ class Worker:
                 break
             self._take_events()
             self._release_boxes_without_cloud(item)
+            self._publish_static()
             if item is None:
                 item = self._next()
             self._live.cloud_frame = self.cloud_frame  # may arrive while boxes wait
@@ -164,8 +170,8 @@ class Worker:
         Either thread may call this.
 
         """
-        reason = f'{message.topic}_queue_full'
-        self._health.report(reason, REASONS[reason].remedy)
+        reason = REASONS[f'{message.topic}_queue_full']
+        self._health.report(reason, reason.remedy)
         if message.topic == 'boxes':
             self._publish([Outgoing(message.content, False)])
             self._inbox.put_passing(message)  # the final copy, in the order of all
@@ -220,7 +226,7 @@ class Worker:
                 assert self._live.adapter is not None  # set before boxes are subscribed to
                 content = self._live.adapter.from_msg(message.content)
         except UnsupportedMessage as error:
-            self._health.report('unreadable', f'{message.topic}: {error}')
+            self._health.report(Reason.UNREADABLE, f'{message.topic}: {error}')
         except Exception as error:
             self._health.report_failure(error)
         else:
@@ -245,8 +251,10 @@ class Worker:
             self._publish(self._guarded(self._live.flush))
         if self._board.is_showing and self._live.has_ceased(now):
             self._markers.publish(self._board.clear())
-        is_holding = self._live.is_holding
-        self._inbox.wake_up.wait(HELD_PERIOD if is_holding else IDLE_PERIOD)
+        period = HELD_PERIOD if self._live.is_holding else IDLE_PERIOD
+        if self._live.static_points is not None:
+            period = min(period, self._live.static_points.due(now))
+        self._inbox.wake_up.wait(period)
         self._waited = 0.0
 
     def _release_boxes_without_cloud(self, item: ReceivedMessage | None) -> None:
@@ -291,7 +299,7 @@ class Worker:
         try:
             self._live.placement.add_info(message)
         except UnsupportedMessage as error:
-            self._health.report('unreadable', f'points_info: {error}')
+            self._health.report(Reason.UNREADABLE, f'points_info: {error}')
 
     def _process(self, item: ReceivedMessage) -> None:
         if isinstance(item.content, BoxArray):
@@ -348,6 +356,18 @@ class Worker:
             else:
                 self._markers.publish(self._board.update(out.given, out.refined))
 
+    def _publish_static(self) -> None:
+        """Publish clouds without moving objects, and those that wait no longer for their boxes."""
+        if self._live.static_points is None or self._static is None:
+            return
+        for cloud in self._live.static_points.take(time.monotonic()):
+            self._static.publish(cloud.message)
+            self._health.count('static_published')
+            self._health.add_static(time.monotonic() - cloud.received, cloud.cpu)
+            if cloud.is_late:
+                reason = Reason.STATIC_UNCHANGED
+                self._health.report(reason, f'{reason.meaning}; {reason.remedy}')
+
     def _finish(self, item: ReceivedMessage | None) -> None:
         """Publish held boxes, and pass waiting messages through unsolved."""
         self._take_events()
@@ -363,6 +383,7 @@ class Worker:
                 self._publish(self._live.last(message.content, NO_TIME))
             message = self._inbox.take()
         self._live.tap.finish()
+        self._publish_static()
         self._markers.publish(self._board.clear())
         publishers = [p for p in (self._early, self._final, self._markers) if p is not None]
         for publisher in publishers:

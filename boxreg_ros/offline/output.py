@@ -15,6 +15,7 @@ from boxreg_ros.offline.background import Background
 from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.reasons import Reason
 from boxreg_ros.review.corrections import Corrections
 from boxreg_ros.structures import (
     ADDED,
@@ -74,6 +75,8 @@ class Sink:
         Boxes before and after, for the report and the tables of tracks.
     corrections : Corrections
         The decisions of a person.
+    array_stamps_ns : list of int
+        Stamps of all box arrays [ns].
     points : PointCollector or None
         Points around the input boxes, for the report.
 
@@ -101,7 +104,7 @@ class Sink:
         recording = request.recording()
         bags = recording if isinstance(recording, Recording) else None
         options = replace(request.options, recording=bags)
-        self._output = LabelOutput(folder, request.formats, provenance, options)
+        self._output = LabelOutput(folder, request.box_formats, provenance, options)
         self.corrections = corrections
         # These import numba, after the fork of the reader.
         from boxreg_ros.review.changes import Changes
@@ -115,6 +118,7 @@ class Sink:
         self._order = StampOrder()
         self._early: dict[object, RefinedBoxes] = {}  # by ticket, until the final estimate is
         self._last_ticket = 0
+        self.array_stamps_ns: list[int] = []
         self.boxes_in = 0
         self.boxes_out = 0
         self.status: Counter[str] = Counter()
@@ -197,6 +201,7 @@ class Sink:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
+        self.array_stamps_ns.append(given.stamp_ns)
         for name, boxes in Counter(given.class_names).items():
             if not self._config.knows_class(name):
                 self.unknown_classes[name] += boxes
@@ -208,7 +213,7 @@ class Sink:
             moved = replace(to_register, ticket=self._last_ticket)
             item = item._replace(moved=moved)
         elif count:
-            left = kept(self.corrections.to_register(given, with_pins=False), 'no_transform')
+            left = kept(self.corrections.to_register(given, with_pins=False), Reason.NO_TRANSFORM)
             result = self.corrections.apply(given, left)
             self._order.expect(Slot(given, item.T_fixed_sensor, item.T_fixed_given, result))
         return item

@@ -107,6 +107,15 @@ def relabel(
             with clock('write'):
                 rows = write_track_tables(folder, tracks, plan)
                 summary.rules, violated = checked(tracks, request.config)
+            if request.needs_point_labels:
+                from boxreg_ros.offline.point_products import write_point_products
+
+                with clock('points'):
+                    stamps_ns = sink.array_stamps_ns
+                    summary.points = write_point_products(
+                        folder, request, tracks, stamps_ns, registrar
+                    )
+                summary.seconds = clock.seconds()
             if sink.points is not None:
                 sink.points.settle(registrar.box_time.resolved(request.config))
                 write_run_report(folder, out, request, summary, rows, violated, sink.points, clock)

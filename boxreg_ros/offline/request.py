@@ -15,13 +15,16 @@ from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.storage.urls import entries_of, url_of
-from boxreg_ros.labels import check_options, module_of, Options
+from boxreg_ros.labels import check_options, labels_points, module_of, Options
 from boxreg_ros.options import option
 from msg_adapters.convention import Convention, STANDARD
 
 if TYPE_CHECKING:
     from boxreg_ros.datasets import SceneRecording
     from boxreg_ros.io.recording import Recording
+
+POINT_FORMATS = ('semantickitti', 'lidarseg')
+"""Formats that ``--label-points`` writes."""
 
 
 def _labels(text: str) -> tuple[str, Path]:
@@ -127,6 +130,23 @@ class Request:
     report: bool = option(
         False, 'also write report.html: every track before and after, to look at in a browser'
     )
+    label_points: bool = option(
+        False,
+        'also label the points of every sweep: formats semantickitti and lidarseg, and fields of '
+        'the clouds of the format mcap',
+    )
+    clouds: tuple[str, ...] = option(
+        (),
+        'also write clouds to OUT/clouds: static (MCAP and map without moving objects), '
+        'background (without any) or object (each track accumulated in its box); can be repeated',
+        choices=('static', 'background', 'object'),
+        is_repeated=True,
+    )
+    undistort: bool = option(
+        False,
+        'also write OUT/clouds/undistorted.mcap: points of moving objects moved to the stamp by '
+        'the motion of their boxes',
+    )
     truth: Path | None = option(
         None,
         'with --report, true boxes that it shows: CSV with the columns of boxes.csv, or a scene '
@@ -142,7 +162,7 @@ class Request:
         self._check_recordings()
         self._check_boxes()
         self._check_part()
-        check_options(self.formats, self.options)
+        check_options(self.box_formats, self.options)
         if self.report:
             from boxreg_ros.review.report import check_packages  # imports torch
 
@@ -208,7 +228,29 @@ class Request:
     @property
     def all_formats(self) -> tuple[str, ...]:
         """Return the formats to write, each once, ``csv`` first."""
-        return tuple(dict.fromkeys(('csv', *self.formats)))
+        return tuple(dict.fromkeys(('csv', *self.box_formats, *self.point_formats)))
+
+    @property
+    def box_formats(self) -> tuple[str, ...]:
+        """Return the formats that are written while boxes are refined."""
+        return tuple(name for name in self.formats if not labels_points(name))
+
+    @property
+    def point_formats(self) -> tuple[str, ...]:
+        """Return the formats of labelled points, each once."""
+        asked = POINT_FORMATS if self.label_points else ()
+        named = (name for name in self.formats if labels_points(name))
+        return tuple(dict.fromkeys((*asked, *named)))
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Return the kinds of clouds without objects, each once."""
+        return tuple(dict.fromkeys(name for name in self.clouds if name != 'object'))
+
+    @property
+    def needs_point_labels(self) -> bool:
+        """Return whether the recording is read again, to label its points."""
+        return bool(self.point_formats or self.clouds or self.undistort or self.label_points)
 
     def inputs(self) -> tuple[Path, ...]:
         """Return the input files and folders."""

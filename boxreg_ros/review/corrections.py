@@ -8,6 +8,7 @@ from typing import Any
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.stamp_order import kept
+from boxreg_ros.reasons import Reason
 from boxreg_ros.review.decisions import Decision, held, Scope
 from boxreg_ros.structures import (
     BOX_EXTENT,
@@ -21,10 +22,6 @@ from boxreg_ros.structures import (
 import numpy as np
 from numpy.typing import NDArray
 
-REJECTED_BY_PERSON = 'rejected'
-"""Reason of boxes that are kept because a person rejected the refined ones."""
-DELETED = 'deleted'
-"""Reason of boxes that a person deleted; their status is `REJECTED`."""
 WITHOUT_EFFECT = ('accept', 'unsure', 'none')
 
 
@@ -125,14 +122,14 @@ class Corrections:
                 boxes[row] = given.boxes[row]  # without the extents of a pin
             found = self._judgement(track_id, given.stamp_ns)
             kind = found.kind if found is not None else 'none'
-            if reasons[row] == DELETED:
+            if reasons[row] == Reason.DELETED:
                 continue
             if found is not None and kind == 'pin' and found.frame_id == given.frame_id:
                 boxes[row] = found.box
                 status[row], reasons[row] = HUMAN, ''
             elif kind == 'reject':
                 boxes[row] = given.boxes[row]
-                status[row], reasons[row] = KEPT, REJECTED_BY_PERSON
+                status[row], reasons[row] = KEPT, str(Reason.REJECTED)
                 covariances[row] = np.eye(6)
             elif is_pinned[row]:
                 boxes[row] = given.boxes[row]
@@ -171,7 +168,7 @@ class Corrections:
         deleted = sorted(set(range(n)) - set(left))
         if not deleted:
             return refined
-        gone = kept(self._renamed(given).take(deleted), DELETED)
+        gone = kept(self._renamed(given).take(deleted), Reason.DELETED)
         gone = replace(gone, status=(REJECTED,) * len(deleted))
         order = np.empty(len(refined.status) + len(deleted), np.int64)
         order[left] = np.arange(len(left))

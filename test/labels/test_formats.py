@@ -260,6 +260,23 @@ def test_nuscenes(tmp_path, name, version):
     np.testing.assert_allclose(pose['rotation'], [sqrt(0.5), 0, 0, sqrt(0.5)], atol=1e-9)
 
 
+def test_two_boxes_of_one_track_in_a_sample_of_nuscenes_are_two_instances(tmp_path):
+    frames = [frame_of([IN_FIXED] * len(ids), ids, STAMP + i) for i, ids in enumerate(['aa', 'a'])]
+    _, folder = written('nuscenes', tmp_path, frames)
+    tables = folder / 'v1.0-boxreg'
+    rows = json.loads((tables / 'sample_annotation.json').read_text())
+    samples = {}
+    for row in rows:
+        samples.setdefault(row['instance_token'], []).append(row['sample_token'])
+    assert sorted(len(found) for found in samples.values()) == [1, 2]
+    assert all(len(set(found)) == len(found) for found in samples.values())
+    counts = {
+        row['token']: row['nbr_annotations']
+        for row in json.loads((tables / 'instance.json').read_text())
+    }
+    assert counts == {token: len(found) for token, found in samples.items()}
+
+
 def test_argoverse2(tmp_path):
     feather = pytest.importorskip('pyarrow.feather')
     _, folder = written('argoverse2', tmp_path)

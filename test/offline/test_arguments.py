@@ -14,7 +14,7 @@ WORDS = """
 --odometry /odom --associate --labels csv:b.csv --fixed-frame map --start 1 --end 2.5
 --decisions d.csv --formats csv,mcap --with-points --swap-axes --label-frame left --report
 --truth t.csv --complete --set complete.prune=false --set vehicle.names=[car,van] --strict
---fail-under 0.9
+--fail-under 0.9 --label-points --clouds static --clouds object --undistort
 """
 
 
