@@ -25,8 +25,8 @@ from boxreg_ros.errors import BoxregError
 from boxreg_ros.offline.arguments import (
     add_options,
     add_recordings,
+    request_from,
     TOPICS,
-    topics_from,
     words_of,
 )
 from boxreg_ros.offline.request import Request
@@ -94,17 +94,17 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
         If nothing in it can be read.
 
     """
-    from boxreg_ros.offline.sources import scene_address, source_of
+    from boxreg_ros.offline.sources import scene_address
 
-    topics = topics_from(args)
-    source = source_of(args.recordings, **topics)
+    request = request_from(args)
+    source = request.recording()
     if scene_address(args.recordings) is None:
         facts = _contents(args.recordings)
     else:
         facts = _scene_contents(args.recordings)
     try:
         with source as recording:
-            facts |= _sampled(recording, topics['convention'])
+            facts |= _sampled(recording, request.convention)
             facts['damage'] = [damage._asdict() for damage in recording.damages]
     except BoxregError as error:
         facts['problems'].append(str(error))
