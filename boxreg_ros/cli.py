@@ -49,6 +49,7 @@ COMMANDS = {
     'recover': Command(
         'recorder.recover_command', 'complete labels of a drive whose recording was cut off'
     ),
+    'compile': Command('offline.compile_command', 'compile the method now, for images and robots'),
     'node': Command('live.main', 'run the live node (where there is no ros2 run)'),
 }
 DONE = 0
