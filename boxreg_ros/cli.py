@@ -32,6 +32,9 @@ COMMANDS = {
     'relabel': Command(
         'offline.relabel_command', 'refine the boxes of recordings and write label files'
     ),
+    'follow': Command(
+        'offline.follow_command', 'follow objects from one box or a few of each to whole tracks'
+    ),
     'inspect': Command(
         'offline.inspect', 'show what is in a recording, and the relabel command to run'
     ),
