@@ -67,6 +67,34 @@ def test_rosdep_keys_cover_the_imports():
     assert missing == []
 
 
+INSTALLATIONS = (
+    'README.md',
+    'docs/getting-started.md',
+    '.github/workflows/test.yaml',
+    'Dockerfile',
+)
+
+
+@pytest.mark.parametrize('file', INSTALLATIONS)
+def test_installations_leave_nothing_of_pip_to_rosdep(file):
+    index = yaml.safe_load((ROOT / 'test' / 'rosdep_noble.yaml').read_text(encoding='utf-8'))
+    manifest = ElementTree.parse(ROOT / 'package.xml')
+    keys = {item.text for item in manifest.iter() if item.tag.endswith('depend')}
+    assert keys - set(index['ros']) - set(index['apt']) <= set(index['pip'])
+    text = (ROOT / file).read_text(encoding='utf-8').replace('\\\n', ' ')
+    (line,) = re.findall(r'rosdep install .*?--skip-keys "(.*?)"', text)
+    assert keys & set(index['pip']) <= set(line.split())
+    by_pip = set(re.findall(r'[a-z]+', ' '.join(re.findall(r'pip install (.*)', text)).lower()))
+    names = {index['pip'].get(key, key.removeprefix('python3-')) for key in line.split()}
+    assert {*names, 'mcap'} <= by_pip
+
+
+def test_a_robot_needs_nothing_with_a_window():
+    manifest = ElementTree.parse(ROOT / 'package.xml')
+    needed = {item.text for item in manifest.iter('exec_depend')}
+    assert not needed & {'rviz2', 'python3-matplotlib', 'python3-jinja2'}
+
+
 def run(command, **options):
     """Run a command that must succeed, outside of the source tree; return its output."""
     environment = {key: value for key, value in os.environ.items() if key != 'PYTHONPATH'}

@@ -59,6 +59,8 @@ class Sink:
     ----------
     boxes_in, boxes_out : int
         Boxes of the input, and boxes written, added ones included.
+    arrays_in, arrays_out : int
+        Box arrays of the input, and those written, that have any box.
     status, reasons : Counter
         Of the boxes written.
     heading_flips : int
@@ -84,6 +86,7 @@ class Sink:
         self._fixed_frame = source.fixed_frame
         self._sensor_frame = source.sensor_frame
         self._writes_early = request.config.estimate == 'early'
+        self._has_keyframes = request.keyframes
         self._clock = clock
         self._config = request.config
         self.time_ranges: dict[str, tuple[int, int]] = {}
@@ -114,6 +117,8 @@ class Sink:
         self.array_stamps_ns: list[int] = []
         self.boxes_in = 0
         self.boxes_out = 0
+        self.arrays_in = 0
+        self.arrays_out = 0
         self.status: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
         self.heading_flips = 0
@@ -192,15 +197,21 @@ class Sink:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
+        self.arrays_in += count > 0
         self.array_stamps_ns.append(given.stamp_ns)
         for name, boxes in Counter(given.class_names).items():
             if not self._config.knows_class(name):
                 self.unknown_classes[name] += boxes
-        if isinstance(item.moved, BoxArray):
-            slot = Slot(item.moved, item.T_fixed_sensor, item.T_fixed_given)
+        moved = item.moved
+        if isinstance(moved, BoxArray):
+            if self._has_keyframes:  # soft: evidence may move those that files call pinned
+                moved = replace(moved, pinned=None)
             self._last_ticket += 1
+            slot = Slot(moved, item.T_fixed_sensor, item.T_fixed_given)
             self._order.expect(slot, self._last_ticket)
-            moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
+            moved = replace(self.corrections.pinned(moved), ticket=self._last_ticket)
+            if self._has_keyframes:
+                moved = replace(moved, pinned=np.ones(count, bool))
             item = item._replace(moved=moved)
         elif count:
             result = kept(given, Reason.NO_TRANSFORM)
@@ -210,6 +221,7 @@ class Sink:
     def _put(self, refined: RefinedBoxes, slot: Slot, early: RefinedBoxes | None) -> None:
         """Count the boxes of one array and write them in all formats; in the thread."""
         self.boxes_out += len(refined.status)
+        self.arrays_out += len(refined.status) > 0
         self.status.update(refined.status)
         self.reasons.update(filter(None, refined.reasons))
         self.heading_flips += _heading_flips(slot.boxes, refined)

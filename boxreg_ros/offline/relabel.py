@@ -14,9 +14,10 @@ from dataclasses import asdict
 import json
 from pathlib import Path
 from shutil import copyfile
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.offline.every_sweep import Arrivals, with_empty_arrays
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.products import (
     checked,
@@ -76,17 +77,17 @@ def relabel(
     clock = Stopwatch()
     progress = progress or Progress()
     fingerprint = request.fingerprint()  # before reading: the files may change meanwhile
-    shown = _Passes(progress, 1 + bool(request.config.complete.steps))
+    shown = _Passes(progress, 1 + request.completes)
     with writing(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
-        plan, completion = _survey(request, clock, shown, journal)
+        survey = _survey(request, clock, shown, journal)
         receive = workers.enter_context(reader(request))
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
         from boxreg_ros.offline.registration_worker import registration_worker
 
         recording = ReadAhead(receive)
-        if plan is None:
+        if survey is None:
             clock.begun('start')
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.announce)
@@ -94,9 +95,11 @@ def relabel(
         registrar = BoxRegistrar(request.config, _journaled(submit, journal))
         with whole_folder(out, request.inputs()) as folder:
             with Sink(folder, request, recording.source, clock) as sink:
-                _register(recording, registrar, completion, sink, clock, shown)
+                _register(recording, registrar, survey, sink, clock, shown)
+            plan = None if survey is None else survey.plan
             summary = Summary.of(request, recording, registrar, sink)
             summary.complete = completed_counts(plan)
+            summary.seeds = [] if survey is None else survey.ends
             for stage, seconds in recording.findings.seconds.items():
                 clock.add(stage, seconds)
             summary.fingerprint = fingerprint
@@ -161,39 +164,60 @@ class _Passes:
         self._done += 1
 
 
+class _Survey(NamedTuple):
+    """The first pass over a recording: what completes its tracks, and where keyframes end."""
+
+    plan: CompletionPlan
+    completion: Completion
+    parts: list[Arrivals]
+    ends: list[dict[str, Any]]
+
+
 def _survey(
     request: Request, clock: Stopwatch, progress: _Passes, journal: EstimateJournal | None
-) -> tuple[CompletionPlan | None, Completion | None]:
-    """Register the recording a first time and plan its whole tracks; None without steps."""
-    if not request.config.complete.steps:
-        return None, None
+) -> _Survey | None:
+    """Read the recording a first time and plan its whole tracks; None where none is completed."""
+    if not request.completes:
+        return None
     with ExitStack() as workers:
         receive = workers.enter_context(reader(request))
         from boxreg_ros.offline.completion import Completion, first_pass
-        from boxreg_ros.offline.registration_worker import registration_worker
 
         recording = ReadAhead(receive)
         clock.begun('start')
+        fixed_frame = recording.source.fixed_frame
+        items = ((item.moved, item.restarts) for item in progress.each(recording))
+        if request.keyframes:
+            from boxreg_ros.offline.keyframes import ends_of, keyframes
+
+            with clock('follow'):
+                plan, parts, tracks = keyframes(items, fixed_frame, request.config)
+            return _Survey(plan, Completion(plan, request.config), parts, ends_of(tracks))
+        from boxreg_ros.offline.registration_worker import registration_worker
+
         submit = workers.enter_context(
             registration_worker(request.config, clock, progress.progress.announce)
         )
-        items = ((item.moved, item.restarts) for item in progress.each(recording))
-        submit = _journaled(submit, journal)
-        first = first_pass(items, request.config, submit)
-        plan = first.plan(recording.source.fixed_frame, request.config)
-        return plan, Completion(plan, request.config)
+        first = first_pass(items, request.config, _journaled(submit, journal), fixed_frame)
+        plan = first.plan(fixed_frame, request.config)
+        return _Survey(plan, Completion(plan, request.config), first.parts, [])
 
 
 def _register(
     recording: ReadAhead,
     registrar: BoxRegistrar,
-    completion: Completion | None,
+    survey: _Survey | None,
     sink: Sink,
     clock: Stopwatch,
     progress: _Passes,
 ) -> None:
-    """Read the recording, register its boxes, with those of `completion`, and write them."""
-    for item in progress.each(recording):
+    """Read the recording, register its boxes, with those of the survey, and write them."""
+    items = progress.each(recording)
+    completion = None
+    if survey is not None:
+        completion = survey.completion
+        items = with_empty_arrays(items, survey.parts, recording.source.fixed_frame)
+    for item in items:
         with_ticket = sink.expect(item)
         moved = with_ticket.moved
         with clock('registrar'):

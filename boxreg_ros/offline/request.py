@@ -86,6 +86,12 @@ class Request:
         parse=_labels,
         text=lambda labels: ':'.join(map(str, labels)),
     )
+    keyframes: bool = option(
+        False,
+        "the boxes are a person's, at some sweeps only: none is rejected or renamed, and each "
+        'object gets a box at every sweep, beyond its first and last keyframe as long as points '
+        'support it',
+    )
     fixed_frame: str | None = option(
         None,
         'frame to refine in (default: topmost frame that the frame of the clouds moves in)',
@@ -157,6 +163,12 @@ class Request:
         self._check_recordings()
         self._check_boxes()
         self._check_part()
+        if self.keyframes and self.config.complete.steps:
+            raise ConfigError(
+                f'keyframes: expected without steps of --complete, got '
+                f'{", ".join(self.config.complete.steps)}; leave them out: keyframes are neither '
+                f'joined nor rejected, and missing boxes are followed through the points'
+            )
         check_options(self.box_formats, self.options)
         if self.report:
             from boxreg_ros.review.report import check_packages  # imports torch
@@ -246,6 +258,11 @@ class Request:
     def needs_point_labels(self) -> bool:
         """Return whether the recording is read again, to label its points."""
         return bool(self.point_formats or self.clouds or self.undistort or self.label_points)
+
+    @property
+    def completes(self) -> bool:
+        """Return whether boxes are added: the recording is read twice."""
+        return self.keyframes or bool(self.config.complete.steps)
 
     def inputs(self) -> tuple[Path, ...]:
         """Return the input files and folders."""

@@ -79,6 +79,11 @@ class Summary:
         Of everything that can change the results.
     complete : dict
         Tracks and boxes that each step of completion changed; empty without steps.
+    seeds : list of dict
+        Where each track of keyframes ends in both directions and why, and keyframes that could
+        not be used; empty without keyframes.
+    sweeps_with_boxes : dict
+        Sweeps with a box ``before`` and ``after`` the run.
     fingerprint : str
         Of the request and its files.
     seconds : dict
@@ -123,6 +128,8 @@ class Summary:
     versions: dict[str, str]
     associated_tracks: int | None = None
     complete: dict[str, int] = field(default_factory=dict)
+    seeds: list[dict[str, Any]] = field(default_factory=list)
+    sweeps_with_boxes: dict[str, int] = field(default_factory=dict)
     fingerprint: str = ''
     seconds: dict[str, float] = field(default_factory=dict)
     rules: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -158,6 +165,7 @@ class Summary:
             box_arrays=findings.counts['box_arrays'],
             boxes_in=sink.boxes_in,
             boxes_out=sink.boxes_out,
+            sweeps_with_boxes={'before': sink.arrays_in, 'after': sink.arrays_out},
             status=dict(sink.status),
             reasons=dict(sink.reasons.most_common()),
             time_jumps=findings.counts[Reason.TIME_JUMP],
