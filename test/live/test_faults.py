@@ -402,7 +402,7 @@ def test_bench_node_reports_rates_latencies_and_resources(domain):
         assert 50.0 < report[f'memory {when} [MB]'] < 5000.0
         assert 5 < report[f'handles {when}'] < 100
     counters = report['counters']
-    assert counters['boxes_received'] >= 85
+    assert counters['boxes_received'] == 90
     assert counters['refined'] > 100
 
 
