@@ -18,7 +18,7 @@ import os
 from pathlib import Path
 import re
 import time
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import RecordingError, TransferError, unreadable
 
@@ -55,23 +55,8 @@ class Entry(NamedTuple):
     version: str
 
 
-class ByteSource(Protocol):
-    """A file that is read by ranges; `size` in bytes."""
-
-    size: int
-
-    def read(self, first: int, end: int) -> bytes:
-        """Return a part of the file; fewer bytes at its end."""
-
-    def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
-        """Begin to read ranges that are needed next."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-
 class LocalFile:
-    """A file of this machine; see `ByteSource`."""
+    """A file of this machine that is read by ranges; `size` in bytes."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open('rb')
@@ -97,10 +82,12 @@ class LocalFile:
 
 class RemoteFile:
     """
-    A file behind a URL; see `ByteSource`.
+    A file behind a URL that is read by ranges.
 
     Attributes
     ----------
+    size : int
+        Size of the file [bytes].
     bytes_read : int
         Number of bytes that were requested so far.
 
@@ -168,6 +155,9 @@ class RemoteFile:
         return _answer_of(self._path, content)
 
 
+ByteSource = LocalFile | RemoteFile
+
+
 class _WholeFile(TransferError):
     """A server sends the whole file in place of a range."""
 
@@ -178,7 +168,7 @@ def url_of(path: Path) -> str | None:
     return f'{match[1]}://{match[2]}' if match else None
 
 
-def byte_source_of(path: Path) -> LocalFile | RemoteFile:
+def byte_source_of(path: Path) -> ByteSource:
     """Return an open file."""
     return LocalFile(path) if url_of(path) is None else RemoteFile(path)
 
