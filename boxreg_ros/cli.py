@@ -244,6 +244,7 @@ def _run(arguments: list[str]) -> int:
         options = re.findall(r'--[a-z-]+', args.subparser.format_usage())
         proposal = _proposal(unknown, options)
         args.subparser.error(f'unrecognized arguments: {" ".join(unknown)}{proposal}')
+    args.arguments = arguments
     keep_freed_memory()
     collect_rarely()
     return int(_module(args.command).run(args))

@@ -31,13 +31,14 @@ from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, delete_remains, SUMMARY, whole_folder, writing
 from boxreg_ros.offline.stopwatch import Stopwatch
 from boxreg_ros.offline.summary import Summary
-from boxreg_ros.review.decisions import DECISIONS
+from boxreg_ros.review.corrections import Corrections
+from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.structures import BoxArray, RefinedBoxes
 import yaml
 
 if TYPE_CHECKING:
     from boxreg_ros.core.registrar import BoxRegistrar, Submit
-    from boxreg_ros.offline.completion import Completion
+    from boxreg_ros.offline.completion import Completion, Moved
     from boxreg_ros.offline.journal import EstimateJournal
     from boxreg_ros.tracks.complete import CompletionPlan
 
@@ -80,7 +81,8 @@ def relabel(
     shown = _Passes(progress, 1 + request.completes)
     with writing(out), ExitStack() as workers:
         journal = workers.enter_context(_journal(out, fingerprint)) if resume else None
-        survey = _survey(request, clock, shown, journal)
+        corrections = _corrections(request)
+        survey = _survey(request, clock, shown, journal, corrections)
         receive = workers.enter_context(reader(request))
         # The recording is opened while this process imports numba, which takes half a second.
         from boxreg_ros.core.registrar import BoxRegistrar
@@ -94,7 +96,7 @@ def relabel(
         )
         registrar = BoxRegistrar(request.config, _journaled(submit, journal))
         with whole_folder(out, request.inputs()) as folder:
-            with Sink(folder, request, recording.source, clock) as sink:
+            with Sink(folder, request, recording.source, clock, corrections) as sink:
                 _register(recording, registrar, survey, sink, clock, shown)
             plan = None if survey is None else survey.plan
             summary = Summary.of(request, recording, registrar, sink)
@@ -173,8 +175,17 @@ class _Survey(NamedTuple):
     ends: list[dict[str, Any]]
 
 
+def _corrections(request: Request) -> Corrections:
+    """Return the decisions of a person; none without a file of them."""
+    return Corrections(() if request.decisions is None else read_decisions(request.decisions))
+
+
 def _survey(
-    request: Request, clock: Stopwatch, progress: _Passes, journal: EstimateJournal | None
+    request: Request,
+    clock: Stopwatch,
+    progress: _Passes,
+    journal: EstimateJournal | None,
+    corrections: Corrections,
 ) -> _Survey | None:
     """Read the recording a first time and plan its whole tracks; None where none is completed."""
     if not request.completes:
@@ -186,7 +197,10 @@ def _survey(
         recording = ReadAhead(receive)
         clock.begun('start')
         fixed_frame = recording.source.fixed_frame
-        items = ((item.moved, item.restarts) for item in progress.each(recording))
+        items = (
+            (_corrected(item.moved, corrections), item.restarts)
+            for item in progress.each(recording)
+        )
         if request.keyframes:
             from boxreg_ros.offline.keyframes import ends_of, keyframes
 
@@ -201,6 +215,11 @@ def _survey(
         first = first_pass(items, request.config, _journaled(submit, journal), fixed_frame)
         plan = first.plan(fixed_frame, request.config)
         return _Survey(plan, Completion(plan, request.config), first.parts, [])
+
+
+def _corrected(item: Moved, corrections: Corrections) -> Moved:
+    """Return boxes as they are to be registered; sweeps as they are."""
+    return corrections.to_register(item) if isinstance(item, BoxArray) else item
 
 
 def _register(

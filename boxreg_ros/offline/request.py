@@ -57,6 +57,8 @@ class Request:
         Settings of the core.
     options : Options
         Settings of the label formats.
+    command : tuple of str
+        Arguments of `boxreg` that describe the request; empty if it was made in another way.
     others
         As their options state; None for the default named there.
 
@@ -112,7 +114,8 @@ class Request:
     config: Config = field(default_factory=Config)
     decisions: Path | None = option(
         None,
-        'decisions.csv of boxreg review: keep rejected tracks as input, hold pinned boxes',
+        'decisions.csv of boxreg review: split, join, rename and delete tracks, keep rejected '
+        'ones as input, hold pinned boxes',
         metavar='FILE',
         parse=Path,
     )
@@ -157,6 +160,8 @@ class Request:
         metavar='FILE',
         parse=Path,
     )
+
+    command: tuple[str, ...] = field(default=(), repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the options."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
+from pathlib import Path
 import platform
 from typing import Any, Self, TYPE_CHECKING
 
@@ -34,6 +35,9 @@ class Summary:
     ----------
     recordings : list of str
         Paths.
+    command, folder : list of str, and str
+        Arguments of `boxreg` that made the result, and the folder they were given in; no
+        arguments for a run from Python.
     topics : dict
         Topics of points, boxes and odometry; None where there is none.
     labels : dict or None
@@ -96,6 +100,8 @@ class Summary:
     """
 
     recordings: list[str]
+    command: list[str]
+    folder: str
     topics: dict[str, str | None]
     labels: dict[str, Any] | None
     fixed_frame: str
@@ -157,6 +163,8 @@ class Summary:
         findings = recording.findings
         return cls(
             recordings=[str(path) for path in request.recordings],
+            command=list(request.command),
+            folder=str(Path.cwd()),
             topics=source.topics,
             labels=_labels(request, findings.outside),
             fixed_frame=source.fixed_frame,
