@@ -2,6 +2,9 @@
 
 from pathlib import Path
 import shutil
+import signal
+import subprocess
+import sys
 from threading import Thread
 
 from boxreg_ros import Config, refine, Track
@@ -361,6 +364,24 @@ def test_axe_finds_nothing(server):
         page.keyboard.press('e')
         found = axe.run(page)
         assert found.violations_count == 0, found.generate_report()
+
+
+def test_a_review_begins_with_a_recording(made, tmp_path, capfd):
+    out = tmp_path / 'out'
+    command = [sys.executable, '-m', 'boxreg_ros.cli', 'review', str(made / 'drive')]
+    assert main([*command[3:]]) == 1  # no result
+    assert 'expected a finished result' in capfd.readouterr().err
+    command += ['-o', str(out), '--port', '0', *FORMATS, *QUICK]
+    for word in ('boxes in', 'up to date'):
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            lines = [process.stdout.readline() for _ in range(2)]
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=60)
+        assert process.returncode == 0
+        assert word in lines[0]
+        assert lines[1].startswith('http://127.0.0.1:')
+    assert (out / 'report.html').is_file()
+    assert (out / 'sustechpoints').is_dir()
 
 
 def test_every_part_of_the_script_is_in_the_page():
