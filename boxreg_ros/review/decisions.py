@@ -342,15 +342,16 @@ class DecisionLog:
             os.fsync(file.fileno())
 
     def _write_at(self, end: int, rows: bytes) -> None:
-        with open(self._path, 'r+b') as file:
+        with open(self._path, 'r+b', buffering=0) as file:
             file.truncate(end)  # without the part of a row that a crash has left
             file.seek(end)
+            left = memoryview(rows)
             try:
-                file.write(rows)
-                file.flush()
+                while left:
+                    left = left[file.write(left) :]
                 os.fsync(file.fileno())
             except OSError:  # as of a full disk
-                os.truncate(self._path, end)
+                file.truncate(end)
                 raise
 
 

@@ -23,6 +23,11 @@ QUICK = ['--set', 'solver.rounds=2', '--set', 'sampling.points=64']
 FORMATS = ['--formats', 'openlabel,sustechpoints']
 DO = '[data-do={}]'
 NUM_SWEEPS = 14
+LEAVING = """(() => {
+  const event = new Event('beforeunload', { cancelable: true });
+  dispatchEvent(event);
+  return event.defaultPrevented;
+})()"""
 
 pytestmark = NEEDS_BROWSER
 
@@ -72,11 +77,13 @@ def answer(page, text):
 def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
     with opened_page(server.address + '#track=1') as page:
         assert sorted(ids_of(page)) == ['1', '2']
+        lengths = 'TRACKS.map(track => track.path.length).sort((a, b) => a - b)'
         open_track(page, '1', 8)
         page.keyboard.press('s')
         page.wait_for_function('TRACKS.length === 3')
         assert sorted(ids_of(page)) == ['1', '1_2', '2']
         page.wait_for_function("current().id === '1_2'")
+        assert page.evaluate(lengths) == [6, 8, 14]
         assert page.evaluate('[view.row, view.part.stamps.length]') == [0, 6]
         page.click(DO.format('rename'))
         answer(page, 'new')
@@ -113,7 +120,8 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
         open_track(page, '1', 0)
         page.keyboard.press('j')
         page.wait_for_selector('#ask[open]')
-        assert page.locator('#ask-proposals button').first.inner_text().startswith('1_2 ')
+        proposed = page.locator('#ask-proposals button').first.inner_text()
+        assert proposed == '1_2 car: 0.1 s and 0.0 m apart'
         page.keyboard.press('Enter')
         page.wait_for_function('TRACKS.length === 2')
         page.keyboard.press('z')
@@ -250,6 +258,7 @@ def test_a_correction_shows_its_figures_is_typed_and_undone_in_steps(server):
         assert shown == pytest.approx(expected, abs=0.02)
         page.mouse.up()
         assert page.evaluate('numInside(pointsAt(view.part, view.row), view.edit)') < inside
+        assert page.evaluate(LEAVING)  # the browser asks before it is lost
         page.keyboard.press('l')
         page.fill('#n-width', '3')
         page.keyboard.press('Enter')

@@ -51,7 +51,7 @@ function decidedOf(track) {
   const single = [...inputs].flatMap(input => log.ofInput.get(input) ?? []).filter(row => row.stamp_ns && TOPIC_OF[row.decision] === 'judgement');
   const boxes = single.length && (track.isWhole ? single : single.filter(row => track.members().some(([s, k]) => inputOf(s, k) === row.track_id && covers(row, stampOf(s, k))))).length;
   const gone = isGone(track) ? 'delete' : track.deleted ? `${track.deleted} deleted` : '';
-  const edits = [track.isWhole ? '' : 'id', track.pieces.some(({ s }) => DATA.tracks[s].class !== track.class) ? 'class' : ''];
+  const edits = [track.isWhole ? '' : track.pieces.some(({ s }) => DATA.tracks[s].id !== track.id) ? 'id' : 'split', track.pieces.some(({ s }) => DATA.tracks[s].class !== track.class) ? 'class' : ''];
   return [word, gone, ...edits, boxes ? `${boxes} ${boxes === 1 ? 'box' : 'boxes'}` : ''].filter(Boolean).join(', ');
 }
 
