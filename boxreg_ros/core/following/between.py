@@ -57,10 +57,7 @@ def _closed(way: Way, rows: Ints, part: Floats, target: Floats) -> Floats | None
     """Return the poses (n, 4) of a way moved so that it ends at `target`; None where it is far."""
     if way.reason != ARRIVED or not len(rows):
         return None
-    stop = max(way.poses, key=lambda row: abs(row - rows[0]))
-    if stop not in way.seen:
-        return None
-    gap = target - way.poses[stop]
+    gap = target - list(way.poses.values())[-1]
     gap[3] = wrap_angle(gap[3])
     if np.linalg.norm(gap[:3]) > MAX_GAP or abs(gap[3]) > MAX_GAP_YAW:
         return None
