@@ -27,7 +27,7 @@ from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.batch_results import DONE, Result, UP_TO_DATE
 from boxreg_ros.offline.job import Job, JOBS
 from boxreg_ros.offline.progress import PIPE
-from boxreg_ros.offline.result_folder import earlier_summary, whole_summary
+from boxreg_ros.offline.result_folder import claimed, earlier_summary, whole_summary
 from boxreg_ros.offline.time_limit import Watch, watched
 
 DRIVE = '{drive}'
@@ -167,6 +167,9 @@ class JobRunner:
         result.seconds = round(time.monotonic() - begun, 1)
         if result.exit_status == 0:
             result.status = DONE
+            return
+        with suppress(RecordingError), claimed(self.out / job.name):
+            pass  # deletes what a process that was killed has left
 
     def _attempt(self, job: Job, result: Result) -> bool:
         """Run the process of a job once; return whether another attempt would end the same."""

@@ -58,11 +58,17 @@ class Demands:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg relabel`."""
     add_recordings(parser)
+    add_run_arguments(parser)
+
+
+def add_run_arguments(parser: argparse.ArgumentParser, out: Path | None = None) -> None:
+    """Add the options of a run; `out` is the default of its result folder."""
     add_options(parser, Request)
     add_options(parser, Settings)
+    shown = '' if out is None else ' (default: %(default)s)'
     parser.add_argument(
-        '-o', '--out', type=Path, required=True,
-        help='result folder; it is written completely or not at all',
+        '-o', '--out', type=Path, required=out is None, default=out,
+        help=f'result folder; it is written completely or not at all{shown}',
     )  # fmt: skip
     parser.add_argument(
         '--resume', action='store_true',

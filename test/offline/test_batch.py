@@ -194,10 +194,6 @@ def test_a_drive_without_progress_or_with_too_much_memory_is_ended(tmp_path, cap
     assert {item.name for item in out.iterdir()} == {
         'jobs', 'index.csv', 'summary.json', 'report.html',
     }  # fmt: skip
-    (job,) = jobs_of([path])
-    # Longer than the limit in all, never without progress.
-    result = JobRunner(out, tuple(QUICK), '', timeout=4.0)(job)
-    assert result.status == 'done'
 
 
 def test_missing_and_repeated_drives_fail_and_the_others_go_on(tmp_path, capsys):
@@ -274,6 +270,25 @@ def test_a_killed_process_is_tried_again_and_named(tmp_path, monkeypatch):
     result = JobRunner(tmp_path / 'out', (), '', retries=2)(job)
     assert (result.status, result.exit_status, result.attempts) == ('failed', -9, 3)
     assert 'killed by signal 9; the most frequent cause is too little memory' in result.last_line
+
+
+def test_a_drive_that_goes_on_has_no_limit_of_time(tmp_path, monkeypatch):
+    path = Drive(sweeps=6).write(tmp_path / 'one')
+    reader, writer = os.pipe()
+    monkeypatch.setenv('BOXREG_PROGRESS', str(writer))
+    assert main(['relabel', str(path), '-o', str(tmp_path / 'alone'), *QUICK]) == 0
+    assert len(os.read(reader, 100)) >= 5  # for each sweep behind the first
+    script = tmp_path / 'python'
+    steps = 'os.write(int(os.environ["BOXREG_PROGRESS"]), b"."), time.sleep(0.2)'
+    script.write_text(f'#!{sys.executable}\nimport os, time\nfor _ in range(20): {steps}\n')
+    script.chmod(0o755)
+    monkeypatch.setattr('sys.executable', str(script))
+    (job,) = jobs_of([path])
+    result = JobRunner(tmp_path / 'out', (), '', timeout=2.0)(job)
+    assert (result.exit_status, result.status) == (0, 'done')
+    assert result.seconds > 2.0
+    for end in (reader, writer):
+        os.close(end)
 
 
 def test_a_batch_that_is_killed_takes_its_processes_with_it(tmp_path):

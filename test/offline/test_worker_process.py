@@ -12,8 +12,8 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.core.registration import register
 from boxreg_ros.errors import BoxregError
+from boxreg_ros.io.compilation import announced_compilation, COMPILING
 from boxreg_ros.offline import registration_worker as registration
-from boxreg_ros.offline.compilation import announced_compilation, COMPILING
 from boxreg_ros.offline.registration_worker import registration_worker
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.stopwatch import Stopwatch

@@ -22,12 +22,13 @@ from boxreg_ros.io.label_feed import (
     PROGRAM,
     RecorderSettings,
     RecorderStatus,
+    segment_limit,
     Split,
 )
 from boxreg_ros.labels import frames_of, LabelFrame
 from boxreg_ros.labels.segments import read_index
 from boxreg_ros.recorder.folder import lock_of
-from boxreg_ros.recorder.main import Recorder, segment_limit, serve
+from boxreg_ros.recorder.main import Recorder, serve
 from boxreg_ros.recorder.segment import journal_settings, Segment
 from boxreg_ros.structures import BoxArray, RefinedBoxes, Sweep
 import numpy as np

@@ -18,7 +18,7 @@ import os
 from pathlib import Path
 import re
 import time
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from boxreg_ros.errors import RecordingError, TransferError, unreadable
 
@@ -57,23 +57,8 @@ class Entry(NamedTuple):
     version: str
 
 
-class ByteSource(Protocol):
-    """A file that is read by ranges; `size` in bytes."""
-
-    size: int
-
-    def read(self, first: int, end: int) -> bytes:
-        """Return a part of the file; fewer bytes at its end."""
-
-    def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
-        """Begin to read ranges that are needed next."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-
 class LocalFile:
-    """A file of this machine; see `ByteSource`."""
+    """A file of this machine that is read by ranges; `size` in bytes."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open('rb')
@@ -92,6 +77,9 @@ class LocalFile:
     def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
         """Leave it to the system, which reads ahead itself."""
 
+    def check_unchanged(self) -> None:
+        """Do nothing: a file that is being recorded is read as far as it goes."""
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -99,10 +87,12 @@ class LocalFile:
 
 class RemoteFile:
     """
-    A file behind a URL; see `ByteSource`.
+    A file behind a URL that is read by ranges.
 
     Attributes
     ----------
+    size : int
+        Size of the file [bytes].
     bytes_read : int
         Number of bytes that were requested so far.
 
@@ -111,7 +101,8 @@ class RemoteFile:
     def __init__(self, path: Path) -> None:
         self._system, self._name = _system_of(path)
         self._path = path
-        self.size = entry_of(path).size
+        self._entry = entry_of(path)
+        self.size = self._entry.size
         self.bytes_read = 0
         self._pool = ThreadPoolExecutor(READERS)
         self._ranges: OrderedDict[tuple[int, int], Future[bytes]] = OrderedDict()
@@ -137,6 +128,15 @@ class RemoteFile:
             whole = first, min(end, self.size)
             if first < self.size and whole not in self._ranges:
                 self._fetch(*whole)
+
+    def check_unchanged(self) -> None:
+        """Raise TransferError if the file is another one than at the start."""
+        self._system.invalidate_cache()
+        if entry_of(self._path) != self._entry:
+            raise TransferError(
+                f'{url_of(self._path)}: expected the file as it was at the start, got another '
+                f'version; run again when it is no longer written'
+            )
 
     def close(self) -> None:
         """Cancel the open requests."""
@@ -170,6 +170,9 @@ class RemoteFile:
         return _answer_of(self._path, content)
 
 
+ByteSource = LocalFile | RemoteFile
+
+
 class _WholeFile(TransferError):
     """A server sends the whole file in place of a range."""
 
@@ -180,7 +183,7 @@ def url_of(path: Path) -> str | None:
     return f'{match[1]}://{match[2]}' if match else None
 
 
-def byte_source_of(path: Path) -> LocalFile | RemoteFile:
+def byte_source_of(path: Path) -> ByteSource:
     """Return an open file."""
     return LocalFile(path) if url_of(path) is None else RemoteFile(path)
 
