@@ -307,6 +307,8 @@ class Ingredients:
     """Motion residuals are down-weighted beyond three deviations."""
     robust_weights: bool = True
     """Input poses and labelling margins far from the expected ones are down-weighted."""
+    without: tuple[str, ...] = ()
+    """Names of `RESIDUALS` that are left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,7 +388,6 @@ class Config:
     queue: int = setting(
         20, 'maximum number of unpaired sweeps, and of box arrays, held', '', 1, 10000
     )
-    device: str = setting('cpu', "torch device of the solver: 'cpu', 'cuda', 'cuda:1', ...")
     sampling: SamplingConfig = SamplingConfig()
     faces: FaceConfig = FaceConfig()
     solver: SolverConfig = SolverConfig()

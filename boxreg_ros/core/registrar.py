@@ -13,12 +13,12 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
+from boxreg_ros.core.method.constants import Constants, CONSTANTS
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import column, joined
 from boxreg_ros.core.track_window import Estimate, Window
-from boxreg_ros.errors import ConfigError
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
 
@@ -29,8 +29,6 @@ Submit = Callable[[list[Window], Config, InputModel], GetEstimates]
 Budget = Callable[[], int]
 """Returns how many windows may be solved for the box array at hand."""
 
-CPU = 'cpu'
-"""The device that torch has everywhere: it is not imported to check that."""
 VELOCITY_OBSERVATIONS = 4
 """Observations that the input velocity is estimated from; chosen: 0.3 s at 10 Hz."""
 UNKNOWN_COVARIANCE = np.full((6, 6), inf)
@@ -61,6 +59,8 @@ class BoxRegistrar:
     budget : callable, optional
         Called once for each box array with `estimate` 'early' or 'final'; limits the windows that
         are solved for it. Default: all are.
+    constants : Constants, optional
+        Numbers of the method.
 
     Attributes
     ----------
@@ -72,11 +72,6 @@ class BoxRegistrar:
         Sweeps and boxes added, boxes by status, and everything dropped or kept, by reason.
     box_time : BoxTimeEvidence
         Evidence of the time that the input boxes are of.
-
-    Raises
-    ------
-    ConfigError
-        If torch cannot use `config.device`.
 
     Notes
     -----
@@ -110,20 +105,24 @@ class BoxRegistrar:
     """
 
     def __init__(
-        self, config: Config, submit: Submit | None = None, budget: Budget | None = None
+        self,
+        config: Config,
+        submit: Submit | None = None,
+        budget: Budget | None = None,
+        constants: Constants = CONSTANTS,
     ) -> None:
-        _check_device(config.device)
         self.config = config
         self.counts: Counter[str] = Counter()
         self._submit = submit
         self._budget = budget
+        self._constants = constants
         self.reset()
 
     def reset(self) -> None:
         """Discard tracks and box arrays that are held; keep the counts."""
         config = self.config
         self._matcher = StampMatcher(config, self.counts)
-        self._input_model = InputModel(config.faces)
+        self._input_model = InputModel(config.faces, self._constants)
         self.box_time = BoxTimeEvidence()
         self._pending = deque[PendingArray]()
         self._newest_ns = -inf
@@ -421,19 +420,3 @@ def submit_locally(windows: list[Window], config: Config, model: InputModel) -> 
     from boxreg_ros.core.registration import register
 
     return partial(register, windows, config, model)
-
-
-def _check_device(device: str) -> None:
-    """Raise ConfigError if torch cannot use `device`."""
-    if device == CPU:
-        return
-    import torch
-
-    try:
-        torch.zeros(1, device=device)
-    except (AssertionError, RuntimeError) as error:  # torch raises either
-        reason = str(error).splitlines()[0]
-        raise ConfigError(
-            f"device: expected one that torch can use here, such as 'cpu', got {device!r}: "
-            f'{reason}'
-        ) from None

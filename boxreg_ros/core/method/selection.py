@@ -1,6 +1,6 @@
 """Selection of few numbers by rank: numba's own sort takes seconds to compile."""
 
-from boxreg_ros.core.kernels.compile import kernel
+from boxreg_ros.core.method.compile import kernel
 
 
 @kernel

@@ -2,35 +2,24 @@
 Factorisation of one arrowhead matrix: a chain of poses with a border, in plain loops.
 
 A pose is coupled to the two poses after it, its `links`, and to the shared variables, the
-`border`; see `ArrowheadArrays`. The Cholesky factor U, A = U' U, has the same shape and replaces
+`border`; see `Arrowhead`. The Cholesky factor U, A = U' U, has the same shape and replaces
 the matrix A. Large products are those of BLAS, since numba unrolls short loops into scalars.
 
 """
 
 from math import sqrt
 
-from boxreg_ros.core.kernels.arrays import ArrowheadArrays
-from boxreg_ros.core.kernels.compile import kernel
+from boxreg_ros.core.method.arrays import Arrowhead, POSE, SHARED, SPAN
+from boxreg_ros.core.method.compile import kernel
 import numpy as np
 
-POSE = 6
 NEXT = 2 * POSE
 """Variables of the two poses after one."""
-SPAN = POSE + NEXT
-BORDER = 23
-"""Shared variables."""
-REST = NEXT + BORDER
+REST = NEXT + SHARED
 """Variables that a pose is coupled to."""
 RIDGE = 1e-9
-"""Added to the diagonal: an unobserved variable does not break the factorisation."""
-
-
-@kernel
-def empty_arrowhead(N):
-    """Return a matrix with a chain of N poses; all zero."""
-    return ArrowheadArrays(
-        np.zeros((N + 2, POSE, SPAN)), np.zeros((N + 2, POSE, BORDER)), np.zeros((BORDER, BORDER))
-    )
+"""Added to the diagonal: an unobserved variable does not break the factorisation. Derived: the
+information of a deviation of 30 km."""
 
 
 @kernel
@@ -44,17 +33,17 @@ def clear(A):
 @kernel
 def fix_variables(A, free):
     """Make rows and columns of variables that are not `free` (6 N + 23,) those of the identity."""
-    n = len(free) - BORDER
+    n = len(free) - SHARED
     for i in range(n):
         pose, a = i // POSE, i % POSE
         links, border = A.links[pose, a], A.border[pose, a]
         for c in range(min(SPAN, n - POSE * pose)):
             links[c] *= free[i] * free[POSE * pose + c]
-        for s in range(BORDER):
+        for s in range(SHARED):
             border[s] *= free[i] * free[n + s]
         links[a] += 1.0 - free[i] + RIDGE
-    for s in range(BORDER):
-        for t in range(s, BORDER):
+    for s in range(SHARED):
+        for t in range(s, SHARED):
             A.corner[s, t] *= free[n + s] * free[n + t]
         A.corner[s, s] += 1.0 - free[n + s] + RIDGE
 
@@ -115,7 +104,7 @@ def eliminate_pose(A, pose):
             links[pose + 1, a, c] -= by_links[a, c]
         for c in range(POSE):
             links[pose + 2, a, c] -= by_links[POSE + a, POSE + c]
-        for s in range(BORDER):
+        for s in range(SHARED):
             border[pose + 1, a, s] -= by_border[a, s]
             border[pose + 2, a, s] -= by_border[POSE + a, s]
     return True
@@ -128,7 +117,7 @@ def factorise(A):
     for pose in range(N):
         if not eliminate_pose(A, pose):
             return False
-    border = A.border[:N].reshape(POSE * N, BORDER)
+    border = A.border[:N].reshape(POSE * N, SHARED)
     A.corner[:] -= np.dot(border.T, border)
     return factorise_corner(A.corner)
 
@@ -136,14 +125,14 @@ def factorise(A):
 @kernel
 def substitute_forward(U, x, count):
     """Eliminate the first `count` variables of the chain from a right side (6 N + 23,)."""
-    n = len(x) - BORDER
+    n = len(x) - SHARED
     for i in range(count):
         pose, a = i // POSE, i % POSE
         first = POSE * pose
         x[i] /= U.links[pose, a, a]
         for c in range(a + 1, min(SPAN, n - first)):
             x[first + c] -= U.links[pose, a, c] * x[i]
-        for s in range(BORDER):
+        for s in range(SHARED):
             x[n + s] -= U.border[pose, a, s] * x[i]
 
 
@@ -151,14 +140,14 @@ def substitute_forward(U, x, count):
 def solve(U, x):
     """Replace a right side `x` (6 N + 23,) by the solution of U' U x = b."""
     links, border, corner = U
-    n = len(x) - BORDER
+    n = len(x) - SHARED
     substitute_forward(U, x, n)
-    for s in range(BORDER):
+    for s in range(SHARED):
         x[n + s] /= corner[s, s]
-        for t in range(s + 1, BORDER):
+        for t in range(s + 1, SHARED):
             x[n + t] -= corner[s, t] * x[n + s]
-    for s in range(BORDER - 1, -1, -1):
-        for t in range(s + 1, BORDER):
+    for s in range(SHARED - 1, -1, -1):
+        for t in range(s + 1, SHARED):
             x[n + s] -= corner[s, t] * x[n + t]
         x[n + s] /= corner[s, s]
     for i in range(n - 1, -1, -1):
@@ -167,7 +156,7 @@ def solve(U, x):
         value = x[i]
         for c in range(a + 1, min(SPAN, n - first)):
             value -= links[pose, a, c] * x[first + c]
-        for s in range(BORDER):
+        for s in range(SHARED):
             value -= border[pose, a, s] * x[n + s]
         x[i] = value / links[pose, a, a]
 
@@ -191,7 +180,7 @@ def fill_inverse_root(U, inverse):
 @kernel
 def invert_corner(corner, inverse):
     """Write the inverse (23, 23) of U' U of a corner's factor."""
-    root = np.empty((BORDER, BORDER))
+    root = np.empty((SHARED, SHARED))
     fill_inverse_root(corner, root)
     np.dot(root, root.T, inverse)
 
@@ -247,6 +236,6 @@ def invert_poses(U, corner_inverse, blocks, border_blocks):
         for a in range(POSE):
             for b in range(POSE):
                 blocks[pose, a, b] = (own[a, b] + own[b, a]) / 2
-            for s in range(BORDER):
+            for s in range(SHARED):
                 border_blocks[pose, a, s] = -across[a, NEXT + s]
         shift_known(known, blocks[pose], across)

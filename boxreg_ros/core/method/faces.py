@@ -1,43 +1,44 @@
 """
-The outermost points on each face of each box, as their second moments, in plain loops.
+The outermost points on each face of each box, as their second moments, (M10) to (M12).
 
-The torch twin is `boxreg_ros.core.face_support.observe_faces_torch`; the formulas are (M10) to
-(M12).
+This is the correspondence search of every round.
 
 """
 
 from math import ceil, inf, isfinite, isnan, sqrt
 from typing import Any, NamedTuple
 
-from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.rotation import fill_rotation
+from boxreg_ros.core.method.arrays import BOTTOM, EXTENT, GAP
+from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.rotation import fill_rotation
 import numpy as np
 
-EXTENT, GAP = 0, 9
-"""First of the shared variables of each kind."""
 FACES = 5
 """Front, back, left, right, top: the bottom is observed by the road."""
-BOTTOM = 5
+STRIP_AXIS = (1, 1, 0, 0, 1)
+"""Box axis along which the strips of each of these lie side by side."""
 NOWHERE = 1e9
 """Depth of points that are not on a face [m]."""
 ALWAYS_VISIBLE = 9.0
 """Tangent of the roof; that of the bottom is its negative."""
 FAR_SENSOR = 1e6
 """Distance of an unknown sensor, over that of the centre of the points."""
+MIN_ALONG = 0.5
+"""Least distance along a face in the tangent of its visibility [m]. Chosen."""
 
 
 @kernel
-def fill_candidates(depth, m, numbers, index):
+def fill_candidates(depth, m, constants, index):
     """
     Write which of m points may be outermost on a face; return how many, and their largest depth.
 
     Those further behind the outermost one than `max_depth` are on another surface.
 
     """
-    limit = numbers.deepest - numbers.max_depth
+    limit = constants.deepest - constants.max_depth
     for i in range(m):
         limit = min(limit, depth[i])
-    limit += numbers.max_depth
+    limit += constants.max_depth
     count = 0
     for i in range(m):
         index[count] = i
@@ -46,7 +47,7 @@ def fill_candidates(depth, m, numbers, index):
 
 
 @kernel
-def fill_depths(m, half, level, numbers, work):
+def fill_depths(m, half, level, constants, work):
     """
     Write how far inside of the expected surface of each face each of m points is, (5, M) [m].
 
@@ -56,9 +57,9 @@ def fill_depths(m, half, level, numbers, work):
     """
     local, excess, strip, depth = work.local, work.excess, work.strip, work.depth
     outside_margin, edge_margin, deepest = (
-        numbers.outside_margin, numbers.edge_margin, numbers.deepest
+        constants.outside_margin, constants.edge_margin, constants.deepest
     )  # fmt: skip
-    strips = numbers.strips
+    strips = constants.strips
     for k in range(3):
         for i in range(m):
             excess[k, i] = abs(local[k, i]) - half[k]
@@ -89,7 +90,7 @@ def fill_depths(m, half, level, numbers, work):
 
 
 @kernel
-def outermost_points(m, wanted, numbers, work, moments):
+def outermost_points(m, wanted, constants, work, moments):
     """
     Find the outermost ones of m points on each of the five faces of one box.
 
@@ -99,8 +100,8 @@ def outermost_points(m, wanted, numbers, work, moments):
     points, candidates = work.moved, work.candidates
     best_depth, best_index = work.best_depth, work.best_index
     for face in range(FACES):
-        own_strip, depth = work.strip[numbers.strip_axis[face]], work.depth[face]
-        count, limit = fill_candidates(depth, m, numbers, candidates)
+        own_strip, depth = work.strip[STRIP_AXIS[face]], work.depth[face]
+        count, limit = fill_candidates(depth, m, constants, candidates)
         best_depth[:, :wanted] = NOWHERE
         for candidate in range(count):
             i = candidates[candidate]
@@ -140,10 +141,10 @@ def outermost_points(m, wanted, numbers, work, moments):
 
 
 @kernel
-def returns_of(windows, values, b, n):
+def returns_of(problem, values, b, n):
     """Return the values of the points of one observation."""
-    first = windows.first[b, n]
-    return values[first : first + windows.counts[b, n] * windows.stride : windows.stride]
+    first = problem.first[b, n]
+    return values[first : first + problem.counts[b, n] * problem.stride : problem.stride]
 
 
 @kernel
@@ -158,18 +159,18 @@ def centre_of(points, centre):
 
 
 @kernel
-def fill_visibility(box, origins, points, numbers, R, toward, tangent):
+def fill_visibility(box, origins, points, R, toward, tangent):
     """Write the visibility of each face of one input box from its best sensor, (6,)."""
     fill_rotation(box[6], box[7], box[8], R)
     tangent[:4] = -inf
     for sensor in range(len(origins)):
-        raise_visibility(box, origins[sensor], points, numbers, R, toward, tangent)
+        raise_visibility(box, origins[sensor], points, R, toward, tangent)
     tangent[4] = ALWAYS_VISIBLE
     tangent[5] = -ALWAYS_VISIBLE
 
 
 @kernel
-def raise_visibility(box, origin, points, numbers, R, toward, tangent):
+def raise_visibility(box, origin, points, R, toward, tangent):
     """Raise the visibility of the upright faces to that from one sensor."""
     if isfinite(origin[0]) and isfinite(origin[1]) and isfinite(origin[2]):
         for k in range(3):
@@ -187,26 +188,26 @@ def raise_visibility(box, origin, points, numbers, R, toward, tangent):
             outward += sign * toward[k] * R[k, axis]
             along += toward[k] * R[k, 1 - axis]
         along = abs(along) - box[4 - axis] / 2
-        tangent[face] = max(tangent[face], outward / max(along, numbers.min_along))
+        tangent[face] = max(tangent[face], outward / max(along, MIN_ALONG))
 
 
 @kernel
-def fill_insets(origins, tangent, occlusion_inset, range_inset, numbers, shares, inset, weight):
+def fill_insets(origins, tangent, occlusion_inset, range_inset, constants, shares, inset, weight):
     """Write the shares (2, 6) of the two insets, their sum (6,), and the weights of faces (6,)."""
     reach = sqrt(origins[0, 0] ** 2 + origins[0, 1] ** 2)
     for sensor in range(1, len(origins)):
         reach = min(reach, sqrt(origins[sensor, 0] ** 2 + origins[sensor, 1] ** 2))
-    beyond = 0.0 if isnan(reach) else (reach - numbers.near_range) / numbers.range_span
-    beyond = min(max(beyond, 0.0), numbers.max_range_share)
+    beyond = 0.0 if isnan(reach) else (reach - constants.near_range) / constants.range_span
+    beyond = min(max(beyond, 0.0), constants.max_range_share)
     for face in range(6):
-        u = tangent[face] + numbers.edge_lead[face]
-        occluded = 0.5 - 0.5 * u / sqrt(u**2 + numbers.softness)
+        u = tangent[face] + constants.edge_lead[face]
+        occluded = 0.5 - 0.5 * u / sqrt(u**2 + constants.visibility_softness)
         shares[0, face] = occluded
         shares[1, face] = (1.0 - occluded) * beyond
         by_range = shares[1, face] * range_inset[face]
         inset[face] = occluded * occlusion_inset[face] + by_range
-        seen = 1.0 if tangent[face] > 0.0 else numbers.occluded_weight
-        weight[face] = seen / (1.0 + (by_range / numbers.range_half_weight) ** 2)
+        seen = 1.0 if tangent[face] > 0.0 else constants.occluded_weight
+        weight[face] = seen / (1.0 + (by_range / constants.range_half_weight) ** 2)
 
 
 @kernel
@@ -220,14 +221,14 @@ def fill_velocity(poses, times, n, length, velocity):
 
 
 @kernel
-def fill_moved(windows, b, n, velocity, is_moving, moved):
+def fill_moved(b, n, problem, velocity, moved):
     """Write the points of one observation at the stamp of its box (M12), (3, M) [m]."""
-    points = returns_of(windows, windows.points, b, n)
-    delays = returns_of(windows, windows.delays, b, n)
+    points = returns_of(problem, problem.points, b, n)
+    delays = returns_of(problem, problem.delays, b, n)
     for i in range(len(points)):
         for k in range(3):
             moved[k, i] = points[i, k]
-    if is_moving:
+    if problem.is_moving:
         for k in range(3):
             for i in range(len(points)):
                 moved[k, i] -= velocity[k] * delays[i]
@@ -292,31 +293,31 @@ class FaceWork(NamedTuple):
 
 
 @kernel
-def empty_face_work(begin, end, windows, numbers):
+def empty_face_work(begin, end, problem, constants):
     """Return arrays for the observations of the windows `begin` to `end`."""
-    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
-    size = ceil(max(numbers.min_points, numbers.share * M)) + 1
+    M = max(1, problem.counts[begin:end].max()) if end > begin else 1
+    size = ceil(max(constants.min_face_points, constants.outermost / constants.strips * M)) + 1
     return FaceWork(
         np.empty((3, M)), np.empty((3, M)), np.empty((3, M)), np.empty((2, M), np.int32),
-        np.empty((FACES, M)), np.empty(M + 1, np.int32), np.empty((numbers.strips, size)),
-        np.empty((numbers.strips, size), np.int64), np.empty(FACES, np.int64), np.empty(FACES),
+        np.empty((FACES, M)), np.empty(M + 1, np.int32), np.empty((constants.strips, size)),
+        np.empty((constants.strips, size), np.int64), np.empty(FACES, np.int64), np.empty(FACES),
     )  # fmt: skip
 
 
 @kernel
-def clear_padding(length, row, faces):
-    """Set the face observations of the padding of window `row` to zero."""
-    faces.moments[row, length:] = 0.0
-    faces.distance[row, length:] = 0.0
-    faces.weight[row, length:] = 0.0
-    faces.inset[row, length:] = 0.0
-    faces.inset_shares[row, length:] = 0.0
-    faces.num_points[row, length:] = 0.0
+def clear_padding(length, b, faces):
+    """Set the face observations of the padding of window `b` to zero."""
+    faces.moments[b, length:] = 0.0
+    faces.distance[b, length:] = 0.0
+    faces.weight[b, length:] = 0.0
+    faces.inset[b, length:] = 0.0
+    faces.inset_shares[b, length:] = 0.0
+    faces.num_points[b, length:] = 0.0
 
 
 @kernel
 def observe_window(
-    b, windows, poses, shared, occlusion_inset, range_inset, numbers, work, row, faces
+    b, problem, poses, shared, occlusion_inset, range_inset, constants, work, faces
 ):
     """
     Write the face observations of window `b`.
@@ -325,20 +326,25 @@ def observe_window(
     ----------
     b : int
         The window.
-    windows : WindowArrays
-        Input of the windows.
+    problem : Problem
+        Input of the batch.
     poses, shared : array, shapes (N, 6) and (23,)
-        Its boxes of this round.
+        Boxes of the window in this round.
     occlusion_inset, range_inset : array, shape (6,)
-        As in `boxreg_ros.core.face_support.FaceOffsets` [m].
-    numbers : FaceNumbers
-        Constants and settings.
+        As in `Inputs`, of its kind [m].
+    constants : Constants
     work : FaceWork
         Arrays to work in.
-    row : int
-        Where in `faces` the window is written.
-    faces : FaceArrays
-        Written; zero for padding.
+    faces : Faces
+        Of the batch: written for the window, zero for padding.
+
+    Notes
+    -----
+    The paper takes the K points closest to a face that is visible by the points' centre of mass
+    [Eq. 4]. Here the outermost ones are taken: the closest points of a face that is given too far
+    inside may lie anywhere. On a face with a wrong yaw the outermost points are all at one end:
+    each strip has its own, so that the face is turned as well. Points far behind the outermost
+    one belong to another surface.
 
     """
     R = np.empty((3, 3))
@@ -348,86 +354,80 @@ def observe_window(
     toward = np.empty(3)
     tangent = np.empty(6)
     velocity = np.zeros(3)
-    length = windows.lengths[b]
-    clear_padding(length, row, faces)
+    length = problem.lengths[b]
+    clear_padding(length, b, faces)
     for k in range(3):
         half[k] = shared[EXTENT + k] / 2
     for n in range(length):
-        m = windows.counts[b, n]
-        box, pose, origins = windows.boxes[b, n], poses[n], windows.origins[b, n]
-        ground = windows.ground[b, n]
-        distance, weight, inset = faces.distance[row, n], faces.weight[row, n], faces.inset[row, n]
-        points = returns_of(windows, windows.points, b, n)
-        fill_visibility(box, origins, points, numbers, R, toward, tangent)
+        m = problem.counts[b, n]
+        box, pose, origins = problem.boxes[b, n], poses[n], problem.origins[b, n]
+        ground = problem.ground[b, n]
+        distance, weight, inset = faces.distance[b, n], faces.weight[b, n], faces.inset[b, n]
+        points = returns_of(problem, problem.points, b, n)
+        fill_visibility(box, origins, points, R, toward, tangent)
         fill_insets(
-            origins, tangent, occlusion_inset, range_inset, numbers,
-            faces.inset_shares[row, n], inset, weight,
+            origins, tangent, occlusion_inset, range_inset, constants,
+            faces.inset_shares[b, n], inset, weight,
         )  # fmt: skip
         for k in range(3):
             shift[k] = pose[k] - box[k]
         for face in range(6):
             level[face] = shared[GAP + face] + inset[face]
-        if numbers.is_moving:
-            fill_velocity(poses, windows.times[b], n, length, velocity)
+        if problem.is_moving:
+            fill_velocity(poses, problem.times[b], n, length, velocity)
         fill_rotation(pose[3], pose[4], pose[5], R)
-        fill_moved(windows, b, n, velocity, numbers.is_moving, work.moved)
+        fill_moved(b, n, problem, velocity, work.moved)
         to_box_axes(m, work.moved, shift, R, work.local)
-        near = fill_depths(m, half, level, numbers, work)
-        wanted = ceil(max(numbers.min_points, numbers.share * near))
-        outermost_points(m, wanted, numbers, work, faces.moments[row, n])
+        near = fill_depths(m, half, level, constants, work)
+        share = constants.outermost / constants.strips
+        wanted = ceil(max(constants.min_face_points, share * near))
+        outermost_points(m, wanted, constants, work, faces.moments[b, n])
         for face in range(FACES):
             distance[face] = -work.mean_depth[face]
-            if work.number[face] < numbers.min_points:
+            if work.number[face] < constants.min_face_points:
                 weight[face] = 0.0
         gap = shared[GAP + BOTTOM]
-        add_road(shift, ground, half[2], gap, faces.moments[row, n, BOTTOM], distance)
+        add_road(shift, ground, half[2], gap, faces.moments[b, n, BOTTOM], distance)
         weight[BOTTOM] = 1.0 if isfinite(ground) else 0.0
-        faces.num_points[row, n] = near
+        faces.num_points[b, n] = near
 
 
 @kernel
-def observe_faces(
-    begin, end, windows, poses, shared, occlusion_inset, range_inset, numbers, faces
-):
-    """
-    Write the face observations of the windows `begin` to `end`.
-
-    `poses`, `shared` and insets are (B, N, 6), (B, 23) and (B, 6), else as in `observe_window`.
-
-    """
-    work = empty_face_work(begin, end, windows, numbers)
+def observe_faces(begin, end, problem, poses, shared, inputs, constants, faces):
+    """Write the face observations of the windows `begin` to `end`, see `observe_window`."""
+    work = empty_face_work(begin, end, problem, constants)
     for b in range(begin, end):
+        kind = problem.kind[b]
         observe_window(
-            b, windows, poses[b], shared[b], occlusion_inset[b], range_inset[b], numbers, work, b,
-            faces,
+            b, problem, poses[b], shared[b], inputs.occlusion_inset[kind],
+            inputs.range_inset[kind], constants, work, faces,
         )  # fmt: skip
 
 
 @kernel
-def count_held(begin, end, windows, poses, extents, margin, is_moving, held):
+def count_held(begin, end, problem, poses, extents, margin, held):
     """
     Write how many points are in each box, or less than `margin` outside of it, (B, N).
 
-    Boxes at `poses` (B, N, 6) of `extents` (B, N, 3); windows `begin` to `end`. With `is_moving`
-    points are at the stamp of their box (M12).
+    Boxes at `poses` (B, N, 6) of `extents` (B, N, 3); windows `begin` to `end`.
 
     """
-    M = max(1, windows.counts[begin:end].max()) if end > begin else 1
+    M = max(1, problem.counts[begin:end].max()) if end > begin else 1
     moved = np.empty((3, M))
     local = np.empty((3, M))
     R = np.empty((3, 3))
     velocity = np.zeros(3)
     shift = np.empty(3)
     for b in range(begin, end):
-        for n in range(windows.lengths[b]):
-            m = windows.counts[b, n]
-            pose, extent, box = poses[b, n], extents[b, n], windows.boxes[b, n]
+        for n in range(problem.lengths[b]):
+            m = problem.counts[b, n]
+            pose, extent, box = poses[b, n], extents[b, n], problem.boxes[b, n]
             fill_rotation(pose[3], pose[4], pose[5], R)
-            if is_moving:
-                fill_velocity(poses[b], windows.times[b], n, windows.lengths[b], velocity)
+            if problem.is_moving:
+                fill_velocity(poses[b], problem.times[b], n, problem.lengths[b], velocity)
             for k in range(3):
                 shift[k] = pose[k] - box[k]
-            fill_moved(windows, b, n, velocity, is_moving, moved)
+            fill_moved(b, n, problem, velocity, moved)
             to_box_axes(m, moved, shift, R, local)
             reach_x, reach_y, reach_z = (
                 extent[0] / 2 + margin, extent[1] / 2 + margin, extent[2] / 2 + margin

@@ -2,7 +2,7 @@
 
 from math import cos, sin
 
-from boxreg_ros.core.kernels.compile import kernel
+from boxreg_ros.core.method.compile import kernel
 
 
 @kernel

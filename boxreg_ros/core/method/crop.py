@@ -1,18 +1,57 @@
-"""
-Pairs of a point and a box that are near each other, in plain loops.
+"""Pairs of a point and a box that are near each other, and the road beside the boxes."""
 
-The numpy twins are `crop_numpy` and `own_points_numpy` of `boxreg_ros.core.observation`.
+from typing import Any, NamedTuple
 
-"""
-
-from boxreg_ros.core.kernels.compile import kernel
-from boxreg_ros.core.kernels.selection import nth
+from boxreg_ros.core.method.compile import kernel
+from boxreg_ros.core.method.selection import nth
 import numpy as np
 
 MIN_SIDE, MAX_SIDE = 16, 256
 """Cells of the raster along x and y; those of far places share a cell. Powers of two."""
 LARGEST = 1e9
 """Coordinates are limited to this, so that they fit an integer [m]."""
+
+
+class Shapes(NamedTuple):
+    """
+    Boxes as points near them are found.
+
+    Attributes
+    ----------
+    centers : array, shape (n, 3)
+        In the frame of the points [m].
+    turn : array, shape (3, 3)
+        Rotation from the frame of the points to that of the boxes.
+    rotations : array, shape (n, 3, 3)
+        From the axes of each box to the frame of the boxes.
+    half : array, shape (n, 3)
+        Half the extents [m].
+    reach : array, shape (n, 3)
+        Half the bounding boxes along the axes of the points, with a margin [m].
+
+    """
+
+    centers: Any
+    turn: Any
+    rotations: Any
+    half: Any
+    reach: Any
+
+
+class CropNumbers(NamedTuple):
+    """Constants and settings of `boxreg_ros.core.observation`; there they are described."""
+
+    margin: float
+    own_margin: float
+    ownership_tolerance: float
+    clearance: float
+    has_road: bool
+    road_width: float
+    road_gap: float
+    road_range: float
+    road_quantiles: tuple[float, ...]
+    road_flatness: float
+    min_road_points: int
 
 
 @kernel
@@ -141,7 +180,7 @@ def crop(points, shapes, margin):
     ----------
     points : array, shape (3, M)
         Coordinates [m].
-    shapes : ShapeArrays
+    shapes : Shapes
         Boxes, with bounding boxes that include the margin.
     margin : float
         Distance from the faces of the box [m].
@@ -234,7 +273,9 @@ def sorted_by_x(owner, x, n):
     """
     Return the order of P pairs by `owner`, one of `n`, then by `x`, (P,).
 
-    Both are packed into 32 bits, which a radix sort takes 8 at a time; see the numpy twin.
+    Both are packed into 32 bits, which a radix sort takes 8 at a time. Values closer than 2^-23 of
+    the largest one, with 64 boxes, may count as equal and keep their order: every machine sorts
+    them alike.
 
     """
     P = len(owner)
