@@ -21,6 +21,10 @@ unexport PYTHONPATH AMENT_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMP
 # Containers often set it: every process would compile all its modules, torch alone for 1.2 s.
 unexport PYTHONDONTWRITEBYTECODE
 
+# Recordings with known truth, and which stored measurements are made again.
+DATA ?= ../recordings
+ONLY ?= *
+
 version := $(shell $(PYTHON) -c 'import platform; print(platform.python_version())')
 runtime := $(VENV)/.runtime-$(version)
 tests := $(VENV)/.tests-$(version)
@@ -39,7 +43,7 @@ JAZZY_TESTS := $(addprefix --ignore test/core/,test_refine.py test_kernel_cache.
 # Each worker begins with one end of the suite and takes tests of the other when it is done.
 SHARED := -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo test environments compiled compiled-jazzy test-main coverage test-jazzy lint format docs figures clean
+.PHONY: help demo test environments compiled compiled-jazzy test-main coverage test-jazzy lint format docs results figures clean
 
 help: ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -91,8 +95,12 @@ docs: $(tests) ## write the generated pages and build the documentation into out
 	PYTHONPATH=test $(BIN)/python test/live/test_share.py
 	$(BIN)/mkdocs build --strict --quiet --site-dir out/site
 
+results: $(tests) ## measure again as docs/results/$(ONLY).json say, with recordings in DATA (hours)
+	$(BIN)/python test/measure renew $(DATA) --only '$(ONLY)'
+	$(BIN)/python docs/results.py
+
 figures: $(tests) ## draw every picture again from runs of this machine (some minutes)
-	$(BIN)/python docs/figures.py
+	PYTHONPATH=test $(BIN)/python docs/figures.py
 
 clean: ## remove environments and whatever builds and runs left
 	rm -rf $(VENV) $(VENV_JAZZY) .venv-consumers build dist install log out .coverage

@@ -19,7 +19,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'{NAME}/resource/{NAME}']),
         (f'share/{NAME}', ['package.xml', *sorted(glob(f'{NAME}/share/*'))]),
     ],
-    # Read by `boxreg bench node` and `relabel --report`, without an installation too.
+    # Read by the node and `relabel --report`, without an installation too.
     package_data={NAME: ['py.typed', 'share/*'], 'msg_adapters': ['py.typed']},
     entry_points={
         'console_scripts': [
@@ -51,8 +51,8 @@ setup(
     extras_require={
         # Point clouds that are compressed by Draco.
         'compressed': ['DracoPy>=2,<3'],
-        # A baseline of `boxreg bench`, its figures, and the browser of `boxreg bench report`.
-        'bench': ['matplotlib', 'playwright', 'small-gicp'],
+        # A baseline of `boxreg bench`, and its figures.
+        'bench': ['matplotlib', 'small-gicp'],
         # Data sets as recordings: tables of nuScenes, pickles of PandaSet, tables of Arrow.
         'datasets': ['ijson>=3.2', 'pandas>=2', 'pyarrow'],
         # Label formats that are tables of Arrow: parquet, argoverse2, waymo.
@@ -92,9 +92,11 @@ setup(
             'hypothesis',
             'ijson>=3.2',
             'jinja2',
+            'latex2mathml',
             'matplotlib',
             'mcap-protobuf-support',
             'mcap-ros2-support',
+            'mermaidx',
             'mkdocs-material',
             'moto[s3]',
             'mypy',
@@ -114,6 +116,7 @@ setup(
             'shapely',
             'small-gicp',
             'trackeval>=1.3,<2',
+            'ziamath',
         ],
         # What test/build_interfaces.py builds message types with.
         'interfaces': [

@@ -12,8 +12,8 @@ import os
 import re
 import signal
 import sys
-from threading import current_thread, main_thread
-from types import ModuleType
+from threading import current_thread, main_thread, Timer
+from types import FrameType, ModuleType
 from typing import Any, NamedTuple, NoReturn
 
 from boxreg_ros import __version__
@@ -56,8 +56,11 @@ FAILED = 1
 WRONG_USAGE = 2
 SIGNALLED = 128
 """Added to the number of the signal that ended a run, as shells do."""
-INTERRUPTED = 'interrupted; nothing was written'
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
+LOSING_FILES = ('weakref.py', '<frozen importlib._bootstrap>')
+"""Code between whose frames an exception is printed and ignored, or breaks a module for good."""
+RETRY_SECONDS = 0.02
+"""Time after which a signal is tried again that could not be raised [s]; chosen: not felt."""
 
 
 def command() -> NoReturn:
@@ -76,6 +79,24 @@ def command() -> NoReturn:
 
 class _EndedBySignal(BaseException):
     """One of `ENDING_SIGNALS` was received; its argument is the number."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, and propose the choice that may have been meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and exit."""
+        self.exit(WRONG_USAGE, f'{self.prog}: {message}; {self.prog} --help lists all options\n')
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a value that is none of the choices."""
+        choices = [*action.choices] if action.choices is not None else [value]
+        if value not in choices:
+            names = ', '.join(map(str, choices))
+            proposal = _proposal([str(value)], map(str, choices))
+            raise argparse.ArgumentError(
+                action, f'expected one of {names}, got {value!r}{proposal}'
+            )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -109,10 +130,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except KeyboardInterrupt:
-        return _fail(INTERRUPTED, SIGNALLED + signal.SIGINT)
+        return _fail(_ended_by(signal.SIGINT, arguments), SIGNALLED + signal.SIGINT)
     except _EndedBySignal as end:
         number = end.args[0]
-        return _fail(_ended_by(number), SIGNALLED + number)
+        return _fail(_ended_by(number, arguments), SIGNALLED + number)
     except (BoxregError, OSError) as error:
         if is_debug:
             raise
@@ -136,51 +157,69 @@ def _ended_by_signals(arguments: list[str]) -> Iterator[None]:
     Raise `_EndedBySignal` on `ENDING_SIGNALS` inside the block, so that files are removed.
 
     `KeyboardInterrupt` on SIGINT. While torch is imported there are no files yet, and an exception
-    within its libraries would abort the process: it ends at once.
+    within its libraries would abort the process: it ends at once. Where an exception would be
+    lost, the signal is sent again.
 
     """
+    retries: list[Timer] = []
 
-    def interrupt(number: int, frame: Any) -> None:
+    def end(number: int, frame: FrameType | None) -> None:
         if _is_importing_torch():
-            os._exit(_fail(INTERRUPTED, SIGNALLED + number))
-        signal.default_int_handler(number, frame)
-
-    def end(number: int, _: Any) -> None:
-        if _is_importing_torch():
-            os._exit(_fail(_ended_by(number), SIGNALLED + number))
+            os._exit(_fail(_ended_by(number, arguments), SIGNALLED + number))
+        if _loses_exceptions(frame):
+            retries.append(Timer(RETRY_SECONDS, os.kill, (os.getpid(), number)))
+            retries[-1].daemon = True
+            retries[-1].start()
+            return
+        if number == signal.SIGINT:
+            signal.default_int_handler(number, frame)
         for one in handled:  # a second signal must not interrupt the clean-up
             signal.signal(one, signal.SIG_IGN)
         raise _EndedBySignal(number)
 
-    before = {one: signal.getsignal(one) for one in ENDING_SIGNALS}
+    before = {one: signal.getsignal(one) for one in (signal.SIGINT, *ENDING_SIGNALS)}
     # A signal that is ignored stays so: nohup ignores SIGHUP.
-    handled = [one for one, handler in before.items() if handler == signal.SIG_DFL]
-    handles_interrupts = signal.getsignal(signal.SIGINT) == signal.default_int_handler
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    handled = [one for one, handler in before.items() if handler in defaults]
     if arguments[:1] == ['node'] or current_thread() is not main_thread():
         handled = []  # the node handles signals itself; only the main thread may set handlers
-        handles_interrupts = False
     try:
         for one in handled:
             signal.signal(one, end)
-        if handles_interrupts:
-            signal.signal(signal.SIGINT, interrupt)
         yield
     finally:
+        for timer in retries:
+            timer.cancel()
         for one in handled:
             signal.signal(one, before[one])
-        if handles_interrupts:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _ended_by(number: int) -> str:
-    """Return the message of a run that a signal has ended."""
-    return f'ended by {signal.Signals(number).name}; nothing was written'
+def _ended_by(number: int, arguments: list[str]) -> str:
+    """Return the message of a run that a signal has ended, with the way to go on."""
+    cause = 'interrupted' if number == signal.SIGINT else f'ended by {signal.Signals(number).name}'
+    if arguments[:1] == ['batch']:
+        return f'{cause}; the drives that are done are kept, the same command goes on'
+    if arguments[:1] != ['relabel']:
+        return f'{cause}; nothing was written'
+    if '--resume' in arguments:
+        return f'{cause}; nothing was written, the same command goes on'
+    return f'{cause}; nothing was written; a run with --resume goes on where it was interrupted'
 
 
 def _is_importing_torch() -> bool:
     """Return whether the import of torch has begun and not ended."""
     spec = getattr(sys.modules.get('torch'), '__spec__', None)
     return bool(getattr(spec, '_initializing', False))
+
+
+def _loses_exceptions(frame: FrameType | None) -> bool:
+    """Return whether a frame lies in a destructor, or in the import of compiled code."""
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == '__del__' or code.co_filename.endswith(LOSING_FILES):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _run(arguments: list[str]) -> int:
@@ -223,9 +262,7 @@ def _module(command: str) -> ModuleType:
 
 def parser(command: str | None) -> argparse.ArgumentParser:
     """Return the parser of `boxreg`; only the subparser of `command` has its options."""
-    whole = argparse.ArgumentParser(
-        'boxreg', description='Register tracked 3D boxes to point clouds.'
-    )
+    whole = _Parser('boxreg', description='Register tracked 3D boxes to point clouds.')
     whole.add_argument('--debug', action='store_true', help=argparse.SUPPRESS)
     whole.add_argument('--version', action='version', version=f'boxreg {__version__}')
     subparsers = whole.add_subparsers(dest='command', required=True, metavar='COMMAND')

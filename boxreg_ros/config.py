@@ -21,21 +21,13 @@ import yaml
 
 _T = TypeVar('_T')
 
-RENAMED = {
-    'faces.depth_ends': 'faces.inset_ends',
-    'faces.depth_sides': 'faces.inset_sides',
-    'faces.spread': 'vehicle.gap_spread',
-}
-"""Settings of earlier versions by their old names: the error names the new one."""
 YAML_ERRORS = (yaml.YAMLError, ValueError, RecursionError)
 """Of `yaml.safe_load`: malformed text, dates that do not exist, and nesting that is too deep."""
-REMOVED = {'solver.history': 'no result depends on it'}
-"""Settings of earlier versions that are gone, and why."""
-
 NODE_OPTIONS = (
     *('boxes_type', 'points', 'points_type', 'time_unit', 'sensor_frames', 'points_info'),
     *('pose_reference', 'size_order', 'forward_axis', 'associate', 'fixed_frame'),
-    *('output_frame', 'transform_timeout', 'deadline', 'backlog', 'config_file', 'record_to'),
+    *('output_frame', 'transform_timeout', 'deadline', 'backlog', 'static_points'),
+    *('static_points_wait', 'config_file', 'record_to'),
     *('record_formats', 'record_points', 'record_segment', 'record_camera'),
     *('use_sim_time', 'start_type_description_service', 'qos_overrides'),
 )
@@ -565,10 +557,6 @@ def _unknown(prefix: str, key: str, known: Mapping[str, Any]) -> str:
     """Return the message of a setting that a group does not have, with what to set instead."""
     name = prefix + key
     group, dot, last = key.partition('.')
-    if name in RENAMED:
-        return f'{name}: was renamed; set {RENAMED[name]}'
-    if name in REMOVED:
-        return f'{name}: was removed, {REMOVED[name]}; leave it out'
     if dot and is_dataclass(known.get(group)):
         return f'{name}: expected a nested group; write {group}: {{{last}: ...}}'
     names = ', '.join(sorted(set(known) - {'ingredients'}))  # for `boxreg bench ablation` alone

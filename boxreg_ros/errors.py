@@ -40,6 +40,10 @@ class RecordingError(BoxregError):
     """A recording cannot be read, or does not contain the data requested."""
 
 
+class TransferError(RecordingError):
+    """Bytes could not be copied from or to a disk or server; of their content nothing is known."""
+
+
 def remedy_of(error: OSError) -> str:
     """Return what helps against an error of a file."""
     return FILE_REMEDIES.get(error.errno or 0, OTHER_REMEDY)

@@ -71,6 +71,11 @@ REASONS = {
         'not written beside the labels: the recorder, or its disk, is slower than the data',
         REDUCE_RECORDING,
     ),
+    'static_unchanged': Reason(
+        'cloud',
+        'published on `static_points` unchanged, because its boxes were late or missing',
+        'enlarge `static_points_wait`, or see the reasons of late boxes',
+    ),
     'points_lost': Reason('cloud', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
     'boxes_lost': Reason('message', 'lost by DDS between publisher and node', ENLARGE_TRANSPORT),
     'sweep_without_transform': Reason(
@@ -160,7 +165,10 @@ REASONS = {
         'give each object an id of its own',
     ),
     'invalid_box': Reason(
-        'box', 'contains NaN, infinity or an extent that is not positive', 'check the detector'
+        'box',
+        'contains NaN or infinity, an extent that is not positive or above 1 km, or a position '
+        'beyond 30,000 km',
+        'check the detector, and its units',
     ),
     'not_finite': Reason(
         'box',

@@ -26,6 +26,10 @@ Ints = NDArray[np.int64]
 X, Y, Z, LENGTH, WIDTH, HEIGHT, ROLL, PITCH, YAW = range(9)
 POSE = [X, Y, Z, ROLL, PITCH, YAW]
 BOX_EXTENT = slice(LENGTH, HEIGHT + 1)
+LARGEST_EXTENT = 1e3
+"""Objects are smaller [m]; chosen: twice the longest ship."""
+LARGEST_COORDINATE = 3e7
+"""Centres are nearer to the origin [m]; maps have up to 20,037,509 m (Web Mercator)."""
 """Columns of the extents of a box."""
 BOX_AXES = 'x y z length width height roll pitch yaw'
 
@@ -114,9 +118,18 @@ def _check_stamp(stamp_ns: object) -> None:
 
 
 def is_valid_box(boxes: Floats) -> NDArray[np.bool_]:
-    """Return for `boxes` (..., 9) whether they are finite with positive extents, shape (...)."""
+    """
+    Return which `boxes` (..., 9) can be of an object, shape (...).
+
+    They are finite, their extents are positive and below `LARGEST_EXTENT`, and their centre lies
+    within `LARGEST_COORDINATE`.
+
+    """
+    extents = boxes[..., BOX_EXTENT]
     is_finite = np.isfinite(boxes).all(axis=-1)
-    return np.asarray(is_finite & (boxes[..., LENGTH : HEIGHT + 1] > 0).all(axis=-1))
+    is_sized = ((extents > 0) & (extents < LARGEST_EXTENT)).all(axis=-1)
+    is_placed = (np.abs(boxes[..., : Z + 1]) < LARGEST_COORDINATE).all(axis=-1)
+    return np.asarray(is_finite & is_sized & is_placed)
 
 
 def _is_float_array(value: object) -> bool:

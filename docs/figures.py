@@ -1,5 +1,5 @@
 """
-Draw every picture of the README and of the documentation: ``python docs/figures.py``.
+Draw every picture of the README and of the documentation: ``make figures``.
 
 Each picture comes from a run of ``boxreg`` on this machine. The report's picture is a screenshot
 and needs Chromium; where there is none, that picture alone stays as it is.
@@ -19,7 +19,6 @@ import sys
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from boxreg_ros.bench.report import BROWSER_OPTIONS, BROWSERS
 from boxreg_ros.config import Config
 from boxreg_ros.core.observation import GROUND_CLEARANCE
 from boxreg_ros.io.box_table import BoxTable
@@ -30,6 +29,7 @@ from boxreg_ros.review.report import REPORT
 from boxreg_ros.review.track_points import PointCollector, SHOWN_MARGIN
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_EXTENT, BoxArray, Floats, RefinedBoxes, ROLL, Sweep, X, Y, Z
+from browser import BROWSER_OPTIONS, BROWSERS
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray

@@ -4,10 +4,11 @@ Write the tables of `docs/results.md` and `docs/results/` from the stored measur
     python docs/results.py            write the pages
     python docs/results.py --check    exit with status 1 if a page is not what would be written
 
-A measurement is the output of ``boxreg bench ... --json``, stored as ``KIND_DATA.json``, for
-example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a --json``. The tables of
-a kind are in ``KIND.md`` beside it, between two marks; the text around the marks is written by
-hand. `docs/results.md` has the main figures of each kind.
+A measurement is the output of ``boxreg bench`` or of ``test/measure``, stored as
+``KIND_DATA.json``, for example ``real_pandaset_002_a.json`` of ``boxreg bench real pandaset_002_a
+--json``. The tables of a kind are in ``KIND.md`` beside it, or on the page that `PAGES` has for
+it, between two marks; the text around the marks is written by hand. `docs/results.md` has the main
+figures of each kind.
 
 """
 
@@ -46,6 +47,13 @@ DATA = {
     'street': 'The sample recording, simulated',
 }
 """Title of each recording, in the order of the tables."""
+PAGES = {
+    **dict.fromkeys(('kinds', 'highway', 'lidars', 'paper'), 'scenes'),
+    **dict.fromkeys(('covariance', 'review'), 'certainty'),
+    **dict.fromkeys(('speed', 'scale', 'report'), 'speed'),
+    **dict.fromkeys(('node', 'load', 'kills'), 'node'),
+}
+"""Page of the kinds of measurements that share one; the others have a page of their name."""
 SHOWN_LOSS = 0.001
 """Smaller changes of mean IoU are within the scatter of noise seeds."""
 MAIN_METHODS = (
@@ -75,10 +83,15 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def pages(store: Path) -> dict[Path, str]:
     """Return the text of each page for the measurements in a folder."""
-    generated = {OVERVIEW: _overview(store)}
+    parts = [(OVERVIEW, '', _overview(store))]
     for kind in TABLES:
-        generated[STORE / f'{kind}.md'] = _tables(store, kind)
-    return {path: between_marks(path, '\n'.join(parts)) for path, parts in generated.items()}
+        page = STORE / f'{PAGES.get(kind, kind)}.md'
+        parts.append((page, kind if kind in PAGES else '', _tables(store, kind)))
+    written: dict[Path, str] = {}
+    for page, section, lines in parts:
+        text = written.get(page) or page.read_text(encoding='utf-8')
+        written[page] = between_marks(page.name, text, '\n'.join(lines), section)
+    return written
 
 
 def _tables(store: Path, kind: str) -> Iterable[str]:
@@ -88,7 +101,7 @@ def _tables(store: Path, kind: str) -> Iterable[str]:
     for data, document in _measurements(store, kind):
         title = _title(data)
         if title:
-            yield f'## {title}\n'
+            yield f'{"###" if kind in PAGES else "##"} {title}\n'
         yield _origin(document)
         yield from (f'{part}\n' for part in TABLES[kind](document['results']))
 
@@ -167,7 +180,7 @@ def _gains(store: Path) -> Iterable[str]:
     yield '## Classes'
     yield (
         'Mean 3D IoU minus that of the input and of smoothing, with standard errors over tracks. '
-        '[Gain of each class](results/kinds.md) has BEV IoU and the other recordings.'
+        '[Gain of each class](results/scenes.md) has BEV IoU and the other recordings.'
     )
     ((_, document),) = [found for found in _measurements(store, 'kinds') if not _title(found[0])]
     for drives, classes in document['results'].items():
@@ -213,7 +226,7 @@ def _coverage(store: Path) -> Iterable[str]:
     yield '## Covariances'
     yield (
         'Part of the errors of whole tracks within two standard deviations; 0.95 is consistent. '
-        '[Covariances](results/covariance.md) has squared errors, the other estimates and classes.'
+        '[Covariances](results/certainty.md) has squared errors, the other estimates and classes.'
     )
     rows = []
     for _, document in _measurements(store, 'covariance'):
@@ -230,8 +243,8 @@ def _ranking(store: Path) -> Iterable[str]:
     yield '## Review list'
     yield (
         'Share of the worst tracks that are in the first fifth of the list: by risk, and by the '
-        'orders it is compared with. [Review list](results/review.md) has shorter parts of the '
-        'lists, and the gain of one corrected box.'
+        'orders it is compared with. [Review list](results/certainty.md#review-list) has shorter '
+        'parts of the lists, and the gain of one corrected box.'
     )
     rows = []
     for _, document in _measurements(store, 'review'):
@@ -248,8 +261,8 @@ def _times(store: Path) -> Iterable[str]:
     yield '## Speed'
     yield (
         'On two cores of a CPU. [Speed](results/speed.md) has all figures, '
-        '[The live node under load](results/load.md) latencies, [Scale](results/scale.md) '
-        'core-hours of a fleet.'
+        '[The live node under load](results/node.md#under-load) latencies, '
+        '[Scale](results/speed.md#scale) core-hours of a fleet.'
     )
     ((_, speed),) = _measurements(store, 'speed')
     ((_, load),) = _measurements(store, 'load')
@@ -304,7 +317,7 @@ def _accuracy(results: Any) -> Iterable[str]:
             rows.append([name, *map(_number, values)])
         yield f'{measured["input"]["boxes"]} true boxes.'
         yield _table(['', *header.split()], rows)
-        yield from _groups(measured, '3D IoU')
+        yield _table(*_parts(measured, '3D IoU'))
         if 'by_class' in measured['input']:
             yield _classes(measured)
         yield from _compared(measured)
@@ -312,29 +325,28 @@ def _accuracy(results: Any) -> Iterable[str]:
             yield f'{name}: {reason}.'
 
 
-def _groups(measured: Any, iou: str) -> Iterable[str]:
-    for key, title in (('by_range', 'by range [m]'), ('by_points', 'by number of points')):
-        grouped = {name: row[key] for name, row in measured.items() if key in row}
-        labels = list(dict.fromkeys(label for row in grouped.values() for label in row))
+def _parts(measured: Any, iou: str) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of the IoU by range, by number of points and of moving objects."""
+    header = [iou]
+    rows = {name: [name] for name, row in measured.items() if 'by_range' in row}
+    for key, unit in (('by_range', 'm'), ('by_points', 'points')):
+        labels = list(dict.fromkeys(part for name in rows for part in measured[name][key]))
         if len(labels) < 2:  # the same as the mean of all boxes
             continue
-        rows = [
-            [name, *(_number(row.get(label)) for label in labels)] for name, row in grouped.items()
-        ]
-        yield _table([f'{iou} {title}', *labels], rows)
+        header += [f'{label} {unit}' for label in labels]
+        for name, row in rows.items():
+            row += [_number(measured[name][key].get(label)) for label in labels]
+    moving = {name: measured[name]['moving'] for name in rows if 'moving' in measured[name]}
+    if moving:
+        header += [f'moving ({moving["input"]["boxes"]}): BEV', '3D', 'yaw [degrees]']
+    for name, found in moving.items():
+        rows[name] += [_number(found['iou_bev']), _number(found['iou_3d'])]
+        rows[name].append(_number(found['yaw_degrees'], 2))
+    return header, list(rows.values())
 
 
 def _compared(measured: Any) -> Iterable[str]:
-    """Yield the table of moving objects, and that of the differences between methods."""
-    moving = {name: row['moving'] for name, row in measured.items() if 'moving' in row}
-    if moving:
-        rows = [
-            [name, *(_number(row[key]) for key in ('iou_bev', 'iou_3d')),
-             _number(row['yaw_degrees'], 2)]
-            for name, row in moving.items()
-        ]  # fmt: skip
-        head = f'moving objects ({moving["input"]["boxes"]} boxes)'
-        yield _table([head, 'BEV', '3D', 'median error of yaw [degrees]'], rows)
+    """Yield the table of the differences between methods."""
     rows = [
         [f'{name} - {other}', scope, *_difference(found)]
         for name, row in measured.items()
@@ -401,7 +413,7 @@ def _paper(results: Any) -> Iterable[str]:
         iou = '3D IoU' if mode == '3d' else 'BEV IoU'
         titles = (iou, *(f'{iou}, {part}' for part in ('first', 'last', 'full windows')))
         yield _table([f'mode: {mode}', *pose, *titles], rows)
-        yield from _groups(measured, iou)
+        yield _table(*_parts(measured, iou))
 
 
 def _ingredients() -> str:
@@ -491,6 +503,22 @@ def _kinds(rows: Any) -> Iterable[str]:
 def _figures(results: Any) -> Iterable[str]:
     """Yield a plain table of names and values."""
     yield _table(['', ''], _flat(results))
+
+
+def _node(results: Any) -> Iterable[str]:
+    """Yield the figures of one run, or of several runs side by side."""
+    runs: dict[str, dict[str, str]] = {}
+    for name, value in _flat(results):
+        run, _, figure = name.partition(': ')
+        if not run.endswith(('recording 1', 'recording 2')):
+            run, figure = '', name
+        runs.setdefault(run, {})[figure] = value
+    alone = runs.pop('', {})
+    if runs:
+        figures = list(dict.fromkeys(figure for run in runs.values() for figure in run))
+        rows = [[figure, *(run.get(figure, '-') for run in runs.values())] for figure in figures]
+        yield _table(['', *runs], rows)
+    yield _table(['', ''], alone.items())
 
 
 def _lidars(results: Any) -> Iterable[str]:
@@ -698,7 +726,7 @@ TABLES: dict[str, Callable[[Any], Iterable[str]]] = {
     'load': _load,
     'scale': _scale,
     'kills': _figures,
-    'node': _figures,
+    'node': _node,
 }
 """The tables of one measurement, for each kind of measurements."""
 

@@ -14,7 +14,7 @@ from typing import Any
 import zlib
 
 from boxreg_ros.errors import UnsupportedMessage
-from msg_adapters.pointcloud import DTYPES
+from msg_adapters.pointcloud import bytes_of, DTYPES
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +25,8 @@ FOXGLOVE_TYPE = 'foxglove_msgs/msg/CompressedPointCloud'
 CLOUD_TYPES = (POINTS_TYPE, COMPRESSED_TYPE, FOXGLOVE_TYPE, *LIVOX_TYPES)
 """Types of messages that `plain` reads."""
 
+MAX_CLOUD_BYTES = 2**30
+"""Compressed clouds that claim to be larger are refused [bytes]: 30 million points."""
 GZIP_OR_ZLIB = 32 + zlib.MAX_WBITS
 """``wbits`` of zlib that accept either header."""
 DRACO_POSITION = 0
@@ -56,7 +58,7 @@ def plain(msg: Any) -> Any:
         header = SimpleNamespace(stamp=msg.timestamp, frame_id=msg.frame_id)
         if msg.format != 'draco':
             raise _unknown_format('CompressedPointCloud', msg.format, ('draco',))
-        return _cloud_of_columns(header, _draco_columns(bytes(msg.data)))
+        return _cloud_of_columns(header, _draco_columns(bytes(bytes_of(msg.data))))
     if hasattr(msg, 'point_num'):
         columns = [
             (name, np.array([getattr(point, name) for point in msg.points], kind))
@@ -77,11 +79,15 @@ def _decompressed(msg: Any) -> Any:
     """Return a CompressedPointCloud2 as a cloud."""
     if msg.format == 'draco':
         return _draco_cloud(msg)
-    data = bytes(msg.compressed_data)
+    data = bytes(bytes_of(msg.compressed_data))
     if msg.format not in DECOMPRESSORS:
         raise _unknown_format('CompressedPointCloud2', msg.format, ('draco', *DECOMPRESSORS))
     size = msg.height * max(msg.row_step, msg.width * msg.point_step)
+    if not 0 <= size <= MAX_CLOUD_BYTES:
+        raise _damaged(msg.format, len(data), f'a cloud of {size} bytes')
     raw = DECOMPRESSORS[msg.format](data, size)
+    if len(raw) < size:
+        raise _damaged(msg.format, len(data), f'{len(raw)} of {size} bytes of the cloud')
     return SimpleNamespace(
         header=msg.header, height=msg.height, width=msg.width, fields=msg.fields,
         is_bigendian=msg.is_bigendian, point_step=msg.point_step, row_step=msg.row_step,
@@ -91,7 +97,7 @@ def _decompressed(msg: Any) -> Any:
 
 def _inflated(data: bytes, size: int) -> bytes:
     try:
-        return zlib.decompress(data, GZIP_OR_ZLIB, size or zlib.DEF_BUF_SIZE)
+        return zlib.decompressobj(GZIP_OR_ZLIB).decompress(data, size + 1)[:size]
     except zlib.error as error:
         raise _damaged('zlib', len(data), str(error)) from None
 
@@ -100,18 +106,18 @@ def _unzstd(data: bytes, size: int) -> bytes:
     import zstandard
 
     try:
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        return zstandard.ZstdDecompressor().stream_reader(data).read(size)
     except zstandard.ZstdError as error:
         raise _damaged('zstd', len(data), str(error)) from None
 
 
 DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {'zlib': _inflated, 'zstd': _unzstd}
-"""``format`` -> function of the compressed data and the size of the cloud in bytes."""
+"""``format`` -> function that unpacks compressed data to at most a number of bytes."""
 
 
 def is_reordered(msg: Any) -> bool:
     """Return whether the compression of a cloud has changed the order of its points."""
-    data = getattr(msg, 'compressed_data', b'')
+    data = bytes_of(getattr(msg, 'compressed_data', b''))
     has_method = getattr(msg, 'format', '') == 'draco' and len(data) > DRACO_METHOD
     return has_method and int(data[DRACO_METHOD]) == DRACO_KD_TREE
 
@@ -126,7 +132,7 @@ def _draco_cloud(msg: Any) -> Any:
     """
     columns = [
         column
-        for attribute in _draco_attributes(bytes(msg.compressed_data))
+        for attribute in _draco_attributes(bytes(bytes_of(msg.compressed_data)))
         for column in _columns(attribute)
     ]
     names = [field.name for field in msg.fields]

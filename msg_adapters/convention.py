@@ -7,6 +7,7 @@ from itertools import permutations
 from math import pi
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.options import option
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
 from boxreg_ros.structures import BoxArray, Floats, HEIGHT, LENGTH, PITCH, ROLL, X, YAW, Z
 import numpy as np
@@ -57,10 +58,25 @@ class Convention:
 
     """
 
-    pose_reference: str = 'center'
-    size_order: str = 'lwh'
-    forward_axis: str = 'x+'
-    associate: bool = False
+    pose_reference: str = option(
+        'center',
+        f'point of the box at its pose: {", ".join(REFERENCES)}, or X,Y,Z as fractions of length, '
+        f'width and height (default: %(default)s)',
+        metavar='POINT',
+    )
+    size_order: str = option(
+        'lwh',
+        'meaning of x, y and z of a size (default: %(default)s: length, width, height)',
+        choices=SIZE_ORDERS,
+    )
+    forward_axis: str = option(
+        'x+',
+        'axis of the box pose that points forward (default: %(default)s)',
+        choices=tuple(FORWARD),
+    )
+    associate: bool = option(
+        False, 'replace the track ids of the input: associate boxes over time'
+    )
 
     def __post_init__(self) -> None:
         """Check the values."""

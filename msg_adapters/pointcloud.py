@@ -123,6 +123,13 @@ def finite_rows(msg: Any) -> Ints | None:
     return None if is_finite.all() else np.flatnonzero(is_finite)
 
 
+def positions(msg: Any) -> Floats:
+    """Return x, y and z of all points of a cloud, (height * width, 3), not finite ones too."""
+    fields = _fields(msg)
+    table = _table(msg, [fields[key] for key in 'xyz'])
+    return np.column_stack([table[key].reshape(-1).astype(np.float64) for key in 'xyz'])
+
+
 def intensities(msg: Any) -> Floats | None:
     """
     Return the intensities of the points, in the unit of the sensor.
@@ -151,6 +158,17 @@ def intensities(msg: Any) -> Floats | None:
     return np.nan_to_num(values, posinf=0, neginf=0)
 
 
+def bytes_of(data: Any) -> Any:
+    """
+    Return what numpy can read of a field of bytes.
+
+    A message of ROS 2 Lyrical may hold them in the memory of a device, as an object with
+    ``to_bytes`` and without the buffer protocol.
+
+    """
+    return data.to_bytes() if hasattr(data, 'to_bytes') else data
+
+
 def _fields(msg: Any) -> dict[str, Any]:
     """Return the fields of a message by name; x, y and z are among them."""
     fields = {field.name: field for field in msg.fields}
@@ -173,7 +191,7 @@ def _first(names: Sequence[str], fields: Mapping[str, Any]) -> str | None:
 
 def _table(msg: Any, fields: list[Any]) -> NDArray[Any]:
     """Return a structured view (height, width) of the raw bytes, with these fields only."""
-    data = np.frombuffer(msg.data, np.uint8)
+    data = np.frombuffer(bytes_of(msg.data), np.uint8)
     row_step = _checked_row_step(msg, len(data))
     order = '>' if msg.is_bigendian else '<'
     for field in fields:

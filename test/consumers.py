@@ -55,6 +55,32 @@ def nuscenes(folder, version):
     return boxes
 
 
+def lidarseg(folder, version):
+    """Return the points of each category of each sample, and of each panoptic instance."""
+    import numpy as np
+    from nuscenes.nuscenes import NuScenes
+    from nuscenes.utils.data_io import load_bin_file, panoptic_to_lidarseg
+
+    data = NuScenes(version, folder, verbose=False)
+    names = data.lidarseg_idx2name_mapping
+    samples = []
+    for row, whole in zip(data.lidarseg, data.panoptic, strict=True):
+        assert row['sample_data_token'] == whole['sample_data_token']
+        categories = load_bin_file(str(Path(folder, row['filename'])), type='lidarseg')
+        codes = load_bin_file(str(Path(folder, whole['filename'])), type='panoptic')
+        assert (panoptic_to_lidarseg(codes) == categories).all()
+        sweep = data.get('sample_data', row['sample_data_token'])
+        counts = [np.unique(values, return_counts=True) for values in (categories, codes)]
+        (found, number), (instances, points) = counts
+        samples.append({
+            'timestamp': sweep['timestamp'],
+            'categories': dict(zip(map(names.get, found.tolist()), number.tolist(), strict=True)),
+            'instances': dict(zip(instances.tolist(), points.tolist(), strict=True)),
+            'size': Path(folder, sweep['filename']).stat().st_size,
+        })  # fmt: skip
+    return samples
+
+
 def nuscenes_scene(folder, version, name):
     """Return sweeps and boxes of a scene in the global frame, through the devkit's transforms."""
     import numpy as np

@@ -101,16 +101,6 @@ def test_dotted_keys_and_plain_groups_are_refused_with_how_to_write_them():
         Config(solver={'rounds': 3})
 
 
-def test_a_removed_setting_is_refused_with_the_reason():
-    with pytest.raises(ConfigError, match=r'solver\.history: was removed, no result depends'):
-        Config.from_dict({'solver': {'history': 3}})
-
-
-def test_a_renamed_setting_is_refused_with_its_new_name():
-    with pytest.raises(ConfigError, match=r'set faces\.inset_ends'):
-        Config().updated({'faces.depth_ends': 0.3})
-
-
 @pytest.mark.parametrize('name', ['windw', 'solver.round', 'window.size', 'a.b.c'])
 def test_unknown_dotted_names_are_refused(name):
     with pytest.raises(ConfigError, match='window' if name == 'window.size' else name[0]):

@@ -8,6 +8,7 @@ import sys
 
 from boxreg_ros.cli import parser
 from boxreg_ros.reasons import REASONS
+from browser import launched, NEEDS_BROWSER
 import generate
 from paths import ROOT
 import pytest
@@ -139,10 +140,46 @@ def test_every_page_is_in_the_navigation():
     assert listed == pages, 'add the page to "nav" in mkdocs.yml'
 
 
-def test_documentation_builds_without_a_warning(tmp_path):
-    if importlib.util.find_spec('mkdocs') is None or importlib.util.find_spec('material') is None:
-        pytest.skip('mkdocs-material is not installed')
-    command = [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', tmp_path]
+@pytest.fixture(scope='module')
+def site(tmp_path_factory):
+    """Build the documentation, without a warning, and return its folder."""
+    for name in ('mkdocs', 'material', 'latex2mathml', 'mermaidx', 'ziamath'):
+        if importlib.util.find_spec(name) is None:
+            pytest.skip(f'{name} is not installed')
+    folder = tmp_path_factory.mktemp('site')
+    command = [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', folder]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / 'tasks' / 'relabel-a-bag' / 'index.html').is_file()
+    return folder
+
+
+def test_every_page_of_the_site_is_there_and_needs_no_network(site):
+    pages = {path.relative_to(DOCS).with_suffix('.html') for path in DOCS.rglob('*.md')}
+    for page in pages:
+        text = (site / page).read_text(encoding='utf-8')
+        loaded = re.findall(r'<(?:script|img|link|iframe)\b[^>]* (?:src|href)="([^"]+)"', text)
+        assert [url for url in loaded if url.startswith(('http', '//'))] == [], page
+        assert 'class="arithmatex"' not in text and 'class="mermaid"' not in text, page
+
+
+@NEEDS_BROWSER
+def test_formulas_and_diagrams_are_visible_without_a_network(site):
+    with launched() as browser:
+        page = browser.new_page(offline=True)
+        page.goto((site / 'method.html').as_uri())
+        formulas = page.locator('math')
+        assert formulas.count() >= 50
+        assert not re.search(r'\\[a-z(\[]', ' '.join(formulas.all_text_contents()))
+        numerator, bar = (page.locator(f'mfrac > :nth-child({n})').first for n in (1, 2))
+        above, below = numerator.bounding_box(), bar.bounding_box()
+        assert above['y'] + above['height'] <= below['y'] + 1 and below['width'] > 3
+        states = 'document.fonts.ready.then(fonts => [...fonts].map(font => font.status))'
+        assert page.evaluate(states) == ['loaded']
+        source = (DOCS / 'architecture.md').read_text(encoding='utf-8')
+        page.goto((site / 'architecture.html').as_uri())
+        diagrams = page.locator('svg[aria-roledescription]')
+        assert diagrams.count() == source.count('```mermaid') > 0
+        for diagram in diagrams.all():
+            box = diagram.bounding_box()
+            assert box['width'] > 300 and box['height'] > 100
+            assert 'core' in diagram.text_content()

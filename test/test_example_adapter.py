@@ -116,6 +116,6 @@ def test_relabel_refines_the_boxes(tmp_path, drive):
     summary = relabel(
         Request((recording,), config=config, formats=('csv', 'mcap')), tmp_path / 'out'
     )
-    assert summary['topics']['boxes'] == '/boxes'
-    assert (summary['boxes_in'], summary['boxes_out']) == (14, 14)
-    assert summary['status']['refined'] == 14
+    assert summary.topics['boxes'] == '/boxes'
+    assert (summary.boxes_in, summary.boxes_out) == (14, 14)
+    assert summary.status['refined'] == 14

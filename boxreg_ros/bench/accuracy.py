@@ -26,7 +26,8 @@ from boxreg_ros.bench.common import (
 from boxreg_ros.bench.differences import Difference, differences
 from boxreg_ros.bench.methods import add_method_argument, run_methods
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.offline.arguments import add_lidar_arguments, lidars_from
+from boxreg_ros.io.lidars import Lidars
+from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.box_scores import (
     groups,
     Mask,
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `boxreg bench real`."""
     add_scope_arguments(parser)
     add_method_argument(parser)
-    add_lidar_arguments(parser)
+    add_options(parser, Lidars)
     add_json_argument(parser)
 
 
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     report: dict[str, Any] = {}
     with progress_bar(len(args.data) * len(args.methods), args) as bar:
         for folder in args.data:
-            drive = Drive.read(folder, lidars_from(args))
+            drive = Drive.read(folder, Lidars(**values_of(args, Lidars)))
             methods = run_methods(drive, '3d', args.methods, bar.update)
             found = {
                 name: boxes if isinstance(boxes, str) else in_scope(boxes, drive.truth, args)

@@ -83,14 +83,14 @@ def _cell(value: float | str) -> str:
     return '-' if math.isnan(value) else f'{value:.3f}'
 
 
-def print_json(results: Any) -> None:
+def print_json(results: Any, program: str = 'boxreg') -> None:
     """
-    Print the results of a sub-command as one JSON document.
+    Print the results of a sub-command of a program as one JSON document.
 
     The document has three members: ``version`` of the package, ``command`` as it was typed, and
     ``results``. NaN becomes ``null``. `docs/results.py` writes its tables from such files.
 
     """
-    command = shlex.join(['boxreg', *sys.argv[1:]])
+    command = f'{program} {shlex.join(sys.argv[1:])}'
     document = {'version': __version__, 'command': command, 'results': finite(results)}
     print(json.dumps(document))

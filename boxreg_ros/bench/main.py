@@ -17,20 +17,8 @@ class SubCommand(NamedTuple):
 MEASUREMENTS = {
     'paper': SubCommand('paper', "the paper's experiment: its Table I and two figures"),
     'real': SubCommand('accuracy', 'accuracy on recordings with known truth'),
-    'kinds': SubCommand('kinds', 'gain of each class of objects, with standard errors'),
-    'tracks': SubCommand('tracks', 'broken tracks before and after each completing step'),
     'ablation': SubCommand('ablation', 'accuracy without each ingredient of the method'),
-    'sensitivity': SubCommand('sensitivity', 'accuracy with each setting halved and doubled'),
-    'highway': SubCommand('highway', 'accuracy at 5 and at 30 m/s, with boxes of either time'),
-    'lidars': SubCommand('lidars', 'accuracy on a truck with LiDARs at its corners'),
-    'covariance': SubCommand('covariance', 'covariances against errors, by estimate and class'),
-    'review': SubCommand('review', 'how early the review list shows the bad tracks'),
-    'report': SubCommand('report', 'first paint and frame times of report.html'),
     'speed': SubCommand('speed.command', 'time per tick, per box and per window'),
-    'scale': SubCommand('scale', 'core hours and memory per hour, and a simulated fleet'),
-    'load': SubCommand('load', 'latency and accuracy of the live node by number of tracks'),
-    'node': SubCommand('node', 'latency and memory of the live node, over DDS'),
-    'kills': SubCommand('kills', 'loss of recorded labels when a process is killed'),
 }
 
 

@@ -9,7 +9,7 @@ from itertools import accumulate, chain
 from math import inf
 from typing import NamedTuple
 
-from boxreg_ros.config import Config
+from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
@@ -160,6 +160,15 @@ class BoxRegistrar:
         for array in self._pending:
             array.num_unsettled = 0
         return [*ready, *self._pop_settled()]
+
+    def margins(self) -> Floats:
+        """Return the labelling margin of each face, of each of `KINDS`, (K, 6) [m]."""
+        from boxreg_ros.core.batch import FACE_GAPS  # imports torch
+
+        kinds = [getattr(self.config, kind) for kind in KINDS]
+        of_settings = np.array([[getattr(kind, name) for name in FACE_GAPS] for kind in kinds])
+        margins: Floats = of_settings + self._input_model.offsets().gap_correction.numpy()
+        return margins
 
     def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
         for pair in pairs:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Sequence
 import csv
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ COLUMNS = (
     'stamp_ns', 'frame_id', 'track_id', 'class_name', 'score', 'x', 'y', 'z',
     'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height', 'status', 'num_points',
 )  # fmt: skip
+UTF_16_MARKS = BOM_UTF16_LE, BOM_UTF16_BE
+EXPORTS = {'\0': 'UTF-16', ';': 'semicolons', '\t': 'tabs'}
+"""What a header has that a spreadsheet has exported in another form, and the name of the form."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +113,12 @@ class BoxTable:
         try:
             with open(path, newline='', encoding='utf-8-sig') as file:  # spreadsheets add a BOM
                 reader = csv.DictReader(file)
-                missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+                names = reader.fieldnames or ()
+                missing = [name for name in COLUMNS if name not in names]
                 if missing:
+                    for mark, found in EXPORTS.items():
+                        if mark in ''.join(names):
+                            raise _exported(path, found)
                     raise RecordingError(
                         f'{path}: not a table of boxes, columns missing: {", ".join(missing)}; '
                         f'expected those of boxes.csv; add them, or give another file'
@@ -119,6 +127,8 @@ class BoxTable:
         except OSError as error:
             raise RecordingError(unreadable(path, error)) from None
         except (UnicodeDecodeError, csv.Error) as error:
+            if isinstance(error, UnicodeDecodeError) and error.object.startswith(UTF_16_MARKS):
+                raise _exported(path, 'UTF-16') from None
             raise RecordingError(
                 f'{path}: cannot be read as CSV: {error}; give a table like boxes.csv'
             ) from None
@@ -194,6 +204,14 @@ class BoxTable:
                     self.stamps_ns[i], self.frame_id, self.track_ids[i], self.class_names[i],
                     *(f'{number:.9f}' for number in numbers), self.status[i], self.num_points[i],
                 ])  # fmt: skip
+
+
+def _exported(path: str | Path, found: str) -> RecordingError:
+    """Return the error of a table that a spreadsheet has exported in another form."""
+    return RecordingError(
+        f'{path}: expected a table in UTF-8 with commas, got {found}, as spreadsheets export it; '
+        f'save it as "CSV UTF-8 (comma delimited)", with points in the numbers'
+    )
 
 
 @lru_cache(1024)

@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.transforms import TransformTree
+from boxreg_ros.options import option
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, concatenation, pointcloud
 from msg_adapters.concatenation import ConcatenationInfo
-from msg_adapters.point_layout import AUTO
+from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,10 +71,34 @@ class Lidars:
 
     """
 
-    topics: tuple[str, ...] = ()
-    frames: tuple[str, ...] = ()
-    info: str = ''
-    time_unit: str = AUTO
+    topics: tuple[str, ...] = option(
+        (),
+        'topic of the point clouds (default: found by type); repeat it to merge the clouds of '
+        'several LiDARs',
+        flag='--points',
+        metavar='TOPIC',
+        is_repeated=True,
+    )
+    frames: tuple[str, ...] = option(
+        (),
+        'frame of the LiDAR where clouds are in another one: once per --points, or once per LiDAR '
+        'of a single concatenated cloud',
+        flag='--sensor-frame',
+        metavar='FRAME',
+        is_repeated=True,
+    )
+    info: str = option(
+        '',
+        'topic of ConcatenatedPointCloudInfo, which divides a concatenated cloud among its LiDARs '
+        '(default: that of the clouds with _info behind it, if there is one)',
+        flag='--points-info',
+        metavar='TOPIC',
+    )
+    time_unit: str = option(
+        AUTO,
+        'unit of the times of the points (default: that of the layout, else by magnitude)',
+        choices=TIME_UNIT_CHOICES,
+    )
 
     def __post_init__(self) -> None:
         """Check that the parts fit each other."""

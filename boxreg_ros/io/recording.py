@@ -271,6 +271,25 @@ class Recording:
         encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
         return bytes(encode(replaced, kind))
 
+    def cloud_message(self, topic: str, data: Bytes) -> Any:
+        """
+        Return a message of a topic of clouds from its bytes.
+
+        Raises
+        ------
+        UnsupportedMessage
+            If it is malformed.
+
+        """
+        (connection, *_) = self._topics.connections({topic})
+        return self._decoder.message(Record(connection, 0, data))
+
+    def encoded_cloud(self, message: Any) -> bytes:
+        """Return the bytes of a PointCloud2 as the recording encodes its messages."""
+        store = self._reader.typestore
+        encode = store.serialize_cdr if self._reader.is2 else store.serialize_ros1
+        return bytes(encode(message, clouds.POINTS_TYPE))
+
     def received_ns(self, topic: str, received_ns: int, data: Bytes) -> int:
         """Return the receive time that a message on a topic of `apart` gets: its cloud's [ns]."""
         (connection, *_) = self._topics.connections({topic})

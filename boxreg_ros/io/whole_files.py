@@ -8,9 +8,11 @@ import errno
 from io import StringIO
 import os
 from pathlib import Path
+import tempfile
 from typing import TextIO
 from uuid import uuid4
 
+from boxreg_ros.errors import TransferError
 from boxreg_ros.io.storage.urls import url_of, write_text
 
 DISK_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -32,6 +34,31 @@ def written_whole(path: Path) -> Iterator[TextIO]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """
+    Yield a folder on the disk of temporary files, which is deleted at the end.
+
+    Raises
+    ------
+    TransferError
+        If that disk is full.
+
+    """
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            yield Path(folder)
+    except OSError as error:
+        # Where no folder has room for a file, tempfile raises a FileNotFoundError.
+        if error.errno not in DISK_ERRORS and 'temporary directory' not in str(error):
+            raise
+        place = tempfile.tempdir or os.environ.get('TMPDIR', '/tmp')
+        raise TransferError(
+            f'temporary files in {place}: expected room for a copy, got: {error.strerror}; free '
+            f'some space there, or set TMPDIR to a folder on another disk'
+        ) from None
 
 
 def store(paths: Iterable[Path]) -> None:

@@ -2,7 +2,8 @@
 Label formats: one module per format, behind `protocol.FormatModule`, listed in `registry.FORMATS`.
 
 To add a format, write a module with ``FORMAT``, ``Writer`` and, where files can be read back,
-``read``, and add its name to the table; docs/tasks/write-a-label-format.md shows it step by step.
+``read``, and name it in the table or, in a package of your own, by an entry point;
+docs/tasks/write-a-label-format.md shows it step by step.
 
 """
 
@@ -20,7 +21,9 @@ from boxreg_ros.labels.registry import (
     check_options,
     FORMATS,
     frames_of,
+    import_format,
     is_written,
+    labels_points,
     module_of,
     writer_for,
 )
@@ -31,7 +34,9 @@ __all__ = [
     'Format',
     'FORMATS',
     'frames_of',
+    'import_format',
     'is_written',
+    'labels_points',
     'LabelFrame',
     'LabelOutput',
     'LabelWriter',

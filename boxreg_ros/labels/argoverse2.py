@@ -9,9 +9,7 @@ columns.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,8 @@ from typing import Any
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.transforms import matrix
 from boxreg_ros.labels.arrow import read_rows, read_table, Table
-from boxreg_ros.labels.files import frame_names, to_json, write_provenance
+from boxreg_ros.labels.files import frame_names, to_json
+from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     Format,
     LabelFrame,
@@ -30,7 +29,7 @@ from boxreg_ros.labels.protocol import (
 from boxreg_ros.labels.records import (
     boxes_from_quaternions,
     EVIDENCE_COLUMNS,
-    evidence_values,
+    evidence_of,
     refined_boxes,
 )
 from boxreg_ros.rotations import quaternion_from_matrix
@@ -69,30 +68,24 @@ EGO_POSES_FILE = 'city_SE3_egovehicle.feather'
 LIDAR_NAME = 'up_lidar'
 
 
-class Writer:
+class Writer(FolderWriter):
     """Write annotations and poses in batches."""
 
+    folders = ('calibration',)
+    cloud_file = 'sensors/lidar/{name}.feather'
+
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self.dropped: Counter[str] = Counter()
-        self._folder = folder
-        self._provenance = asdict(provenance)
-        self._clouds = folder / 'sensors' / 'lidar'
-        if options.with_points:
-            self._clouds.mkdir(parents=True)
-        self._annotations = Table(
-            folder / ANNOTATIONS_FILE,
-            ANNOTATION_COLUMNS | EVIDENCE_COLUMNS,
-            to_json(self._provenance),
-        )
+        super().__init__(folder, provenance, options)
+        columns = ANNOTATION_COLUMNS | EVIDENCE_COLUMNS
+        self._annotations = Table(folder / ANNOTATIONS_FILE, columns, to_json(self.about))
         self._poses = Table(folder / EGO_POSES_FILE, {'timestamp_ns': 'int64'} | POSE_COLUMNS)
-        (folder / 'calibration').mkdir()
         path = folder / 'calibration' / 'egovehicle_SE3_sensor.feather'
         calibration = Table(path, {'sensor_name': 'string'} | POSE_COLUMNS)
         calibration.add(LIDAR_NAME, *_pose_values(np.eye(4)))
         calibration.close()
 
-    def write(self, frame: LabelFrame) -> None:
-        """Add a row per box, the pose and the cloud."""
+    def add(self, frame: LabelFrame) -> None:
+        """Add a row per box, and the pose."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         refined = frame.refined
         array = refined.boxes
@@ -106,21 +99,22 @@ class Writer:
                 *quaternion,
                 *box[X : Z + 1],
                 int(refined.num_points[row]),
-                *evidence_values(refined, row),
+                *evidence_of(refined, row).values(),
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(array.stamp_ns, *_pose_values(frame.T_fixed_sensor))
-        if frame.sweep is not None:
-            path = self._clouds / f'{array.stamp_ns}.feather'
-            _write_cloud(path, array.stamp_ns, frame.sweep, frame.intensities)
-        self._provenance['fixed_frame'] = frame.fixed_frame
-        self._provenance['sensor_frame'] = frame.sensor_frame
 
-    def close(self) -> None:
-        """Complete the files."""
+    def add_cloud(self, path: Path, frame: LabelFrame) -> None:
+        """Write a sweep as a table; `path` is by its stamp, as the kit needs it."""
+        assert frame.sweep is not None
+        stamp_ns = frame.refined.boxes.stamp_ns
+        path = path.with_name(f'{stamp_ns}.feather')
+        _write_cloud(path, stamp_ns, frame.sweep, frame.intensities)
+
+    def finish(self) -> None:
+        """Complete the tables."""
         self._annotations.close()
         self._poses.close()
-        write_provenance(self._folder, self._provenance)
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -186,12 +180,7 @@ def _refined(path: Path, table: Any, frame_id: str) -> Iterator[RefinedBoxes]:
             [item.get('track_uuid') or '' for item in items],
             [item['category'] for item in items],
             boxes_from_quaternions(poses_xyz_xyzw[:, :3], extents, poses_xyz_xyzw[:, 3:]),
-            [item.get('score') for item in items],
-            [item.get('status') for item in items],
-            [item.get('num_interior_pts') or 0 for item in items],
-            [item.get('covariance') for item in items],
-            [item.get('reason') for item in items],
-            [item.get('extent_covariance') for item in items],
+            [item | {'num_points': item.get('num_interior_pts')} for item in items],
         )
 
 

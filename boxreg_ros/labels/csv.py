@@ -131,8 +131,11 @@ def read(path: Path) -> Iterator[LabelFrame]:
             [table.track_ids[i] for i in rows],
             [table.class_names[i] for i in rows],
             table.boxes[rows],
-            table.scores[rows],
-            [table.status[i] for i in rows],
-            table.num_points[rows],
+            [
+                {'score': score, 'status': table.status[i], 'num_points': count}
+                for i, score, count in zip(
+                    rows, table.scores[rows], table.num_points[rows], strict=True
+                )
+            ],
         )
         yield LabelFrame(refined, fixed_frame, '')

@@ -9,20 +9,19 @@ sensor frame; the extents are along x (forward), y (left) and z of the box.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import require_single
-from boxreg_ros.labels.protocol import absolute, Format, INPUT_STATUS, LabelFrame
-from boxreg_ros.labels.records import finite_or_none, refined_boxes
-from boxreg_ros.labels.sidecar import read_sidecar, Sidecar, STAMPS_FILE
+from boxreg_ros.labels.files import following, require_single
+from boxreg_ros.labels.folder import FolderWriter, FrameNames
+from boxreg_ros.labels.protocol import absolute, Format, LabelFrame
+from boxreg_ros.labels.records import evidence_of, refined_boxes, UPPER_TRIANGLE
+from boxreg_ros.labels.sidecar import read_sidecar, STAMPS_FILE
 from boxreg_ros.rotations import matrix_from_rpy, rpy_from_matrix
-from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, ROLL, X, Z
+from boxreg_ros.structures import Floats, HEIGHT, LENGTH, ROLL, X, Z
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -30,7 +29,6 @@ EVIDENCE_KEY = 'boxreg'
 """Key of the evidence that is written beside a box; the tools ignore it."""
 UNKNOWN_CLASS = 'unknown'
 """Class name of boxes without one, for tools that require a name."""
-UPPER_TRIANGLE = np.triu_indices(6)
 
 
 def cuboid_format(name: str, title: str, files: str) -> Format:
@@ -64,9 +62,9 @@ def xyz(values: Iterable[float]) -> dict[str, float]:
     return dict(zip('xyz', map(float, values), strict=True))
 
 
-def from_xyz(vector: Mapping[str, float]) -> list[float]:
-    """Return the numbers of a vector that is written by axis."""
-    return [float(vector[axis]) for axis in 'xyz']
+def box_from_xyz(*vectors: Mapping[str, float]) -> Floats:
+    """Return a box (9,) from its centre, angles and extents that are written by axis."""
+    return box_from_cuboid(*([float(vector[axis]) for axis in 'xyz'] for vector in vectors))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,50 +104,34 @@ class ReadCuboid(NamedTuple):
     evidence: Mapping[str, Any]
 
 
-def cuboids_of(frame: LabelFrame, dropped: Counter[str]) -> Iterator[Cuboid]:
-    """Yield the valid boxes of a frame in the sensor frame; the others are counted."""
-    rows, boxes = frame.boxes_in('sensor', dropped)
-    for row, box, angles in zip(rows.tolist(), boxes, xyz_angles(boxes), strict=True):
-        yield Cuboid(
-            row,
-            frame.refined.boxes.track_ids[row],
-            frame.refined.boxes.class_names[row] or UNKNOWN_CLASS,
-            xyz(box[X : Z + 1]),
-            xyz(angles),
-            xyz(box[LENGTH : HEIGHT + 1]),
-            _evidence(frame.refined, row),
-        )
+class CuboidWriter(FolderWriter):
+    """Write the labels and the cloud of each frame, as the tools share them."""
 
+    needs_clouds: ClassVar[bool] = True
+    has_sidecar: ClassVar[bool] = True
 
-def _evidence(refined: RefinedBoxes, row: int) -> dict[str, Any]:
-    return {
-        'status': refined.status[row],
-        'reason': refined.reasons[row],
-        'num_points': int(refined.num_points[row]),
-        'score': finite_or_none(refined.boxes.scores[row]),
-        'covariance': refined.covariances[row][UPPER_TRIANGLE].tolist(),
-        'extent_covariance': refined.extent_covariances[row].ravel().tolist(),
-    }
-
-
-class FrameNames:
-    """Names of frames that sort by time: the stamp [ns]; a repeated stamp gets ``_1``."""
-
-    def __init__(self) -> None:
-        self._used: Counter[int] = Counter()
-
-    def of(self, stamp_ns: int) -> str:
-        """Return the name of the next frame of this stamp."""
-        number = self._used[stamp_ns]
-        self._used[stamp_ns] += 1
-        name = f'{stamp_ns:019d}'
-        return f'{name}_{number}' if number else name
-
-
-def write_points(frame: LabelFrame, path: Path) -> None:
-    """Write the cloud of a frame; an empty one if it has none, because the tools need a file."""
-    points = np.zeros((0, 3)) if frame.sweep is None else frame.sweep.points
-    write_cloud(path, points, frame.intensities)
+    def cuboids(self, frame: LabelFrame) -> Iterator[Cuboid]:
+        """Yield the valid boxes of a frame in the sensor frame; the others are counted."""
+        rows, boxes = frame.boxes_in('sensor', self.dropped)
+        array = frame.refined.boxes
+        for row, box, angles in zip(rows.tolist(), boxes, xyz_angles(boxes), strict=True):
+            evidence = evidence_of(frame.refined, row)
+            yield Cuboid(
+                row,
+                array.track_ids[row],
+                array.class_names[row] or UNKNOWN_CLASS,
+                xyz(box[X : Z + 1]),
+                xyz(angles),
+                xyz(box[LENGTH : HEIGHT + 1]),
+                {
+                    'status': evidence['status'],
+                    'reason': evidence['reason'],
+                    'num_points': int(frame.refined.num_points[row]),
+                    'score': evidence['score'],
+                    'covariance': frame.refined.covariances[row][UPPER_TRIANGLE].tolist(),
+                    'extent_covariance': evidence['extent_covariance'],
+                },
+            )
 
 
 def single_part(path: Path, what: str, members: Collection[str]) -> tuple[Path, Path]:
@@ -214,38 +196,14 @@ def read_frames(
             )
         order = names
     for index, name in enumerate(order):
-        try:
-            refined = _refined(cuboids_by_name(name), sidecar, index)
-        except (AttributeError, TypeError, ValueError) as error:
-            raise RecordingError(
-                f'{folder}: frame {name!r}: expected attributes as boxreg writes them, got '
-                f'others: {error}; remove the attributes that were changed'
-            ) from None
+        cuboids = cuboids_by_name(name)
+        with following(folder, f'attributes as boxreg writes them in frame {name!r}'):
+            refined = refined_boxes(
+                sidecar.stamps_ns[index],
+                sidecar.sensor_frame,
+                [cuboid.track_id for cuboid in cuboids],
+                [cuboid.class_name for cuboid in cuboids],
+                [cuboid.box for cuboid in cuboids],
+                [cuboid.evidence for cuboid in cuboids],
+            )
         yield sidecar.frame(index, refined).moved('fixed')
-
-
-def _refined(cuboids: Sequence[ReadCuboid], sidecar: Sidecar, index: int) -> RefinedBoxes:
-    """Return the boxes of one frame with the evidence in their attributes."""
-    evidence = [cuboid.evidence for cuboid in cuboids]
-    return refined_boxes(
-        sidecar.stamps_ns[index],
-        sidecar.sensor_frame,
-        [cuboid.track_id for cuboid in cuboids],
-        [cuboid.class_name for cuboid in cuboids],
-        [cuboid.box for cuboid in cuboids],
-        [item.get('score', 1.0) for item in evidence],
-        [str(item.get('status', INPUT_STATUS)) for item in evidence],
-        [int(item.get('num_points', 0)) for item in evidence],
-        [_covariance(item.get('covariance')) for item in evidence],
-        [str(item.get('reason', '')) for item in evidence],
-        [item.get('extent_covariance') for item in evidence],
-    )
-
-
-def _covariance(upper: ArrayLike | None) -> Floats | None:
-    """Return the symmetric matrix (6, 6) of an upper triangle."""
-    if upper is None:
-        return None
-    matrix = np.zeros((6, 6))
-    matrix[UPPER_TRIANGLE] = upper
-    return matrix + np.triu(matrix, 1).T

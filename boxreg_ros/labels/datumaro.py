@@ -8,45 +8,40 @@ format if the precision matters.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.cuboids import (
     box_from_cuboid,
     Cuboid,
-    cuboids_of,
-    FrameNames,
+    cuboid_format,
+    CuboidWriter,
     read_frames,
     ReadCuboid,
-    write_points,
 )
-from boxreg_ros.labels.files import from_json, to_json
-from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.labels.files import following, from_json, JsonList
+from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import TrackNumbers
-from boxreg_ros.labels.sidecar import SidecarWriter
 
-FORMAT = Format(
-    name='datumaro',
-    title='Datumaro, CVAT',
-    frame='sensor',
-    reference='centre',
+FORMAT = replace(
+    cuboid_format(
+        name='datumaro',
+        title='Datumaro, CVAT',
+        files='annotations/default.json, point_clouds/default/STAMP.pcd',
+    ),
     sizes='length width height (x y z); height width length with --swap-axes',
-    rotation='angles x y z, R = Rx Ry Rz',
-    files='annotations/default.json, point_clouds/default/STAMP.pcd',
     options=('with_points', 'swap_axes'),
 )
-SUBSET = 'default'
+ANNOTATIONS_FILE = 'annotations/default.json'
 POINT_CLOUD_MEDIA = 6
 """Number of the media type in Datumaro."""
 SWAPPED_KEY = 'scale_is_height_width_length'
 """Key of the header that states `Options.swap_axes`."""
 
 
-class Writer:
+class Writer(CuboidWriter):
     """
     Write one item per frame, and the classes when closed.
 
@@ -56,55 +51,41 @@ class Writer:
 
     """
 
-    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self.dropped: Counter[str] = Counter()
-        self._axes = 'zyx' if options.swap_axes else 'xyz'
-        self._names = FrameNames()
-        self._tracks = TrackNumbers()
-        self._sidecar = SidecarWriter(folder, provenance)
-        self._labels: dict[str, int] = {}
-        self._clouds = folder / 'point_clouds' / SUBSET
-        self._with_points = options.with_points
-        if self._with_points:
-            self._clouds.mkdir(parents=True)
-        (folder / 'annotations').mkdir()
-        self._file = (folder / 'annotations' / f'{SUBSET}.json').open('w', encoding='utf-8')
-        infos = asdict(provenance) | {SWAPPED_KEY: options.swap_axes}
-        head = {'dm_format_version': '1.0', 'media_type': POINT_CLOUD_MEDIA, 'infos': infos}
-        self._file.write(to_json(head)[:-1] + ',\n"items": [')
-        self._frames = 0
+    folders = ('annotations',)
+    cloud_file = 'point_clouds/default/{name}.pcd'
 
-    def write(self, frame: LabelFrame) -> None:
+    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
+        super().__init__(folder, provenance, options)
+        self._axes = 'zyx' if options.swap_axes else 'xyz'
+        self._tracks = TrackNumbers()
+        self._labels: dict[str, int] = {}
+        infos = self.about | {SWAPPED_KEY: options.swap_axes}
+        head = {'dm_format_version': '1.0', 'media_type': POINT_CLOUD_MEDIA, 'infos': infos}
+        self._items = JsonList(folder / ANNOTATIONS_FILE, head, 'items')
+
+    def add(self, frame: LabelFrame) -> None:
         """Add an item."""
-        name = self._names.of(frame.refined.boxes.stamp_ns)
         seen: set[str] = set()
         annotations: list[dict[str, Any]] = []
-        for cuboid in cuboids_of(frame, self.dropped):
+        for cuboid in self.cuboids(frame):
             # A track occurs once per frame: a repeated track id gets a number of its own.
             is_repeated = cuboid.track_id in seen
             number = self._tracks.of('' if is_repeated else cuboid.track_id)
             seen.add(cuboid.track_id)
             annotations.append(self._annotation(len(annotations), number, cuboid))
-        item = {
-            'id': name,
-            'annotations': annotations,
-            'attr': {'frame': self._frames},
-            'point_cloud': {'path': f'{name}.pcd'},
-        }
-        separator = ',' if self._frames else ''
-        self._file.write(f'{separator}\n{to_json(item)}')
-        self._frames += 1
-        if self._with_points:
-            write_points(frame, self._clouds / f'{name}.pcd')
-        self._sidecar.add(frame)
+        self._items.append(
+            {
+                'id': self.name,
+                'annotations': annotations,
+                'attr': {'frame': self.number},
+                'point_cloud': {'path': f'{self.name}.pcd'},
+            }
+        )
 
-    def close(self) -> None:
-        """Write the classes and close the files."""
+    def finish(self) -> None:
+        """Write the classes."""
         labels = [{'name': name, 'parent': '', 'attributes': []} for name in self._labels]
-        categories = {'label': {'labels': labels, 'attributes': []}}
-        self._file.write(f'\n],\n"categories": {to_json(categories)}}}\n')
-        self._file.close()
-        self._sidecar.close()
+        self._items.close({'categories': {'label': {'labels': labels, 'attributes': []}}})
 
     def _annotation(self, index: int, track_number: int, cuboid: Cuboid) -> dict[str, Any]:
         """Return the annotation of a cuboid; its class is added to the labels."""
@@ -123,18 +104,10 @@ class Writer:
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
-    """
-    Yield the items of a data set with one stamp [ns] per item in its ``timestamps.txt``.
-
-    Raises
-    ------
-    RecordingError
-        If a file is missing or does not hold cuboids of Datumaro.
-
-    """
-    file = path / 'annotations' / f'{SUBSET}.json'
+    """Yield the items of a data set with one stamp [ns] per item in its ``timestamps.txt``."""
+    file = path / ANNOTATIONS_FILE
     content = from_json(file)
-    try:
+    with following(file, 'cuboids of Datumaro'):
         labels = [label['name'] for label in content['categories']['label']['labels']]
         is_swapped = bool(content.get('infos', {}).get(SWAPPED_KEY))
         items = {
@@ -145,8 +118,6 @@ def read(path: Path) -> Iterator[LabelFrame]:
             ]
             for item in sorted(content['items'], key=_order)
         }
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise RecordingError(f'{file}: expected cuboids of Datumaro: {error!r}') from None
     yield from read_frames(path, list(items), items.__getitem__)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import json
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -33,6 +34,11 @@ def require_single(found: Sequence[Path], path: Path, what: str) -> Path:
 def to_json(value: Any) -> str:
     """Return `value` as standard JSON: NaN and infinity become null, text is not escaped."""
     return orjson.dumps(value, option=JSON_OPTIONS).decode()
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` as a JSON file of one line."""
+    path.write_text(to_json(value) + '\n', encoding='utf-8')
 
 
 def from_json(path: Path) -> Any:
@@ -96,27 +102,56 @@ def _streamed(path: Path, parse: Callable[[BinaryIO], Iterator[Any]]) -> Iterato
 
 
 class JsonList:
-    """A JSON file that holds one list, written item by item."""
+    """
+    A JSON file that holds one list, written item by item.
 
-    def __init__(self, path: Path) -> None:
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    head : mapping, optional
+        Members of an object around the list.
+    name : str
+        Name of the list in this object.
+
+    """
+
+    def __init__(self, path: Path, head: Mapping[str, Any] | None = None, name: str = '') -> None:
         self._file = path.open('w', encoding='utf-8')
-        self._separator = '[\n'
+        begin = '' if head is None else f'{to_json(head)[:-1]},\n"{name}": '
+        self._separator = f'{begin}[\n'
 
     def append(self, item: Any) -> None:
         """Add an item on a line of its own."""
         self._file.write(self._separator + to_json(item))
         self._separator = ',\n'
 
-    def close(self) -> None:
-        """Close the list and the file."""
-        is_empty = self._separator == '[\n'
-        self._file.write('[]\n' if is_empty else '\n]\n')
+    def close(self, tail: Mapping[str, Any] | None = None) -> None:
+        """Close the list and the file; `tail` are members of the object after the list."""
+        is_empty = self._separator != ',\n'
+        self._file.write(f'{self._separator[:-1]}]' if is_empty else '\n]')
+        if tail is not None:
+            members = ''.join(f',\n"{name}": {to_json(item)}' for name, item in tail.items())
+            self._file.write(f'{members}}}')
+        self._file.write('\n')
         self._file.close()
+
+
+@contextmanager
+def following(path: Path, what: str) -> Iterator[None]:
+    """Raise errors of the content of `path` as RecordingError; `what` is what was expected."""
+    try:
+        yield
+    except OSError as error:
+        raise RecordingError(unreadable(path, error)) from None
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        text = f'{type(error).__name__} {error}'
+        raise RecordingError(f'{path}: expected {what}: {text}; write it again') from None
 
 
 def write_provenance(folder: Path, content: Mapping[str, Any]) -> None:
     """Write ``boxreg.json``: the fields of `Provenance`, names of frames and of tracks."""
-    (folder / PROVENANCE_FILE).write_text(to_json(content) + '\n', encoding='utf-8')
+    write_json(folder / PROVENANCE_FILE, content)
 
 
 def read_provenance(folder: Path) -> dict[str, Any]:

@@ -9,15 +9,14 @@ of -1. Occlusion is 3, unknown. Stamps and poses are in the files of `sidecar`.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from boxreg_ros.errors import RecordingError, unreadable
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.camera import Camera
-from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import read_provenance, require_single
+from boxreg_ros.labels.files import following, read_provenance, require_single
+from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     absolute,
     Format,
@@ -27,7 +26,7 @@ from boxreg_ros.labels.protocol import (
     SceneFrames,
 )
 from boxreg_ros.labels.records import refined_boxes, TrackNumbers
-from boxreg_ros.labels.sidecar import read_sidecar, SidecarWriter
+from boxreg_ros.labels.sidecar import read_sidecar
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH
 import numpy as np
@@ -55,7 +54,7 @@ IGNORED_CLASS = 'DontCare'
 """Regions without labels, which have no 3D box."""
 
 
-class Writer:
+class Writer(FolderWriter):
     """
     Write one line per box.
 
@@ -64,22 +63,19 @@ class Writer:
 
     """
 
+    folders = ('label_02', 'calib')
+    cloud_file = f'velodyne/{SEQUENCE}/{{number:06d}}.bin'
+    has_sidecar = True
+
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self.dropped: Counter[str] = Counter()
         self._camera = Camera.read(options.camera, 'format kitti')
-        self._clouds = folder / 'velodyne' / SEQUENCE
-        for name in ('label_02', 'calib'):
-            (folder / name).mkdir()
-        if options.with_points:
-            self._clouds.mkdir(parents=True)
+        super().__init__(folder, provenance, options)
         _write_calibration(self._camera, folder / 'calib' / f'{SEQUENCE}.txt')
         path = folder / 'label_02' / f'{SEQUENCE}.txt'
         self._file = path.open('w', encoding='utf-8')
-        self._sidecar = SidecarWriter(folder, provenance)
-        self._numbers = TrackNumbers()
-        self._frames = 0
+        self._tracks = TrackNumbers()
 
-    def write(self, frame: LabelFrame) -> None:
+    def add(self, frame: LabelFrame) -> None:
         """Add the lines of a frame."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         array = frame.refined.boxes
@@ -97,20 +93,17 @@ class Writer:
             numbers = [alpha, *rectangles[i], *size, *location, rotations_y[i]]
             if np.isfinite(array.scores[row]):
                 numbers.append(array.scores[row])
-            track = self._numbers.of(array.track_ids[row])
+            track = self._tracks.of(array.track_ids[row])
             name = _kitti_class(array.class_names[row])
-            self._file.write(f'{self._frames} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')
+            self._file.write(f'{self.number} {track} {name} {truncation[i]} {UNKNOWN_OCCLUSION} ')
             self._file.write(' '.join(f'{value:.6f}' for value in numbers) + '\n')
-        if frame.sweep is not None:
-            path = self._clouds / f'{self._frames:06d}.bin'
-            write_cloud(path, frame.sweep.points, frame.intensities)
-        self._sidecar.add(frame)
-        self._frames += 1
 
-    def close(self) -> None:
-        """Complete the files."""
+    def finish(self) -> None:
+        """Complete the labels, and name the tracks."""
         self._file.close()
-        self._sidecar.close(self._numbers.names())
+        names = self._tracks.names()
+        if names:
+            self.about['tracks'] = names
 
 
 class _Line(NamedTuple):
@@ -204,30 +197,24 @@ def _refined(
         [tracks.get(line.track, line.track) for line in lines],
         [line.class_name for line in lines],
         _boxes(camera, numbers),
-        [line.score for line in lines],
+        [{'score': line.score} for line in lines],
     )
 
 
 def _read_lines(path: Path) -> dict[int, list[_Line]]:
     """Return the lines of a label file by frame; their order within a frame is kept."""
     lines_by_frame: dict[int, list[_Line]] = {}
-    try:
+    with following(path, '17 or 18 columns of KITTI tracking'):
         for text in path.read_text(encoding='utf-8').splitlines():
             words = text.split()
             if not words or words[2] == IGNORED_CLASS:
                 continue
             numbers = [float(word) for word in words[10:17]]
             score = float(words[17]) if len(words) > 17 else np.nan
-            line = _Line(words[1], words[2], numbers, score)
             if len(numbers) != 7:
                 raise ValueError(f'got {len(words)} columns')
+            line = _Line(words[1], words[2], numbers, score)
             lines_by_frame.setdefault(int(words[0]), []).append(line)
-    except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
-    except (IndexError, ValueError) as error:
-        raise RecordingError(
-            f'{path}: expected 17 or 18 columns of KITTI tracking: {error}'
-        ) from None
     return lines_by_frame
 
 

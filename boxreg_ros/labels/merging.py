@@ -5,9 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.items import Item
+from boxreg_ros.io.times import time_range
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.labels.protocol import LabelFrame
+from boxreg_ros.structures import HUMAN, is_valid_box
+
+LARGEST_LAG_NS = 10**9
+"""Labels that begin or end so close to the clouds are of their drive [ns]; chosen: ten periods."""
+LONGEST_DRIVE_NS = 24 * 3600 * 10**9
+"""The same where only a part of the recording is read [ns]; chosen: a day."""
 
 
 class LabelMerger:
@@ -15,7 +23,8 @@ class LabelMerger:
     Yield the boxes of a stamp after the sweep of that stamp, or the next one.
 
     Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and
-    move with the recording; the others are taken in the frame that the labels name.
+    move with the recording; the others are taken in the frame that the labels name. Boxes of the
+    status ``human`` are pinned.
 
     Parameters
     ----------
@@ -34,6 +43,11 @@ class LabelMerger:
     ----------
     outside : int
         Boxes left out.
+
+    Raises
+    ------
+    RecordingError
+        If all labels are earlier than the clouds, or all later.
 
     """
 
@@ -54,6 +68,8 @@ class LabelMerger:
         self._is_part = is_part
         self._first_ns: int | None = None
         self._newest_ns = 0
+        self._labelled_ns: tuple[int, int] | None = None  # of the first and the newest label
+        self._longest_ns = LONGEST_DRIVE_NS if is_part else LARGEST_LAG_NS
 
     def after(self, received_ns: int, stamp_ns: int) -> Iterator[Item]:
         """Yield the boxes up to the stamp of a sweep [ns], which is the next of the recording."""
@@ -63,9 +79,14 @@ class LabelMerger:
             self._first_ns = self._newest_ns
         while self._next is not None and _stamp(self._next) <= self._newest_ns:
             yield from self._take(self._is_part and _stamp(self._next) < self._first_ns)
+        if self._next is None and self._labelled_ns is not None:
+            self._check(self._first_ns - self._labelled_ns[1])
 
     def rest(self) -> Iterator[Item]:
         """Yield the boxes later than the last sweep."""
+        if self._next is not None and self._labelled_ns is None and self._first_ns is not None:
+            self._labelled_ns = _stamp(self._next), _stamp(self._next)
+            self._check(self._labelled_ns[0] - self._newest_ns)
         while self._next is not None:
             yield from self._take(self._is_part)
 
@@ -73,11 +94,25 @@ class LabelMerger:
         """Yield the next boxes, or count them as outside, and go on to those after them."""
         frame = self._next
         assert frame is not None
+        stamp_ns = _stamp(frame)
+        first_ns = stamp_ns if self._labelled_ns is None else self._labelled_ns[0]
+        self._labelled_ns = first_ns, stamp_ns
         if is_outside:
             self.outside += len(frame.refined.status)
         else:
             yield _item(frame, self._received_ns, self._tree, self._sensor_frame)
         self._next = next(self._frames, None)
+
+    def _check(self, apart_ns: int) -> None:
+        """Refuse labels that lie further apart from the clouds [ns] than those of one drive."""
+        if apart_ns <= self._longest_ns or self._labelled_ns is None or self._first_ns is None:
+            return
+        raise RecordingError(
+            f'labels: expected those of the time of the clouds, got labels of '
+            f'{time_range(*self._labelled_ns)}, clouds of '
+            f'{time_range(self._first_ns, self._newest_ns)}: another drive? give the labels of '
+            f'this recording'
+        )
 
 
 def _item(frame: LabelFrame, received_ns: int, tree: TransformTree, sensor_frame: str) -> Item:
@@ -87,6 +122,9 @@ def _item(frame: LabelFrame, received_ns: int, tree: TransformTree, sensor_frame
     is_sensor = frame.sensor_frame != '' and boxes.frame_id == frame.sensor_frame
     if is_sensor and not tree.connects(boxes.frame_id, sensor_frame):
         boxes = replace(boxes, frame_id=sensor_frame)
+    if HUMAN in placed.refined.status:
+        is_human = [status == HUMAN for status in placed.refined.status]
+        boxes = replace(boxes, pinned=is_human & is_valid_box(boxes.boxes))
     return Item(received_ns, boxes, refined=replace(placed.refined, boxes=boxes))
 
 

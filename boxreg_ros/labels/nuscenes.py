@@ -10,9 +10,7 @@ sweeps the stamp, of instances the track id. A track that changes its class is s
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
 import hashlib
 from pathlib import Path
 import struct
@@ -21,16 +19,16 @@ import zlib
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.transforms import matrix
-from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import (
+    following,
     frame_names,
     from_json,
     json_items,
     json_members,
     JsonList,
     require_single,
-    write_provenance,
 )
+from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     absolute,
     Format,
@@ -39,7 +37,7 @@ from boxreg_ros.labels.protocol import (
     Provenance,
     SceneFrames,
 )
-from boxreg_ros.labels.records import boxes_from_quaternions, finite_or_none, refined_boxes
+from boxreg_ros.labels.records import boxes_from_quaternions, evidence_of, refined_boxes
 from boxreg_ros.rotations import quaternion_from_matrix
 from boxreg_ros.structures import Floats, HEIGHT, LENGTH, RefinedBoxes, WIDTH, X, Z
 from msg_adapters.poses import quaternions_of
@@ -62,7 +60,7 @@ STREAMED_TABLES = ('sample', 'sample_data', 'sample_annotation', 'ego_pose')
 EMPTY_MAP = 'maps/empty.png'
 
 
-class Writer:
+class Writer(FolderWriter):
     """
     Write the rows of each sample; the tables of one row or one per track when closed.
 
@@ -73,42 +71,29 @@ class Writer:
 
     version = 'v1.0-boxreg'
     channel = 'LIDAR_TOP'
-    clouds = 'samples/LIDAR_TOP'
+    cloud_file = 'samples/LIDAR_TOP/{number:05d}.pcd.bin'
     date_key = 'date_captured'
+    needs_pose = True
 
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self.dropped: Counter[str] = Counter()
-        self._folder = folder
+        super().__init__(folder, provenance, options)
         self._tables = folder / self.version
         self._tables.mkdir()
-        if options.with_points:
-            (folder / self.clouds).mkdir(parents=True)
-        self._provenance = asdict(provenance)
         self._streams = {name: JsonList(self._tables / f'{name}.json') for name in STREAMED_TABLES}
         self._held_rows: dict[str, dict[str, Any]] = {}  # by table
         self._held_annotations: dict[str, dict[str, Any]] = {}  # by instance key
         self._instances: dict[str, dict[str, Any]] = {}
         self._categories: dict[str, str] = {}
-        self._num_samples = 0
         self._num_single = 0  # annotations that are an instance of their own
 
-    def write(self, frame: LabelFrame) -> None:
+    def add(self, frame: LabelFrame) -> None:
         """Add a sample with its annotations."""
+        assert frame.T_fixed_sensor is not None  # of `needs_pose`
         rows, boxes = frame.boxes_in('fixed', self.dropped)
-        if frame.T_fixed_sensor is None:
-            self.dropped['no_transform'] += len(rows)
-            return
-        self._provenance['fixed_frame'] = frame.fixed_frame
-        self._provenance['sensor_frame'] = frame.sensor_frame
-        number = self._num_samples
-        self._num_samples += 1
-        cloud_file = f'{self.clouds}/{number:05d}.pcd.bin'
-        self._add_sample(number, frame.refined.boxes.stamp_ns, cloud_file, frame.T_fixed_sensor)
-        if frame.sweep is not None:
-            write_cloud(self._folder / cloud_file, frame.sweep.points, frame.intensities)
-        self._add_annotations(frame, self._token('sample', number), rows.tolist(), boxes)
+        self._add_sample(frame.refined.boxes.stamp_ns, frame.T_fixed_sensor)
+        self._add_annotations(frame, self._token('sample', self.number), rows.tolist(), boxes)
 
-    def close(self) -> None:
+    def finish(self) -> None:
         """Write the rows still held and the remaining tables."""
         for table, row in self._held_rows.items():
             self._streams[table].append(row)
@@ -122,17 +107,14 @@ class Writer:
                 rows_file.append(row)
             rows_file.close()
         # The devkit requires a map.
-        (self._folder / EMPTY_MAP).parent.mkdir()
-        (self._folder / EMPTY_MAP).write_bytes(_black_pixel())
-        write_provenance(self._folder, self._provenance)
+        (self.folder / EMPTY_MAP).parent.mkdir()
+        (self.folder / EMPTY_MAP).write_bytes(_black_pixel())
 
-    def _add_sample(
-        self, number: int, stamp_ns: int, cloud_file: str, T_fixed_sensor: Floats
-    ) -> None:
+    def _add_sample(self, stamp_ns: int, T_fixed_sensor: Floats) -> None:
         """Add the rows of a sample: itself, its sweep and the pose of the ego vehicle."""
         timestamp = round(stamp_ns / 1000)
-        sample = self._token('sample', number)
-        pose = self._token('ego_pose', number)
+        sample = self._token('sample', self.number)
+        pose = self._token('ego_pose', self.number)
         self._link(
             'sample',
             {
@@ -146,7 +128,7 @@ class Writer:
         self._link(
             'sample_data',
             {
-                'token': self._token('sample_data', number),
+                'token': self._token('sample_data', self.number),
                 'sample_token': sample,
                 'ego_pose_token': pose,
                 'calibrated_sensor_token': self._token('calibrated_sensor'),
@@ -155,7 +137,7 @@ class Writer:
                 'is_key_frame': True,
                 'height': 0,
                 'width': 0,
-                'filename': cloud_file,
+                'filename': self.cloud_file.format(number=self.number),
                 'prev': '',
                 'next': '',
                 'is_valid': True,
@@ -202,11 +184,7 @@ class Writer:
                 'num_radar_pts': 0,
                 'prev': '',
                 'next': '',
-                'status': refined.status[row],
-                'reason': refined.reasons[row],
-                'score': finite_or_none(array.scores[row]),
-                'covariance': refined.covariances[row].ravel().tolist(),
-                'extent_covariance': refined.extent_covariances[row].ravel().tolist(),
+                **evidence_of(refined, row),
                 'stamp_ns': array.stamp_ns,
             }
             if is_single:
@@ -274,12 +252,10 @@ class Writer:
     def _drive_tables(self) -> dict[str, list[dict[str, Any]]]:
         """Return the tables of the drive: one log, one scene and an empty map."""
         log = self._token('log')
-        recordings = ', '.join(self._provenance['recordings'])
-        tool = f'{self._provenance["tool"]} {self._provenance["version"]}'
-        first_sample = last_sample = ''
-        if self._num_samples:
-            first_sample = self._token('sample', 0)
-            last_sample = self._token('sample', self._num_samples - 1)
+        recordings = ', '.join(self.about['recordings'])
+        tool = f'{self.about["tool"]} {self.about["version"]}'
+        samples = [self._token('sample', number) for number in (0, self.number - 1)]
+        first, last = samples if self.number else ('', '')
         log_row = {
             'token': log,
             'logfile': recordings,
@@ -290,9 +266,9 @@ class Writer:
         scene_row = {
             'token': self._token('scene'),
             'log_token': log,
-            'nbr_samples': self._num_samples,
-            'first_sample_token': first_sample,
-            'last_sample_token': last_sample,
+            'nbr_samples': self.number,
+            'first_sample_token': first,
+            'last_sample_token': last,
             'name': 'scene-0001',
             'description': f'{tool}: {recordings}',
         }
@@ -306,8 +282,8 @@ class Writer:
 
     def _token(self, kind: str, key: object = '') -> str:
         """Return 32 digits that are the same in every run over the same recording."""
-        provenance = self._provenance
-        text = f'{provenance["recordings"]} {provenance["config_hash"]} {kind} {key}'
+        about = self.about
+        text = f'{about["recordings"]} {about["config_hash"]} {kind} {key}'
         return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
 
 
@@ -325,12 +301,8 @@ def read(path: Path) -> Iterator[LabelFrame]:
     if not (path / 'sample.json').exists():
         found = sorted(file.parent for file in path.glob('*/sample.json'))
     tables = require_single(found, path, 'folder with the tables of nuScenes')
-    try:
+    with following(tables, 'the tables of nuScenes'):
         yield from _read_tables(tables)
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(
-            f'{tables}: expected the tables of nuScenes: {type(error).__name__} {error}'
-        ) from None
 
 
 def _read_tables(tables: Path) -> Iterator[LabelFrame]:
@@ -362,12 +334,8 @@ def read_scene(path: Path, scene: SceneFrames) -> Iterator[LabelFrame]:
 
     """
     read_boxes = _scene_annotations if path.is_dir() else _scene_results
-    try:
+    with following(path, 'the tables or results of nuScenes'):
         boxes_by_sample = read_boxes(path, scene)
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(
-            f'{path}: expected the tables or results of nuScenes: {type(error).__name__} {error}'
-        ) from None
     for token in scene.stamps_ns:
         yield LabelFrame(boxes_by_sample[token], scene.fixed_frame, scene.sensor_frame)
 
@@ -412,7 +380,7 @@ def _scene_results(path: Path, scene: SceneFrames) -> dict[str, RefinedBoxes]:
             [str(item.get('tracking_id', '')) for item in items],
             [item[f'{task}_name'] for item in items],
             _boxes_of(items),
-            [item[f'{task}_score'] for item in items],
+            [{'score': item[f'{task}_score']} for item in items],
         )
     return found
 
@@ -436,12 +404,7 @@ def _annotated(
         [track.get('instance_name') or track['token'] for track in tracks],
         [_row_of(names, track['category_token'], 'category') for track in tracks],
         _boxes_of(items),
-        [item.get('score') for item in items],
-        [item.get('status') for item in items],
-        [item['num_lidar_pts'] for item in items],
-        [item.get('covariance') for item in items],
-        [item.get('reason') for item in items],
-        [item.get('extent_covariance') for item in items],
+        [item | {'num_points': item['num_lidar_pts']} for item in items],
     )
 
 

@@ -17,8 +17,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels.files import from_json, to_json
+from boxreg_ros.labels.files import following, from_json, to_json
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import refined_boxes
 from boxreg_ros.rotations import rpy_from_quaternion
@@ -209,7 +208,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     if path.is_dir():
         path = path / 'labels.json'
     content = from_json(path)
-    try:
+    with following(path, 'frames with stamps and cuboids as in ASAM OpenLABEL 1.0'):
         label = content['openlabel']
         has_names = label.get('metadata', {}).get('annotator') == Provenance().tool
         objects = label.get('objects', {})
@@ -217,11 +216,6 @@ def read(path: Path) -> Iterator[LabelFrame]:
         classes = {uid: str(item.get('type', '')) for uid, item in objects.items()}
         for _, frame in sorted(label.get('frames', {}).items(), key=lambda item: int(item[0])):
             yield from _read_frame(frame, names, classes)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RecordingError(
-            f'{path}: expected frames with stamps and cuboids as in ASAM OpenLABEL 1.0: '
-            f'{type(error).__name__} {error}'
-        ) from None
 
 
 def _read_frame(
@@ -234,19 +228,13 @@ def _read_frame(
         stamp_ns = round(float(properties['timestamp']) * 1e9)
     transforms = list(properties.get('transforms', {}).values())
     for system, items in _cuboids_by_system(frame).items():
-        attributes = [_attributes(cuboid) for _, cuboid in items]
         refined = refined_boxes(
             int(stamp_ns),
             system,
             [names[uid] for uid, _ in items],
             [classes[uid] for uid, _ in items],
             [_box(cuboid['val']) for _, cuboid in items],
-            [found.get('score') for found in attributes],
-            [found.get('status') for found in attributes],
-            [found.get('num_points', 0) for found in attributes],
-            [found.get('covariance') for found in attributes],
-            [found.get('reason') for found in attributes],
-            [found.get('extent_covariance') for found in attributes],
+            [_attributes(cuboid) for _, cuboid in items],
         )
         fixed_frame, sensor_frame, T_fixed_sensor = _pose(system, transforms)
         yield LabelFrame(refined, fixed_frame, sensor_frame, T_fixed_sensor)

@@ -113,12 +113,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
             [item['track_id'] for item in items],
             [item['class_name'] for item in items],
             boxes_from_quaternions(numbers[:, 1:4], numbers[:, 8:], numbers[:, 4:8]),
-            numbers[:, 0],
-            [item['status'] for item in items],
-            [item['num_points'] for item in items],
-            [item.get('covariance') for item in items],
-            [item.get('reason') for item in items],
-            [item.get('extent_covariance') for item in items],
+            items,
         )
         T = items[0].get('T_fixed_sensor')
         yield LabelFrame(

@@ -14,10 +14,12 @@ from typing import Protocol, TYPE_CHECKING
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
+from boxreg_ros.options import option
 from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, RefinedBoxes, Sweep
 import numpy as np
 
 if TYPE_CHECKING:
+    from boxreg_ros.core.point_labels import PointLabels
     from boxreg_ros.io.recording import Recording
     from boxreg_ros.labels.camera import Camera
 
@@ -49,6 +51,8 @@ class Format:
         Packages of pip that are needed beyond those of boxreg_ros itself.
     options : tuple of str
         Fields of `Options` that the writer uses.
+    has_points : bool
+        Whether it labels points; such a format is written by ``boxreg relabel`` alone.
 
     """
 
@@ -61,6 +65,7 @@ class Format:
     files: str
     packages: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
+    has_points: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +88,8 @@ class LabelFrame:
         Intensities of its points in the unit of the sensor; None if it has none.
     T_fixed_given : array, shape (4, 4), or None
         Pose of the frame of the input boxes; None if unknown.
+    points : PointLabels or None
+        Labels of the points of `sweep`, for formats of points.
 
     """
 
@@ -93,6 +100,7 @@ class LabelFrame:
     sweep: Sweep | None = None
     intensities: Floats | None = None
     T_fixed_given: Floats | None = None
+    points: PointLabels | None = None
 
     def boxes_in(self, frame: str, dropped: Counter[str]) -> tuple[Ints, Floats]:
         """
@@ -222,9 +230,18 @@ class Options:
 
     """
 
-    with_points: bool = False
-    camera: Path | None = None
-    swap_axes: bool = False
+    with_points: bool = option(
+        False, 'also write the point clouds that a label format stores beside its labels'
+    )
+    camera: Path | None = option(
+        None,
+        'camera calibration, for formats with image coordinates',
+        metavar='FILE',
+        parse=Path,
+    )
+    swap_axes: bool = option(
+        False, 'write the extents in the order that Datumaro and CVAT display them'
+    )
     recording: Recording | None = None
 
 

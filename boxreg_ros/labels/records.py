@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any
 
@@ -16,52 +16,69 @@ FIRST_ASSIGNED_NUMBER = 10**6
 """Track numbers below keep their value; assigned numbers start here (see `TrackNumbers`)."""
 MIN_QUATERNION_NORM = 1e-6
 """A shorter quaternion states no orientation."""
+UPPER_TRIANGLE = np.triu_indices(6)
 
 
-def refined_boxes(  # noqa: PLR0913 (one argument per column of a label file)
+def refined_boxes(
     stamp_ns: int,
     frame_id: str,
     track_ids: Sequence[str],
     class_names: Sequence[str],
     boxes: ArrayLike,
-    scores: Sequence[float | None] | Floats | None = None,
-    status: Sequence[str | None] | None = None,
-    num_points: ArrayLike | None = None,
-    covariances: Sequence[ArrayLike | None] | None = None,
-    reasons: Sequence[str | None] | None = None,
-    extent_covariances: Sequence[ArrayLike | None] | None = None,
+    evidence: Sequence[Mapping[str, Any]] = (),
 ) -> RefinedBoxes:
     """
     Return the n boxes of one stamp as read from a file.
 
-    Columns and entries that are None get defaults: score NaN, status `INPUT_STATUS`, 0 points,
-    unit matrices as covariances, no reason.
+    Parameters
+    ----------
+    stamp_ns : int
+        Stamp [ns].
+    frame_id : str
+        Frame of the boxes.
+    track_ids, class_names : sequence of n str
+        Identity and category.
+    boxes : array_like, shape (n, 9)
+        The boxes.
+    evidence : sequence of n mappings, optional
+        Values of a box by the names of `evidence_of` and ``num_points``; others are ignored. Of a
+        value that is missing or None the default is taken: score NaN, status `INPUT_STATUS`,
+        0 points, unit matrices, no reason.
 
     """
     n = len(track_ids)
-    missing = [None] * n
-    numbers = np.zeros(n, np.int64) if num_points is None else np.asarray(num_points, np.int64)
-    matrices = np.zeros((n, 6, 6))  # (n, row, column)
-    for i, covariance in enumerate(covariances or missing):
-        matrices[i] = np.eye(6) if covariance is None else np.reshape(covariance, (6, 6))
-    extents = np.zeros((n, 3, 3))  # (n, row, column)
-    for i, covariance in enumerate(extent_covariances or missing):
-        extents[i] = np.eye(3) if covariance is None else np.reshape(covariance, (3, 3))
+    items = evidence or [{}] * n
+    scores = [item.get('score') for item in items]
+    extents = [item.get('extent_covariance') for item in items]
     return RefinedBoxes(
         BoxArray(
             stamp_ns,
             frame_id,
             tuple(track_ids),
             tuple(class_names),
-            np.array(missing if scores is None else scores, np.float64),
+            np.array(scores, np.float64),
             np.asarray(boxes, np.float64).reshape(n, 9),
         ),
-        tuple(item or INPUT_STATUS for item in status or missing),
-        tuple(item or '' for item in reasons or missing),
-        numbers,
-        matrices,
-        extent_covariances=extents,
+        tuple(str(item.get('status') or INPUT_STATUS) for item in items),
+        tuple(str(item.get('reason') or '') for item in items),
+        np.array([item.get('num_points') or 0 for item in items], np.int64),
+        np.reshape([_covariance(item.get('covariance')) for item in items], (n, 6, 6)),
+        extent_covariances=np.reshape(
+            [np.eye(3) if extent is None else np.reshape(extent, (3, 3)) for extent in extents],
+            (n, 3, 3),
+        ),
     )
+
+
+def _covariance(values: ArrayLike | None) -> Floats:
+    """Return the matrix (6, 6) of its rows or of its upper triangle; the unit matrix for None."""
+    if values is None:
+        return np.eye(6)
+    if np.size(values) == 36:
+        return np.reshape(np.asarray(values, np.float64), (6, 6))
+    matrix = np.zeros((6, 6))
+    matrix[UPPER_TRIANGLE] = values
+    return matrix + np.triu(matrix, 1).T
 
 
 def boxes_from_quaternions(
@@ -84,18 +101,18 @@ EVIDENCE_COLUMNS = {
     'covariance': 'double[]',
     'extent_covariance': 'double[]',
 }
-"""Columns of `evidence_values` in tables of Arrow, which the kits of the data sets ignore."""
+"""Columns of `evidence_of` in tables of Arrow, which the kits of the data sets ignore."""
 
 
-def evidence_values(refined: RefinedBoxes, row: int) -> tuple[Any, ...]:
-    """Return the values of `EVIDENCE_COLUMNS` for a box."""
-    return (
-        refined.status[row],
-        refined.reasons[row],
-        finite_or_none(refined.boxes.scores[row]),
-        refined.covariances[row].ravel().tolist(),
-        refined.extent_covariances[row].ravel().tolist(),
-    )
+def evidence_of(refined: RefinedBoxes, row: int) -> dict[str, Any]:
+    """Return the values of `EVIDENCE_COLUMNS` of a box."""
+    return {
+        'status': refined.status[row],
+        'reason': refined.reasons[row],
+        'score': finite_or_none(refined.boxes.scores[row]),
+        'covariance': refined.covariances[row].ravel().tolist(),
+        'extent_covariance': refined.extent_covariances[row].ravel().tolist(),
+    }
 
 
 def finite_or_none(value: float) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from importlib import import_module
+from importlib.metadata import entry_points
 from itertools import chain
 from pathlib import Path
 from typing import cast
@@ -23,7 +24,7 @@ from boxreg_ros.labels.protocol import (
 )
 from boxreg_ros.labels.segments import segments_of
 
-FORMATS = {
+BUILT_IN = {
     'csv': 'boxreg_ros.labels.csv',
     'parquet': 'boxreg_ros.labels.parquet',
     'openlabel': 'boxreg_ros.labels.openlabel',
@@ -38,6 +39,13 @@ FORMATS = {
     'supervisely': 'boxreg_ros.labels.supervisely',
     'xtreme1': 'boxreg_ros.labels.xtreme1',
     'mcap': 'boxreg_ros.labels.mcap',
+    'semantickitti': 'boxreg_ros.labels.semantickitti',
+    'lidarseg': 'boxreg_ros.labels.lidarseg',
+}
+GROUP = 'boxreg_ros.labels'
+"""Entry points of this group are formats of other packages: ``name = package.module``."""
+FORMATS = BUILT_IN | {
+    point.name: point.value for point in entry_points(group=GROUP) if point.name not in BUILT_IN
 }
 """Name on the command line -> module that implements `protocol.FormatModule`."""
 IN_RESULT_FOLDER = ('csv', 'mcap')
@@ -56,7 +64,7 @@ def module_of(name: str) -> FormatModule:
         If the format does not exist, or needs a package that is not installed.
 
     """
-    module = _imported(name)
+    module = import_format(name)
     for package in module.FORMAT.packages:
         try:
             import_module(package.replace('-', '_'))
@@ -69,7 +77,12 @@ def module_of(name: str) -> FormatModule:
 
 def can_read(name: str) -> bool:
     """Return whether label files of this format can be read back."""
-    return hasattr(_imported(name), 'read')
+    return hasattr(import_format(name), 'read')
+
+
+def labels_points(name: str) -> bool:
+    """Return whether a format labels points and not boxes."""
+    return module_of(name).FORMAT.has_points
 
 
 def check_options(names: Sequence[str], options: Options) -> None:
@@ -80,13 +93,19 @@ def check_options(names: Sequence[str], options: Options) -> None:
     ------
     ConfigError
         If an option is not used; the message lists the formats that use it. If the camera that a
-        format needs is not given or cannot be read. Also as `module_of`.
+        format needs is not given or cannot be read, or a format labels points. Also as
+        `module_of`.
 
     """
+    for name in filter(labels_points, names):
+        raise ConfigError(
+            f'format {name!r} labels the points of clouds: expected formats of boxes; write it '
+            f'by boxreg relabel --label-points'
+        )
     used = {option for name in names for option in module_of(name).FORMAT.options}
     for option in COMMAND_LINE_OPTIONS:
         if getattr(options, option) and option not in used:
-            able = [name for name in FORMATS if option in _imported(name).FORMAT.options]
+            able = [name for name in FORMATS if option in import_format(name).FORMAT.options]
             raise ConfigError(
                 f'--{option.replace("_", "-")}: expected a format that uses it '
                 f'({", ".join(able)}), got {", ".join(names)}; add one, or leave it out'
@@ -161,13 +180,27 @@ def frames_of(name: str, path: Path, scene: SceneFrames | None = None) -> Iterat
     return chain.from_iterable(read(_folder_of(name, segment)) for segment in segments)
 
 
-def _imported(name: str) -> FormatModule:
-    """Return the module of a format, whether or not the packages it needs are installed."""
+def import_format(name: str) -> FormatModule:
+    """
+    Return the module of a format, whether or not the packages it needs are installed.
+
+    Raises
+    ------
+    ConfigError
+        If the format does not exist, or the package that has it cannot be imported.
+
+    """
     if name not in FORMATS:
         similar = get_close_matches(name, FORMATS, 1)
         meant = f'; did you mean {similar[0]}?' if similar else ''
         raise ConfigError(f'format {name!r}: expected one of {", ".join(FORMATS)}{meant}')
-    return cast(FormatModule, import_module(FORMATS[name]))
+    try:
+        return cast(FormatModule, import_module(FORMATS[name]))
+    except (ImportError, SyntaxError) as error:
+        raise ConfigError(
+            f'format {name!r} of another package: expected a module {FORMATS[name]}, got '
+            f'{type(error).__name__}: {error}; update or uninstall that package'
+        ) from None
 
 
 def _folder_of(name: str, out: Path) -> Path:

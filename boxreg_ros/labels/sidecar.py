@@ -9,46 +9,18 @@ Three files: ``timestamps.txt`` with one stamp per frame [ns]; ``poses.txt`` wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime, UTC
 from pathlib import Path
 
 from boxreg_ros.errors import RecordingError
-from boxreg_ros.labels.files import frame_names, read_provenance, write_provenance
-from boxreg_ros.labels.protocol import LabelFrame, Provenance
+from boxreg_ros.labels.files import frame_names, read_provenance
+from boxreg_ros.labels.protocol import LabelFrame
 from boxreg_ros.structures import Floats, RefinedBoxes
 import numpy as np
 
 STAMPS_FILE = 'timestamps.txt'
 POSES_FILE = 'poses.txt'
-
-
-class SidecarWriter:
-    """Write the three files, frame by frame."""
-
-    def __init__(self, folder: Path, provenance: Provenance) -> None:
-        self._folder = folder
-        self._stamps = (folder / STAMPS_FILE).open('w', encoding='utf-8')
-        self._poses = (folder / POSES_FILE).open('w', encoding='utf-8')
-        self._content = asdict(provenance)
-
-    def add(self, frame: LabelFrame) -> None:
-        """Add the next frame."""
-        T = frame.T_fixed_sensor
-        rows = np.full((3, 4), np.nan) if T is None else T[:3]
-        self._stamps.write(f'{frame.refined.boxes.stamp_ns}\n')
-        self._poses.write(' '.join(map(repr, rows.ravel().tolist())) + '\n')
-        self._content['fixed_frame'] = frame.fixed_frame
-        self._content['sensor_frame'] = frame.sensor_frame
-
-    def close(self, tracks: Mapping[str, str] | None = None) -> None:
-        """Complete the files; `tracks` are track ids by the numbers in the labels."""
-        self._stamps.close()
-        self._poses.close()
-        if tracks:
-            self._content['tracks'] = tracks
-        write_provenance(self._folder, self._content)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,42 +7,34 @@ Supervisely: a project of point cloud episodes.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
-from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.cuboids import (
-    box_from_cuboid,
+    box_from_xyz,
     Cuboid,
     cuboid_format,
-    cuboids_of,
+    CuboidWriter,
     EVIDENCE_KEY,
-    FrameNames,
-    from_xyz,
     read_frames,
     ReadCuboid,
     single_part,
-    write_points,
 )
-from boxreg_ros.labels.files import from_json, to_json
+from boxreg_ros.labels.files import following, from_json, JsonList, to_json, write_json
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
-from boxreg_ros.labels.sidecar import SidecarWriter
 
 FORMAT = cuboid_format(
     name='supervisely',
     title='Supervisely episodes',
     files='meta.json, episode/annotation.json, episode/pointcloud/STAMP.pcd',
 )
-EPISODE_FOLDER = 'episode'
 CUBOID = 'cuboid_3d'
 TAGS = ('track_id', 'status')
 
 
-class Writer:
+class Writer(CuboidWriter):
     """
     Write one record per frame, and the objects with their tags when closed.
 
@@ -52,48 +44,35 @@ class Writer:
 
     """
 
+    folders = ('episode/pointcloud',)
+    cloud_file = 'episode/pointcloud/{name}.pcd'
+
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self.dropped: Counter[str] = Counter()
-        self._folder = folder
-        self._episode = folder / EPISODE_FOLDER
-        self._with_points = options.with_points
-        self._names = FrameNames()
-        self._sidecar = SidecarWriter(folder, provenance)
-        (self._episode / 'pointcloud').mkdir(parents=True)
-        self._file = (self._episode / 'annotation.json').open('w', encoding='utf-8')
-        head = {'description': to_json(asdict(provenance)), 'key': _key('episode'), 'tags': []}
-        self._file.write(to_json(head)[:-1] + ',\n"frames": [')
-        self._frames: list[str] = []
+        super().__init__(folder, provenance, options)
+        self._episode = folder / 'episode'
+        head = {'description': to_json(self.about), 'key': _key('episode'), 'tags': []}
+        self._records = JsonList(self._episode / 'annotation.json', head, 'frames')
+        self._clouds: list[str] = []
         self._objects: dict[str, dict[str, Any]] = {}
 
-    def write(self, frame: LabelFrame) -> None:
-        """Add a frame."""
-        number = len(self._frames)
-        name = self._names.of(frame.refined.boxes.stamp_ns)
+    def add(self, frame: LabelFrame) -> None:
+        """Add the record of a frame."""
         figures = []
-        for cuboid in cuboids_of(frame, self.dropped):
-            object_key = self._add_to_object(cuboid, number)
-            figures.append(_figure(cuboid, number, object_key))
-        content = to_json({'index': number, 'figures': figures})
-        separator = ',' if number else ''
-        self._file.write(f'{separator}\n{content}')
-        self._frames.append(f'{name}.pcd')
-        if self._with_points:
-            write_points(frame, self._episode / 'pointcloud' / f'{name}.pcd')
-        self._sidecar.add(frame)
+        for cuboid in self.cuboids(frame):
+            object_key = self._add_to_object(cuboid, self.number)
+            figures.append(_figure(cuboid, self.number, object_key))
+        self._records.append({'index': self.number, 'figures': figures})
+        self._clouds.append(f'{self.name}.pcd')
 
-    def close(self) -> None:
+    def finish(self) -> None:
         """Write the objects and the files of the project."""
-        objects = to_json(list(self._objects.values()))
-        count = len(self._frames)
-        self._file.write(f'\n],\n"objects": {objects},\n"framesCount": {count}}}\n')
-        self._file.close()
-        classes = dict.fromkeys(item['classTitle'] for item in self._objects.values())
-        _dump(self._folder / 'meta.json', _meta(classes))
+        objects = list(self._objects.values())
+        self._records.close({'objects': objects, 'framesCount': len(self._clouds)})
+        classes = dict.fromkeys(item['classTitle'] for item in objects)
+        write_json(self.folder / 'meta.json', _meta(classes))
         ids: dict[str, Any] = {kind: {} for kind in ('tags', 'objects', 'figures', 'videos')}
-        _dump(self._folder / 'key_id_map.json', ids)
-        _dump(self._episode / 'frame_pointcloud_map.json', dict(enumerate(self._frames)))
-        self._sidecar.close()
+        write_json(self.folder / 'key_id_map.json', ids)
+        write_json(self._episode / 'frame_pointcloud_map.json', dict(enumerate(self._clouds)))
 
     def _add_to_object(self, cuboid: Cuboid, number: int) -> str:
         """Return the key of the object of a cuboid; add its status in frame `number`."""
@@ -127,18 +106,12 @@ def read(path: Path) -> Iterator[LabelFrame]:
 
     ``timestamps.txt`` in the episode or in the project has one stamp [ns] per frame.
 
-    Raises
-    ------
-    RecordingError
-        If a file is missing or does not contain cuboids of Supervisely, or there are several
-        episodes.
-
     """
     episode, folder = single_part(path, 'episode', ['annotation.json'])
     file = episode / 'annotation.json'
     content = from_json(file)
     clouds = from_json(file.with_name('frame_pointcloud_map.json'))
-    try:
+    with following(file, 'cuboids of Supervisely'):
         objects = {item['key']: item for item in content['objects']}
         figures = {str(frame['index']): frame['figures'] for frame in content['frames']}
         cuboids = {
@@ -149,8 +122,6 @@ def read(path: Path) -> Iterator[LabelFrame]:
             ]
             for index, cloud in sorted(clouds.items(), key=lambda item: int(item[0]))
         }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RecordingError(f'{file}: expected cuboids of Supervisely: {error!r}') from None
     yield from read_frames(folder, list(cuboids), cuboids.__getitem__)
 
 
@@ -158,11 +129,7 @@ def _cuboid(figure: dict[str, Any], parent: dict[str, Any]) -> ReadCuboid:
     """Return the cuboid of a figure; `parent` is its object."""
     tags = {tag['name']: tag.get('value') for tag in parent.get('tags', ())}
     geometry = figure['geometry']
-    box = box_from_cuboid(
-        from_xyz(geometry['position']),
-        from_xyz(geometry['rotation']),
-        from_xyz(geometry['dimensions']),
-    )
+    box = box_from_xyz(geometry['position'], geometry['rotation'], geometry['dimensions'])
     track_id = str(tags.get('track_id', parent['key']))
     return ReadCuboid(track_id, parent['classTitle'], box, figure.get(EVIDENCE_KEY, {}))
 
@@ -203,7 +170,3 @@ def _key(text: str) -> str:
 def _colour(text: str) -> str:
     """Return a colour that is the same in every run, as hexadecimal RGB."""
     return '#' + _key(text)[:6].upper()
-
-
-def _dump(path: Path, content: Any) -> None:
-    path.write_text(to_json(content) + '\n', encoding='utf-8')

@@ -19,5 +19,5 @@ class Writer(nuscenes.Writer):
 
     version = 'annotation'
     channel = 'LIDAR_CONCAT'
-    clouds = 'data/LIDAR_CONCAT'
+    cloud_file = 'data/LIDAR_CONCAT/{number:05d}.pcd.bin'
     date_key = 'data_captured'

@@ -10,9 +10,8 @@ they read the extents along x, y and z from ``h``, ``w`` and ``l`` and the posit
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 import re
 import shutil
@@ -21,9 +20,9 @@ from typing import cast, NamedTuple
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape, unescape
 
-from boxreg_ros.errors import RecordingError, unreadable
-from boxreg_ros.labels.clouds import write_cloud
-from boxreg_ros.labels.files import to_json
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.labels.files import following, to_json
+from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import (
     Format,
     LabelFrame,
@@ -32,7 +31,7 @@ from boxreg_ros.labels.protocol import (
     SceneFrames,
 )
 from boxreg_ros.labels.records import refined_boxes
-from boxreg_ros.labels.sidecar import read_sidecar, SidecarWriter
+from boxreg_ros.labels.sidecar import read_sidecar
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     ADDED,
@@ -103,27 +102,23 @@ class _Tracklet:
     states: list[int] = field(default_factory=list)
 
 
-class Writer:
+class Writer(FolderWriter):
     """Hold the tracklets of the current frame, and write each when its track is interrupted."""
 
+    cloud_file = 'velodyne_points/data/{number:010d}.bin'
+    has_sidecar = True
+
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self.dropped: Counter[str] = Counter()
-        self._path = folder / FILE
-        self._clouds = folder / 'velodyne_points' / 'data'
-        if options.with_points:
-            self._clouds.mkdir(parents=True)
+        super().__init__(folder, provenance, options)
         self._is_swapped = options.swap_axes
-        self._provenance = asdict(provenance)
-        if self._is_swapped:
-            self._provenance['axes'] = SWAPPED_COMMENT
+        origin = self.about | ({'axes': SWAPPED_COMMENT} if self._is_swapped else {})
+        self._origin = _comment(to_json(origin))
         # The file begins with the number of tracklets: they are collected in another file first.
         self._body = TemporaryFile('w+', encoding='utf-8', dir=folder)  # noqa: SIM115
-        self._sidecar = SidecarWriter(folder, provenance)
         self._open: dict[tuple[str, str], _Tracklet] = {}
         self._count = 0
-        self._frames = 0
 
-    def write(self, frame: LabelFrame) -> None:
+    def add(self, frame: LabelFrame) -> None:
         """Add a pose to the tracklets of this frame, and write those that have ended."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         array = frame.refined.boxes
@@ -131,7 +126,7 @@ class Writer:
         for row, box in zip(rows, boxes, strict=True):
             track_id = array.track_ids[row]
             class_name = array.class_names[row]
-            tracklet = _Tracklet(track_id, class_name, self._frames)
+            tracklet = _Tracklet(track_id, class_name, self.number)
             key = (track_id, class_name)
             if not track_id or key in continued:  # no identity: a tracklet of one frame
                 key = (f'\0{row}', '')
@@ -144,24 +139,17 @@ class Writer:
         for tracklet in self._open.values():
             self._write(tracklet)
         self._open = continued
-        if frame.sweep is not None:
-            path = self._clouds / f'{self._frames:010d}.bin'
-            write_cloud(path, frame.sweep.points, frame.intensities)
-        self._sidecar.add(frame)
-        self._frames += 1
 
-    def close(self) -> None:
+    def finish(self) -> None:
         """Write the open tracklets, and assemble the file."""
         for tracklet in self._open.values():
             self._write(tracklet)
         self._body.seek(0)
-        with self._path.open('w', encoding='utf-8') as file:
-            origin = _comment(to_json(self._provenance))
-            file.write(XML_HEAD.format(origin=origin, count=self._count))
+        with (self.folder / FILE).open('w', encoding='utf-8') as file:
+            file.write(XML_HEAD.format(origin=self._origin, count=self._count))
             shutil.copyfileobj(self._body, file)
             file.write(TAIL)
         self._body.close()
-        self._sidecar.close()
 
     def _write(self, tracklet: _Tracklet) -> None:
         boxes = np.array(tracklet.boxes)
@@ -259,16 +247,15 @@ def _refined(stamp_ns: int, frame_id: str, boxes: list[_ReadBox]) -> RefinedBoxe
 
 def _read_boxes(path: Path) -> dict[int, list[_ReadBox]]:
     """Return the boxes of a tracklet file by the index of their frame."""
-    try:
-        builder = ElementTree.TreeBuilder(insert_comments=True)
-        tree = ElementTree.parse(path, ElementTree.XMLParser(target=builder))
+    with following(path, 'tracklets of KITTI'):
         text = path.read_text(encoding='utf-8')
+        builder = ElementTree.TreeBuilder(insert_comments=True)
+        try:
+            tree = ElementTree.parse(path, ElementTree.XMLParser(target=builder))
+        except ElementTree.ParseError as error:
+            raise ValueError(str(error)) from None
         is_swapped = SWAPPED_COMMENT in text[: text.find('<boost_serialization')]
         return _boxes_by_frame(tree.getroot(), is_swapped)
-    except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
-    except (ElementTree.ParseError, ValueError) as error:
-        raise RecordingError(f'{path}: expected tracklets of KITTI: {error}') from None
 
 
 def _boxes_by_frame(root: ElementTree.Element, is_swapped: bool) -> dict[int, list[_ReadBox]]:

@@ -8,9 +8,7 @@ without a column in the tables are in additional columns named ``boxreg``.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
 from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
@@ -18,9 +16,10 @@ from pathlib import Path
 from boxreg_ros.config import Config, words_of
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.labels.arrow import read_rows, Table
-from boxreg_ros.labels.files import frame_names, require_single, to_json, write_provenance
+from boxreg_ros.labels.files import frame_names, require_single, to_json
+from boxreg_ros.labels.folder import FolderWriter
 from boxreg_ros.labels.protocol import absolute, Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_values, refined_boxes
+from boxreg_ros.labels.records import EVIDENCE_COLUMNS, evidence_of, refined_boxes
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import HEIGHT, LENGTH, X, YAW, Z
 import numpy as np
@@ -73,25 +72,23 @@ TYPE_NAMES = ('', 'vehicle', 'pedestrian', 'sign', 'cyclist')
 """Names of the values of the type column; '' is unknown."""
 
 
-class Writer:
+class Writer(FolderWriter):
     """Write boxes and poses in batches."""
 
+    folders = ('lidar_box', 'vehicle_pose')
+
     def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
-        self.dropped: Counter[str] = Counter()
-        self._folder = folder
-        self._provenance = asdict(provenance)
+        super().__init__(folder, provenance, options)
         self._segment = 'boxreg'
         if provenance.recordings:
             self._segment = Path(provenance.recordings[0]).stem
-        for name in ('lidar_box', 'vehicle_pose'):
-            (folder / name).mkdir()
         file = f'{self._segment}.parquet'
-        self._boxes = Table(folder / 'lidar_box' / file, BOX_COLUMNS, to_json(self._provenance))
+        self._boxes = Table(folder / 'lidar_box' / file, BOX_COLUMNS, to_json(self.about))
         self._poses = Table(
             folder / 'vehicle_pose' / file, KEY_COLUMNS | {VEHICLE_POSE: 'double[16]'}
         )
 
-    def write(self, frame: LabelFrame) -> None:
+    def add(self, frame: LabelFrame) -> None:
         """Add a row per box, and the pose."""
         rows, boxes = frame.boxes_in('sensor', self.dropped)
         refined = frame.refined
@@ -109,18 +106,15 @@ class Writer:
                 *[None] * len(UNUSED_COLUMNS),
                 array.stamp_ns,
                 array.class_names[row],
-                *evidence_values(refined, row),
+                *evidence_of(refined, row).values(),
             )
         if frame.T_fixed_sensor is not None:
             self._poses.add(*key, frame.T_fixed_sensor.ravel().tolist())
-        self._provenance['fixed_frame'] = frame.fixed_frame
-        self._provenance['sensor_frame'] = frame.sensor_frame
 
-    def close(self) -> None:
-        """Complete the files."""
+    def finish(self) -> None:
+        """Complete the tables."""
         self._boxes.close()
         self._poses.close()
-        write_provenance(self._folder, self._provenance)
 
 
 def read(path: Path) -> Iterator[LabelFrame]:
@@ -157,12 +151,11 @@ def read(path: Path) -> Iterator[LabelFrame]:
             [item[OBJECT] for item in items],
             [item.get('boxreg.class_name') or TYPE_NAMES[item[TYPE]] for item in items],
             boxes,
-            [item.get('boxreg.score') for item in items],
-            [item.get('boxreg.status') for item in items],
-            [item[NUM_POINTS] for item in items],
-            [item.get('boxreg.covariance') for item in items],
-            [item.get('boxreg.reason') for item in items],
-            [item.get('boxreg.extent_covariance') for item in items],
+            [
+                {name: item.get(f'boxreg.{name}') for name in EVIDENCE_COLUMNS}
+                | {'num_points': item[NUM_POINTS]}
+                for item in items
+            ],
         )
         T = T_world_vehicle.get(items[0][MICROSECONDS])
         yield LabelFrame(refined, fixed_frame, sensor_frame, T)

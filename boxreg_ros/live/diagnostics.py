@@ -46,6 +46,7 @@ class Health:
         self._logged: Counter[str] = Counter()
         self._logged_at = {WAITING: time.monotonic()}
         self._latencies: list[float] = []
+        self._static: list[tuple[float, float]] = []
         self._since = time.monotonic()
 
     def count(self, name: str, number: int = 1) -> None:
@@ -62,6 +63,11 @@ class Health:
         """Record the time from the arrival of boxes to the publication of the early estimate."""
         with self._lock:
             self._latencies.append(seconds)
+
+    def add_static(self, seconds: float, cpu: float) -> None:
+        """Record latency and CPU time of a cloud without moving objects [s]."""
+        with self._lock:
+            self._static.append((seconds, cpu))
 
     def report(self, reason: str, text: str, number: int = 1) -> None:
         """Count a reason and log the text, at most once per `LOG_PERIOD` and reason."""
@@ -128,10 +134,14 @@ class Health:
             self._reported = counts
             latencies = sorted(self._latencies)
             self._latencies = []
+            static = self._static
+            self._static = []
             period = max(now - self._since, 1e-3)
             self._since = now
         values = {f'{rate} [Hz]': f'{recent[rate] / period:.1f}' for rate in RATES}
-        values |= _latency_values(latencies)
+        values |= _latency_values('latency', latencies)
+        values |= _latency_values('static_points latency', sorted(wait for wait, _ in static))
+        values |= _latency_values('static_points CPU', sorted(cpu for _, cpu in static))
         values |= {key: str(value) for key, value in facts.items()}
         values |= {key: str(number) for key, number in sorted(counts.items())}
         level, message = _level_and_message(recent)
@@ -161,13 +171,13 @@ def _awaited(counts: Mapping[str, int], fixed_frame: str) -> str:
     return f'boxes that can be refined; so far most often {why}: {REASONS[why].meaning}'
 
 
-def _latency_values(latencies: list[float]) -> dict[str, str]:
-    """Return quantiles of sorted latencies; nothing if there are none."""
+def _latency_values(what: str, latencies: list[float]) -> dict[str, str]:
+    """Return quantiles of sorted times [s]; nothing if there are none."""
     values = {}
     for name, share in LATENCY_QUANTILES:
         if latencies:
             row = min(int(share * len(latencies)), len(latencies) - 1)
-            values[f'latency {name} [ms]'] = f'{1e3 * latencies[row]:.1f}'
+            values[f'{what} {name} [ms]'] = f'{1e3 * latencies[row]:.1f}'
     return values
 
 

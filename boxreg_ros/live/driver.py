@@ -23,6 +23,7 @@ from boxreg_ros.io.session import (
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.label_tap import CloudPart, LabelTap
+from boxreg_ros.live.static_points import StaticPoints
 from boxreg_ros.structures import BoxArray, COASTED, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -148,6 +149,9 @@ class LiveRegistrar:
         Topics of the clouds and frames of the LiDARs.
     budget : TickBudget, optional
         Limits the windows that are solved for a box array. Default: all are solved.
+    static_patience : float, optional
+        How long a cloud without moving objects waits for its boxes [s]. Default: no such clouds
+        are made.
 
     Attributes
     ----------
@@ -159,6 +163,8 @@ class LiveRegistrar:
         As above; may change.
     tap : LabelTap
         Records labels, once it has a recorder.
+    static_points : StaticPoints or None
+        Makes clouds without moving objects, if they are asked for.
 
     """
 
@@ -172,6 +178,7 @@ class LiveRegistrar:
         convention: Convention = STANDARD,
         lidars: Lidars = SINGLE_LIDAR,
         budget: TickBudget | None = None,
+        static_patience: float | None = None,
     ) -> None:
         self.output_frame = output_frame.lstrip('/')
         self.transform_timeout = transform_timeout
@@ -184,6 +191,9 @@ class LiveRegistrar:
         self._registrar = BoxRegistrar(config)
         if budget is not None:
             self._registrar = BoxRegistrar(config, budget.submit, budget.windows)
+        self.static_points: StaticPoints | None = None
+        if static_patience is not None:
+            self.static_points = StaticPoints(static_patience, self._registrar)
         self._jumps = JumpConfirmation[ReceivedMessage]()
         self._held: deque[_Pending | _Passing] = deque()  # in order of arrival; first: pending
         self._detections: dict[str, _Detection] = {}  # by track id, while tracks may coast
@@ -317,7 +327,7 @@ class LiveRegistrar:
                 return []
             assert isinstance(moved, Sweep)
             assert admitted.T_fixed_item is not None
-            part = CloudPart(item.message, content, admitted.T_fixed_item)
+            part = CloudPart(item.message, content, admitted.T_fixed_item, item.received)
             return self._register(self._session.merged(moved, part))
         if moved is not None:
             assert isinstance(moved, BoxArray) and admitted.T_fixed_item is not None
@@ -336,7 +346,10 @@ class LiveRegistrar:
         """Register sweeps; return the messages that are ready to be published."""
         ready: list[Outgoing] = []
         for sweep, parts in complete:
-            self.tap.add_cloud(sweep, [part for part in parts if part is not None])
+            clouds = [part for part in parts if part is not None]
+            self.tap.add_cloud(sweep, clouds)
+            if self.static_points is not None:
+                self.static_points.add_cloud(sweep, clouds)
             ready += self._outgoing(hand_to_registrar(self._registrar, sweep, restarts=False))
         return ready
 
@@ -398,6 +411,8 @@ class LiveRegistrar:
         """Forget everything but the transforms; return everything that is held."""
         ready = self.flush()
         self._detections = {}
+        if self.static_points is not None:
+            self.static_points.reset()
         self._registrar.reset()
         self._session.restart()
         return ready
@@ -417,6 +432,8 @@ class LiveRegistrar:
             Messages made before the error, and all that are held, passed through.
 
         """
+        if self.static_points is not None:
+            self.static_points.reset()
         self._registrar.reset()
         self._session.restart()
         self._detections = {}
@@ -522,6 +539,8 @@ class LiveRegistrar:
             pending = refined.boxes.ticket
             assert isinstance(pending, _Pending)
             self._made.append(self._message_of(refined, pending))
+            if self.static_points is not None and not pending.is_early_out:
+                self.static_points.add_boxes(refined)
             pending.is_early_out = True
             self.tap.take(refined)
             if refined.is_final:

@@ -18,11 +18,17 @@ import numpy as np
 
 
 class CloudPart(NamedTuple):
-    """A cloud of one LiDAR: its message, and its sweep in its own frame with the pose of that."""
+    """
+    A cloud of one LiDAR.
+
+    Its message, its sweep in its own frame with the pose of that, and when it arrived [s].
+
+    """
 
     message: Any
     sweep: Sweep
     T_fixed_sweep: Floats
+    received: float = 0.0
 
 
 class LabelTap:
@@ -65,7 +71,7 @@ class LabelTap:
             return
         sweep, T_fixed_sweep = whole, np.eye(4)
         if len(parts) == 1:  # not moved, files get the numbers of the message
-            _, sweep, T_fixed_sweep = parts[0]
+            sweep, T_fixed_sweep = parts[0].sweep, parts[0].T_fixed_sweep
             sweep = replace(sweep, times=whole.times)
         self._cloud_stamps.append(sweep.stamp_ns)
         needed_from_ns = min(self._cloud_stamps)

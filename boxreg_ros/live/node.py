@@ -24,7 +24,7 @@ from boxreg_ros.live.topics import import_message, NodeTopics
 from boxreg_ros.live.worker import Worker
 from diagnostic_msgs.msg import DiagnosticArray
 from msg_adapters import adapter_for, canonical, cdr
-from msg_adapters.clouds import header_of
+from msg_adapters.clouds import header_of, POINTS_TYPE
 from msg_adapters.concatenation import INFO_TYPE
 from msg_adapters.serialized import serialized_adapter_for
 from nav_msgs.msg import Odometry
@@ -106,6 +106,7 @@ class BoxregNode(Node):
         self._live = LiveRegistrar(
             config, options.fixed_frame, options.output_frame, options.transform_timeout,
             self._health.report, options.convention, options.lidars, self._budget,
+            options.static_points_wait if options.static_points else None,
         )  # fmt: skip
         gc.collect()
         gc.freeze()  # a collection of imported objects would take 50 ms, several times a minute
@@ -135,6 +136,8 @@ class BoxregNode(Node):
             self._live, self._inbox, self._health, self.get_logger(), self._budget,
             options.backlog, self._markers,
         )  # fmt: skip
+        if options.static_points:
+            self._open_static_points(options.points_type)
         self.recording.offer_services()
         self._opened.callback(self.recording.withdraw_services)
         if options.record_to:
@@ -173,6 +176,16 @@ class BoxregNode(Node):
         self.worker.stop()
 
     # ------------------------------------------------------------ topics
+
+    def _open_static_points(self, points_type: str) -> None:
+        """Publish clouds without moving objects."""
+        if canonical(points_type) != POINTS_TYPE:
+            raise ConfigError(
+                f'static_points: expected clouds of type {POINTS_TYPE}, whose layout is kept, got '
+                f'{points_type}; decompress them first, or leave static_points out'
+            )
+        depth = 2 * self._inbox.capacity['points']
+        self.worker.open_static_points(self._topics.publish(POINTS_TYPE, 'static_points', depth))
 
     def _subscribe_to_points(self, points_type: str, lidars: Lidars) -> None:
         """Subscribe to the clouds of all LiDARs, and to the info on concatenated ones."""

@@ -82,6 +82,16 @@ NODE_SETTINGS = (
         's', 0.0, 3600.0,
     ),
     Setting(
+        'static_points', False,
+        'also publish static_points: each cloud without the points of moving objects, by the '
+        'early boxes',
+    ),
+    Setting(
+        'static_points_wait', 0.2,
+        'maximum wait of a cloud of static_points for its boxes, after which it passes unchanged',
+        's', 0.0, 60.0,
+    ),
+    Setting(
         'config_file', 'boxreg_node.yaml', 'file that ~/save_config writes all parameters to'
     ),
     Setting(
@@ -132,6 +142,8 @@ class NodeOptions(NamedTuple):
     transform_timeout: float
     deadline: float
     backlog: float
+    static_points: bool
+    static_points_wait: float
     config_file: str
     record_to: str
     record_formats: tuple[str, ...]

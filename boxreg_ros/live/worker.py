@@ -113,6 +113,7 @@ class Worker:
         self._fully_collected_at = time.monotonic()
         self._board = MarkerBoard()
         self._markers = markers
+        self._static: Publisher | None = None
         self._early: Publisher | None = None
         self._final: Publisher | None = None
         self._stopping = Event()
@@ -124,6 +125,10 @@ class Worker:
         self._live.adapter = adapter
         self._early = early
         self._final = final
+
+    def open_static_points(self, publisher: Publisher) -> None:
+        """Set the publisher of clouds without moving objects."""
+        self._static = publisher
 
     def facts(self) -> dict[str, object]:
         """Return the facts about the boxes for /diagnostics, beside the counters."""
@@ -143,6 +148,7 @@ class Worker:
                 break
             self._take_events()
             self._release_boxes_without_cloud(item)
+            self._publish_static()
             if item is None:
                 item = self._next()
             self._live.cloud_frame = self.cloud_frame  # may arrive while boxes wait
@@ -245,8 +251,10 @@ class Worker:
             self._publish(self._guarded(self._live.flush))
         if self._board.is_showing and self._live.has_ceased(now):
             self._markers.publish(self._board.clear())
-        is_holding = self._live.is_holding
-        self._inbox.wake_up.wait(HELD_PERIOD if is_holding else IDLE_PERIOD)
+        period = HELD_PERIOD if self._live.is_holding else IDLE_PERIOD
+        if self._live.static_points is not None:
+            period = min(period, self._live.static_points.due(now))
+        self._inbox.wake_up.wait(period)
         self._waited = 0.0
 
     def _release_boxes_without_cloud(self, item: ReceivedMessage | None) -> None:
@@ -348,6 +356,18 @@ class Worker:
             else:
                 self._markers.publish(self._board.update(out.given, out.refined))
 
+    def _publish_static(self) -> None:
+        """Publish clouds without moving objects, and those that wait no longer for their boxes."""
+        if self._live.static_points is None or self._static is None:
+            return
+        for cloud in self._live.static_points.take(time.monotonic()):
+            self._static.publish(cloud.message)
+            self._health.count('static_published')
+            self._health.add_static(time.monotonic() - cloud.received, cloud.cpu)
+            if cloud.is_late:
+                reason = REASONS['static_unchanged']
+                self._health.report('static_unchanged', f'{reason.meaning}; {reason.remedy}')
+
     def _finish(self, item: ReceivedMessage | None) -> None:
         """Publish held boxes, and pass waiting messages through unsolved."""
         self._take_events()
@@ -363,6 +383,7 @@ class Worker:
                 self._publish(self._live.last(message.content, NO_TIME))
             message = self._inbox.take()
         self._live.tap.finish()
+        self._publish_static()
         self._markers.publish(self._board.clear())
         publishers = [p for p in (self._early, self._final, self._markers) if p is not None]
         for publisher in publishers:

@@ -1,38 +1,40 @@
-"""Command line options shared by the subcommands that read recordings."""
+"""The options of commands, from the dataclasses that state them, and back to these."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, Field, fields, is_dataclass, MISSING
+import json
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-from boxreg_ros.config import Config, YAML_ERRORS
-from msg_adapters.convention import Convention, FORWARD, REFERENCES, SIZE_ORDERS, STANDARD
-from msg_adapters.point_layout import AUTO, TIME_UNIT_CHOICES
+from boxreg_ros.config import COMPLETE_STEPS, Config, YAML_ERRORS
+from boxreg_ros.offline.request import Request
+from boxreg_ros.options import Option, option
 import yaml
-
-if TYPE_CHECKING:
-    from boxreg_ros.io.lidars import Lidars
 
 RECORDINGS = (
     'MCAP file, rosbag2 folder, .db3 file or ROS 1 bag, or a scene of a data set as in '
     'nuscenes:/data#scene-0061'
 )
 """Kinds of recordings, for the help of options."""
+TOPICS = ('lidars', 'boxes', 'odometry', 'pose_reference', 'size_order', 'forward_axis')
+"""Options of `Request` for the topics to read, and for the convention of the boxes."""
 
 
-def add_recording_arguments(
+def add_recordings(
     parser: argparse.ArgumentParser,
     several: str = 'several are merged by time',
     count: str = '+',
 ) -> None:
     """
-    Add the recordings, their topics and the settings.
+    Add the recordings.
 
     Parameters
     ----------
     parser : ArgumentParser
-        Gets the arguments.
+        Gets the argument.
     several : str
         Use of several recordings, for the help.
     count : str
@@ -43,117 +45,98 @@ def add_recording_arguments(
         'recordings', nargs=count, type=Path, metavar='RECORDING',
         help=f'{RECORDINGS}; {several}',
     )  # fmt: skip
-    add_topic_arguments(parser)
-    parser.add_argument('--config', type=Path, metavar='FILE', help='settings as a YAML file')
-    parser.add_argument(
-        '--set', action='append', default=[], type=key_value, metavar='KEY=VALUE',
-        help='one setting, as in solver.rounds=2; overrides --config; can be repeated',
-    )  # fmt: skip
 
 
-def add_lidar_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the topics of the clouds, and the frames and times of their LiDARs."""
-    parser.add_argument(
-        '--points', action='append', default=[], metavar='TOPIC',
-        help='topic of the point clouds (default: found by type); repeat it to merge the clouds '
-        'of several LiDARs',
-    )  # fmt: skip
-    parser.add_argument(
-        '--sensor-frame', action='append', default=[], metavar='FRAME', dest='sensor_frames',
-        help='frame of the LiDAR where clouds are in another one: once per --points, or once per '
-        'LiDAR of a single concatenated cloud',
-    )  # fmt: skip
-    parser.add_argument(
-        '--points-info', metavar='TOPIC', default='',
-        help='topic of ConcatenatedPointCloudInfo, which divides a concatenated cloud among its '
-        'LiDARs (default: that of the clouds with _info behind it, if there is one)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--time-unit', choices=TIME_UNIT_CHOICES, default=AUTO,
-        help='unit of the times of the points (default: that of the layout, else by magnitude)',
-    )  # fmt: skip
+def add_options(
+    parser: argparse.ArgumentParser, owner: type, *names: str, **defaults: Any
+) -> None:
+    """
+    Add the options that a dataclass states, those of dataclasses within it included.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Gets the options.
+    owner : type
+        The dataclass.
+    names : str
+        Fields to add; all by default. A dataclass within `owner` adds all its options.
+    defaults : object
+        Defaults that differ from those of the fields, by name.
+
+    """
+    for one, facts in _options(owner, names):
+        default = defaults.get(one.name, one.default)
+        shown = ','.join(default) if isinstance(default, tuple) else default
+        more: dict[str, Any] = {'dest': one.name, 'default': default}
+        more['help'] = facts.meaning.replace('%(default)s', str(shown))
+        if default is False:
+            parser.add_argument(_flag(one, facts), action='store_true', **more)
+            continue
+        if facts.is_repeated:
+            more |= {'action': 'append', 'default': []}
+        if facts.choices:
+            more['choices'] = facts.choices
+        parser.add_argument(
+            _flag(one, facts), type=facts.parse, metavar=facts.metavar, **more
+        )  # fmt: skip
 
 
-def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the topics to read, the LiDARs, and the convention of the boxes."""
-    add_lidar_arguments(parser)
-    parser.add_argument(
-        '--boxes', metavar='TOPIC', help='topic of the boxes (default: found by type)'
-    )
-    parser.add_argument(
-        '--odometry', metavar='TOPIC',
-        help='odometry topic, used where TF does not connect the clouds with a fixed frame '
-        '(default: found by type)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--pose-reference', metavar='POINT', default=STANDARD.pose_reference,
-        help=f'point of the box at its pose: {", ".join(REFERENCES)}, or X,Y,Z as fractions of '
-        f'length, width and height (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--size-order', choices=SIZE_ORDERS, default=STANDARD.size_order,
-        help='meaning of x, y and z of a size (default: %(default)s: length, width, height)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--forward-axis', choices=FORWARD, default=STANDARD.forward_axis,
-        help='axis of the box pose that points forward (default: %(default)s)',
-    )  # fmt: skip
+def values_of(args: argparse.Namespace, owner: type) -> dict[str, Any]:
+    """Return the values of the options of a dataclass, by the names of its fields."""
+    values: dict[str, Any] = {}
+    for one in fields(owner):
+        facts = one.metadata.get('option')
+        if facts is None:
+            inner = _inner(one)
+            if inner is not None and next(_options(inner), None):
+                values[one.name] = inner(**values_of(args, inner))
+        elif hasattr(args, one.name):
+            value = getattr(args, one.name)
+            values[one.name] = tuple(value) if facts.is_repeated else value
+    return values
 
 
-def add_label_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the label formats, for every subcommand that writes them."""
-    parser.add_argument(
-        '--camera', type=Path, metavar='FILE',
-        help='camera calibration, for formats with image coordinates',
-    )  # fmt: skip
-    parser.add_argument(
-        '--swap-axes', action='store_true',
-        help='write the extents in the order that Datumaro and CVAT display them',
-    )  # fmt: skip
-    parser.add_argument(
-        '--with-points', action='store_true',
-        help='also write the point clouds that a label format stores beside its labels',
-    )  # fmt: skip
-    parser.add_argument(
-        '--label-frame', metavar='FRAME',
-        help='sensor frame of the label files (default: frame of the clouds)',
-    )  # fmt: skip
-
-
-def lidars_from(args: argparse.Namespace) -> Lidars:
-    """Return the topics of the clouds and the frames of the LiDARs of the arguments."""
-    from boxreg_ros.io.lidars import Lidars  # imports numpy
-
-    frames = tuple(args.sensor_frames)
-    return Lidars(tuple(args.points), frames, args.points_info, args.time_unit)
-
-
-def lidar_options(args: argparse.Namespace) -> list[str]:
-    """Return the options that `lidars_from` reads, as they are written."""
-    words = [f'--points={topic}' for topic in args.points]
-    words += [f'--sensor-frame={frame}' for frame in args.sensor_frames]
-    if args.points_info:
-        words.append(f'--points-info={args.points_info}')
-    if args.time_unit != AUTO:
-        words.append(f'--time-unit={args.time_unit}')
+def words_of(args: argparse.Namespace, owner: type, *names: str) -> list[str]:
+    """Return the options of a dataclass as they are written, for the command of another run."""
+    words = []
+    for one, facts in _options(owner, names):
+        value = getattr(args, one.name)
+        flag = _flag(one, facts)
+        if facts.is_repeated:
+            words += [f'{flag}={facts.text(part)}' for part in value]
+        elif value is True:
+            words.append(flag)
+        elif value != one.default:
+            words.append(f'{flag}={facts.text(value)}')
     return words
 
 
-def convention_from(args: argparse.Namespace, associate: bool = False) -> Convention:
-    """Return the convention of the boxes that the arguments describe."""
-    return Convention(args.pose_reference, args.size_order, args.forward_axis, associate)
+def _options(owner: type, names: tuple[str, ...] = ()) -> Iterator[tuple[Field[Any], Option]]:
+    """Yield the fields of a dataclass that state an option, those of inner ones in their place."""
+    for one in fields(owner):
+        facts = one.metadata.get('option')
+        inner = _inner(one)
+        if facts is not None:
+            if not names or one.name in names:
+                yield one, facts
+        elif inner is not None:
+            yield from _options(inner, () if one.name in names else names)
 
 
-def key_value(text: str) -> tuple[str, Any]:
-    """
-    Return name and value of ``KEY=VALUE``, the value parsed as YAML.
+def _inner(one: Field[Any]) -> type | None:
+    """Return the dataclass that is the type of a field; None for another type."""
+    default = one.default if one.default_factory is MISSING else one.default_factory
+    kind = default if isinstance(default, type) else type(default)
+    return kind if is_dataclass(kind) else None
 
-    Raises
-    ------
-    ArgumentTypeError
-        If the text has another form, or the value is not YAML.
 
-    """
+def _flag(one: Field[Any], facts: Option) -> str:
+    return facts.flag or f'--{one.name.replace("_", "-")}'
+
+
+def _key_value(text: str) -> tuple[str, Any]:
+    """Return name and value of ``KEY=VALUE``, the value parsed as YAML."""
     name, equals, value = text.partition('=')
     if not name or not equals:
         raise argparse.ArgumentTypeError(f'expected KEY=VALUE, got {text!r}')
@@ -163,7 +146,58 @@ def key_value(text: str) -> tuple[str, Any]:
         raise argparse.ArgumentTypeError(f'{name}: expected a YAML value, got {value!r}') from None
 
 
+def _written(setting: tuple[str, Any]) -> str:
+    name, value = setting
+    return f'{name}={json.dumps(value)}'
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The options that make a `Config`; a setting of its own wins over one that sets several."""
+
+    config: Path | None = option(None, 'settings as a YAML file', metavar='FILE', parse=Path)
+    set: tuple[tuple[str, Any], ...] = option(
+        (),
+        'one setting, as in solver.rounds=2; overrides --config and --complete; can be repeated',
+        metavar='KEY=VALUE',
+        parse=_key_value,
+        text=_written,
+        is_repeated=True,
+    )
+    complete: bool = option(
+        False,
+        'complete the tracks: join fragments, reject ghosts, add missing boxes (sets '
+        'complete.stitch, static, prune, fill and extend)',
+    )
+    workers: int | None = option(
+        None,
+        'CPU cores of the solver (sets solver.threads); with 1 the run is one process',
+        metavar='N',
+        parse=int,
+    )
+
+    def effective(self) -> Config:
+        """Return the settings: ``--config``, then the shorthands, then ``--set``."""
+        config = Config() if self.config is None else Config.from_yaml(self.config)
+        shorthands: dict[str, Any] = {}
+        if self.complete:
+            shorthands |= {f'complete.{step}': True for step in COMPLETE_STEPS}
+        if self.workers is not None:
+            shorthands['solver.threads'] = self.workers
+        return config.updated(shorthands).updated(dict(self.set))
+
+
 def config_from(args: argparse.Namespace) -> Config:
-    """Return the settings of ``--config``, overridden by those of ``--set``."""
-    config = Config() if args.config is None else Config.from_yaml(args.config)
-    return config.updated(dict(args.set))
+    """Return the settings that the arguments describe."""
+    return Settings(**values_of(args, Settings)).effective()
+
+
+def request_from(args: argparse.Namespace) -> Request:
+    """Return the request that the arguments describe."""
+    return Request(tuple(args.recordings), config=config_from(args), **values_of(args, Request))
+
+
+def topics_from(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the values of `TOPICS`, as `source_of` takes them."""
+    values = values_of(args, Request)
+    return {name: values[name] for name in ('lidars', 'boxes', 'odometry', 'convention')}

@@ -12,33 +12,44 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
-import json
+from dataclasses import fields, replace
 from pathlib import Path
 import sys
 from typing import Any
 
+from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.storage.urls import url_of
-from boxreg_ros.offline.arguments import add_recording_arguments, config_from, lidar_options
+from boxreg_ros.offline.arguments import (
+    add_options,
+    add_recordings,
+    Settings,
+    values_of,
+    words_of,
+)
 from boxreg_ros.offline.batch_results import row_of, rows_of_shards, write_results
 from boxreg_ros.offline.job import Job, JOB_FAILED, jobs_of, UP_TO_DATE
 from boxreg_ros.offline.job_process import JobRunner
+from boxreg_ros.offline.relabel_command import Demands
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import writing
 
 DONE = 0
 FAILED = 1
 ENGINES = ('local', 'ray')
+DRIVE_SETTINGS = tuple(one.name for one in fields(Settings) if one.name != 'workers')
+"""Options of `Settings` that a drive takes; ``--workers`` is the number of drives here."""
 REQUESTS = 16
 """Sizes of files that are asked for at a time; chosen: servers answer each in some 0.1 s."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg batch`."""
-    add_recording_arguments(
-        parser,
-        'each is one drive; also a pattern in quotes, or a .txt or .lst file of drives',
-        '*',
-    )
+    several = 'each is one drive; also a pattern in quotes, or a .txt or .lst file of drives'
+    add_recordings(parser, several, '*')
+    add_options(parser, Request, formats=('csv',))
+    add_options(parser, Settings, *DRIVE_SETTINGS)
+    add_options(parser, Demands)
     parser.add_argument(
         '-o', '--out', type=Path, required=True, help='folder with one result folder per drive'
     )
@@ -46,14 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--workers', type=int, default=1, metavar='N',
         help='drives that are relabelled at a time, each on one core (default: %(default)s)',
     )  # fmt: skip
-    parser.add_argument(
-        '--formats', default='csv', metavar='NAME,...',
-        help='label formats to write, see `boxreg formats` (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument('--report', action='store_true', help='write report.html for each drive')
-    parser.add_argument(
-        '--strict', action='store_true', help='a drive that cannot be read completely has failed'
-    )
     _add_machine_arguments(parser)
 
 
@@ -114,7 +117,13 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(
             '--address: expected with --engine ray, got it without; add --engine ray'
         )
-    config_from(args)
+    options = values_of(args, Request) | {'report': False}  # to check that imports torch
+    Request((), config=_config(args), **options)
+
+
+def _config(args: argparse.Namespace) -> Config:
+    """Return the settings of all drives."""
+    return replace(Settings(**values_of(args, Settings)), workers=None).effective()
 
 
 def _run_all(jobs: list[Job], args: argparse.Namespace) -> None:
@@ -125,8 +134,8 @@ def _run_all(jobs: list[Job], args: argparse.Namespace) -> None:
     with ThreadPoolExecutor(REQUESTS) as pool:
         list(pool.map(Job.measure, waiting))
     jobs = sorted(jobs, key=lambda job: -job.size)  # no large one is left to the end
-    options = tuple(_options(args))
-    runner = JobRunner(args.out, options, str(config_from(args)), args.retries, args.timeout)
+    options = tuple(options_of_drives(args))
+    runner = JobRunner(args.out, options, str(_config(args)), args.retries, args.timeout)
     total = sum(job.size for job in waiting)
     is_hidden = not sys.stderr.isatty()
     failed = 0
@@ -171,17 +180,10 @@ def _ended(out: Path, rows: Sequence[dict[str, Any]]) -> int:
     return DONE if done == len(rows) else FAILED
 
 
-def _options(args: argparse.Namespace) -> list[str]:
+def options_of_drives(args: argparse.Namespace) -> list[str]:
     """Return the options of `boxreg relabel` for every drive."""
-    options = ['--formats', args.formats, *lidar_options(args)]
-    for name in ('boxes', 'odometry', 'pose_reference', 'size_order', 'forward_axis'):
-        value = getattr(args, name)
-        if value is not None:
-            options.append(f'--{name.replace("_", "-")}={value}')
-    if args.config is not None:
-        options.append(f'--config={args.config}')
-    options += [f'--set={key}={json.dumps(value)}' for key, value in args.set]
-    options += [f'--{name}' for name in ('report', 'strict') if getattr(args, name)]
+    options = words_of(args, Request) + words_of(args, Settings, *DRIVE_SETTINGS)
+    options += words_of(args, Demands)
     return [*options, '--workers=1']  # the drives share the cores; results are the same
 
 

@@ -31,12 +31,15 @@ from boxreg_ros.core.track_window import Window
 from boxreg_ros.core.window import group_windows, stack_windows
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.offline.arguments import (
-    add_recording_arguments,
+    add_options,
+    add_recordings,
     config_from,
-    convention_from,
-    lidars_from,
+    Settings,
+    TOPICS,
+    topics_from,
 )
 from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import spare_file
 from boxreg_ros.offline.sources import source_of, true_boxes
 from boxreg_ros.structures import Floats, is_valid_box
@@ -261,7 +264,9 @@ def table(measured: Mapping[str, Measured], config: Config) -> list[str]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads."""
-    add_recording_arguments(parser)
+    add_recordings(parser)
+    add_options(parser, Request, *TOPICS)
+    add_options(parser, Settings, 'config', 'set')
     parser.add_argument(
         '--truth', type=Path, required=True, metavar='TRUTH.csv',
         help='true boxes of some tracks, in the columns of boxes.csv',
@@ -282,13 +287,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         _check_output(args)
     truth = true_boxes(args.truth)
-    recording = source_of(
-        args.recordings,
-        lidars_from(args),
-        args.boxes,
-        args.odometry,
-        convention=convention_from(args),
-    )
+    recording = source_of(args.recordings, **topics_from(args))
     recording.has_boxes = not args.no_boxes
     drive = Drive.of(recording, truth, config.tolerance, config)
     if drive.left_out:

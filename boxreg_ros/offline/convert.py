@@ -26,12 +26,9 @@ from boxreg_ros.labels import (
     writer_for,
 )
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.offline.arguments import (
-    add_label_arguments,
-    add_lidar_arguments,
-    lidars_from,
-)
+from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.labelled_recording import label_frame_of
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import SUMMARY, whole_folder
 from boxreg_ros.offline.sources import source_of
 from boxreg_ros.structures import BoxArray, Sweep
@@ -258,20 +255,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--recording', type=Path, action='append', default=[], metavar='RECORDING',
         help='recording of the labels, if the label files lack the sensor poses; repeatable',
     )  # fmt: skip
-    add_label_arguments(parser)
-    add_lidar_arguments(parser)
-    parser.add_argument(
-        '--odometry', metavar='TOPIC', help='odometry of the recording, if TF has no fixed frame'
-    )
-    parser.add_argument('--fixed-frame', metavar='FRAME', help='fixed frame of the recording')
+    add_options(
+        parser, Request, 'options', 'label_frame', 'lidars', 'odometry', 'fixed_frame'
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Convert, and print one line with the counts."""
     request = Conversion(
         args.source, args.source_format, args.target_formats,
-        Options(args.with_points, args.camera, args.swap_axes), tuple(args.recording),
-        lidars_from(args), args.fixed_frame, args.label_frame, args.odometry,
+        Options(**values_of(args, Options)), tuple(args.recording),
+        Lidars(**values_of(args, Lidars)), args.fixed_frame, args.label_frame, args.odometry,
     )  # fmt: skip
     summary = convert(request, args.out)
     parts = [

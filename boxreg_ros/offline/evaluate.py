@@ -13,7 +13,8 @@ from typing import Any
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.covariance_table import BoxCovariance, COVARIANCES, read_covariances
-from boxreg_ros.offline.arguments import add_topic_arguments, convention_from, lidars_from
+from boxreg_ros.io.times import time_range
+from boxreg_ros.offline.arguments import add_options, TOPICS, topics_from, words_of
 from boxreg_ros.offline.box_scores import (
     by_overlap,
     groups,
@@ -24,6 +25,7 @@ from boxreg_ros.offline.box_scores import (
 )
 from boxreg_ros.offline.consistency import consistency
 from boxreg_ros.offline.consistency import table as consistency_table
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import earlier_summary
 from boxreg_ros.offline.sources import true_boxes
 from boxreg_ros.offline.track_scores import (
@@ -32,7 +34,7 @@ from boxreg_ros.offline.track_scores import (
     track_scores,
     TrackScores,
 )
-from boxreg_ros.structures import Ints, is_valid_box, REJECTED
+from boxreg_ros.structures import is_valid_box, REJECTED
 import numpy as np
 
 
@@ -57,11 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='compare only true boxes whose class name contains one of these words, as in '
         'car,van,truck',
     )  # fmt: skip
-    add_topic_arguments(parser)
-    parser.add_argument(
-        '--fixed-frame', metavar='FRAME',
-        help='frame to compare in, for a recording (default: as for boxreg relabel)',
-    )  # fmt: skip
+    add_options(parser, Request, *TOPICS, 'fixed_frame')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
 
@@ -69,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the scores of a table of boxes or of the input boxes of a recording."""
     truth = true_boxes(args.truth)
     predicted = _predicted(args, truth.frame_id)
+    _check_same_drive(args, predicted, truth)
     classes = [word for part in args.classes for word in part.split(',') if word]
     matches = match(predicted, truth, args.min_points, classes, by_overlap)
     if matches.invalid:
@@ -138,20 +137,19 @@ def _predicted(args: argparse.Namespace, frame_id: str) -> BoxTable:
     source: Path = args.predicted
     if (source / 'boxes.csv').is_file():
         source = source / 'boxes.csv'
-    topics = {'boxes': args.boxes, 'odometry': args.odometry}
-    convention = convention_from(args)
     if source.suffix == '.csv':
-        if any(topics.values()) or args.points or args.fixed_frame or not convention.is_standard:
+        unused = words_of(args, Request, *TOPICS, 'fixed_frame')
+        if unused:
             raise ConfigError(
-                f'--points, --boxes, --odometry, --fixed-frame, {convention}: expected with a '
-                f'recording only, got the table {str(source)!r}; leave them out'
+                f'{" ".join(unused)}: expected with a recording only, got the table '
+                f'{str(source)!r}; leave them out'
             )
         found = _table_in_frame(BoxTable.read_frames(source), frame_id)
         return found.rows(np.array([status != REJECTED for status in found.status], bool))
     from boxreg_ros.io.fixed_frame import input_boxes  # slow to import: it reads bags
     from boxreg_ros.offline.sources import source_of
 
-    recording = source_of([source], lidars_from(args), convention=convention, **topics)
+    recording = source_of([source], **topics_from(args))
     arrays, others = input_boxes(recording, args.fixed_frame)
     if others:
         _warn(others)
@@ -204,15 +202,24 @@ def _why_none_matches(predicted: BoxTable, truth: BoxTable) -> str:
         )
     stamps = np.intersect1d(predicted.stamps_ns, truth.stamps_ns)
     return (
-        f'no predicted box overlaps a true one: {len(stamps)} stamps are in both; stamps of '
-        f'predicted boxes: {time_range(predicted.stamps_ns)}, of true boxes: '
-        f'{time_range(truth.stamps_ns)}; compare boxes of one recording in one frame'
+        f'no predicted box overlaps a true one: {len(stamps)} stamps are in both; compare boxes '
+        f'of one recording in one frame'
     )
 
 
-def time_range(stamps_ns: Ints) -> str:
-    """Return the first and the last of stamps [ns] as text [s]."""
-    return f'{stamps_ns.min() * 1e-9:.3f} to {stamps_ns.max() * 1e-9:.3f} s'
+def _check_same_drive(args: argparse.Namespace, predicted: BoxTable, truth: BoxTable) -> None:
+    """Refuse boxes of another time than the true ones."""
+    if not (len(predicted.boxes) and len(truth.boxes)):
+        return
+    found, true = (
+        (int(table.stamps_ns.min()), int(table.stamps_ns.max())) for table in (predicted, truth)
+    )
+    if found[0] > true[1] or true[0] > found[1]:
+        raise RecordingError(
+            f'{args.truth}: expected true boxes of the time of {args.predicted}, got boxes of '
+            f'{time_range(*found)}, true boxes of {time_range(*true)}: another drive? give the '
+            f'true boxes of this one'
+        )
 
 
 def _warn(message: str) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
 
 from boxreg_ros.datasets import DATASETS
 from boxreg_ros.datasets import module_of as dataset_module
-from boxreg_ros.labels import can_read, Format, FORMATS
+from boxreg_ros.errors import ConfigError
+from boxreg_ros.labels import can_read, FORMATS, import_format
 
 FORMAT_COLUMNS = (
     'name',
@@ -38,11 +38,19 @@ def dataset_rows() -> list[tuple[str, ...]]:
 
 
 def rows() -> list[tuple[str, ...]]:
-    """Return the conventions of each format, in the columns of `FORMAT_COLUMNS`."""
+    """
+    Return the conventions of each format, in the columns of `FORMAT_COLUMNS`.
+
+    A format of another package that cannot be imported has its error in place of the title.
+
+    """
     table: list[tuple[str, ...]] = []
-    for name, path in FORMATS.items():
-        # Not `module_of`: the table lists formats whose packages are not installed too.
-        form: Format = import_module(path).FORMAT
+    for name in FORMATS:
+        try:
+            form = import_format(name).FORMAT
+        except ConfigError as error:
+            table.append((name, str(error), *[''] * (len(FORMAT_COLUMNS) - 2)))
+            continue
         table.append(
             (
                 name,
@@ -66,8 +74,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print a paragraph per label format and per data set."""
     for name, title, is_readable, *conventions, needs in rows():
-        print(f'{name}: {title}' + ('' if is_readable else ' (written only)'))
-        for column, text in zip(FORMAT_COLUMNS[3:], conventions, strict=False):
+        is_broken = not any(conventions)
+        print(f'{name}: {title}' + ('' if is_readable or is_broken else ' (written only)'))
+        for column, text in zip(
+            FORMAT_COLUMNS[3:], [] if is_broken else conventions, strict=False
+        ):
             print(f'    {column:9} {text}')
         if needs:
             print(f'    needs     pip install {needs}')

@@ -13,6 +13,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from itertools import pairwise
 import json
 from pathlib import Path
@@ -22,12 +23,13 @@ from typing import Any, TYPE_CHECKING
 from boxreg_ros.config import Config
 from boxreg_ros.errors import BoxregError
 from boxreg_ros.offline.arguments import (
-    add_topic_arguments,
-    convention_from,
-    lidar_options,
-    lidars_from,
-    RECORDINGS,
+    add_options,
+    add_recordings,
+    TOPICS,
+    topics_from,
+    words_of,
 )
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import spare_file
 from boxreg_ros.offline.timeline import check_plotly, merged_spans, write_timeline
 
@@ -41,17 +43,16 @@ SAMPLE_SECONDS = 3.0
 """Part of the recording whose messages are read [s]; chosen: 30 sweeps at 10 Hz take 0.25 s."""
 SAMPLE_ITEMS = 60
 """Clouds and box arrays that are read at most: those of this time at 10 Hz."""
+REPORT_PACKAGES = ('jinja2', 'plotly')
+"""Without them ``--report`` is not proposed; those that a plain installation lacks."""
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `boxreg inspect`."""
-    parser.add_argument(
-        'recordings', nargs='+', type=Path, metavar='RECORDING',
-        help=f'{RECORDINGS}; several are merged by time; a data set without a scene is listed',
-    )  # fmt: skip
-    add_topic_arguments(parser)
+    add_recordings(parser, 'several are merged by time; a data set without a scene is listed')
+    add_options(parser, Request, *TOPICS)
     parser.add_argument('--json', action='store_true', help='print JSON')
     parser.add_argument(
         '--html', type=Path, metavar='FILE',
@@ -93,16 +94,15 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
     """
     from boxreg_ros.offline.sources import scene_address, source_of
 
-    convention = convention_from(args)
-    lidars = lidars_from(args)
-    source = source_of(args.recordings, lidars, args.boxes, args.odometry, convention=convention)
+    topics = topics_from(args)
+    source = source_of(args.recordings, **topics)
     if scene_address(args.recordings) is None:
         facts = _contents(args.recordings)
     else:
         facts = _scene_contents(args.recordings)
     try:
         with source as recording:
-            facts |= _sampled(recording, convention)
+            facts |= _sampled(recording, topics['convention'])
             facts['damage'] = [damage._asdict() for damage in recording.damages]
     except BoxregError as error:
         facts['problems'].append(str(error))
@@ -383,16 +383,12 @@ def _command(args: argparse.Namespace, facts: dict[str, Any]) -> str:
     scene = scene_address([first])
     out = f'out/{first.stem if scene is None else scene.scene or scene.root.name}'
     words = ['boxreg', 'relabel', *map(str, args.recordings), '-o', out]
-    words += lidar_options(args)
-    for name in ('boxes', 'odometry'):
-        if getattr(args, name):
-            words += [f'--{name}', getattr(args, name)]
-    convention = convention_from(args)
-    if not convention.is_standard:
-        for name in ('pose_reference', 'size_order', 'forward_axis'):
-            words += [f'--{name.replace("_", "-")}', getattr(convention, name)]
+    words += words_of(args, Request, *TOPICS)
     if facts['sample']['boxes_without_id']:
         words.append('--associate')
+    words.append('--complete')
+    if all(map(find_spec, REPORT_PACKAGES)):
+        words.append('--report')
     return shlex.join(words)
 
 

@@ -72,6 +72,8 @@ class Sink:
         Boxes before and after, for the report and the tables of tracks.
     corrections : Corrections
         Rejected tracks and pinned boxes.
+    array_stamps_ns : list of int
+        Stamps of all box arrays [ns].
     points : PointCollector or None
         Points around the input boxes, for the report.
 
@@ -92,7 +94,7 @@ class Sink:
         recording = request.recording()
         bags = recording if isinstance(recording, Recording) else None
         options = replace(request.options, recording=bags)
-        self._output = LabelOutput(folder, request.formats, provenance, options)
+        self._output = LabelOutput(folder, request.box_formats, provenance, options)
         self.corrections = Corrections(
             read_decisions(request.decisions) if request.decisions is not None else ()
         )
@@ -108,6 +110,7 @@ class Sink:
         self._order = StampOrder()
         self._early: dict[object, RefinedBoxes] = {}  # by ticket, until the final estimate is
         self._last_ticket = 0
+        self.array_stamps_ns: list[int] = []
         self.boxes_in = 0
         self.boxes_out = 0
         self.status: Counter[str] = Counter()
@@ -188,6 +191,7 @@ class Sink:
         """Reserve a place; boxes that could not be transformed have their result at once."""
         count = len(given.track_ids)
         self.boxes_in += count
+        self.array_stamps_ns.append(given.stamp_ns)
         for name, boxes in Counter(given.class_names).items():
             if not self._config.knows_class(name):
                 self.unknown_classes[name] += boxes

@@ -19,7 +19,7 @@ DEFAULT_JOB_BYTES = 10**9
 """
 Memory that a job declares before one was measured [bytes].
 
-Twice the memory that was measured for a sweep of 150,000 points (docs/results/scale.md).
+Twice the memory that was measured for a sweep of 150,000 points (docs/results/speed.md#scale).
 
 """
 MEMORY_RESERVE = 1.2

@@ -13,7 +13,7 @@ from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.io.fixed_frame import FixedFrameItems, MovedItem
@@ -133,7 +133,7 @@ class Findings(NamedTuple):
     damages: list[Damage]
     outside: int
     warning: str
-    facts: dict[str, object]
+    facts: dict[str, Any]
     seconds: dict[str, float]
 
 

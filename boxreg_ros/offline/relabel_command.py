@@ -3,135 +3,29 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
 import sys
 from typing import Any, Self, TYPE_CHECKING
 
-from boxreg_ros.config import COMPLETE_STEPS
 from boxreg_ros.offline.arguments import (
-    add_label_arguments,
-    add_recording_arguments,
-    config_from,
-    convention_from,
-    lidars_from,
+    add_options,
+    add_recordings,
+    request_from,
+    Settings,
+    values_of,
 )
 from boxreg_ros.offline.progress import Progress
+from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import CONFIG, earlier_summary, spare, SUMMARY
+from boxreg_ros.options import option
 
 if TYPE_CHECKING:
-    from boxreg_ros.offline.request import Request
+    from boxreg_ros.offline.summary import Summary
 
 DONE = 0
 FAILED = 1
 BAR = '{percentage:3.0f}% {bar} {n:.0f}/{total:.0f} s of the recording, {remaining} left {desc}'
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `boxreg relabel`."""
-    add_recording_arguments(parser)
-    _add_input_arguments(parser)
-    _add_track_arguments(parser)
-    _add_result_arguments(parser)
-    _add_run_arguments(parser)
-
-
-def _add_input_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of inputs beside the recording, and of the part that is read."""
-    parser.add_argument(
-        '--labels', type=_labels_argument, metavar='FORMAT:PATH',
-        help='read the boxes from label files instead of a topic',
-    )  # fmt: skip
-    add_label_arguments(parser)
-    parser.add_argument(
-        '--fixed-frame', metavar='FRAME',
-        help='frame to refine in (default: topmost frame that the frame of the clouds moves in)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--start', type=float, metavar='S',
-        help='start of the part to refine, from the beginning of the recording [s]',
-    )  # fmt: skip
-    parser.add_argument(
-        '--end', type=float, metavar='S',
-        help='end of the part to refine, from the beginning of the recording [s]',
-    )  # fmt: skip
-
-
-def _add_track_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the steps on tracks beside their refinement."""
-    parser.add_argument(
-        '--associate', action='store_true',
-        help='replace the track ids of the input: associate boxes over time',
-    )  # fmt: skip
-    parser.add_argument(
-        '--complete', action='store_true',
-        help='complete the tracks: join fragments, reject ghosts, add missing boxes (sets '
-        'complete.stitch, static, prune, fill and extend)',
-    )  # fmt: skip
-    parser.add_argument('--bridge', nargs='?', action=_Removed, help=argparse.SUPPRESS)
-    parser.add_argument(
-        '--decisions', type=Path, metavar='FILE',
-        help='decisions.csv of boxreg review: keep rejected tracks as input, hold pinned boxes',
-    )  # fmt: skip
-
-
-def _add_result_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the output."""
-    parser.add_argument(
-        '-o', '--out', type=Path, required=True,
-        help='result folder; it is written completely or not at all',
-    )  # fmt: skip
-    parser.add_argument(
-        '--formats', default='csv,openlabel', metavar='NAME,...', type=_names,
-        help='label formats to write, see `boxreg formats`; csv is always written '
-        '(default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--report', action='store_true',
-        help='also write report.html: every track before and after, to look at in a browser',
-    )  # fmt: skip
-    parser.add_argument(
-        '--truth', type=Path, metavar='FILE',
-        help='with --report, true boxes that it shows: CSV with the columns of boxes.csv, or a '
-        'scene of a data set',
-    )  # fmt: skip
-
-
-def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of resuming, of the exit status and of processes."""
-    parser.add_argument(
-        '--resume', action='store_true',
-        help='go on with an interrupted run of the same request, files and settings; do nothing '
-        'if OUT holds its result',
-    )  # fmt: skip
-    parser.add_argument(
-        '--strict', action='store_true',
-        help='exit with status 1 if a part of the recording could not be read, or has no stamps',
-    )  # fmt: skip
-    parser.add_argument(
-        '--fail-under', type=_part, default=0.0, metavar='PART',
-        help='exit with 1, the results kept, if a smaller part of the boxes is refined, as in 0.9',
-    )  # fmt: skip
-    parser.add_argument(
-        '--workers', type=int, metavar='N',
-        help='CPU cores of the solver (sets solver.threads); with 1 the run is one process',
-    )  # fmt: skip
-
-
-class _Removed(argparse.Action):
-    """An option of earlier versions: its error names what replaces it."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        _namespace: argparse.Namespace,
-        _values: object,
-        option_string: str | None = None,
-    ) -> None:
-        """Refuse the option."""
-        parser.error(
-            f'{option_string}: was removed; use --complete, or for missing boxes alone '
-            f'--set complete.fill=true --set complete.fill_gap=SECONDS'
-        )
 
 
 def _part(text: str) -> float:
@@ -145,17 +39,37 @@ def _part(text: str) -> float:
     return part
 
 
-def _names(text: str) -> tuple[str, ...]:
-    """Return the names of a list with commas."""
-    return tuple(name.strip() for name in text.split(','))
+@dataclass(frozen=True, slots=True)
+class Demands:
+    """The options that decide on the exit status of a run that has written its results."""
+
+    strict: bool = option(
+        False,
+        'exit with status 1 if a part of the recording could not be read, or has no stamps',
+    )
+    fail_under: float = option(
+        0.0,
+        'exit with 1, the results kept, if a smaller part of the boxes is refined, as in 0.9',
+        metavar='PART',
+        parse=_part,
+    )
 
 
-def _labels_argument(text: str) -> tuple[str, Path]:
-    """Return format and path of ``FORMAT:PATH``."""
-    name, colon, path = text.partition(':')
-    if not name or not colon or not path:
-        raise argparse.ArgumentTypeError(f'expected FORMAT:PATH, got {text!r}')
-    return name, Path(path)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `boxreg relabel`."""
+    add_recordings(parser)
+    add_options(parser, Request)
+    add_options(parser, Settings)
+    parser.add_argument(
+        '-o', '--out', type=Path, required=True,
+        help='result folder; it is written completely or not at all',
+    )  # fmt: skip
+    parser.add_argument(
+        '--resume', action='store_true',
+        help='go on with an interrupted run of the same request, files and settings; do nothing '
+        'if OUT holds its result',
+    )  # fmt: skip
+    add_options(parser, Demands)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -165,13 +79,16 @@ def run(args: argparse.Namespace) -> int:
     Status 1 also if the recording has boxes and none was refined; the result is kept.
 
     """
-    from boxreg_ros.offline.relabel import closing_line, notes, relabel
+    from boxreg_ros.offline.notes import closing_line, notes
+    from boxreg_ros.offline.relabel import relabel
+    from boxreg_ros.offline.summary import Summary
 
-    request = _request(args)
+    request = request_from(args)
+    demands = Demands(**values_of(args, Demands))
     earlier = earlier_summary(args.out)
     if args.resume and earlier and _is_complete(earlier, request, args.out):
         print(f'{args.out}: up to date, made from the same files with the same settings')
-        return _status(earlier, args.fail_under, args.strict)
+        return _status(Summary.from_json(earlier), demands)
     if args.config != args.out / CONFIG:  # this one is written again with the same content
         spare(args.out, [args.config])
     with ProgressBar() as bar:
@@ -181,52 +98,22 @@ def run(args: argparse.Namespace) -> int:
     for note in notes(summary):
         print(f'boxreg: {note}', file=sys.stderr)
     print(closing_line(summary, args.out))
-    return _status(summary, args.fail_under, args.strict)
+    return _status(summary, demands)
 
 
-def _status(summary: dict[str, Any], fail_under: float, is_strict: bool) -> int:
+def _status(summary: Summary, demands: Demands) -> int:
     """Return the exit status of a run; say on stderr if it misses ``--fail-under``."""
-    from boxreg_ros.offline.relabel import has_failed, is_complete, num_refined, part_refined
-
-    if part_refined(summary) < fail_under:
+    if summary.part_refined < demands.fail_under:
         print(
-            f'boxreg: --fail-under: expected at least {fail_under:.1%} of the boxes refined, got '
-            f'{num_refined(summary):,} of {summary["boxes_in"]:,}; the results are kept, see '
-            f'"reasons" in {SUMMARY}',
+            f'boxreg: --fail-under: expected at least {demands.fail_under:.1%} of the boxes '
+            f'refined, got {summary.num_refined:,} of {summary.boxes_in:,}; the results are '
+            f'kept, see "reasons" in {SUMMARY}',
             file=sys.stderr,
         )
         return FAILED
-    return FAILED if has_failed(summary) or (is_strict and not is_complete(summary)) else DONE
-
-
-def _request(args: argparse.Namespace) -> Request:
-    """Return the request that the arguments describe."""
-    from boxreg_ros.labels import Options
-    from boxreg_ros.offline.request import Request
-
-    config = config_from(args)
-    if args.complete:
-        config = config.updated({f'complete.{step}': True for step in COMPLETE_STEPS})
-    if args.workers is not None:
-        config = config.updated({'solver.threads': args.workers})
-    return Request(
-        recordings=tuple(args.recordings),
-        lidars=lidars_from(args),
-        boxes=args.boxes,
-        odometry=args.odometry,
-        fixed_frame=args.fixed_frame,
-        formats=args.formats,
-        start=args.start,
-        end=args.end,
-        config=config,
-        options=Options(args.with_points, args.camera, args.swap_axes),
-        labels=args.labels,
-        label_frame=args.label_frame,
-        convention=convention_from(args, args.associate),
-        report=args.report,
-        truth=args.truth,
-        decisions=args.decisions,
-    )
+    if demands.strict and not summary.is_complete:
+        return FAILED
+    return FAILED if summary.has_failed else DONE
 
 
 def _is_complete(earlier: dict[str, Any], request: Request, out: Path) -> bool:

@@ -2,28 +2,48 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentTypeError
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 import hashlib
 from math import isfinite
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.config import Config
-from boxreg_ros.datasets import address_of, scene_inputs, SceneRecording
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
-from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage.urls import entries_of, url_of
-from boxreg_ros.labels import check_options, module_of, Options
-from boxreg_ros.offline.sources import source_of
+from boxreg_ros.labels import check_options, labels_points, module_of, Options
+from boxreg_ros.options import option
 from msg_adapters.convention import Convention, STANDARD
+
+if TYPE_CHECKING:
+    from boxreg_ros.datasets import SceneRecording
+    from boxreg_ros.io.recording import Recording
+
+POINT_FORMATS = ('semantickitti', 'lidarseg')
+"""Formats that ``--label-points`` writes."""
+
+
+def _labels(text: str) -> tuple[str, Path]:
+    """Return format and path of ``FORMAT:PATH``."""
+    name, colon, path = text.partition(':')
+    if not name or not colon or not path:
+        raise ArgumentTypeError(f'expected FORMAT:PATH, got {text!r}')
+    return name, Path(path)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Return the names of a list with commas."""
+    return tuple(name.strip() for name in text.split(','))
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
     """
-    Inputs and options of one relabel run.
+    Inputs and options of one relabel run; each command line option is stated by its field.
 
     Attributes
     ----------
@@ -31,30 +51,14 @@ class Request:
         Files or folders of one drive, merged by time, or the address of a scene of a data set.
     lidars : Lidars
         Topics of the clouds, and their LiDARs.
-    boxes, odometry : str or None
-        Topics; None where the only topic of the type is used.
-    fixed_frame : str or None
-        Frame to refine in; None for the topmost frame that the frame of the clouds moves in.
-    formats : tuple of str
-        Label formats to write; ``csv`` is always written.
-    start, end : float or None
-        Part of the recording to read, from its beginning [s].
+    convention : Convention
+        Meaning of pose and size of the input boxes.
     config : Config
         Settings of the core.
     options : Options
         Settings of the label formats.
-    labels : tuple of str and Path, or None
-        Format and path of label files to read the boxes from instead of a topic.
-    label_frame : str or None
-        Sensor frame of the written label files; None for the frame of the clouds.
-    convention : Convention
-        Meaning of pose and size of the input boxes.
-    report : bool
-        Also write ``report.html``.
-    decisions : Path or None
-        Decisions of `boxreg review`: rejected tracks and pinned boxes.
-    truth : Path or None
-        True boxes that the report shows: the columns of ``boxes.csv``, or the address of a scene.
+    others
+        As their options state; None for the default named there.
 
     Raises
     ------
@@ -65,27 +69,95 @@ class Request:
 
     recordings: tuple[Path, ...]
     lidars: Lidars = SINGLE_LIDAR
-    boxes: str | None = None
-    odometry: str | None = None
-    fixed_frame: str | None = None
-    formats: tuple[str, ...] = ('csv', 'openlabel')
-    start: float | None = None
-    end: float | None = None
-    config: Config = field(default_factory=Config)
-    options: Options = field(default_factory=Options)
-    labels: tuple[str, Path] | None = None
-    label_frame: str | None = None
+    boxes: str | None = option(
+        None, 'topic of the boxes (default: found by type)', metavar='TOPIC'
+    )
+    odometry: str | None = option(
+        None,
+        'odometry topic, used where TF does not connect the clouds with a fixed frame (default: '
+        'found by type)',
+        metavar='TOPIC',
+    )
     convention: Convention = STANDARD
-    report: bool = False
-    truth: Path | None = None
-    decisions: Path | None = None
+    labels: tuple[str, Path] | None = option(
+        None,
+        'read the boxes from label files instead of a topic',
+        metavar='FORMAT:PATH',
+        parse=_labels,
+        text=lambda labels: ':'.join(map(str, labels)),
+    )
+    fixed_frame: str | None = option(
+        None,
+        'frame to refine in (default: topmost frame that the frame of the clouds moves in)',
+        metavar='FRAME',
+    )
+    start: float | None = option(
+        None,
+        'start of the part to refine, from the beginning of the recording [s]',
+        metavar='S',
+        parse=float,
+    )
+    end: float | None = option(
+        None,
+        'end of the part to refine, from the beginning of the recording [s]',
+        metavar='S',
+        parse=float,
+    )
+    config: Config = field(default_factory=Config)
+    decisions: Path | None = option(
+        None,
+        'decisions.csv of boxreg review: keep rejected tracks as input, hold pinned boxes',
+        metavar='FILE',
+        parse=Path,
+    )
+    formats: tuple[str, ...] = option(
+        ('csv', 'openlabel'),
+        'label formats to write, see `boxreg formats`; csv is always written (default: '
+        '%(default)s)',
+        metavar='NAME,...',
+        parse=_names,
+        text=','.join,
+    )
+    options: Options = field(default_factory=Options)
+    label_frame: str | None = option(
+        None,
+        'sensor frame of the label files (default: frame of the clouds)',
+        metavar='FRAME',
+    )
+    report: bool = option(
+        False, 'also write report.html: every track before and after, to look at in a browser'
+    )
+    label_points: bool = option(
+        False,
+        'also label the points of every sweep: formats semantickitti and lidarseg, and fields of '
+        'the clouds of the format mcap',
+    )
+    clouds: tuple[str, ...] = option(
+        (),
+        'also write clouds to OUT/clouds: static (MCAP and map without moving objects), '
+        'background (without any) or object (each track accumulated in its box); can be repeated',
+        choices=('static', 'background', 'object'),
+        is_repeated=True,
+    )
+    undistort: bool = option(
+        False,
+        'also write OUT/clouds/undistorted.mcap: points of moving objects moved to the stamp by '
+        'the motion of their boxes',
+    )
+    truth: Path | None = option(
+        None,
+        'with --report, true boxes that it shows: CSV with the columns of boxes.csv, or a scene '
+        'of a data set',
+        metavar='FILE',
+        parse=Path,
+    )
 
     def __post_init__(self) -> None:
         """Check the options."""
         self._check_recordings()
         self._check_boxes()
         self._check_part()
-        check_options(self.formats, self.options)
+        check_options(self.box_formats, self.options)
         if self.report:
             from boxreg_ros.review.report import check_packages  # imports torch
 
@@ -135,6 +207,8 @@ class Request:
 
     def recording(self) -> Recording | SceneRecording:
         """Return the recording, not yet open."""
+        from boxreg_ros.offline.sources import source_of  # imports rosbags
+
         return source_of(
             self.recordings,
             self.lidars,
@@ -149,7 +223,29 @@ class Request:
     @property
     def all_formats(self) -> tuple[str, ...]:
         """Return the formats to write, each once, ``csv`` first."""
-        return tuple(dict.fromkeys(('csv', *self.formats)))
+        return tuple(dict.fromkeys(('csv', *self.box_formats, *self.point_formats)))
+
+    @property
+    def box_formats(self) -> tuple[str, ...]:
+        """Return the formats that are written while boxes are refined."""
+        return tuple(name for name in self.formats if not labels_points(name))
+
+    @property
+    def point_formats(self) -> tuple[str, ...]:
+        """Return the formats of labelled points, each once."""
+        asked = POINT_FORMATS if self.label_points else ()
+        named = (name for name in self.formats if labels_points(name))
+        return tuple(dict.fromkeys((*asked, *named)))
+
+    @property
+    def maps(self) -> tuple[str, ...]:
+        """Return the kinds of clouds without objects, each once."""
+        return tuple(dict.fromkeys(name for name in self.clouds if name != 'object'))
+
+    @property
+    def needs_point_labels(self) -> bool:
+        """Return whether the recording is read again, to label its points."""
+        return bool(self.point_formats or self.clouds or self.undistort or self.label_points)
 
     def inputs(self) -> tuple[Path, ...]:
         """Return the input files and folders."""
@@ -188,5 +284,7 @@ class Request:
 
 def _parts_of(path: Path) -> tuple[Path, ...]:
     """Return the files and folders of a path: those of a scene, or the path itself."""
+    from boxreg_ros.datasets import address_of, scene_inputs  # imports rosbags
+
     address = address_of(path)
     return (path,) if address is None else scene_inputs(address)

@@ -10,13 +10,12 @@ import json
 import os
 from pathlib import Path
 import shutil
-from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import uuid4
 
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.storage.urls import names_of, read_text, upload, url_of
-from boxreg_ros.io.whole_files import DISK_ERRORS
+from boxreg_ros.io.whole_files import DISK_ERRORS, temporary_folder
 
 REFUSED_ERRORS = (
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT,
@@ -115,9 +114,9 @@ def _uploaded_folder(out: Path) -> Iterator[Path]:
     """Yield a folder of this machine that is uploaded to the URL `out` on success."""
     if earlier_summary(out) is None and names_of(out):
         raise _other_files(out)
-    with TemporaryDirectory() as folder:
-        yield Path(folder)
-        upload(Path(folder), out, SUMMARY)
+    with temporary_folder() as folder:
+        yield folder
+        upload(folder, out, SUMMARY)
 
 
 @contextmanager

@@ -202,7 +202,7 @@ class DecisionLog:
 
 class Corrections:
     """
-    Rejected tracks and pinned boxes, as a run applies them.
+    Rejected tracks and pinned boxes, as a run applies them; boxes can be pinned already.
 
     Parameters
     ----------
@@ -240,12 +240,16 @@ class Corrections:
         """
         if not self._made:
             return given
-        is_pinned = np.zeros(len(given.track_ids), bool)
+        is_pinned = _is_pinned(given)
         boxes = given.boxes.copy()
         for row, track_id in enumerate(given.track_ids):
-            boxes[row, BOX_EXTENT] = self._extents.get(track_id, boxes[row, BOX_EXTENT])
+            if not is_pinned[row]:
+                boxes[row, BOX_EXTENT] = self._extents.get(track_id, boxes[row, BOX_EXTENT])
             found = self._of(track_id, given.stamp_ns)
-            if found is None or found.kind != 'pin' or found.box is None:
+            if found is None:
+                continue
+            if found.kind != 'pin' or found.box is None:
+                is_pinned[row] = False
                 continue
             if found.frame_id != given.frame_id:
                 raise RecordingError(
@@ -259,7 +263,8 @@ class Corrections:
 
     def apply(self, given: BoxArray, refined: RefinedBoxes) -> RefinedBoxes:
         """Return the result with rejected boxes as in the input, and pinned boxes as pinned."""
-        if not self._made:
+        is_pinned = _is_pinned(given)
+        if not (self._made or is_pinned.any()):
             return refined
         boxes = refined.boxes.boxes.copy()
         status = list(refined.status)
@@ -270,8 +275,10 @@ class Corrections:
                 boxes[row] = given.boxes[row]  # without the extents of a pin
             found = self._of(track_id, given.stamp_ns)
             if found is None:
-                continue
-            if found.kind == 'pin' and found.box is not None:
+                if is_pinned[row]:
+                    boxes[row] = given.boxes[row]
+                    status[row], reasons[row] = HUMAN, ''
+            elif found.kind == 'pin' and found.box is not None:
                 boxes[row] = found.box
                 status[row], reasons[row] = HUMAN, ''
             elif found.kind == 'reject':
@@ -294,6 +301,13 @@ class Corrections:
                 self._unused.discard(key)
                 found = found or self._made[key]
         return found
+
+
+def _is_pinned(boxes: BoxArray) -> NDArray[np.bool_]:
+    """Return which boxes of an array (n,) are pinned, as a copy."""
+    if boxes.pinned is None:
+        return np.zeros(len(boxes.track_ids), bool)
+    return boxes.pinned.copy()
 
 
 def _extents_of_pins(decisions: Iterable[Decision]) -> dict[str, Floats]:

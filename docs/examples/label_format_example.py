@@ -7,10 +7,9 @@ from collections.abc import Iterator
 import json
 from pathlib import Path
 
-from boxreg_ros.errors import RecordingError, unreadable
 from boxreg_ros.labels import Format, LabelFrame, Options, Provenance
-from boxreg_ros.labels.files import to_json
-from boxreg_ros.labels.records import refined_boxes
+from boxreg_ros.labels.files import following, to_json
+from boxreg_ros.labels.records import evidence_of, refined_boxes
 
 FORMAT = Format(
     name='jsonl',
@@ -39,9 +38,8 @@ class Writer:
             'frame_id': frame.fixed_frame,
             'track_ids': [array.track_ids[row] for row in rows],
             'class_names': [array.class_names[row] for row in rows],
-            'scores': array.scores[rows].tolist(),
-            'status': [frame.refined.status[row] for row in rows],
             'boxes': boxes.tolist(),
+            'evidence': [evidence_of(frame.refined, row) for row in rows],
         }
         self._file.write(to_json(line) + '\n')
 
@@ -54,7 +52,7 @@ def read(path: Path) -> Iterator[LabelFrame]:
     """Yield the frames of a file, or of the file in a folder."""
     if path.is_dir():
         path = path / 'boxes.jsonl'
-    try:
+    with following(path, 'one JSON object per line'):
         for text in path.read_text(encoding='utf-8').splitlines():
             line = json.loads(text)
             refined = refined_boxes(
@@ -63,11 +61,6 @@ def read(path: Path) -> Iterator[LabelFrame]:
                 line['track_ids'],
                 line['class_names'],
                 line['boxes'],
-                line['scores'],
-                line['status'],
+                line['evidence'],
             )
             yield LabelFrame(refined, fixed_frame=line['frame_id'], sensor_frame='')
-    except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(f'{path}: expected one JSON object per line: {error!r}') from None

@@ -6,24 +6,15 @@ import json
 import sys
 
 from boxreg_ros import __version__, cli
-from boxreg_ros.bench import kinds
 from boxreg_ros.bench import main as bench
 from boxreg_ros.bench.accuracy import GROUPINGS
 from boxreg_ros.bench.methods import METHODS, run_methods
 from boxreg_ros.bench.paper import ERROR_COLUMNS, error_row
-from boxreg_ros.bench.report import COMPOSITORS
-from boxreg_ros.bench.review import _without_constant_error, with_pins
-from boxreg_ros.bench.tracks import ONE_LABEL, rows_with_one_label, scores_by_kind, UNBROKEN
 from boxreg_ros.errors import ConfigError, RecordingError
-from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.offline.box_scores import evaluate, match
 from boxreg_ros.offline.drive import Drive
-from boxreg_ros.review.changes import Changes
-from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.recorder import write_recording
 from boxreg_ros.simulation.simulate import simulate
-from boxreg_ros.structures import BoxArray, RefinedBoxes
-from browser import NEEDS_BROWSER
 import numpy as np
 import pytest
 import torch
@@ -135,24 +126,6 @@ def test_real_prints_all_methods_and_groups(folder, capsys):
     assert set(report) == {'input', 'L-shape per sweep'} | smoothed
 
 
-def test_kinds_compares_each_class_with_input_and_smoothing(folder, capsys, monkeypatch):
-    monkeypatch.setattr(kinds, 'MIN_CLASS_BOXES', 10)
-    assert run('kinds', folder, '--json') == 0
-    found = json.loads(capsys.readouterr().out)['results'][str(folder)]
-    assert set(found) == {'car'}
-    assert set(found['car']) == {'ours, early', 'ours, final', 'ours, track'}
-    drive = Drive.read(folder)
-    methods = run_methods(drive, wanted=('ours',))
-    own, given = (match(methods[name], drive.truth, 1) for name in ('ours, track', 'input'))
-    is_car = own.is_matched & np.equal(own.class_names, 'car')
-    gain = found['car']['ours, track']['input']
-    assert gain['boxes'] == is_car.sum()
-    assert gain['iou_bev'] == pytest.approx((own.iou_bev - given.iou_bev)[is_car].mean())
-    assert set(found['car']['ours, final']) == {'input', 'smoothing, final'}
-    assert run('kinds', folder) == 0
-    assert 'ours, early, minus' in capsys.readouterr().out
-
-
 def test_real_refuses_folders_without_truth_or_recording(tmp_path, folder):
     with pytest.raises(RecordingError, match='expected a folder'):
         run('real', tmp_path / 'absent')
@@ -209,123 +182,9 @@ def test_json_names_version_and_command(folder, capsys, monkeypatch):
     assert set(document) == {'version', 'command', 'results'}
 
 
-def test_covariances_are_measured_for_each_estimate(folder, capsys):
-    assert run('covariance', folder, '--json') == 0
-    report = json.loads(capsys.readouterr().out)['results'][str(folder)]
-    assert set(report) == {'early', 'final', 'track'}
-    for groups in report.values():
-        group = groups['all']
-        assert group['boxes'] > 10
-        assert all(0.6 < value <= 1 for value in group['coverage'].values())
-        assert all(0 < value < 6 for value in group['nees'].values())
-    assert run('covariance', folder) == 0
-    assert 'early' in capsys.readouterr().out
-
-
-def test_review_ranks_tracks_and_pins_a_box_of_the_worst(folder, capsys):
-    assert run('review', folder, '--json') == 0
-    report = json.loads(capsys.readouterr().out)['results'][str(folder)]
-    assert set(report) == {'own boxes', 'planted errors'}
-    for found in report.values():
-        assert found['bad'] == np.ceil(0.1 * found['tracks'])
-        pins = found['pins']
-        missing = 1 - pins['before']
-        assert pins['gained'] == pytest.approx((pins['after'] - pins['before']) / missing)
-    assert report['own boxes']['tracks'] == 4
-    assert report['own boxes']['pins']['gained'] > 0
-
-
-def test_errors_that_are_constant_in_the_box_frame_are_removed(folder):
-    drive = Drive.read(folder)
-    truth = drive.truth
-    is_car = np.array(truth.track_ids) == '9'
-    boxes = truth.boxes[is_car].copy()
-    boxes[:, :3] += matrix_from_rpy(boxes[:, 6:]) @ np.array([0.4, -0.2, 0.1])
-    boxes[:, 3:6] += 0.3
-    boxes[:, 8] += 0.05
-    changes = Changes(truth.frame_id)
-    for stamp_ns, box in zip(truth.stamps_ns[is_car].tolist(), boxes, strict=True):
-        array = BoxArray(stamp_ns, truth.frame_id, ('9',), ('car',), np.ones(1), box[None])
-        columns = ('refined',), ('',), np.ones(1, int), np.eye(6)[None]
-        changes.add(array, RefinedBoxes(array, *columns))
-    (track,) = changes.tracks()
-    found = _without_constant_error(drive, track)
-    np.testing.assert_allclose(found.boxes, truth.boxes[is_car], atol=1e-9)
-
-
-def test_coasting_finds_missed_boxes(folder, capsys):
-    assert run('tracks', folder, '--coast', 0.5, '--far-misses', '--json') == 0
-    rows = json.loads(capsys.readouterr().out)['results'][str(folder)]
-    assert list(rows) == [UNBROKEN, 'input', 'final', 'coast 0.5 s']
-    assert rows['final']['added'] == 0 < rows['coast 0.5 s']['added']
-    assert rows['final']['recall'] < rows['coast 0.5 s']['recall']
-    assert rows['input']['recall'] <= rows[UNBROKEN]['recall']
-    # Only vehicles have boxes in this drive.
-    last = rows['coast 0.5 s']
-    assert set(last['by_kind']) == {'vehicle', 'cyclist', 'pedestrian'}
-    assert last['by_kind']['vehicle']['added_iou'] == last['added_iou']
-    assert last['by_kind']['pedestrian']['recall'] == 0
-    assert 0.5 < last['given_iou'] < 1
-
-
-def test_objects_with_two_labels_are_scored_apart(folder):
-    drive = Drive.read(folder)
-    truth = drive.truth
-    assert len(rows_with_one_label(truth)) == len(truth.boxes)
-    car = [row for row, track_id in enumerate(truth.track_ids) if track_id == '9']
-    rows = [*range(len(truth.boxes)), *car]
-    doubled = BoxTable(
-        truth.stamps_ns[rows], truth.frame_id, (*truth.track_ids, *('second',) * len(car)),
-        tuple(truth.class_names[row] for row in rows), truth.scores[rows], truth.boxes[rows],
-        tuple(truth.status[row] for row in rows), truth.num_points[rows],
-    )  # fmt: skip
-    names = [doubled.track_ids[row] for row in rows_with_one_label(doubled)]
-    assert set(names) == set(truth.track_ids) - {'9'}
-    scores = scores_by_kind(truth, doubled)
-    assert scores['vehicle'].recall < 1
-    assert scores[ONE_LABEL].recall == scores[ONE_LABEL].precision == 1
-
-
-def test_highway_measures_all_methods_at_both_speeds(capsys):
-    assert run('highway', '--seeds', 1, '--sweeps', 6, '--json') == 0
-    results = json.loads(capsys.readouterr().out)['results']
-    assert list(results) == ['stamp', 'sight']
-    for rows in results.values():
-        assert {'input', 'smoothing only', 'ours, early', 'ours, track'} <= set(rows)
-        assert all(0.5 < iou < 1 for found in rows.values() for iou in found.values())
-
-
-def test_a_pin_holds_the_true_box_at_its_stamp(folder):
-    drive = Drive.read(folder)
-    array = drive.boxes[2]
-    pinned = with_pins(drive, {'9': array.stamp_ns}).boxes
-    row = array.track_ids.index('9')
-    true = drive.truth.boxes[
-        (drive.truth.stamps_ns == array.stamp_ns) & (np.array(drive.truth.track_ids) == '9')
-    ]
-    np.testing.assert_array_equal(pinned[2].boxes[[row]], true)
-    assert sum(int(array.pinned.sum()) for array in pinned) == 1
-
-
-@NEEDS_BROWSER
-def test_report_measures_paint_and_frames(capsys):
-    pytest.importorskip('plotly', reason='plotly is not installed')
-    pytest.importorskip('playwright', reason='playwright is not installed')
-    small = ['--tracks', 3, '--boxes', 4, '--points', 2000]
-    assert run('report', *small, '--json') == 0
-    measured = json.loads(capsys.readouterr().out)['results']['3 tracks of 4 boxes']
-    for compositor in COMPOSITORS:
-        found = measured[compositor]
-        assert found['first paint [ms]'] > 0
-        assert 0 < found['script of a step [ms]'] <= found['longest script of a step [ms]']
-        assert 0 < found['frames per second'] < 70
-        assert 0 <= found['part of late frames'] <= 1
-
-
 @pytest.mark.parametrize('name', bench.MEASUREMENTS)
 def test_every_measurement_prints_json(name):
     parser = argparse.ArgumentParser()
     bench.add_arguments(parser)
-    own_data = ('highway', 'kills', 'lidars', 'load', 'node', 'paper', 'report', 'speed')
-    data = [] if name in own_data else ['folder']
+    data = [] if name in ('paper', 'speed') else ['folder']
     assert parser.parse_args([name, *data, '--json']).json

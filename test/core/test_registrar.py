@@ -304,8 +304,10 @@ def valued(column, value):
         (valued(8, np.inf), ('invalid_box', '')),
         (valued(4, 0.0), ('invalid_box', '')),
         (valued(3, -4.4), ('invalid_box', '')),
+        (valued(3, 1e6), ('invalid_box', '')),
+        (valued(1, 1e9), ('invalid_box', '')),
     ],
-    ids=['no id', 'same id', 'nan', 'infinite', 'flat', 'negative'],
+    ids=['no id', 'same id', 'nan', 'infinite', 'flat', 'negative', 'huge', 'far'],
 )
 def test_boxes_that_cannot_be_refined_are_returned_unchanged(stream, estimate, spoil, reasons):
     spoilt = list(stream)

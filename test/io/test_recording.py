@@ -5,6 +5,7 @@ import sqlite3
 from boxreg_ros.errors import RecordingError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.io.recording import Recording
+from boxreg_ros.io.storage.files import part_of
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.structures import BoxArray, Sweep
 from mcap.reader import make_reader
@@ -70,6 +71,16 @@ def test_split_recordings_are_merged_by_time(tmp_path):
     sweeps, arrays, _ = read(paths[::-1])
     assert [sweep.stamp_ns for sweep in sweeps] == drive.stamps
     assert [array.stamp_ns for array in arrays] == drive.stamps
+
+
+def test_parts_are_in_the_order_of_their_numbers(tmp_path):
+    """As rosbag2 names them without padding: 10 behind 9."""
+    folder = tmp_path / 'drive'
+    folder.mkdir()
+    names = [f'2026_11_26-drive_{number}.mcap' for number in range(12)]
+    for name in reversed(names):
+        (folder / name).touch()
+    assert [file.name for file in part_of(folder).files] == names
 
 
 # Definitions -----------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import socket
 from threading import Thread
 
 from boxreg_ros.cli import main
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, TransferError
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.storage import urls
 from boxreg_ros.io.storage.files import part_of
@@ -28,7 +28,13 @@ QUICK = ['--set=min_observations=3', '--formats=csv']
 
 
 class Files(BaseHTTPRequestHandler):
-    """Serve the files of a folder, whole or a range, and count the bytes."""
+    """
+    Serve the files of a folder, whole or a range, and count the bytes.
+
+    Ranges that `fault_of` of the server names a fault for are answered with it: ``error`` (500),
+    ``cut`` (the connection ends in the middle), ``short`` (206 with half of the bytes).
+
+    """
 
     def do_HEAD(self):
         self.respond(with_content=False)
@@ -43,10 +49,17 @@ class Files(BaseHTTPRequestHandler):
             return
         data = path.read_bytes()
         first, last = 0, len(data) - 1
-        asked = self.headers.get('Range')
+        asked = self.server.has_ranges and self.headers.get('Range')
         if asked:
             begin, _, end = asked.removeprefix('bytes=').partition('-')
             first, last = int(begin), min(int(end or last), last)
+        fault = self.server.fault_of(first, last) if asked else None
+        if fault == 'error':
+            self.send_error(500)
+            return
+        sent_last = (first + last) // 2 if fault else last
+        if fault == 'short':
+            last = sent_last
         self.send_response(206 if asked else 200)
         self.send_header('Accept-Ranges', 'bytes')
         self.send_header('Content-Length', str(last + 1 - first))
@@ -55,7 +68,7 @@ class Files(BaseHTTPRequestHandler):
         self.end_headers()
         if with_content:
             self.server.sent.append(last + 1 - first)
-            self.wfile.write(data[first : last + 1])
+            self.wfile.write(data[first : sent_last + 1])
 
     def log_message(self, *_):
         """Be silent."""
@@ -64,7 +77,8 @@ class Files(BaseHTTPRequestHandler):
 @contextmanager
 def http_server(folder):
     server = ThreadingHTTPServer(('127.0.0.1', 0), Files)
-    server.folder, server.sent = folder, []
+    server.folder, server.sent, server.fault_of = folder, [], lambda *_: None
+    server.has_ranges = True
     Thread(target=server.serve_forever, daemon=True).start()
     yield server, f'http://127.0.0.1:{server.server_port}'
     server.shutdown()
@@ -145,6 +159,66 @@ def test_recordings_over_http_give_the_same_boxes(tmp_path, whole):
     with http_server(tmp_path) as (_, url):
         assert main(['relabel', f'{url}/whole.mcap', '-o', str(remote), *QUICK]) == 0
     assert boxes(remote) == boxes(local)
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr(urls, 'REPEAT_SECONDS', (0.01, 0.01))
+
+
+@pytest.mark.parametrize('fault', ['error', 'cut', 'short'])
+def test_a_request_that_fails_is_repeated(tmp_path, whole, fault, impatient):
+    """The first request for each range fails: the boxes are those of the file."""
+    local, remote = tmp_path / 'local', tmp_path / 'remote'
+    assert main(['relabel', str(whole), '-o', str(local), *QUICK]) == 0
+    asked = set()
+
+    def fault_of(*place):
+        has_failed = place in asked
+        asked.add(place)
+        return None if has_failed else fault
+
+    with http_server(tmp_path) as (server, url):
+        server.fault_of = fault_of
+        assert main(['relabel', f'{url}/whole.mcap', '-o', str(remote), *QUICK]) == 0
+    assert len(asked) > 1
+    assert boxes(remote) == boxes(local)
+    assert json.loads((remote / 'summary.json').read_text())['damage'] == []
+
+
+@pytest.mark.parametrize('fault', ['error', 'cut', 'short'])
+def test_bytes_that_a_server_does_not_send_are_no_damage(
+    tmp_path, large, fault, impatient, capsys
+):
+    """A part in the middle never comes: the run fails and writes nothing."""
+    out = tmp_path / 'out'
+    middle = large.stat().st_size // 2
+    with http_server(large.parent) as (server, url):
+        server.fault_of = lambda first, last: fault if first <= middle <= last else None
+        path = f'{url}/{large.name}'
+        assert main(['relabel', path, '-o', str(out), *QUICK]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f'boxreg: {path}: got no answer: ')
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('has_ranges', [True, False])
+def test_a_copy_of_a_file_is_whole(tmp_path, large, has_ranges, impatient):
+    """A file that is copied first, from servers with and without ranges."""
+    asked = []
+
+    def fault_of(*place):
+        asked.append(place)
+        return 'short' if len(asked) % 2 and has_ranges else None
+
+    with http_server(large.parent) as (server, url):
+        server.fault_of, server.has_ranges = fault_of, has_ranges
+        urls.download(Path(f'{url}/{large.name}'), tmp_path / 'copy')
+        if not has_ranges:
+            with pytest.raises(TransferError, match='a server that sends ranges'):
+                read_slice(f'{url}/{large.name}')
+    assert (tmp_path / 'copy').read_bytes() == large.read_bytes()
+    assert len(asked) > 3 or not has_ranges
 
 
 @pytest.fixture(scope='module')
@@ -333,7 +407,7 @@ def test_refused_credentials_of_an_object_store(tmp_path, whole, store, out, mon
 
 def test_a_server_that_does_not_answer_fails_its_drive_only(tmp_path, monkeypatch, capsys):
     path = Drive(sweeps=6).write(tmp_path / 'drive')
-    monkeypatch.setattr(urls, 'ANSWER_SECONDS', 1.0)
+    monkeypatch.setattr(urls, 'ANSWER_SECONDS', 0.5)
     with socket.create_server(('127.0.0.1', 0)) as silent:
         url = f'http://127.0.0.1:{silent.getsockname()[1]}/silent.mcap'
         command = ['batch', url, str(path), '-o', str(tmp_path / 'out')]

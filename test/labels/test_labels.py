@@ -188,7 +188,7 @@ def test_formats_state_all_conventions():
     for name in FORMATS:
         conventions = import_module(FORMATS[name]).FORMAT
         assert conventions.name == name
-        required = set(conventions.__slots__) - {'packages', 'options'}
+        required = set(conventions.__slots__) - {'packages', 'options', 'has_points'}
         assert all(getattr(conventions, field) for field in required)
 
 

@@ -5,11 +5,11 @@ import os
 from pathlib import Path
 import signal
 import subprocess
-import sys
 
-from boxreg_ros.bench.node import vitals
 from boxreg_ros.config import Config
 from boxreg_ros.live.topics import import_message
+from measure import MEASURE
+from measure.node import vitals
 from msg_adapters import vision
 import numpy as np
 import pytest
@@ -383,12 +383,12 @@ def domain():
     return {**os.environ, 'ROS_DOMAIN_ID': str(next_domain())}
 
 
-BENCH = [sys.executable, '-m', 'boxreg_ros.cli', 'bench', 'node', '--tracks=3', '--points=3000']
+LOAD = [*MEASURE, 'node', '--tracks=3', '--points=3000']
 
 
 def test_bench_node_reports_rates_latencies_and_resources(domain):
     done = subprocess.run(
-        [*BENCH, '--seconds=9', '--json'], cwd=ROOT, env=domain, capture_output=True, text=True,
+        [*LOAD, '--seconds=9', '--json'], cwd=ROOT, env=domain, capture_output=True, text=True,
         timeout=120,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -410,7 +410,7 @@ def test_boxes_are_refined_after_the_publisher_was_killed_and_restarted(domain, 
     domain['ROS_DOMAIN_ID'] = str(graph.domain)
     diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
     node = graph.start('-p', 'window:=5', '-p', 'lag:=2')
-    command = [*BENCH, '--role=publish', f'--log={tmp_path / "sent"}', '--seconds=60']
+    command = [*LOAD, '--role=publish', f'--log={tmp_path / "sent"}', '--seconds=60']
 
     def refined():
         return int(values_of(diagnostics).get('refined', 0))

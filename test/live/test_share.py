@@ -4,7 +4,6 @@ import json
 import re
 from xml.etree import ElementTree
 
-from boxreg_ros.bench.node import PROFILE
 from boxreg_ros.config import Config
 from boxreg_ros.io.markers import NAMESPACES
 from boxreg_ros.live.params import (
@@ -13,6 +12,7 @@ from boxreg_ros.live.params import (
     parameters_schema,
     parameters_yaml,
 )
+from measure.node import PROFILE
 from paths import ROOT, SHARE
 import pytest
 import rclpy

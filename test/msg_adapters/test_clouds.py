@@ -2,6 +2,7 @@
 
 import base64
 import sys
+import tracemalloc
 from types import SimpleNamespace
 import zlib
 
@@ -56,6 +57,48 @@ def test_lossless_clouds_are_equal_to_the_original(kind, pack):
     np.testing.assert_array_equal(sweep.points, known.points)
     np.testing.assert_array_equal(sweep.times, known.times)
     np.testing.assert_array_equal(pointcloud.intensities(found), pointcloud.intensities(message))
+
+
+@pytest.mark.parametrize('kind, pack', PAIRS)
+def test_not_more_than_the_cloud_is_unpacked(kind, pack):
+    message = cloud()
+    known = pointcloud.from_msg(message)
+    bomb = compressed(message, kind, pack(message.data.tobytes() + bytes(2**26)))
+    tracemalloc.start()
+    sweep = pointcloud.from_msg(clouds.plain(bomb))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**20
+    np.testing.assert_array_equal(sweep.points, known.points)
+    bomb.height = 2**31
+    with pytest.raises(UnsupportedMessage, match='a cloud of'):
+        clouds.plain(bomb)
+
+
+class DeviceBytes:
+    """Bytes in the memory of a device, as messages of ROS 2 Lyrical have them: no buffer."""
+
+    def __init__(self, data):
+        self._data = data
+
+    def __len__(self):
+        return len(self._data)
+
+    def to_bytes(self):
+        return self._data.tobytes()
+
+
+def test_bytes_of_a_device_are_read():
+    message = cloud()
+    expected = pointcloud.from_msg(message)
+    packed = compressed(message, 'zlib', zlib.compress(message.data.tobytes()))
+    packed.compressed_data = DeviceBytes(packed.compressed_data)
+    message.data = DeviceBytes(message.data)
+    for given in (message, clouds.plain(packed)):
+        sweep = pointcloud.from_msg(given)
+        np.testing.assert_array_equal(sweep.points, expected.points)
+        np.testing.assert_array_equal(sweep.times, expected.times)
+    assert not clouds.is_reordered(packed)
 
 
 def draco(points, **attributes):

@@ -1,12 +1,13 @@
 """`boxreg convert`, `boxreg formats` and `boxreg relabel --labels`."""
 
+from dataclasses import replace
 from importlib import import_module
 import json
 
 from boxreg_ros import cli
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
-from boxreg_ros.io.fixed_frame import input_boxes
+from boxreg_ros.io.fixed_frame import FixedFrameItems, input_boxes
 from boxreg_ros.labels import FORMATS, frames_of, Options
 from boxreg_ros.offline.convert import Conversion, convert
 from boxreg_ros.offline.formats import FORMAT_COLUMNS, rows
@@ -22,6 +23,9 @@ CALIBRATION = """P2: 700 0 621 0 0 700 187 0 0 0 1 0
 R_rect: 1 0 0 0 1 0 0 0 1
 Tr_velo_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
 """
+
+WITH_STATUS = tuple(sorted(set(FORMATS) - {'kitti', 'tracklets', 'mcap'}))
+"""Formats that can say that a person has placed a box."""
 
 
 @pytest.fixture
@@ -61,9 +65,9 @@ def test_labels_are_refined_like_boxes_of_a_topic(tmp_path, drive):
     relabel(Request((recording,), config=QUICK), tmp_path / 'topic')
     request = Request((recording,), config=QUICK, labels=('csv', table))
     summary = relabel(request, tmp_path / 'labels')
-    assert summary['labels'] == {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0}
-    assert summary['topics']['boxes'] is None
-    assert (summary['boxes_in'], summary['status']['refined']) == (14, 14)
+    assert summary.labels == {'format': 'csv', 'path': str(table), 'boxes_outside_part': 0}
+    assert summary.topics['boxes'] is None
+    assert (summary.boxes_in, summary.status['refined']) == (14, 14)
     assert_same_boxes(rows_of(tmp_path / 'labels'), rows_of(tmp_path / 'topic'), 1e-5)
 
 
@@ -87,12 +91,37 @@ def test_labels_with_other_frame_names_are_refined_alike(tmp_path, drive, camera
     assert_same_boxes(found, expected, atol)
 
 
+def test_boxes_of_a_person_stay_as_they_are(tmp_path, drive):
+    recording, table = drive
+    corrected = BoxTable.read(table)
+    rows = [6, 7]
+    corrected.boxes[rows] += np.array([0.05, 0.05, 0.05, 0, 0, 0, 0, 0, 0.01])
+    status = list(corrected.status)
+    status[6] = status[7] = 'human'
+    replace(corrected, status=tuple(status)).write(table)
+    options = Options(with_points=True)
+    convert(Conversion(table, 'csv', WITH_STATUS, options, (recording,)), tmp_path / 'made')
+    for name in WITH_STATUS:
+        labels = (name, tmp_path / 'made' / ('boxes.csv' if name == 'csv' else name))
+        with source_of([recording], labels=labels) as source:
+            items = list(FixedFrameItems(source, QUICK).read(with_clouds=False))
+        pins = [item.moved.pinned for item in items]
+        assert [pin is not None and pin.all() for pin in pins] == [i == 3 for i in range(7)], name
+    config = QUICK.updated({'complete.static': True})
+    for steps in (config, QUICK):
+        relabel(Request((recording,), config=steps, labels=labels), tmp_path / 'out')
+        found = BoxTable.read(tmp_path / 'out' / 'boxes.csv')
+        assert [found.status[row] for row in rows] == ['human', 'human']
+        np.testing.assert_allclose(found.boxes[rows], corrected.boxes[rows], atol=2e-5)
+        assert 'refined' in found.status
+
+
 def test_labels_of_a_recording_without_boxes(tmp_path, drive):
     _, table = drive
     bare = Drive(sweeps=7)
     bare.items = [item for item in bare.items if item[0] != '/boxes']
     request = Request((bare.write(tmp_path / 'bare'),), config=QUICK, labels=('csv', table))
-    assert relabel(request, tmp_path / 'out')['boxes_out'] == 14
+    assert relabel(request, tmp_path / 'out').boxes_out == 14
 
 
 def test_labels_outside_of_the_requested_part_are_counted(tmp_path, drive):
@@ -103,7 +132,21 @@ def test_labels_outside_of_the_requested_part_are_counted(tmp_path, drive):
     stamps = {int(row['stamp_ns']) for row in rows_of(tmp_path / 'out')}
     first = min(int(row['stamp_ns']) for row in rows_of_table(table))
     assert {round((stamp - first) / SECOND, 1) for stamp in stamps} == {0.2, 0.3, 0.4}
-    assert summary['labels']['boxes_outside_part'] == 8
+    assert summary.labels['boxes_outside_part'] == 8
+
+
+@pytest.mark.parametrize('apart', [-(10**18), 10**18, -(10**10), 10**10])
+def test_labels_of_another_drive_are_refused(tmp_path, drive, apart):
+    recording, table = drive
+    labels = BoxTable.read(table)
+    replace(labels, stamps_ns=labels.stamps_ns + apart).write(table)
+    request = Request((recording,), config=QUICK, labels=('csv', table))
+    with pytest.raises(RecordingError, match=r'clouds of .* \(2023-11-14\): another drive\?'):
+        relabel(request, tmp_path / 'out')
+    assert not (tmp_path / 'out').exists()
+    part = Request((recording,), config=QUICK, labels=('csv', table), end=0.3)
+    if abs(apart) < 10**12:
+        assert relabel(part, tmp_path / 'out').labels['boxes_outside_part'] == 14
 
 
 def module_packages(name):
@@ -120,7 +163,7 @@ def test_labels_without_transform_are_kept_with_the_reason(tmp_path, drive):
     text = table.read_text().replace(',odom,', ',mars,')
     table.write_text(text)
     request = Request((recording,), config=QUICK, labels=('csv', table))
-    assert relabel(request, tmp_path / 'out')['reasons'] == {'no_transform': 14}
+    assert relabel(request, tmp_path / 'out').reasons == {'no_transform': 14}
 
 
 def test_label_frame_other_than_the_sensor(tmp_path, drive):

@@ -4,6 +4,7 @@ import argparse
 import codecs
 from dataclasses import replace
 import json
+import re
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable, COLUMNS
@@ -183,6 +184,17 @@ def test_malformed_table_is_refused(tmp_path, text, message):
         BoxTable.read(tmp_path / 'boxes.csv')
 
 
+@pytest.mark.parametrize(('mark', 'encoding', 'found'), [
+    (',', 'utf-16', 'UTF-16'), (',', 'utf-16-be', 'UTF-16'), (';', 'utf-8-sig', 'semicolons'),
+    ('\t', 'utf-16', 'UTF-16'), ('\t', 'utf-8', 'tabs'),
+])  # fmt: skip
+def test_other_exports_of_spreadsheets_are_named(tmp_path, mark, encoding, found):
+    path = tmp_path / 'boxes.csv'
+    path.write_text(mark.join(COLUMNS) + '\n' + mark.join('1' * 17), encoding=encoding)
+    with pytest.raises(RecordingError, match=f'got {found}, .*save it as "CSV UTF-8'):
+        BoxTable.read(path)
+
+
 def test_absent_or_binary_table_is_refused(tmp_path):
     (tmp_path / 'binary.csv').write_bytes(bytes(range(256)))
     for name, reason in (('absent.csv', 'read: No such file'), ('binary.csv', 'read as CSV')):
@@ -234,11 +246,15 @@ def test_tables_without_a_common_stamp_are_explained(tmp_path, capsys):
     truth = truth_table()
     truth.write(tmp_path / 'truth.csv')
     replace(truth, stamps_ns=truth.stamps_ns + 10**12).write(tmp_path / 'boxes.csv')
+    expected = (
+        'got boxes of 1000.000 to 1000.900 s (1970-01-01), true boxes of 0.000 to 0.900 s '
+        '(1970-01-01): another drive?'
+    )
+    with pytest.raises(RecordingError, match=re.escape(expected)):
+        run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv')
+    replace(truth, stamps_ns=truth.stamps_ns + 10).write(tmp_path / 'boxes.csv')
     assert run(tmp_path / 'boxes.csv', tmp_path / 'truth.csv') == 1
-    assert (
-        'no predicted box overlaps a true one: 0 stamps are in both; stamps of predicted boxes: '
-        '1000.000 to 1000.900 s, of true boxes: 0.000 to 0.900 s'
-    ) in capsys.readouterr().err
+    assert 'overlaps a true one: 0 stamps are in both' in capsys.readouterr().err
 
 
 def test_invalid_true_boxes_are_left_out_with_a_warning(tmp_path, capsys):

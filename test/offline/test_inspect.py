@@ -4,6 +4,7 @@ import json
 import shlex
 
 from boxreg_ros.cli import main
+from paths import ROOT
 import pytest
 from ros_messages import Drive, SECOND, START, write_recording
 
@@ -18,7 +19,9 @@ def test_contents_and_the_command_to_run(tmp_path, capsys, storage):
     path = Drive(sweeps=12).write(tmp_path / 'drive', storage)
     status, facts = facts_of(capsys, path)
     assert status == 0
-    assert facts['command'] == shlex.join(['boxreg', 'relabel', str(path), '-o', 'out/drive'])
+    pytest.importorskip('plotly')
+    words = ['boxreg', 'relabel', str(path), '-o', 'out/drive', '--complete', '--report']
+    assert facts['command'] == shlex.join(words)
     assert facts['seconds'] == pytest.approx(1.1, abs=1e-6)
     topics = {entry['topic']: entry for entry in facts['topics']}
     assert topics['/points']['messages'] == 12
@@ -34,6 +37,13 @@ def test_contents_and_the_command_to_run(tmp_path, capsys, storage):
     assert sample['sweep_period_s'] == pytest.approx(0.1)
     assert sample['stamp_offset_s'] == 0
     assert facts['damage'] == facts['warnings'] == facts['problems'] == []
+
+
+def test_the_command_is_that_of_the_readme(capsys, monkeypatch):
+    pytest.importorskip('plotly')
+    monkeypatch.chdir(ROOT)
+    _, facts = facts_of(capsys, 'bags/street.mcap')
+    assert f'    {facts["command"]}\n' in (ROOT / 'README.md').read_text(encoding='utf-8')
 
 
 def test_why_no_command_can_be_run(tmp_path, capsys):

@@ -16,8 +16,10 @@ from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.labels import Options
 from boxreg_ros.labels.cloud_spool import Spool
 from boxreg_ros.offline.convert import Conversion, convert
-from boxreg_ros.offline.relabel import closing_line, notes, relabel, Request
+from boxreg_ros.offline.notes import closing_line, notes
+from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.sources import source_of
+from boxreg_ros.offline.summary import Summary
 from boxreg_ros.review import tables
 from boxreg_ros.structures import Sweep
 from msg_adapters.convention import Convention
@@ -51,10 +53,10 @@ def test_the_summary_states_the_time_of_the_boxes(tmp_path, scenario, known, set
     )
     settings = {'sampling.box_time': setting}
     summary, _ = run(tmp_path / 'way.mcap', tmp_path / 'out', settings=settings, formats=('csv',))
-    assert summary['box_time']['setting'] == setting
-    assert summary['box_time']['estimated'] == known
+    assert summary.box_time['setting'] == setting
+    assert summary.box_time['estimated'] == known
     other = {'stamp': 'sight', 'sight': 'stamp'}[known]
-    votes = summary['box_time']['votes']
+    votes = summary.box_time['votes']
     assert votes[known] > 2 * votes[other]
 
 
@@ -69,11 +71,11 @@ def test_every_box_is_written_once_in_order(tmp_path, estimate, boxes):
     )
     assert keys(rows) == [(stamp, track) for stamp in drive.stamps for track in ('1', '2')]
     assert {row['frame_id'] for row in rows} == {'odom'}
-    assert (summary['sweeps'], summary['box_arrays']) == (7, 7)
-    assert (summary['boxes_in'], summary['boxes_out']) == (14, 14)
-    assert sum(summary['status'].values()) == 14
-    assert sum(summary['reasons'].values()) == summary['status'].get('kept', 0)
-    assert summary['status'].get('refined', 0) > 0
+    assert (summary.sweeps, summary.box_arrays) == (7, 7)
+    assert (summary.boxes_in, summary.boxes_out) == (14, 14)
+    assert sum(summary.status.values()) == 14
+    assert sum(summary.reasons.values()) == summary.status.get('kept', 0)
+    assert summary.status.get('refined', 0) > 0
 
 
 def test_refined_boxes_match_the_truth_in_the_fixed_frame(tmp_path):
@@ -130,11 +132,13 @@ def test_output_folder_contents(tmp_path):
         'tracks.csv',
     ]  # fmt: skip
     assert Config.from_yaml(out / 'config.yaml') == QUICK.updated({'solver.iterations': 2})
-    assert json.loads((out / 'summary.json').read_text()) == summary
-    assert summary['topics'] == {'points': '/points', 'boxes': '/boxes', 'odometry': None}
-    assert summary['fixed_frame'] == 'odom'
-    assert set(summary['versions']) >= {'boxreg_ros', 'torch', 'numpy', 'rosbags'}
-    assert set(summary['seconds']) == {
+    content = json.loads((out / 'summary.json').read_text())
+    assert content == summary.as_json()
+    assert Summary.from_json(content) == summary
+    assert summary.topics == {'points': '/points', 'boxes': '/boxes', 'odometry': None}
+    assert summary.fixed_frame == 'odom'
+    assert set(summary.versions) >= {'boxreg_ros', 'torch', 'numpy', 'rosbags'}
+    assert set(summary.seconds) == {
         'start', 'read', 'decode', 'transform', 'registrar', 'solve', 'write', 'total',
     }  # fmt: skip
     label = json.loads((out / 'openlabel' / 'labels.json').read_text())['openlabel']
@@ -188,11 +192,11 @@ def test_invalid_boxes_are_written_unchanged(tmp_path):
     assert np.isnan(table.boxes[9, 6:]).all()
     assert np.isfinite(np.delete(table.boxes, [8, 9], axis=0)).all()
     assert float(bad['inside out']['width']) == -2.0
-    reasons = summary['reasons']
+    reasons = summary.reasons
     assert reasons['invalid_box'] == 4
     assert reasons['no_track_id'] == 1
     assert reasons['duplicate_track_id'] == 1
-    assert summary['status']['kept'] == sum(reasons.values())
+    assert summary.status['kept'] == sum(reasons.values())
     label = json.loads((tmp_path / 'out' / 'openlabel' / 'labels.json').read_text())
     assert len(label['openlabel']['frames']['2']['objects']) == 5
 
@@ -207,9 +211,9 @@ def test_boxes_without_transform_stay_in_their_frame(tmp_path):
     assert {(row['frame_id'], row['status']) for row in early} == {('lidar', 'kept')}
     assert {row['frame_id'] for row in rows[4:]} == {'odom'}
     assert keys(rows) == [(stamp, track) for stamp in drive.stamps for track in ('1', '2')]
-    assert summary['reasons']['no_transform'] == 4
-    assert summary['dropped']['sweep_without_transform'] == 2
-    assert 'odom -> base is known from' in summary['first_missing_transform']
+    assert summary.reasons['no_transform'] == 4
+    assert summary.dropped['sweep_without_transform'] == 2
+    assert 'odom -> base is known from' in summary.first_missing_transform
     (note,) = notes(summary)
     assert note.startswith('4 boxes and 2 clouds have no transform; first: transform odom -> base')
     arrays, left_out = input_boxes(source_of([tmp_path / 'drive']))
@@ -225,9 +229,9 @@ def test_boxes_in_an_unconnected_frame(tmp_path):
             for detection in message.detections:
                 detection.header.frame_id = 'radar'
     summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
-    assert summary['reasons'] == {'no_transform': 6}
+    assert summary.reasons == {'no_transform': 6}
     assert {row['frame_id'] for row in rows} == {'radar'}
-    assert "'radar'" in summary['first_missing_transform']
+    assert "'radar'" in summary.first_missing_transform
 
 
 def test_unpaired_sweeps_and_boxes(tmp_path):
@@ -240,8 +244,8 @@ def test_unpaired_sweeps_and_boxes(tmp_path):
     summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
     assert len(rows) == 10
     assert {row['status'] for row in rows[2:4]} == {'kept'}
-    assert summary['reasons']['no_sweep'] == 2
-    assert summary['dropped']['sweep_without_boxes'] == 1
+    assert summary.reasons['no_sweep'] == 2
+    assert summary.dropped['sweep_without_boxes'] == 1
 
 
 @pytest.mark.parametrize(
@@ -270,9 +274,9 @@ def test_topic_recorded_at_another_time_is_merged_by_stamp(tmp_path, storage, to
     )
     summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
     assert rows_of(tmp_path / 'out') == expected
-    assert summary['status'] == {'refined': 24}
-    assert summary['recorded_apart'] == {topic: pytest.approx(late)}
-    assert together['recorded_apart'] == {}
+    assert summary.status == {'refined': 24}
+    assert summary.recorded_apart == {topic: pytest.approx(late)}
+    assert together.recorded_apart == {}
     # Start and end count from the first cloud, whenever the rest was recorded.
     options = {'start': 0.35, 'end': 0.75, 'config': QUICK}
     relabel(Request(paths, **options), tmp_path / 'part')
@@ -290,7 +294,7 @@ def test_boxes_of_a_slow_detector_are_merged_by_stamp(tmp_path):
     path = write_recording(tmp_path / 'slow', sorted(slow, key=lambda item: item[1]))
     summary, rows = run(path, tmp_path / 'out')
     assert rows == expected
-    assert summary['recorded_apart'] == {'/boxes': pytest.approx(5.5)}
+    assert summary.recorded_apart == {'/boxes': pytest.approx(5.5)}
     assert closing_line(summary, tmp_path).endswith('; merged by stamp: /boxes (+5.5 s)')
 
 
@@ -307,7 +311,7 @@ def test_topic_longer_than_the_clouds_is_merged_by_stamp(tmp_path):
         write_recording(tmp_path / 'poses', poses),
     )
     summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
-    assert summary['recorded_apart'] == {'/tf': pytest.approx(3600)}
+    assert summary.recorded_apart == {'/tf': pytest.approx(3600)}
     assert rows_of(tmp_path / 'out') == expected
 
 
@@ -330,7 +334,7 @@ def test_empty_arrays_at_the_ends_do_not_prevent_the_merge_by_stamp(tmp_path):
     )
     summary = relabel(Request(paths, config=QUICK), tmp_path / 'out')
     assert rows_of(tmp_path / 'out') == expected
-    assert summary['status']['refined'] > 40
+    assert summary.status['refined'] > 40
 
 
 def test_part_without_boxes_is_a_warning(tmp_path, capsys):
@@ -364,8 +368,8 @@ def test_stamps_of_another_clock_do_not_change_the_order(tmp_path):
             for item in (message, *message.detections):
                 item.header.stamp.sec -= 10_000
     summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
-    assert summary['recorded_apart'] == {}
-    assert len(rows) == summary['boxes_in'] == 24
+    assert summary.recorded_apart == {}
+    assert len(rows) == summary.boxes_in == 24
     assert {row['status'] for row in rows} == {'kept'}
 
 
@@ -437,8 +441,8 @@ def test_recording_of_a_loop_starts_again_after_the_time_jump(tmp_path, pause):
     length = 5 * SECOND + pause * SECOND
     drive.items += [(topic, t + length, m) for topic, t, m in drive.items if topic != '/tf_static']
     summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
-    assert summary['time_jumps'] == 1
-    assert summary['boxes_out'] == len(rows) == 200
+    assert summary.time_jumps == 1
+    assert summary.boxes_out == len(rows) == 200
     rounds = {}
     for row in rows:
         rounds.setdefault((row['stamp_ns'], row['track_id']), []).append(row)
@@ -462,7 +466,7 @@ def test_empty_clouds_and_empty_arrays(tmp_path):
     ]
     summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
     assert len(rows) == 10
-    assert (summary['sweeps'], summary['box_arrays']) == (6, 6)
+    assert (summary.sweeps, summary.box_arrays) == (6, 6)
 
 
 def test_boxes_without_points_are_written(tmp_path):
@@ -510,17 +514,17 @@ def test_unreadable_messages_are_skipped_and_counted(tmp_path):
     path = truncated(path, tmp_path / 'drive', sizes)
     summary, rows = run(path, tmp_path / 'out', formats=('csv', 'mcap'))
     dropped = {'boxes_without_sweep': 3, 'sweep_without_boxes': 1, 'unreadable': 5}
-    assert summary['dropped'] == dropped
-    assert (summary['sweeps'], summary['box_arrays'], summary['boxes_in']) == (5, 7, 14)
+    assert summary.dropped == dropped
+    assert (summary.sweeps, summary.box_arrays, summary.boxes_in) == (5, 7, 14)
     left = [stamp for k, stamp in enumerate(drive.stamps) if k != 5]
     assert keys(rows) == [(stamp, track) for stamp in left for track in ('1', '2')]
     lost = [drive.stamps[k] for k in (0, 3, 6)]
     status = {int(row['stamp_ns']): row['status'] for row in rows}
     assert status == {stamp: 'kept' if stamp in lost else 'refined' for stamp in left}
-    assert summary['reasons'] == {'no_sweep': 6}
-    assert "'/points' is not a sensor_msgs/msg/PointCloud2" in summary['first_unreadable']
-    assert "'/boxes' is not a vision_msgs/msg/Detection3DArray" in summary['first_unreadable']
-    assert "'/tf' is not a tf2_msgs/msg/TFMessage" in summary['first_unreadable']
+    assert summary.reasons == {'no_sweep': 6}
+    assert "'/points' is not a sensor_msgs/msg/PointCloud2" in summary.first_unreadable
+    assert "'/boxes' is not a vision_msgs/msg/Detection3DArray" in summary.first_unreadable
+    assert "'/tf' is not a tf2_msgs/msg/TFMessage" in summary.first_unreadable
     assert '5 messages could not be read' in closing_line(summary, tmp_path / 'out')
     # The overlay holds the unreadable messages unchanged; the refined topic has the other arrays.
     with AnyReader([tmp_path / 'out' / 'overlay.mcap']) as reader:
@@ -576,7 +580,7 @@ def test_label_frames_without_cloud_are_a_note(tmp_path):
     path = drive.write(tmp_path / 'drive')
     options = {'formats': ('sustechpoints',), 'options': Options(with_points=True)}
     summary, _ = run(path, tmp_path / 'out', **options)
-    assert summary['frames_without_cloud'] == 2
+    assert summary.frames_without_cloud == 2
     assert list(notes(summary)) == ['2 of 6 box arrays have no cloud to write beside them']
     assert list(notes(run(path, tmp_path / 'plain')[0])) == []
 
@@ -591,8 +595,8 @@ def test_unreadable_intensities_drop_no_cloud(tmp_path):
     options = {'formats': ('sustechpoints',), 'options': Options(with_points=True)}
     summary, rows = run(drive.write(tmp_path / 'drive'), tmp_path / 'out', **options)
     assert {row['status'] for row in rows} == {'refined'}
-    assert summary['frames_without_cloud'] == 0
-    assert 'intensity' in summary['first_unreadable']
+    assert summary.frames_without_cloud == 0
+    assert 'intensity' in summary.first_unreadable
 
 
 @pytest.mark.parametrize('name', ['boxes.csv', 'mine/notes.txt'])
@@ -701,7 +705,7 @@ def test_box_topic_with_ids_is_preferred(tmp_path):
     drive.items += more
     path = drive.write(tmp_path / 'drive')
     summary, _ = run(path, tmp_path / 'out')
-    assert summary['topics']['boxes'] == '/boxes'
+    assert summary.topics['boxes'] == '/boxes'
     with pytest.raises(RecordingError, match='/boxes, /clusters'):
         run(path, tmp_path / 'out', convention=Convention(associate=True))
 
@@ -761,4 +765,4 @@ def test_every_real_box_is_written_once(tmp_path, storage, boxes):
     summary, rows = run(recording, tmp_path / 'out')
     assert len(given) > 50
     assert keys(rows) == given
-    assert summary['fixed_frame'] == 'odom'
+    assert summary.fixed_frame == 'odom'

@@ -21,6 +21,7 @@ from boxreg_ros.offline.result_folder import whole_folder
 from preloaded import BOXREG, PreloadedProcess
 import pytest
 from ros_messages import Drive
+import zstandard
 
 SETTINGS = {'track_window': 16, 'min_observations': 3}
 """Windows of sixteen observations, so that there are several batches."""
@@ -167,14 +168,21 @@ def test_file_size_limit_is_an_error_and_leaves_nothing(tmp_path, request_of_dri
         f'from boxreg_ros.cli import main; sys.exit(main(sys.argv[1:]))'
     )
     out = tmp_path / 'results' / 'out'
-    command = ['relabel', str(request_of_drive.recordings[0]), '-o', str(out)]
-    for formats in ('csv', 'openlabel,mcap'):
+    (recording,) = request_of_drive.recordings
+    packed = tmp_path / f'{recording.name}.zstd'
+    packed.write_bytes(zstandard.ZstdCompressor().compress(recording.read_bytes()))
+    room = f"output '{out}': expected room for all files"
+    for path, formats, words in (
+        (recording, 'csv', room),
+        (recording, 'openlabel,mcap', room),
+        (packed, 'csv', f'temporary files in {tmp_path}: expected room for a copy'),
+    ):
         ran = subprocess.run(
-            [sys.executable, '-c', code, *command, f'--formats={formats}', *QUICK],
-            capture_output=True, text=True,
+            [sys.executable, '-c', code, 'relabel', path, '-o', out, '--formats', formats, *QUICK],
+            capture_output=True, text=True, env={**os.environ, 'TMPDIR': str(tmp_path)},
         )  # fmt: skip
         assert ran.returncode == 1
-        assert ran.stderr.startswith(f"boxreg: output '{out}': expected room for all files")
+        assert ran.stderr.startswith(f'boxreg: {words}')
         assert len(ran.stderr.splitlines()) == 1
         assert not list((tmp_path / 'results').iterdir())
 

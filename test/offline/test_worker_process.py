@@ -271,7 +271,7 @@ def test_only_the_worker_imports_torch(tmp_path):
 def test_relabel_writes_the_same_files_in_one_process(tmp_path, monkeypatch):
     request = Request((Drive(sweeps=30).write(tmp_path / 'drive'),), config=SHORT)
     summary = relabel(request, tmp_path / 'worker')
-    assert 0 < summary['seconds']['solve'] < summary['seconds']['total']
+    assert 0 < summary.seconds['solve'] < summary.seconds['total']
     monkeypatch.setattr(os, 'fork', None)
     one_core = SHORT.updated({'solver.threads': 1})
     relabel(Request(request.recordings, config=one_core), tmp_path / 'direct')

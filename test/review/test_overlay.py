@@ -76,7 +76,7 @@ def test_all_messages_are_copied_and_refined_boxes_added(tmp_path, storage, boxe
     assert copied.pop('/boxes_refined_markers')[0] == MARKERS
     assert copied == kinds
     assert [t for t, *_ in refined] == drive.stamps
-    assert summary['status']['refined'] > 0
+    assert summary.status['refined'] > 0
     moved = 0.0
     for stamp_ns, message, original in refined:
         found = adapter.from_msg(message)
@@ -125,7 +125,7 @@ def test_boxes_recorded_at_another_time_get_the_time_of_their_clouds(tmp_path):
         for topic in ('/points', '/boxes', *ADDED):
             times = [row[1:3] for row in rows if row[0] == topic]
             assert times == [(t, t) for t in stamps]
-        assert summary['left_out_of_labels'] == {}
+        assert summary.left_out_of_labels == {}
 
 
 def test_ros1_recording_gives_a_ros1_overlay(tmp_path):
@@ -251,7 +251,7 @@ def test_empty_messages_and_messages_out_of_order(tmp_path):
     times = [t for topic, t, *_ in rows if topic == '/boxes_refined']
     assert times == [t for topic, t, *_ in rows if topic == '/boxes']
     assert len(times) == 6
-    assert summary['left_out_of_labels'] == {}
+    assert summary.left_out_of_labels == {}
 
 
 def test_boxes_without_transform_are_unchanged(tmp_path):
@@ -260,7 +260,7 @@ def test_boxes_without_transform_are_unchanged(tmp_path):
     drive.items = [item for item in drive.items if item[0] != '/tf' or item[1] not in gone]
     path = drive.write(tmp_path / 'drive')
     summary = run(path, tmp_path / 'out')
-    assert summary['reasons']['no_transform'] > 0
+    assert summary.reasons['no_transform'] > 0
     rows, _ = messages_of(tmp_path / 'out' / 'overlay.mcap')
     assert len([row for row in rows if row[0] == '/boxes_refined']) == 6
     kind = 'vision_msgs/msg/Detection3DArray'

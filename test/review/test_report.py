@@ -14,8 +14,9 @@ from boxreg_ros.cli import main
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.notes import closing_line
 from boxreg_ros.offline.progress import Progress
-from boxreg_ros.offline.relabel import closing_line, relabel, Request
+from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.quality import quality
 from boxreg_ros.review.report import write_report
@@ -101,11 +102,11 @@ def test_page_needs_no_other_file(street):
 
 def test_numbers_agree_with_the_summary(street):
     out, summary, page = street
-    before = {**summary, 'seconds': {'total': 0.0}}
+    before = replace(summary, seconds={'total': 0.0})
     assert closing_line(before, out).split(' in 0.0 s')[0] in page.text
     rows = page.data['tracks']
-    assert sum(row['boxes'] for row in rows) == summary['boxes_in']
-    assert sum(row['flips'] for row in rows) == summary['heading_flips'] > 0
+    assert sum(row['boxes'] for row in rows) == summary.boxes_in
+    assert sum(row['flips'] for row in rows) == summary.heading_flips > 0
     with open(out / 'review.csv', newline='', encoding='utf-8') as file:
         review = list(csv.DictReader(file))
     assert [row['id'] for row in rows] == [row['track_id'] for row in review]
@@ -113,11 +114,11 @@ def test_numbers_agree_with_the_summary(street):
     assert [row['riskiest'] for row in rows] == [row['stamp_ns'] for row in review]
     assert [row['why'] for row in rows] == [row['reasons'] for row in review]
     violated = Counter(rule for row in rows for rule, *_ in row['rules'])
-    assert violated == +Counter(summary['rules']['after'])
-    for name, count in summary['reasons'].items():
+    assert violated == +Counter(summary.rules['after'])
+    for name, count in summary.reasons.items():
         assert f'{name} {count}' in page.text
-    for name, before in summary['rules']['before'].items():
-        after = summary['rules']['after'][name]
+    for name, before in summary.rules['before'].items():
+        after = summary.rules['after'][name]
         is_shown = before > 0 or after > 0
         assert (f'{name} warning {before} {after}' in page.text) == (
             is_shown and RULES[name].severity == 'warning'
@@ -131,7 +132,7 @@ def test_numbers_agree_with_the_summary(street):
     for name in ('window: 9', 'lag: 8'):
         assert name in page.text
     assert 'solver.rounds' not in page.text
-    assert 'report' in summary['seconds']
+    assert 'report' in summary.seconds
 
 
 def test_part_holds_the_boxes_and_points_of_its_track(street):
@@ -187,8 +188,8 @@ def test_unusual_boxes_are_counted_and_escaped(tmp_path):
     recording = spoiled(Drive(sweeps=18)).write(tmp_path / 'drive')
     config = QUICK.updated({'complete.fill': True})
     summary, page = run(recording, tmp_path / 'out', config=config)
-    assert summary['status']['interpolated'] == 2
-    assert set(summary['reasons']) >= {
+    assert summary.status['interpolated'] == 2
+    assert set(summary.reasons) >= {
         'no_transform', 'invalid_box', 'no_track_id', 'no_points',
     }  # fmt: skip
     assert SCRIPT not in page.source
@@ -200,7 +201,7 @@ def test_unusual_boxes_are_counted_and_escaped(tmp_path):
     shown = zip(part['status'], part['counts'], strict=True)
     assert [count > 10 for word, count in shown if word == 'interpolated'] == [True, True]
     assert page.rows['flat']['shift'] is None
-    assert sum(row['boxes'] for row in page.rows.values()) == summary['boxes_in']
+    assert sum(row['boxes'] for row in page.rows.values()) == summary.boxes_in
     assert page.text.count('First missing transform') == 1
     parts = [page.part(name) for name in page.rows]
     assert [len(part['stamps']) > 0 for part in parts] == [True] * 8
@@ -218,7 +219,7 @@ def test_page_of_a_run_that_refined_nothing(tmp_path, kind):
         if topic == '/boxes' and kind == 'no boxes':
             message.detections = []
     summary, page = run(drive.write(tmp_path / 'drive'), tmp_path / 'out')
-    assert 'refined' not in summary['status']
+    assert 'refined' not in summary.status
     assert ('No box was refined' in page.text) == (kind != 'no boxes')
     assert all(row['shift'] is None for row in page.rows.values())
     assert bool(page.rows) == (kind != 'no boxes')
@@ -241,7 +242,7 @@ def test_report_is_off_by_default_and_part_of_the_fingerprint(tmp_path):
     plain = Request((recording,), config=QUICK)
     summary = relabel(plain, tmp_path / 'out')
     assert not (tmp_path / 'out' / 'report.html').exists()
-    assert 'report' not in summary['seconds']
+    assert 'report' not in summary.seconds
     assert Request((recording,), config=QUICK, report=True).fingerprint() != plain.fingerprint()
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 import json
 
 from boxreg_ros import cli
-from boxreg_ros.bench.tracks import broken, table_of
 from boxreg_ros.config import COMPLETE_STEPS, Config
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
@@ -17,6 +16,7 @@ from boxreg_ros.offline.track_scores import track_scores
 from boxreg_ros.simulation.simulate import simulate
 from boxreg_ros.structures import ADDED, Sweep
 from drives import ALL_STEPS, complete, drive, only, path, steps_of
+from measure.tracks import broken, table_of
 import numpy as np
 import pytest
 from relabel_results import rows_of
@@ -165,9 +165,9 @@ def test_every_format_has_added_boxes_and_no_rejected_ones(tmp_path):
     path_ = recorded.write(tmp_path / 'drive')
     request = Request((path_,), formats=(*FORMATS, 'mcap'), config=ALL_STEPS)
     summary = relabel(request, tmp_path / 'out')
-    assert (summary['boxes_in'], summary['boxes_out']) == (26, 29)
-    assert summary['status']['interpolated'] == summary['complete']['filled'] == 3
-    assert summary['status']['rejected'] == summary['reasons']['ghost'] == 1
+    assert (summary.boxes_in, summary.boxes_out) == (26, 29)
+    assert summary.status['interpolated'] == summary.complete['filled'] == 3
+    assert summary.status['rejected'] == summary.reasons['ghost'] == 1
     rows = rows_of(tmp_path / 'out')
     assert len(rows) == 29
     assert [row['track_id'] for row in rows if row['status'] == 'rejected'] == ['9']
@@ -186,8 +186,8 @@ def test_every_format_has_added_boxes_and_no_rejected_ones(tmp_path):
 def test_recording_without_steps_is_as_before(tmp_path):
     path_ = Recorded(sweeps=8).write(tmp_path / 'drive')
     summary = relabel(Request((path_,), formats=('csv',), config=only()), tmp_path / 'out')
-    assert summary['complete'] == {}
-    assert summary['boxes_in'] == summary['boxes_out'] == 16
+    assert summary.complete == {}
+    assert summary.boxes_in == summary.boxes_out == 16
 
 
 def test_tracks_are_not_completed_across_a_time_jump(tmp_path):
@@ -199,9 +199,9 @@ def test_tracks_are_not_completed_across_a_time_jump(tmp_path):
     first.items += [(topic, received + shift, message) for topic, received, message in again.items]
     request = Request((first.write(tmp_path / 'drive'),), formats=('csv',), config=ALL_STEPS)
     summary = relabel(request, tmp_path / 'out')
-    assert summary['time_jumps'] == 1
-    assert summary['boxes_in'] == 46
-    assert summary['status']['interpolated'] == 2
+    assert summary.time_jumps == 1
+    assert summary.boxes_in == 46
+    assert summary.status['interpolated'] == 2
 
 
 def test_command_line(tmp_path, capsys):
@@ -215,10 +215,6 @@ def test_command_line(tmp_path, capsys):
     assert cli.main(['evaluate', out, str(tmp_path / 'street_truth.csv'), '--json']) == 0
     tracks = json.loads(capsys.readouterr().out)['tracks']
     assert tracks['added'] > 10
-    with pytest.raises(SystemExit) as status:
-        cli.main(['relabel', str(recording), '-o', out, '--bridge', '1.0'])
-    assert status.value.code == 2
-    assert '--bridge: was removed; use --complete' in capsys.readouterr().err
 
 
 def test_estimates_of_the_node_can_be_completed():

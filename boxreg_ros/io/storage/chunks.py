@@ -45,6 +45,10 @@ Chosen: at 50 MB/s they last for the latency of an object store, 0.1 s, three ti
 """
 MAX_CHUNK_BYTES = 2**30
 """Chunks that claim to be larger are damaged [bytes]; writers make chunks of 1 to 16 MB."""
+MAX_RECORDS = 2**20
+"""Chunks with more records are damaged; those of 16 MB with the smallest of messages have half."""
+RECORD_BYTES = 256
+"""What a message takes in memory beside its content [bytes]."""
 
 
 class Chunk(NamedTuple):
@@ -123,7 +127,7 @@ class ChunkedFile(ABC):
 
         def load(chunk: Chunk) -> list[Record]:
             read_ahead(chunk)
-            return [
+            records = [
                 Record(
                     wanted[message.connection_id], message.received_ns, message.data,
                     message.published_ns, message.sequence,
@@ -131,6 +135,7 @@ class ChunkedFile(ABC):
                 for message in self._messages_of(chunk)
                 if message.connection_id in wanted and _is_within(message.received_ns, start, stop)
             ]  # fmt: skip
+            return _without_chunk(records)
 
         chunks = [
             chunk
@@ -153,13 +158,14 @@ class ChunkedFile(ABC):
         """Set `connections` and `_chunks`, from the index of the file or by a scan."""
 
     @abstractmethod
-    def _unpack(self, chunk: Chunk) -> list[StoredMessage]:
-        """Return the messages of a chunk; any error means that it is damaged."""
+    def _unpack(self, chunk: Chunk, stored: bytes) -> list[StoredMessage]:
+        """Return the messages of a chunk from its bytes; any error means that it is damaged."""
 
     def _messages_of(self, chunk: Chunk) -> list[StoredMessage]:
         """Return the messages of a chunk; none, and a damage is noted, if it is damaged."""
+        stored = self._bytes(chunk.first_byte, chunk.end_byte)  # a failure here is no damage
         try:
-            return self._unpack(chunk)
+            return self._unpack(chunk, stored)
         except Exception as error:  # of the format's library or of a decompressor
             reason = f'damaged chunk ({one_line(error)})'
             self._note(reason, chunk.first_byte, chunk.end_byte, chunk.start_ns, chunk.last_ns)
@@ -252,7 +258,7 @@ def _merged(
             positions[i] += 1
         else:
             held[i] = sorted(load(chunks[i]), key=lambda record: record.received_ns)
-            sizes[i] = sum(len(record.data) for record in held[i])
+            sizes[i] = sum(RECORD_BYTES + len(record.data) for record in held[i])
             while len(held) > 1 and sum(sizes.values()) > buffer_bytes:
                 others = {k: held[k][positions[k]].received_ns for k in held if k != i}
                 last = max(others, key=others.__getitem__)
@@ -261,6 +267,14 @@ def _merged(
             heappush(waiting, (held[i][positions[i]].received_ns, i))
         else:
             del held[i], sizes[i]
+
+
+def _without_chunk(records: list[Record]) -> list[Record]:
+    """Return messages whose memory is theirs: as copies, where views would hold much beside."""
+    views = [record.data for record in records if isinstance(record.data, memoryview)]
+    if not views or 2 * sum(map(len, views)) > views[0].obj.__sizeof__():
+        return records
+    return [record._replace(data=bytes(record.data)) for record in records]
 
 
 def _is_within(time_ns: int, start: int | None, stop: int | None) -> bool:

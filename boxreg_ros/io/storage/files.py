@@ -6,22 +6,24 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, ExitStack
 from heapq import heapify, heappop, heapreplace
 from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory
+import re
 from typing import NamedTuple
 
 from boxreg_ros.config import YAML_ERRORS
-from boxreg_ros.errors import RecordingError, unreadable
+from boxreg_ros.errors import RecordingError, TransferError, unreadable
 from boxreg_ros.io.storage.mcap import McapFile
 from boxreg_ros.io.storage.record import Damage, one_line, Record, span_ns, StorageFile
 from boxreg_ros.io.storage.rosbag1 import Rosbag1File
 from boxreg_ros.io.storage.sqlite import SqliteFile
 from boxreg_ros.io.storage.urls import download, entries_of, entry_of, url_of
+from boxreg_ros.io.whole_files import temporary_folder
 from mcap.records import Schema
 from rosbags.interfaces import Connection
 import yaml
 import zstandard
 
-OPENERS: dict[str, Callable[[Path, Path | None], StorageFile]] = {
+Opener = Callable[[Path, Path | None], StorageFile]
+OPENERS: dict[str, Opener] = {
     '.mcap': McapFile,
     '.db3': SqliteFile,
     '.bag': Rosbag1File,
@@ -31,6 +33,10 @@ COMPRESSED = ('.zstd', '.zst')
 METADATA = 'metadata.yaml'
 BLOCK_BYTES = 2**12
 """Bytes that are decompressed at a time; damage in one costs all of it."""
+MAX_RATIO = 1000
+"""Largest ratio of a file to its compressed one; point clouds are compressed to a third."""
+SPARE_BYTES = 2**16
+"""Bytes that the compressed file may lack for this ratio, at its begin."""
 
 
 class Part(NamedTuple):
@@ -52,17 +58,23 @@ def part_of(path: Path) -> Part:
 
     """
     if url_of(path) is not None:
-        files = [entry.path for entry in entries_of(path) if _kind(entry.path) in OPENERS]
-        return Part(path, tuple(_some(path, files)))
+        found = [entry.path for entry in entries_of(path) if _kind(entry.path) in OPENERS]
+        return Part(path, tuple(_some(path, sorted(found, key=in_order))))
     if not path.exists():
         raise RecordingError(f'no such recording: {str(path)!r}; correct its path')
     if not path.is_dir():
         return Part(path, (path,))
     listed = _listed(path)
-    there = sorted(file for file in path.iterdir() if file.is_file() and _kind(file) in OPENERS)
-    files = [file for file in listed if file.is_file()] or there
+    there = [file for file in path.iterdir() if file.is_file() and _kind(file) in OPENERS]
+    files = [file for file in listed if file.is_file()] or sorted(there, key=in_order)
     missing = tuple(file for file in listed if not file.is_file())
     return Part(path, tuple(_some(path, files)), missing)
+
+
+def in_order(path: Path) -> list[tuple[int, str]]:
+    """Return the key that sorts the parts of a recording: ``drive_10`` behind ``drive_9``."""
+    parts = re.findall('([0-9]+)|([^0-9]+)', path.name)
+    return [(int(number or -1), text) for number, text in parts]
 
 
 def _some(path: Path, files: list[Path]) -> list[Path]:
@@ -106,26 +118,33 @@ def opened(path: Path) -> StorageFile:
     try:
         path.open('rb').close()
     except OSError as error:
-        raise RecordingError(unreadable(path, error)) from None
+        raise TransferError(unreadable(path, error)) from None
     if path.suffix not in COMPRESSED:
         return opener(path, None)
-    with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
-        plain = Path(folder, path.stem)
-        damage = _unpack(path, plain)
-        file = opener(plain, path)
-    if damage is not None:
-        file.damages.insert(0, damage)
-    return file
+    with temporary_folder() as folder:
+        return _opened_compressed(path, folder, opener, path)
 
 
-def _opened_remote(path: Path, opener: Callable[[Path, Path | None], StorageFile]) -> StorageFile:
+def _opened_remote(path: Path, opener: Opener) -> StorageFile:
     """Open a file behind a URL: MCAP by ranges, a copy of other formats."""
     if opener is McapFile and path.suffix not in COMPRESSED:
         return opener(path, None)
-    with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
-        copy = Path(folder, path.name)
+    with temporary_folder() as folder:
+        copy = folder / path.name
         download(path, copy)
-        return opened(copy)
+        if path.suffix in COMPRESSED:
+            return _opened_compressed(copy, folder, opener, path)
+        return opener(copy, path)
+
+
+def _opened_compressed(file: Path, folder: Path, opener: Opener, origin: Path) -> StorageFile:
+    """Unpack a file to a folder, and open it."""
+    plain = folder / file.stem
+    damage = _unpack(file, plain, origin)
+    unpacked = opener(plain, origin)
+    if damage is not None:
+        unpacked.damages.insert(0, damage)
+    return unpacked
 
 
 class Files:
@@ -149,6 +168,8 @@ class Files:
             for path in part.files:
                 try:
                     self._files.append(stack.enter_context(closing(opened(path))))
+                except TransferError:
+                    raise
                 except RecordingError as error:
                     first_error = first_error or error
                     size = size_of(path)
@@ -250,15 +271,17 @@ def _listed(folder: Path) -> list[Path]:
         return []
 
 
-def _unpack(path: Path, plain: Path) -> Damage | None:
+def _unpack(path: Path, plain: Path, origin: Path) -> Damage | None:
     """Decompress a file as far as it is readable; return the damage, if any."""
     unpacker = zstandard.ZstdDecompressor().decompressobj(read_across_frames=True)
     with path.open('rb') as source, plain.open('wb') as target:
         while block := source.read(BLOCK_BYTES):
             try:
                 target.write(unpacker.decompress(block))
-            except zstandard.ZstdError as error:
+                if target.tell() > MAX_RATIO * (source.tell() + SPARE_BYTES):
+                    raise RecordingError(f'more than {MAX_RATIO} times the bytes of the file')
+            except (zstandard.ZstdError, RecordingError) as error:
                 reason = f'damaged compression ({one_line(error)})'
                 first_byte = source.tell() - len(block)
-                return Damage(str(path), reason, first_byte, path.stat().st_size)
+                return Damage(str(origin), reason, first_byte, path.stat().st_size)
     return None

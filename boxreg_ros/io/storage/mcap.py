@@ -1,9 +1,10 @@
 """
 MCAP files: read by their index, or scanned record by record where the index is missing or damaged.
 
-The records are parsed by the mcap library. Its readers stop at the first error; here a damaged
-chunk is left out and noted, and after a damaged record the next plausible chunk is searched for.
-They also copy the bytes of a message three times; here messages are views of their chunk.
+Definitions, attachments and metadata are parsed by the mcap library. Its readers stop at the first
+error, unpack what a chunk holds and not what it claims, and copy a message three times. Here a
+damaged chunk is left out and noted, after a damaged record the next plausible chunk is searched
+for, and messages are views of their chunk.
 
 """
 
@@ -12,15 +13,23 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
+import re
 import struct
-from typing import Any, cast, IO, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 import zlib
 
-from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.storage.chunks import Chunk, ChunkedFile, MAX_CHUNK_BYTES, StoredMessage
+from boxreg_ros.errors import RecordingError, TransferError
+from boxreg_ros.io.storage.chunks import (
+    Chunk,
+    ChunkedFile,
+    MAX_CHUNK_BYTES,
+    MAX_RECORDS,
+    StoredMessage,
+)
 from boxreg_ros.io.storage.record import Bytes, Definition, one_line
-from lz4.frame import decompress as decompress_lz4
+from lz4.frame import LZ4FrameDecompressor
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -40,7 +49,14 @@ HEAD_BYTES = RECORD_HEAD.size
 FOOTER_BYTES = HEAD_BYTES + 20
 CHUNK_HEAD = struct.Struct('<QQQII')
 """First and last receive time, size, checksum, and length of the name of the compression."""
+STORED_BYTES = struct.Struct('<Q')
+"""Number of compressed bytes, behind the name of the compression."""
+MESSAGE_HEAD = struct.Struct('<HIQQ')
+"""Channel, sequence, receive and publish time."""
 COMPRESSIONS = ('', 'lz4', 'zstd')
+CHUNK_BEGIN = re.compile(rb'\x06.{4}\0{4}.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)', re.DOTALL)
+"""Begin of a chunk of less than 4 GB with one of these compressions."""
+CHUNK_BEGIN_BYTES = HEAD_BYTES + CHUNK_HEAD.size + 4
 INDEX_HEAD = struct.Struct('<QQQQI')
 """
 Of a chunk: first and last receive time, first byte, length, and length of its message offsets.
@@ -69,8 +85,6 @@ SCHEMA_FORMATS = {
     'omgidl': MessageDefinitionFormat.IDL,
 }
 
-_T = TypeVar('_T')
-
 
 class _Place(NamedTuple):
     """A record in the file, without its content."""
@@ -78,6 +92,32 @@ class _Place(NamedTuple):
     opcode: int
     first_byte: int
     end_byte: int
+
+
+class _ChunkHead(NamedTuple):
+    """
+    What a chunk claims about itself.
+
+    Attributes
+    ----------
+    start_ns, last_ns : int
+        First and last receive time [ns].
+    size, checksum : int
+        Of its content.
+    compression : str
+        One of `COMPRESSIONS`.
+    begin, stored : int
+        Begin and number of the compressed bytes in the record.
+
+    """
+
+    start_ns: int
+    last_ns: int
+    size: int
+    checksum: int
+    compression: str
+    begin: int
+    stored: int
 
 
 class McapFile(ChunkedFile):
@@ -120,14 +160,10 @@ class McapFile(ChunkedFile):
     def extras(self) -> Iterator[records.Attachment | records.Metadata]:
         """Yield the attachments and the metadata; damaged ones are noted and left out."""
         for place in self._extras:
-            try:
-                kind = (
-                    records.Attachment if place.opcode == Opcode.ATTACHMENT else records.Metadata
-                )
-                yield self._parsed(kind.read, place)
-            except Exception as error:  # of the library, for any malformed content
-                reason = f'damaged attachment or metadata ({one_line(error)})'
-                self._note(reason, place.first_byte, place.end_byte)
+            kind = records.Attachment if place.opcode == Opcode.ATTACHMENT else records.Metadata
+            record = self._parsed(kind, place)
+            if record is not None:
+                yield record
 
     def _open(self) -> None:
         counts = self._read_index()
@@ -166,6 +202,8 @@ class McapFile(ChunkedFile):
         try:
             found, chunks = self._summary_records()
             statistics = next(r for r in found if isinstance(r, records.Statistics))
+        except TransferError:
+            raise
         except Exception:  # of the library, for any malformed content; the scan reports it
             return None
         for record in found:
@@ -174,7 +212,7 @@ class McapFile(ChunkedFile):
             len(self._channels) == statistics.channel_count
             and len(chunks) == statistics.chunk_count
             and (chunks or not statistics.message_count)
-            and all(_is_within(chunk, self.size) for chunk in chunks)
+            and _are_apart(chunks, self.size)
         )
         if not is_complete:
             return None
@@ -210,11 +248,12 @@ class McapFile(ChunkedFile):
             raise RecordingError('expected a summary of its checksum')
         found = []
         chunks = []
-        for opcode, content in _split(summary):
+        for opcode, first, last in _places_in(summary):
+            content = summary[first:last]
             if opcode == Opcode.CHUNK_INDEX:
                 chunks.append(_indexed_chunk(content))
             elif opcode in SUMMARY_RECORDS:
-                found.append(SUMMARY_RECORDS[opcode](ReadDataStream(BytesIO(content))))
+                found.append(_read(SUMMARY_RECORDS[opcode], content))
         return found, chunks
 
     # Scan -------------------------------------------------------------------------------------
@@ -235,8 +274,7 @@ class McapFile(ChunkedFile):
             if place.opcode == Opcode.CHUNK:
                 self._add_chunk([place])
             elif place.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                kind = records.Schema if place.opcode == Opcode.SCHEMA else records.Channel
-                self._add_definition(self._parsed_or_noted(kind.read, place))
+                self._add_definition(self._parsed(DEFINITIONS[place.opcode], place))
             elif place.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
                 self._extras.append(place)
             has_end = has_end or place.opcode == Opcode.DATA_END
@@ -280,39 +318,36 @@ class McapFile(ChunkedFile):
     def _next_chunk(self, position: int) -> int:
         """Return where the next whole chunk begins; the end of the file without."""
         while position < self.size:
-            block = self._bytes(position, position + SEARCH_BYTES)
-            found = block.find(Opcode.CHUNK)
-            while found >= 0:
-                place = self._place_at(position + found)
-                if place is not None and self._chunk_times(place) is not None:
-                    return position + found
-                found = block.find(Opcode.CHUNK, found + 1)
-            position += len(block)
+            # Chunks that begin in this block, one behind the other or within a damaged one.
+            block = self._bytes(position, position + SEARCH_BYTES + CHUNK_BEGIN_BYTES + 4)
+            found = CHUNK_BEGIN.search(block)
+            while found is not None and found.start() < SEARCH_BYTES:
+                place = self._place_at(position + found.start())
+                if place is not None and self._chunk_head_at(place) is not None:
+                    return place.first_byte
+                found = CHUNK_BEGIN.search(block, found.start() + 1)
+            position += SEARCH_BYTES
         return self.size
 
-    def _chunk_times(self, place: _Place) -> tuple[int, int] | None:
-        """Return first and last receive time of a chunk [ns]; None if it is no chunk."""
-        first_byte = place.first_byte + HEAD_BYTES
-        head = self._bytes(first_byte, first_byte + CHUNK_HEAD.size + 16)
-        if len(head) < CHUNK_HEAD.size + 8:
+    def _chunk_head_at(self, place: _Place) -> _ChunkHead | None:
+        """Return the head of a chunk; None if it is no chunk."""
+        record = self._bytes(place.first_byte, place.first_byte + CHUNK_BEGIN_BYTES + 16)
+        size = place.end_byte - place.first_byte
+        try:
+            head = _chunk_head(record, size)
+        except (struct.error, RecordingError):
             return None
-        start_ns, last_ns, size, _, length = CHUNK_HEAD.unpack_from(head)
-        name_end = CHUNK_HEAD.size + length
-        if length > 4 or head[CHUNK_HEAD.size : name_end].decode('latin1') not in COMPRESSIONS:
-            return None
-        (stored,) = struct.unpack_from('<Q', head, name_end)
-        is_whole = first_byte + name_end + 8 + stored == place.end_byte
-        if not is_whole or start_ns > last_ns or size > MAX_CHUNK_BYTES:
-            return None
-        return start_ns, last_ns
+        is_whole = head.begin + head.stored == size and head.start_ns <= head.last_ns
+        return head if is_whole else None
 
     def _add_chunk(self, places: list[_Place]) -> None:
         """Add a chunk, or messages outside of chunks as one, and the definitions in it."""
         if not places:
             return
         is_chunk = places[0].opcode == Opcode.CHUNK
-        start_ns, last_ns = (is_chunk and self._chunk_times(places[0])) or (0, 0)
-        chunk = Chunk(places[0].first_byte, places[-1].end_byte, start_ns, last_ns, {}, is_chunk)
+        head = self._chunk_head_at(places[0]) if is_chunk else None
+        times_ns = (head.start_ns, head.last_ns) if head else (0, 0)
+        chunk = Chunk(places[0].first_byte, places[-1].end_byte, *times_ns, {}, is_chunk)
         messages = self._messages_of(chunk)
         if messages:
             times = [message.received_ns for message in messages]
@@ -321,20 +356,17 @@ class McapFile(ChunkedFile):
                 chunk._replace(start_ns=min(times), last_ns=max(times), counts=counts)
             )
 
-    def _parsed_or_noted(self, read: Callable[[ReadDataStream], _T], place: _Place) -> _T | None:
-        try:
-            return self._parsed(read, place)
-        except Exception as error:  # of the library, for any malformed content
-            reason = f'damaged record ({one_line(error)})'
-            self._note(reason, place.first_byte, place.end_byte)
-            return None
-
     # Content ----------------------------------------------------------------------------------
 
-    def _parsed(self, read: Callable[[ReadDataStream], _T], place: _Place) -> _T:
-        """Return the record at a place."""
+    def _parsed(self, kind: Any, place: _Place) -> Any:
+        """Return the record of a class of `records` at a place; None, and noted, if damaged."""
         content = self._bytes(place.first_byte + HEAD_BYTES, place.end_byte)
-        return read(ReadDataStream(BytesIO(content)))
+        try:
+            return _read(kind.read, content)
+        except Exception as error:  # of the library, for any malformed content
+            reason = f'damaged {kind.__name__.lower()} ({one_line(error)})'
+            self._note(reason, place.first_byte, place.end_byte)
+            return None
 
     def _add_definition(self, record: object) -> None:
         if isinstance(record, records.Schema):
@@ -342,53 +374,43 @@ class McapFile(ChunkedFile):
         elif isinstance(record, records.Channel):
             self._channels.setdefault(record.id, record)
 
-    def _unpack(self, chunk: Chunk) -> list[StoredMessage]:
-        content = memoryview(_content(self._chunk_record(chunk)))
-        stream = _stream_of(content)
+    def _unpack(self, chunk: Chunk, stored: bytes) -> list[StoredMessage]:
+        content = memoryview(_content(stored) if chunk.is_compressible else stored)
         found = []
-        while stream.count < len(content):
-            opcode, length = stream.read1(), stream.read8()
+        for opcode, begin, end in _places_in(content, MAX_RECORDS):
             if opcode == Opcode.MESSAGE:
-                record = records.Message.read(stream, length)
-                found.append(
-                    StoredMessage(
-                        record.channel_id, record.log_time, record.data,
-                        record.publish_time, record.sequence,
-                    )
-                )  # fmt: skip
-                continue
-            body = stream.read(length)
-            if opcode in DEFINITIONS and not self.is_indexed:
-                self._add_definition(DEFINITIONS[opcode].read(ReadDataStream(BytesIO(body))))
+                if begin + MESSAGE_HEAD.size > end:
+                    raise RecordingError(f'a message of {end - begin} bytes')
+                channel, sequence, received_ns, published_ns = MESSAGE_HEAD.unpack_from(
+                    content, begin
+                )
+                data = content[begin + MESSAGE_HEAD.size : end]
+                found.append(StoredMessage(channel, received_ns, data, published_ns, sequence))
+            elif opcode in DEFINITIONS and not self.is_indexed:
+                self._add_definition(_read(DEFINITIONS[opcode].read, content[begin:end]))
         return found
 
-    def _chunk_record(self, chunk: Chunk) -> records.Chunk:
-        """Return a chunk as it is stored; RecordingError if its sizes are wrong."""
-        data = self._bytes(chunk.first_byte, chunk.end_byte)
-        size = chunk.end_byte - chunk.first_byte
-        if not chunk.is_compressible:
-            return records.Chunk('', data, chunk.last_ns, chunk.start_ns, 0, size)
-        if data[:1] != bytes([Opcode.CHUNK]):
-            raise RecordingError('no chunk at the place that the index names')
-        view = memoryview(data)[HEAD_BYTES:]
-        record: records.Chunk = records.Chunk.read(_stream_of(view))
-        if record.compression == 'zstd':
-            size = zstandard.frame_content_size(record.data)
-            if size not in (-1, record.uncompressed_size):
-                raise RecordingError(f'{size} bytes in a chunk of {record.uncompressed_size}')
-        if record.uncompressed_size > MAX_CHUNK_BYTES:
-            raise RecordingError(f'size of {record.uncompressed_size} bytes')
-        return record
+
+def _places_in(content: Bytes, limit: int | None = None) -> list[tuple[int, int, int]]:
+    """Return operation code, begin and end of the records in a summary or a chunk."""
+    places: list[tuple[int, int, int]] = []
+    begin = 0
+    while begin < len(content):
+        opcode, length = RECORD_HEAD.unpack_from(content, begin)
+        begin += HEAD_BYTES
+        end = begin + length
+        if not opcode or end > len(content):
+            raise RecordingError(f'no record: operation code {opcode}, {length} bytes')
+        if len(places) == limit:
+            raise RecordingError(f'more than {limit} records')
+        places.append((opcode, begin, end))
+        begin = end
+    return places
 
 
-def _split(summary: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield operation code and content of the records in a summary."""
-    first_byte = 0
-    while first_byte < len(summary):
-        opcode, length = RECORD_HEAD.unpack_from(summary, first_byte)
-        first_byte += HEAD_BYTES
-        yield opcode, summary[first_byte : first_byte + length]
-        first_byte += length
+def _read(read: Callable[[ReadDataStream], Any], content: Bytes) -> Any:
+    """Return a record that the library parses."""
+    return read(ReadDataStream(BytesIO(content)))
 
 
 def _indexed_chunk(content: bytes) -> Chunk:
@@ -399,40 +421,46 @@ def _indexed_chunk(content: bytes) -> Chunk:
     return Chunk(first_byte, first_byte + length, start_ns, last_ns, counts)
 
 
-class _Views:
-    """A file in memory whose parts are read as views, not as copies."""
-
-    def __init__(self, content: memoryview) -> None:
-        self._content = content
-        self._position = 0
-
-    def read(self, length: int) -> memoryview:
-        """Return the next bytes; fewer at the end."""
-        begin = self._position
-        self._position = begin + length
-        return self._content[begin : self._position]
-
-
-def _stream_of(content: memoryview) -> ReadDataStream:
-    """Return the stream that the records of the library are read from."""
-    return ReadDataStream(cast(IO[bytes], _Views(content)))
-
-
-def _content(chunk: records.Chunk) -> Bytes:
-    """Return the content of a chunk; RecordingError if it is damaged or cannot be unpacked."""
-    content: Bytes = chunk.data
-    if chunk.compression == 'zstd':
-        content = zstandard.decompress(content, chunk.uncompressed_size)
-    elif chunk.compression == 'lz4':
-        content = decompress_lz4(content)
-    elif chunk.compression:
+def _chunk_head(record: bytes, size: int) -> _ChunkHead:
+    """Return the head of a chunk record of `size` bytes; RecordingError if it is none."""
+    if record[:1] != bytes([Opcode.CHUNK]):
+        raise RecordingError('no chunk at the place that the index names')
+    start_ns, last_ns, content_size, checksum, length = CHUNK_HEAD.unpack_from(record, HEAD_BYTES)
+    name_begin = HEAD_BYTES + CHUNK_HEAD.size
+    compression = record[name_begin : name_begin + min(length, 16)].decode('latin1')
+    if compression not in COMPRESSIONS:
         names = ', '.join(map(repr, COMPRESSIONS))
-        raise RecordingError(f'compression: expected one of {names}, got {chunk.compression!r}')
-    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
+        raise RecordingError(f'compression: expected one of {names}, got {compression!r}')
+    (stored,) = STORED_BYTES.unpack_from(record, name_begin + length)
+    begin = name_begin + length + STORED_BYTES.size
+    if begin + stored > size:
+        raise RecordingError(f'{size} bytes of a chunk of {begin + stored}')
+    if content_size > MAX_CHUNK_BYTES:
+        raise RecordingError(f'size of {content_size} bytes')
+    return _ChunkHead(start_ns, last_ns, content_size, checksum, compression, begin, stored)
+
+
+def _content(record: bytes) -> Bytes:
+    """Return the content of a chunk; RecordingError if it is not what the chunk claims."""
+    head = _chunk_head(record, len(record))
+    content: Bytes = memoryview(record)[head.begin : head.begin + head.stored]
+    # Not a byte more than claimed is unpacked: a few bytes may be compressed from any number.
+    if head.compression == 'zstd':
+        claimed = zstandard.frame_content_size(content)
+        if claimed not in (-1, head.size):
+            raise RecordingError(f'{claimed} bytes in a chunk of {head.size}')
+        content = zstandard.decompress(content, head.size)
+    elif head.compression == 'lz4':
+        content = LZ4FrameDecompressor().decompress(content, head.size + 1)
+    if len(content) != head.size:
+        raise RecordingError(f'{len(content)} bytes in a chunk of {head.size}')
+    if head.checksum and zlib.crc32(content) != head.checksum:
         raise RecordingError('its content is not that of its checksum')
     return content
 
 
-def _is_within(chunk: Chunk, size: int) -> bool:
-    """Return whether a chunk index names a place inside of a file of `size` [bytes]."""
-    return chunk.first_byte + HEAD_BYTES <= chunk.end_byte <= size
+def _are_apart(chunks: list[Chunk], size: int) -> bool:
+    """Return whether chunk indexes name places in a file of `size` [bytes], each another one."""
+    places = sorted((chunk.first_byte, chunk.end_byte) for chunk in chunks)
+    are_within = all(first + HEAD_BYTES <= end <= size for first, end in places)
+    return are_within and all(before[1] <= behind[0] for before, behind in pairwise(places))

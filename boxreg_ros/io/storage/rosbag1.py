@@ -6,10 +6,17 @@ from bz2 import BZ2Decompressor
 from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
+from itertools import pairwise
 import struct
 
-from boxreg_ros.errors import RecordingError
-from boxreg_ros.io.storage.chunks import Chunk, ChunkedFile, MAX_CHUNK_BYTES, StoredMessage
+from boxreg_ros.errors import RecordingError, TransferError
+from boxreg_ros.io.storage.chunks import (
+    Chunk,
+    ChunkedFile,
+    MAX_CHUNK_BYTES,
+    MAX_RECORDS,
+    StoredMessage,
+)
 from boxreg_ros.io.storage.record import one_line
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.interfaces import (
@@ -27,6 +34,8 @@ CHUNK_MARK = b'op=\x05'
 """The field of a record's header that marks a chunk."""
 MAX_HEAD_BYTES = 128
 """The header of a chunk has three short fields; a mark is this far behind its begin at most."""
+MAX_HEADER_BYTES = 2**20
+"""Headers of connections have a topic, those of other records a few numbers."""
 SEARCH_BYTES = 2**20
 
 
@@ -57,14 +66,15 @@ class Rosbag1File(ChunkedFile):
             reader.open()
         except Exception:  # of the library, for any malformed content; the scan reports it
             return False
-        ends = sorted([info.pos for info in reader.chunk_infos] + [self.size])
-        for info in reader.chunk_infos:
-            following = ends[ends.index(info.pos) + 1]
-            self._chunks.append(
-                Chunk(
-                    info.pos, following, info.start_time, info.end_time - 1, info.connection_counts
-                )
-            )
+        places = sorted(info.pos for info in reader.chunk_infos)
+        ends = dict(pairwise([*places, self.size]))
+        if len(ends) < len(places):  # entries of the index name the same chunk
+            reader.close()
+            return False
+        self._chunks = [
+            Chunk(i.pos, ends[i.pos], i.start_time, i.end_time - 1, i.connection_counts)
+            for i in reader.chunk_infos
+        ]
         self.connections = [c._replace(owner=self) for c in reader.connections]
         reader.close()
         return True
@@ -108,11 +118,13 @@ class Rosbag1File(ChunkedFile):
         try:
             (length,) = struct.unpack('<I', self._bytes(first_byte, first_byte + 4))
             data_byte = first_byte + 4 + length
-            if data_byte > self.size:
+            if data_byte > self.size or length > MAX_HEADER_BYTES:
                 return None
             header = Header.read(BytesIO(self._bytes(first_byte, data_byte)))
             header.get_uint8('op')
             (size,) = struct.unpack('<I', self._bytes(data_byte, data_byte + 4))
+        except TransferError:
+            raise
         except Exception:  # of the library, for any malformed content
             return None
         end_byte = data_byte + 4 + size
@@ -124,30 +136,34 @@ class Rosbag1File(ChunkedFile):
             block = self._bytes(position, position + SEARCH_BYTES)
             found = block.find(CHUNK_MARK)
             while found >= 0:
-                mark = position + found
-                for first_byte in range(max(position, mark - MAX_HEAD_BYTES), mark):
-                    place = self._record_at(first_byte)
-                    if place is not None and place[0].get_uint8('op') == RecordType.CHUNK:
-                        return first_byte
+                for begin in range(max(0, found - MAX_HEAD_BYTES), found):
+                    # The length of the header, which ends behind the mark.
+                    (length,) = struct.unpack_from('<I', block, begin)
+                    if found - begin <= length <= MAX_HEAD_BYTES:
+                        place = self._record_at(position + begin)
+                        if place is not None and place[0].get_uint8('op') == RecordType.CHUNK:
+                            return position + begin
                 found = block.find(CHUNK_MARK, found + 1)
             # A mark may lie across the blocks, and its header before it.
             position += max(len(block) - MAX_HEAD_BYTES, 1)
         return self.size
 
-    def _unpack(self, chunk: Chunk) -> list[StoredMessage]:
-        stream = BytesIO(self._bytes(chunk.first_byte, chunk.end_byte))
+    def _unpack(self, chunk: Chunk, stored: bytes) -> list[StoredMessage]:
+        stream = BytesIO(stored)
         head = Header.read(stream, RecordType.CHUNK)
-        stored = _sized(stream)
+        data = _sized(stream)
         size = head.get_uint32('size')
         if size > MAX_CHUNK_BYTES:
             raise RecordingError(f'size of {size} bytes')
-        content = _decompressed(stored, head.get_string('compression'), size)
+        content = _decompressed(data, head.get_string('compression'), size)
         if len(content) != size:
             raise RecordingError(f'expected {size} bytes, got {len(content)}')
         return list(self._stored_messages(BytesIO(content), size))
 
     def _stored_messages(self, stream: BytesIO, size: int) -> Iterator[StoredMessage]:
-        while stream.tell() < size:
+        for _ in range(MAX_RECORDS):
+            if stream.tell() >= size:
+                return
             header = Header.read(stream)
             data = _sized(stream)
             operation = header.get_uint8('op')
@@ -157,6 +173,7 @@ class Rosbag1File(ChunkedFile):
             elif operation == RecordType.CONNECTION and not self.connections:
                 connection = self._connection(header, Header.read(_with_length(data)))
                 self._found.setdefault(connection.id, connection)
+        raise RecordingError(f'more than {MAX_RECORDS} records')
 
     def _connection(self, header: Header, about: Header) -> Connection:
         latching = about.get_string('latching') if 'latching' in about else ''

@@ -14,12 +14,12 @@ from contextlib import closing, suppress
 from pathlib import Path
 import shutil
 import sqlite3
-from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, TransferError
 from boxreg_ros.io.storage.record import Damage, NO_MESSAGES_NS, note, one_line, Record, shown
+from boxreg_ros.io.whole_files import temporary_folder
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -33,6 +33,9 @@ DEFINITION_FORMATS = {
     'ros2msg': MessageDefinitionFormat.MSG,
     'ros2idl': MessageDefinitionFormat.IDL,
 }
+TABLES = ('topics', 'messages', 'message_definitions')
+TRANSFER_ERRORS = ('SQLITE_CANTOPEN', 'SQLITE_FULL', 'SQLITE_IOERR', 'SQLITE_NOMEM')
+"""Errors of sqlite that are not about the content of a file: no room for a sort, say."""
 MAX_ID = 2**62
 QUERY_STEPS = 10**6
 STEPS_PER_BYTE = 2
@@ -72,16 +75,21 @@ class SqliteFile:
         self.connections: list[Connection] = []
         self._surviving: list[tuple[int, int, int]] | None = None
         self._size = path.stat().st_size
-        self._database = _opened(path)
+        self._database = _opened(path, self.name)
         try:
             self._note_truncation(path)
+            self._check_tables()
             self._read_topics()
         except sqlite3.Error as error:
             self.close()
+            self._raise_transfer_error(error)
             raise RecordingError(
                 f'{self.name}: expected a database of rosbag2, got: {one_line(error)}; copy or '
                 f'record it again'
             ) from None
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Close the database."""
@@ -96,9 +104,10 @@ class SqliteFile:
         end = MAX_ID if stop is None else stop
         for number, topic, received_ns in self._ordered(sorted(wanted), begin, end):
             try:
-                query = 'SELECT data FROM messages WHERE id = ?'
+                query = 'SELECT data FROM messages WHERE rowid = ?'
                 ((data,),) = self._database.execute(query, (number,))
             except (sqlite3.Error, ValueError) as error:
+                self._raise_transfer_error(error)
                 self._note(f'damaged message ({one_line(error)})', received_ns, received_ns)
                 continue
             if not isinstance(data, bytes):
@@ -117,15 +126,28 @@ class SqliteFile:
         if self._surviving is None:
             marks = ','.join('?' * len(topics))
             yield from self._database.execute(
-                f'SELECT id, topic_id, timestamp FROM messages WHERE topic_id IN ({marks}) '
+                f'SELECT rowid, topic_id, timestamp FROM messages WHERE topic_id IN ({marks}) '
                 f"AND timestamp >= ? AND timestamp < ? AND typeof(timestamp) = 'integer' "
-                f'ORDER BY timestamp, id',
+                f'ORDER BY timestamp, rowid',
                 (*topics, begin, end),
             )
             return
         for row in self._surviving:
             if row[1] in topics and begin <= row[2] < end:
                 yield row
+
+    def _check_tables(self) -> None:
+        """Refuse what computes its rows or values: these may be without end, or of any size."""
+        for table in TABLES:
+            kinds = [row[2] for row in self._database.execute(f'PRAGMA table_list({table})')]
+            columns = list(self._database.execute(f'PRAGMA table_xinfo({table})'))
+            computed = [str(column[1]) for column in columns if column[-1]]
+            if any(kind != 'table' for kind in kinds) or computed:
+                found = ', '.join(computed) or kinds[0]
+                raise RecordingError(
+                    f'{self.name}: expected a plain table {table!r} of rosbag2, got a computed '
+                    f'one ({found}); this is no recording: do not use it'
+                )
 
     def _read_topics(self) -> None:
         definitions = self._definitions()
@@ -137,7 +159,7 @@ class SqliteFile:
         if self._span is not None:
             self.start_time, self.end_time = self._span
         query = f'SELECT id, name, type, serialization_format, {qos}, {digest} FROM topics'
-        for number, *texts in self._database.execute(query):
+        for number, *texts in self._limited(query):
             if not all(isinstance(text, str) for text in texts):
                 self._note(f'damaged topic {number}')
                 continue
@@ -153,7 +175,7 @@ class SqliteFile:
         """Return the message definitions by type; older recordings have none."""
         try:
             rows = list(
-                self._database.execute(
+                self._limited(
                     'SELECT topic_type, encoding, encoded_message_definition '
                     'FROM message_definitions ORDER BY id'
                 )
@@ -179,6 +201,7 @@ class SqliteFile:
             )
             times = [row[0] for row in _ends(self._limited(query))]
         except sqlite3.DatabaseError as error:
+            self._raise_transfer_error(error)
             rows = [row for row in self._rows() if all(isinstance(value, int) for value in row)]
             self._surviving = sorted(rows, key=lambda row: (row[2], row[0]))
             self._note(f'damaged database ({one_line(error)}), read row by row')
@@ -212,7 +235,8 @@ class SqliteFile:
         last_id: int | None = -1
         while last_id is not None:
             query = (
-                'SELECT id, topic_id, timestamp FROM messages NOT INDEXED WHERE id > ? ORDER BY id'
+                'SELECT rowid, topic_id, timestamp FROM messages NOT INDEXED '
+                'WHERE rowid > ? ORDER BY rowid'
             )
             with suppress(sqlite3.DatabaseError):
                 for row in self._database.execute(query, (last_id,)):
@@ -227,7 +251,7 @@ class SqliteFile:
     def _next_readable(self, last_id: int) -> int | None:
         """Return an id just before a row that may be readable; None without such a row."""
         step = 1
-        query = 'SELECT id FROM messages NOT INDEXED WHERE id > ? ORDER BY id LIMIT 1'
+        query = 'SELECT rowid FROM messages NOT INDEXED WHERE rowid > ? ORDER BY rowid LIMIT 1'
         while last_id + step < MAX_ID:
             with suppress(sqlite3.DatabaseError):
                 found = self._database.execute(query, (last_id + step,)).fetchone()
@@ -240,6 +264,14 @@ class SqliteFile:
 
     def _note(self, reason: str, start_ns: int | None = None, end_ns: int | None = None) -> None:
         note(self.damages, Damage(self.name, reason, None, None, start_ns, end_ns))
+
+    def _raise_transfer_error(self, error: Exception) -> None:
+        """Raise TransferError for an error that is not about the content of the file."""
+        if getattr(error, 'sqlite_errorname', '').startswith(TRANSFER_ERRORS):
+            raise TransferError(
+                f'{self.name}: cannot be read: {one_line(error)}; check its disk, and the room '
+                f'in the folder of temporary files (TMPDIR)'
+            ) from None
 
     def _note_truncation(self, path: Path) -> None:
         if (path.parent / (path.name + WAL_SUFFIX)).exists():
@@ -254,12 +286,12 @@ class SqliteFile:
             note(self.damages, Damage(self.name, reason, size, expected))
 
 
-def _opened(path: Path) -> sqlite3.Connection:
+def _opened(path: Path, name: str) -> sqlite3.Connection:
     """Open a database that is not changed; one with a write-ahead log as a merged copy."""
     log = path.with_name(path.name + WAL_SUFFIX)
     if log.exists() and log.stat().st_size:
-        with TemporaryDirectory() as folder:  # an open file stays readable when it is deleted
-            copy = Path(folder, path.name)
+        with temporary_folder() as folder:
+            copy = folder / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(log, copy.with_name(log.name))
             with closing(sqlite3.connect(copy)) as database:

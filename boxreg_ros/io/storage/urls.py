@@ -2,22 +2,25 @@
 Files behind URLs: ``s3://``, ``gs://``, ``https://`` and others that fsspec opens.
 
 A URL is carried as a `Path`, which has one slash in place of two behind the scheme. Files are read
-by ranges: what the index of a recording asks for, and some chunks ahead.
+by ranges: what the index of a recording asks for, and some chunks ahead. Each answer must have the
+length that was asked for; requests that fail are repeated, and then raise `TransferError`.
 
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing
+from functools import partial
 import os
 from pathlib import Path
 import re
-from typing import Any, NamedTuple, Protocol
+import time
+from typing import Any, NamedTuple, Protocol, TypeVar
 
-from boxreg_ros.errors import RecordingError
+from boxreg_ros.errors import RecordingError, TransferError, unreadable
 
 URL = re.compile(r'([a-z][a-z0-9+.-]+):/+(.+)')
 """A scheme has two letters or more."""
@@ -29,9 +32,19 @@ READERS = 4
 """Requests at a time; chosen: object stores send some 50 MB/s each."""
 ANSWER_SECONDS = 60.0
 """Longest time for an answer [s]: 256 kB/s for the largest range, and ten times a slow listing."""
+REPEAT_SECONDS = (0.5, 2.0, 8.0)
+"""Waiting times before a request is repeated [s]: servers restart, or limit the rate."""
+DOWNLOAD_BYTES = 2**23
+"""Size of the ranges in which a whole file is copied."""
 CAUSES = 'check the address, the network and the credentials'
 REFUSED_STATUS = (401, 403)
 """Answers of HTTP to wrong or missing credentials."""
+PASSING_STATUS = (408, 429)
+"""Answers of HTTP below 500 that are worth another request: too slow, too many requests."""
+MISSING_STATUS = (None, 404, 410)
+"""Status behind a FileNotFoundError of a file that does not exist; HTTP raises it for any."""
+
+_T = TypeVar('_T')
 
 
 class Entry(NamedTuple):
@@ -66,7 +79,13 @@ class LocalFile:
 
     def read(self, first: int, end: int) -> bytes:
         """Return a part of the file; fewer bytes at its end."""
-        return os.pread(self._file.fileno(), end - first, first)
+        end = min(end, self.size)
+        if not 0 <= first < end:
+            return b''
+        try:
+            return os.pread(self._file.fileno(), end - first, first)
+        except OSError as error:
+            raise TransferError(unreadable(self._file.name, error)) from None
 
     def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
         """Leave it to the system, which reads ahead itself."""
@@ -98,26 +117,24 @@ class RemoteFile:
     def read(self, first: int, end: int) -> bytes:
         """Return a part of the file; fewer bytes at its end."""
         end = min(end, self.size)
-        if end <= first:
+        if not 0 <= first < end:
             return b''
         for (start, stop), future in self._ranges.items():
             if start <= first and end <= stop:
                 self._ranges.move_to_end((start, stop))
                 return future.result()[first - start : end - start]
-        stop = end
+        begin, stop = first, end
         if end - first < REQUEST_BYTES:
-            first_of_block = min(first, max(self.size - REQUEST_BYTES, 0))
-            stop = min(first_of_block + REQUEST_BYTES, self.size)
-            return self._fetch(first_of_block, stop).result()[
-                first - first_of_block : end - first_of_block
-            ]
-        return self._fetch(first, stop).result()
+            begin = min(first, max(self.size - REQUEST_BYTES, 0))
+            stop = min(begin + REQUEST_BYTES, self.size)
+        return self._fetch(begin, stop).result()[first - begin : end - begin]
 
     def prefetch(self, ranges: Sequence[tuple[int, int]]) -> None:
         """Begin to read ranges that are needed next."""
         for first, end in ranges:
-            if (first, end) not in self._ranges:
-                self._fetch(first, end)
+            whole = first, min(end, self.size)
+            if first < self.size and whole not in self._ranges:
+                self._fetch(*whole)
 
     def close(self) -> None:
         """Cancel the open requests."""
@@ -135,11 +152,24 @@ class RemoteFile:
         return future
 
     def _request(self, first: int, end: int) -> bytes:
-        with _answers(self._path):
-            content = self._system.cat_file(
+        def content() -> bytes:
+            answer = self._system.cat_file(
                 self._name, start=first, end=end, **_limit(self._system)
             )
-            return bytes(content)
+            if len(answer) == end - first:
+                return bytes(answer)
+            if len(answer) == self.size:
+                raise _WholeFile(
+                    f'{url_of(self._path)}: expected a server that sends ranges, got the whole '
+                    f'file; copy it to this machine'
+                )
+            raise EOFError(f'expected {end - first} bytes from {first} on, got {len(answer)}')
+
+        return _answer_of(self._path, content)
+
+
+class _WholeFile(TransferError):
+    """A server sends the whole file in place of a range."""
 
 
 def url_of(path: Path) -> str | None:
@@ -164,28 +194,44 @@ def entry_of(path: Path) -> Entry:
 
     """
     system, name = _system_of(path)
-    with _answers(path):
-        return _entry(path, system.info(name, **_limit(system)))
+    about = _answer_of(path, lambda: system.info(name, **_limit(system)))
+    return _entry(path, about)
 
 
 def entries_of(path: Path) -> list[Entry]:
     """Return a file behind a URL, or the files in the folder that it is, sorted by name."""
     system, name = _system_of(path)
-    with _answers(path):
-        about = system.info(name, **_limit(system))
-        if about['type'] != 'directory':
-            return [_entry(path, about)]
-        listed = system.ls(name, detail=True, **_limit(system))
-        inner = sorted(listed, key=lambda one: str(one['name']))
-        files = [one for one in inner if one['type'] == 'file']
+    about = _answer_of(path, lambda: system.info(name, **_limit(system)))
+    if about['type'] != 'directory':
+        return [_entry(path, about)]
+    listed = _answer_of(path, lambda: system.ls(name, detail=True, **_limit(system)))
+    inner = sorted(listed, key=lambda one: str(one['name']))
+    files = [one for one in inner if one['type'] == 'file']
     return [_entry(path / Path(one['name']).name, one) for one in files]
 
 
 def download(path: Path, target: Path) -> None:
-    """Copy a file behind a URL to this machine."""
+    """Copy a file behind a URL to this machine, by ranges where its server sends them."""
+    with closing(RemoteFile(path)) as source:
+        try:
+            with target.open('wb') as copy:
+                for first in range(0, source.size, DOWNLOAD_BYTES):
+                    ahead = range(first, first + READERS * DOWNLOAD_BYTES, DOWNLOAD_BYTES)
+                    source.prefetch([(begin, begin + DOWNLOAD_BYTES) for begin in ahead])
+                    copy.write(source.read(first, first + DOWNLOAD_BYTES))
+        except _WholeFile:
+            _download_whole(path, target, source.size)
+
+
+def _download_whole(path: Path, target: Path, size: int) -> None:
     system, name = _system_of(path)
-    with _answers(path):
+
+    def download_once() -> None:
         system.get_file(name, str(target))
+        if target.stat().st_size != size:
+            raise EOFError(f'expected {size} bytes, got {target.stat().st_size}')
+
+    _answer_of(path, download_once)
 
 
 def read_text(path: Path) -> str:
@@ -198,8 +244,10 @@ def read_text(path: Path) -> str:
 def read_bytes(path: Path) -> bytes:
     """Return the content of a file behind a URL; OSError if there is none."""
     system, name = _system_of(path)
-    with _answers(path, missing_is_error=False):
-        return bytes(system.cat_file(name, **_limit(system)))
+    content = _answer_of(
+        path, lambda: system.cat_file(name, **_limit(system)), missing_is_error=False
+    )
+    return bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -210,24 +258,20 @@ def write_text(path: Path, text: str) -> None:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file behind a URL; it appears whole."""
     system, name = _system_of(path)
-    with _answers(path):
-        system.pipe_file(name, content)
+    _answer_of(path, lambda: system.pipe_file(name, content))
 
 
 def delete_files(path: Path) -> None:
     """Delete all files below a folder behind a URL."""
     system, name = _system_of(path)
-    names = names_of(path)
-    with _answers(path):
-        for one in names:
-            system.rm_file(f'{name}/{one}')
+    for one in names_of(path):
+        _answer_of(path, partial(system.rm_file, f'{name}/{one}'))
 
 
 def names_of(path: Path) -> list[str]:
     """Return the names of all files below a folder behind a URL; none if it does not exist."""
     system, name = _system_of(path)
-    with _answers(path):
-        found = system.find(name, **_limit(system))
+    found = _answer_of(path, lambda: system.find(name, **_limit(system)))
     return [str(one).removeprefix(name).lstrip('/') for one in found]
 
 
@@ -246,13 +290,11 @@ def upload(folder: Path, target: Path, last: str) -> None:
     system, name = _system_of(target)
     files = {str(file.relative_to(folder)) for file in folder.rglob('*') if file.is_file()}
     old = names_of(target)
-    with _answers(target):
-        if last in old:
-            system.rm_file(f'{name}/{last}')
-        for file in sorted(set(old) - files - {last}):
-            system.rm_file(f'{name}/{file}')
-        for file in sorted(files, key=lambda file: (file == last, file)):
-            system.put_file(str(folder / file), f'{name}/{file}')
+    first_deleted = [last] if last in old else []
+    for file in (*first_deleted, *sorted(set(old) - files - {last})):
+        _answer_of(target, partial(system.rm_file, f'{name}/{file}'))
+    for file in sorted(files, key=lambda file: (file == last, file)):
+        _answer_of(target, partial(system.put_file, str(folder / file), f'{name}/{file}'))
 
 
 def _limit(system: Any) -> dict[str, float]:
@@ -282,32 +324,71 @@ def _system_of(path: Path) -> tuple[Any, str]:
     return system, str(name)
 
 
-@contextmanager
-def _answers(path: Path, missing_is_error: bool = True) -> Iterator[None]:
-    """Turn the errors of file systems, which are of any class, into RecordingError."""
-    try:
-        yield
-    except Exception as error:
-        url = url_of(path)
-        # That of HTTP is a FileNotFoundError for each status.
-        if _is_refusal(error) or _is_refusal(error.__cause__):
-            raise RecordingError(
-                f'{url}: expected credentials that give access, got: {_reason(error)}; set those '
-                f'of this storage, as AWS_ACCESS_KEY_ID or GOOGLE_APPLICATION_CREDENTIALS'
-            ) from None
-        if not isinstance(error, FileNotFoundError):
-            raise RecordingError(f'{url}: got no answer: {_reason(error)}; {CAUSES}') from None
-        if not missing_is_error:
+def _answer_of(path: Path, request: Callable[[], _T], missing_is_error: bool = True) -> _T:
+    """
+    Return the answer to a request for a file behind a URL.
+
+    It is repeated after errors that may pass, once if there was no answer in `ANSWER_SECONDS`.
+
+    Raises
+    ------
+    TransferError
+        If no request is answered. File systems raise errors of any class.
+
+    """
+    begin = time.monotonic()
+    for seconds in (*REPEAT_SECONDS, None):
+        try:
+            return request()
+        except TransferError:
             raise
-        raise RecordingError(f'{url}: expected a file, got none; {CAUSES}') from None
+        except Exception as error:
+            is_missing = (
+                isinstance(error, FileNotFoundError) and _status_of(error) in MISSING_STATUS
+            )
+            if is_missing and not missing_is_error:
+                raise
+            has_time = time.monotonic() - begin < 2 * ANSWER_SECONDS
+            if seconds is None or is_missing or not has_time or not _may_pass(error):
+                raise _error_of(path, error, is_missing) from None
+        time.sleep(seconds)
+    raise AssertionError  # the last attempt returns or raises
+
+
+def _may_pass(error: Exception) -> bool:
+    """Return whether another request may be answered."""
+    status = _status_of(error)
+    if status is not None:
+        return status >= 500 or status in PASSING_STATUS
+    return not _is_refusal(error)
+
+
+def _error_of(path: Path, error: Exception, is_missing: bool) -> TransferError:
+    """Return the error of a request, with a remedy."""
+    url = url_of(path)
+    if _is_refusal(error) or _is_refusal(error.__cause__):
+        return TransferError(
+            f'{url}: expected credentials that give access, got: {_reason(error)}; set those '
+            f'of this storage, as AWS_ACCESS_KEY_ID or GOOGLE_APPLICATION_CREDENTIALS'
+        )
+    if is_missing:
+        return TransferError(f'{url}: expected a file, got none; {CAUSES}')
+    return TransferError(f'{url}: got no answer: {_reason(error)}; {CAUSES}')
+
+
+def _status_of(error: BaseException) -> int | None:
+    """Return the status that a server has answered with, where an error knows it."""
+    cause = error.__cause__ if isinstance(error, FileNotFoundError) else error
+    name = 'status' if hasattr(cause, 'status') else 'code'
+    status = getattr(cause, name, None)
+    return status if isinstance(status, int) else None
 
 
 def _is_refusal(error: BaseException | None) -> bool:
     """Return whether a server has refused the credentials, or there are none."""
     if isinstance(error, PermissionError) or type(error).__name__ == 'NoCredentialsError':
         return True  # the second one of botocore
-    status = getattr(error, 'status', getattr(error, 'code', None))
-    return status in REFUSED_STATUS
+    return error is not None and _status_of(error) in REFUSED_STATUS
 
 
 def _reason(error: Exception) -> str:

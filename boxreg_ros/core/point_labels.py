@@ -1,0 +1,365 @@
+"""
+Labels of points: the object that each point of a sweep is on, and whether that object moves.
+
+Boxes are taken at the time of each point. Points of the road, and points that no box explains, are
+background. Where boxes are missing or uncertain, points are unknown and never background.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.kernels import load
+from boxreg_ros.core.observation import crop, own_points, own_points_numpy
+from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
+from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL, Sweep, X, YAW, Z
+import numpy as np
+from numpy.typing import NDArray
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+BACKGROUND, UNKNOWN = -1, -2
+"""Values of `PointLabels.track` without an object."""
+UNKNOWN_MOTION, PARKED, STOOD, MOVING = range(4)
+"""Motion of an object: never seen to move, stands now but moves at another time, moves."""
+
+# All of these are chosen; `test/measure/points.py` draws what they change.
+TOLERANCE = 0.12
+"""Points up to this far outside of the surface that the margins predict are of the object [m]."""
+BAND = 0.1
+"""Points up to this far outside of that are unknown: of the object or beside it [m]."""
+UNCERTAIN_BAND = 0.5
+"""The same of boxes that no points confirm: kept ones, and ones between those of a gap [m]."""
+ROAD_CLEARANCE = 0.06
+"""Points less than this above the road are of the road [m]: above its noise, below a bumper."""
+MOVING_SPEED = 0.3
+"""Least speed of an object that moves [m/s]: four times the error over `MOTION_SECONDS`."""
+MOTION_SECONDS = 0.5
+"""The speed is that of the boxes within this time [s]."""
+MIN_MOTION_SECONDS = 0.25
+"""Shorter tracks have no known motion [s]."""
+CERTAIN_GAP = 0.6
+"""Between boxes of a moving object that are further apart in time, its place is unknown [s]."""
+
+
+class ObjectTrack(NamedTuple):
+    """
+    The boxes of one object.
+
+    Attributes
+    ----------
+    track_id, class_name : str
+        Identity and category.
+    stamps_ns : array, shape (n,)
+        Strictly increasing [ns].
+    boxes : array, shape (n, 9)
+        In the fixed frame.
+    is_certain : array, shape (n,)
+        Whether the points confirm the box.
+
+    """
+
+    track_id: str
+    class_name: str
+    stamps_ns: Ints
+    boxes: Floats
+    is_certain: Mask
+
+
+class Objects(NamedTuple):
+    """
+    The objects of one stamp.
+
+    Attributes
+    ----------
+    track : array, shape (k,)
+        Row of the track of each.
+    boxes : array, shape (k, 9)
+        At the stamp, in the fixed frame.
+    velocities : array, shape (k, 3)
+        Of the centres [m/s].
+    turn_rates : array, shape (k,)
+        Of the headings [rad/s].
+    motion : array, shape (k,)
+        `PARKED`, `STOOD`, `MOVING` or `UNKNOWN_MOTION`.
+    is_certain : array, shape (k,)
+        Whether the box is where the points are.
+    is_lost : array, shape (k,)
+        Whether the box is a guess, in a long gap of a moving object.
+
+    """
+
+    track: Ints
+    boxes: Floats
+    velocities: Floats
+    turn_rates: Floats
+    motion: Bytes
+    is_certain: Mask
+    is_lost: Mask
+
+
+class PointLabels(NamedTuple):
+    """
+    Labels of the points of a sweep.
+
+    Attributes
+    ----------
+    track : array, shape (M,)
+        Row of the track that each point is on, `BACKGROUND` or `UNKNOWN`.
+    motion : array, shape (M,)
+        Motion of its object, or of the one that an unknown point is next to; `UNKNOWN_MOTION` for
+        points on none.
+    rows : array, shape (L,)
+        Rows of the points on an object, ascending.
+    local : array, shape (L, 3)
+        These points in the frame of their box at their own time [m].
+    at_stamp : array, shape (L, 3)
+        These points in the fixed frame, moved to the stamp with their object [m].
+    tracks : sequence of T ObjectTrack
+        All objects of the drive.
+    moves : array, shape (T,)
+        Whether each of them moves at some time.
+
+    """
+
+    track: Ints
+    motion: Bytes
+    rows: Ints
+    local: Floats
+    at_stamp: Floats
+    tracks: Sequence[ObjectTrack]
+    moves: Mask
+
+    @property
+    def is_dynamic(self) -> Mask:
+        """Return which points are on an object that moves now or later, or may be, (M,)."""
+        is_dynamic: Mask = (self.motion == MOVING) | (self.motion == STOOD)
+        is_dynamic |= (self.track == UNKNOWN) & (self.motion != PARKED)
+        return is_dynamic
+
+
+class PointLabeller:
+    """
+    Label the points of sweeps by the boxes of tracks.
+
+    Parameters
+    ----------
+    tracks : sequence of ObjectTrack
+        All objects of the drive.
+    array_stamps_ns : array, shape (a,)
+        Stamps at which the input has boxes, or states that there are none [ns].
+    config : Config
+        `max_gap`, `reach`, `tolerance`, and the time that boxes are of, `sampling.box_time`.
+    margins : array, shape (T, 6)
+        Labelling margin of each face of each track: front, rear, left, right, top, bottom [m].
+
+    """
+
+    def __init__(
+        self,
+        tracks: Sequence[ObjectTrack],
+        array_stamps_ns: Ints,
+        config: Config,
+        margins: Floats,
+    ) -> None:
+        self.tracks = list(tracks)
+        self._config = config
+        self._array_stamps_ns = np.unique(array_stamps_ns)
+        self._limits = TOLERANCE - margins
+        self._motions = [_track_motion(track) for track in tracks]
+        self._names = self.tracks, np.array([MOVING in one.motion for one in self._motions], bool)
+        self._first_ns = np.array([track.stamps_ns[0] for track in tracks], np.int64)
+        self._last_ns = np.array([track.stamps_ns[-1] for track in tracks], np.int64)
+        self._reach_ns = round(max(config.reach, config.tolerance) * 1e9)
+        self._gap_ns = round(config.max_gap * 1e9)
+
+    def label(self, sweep: Sweep) -> PointLabels:
+        """Return the labels of a sweep in the fixed frame; its times are used where known."""
+        M = len(sweep.points)
+        track = np.full(M, BACKGROUND if self.knows(sweep.stamp_ns) else UNKNOWN)
+        motion = np.zeros(M, np.uint8)
+        objects = self.objects_at(sweep.stamp_ns)
+        if not len(objects.track) or not M:
+            none = np.zeros((0, 3))
+            return PointLabels(track, motion, np.zeros(0, np.int64), none, none, *self._names)
+        row, owner, local, excess = self._near(sweep, objects)
+        band = np.where(objects.is_certain, BAND, UNCERTAIN_BAND)
+        is_unknown = (excess < band[owner]) & ((excess > 0) | objects.is_lost[owner])
+        track[row[is_unknown]] = UNKNOWN
+        motion[row[is_unknown]] = objects.motion[owner[is_unknown]]
+        is_on = np.flatnonzero((excess <= 0) & ~objects.is_lost[owner])
+        deepest_last = is_on[np.argsort(-excess[is_on], kind='stable')]
+        chosen = np.full(M, -1)
+        chosen[row[deepest_last]] = deepest_last
+        rows = np.flatnonzero(chosen >= 0)
+        pairs = chosen[rows]
+        owners = owner[pairs]
+        track[rows] = objects.track[owners]
+        motion[rows] = objects.motion[owners]
+        R = matrix_from_rpy(objects.boxes[:, ROLL:])[owners]
+        at_stamp = np.einsum('lij,lj->li', R, local[pairs]) + objects.boxes[owners, X : Z + 1]
+        return PointLabels(track, motion, rows, local[pairs], at_stamp, *self._names)
+
+    def knows(self, stamp_ns: int) -> bool:
+        """Return whether the boxes of the input say what is there at a stamp."""
+        known = self._array_stamps_ns
+        after = int(np.searchsorted(known, stamp_ns))
+        before_ns = stamp_ns - int(known[after - 1]) if after else None
+        after_ns = int(known[after]) - stamp_ns if after < len(known) else None
+        gaps = [gap for gap in (before_ns, after_ns) if gap is not None]
+        if len(gaps) == 2 and sum(gaps) <= self._gap_ns:
+            return True
+        return min(gaps, default=self._reach_ns + 1) <= self._reach_ns
+
+    def objects_at(self, stamp_ns: int) -> Objects:
+        """Return the objects of a stamp: their boxes, or those between the nearest two."""
+        is_near = (self._first_ns <= stamp_ns + self._reach_ns) & (
+            self._last_ns >= stamp_ns - self._reach_ns
+        )
+        found = [self._object_at(int(t), stamp_ns) for t in np.flatnonzero(is_near)]
+        present = [one for one in found if one is not None]
+        if not present:
+            return Objects(
+                np.zeros(0, np.int64), np.zeros((0, 9)), np.zeros((0, 3)), np.zeros(0),
+                np.zeros(0, np.uint8), np.zeros(0, bool), np.zeros(0, bool),
+            )  # fmt: skip
+        return Objects(*(np.array(column) for column in zip(*present, strict=True)))
+
+    def _object_at(self, t: int, stamp_ns: int) -> tuple[object, ...] | None:
+        """Return one row of `Objects`; None where the track has a gap."""
+        track = self.tracks[t]
+        known = self._motions[t]
+        after = int(np.searchsorted(track.stamps_ns, stamp_ns))
+        if after < len(track.stamps_ns) and track.stamps_ns[after] == stamp_ns:
+            i = after
+            facts = known.velocities[i], known.turn_rates[i], known.motion[i]
+            return t, track.boxes[i], *facts, track.is_certain[i], False
+        if after in (0, len(track.stamps_ns)):  # before the first or after the last box
+            i = min(after, len(track.stamps_ns) - 1)
+            seconds = (stamp_ns - int(track.stamps_ns[i])) * 1e-9
+            box = track.boxes[i].copy()
+            box[X : Z + 1] += known.velocities[i] * seconds
+            box[YAW] += known.turn_rates[i] * seconds
+            facts = known.velocities[i], known.turn_rates[i], known.motion[i]
+            return t, box, *facts, track.is_certain[i], False
+        before_ns, after_ns = (int(ns) for ns in track.stamps_ns[after - 1 : after + 1])
+        seconds = (after_ns - before_ns) * 1e-9
+        moves = MOVING in known.motion[after - 1 : after + 1]
+        if moves and after_ns - before_ns > self._gap_ns:
+            return None
+        first, second = track.boxes[after - 1 : after + 1]
+        part = (stamp_ns - before_ns) / (after_ns - before_ns)
+        turn = float(wrap_angle(2 * (second[YAW] - first[YAW]))) / 2  # no half turns
+        box = (1 - part) * first + part * second
+        box[ROLL:] = first[ROLL:]
+        box[YAW] = first[YAW] + part * turn
+        nearest = after - 1 if part < 0.5 else after
+        velocity = (second - first)[X : Z + 1] / seconds * moves
+        is_certain = bool(track.is_certain[after - 1 : after + 1].all())
+        is_lost = moves and seconds > CERTAIN_GAP
+        facts = velocity, turn / seconds * moves, known.motion[nearest]
+        return t, box, *facts, is_certain and not is_lost, is_lost
+
+    def _near(self, sweep: Sweep, objects: Objects) -> tuple[Ints, Ints, Floats, Floats]:
+        """
+        Return pairs of a point above the road and an object near it.
+
+        Returns
+        -------
+        row, owner : array, shape (P,)
+            Of the point and of the object.
+        local : array, shape (P, 3)
+            The point in the frame of the box at its time [m].
+        excess : array, shape (P,)
+            How far it is outside of the surface and `TOLERANCE`, negative inside [m].
+
+        """
+        boxes = objects.boxes
+        has_times = sweep.times is not None and bool(objects.velocities.any())
+        shift = np.zeros((len(boxes), 3))
+        searched = boxes
+        if has_times and sweep.times is not None:
+            ends = np.array([sweep.times.min(), sweep.times.max()])
+            shift = objects.velocities * ends.mean()
+            searched = boxes.copy()
+            searched[:, X : Z + 1] += shift
+            searched[:, LENGTH] += np.linalg.norm(objects.velocities, axis=1) * np.ptp(ends)
+        near = crop(sweep, searched, TOLERANCE + UNCERTAIN_BAND)
+        row, owner = near.row, near.owner
+        offset = near.offset.T + shift[owner]
+        if has_times and sweep.times is not None:
+            delays = self._delays(sweep.times[row], owner, len(boxes))
+            offset = offset - objects.velocities[owner] * delays[:, None]
+            offset = _turned(offset, -objects.turn_rates[owner] * delays)
+        R = matrix_from_rpy(boxes[:, ROLL:])
+        local = np.einsum('pji,pj->pi', R[owner], offset)
+        half = boxes[:, LENGTH:ROLL] / 2
+        limits = self._limits[objects.track].reshape(-1, 3, 2)  # (object, axis, positive side)
+        side = np.where(local > 0, limits[owner, :, 0], limits[owner, :, 1])
+        excess = (np.abs(local) - half[owner] - side).max(axis=1)
+        find = own_points if load() is not None else own_points_numpy
+        road = np.nan_to_num(find(sweep, boxes, self._config).road)
+        height = local[:, Z] + half[owner, Z]
+        is_above = height > road[owner] + ROAD_CLEARANCE
+        return row[is_above], owner[is_above], local[is_above], excess[is_above]
+
+    def _delays(self, times: Floats, owner: Ints, n: int) -> Floats:
+        """Return the times of points (P,) relative to the time of their box [s]."""
+        if self._config.sampling.box_time == 'stamp':
+            return times
+        middle = np.zeros(n)
+        for i in range(n):
+            own = times[owner == i]
+            middle[i] = np.median(own) if len(own) else 0.0
+        return times - middle[owner]
+
+
+class _TrackMotion(NamedTuple):
+    """Motion at the boxes of a track; as in `Objects`."""
+
+    velocities: Floats
+    turn_rates: Floats
+    motion: Bytes
+
+
+def _track_motion(track: ObjectTrack) -> _TrackMotion:
+    """Return the motion at each box of a track, by the slope of those around it."""
+    seconds = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
+    n = len(seconds)
+    if seconds[-1] < MIN_MOTION_SECONDS:
+        return _TrackMotion(np.zeros((n, 3)), np.zeros(n), np.zeros(n, np.uint8))
+    yaws = np.unwrap(track.boxes[:, YAW], period=np.pi)
+    values = np.column_stack([track.boxes[:, X : Z + 1], yaws])
+    speed = np.linalg.norm(_slopes(seconds, values, MOTION_SECONDS)[:, :2], axis=1)
+    moves = speed > MOVING_SPEED
+    motion = np.where(moves, MOVING, STOOD if moves.any() else PARKED).astype(np.uint8)
+    slopes = np.where(moves[:, None], _slopes(seconds, values, MOTION_SECONDS / 2), 0.0)
+    return _TrackMotion(slopes[:, :3], slopes[:, 3], motion)
+
+
+def _slopes(seconds: Floats, values: Floats, reach: float) -> Floats:
+    """Return the slope of values (n, c) at each of n times, by those within `reach` [s]."""
+    first = np.searchsorted(seconds, seconds - reach - 1e-6)
+    last = np.searchsorted(seconds, seconds + reach + 1e-6)
+    first = np.minimum(first, np.maximum(np.arange(len(seconds)) - 1, 0))  # two boxes at least
+    last = np.maximum(last, np.minimum(np.arange(len(seconds)) + 2, len(seconds)))
+    t = seconds[:, None]
+    values = values - values[0]
+    columns = np.hstack([np.ones_like(t), t, t * t, values, t * values])
+    sums = np.vstack([np.zeros(columns.shape[1]), np.cumsum(columns, axis=0)])
+    sums = sums[last] - sums[first]
+    c = values.shape[1]
+    n, s, ss = sums[:, :1], sums[:, 1:2], sums[:, 2:3]
+    slopes: Floats = (n * sums[:, 3 + c :] - s * sums[:, 3 : 3 + c]) / (n * ss - s * s)
+    return slopes
+
+
+def _turned(vectors: Floats, angles: Floats) -> Floats:
+    """Return vectors (P, 3), each turned about z by its angle (P,) [rad]."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    x, y, z = vectors.T
+    return np.column_stack([cos * x - sin * y, sin * x + cos * y, z])

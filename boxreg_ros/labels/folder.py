@@ -1,0 +1,127 @@
+"""What the writers of folders share, so that each format is its mapping and little else."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar
+
+from boxreg_ros.labels.clouds import write_cloud
+from boxreg_ros.labels.files import write_provenance
+from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.labels.sidecar import POSES_FILE, STAMPS_FILE
+import numpy as np
+
+NO_POINTS = np.zeros((0, 3))
+
+
+class FolderWriter:
+    """
+    Write a scene frame by frame: labels by `add`, clouds, and ``boxreg.json``.
+
+    A format derives from it, states the class attributes and implements `add`; one that completes
+    files at the end also `finish`.
+
+    Parameters
+    ----------
+    folder, provenance, options
+        As of `protocol.WriterFactory`.
+
+    Attributes
+    ----------
+    folders : tuple of str
+        Folders to create.
+    cloud_file : str
+        File of the cloud of a frame, with the fields ``name`` and ``number``; '' for none.
+    needs_clouds : bool
+        Whether a frame without a cloud gets an empty file, because the tool needs one.
+    needs_pose : bool
+        Whether frames without a pose of the sensor are dropped.
+    has_sidecar : bool
+        Whether stamps and poses are written beside the labels, as in `sidecar`.
+    number : int
+        Of the current frame, from 0.
+    name : str
+        Of the current frame, which sorts by time: its stamp [ns]; a repeated stamp gets ``_1``.
+    about : dict
+        Content of ``boxreg.json``: the provenance, then the names of frames.
+
+    """
+
+    folders: ClassVar[tuple[str, ...]] = ()
+    cloud_file: ClassVar[str] = ''
+    needs_clouds: ClassVar[bool] = False
+    needs_pose: ClassVar[bool] = False
+    has_sidecar: ClassVar[bool] = False
+
+    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.folder = folder
+        self.number = 0
+        self.name = ''
+        self.about: dict[str, Any] = asdict(provenance)
+        self._names = FrameNames()
+        self._with_points = options.with_points and self.cloud_file != ''
+        for name in self.folders:
+            (folder / name).mkdir(parents=True)
+        if self._with_points:
+            (folder / self.cloud_file).parent.mkdir(parents=True, exist_ok=True)
+        if self.has_sidecar:
+            self._stamps_file = (folder / STAMPS_FILE).open('w', encoding='utf-8')
+            self._poses_file = (folder / POSES_FILE).open('w', encoding='utf-8')
+
+    def write(self, frame: LabelFrame) -> None:
+        """Add a frame."""
+        T = frame.T_fixed_sensor
+        if self.needs_pose and T is None:
+            rows, _ = frame.boxes_in('fixed', self.dropped)
+            self.dropped['no_transform'] += len(rows)
+            return
+        stamp_ns = frame.refined.boxes.stamp_ns
+        self.name = self._names.of(stamp_ns)
+        self.about['fixed_frame'] = frame.fixed_frame
+        self.about['sensor_frame'] = frame.sensor_frame
+        self.add(frame)
+        if self._with_points and (self.needs_clouds or frame.sweep is not None):
+            path = self.cloud_file.format(name=self.name, number=self.number)
+            self.add_cloud(self.folder / path, frame)
+        if self.has_sidecar:
+            values = np.full((3, 4), np.nan) if T is None else T[:3]
+            self._stamps_file.write(f'{stamp_ns}\n')
+            self._poses_file.write(' '.join(map(repr, values.ravel().tolist())) + '\n')
+        self.number += 1
+
+    def add(self, frame: LabelFrame) -> None:
+        """Write the labels of a frame; `number` and `name` are its own."""
+        raise NotImplementedError
+
+    def add_cloud(self, path: Path, frame: LabelFrame) -> None:
+        """Write the cloud of a frame."""
+        points = NO_POINTS if frame.sweep is None else frame.sweep.points
+        write_cloud(path, points, frame.intensities)
+
+    def finish(self) -> None:
+        """Complete the label files."""
+
+    def close(self) -> None:
+        """Complete the files."""
+        self.finish()
+        if self.has_sidecar:
+            self._stamps_file.close()
+            self._poses_file.close()
+        write_provenance(self.folder, self.about)
+
+
+class FrameNames:
+    """Names of frames that sort by time: the stamp [ns]; a repeated stamp gets ``_1``."""
+
+    def __init__(self) -> None:
+        self._used: Counter[int] = Counter()
+
+    def of(self, stamp_ns: int) -> str:
+        """Return the name of the next frame of this stamp."""
+        number = self._used[stamp_ns]
+        self._used[stamp_ns] += 1
+        name = f'{stamp_ns:019d}'
+        return f'{name}_{number}' if number else name

@@ -1,0 +1,129 @@
+"""
+nuScenes-lidarseg and Panoptic nuScenes: the tables of nuScenes with labels of points.
+
+Each sweep is a sample. Its ``.bin`` has one byte per point, the index of its category: ``noise``
+for points that cannot be known, ``static.other`` for points on no object. Its ``.npz`` has 1000
+times the category plus the number of the instance in its category.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.config import words_of
+from boxreg_ros.core.point_labels import BACKGROUND, PointLabels, UNKNOWN
+from boxreg_ros.labels import nuscenes
+from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
+from boxreg_ros.structures import Ints
+import numpy as np
+
+FORMAT = replace(
+    nuscenes.FORMAT,
+    name='lidarseg',
+    title='nuScenes lidarseg and panoptic (labels of points)',
+    files='v1.0-boxreg/, lidarseg/, panoptic/, samples/, maps/',
+    options=(),
+    has_points=True,
+)
+CATEGORIES = (
+    'noise', 'animal', 'human.pedestrian.adult', 'human.pedestrian.child',
+    'human.pedestrian.construction_worker', 'human.pedestrian.personal_mobility',
+    'human.pedestrian.police_officer', 'human.pedestrian.stroller',
+    'human.pedestrian.wheelchair', 'movable_object.barrier', 'movable_object.debris',
+    'movable_object.pushable_pullable', 'movable_object.trafficcone',
+    'static_object.bicycle_rack', 'vehicle.bicycle', 'vehicle.bus.bendy', 'vehicle.bus.rigid',
+    'vehicle.car', 'vehicle.construction', 'vehicle.emergency.ambulance',
+    'vehicle.emergency.police', 'vehicle.motorcycle', 'vehicle.trailer', 'vehicle.truck',
+    'flat.driveable_surface', 'flat.other', 'flat.sidewalk', 'flat.terrain', 'static.manmade',
+    'static.other', 'static.vegetation', 'vehicle.ego',
+)  # fmt: skip
+"""Categories of nuScenes-lidarseg by their index; the devkit knows no others."""
+UNKNOWN_CATEGORY = CATEGORIES.index('noise')
+BACKGROUND_CATEGORY = CATEGORIES.index('static.other')
+CATEGORY_OF_WORDS = (
+    (('motorcycle', 'motorcyclist', 'motorbike'), 'vehicle.motorcycle'),
+    (('cyclist', 'bicyclist', 'rider', 'bicycle', 'bike'), 'vehicle.bicycle'),
+    (('child',), 'human.pedestrian.child'),
+    (('pedestrian', 'person', 'adult', 'human'), 'human.pedestrian.adult'),
+    (('bus',), 'vehicle.bus.rigid'),
+    (('trailer',), 'vehicle.trailer'),
+    (('construction',), 'vehicle.construction'),
+    (('truck', 'lorry'), 'vehicle.truck'),
+    (('animal',), 'animal'),
+)
+OTHER_CATEGORY = 'vehicle.car'
+"""Other class names are those of vehicles, as everywhere in the package."""
+MAX_INSTANCE = 999
+"""Of the three digits below the category."""
+
+
+class Writer(nuscenes.Writer):
+    """Write the tables of nuScenes, and two files of labels per sweep."""
+
+    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
+        super().__init__(folder, provenance, options)
+        self._rows: dict[str, list[dict[str, str]]] = {'lidarseg': [], 'panoptic': []}
+        for name in self._rows:
+            (folder / name / self.version).mkdir(parents=True)
+        for name in CATEGORIES:
+            self._categories[name] = self._token('category', name)
+        self._of_tracks: tuple[list[int], list[int]] | None = None
+
+    def add(self, frame: LabelFrame) -> None:
+        """Add a sample with its annotations and the labels of its points."""
+        super().add(frame)
+        assert frame.points is not None
+        categories, instances = self._numbers(frame.points)
+        sweep = self._token('sample_data', self.number)
+        for kind, suffix in (('lidarseg', 'bin'), ('panoptic', 'npz')):
+            token = self._token(kind, self.number)
+            path = f'{kind}/{self.version}/{token}_{kind}.{suffix}'
+            row = {'token': token, 'sample_data_token': sweep, 'filename': path}
+            self._rows[kind].append(row)
+            if kind == 'lidarseg':
+                categories.astype(np.uint8).tofile(self.folder / path)
+            else:
+                codes = (1000 * categories + instances).astype(np.uint16)
+                np.savez_compressed(self.folder / path, data=codes)
+
+    def _numbers(self, points: PointLabels) -> tuple[Ints, Ints]:
+        """Return the category and the instance of each point; the same over all sweeps."""
+        if self._of_tracks is None:
+            counts: Counter[str] = Counter()
+            categories, instances = [], []
+            for track in points.tracks:
+                name = category_of(track.class_name)
+                counts[name] += 1
+                categories.append(CATEGORIES.index(name))
+                instances.append(counts[name] if counts[name] <= MAX_INSTANCE else 0)
+            assert (UNKNOWN, BACKGROUND) == (-2, -1)  # the last two entries
+            ends = [UNKNOWN_CATEGORY, BACKGROUND_CATEGORY]
+            self._of_tracks = [*categories, *ends], [*instances, 0, 0]
+        of_categories, of_instances = (np.array(numbers) for numbers in self._of_tracks)
+        return of_categories[points.track], of_instances[points.track]
+
+    def _instance(self, key: str, track_id: str, class_name: str, annotation: str) -> str:
+        """Return the token of an instance, of a category that the devkit knows."""
+        return super()._instance(key, track_id, category_of(class_name), annotation)
+
+    def _closing_tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the tables of nuScenes, with the index of each category, and those of labels."""
+        tables = super()._closing_tables()
+        for index, row in enumerate(tables['category']):
+            row['index'] = index
+        return tables | self._rows
+
+
+def category_of(class_name: str) -> str:
+    """Return the category of objects with a class name."""
+    if class_name in CATEGORIES:
+        return class_name
+    words = words_of(class_name)
+    for names, category in CATEGORY_OF_WORDS:
+        if not words.isdisjoint(names):
+            return category
+    return OTHER_CATEGORY

@@ -1,0 +1,122 @@
+"""
+SemanticKITTI: a sequence of clouds with a number of class and instance per point.
+
+A ``.label`` file has 32 bits per point: the class in the lower 16, the instance in the upper. An
+object that moves at some time of the drive has a ``-moving`` class, as there. Points on no object
+are of the class ``other-object`` (99), and points that cannot be known ``unlabeled`` (0). Poses
+are those of the LiDAR, relative to the first one; the calibration is the identity.
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from boxreg_ros.config import words_of
+from boxreg_ros.core.point_labels import BACKGROUND, PointLabels, UNKNOWN
+from boxreg_ros.io.transforms import inverse
+from boxreg_ros.labels.folder import FolderWriter
+from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
+from boxreg_ros.structures import Floats, Ints
+import numpy as np
+
+FORMAT = Format(
+    name='semantickitti',
+    title='SemanticKITTI (labels of points)',
+    frame='sensor',
+    reference='none: labels are of points',
+    sizes='none',
+    rotation='none',
+    files='sequences/00/, with labels/, velodyne/, poses.txt',
+    has_points=True,
+)
+SEQUENCE = 'sequences/00'
+UNLABELED, OTHER_OBJECT = 0, 99
+CLASSES = (
+    # Words of class names; class of objects that never move, and of those that do.
+    (('motorcyclist',), 32, 255),
+    (('cyclist', 'bicyclist', 'rider'), 31, 253),
+    (('motorcycle', 'motorbike'), 15, 255),
+    (('bicycle', 'bike'), 11, 253),
+    (('pedestrian', 'person', 'adult', 'child'), 30, 254),
+    (('bus',), 13, 257),
+    (('tram', 'train'), 16, 256),
+    (('trailer', 'construction'), 20, 259),
+    (('truck', 'lorry'), 18, 258),
+    (('car', 'van', 'suv', 'vehicle', 'taxi', 'pickup'), 10, 252),
+)
+OTHER_VEHICLE = 20, 259
+MAX_INSTANCE = 2**16 - 1
+
+
+class Writer(FolderWriter):
+    """Write a file of points and one of labels per sweep."""
+
+    folders = (f'{SEQUENCE}/labels', f'{SEQUENCE}/velodyne')
+    cloud_file = f'{SEQUENCE}/velodyne/{{number:06d}}.bin'
+    has_sidecar = True
+    needs_pose = True
+
+    def __init__(self, folder: Path, provenance: Provenance, options: Options) -> None:
+        super().__init__(folder, provenance, options)
+        self._sequence = folder / SEQUENCE
+        identity = ' '.join(map(str, np.eye(4)[:3].ravel()))
+        lines = [f'{name}: {identity}\n' for name in ('P0', 'P1', 'P2', 'P3', 'Tr')]
+        (self._sequence / 'calib.txt').write_text(''.join(lines), encoding='utf-8')
+        self._poses = (self._sequence / 'poses.txt').open('w', encoding='utf-8')
+        self._times = (self._sequence / 'times.txt').open('w', encoding='utf-8')
+        self._T_first_fixed: Floats | None = None
+        self._first_ns = 0
+
+    def add(self, frame: LabelFrame) -> None:
+        """Write the labels of a sweep, its pose and its time."""
+        T = frame.T_fixed_sensor
+        assert T is not None  # of `needs_pose`
+        assert frame.points is not None
+        stamp_ns = frame.refined.boxes.stamp_ns
+        if self._T_first_fixed is None:
+            self._T_first_fixed = inverse(T)
+            self._first_ns = stamp_ns
+        numbers = ' '.join(map(repr, (self._T_first_fixed @ T)[:3].ravel().tolist()))
+        self._poses.write(f'{numbers}\n')
+        self._times.write(f'{(stamp_ns - self._first_ns) * 1e-9:.6e}\n')
+        classes, instances = numbers_of(frame.points)
+        labels = (classes | instances << 16).astype('<u4')
+        labels.tofile(self._sequence / 'labels' / f'{self.number:06d}.label')
+        if not self.number:
+            names = [track.track_id for track in frame.points.tracks]
+            self.about['tracks'] = {str(i + 1): name for i, name in enumerate(names)}
+
+    def finish(self) -> None:
+        """Complete the poses and times."""
+        self._poses.close()
+        self._times.close()
+
+
+def numbers_of(points: PointLabels) -> tuple[Ints, Ints]:
+    """
+    Return the class and the instance of each point, (M,) each.
+
+    Instances are the rows of the tracks, from 1; 0 for points on none, and beyond
+    `MAX_INSTANCE`.
+
+    """
+    of_tracks = [
+        class_of(track.class_name, bool(moves))
+        for track, moves in zip(points.tracks, points.moves, strict=True)
+    ]
+    # The last two entries are those of the track numbers -2 and -1.
+    assert (UNKNOWN, BACKGROUND) == (-2, -1)
+    classes = np.array([*of_tracks, UNLABELED, OTHER_OBJECT], np.int64)
+    instances = np.array([*range(1, len(of_tracks) + 1), 0, 0], np.int64)
+    instances[instances > MAX_INSTANCE] = 0
+    return classes[points.track], instances[points.track]
+
+
+def class_of(class_name: str, moves: bool) -> int:
+    """Return the class of objects of this name, that move at some time or never."""
+    words = words_of(class_name)
+    for names, still, moving in CLASSES:
+        if not words.isdisjoint(names):
+            return moving if moves else still
+    return OTHER_VEHICLE[moves]

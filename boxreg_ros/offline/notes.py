@@ -1,0 +1,167 @@
+"""The sentences of a run: its closing line, and notes about its input and results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MERGED, CLOUD_MISSING
+from boxreg_ros.io.storage.record import Damage
+from boxreg_ros.io.times import time_range
+from boxreg_ros.offline.result_folder import SUMMARY
+from boxreg_ros.offline.summary import Summary
+from boxreg_ros.reasons import REASONS
+from boxreg_ros.structures import (
+    COASTED,
+    EXTENDED,
+    HUMAN,
+    INTERPOLATED,
+    KEPT,
+    REFINED,
+    REJECTED,
+)
+
+MAX_NAMED = 5
+"""Most tracks that a warning names; chosen."""
+FEW_REFINED = 0.5
+"""Refined part of the boxes below which a run prints its most frequent reason. Chosen."""
+
+
+def closing_line(summary: Summary, out: Path) -> str:
+    """Return the result of a run in one line."""
+    status = summary.status
+    parts = [
+        f'{summary.boxes_in:,} boxes in',
+        f'{status.get(REFINED, 0):,} refined',
+        f'{status.get(KEPT, 0):,} kept',
+    ]
+    if summary.reasons:
+        parts[-1] += f' ({_counts(summary.reasons)})'
+    if summary.heading_flips:
+        parts.append(f'{summary.heading_flips:,} heading flips corrected')
+    for word in (HUMAN, REJECTED, INTERPOLATED, EXTENDED, COASTED):
+        if word in status:
+            parts.append(f'{status[word]:,} {word}')
+    line = (
+        f'{out}: {", ".join(parts)} from {summary.sweeps:,} sweeps in '
+        f'{summary.seconds["total"]:.1f} s, fixed frame {summary.fixed_frame}'
+    )
+    if summary.recorded_apart:
+        apart = [f'{topic} ({late:+,.1f} s)' for topic, late in summary.recorded_apart.items()]
+        line += f'; merged by stamp: {", ".join(apart)}'
+    if 'unreadable' in summary.dropped:
+        line += f'; {summary.dropped["unreadable"]:,} messages could not be read'
+    return line
+
+
+def notes(summary: Summary) -> Iterator[str]:
+    """Yield warnings about the input and the results, one line each."""
+    yield from _input_notes(summary)
+    yield from _lidar_notes(summary)
+    yield from _label_notes(summary)
+    if summary.unknown_classes:
+        names = ', '.join(repr(name) for name in summary.unknown_classes)
+        boxes = sum(summary.unknown_classes.values())
+        yield (
+            f'unknown class names are treated as vehicles: {names} ({boxes:,} boxes); name '
+            f'them in vehicle.names, cyclist.names or pedestrian.names'
+        )
+    if summary.part_refined < FEW_REFINED:
+        yield _why_few_were_refined(summary)
+
+
+def _lidar_notes(summary: Summary) -> Iterator[str]:
+    """Yield the clouds that were not used as those of their LiDARs, one line each."""
+    for topic, counts in summary.lidars.items():
+        if counts.get(CLOUD_LATE) or counts.get(CLOUD_MISSING):
+            yield (
+                f'LiDAR {topic}: {counts.get(CLOUD_MERGED, 0):,} clouds merged, '
+                f'{counts.get(CLOUD_LATE, 0):,} late, {counts.get(CLOUD_MISSING, 0):,} missing; '
+                f'the others were used'
+            )
+    if summary.first_unplaced:
+        clouds = sum(
+            summary.dropped.get(name, 0)
+            for name in ('sensor_without_transform', 'cloud_without_info')
+        )
+        yield (
+            f'the LiDARs of {clouds:,} clouds are not all known, the origin of their frame is '
+            f'used; first: {summary.first_unplaced}'
+        )
+
+
+def _label_notes(summary: Summary) -> Iterator[str]:
+    """Yield the boxes, decisions and clouds that label files lack, one line each."""
+    for name, found in summary.left_out_of_labels.items():
+        reasons = ', '.join(f'{count:,} ({reason})' for reason, count in found.items())
+        yield f'format {name} cannot represent some boxes, they are left out: {reasons}'
+    if summary.unused_decisions:
+        unused = summary.unused_decisions
+        named = [*unused[:MAX_NAMED], '...'] if len(unused) > MAX_NAMED else unused
+        names = ', '.join(named)
+        yield (
+            f'decisions: expected those on tracks and boxes of this recording, got '
+            f'{len(unused):,} on others, not used: {names}; give the decisions of this recording '
+            f'to --decisions'
+        )
+    if summary.frames_without_cloud:
+        yield (
+            f'{summary.frames_without_cloud:,} of {summary.box_arrays:,} box arrays have no '
+            f'cloud to write beside them'
+        )
+
+
+def _input_notes(summary: Summary) -> Iterator[str]:
+    """Yield the parts of the recording that cannot be used, one line each."""
+    if summary.damage:
+        yield _damage_line(summary.damage)
+    if summary.without_stamp:
+        counts = ' and '.join(f'{n:,} {kind}' for kind, n in summary.without_stamp.items())
+        yield (
+            f'{counts} have the stamp 0 in their header and cannot be used: receive times do not '
+            f'replace stamps; let the publishers set them'
+        ).replace('box_arrays', 'box arrays')
+    if summary.warning:
+        yield summary.warning
+    if summary.first_unreadable:
+        yield (
+            f'{summary.dropped["unreadable"]:,} messages or sweeps could not be read; the rest '
+            f'was used; first: {summary.first_unreadable}'
+        )
+    if summary.first_missing_transform:
+        boxes = summary.reasons.get('no_transform', 0)
+        sweeps = summary.dropped.get('sweep_without_transform', 0)
+        yield (
+            f'{boxes:,} boxes and {sweeps:,} clouds have no transform; first: '
+            f'{summary.first_missing_transform}'
+        )
+
+
+def _damage_line(damages: list[dict[str, Any]]) -> str:
+    """Return all damages of a recording in one line."""
+    count = len(damages)
+    parts = f'{count:,} parts' if count > 1 else 'a part'
+    return (
+        f'{parts} of the recording cannot be read; the rest was used; first: '
+        f'{Damage(**damages[0])}; {SUMMARY} lists {"all" if count > 1 else "it"} under "damage"'
+    )
+
+
+def _why_few_were_refined(summary: Summary) -> str:
+    """Return the most frequent reason why boxes were kept, its remedy, and both time ranges."""
+    name, count = next(iter(summary.reasons.items()))  # sorted by count
+    reason = REASONS[name]
+    refined = summary.num_refined
+    part = f'only {refined:,} of {summary.boxes_in:,} boxes were refined'
+    if not refined:
+        part = f'none of {summary.boxes_in:,} boxes was refined'
+    line = f'{part}; most frequent reason: {name} ({count:,} boxes): {reason.meaning}'
+    if reason.remedy:
+        line += f'; remedy: {reason.remedy}'
+    ranges = [f'{name} {time_range(*r)}' for name, r in sorted(summary.time_ranges.items())]
+    return f'{line}; time ranges: {", ".join(ranges)}'
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ', '.join(f'{name} {count:,}' for name, count in counts.items())

@@ -1,0 +1,140 @@
+"""What a run writes beside its labels: tables of tracks, violated rules and the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from boxreg_ros.config import Config
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.times import time_range
+from boxreg_ros.offline.notes import closing_line, MAX_NAMED
+from boxreg_ros.offline.request import Request
+from boxreg_ros.offline.sources import true_boxes
+from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.offline.summary import Summary
+from boxreg_ros.structures import Ints
+from boxreg_ros.tracks.track_steps import TrackSteps
+import numpy as np
+
+if TYPE_CHECKING:
+    from boxreg_ros.review.changes import TrackChanges
+    from boxreg_ros.review.rules.protocol import Violation
+    from boxreg_ros.review.tables import TrackRow
+    from boxreg_ros.review.track_points import PointCollector
+    from boxreg_ros.tracks.complete import CompletionPlan
+
+STEP_COLUMNS = ('fragments', 'filled', 'extended', 'rejected', 'reclassified', 'ambiguous')
+
+
+def completed_counts(plan: CompletionPlan | None) -> dict[str, int]:
+    """Return the numbers of tracks and boxes that each step changed; empty without steps."""
+    if plan is None:
+        return {}
+    tracks = plan.tracks
+    return {
+        'tracks': len(tracks),
+        'joined': sum(track.fragments - 1 for track in tracks),
+        'ambiguous': sum(bool(track.ambiguous) for track in tracks),
+        'rejected': sum(track.rejected for track in tracks),
+        'filled': sum(track.filled for track in tracks),
+        'extended': sum(track.extended for track in tracks),
+        'reclassified': sum(track.reclassified for track in tracks),
+    }
+
+
+def write_track_tables(
+    folder: Path, tracks: Sequence[TrackChanges], plan: CompletionPlan | None
+) -> list[TrackRow]:
+    """Write the tables of tracks; return their rows, largest risk first."""
+    from boxreg_ros.review.tables import assessed, write_tables
+
+    rows = assessed(tracks)
+    if plan is None:
+        write_tables(folder, rows)
+    else:
+        write_tables(folder, rows, STEP_COLUMNS, _step_cells(plan.tracks))
+    return rows
+
+
+def checked(
+    tracks: Sequence[TrackChanges], config: Config
+) -> tuple[dict[str, dict[str, int]], dict[str, list[Violation]]]:
+    """Return the number of violations of each rule, ``before`` and ``after``, and those after."""
+    from boxreg_ros.review.rules import counts, violations
+    from boxreg_ros.review.rules.protocol import LabelTrack
+
+    before = []
+    after = []
+    for track in tracks:
+        names = track.track_id, track.class_name, config, track.stamps_ns
+        before.append(LabelTrack.of(*names, track.given, track.num_points))
+        after.append(LabelTrack.of(*names, track.boxes, track.num_points))
+    found = violations(after)
+    return {'before': counts(violations(before)), 'after': counts(found)}, found
+
+
+def write_run_report(
+    folder: Path,
+    out: Path,
+    request: Request,
+    summary: Summary,
+    rows: Sequence[TrackRow],
+    violated: Mapping[str, Sequence[Violation]],
+    points: PointCollector,
+    clock: Stopwatch,
+) -> None:
+    """Write the report and add its time to the summary."""
+    from boxreg_ros.review.report import write_report
+
+    with clock('report'):
+        truth = _truth(request, [row.track for row in rows], summary)
+        line = closing_line(summary, out)
+        write_report(
+            folder, line, summary.as_json(), request.config, rows, violated, points, truth
+        )
+    summary.seconds = clock.seconds()
+
+
+def _truth(request: Request, tracks: Sequence[TrackChanges], summary: Summary) -> BoxTable | None:
+    """Return the true boxes for the report; None, with a warning, where they do not fit."""
+    if request.truth is None:
+        return None
+    truth = true_boxes(request.truth)
+    stamps = np.concatenate([np.zeros(0, np.int64), *(track.stamps_ns for track in tracks)])
+    names = {track.track_id for track in tracks}
+    problem = ''
+    if truth.frame_id != summary.fixed_frame:
+        problem = f'frame {summary.fixed_frame!r}, got {truth.frame_id!r}'
+    elif len(stamps) and not np.isin(stamps, truth.stamps_ns).any():
+        problem = f'boxes of {_range_of(stamps)}, got {_range_of(truth.stamps_ns)}'
+    elif names.isdisjoint(truth.track_ids):
+        problem = f'tracks {sorted(names)[:MAX_NAMED]}, got {truth.track_ids[:MAX_NAMED]}'
+    if not problem:
+        return truth
+    line = (
+        f'truth {str(request.truth)!r}: expected {problem}; the report is written without it: '
+        f'give the true boxes of this drive to --truth'
+    )
+    summary.warning = '; '.join(filter(None, (summary.warning, line)))
+    return None
+
+
+def _range_of(stamps_ns: Ints) -> str:
+    return time_range(int(stamps_ns.min()), int(stamps_ns.max()))
+
+
+def _step_cells(tracks: Sequence[TrackSteps]) -> dict[str, list[int | str]]:
+    """Return the cells of `STEP_COLUMNS` by track id."""
+    return {
+        track.track_id: [
+            track.fragments,
+            track.filled,
+            track.extended,
+            track.rejected,
+            track.reclassified,
+            ' '.join(track.ambiguous),
+        ]
+        for track in tracks
+    }

@@ -1,0 +1,95 @@
+"""Edited copies of a PointCloud2: some of its points, more fields, other places."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping
+from typing import Any
+
+from boxreg_ros.structures import Floats
+from msg_adapters.pointcloud import DTYPES
+from msg_adapters.poses import replaced
+import numpy as np
+from numpy.typing import NDArray
+
+NUMBERS = {kind: number for number, kind in DTYPES.items()}
+"""Kind of dtype -> ``PointField.datatype``."""
+
+
+def with_points(msg: Any, is_kept: NDArray[np.bool_]) -> Any:
+    """
+    Return a cloud with some of its points, in the same layout and under the same header.
+
+    Parameters
+    ----------
+    msg : PointCloud2
+        The cloud.
+    is_kept : array, shape (height * width,)
+        Which points of the message are kept, row by row; those that are not finite count, too.
+
+    """
+    if is_kept.all():
+        return msg
+    kept = _bytes_of(msg)[is_kept]
+    return _with_data(msg, kept)
+
+
+def with_fields(msg: Any, columns: Mapping[str, NDArray[Any]]) -> Any:
+    """
+    Return a cloud with more fields behind those it has.
+
+    Parameters
+    ----------
+    msg : PointCloud2
+        The cloud.
+    columns : mapping of str to array, shape (height * width,)
+        Values by name; the type of a field is that of its array.
+
+    """
+    points = _bytes_of(msg)
+    make = type(msg.fields[0])
+    order = '>' if msg.is_bigendian else '<'
+    fields = list(msg.fields)
+    parts = [points]
+    step = msg.point_step
+    for name, values in columns.items():
+        kind = values.dtype.str[1:]
+        fields.append(make(name=name, offset=step, datatype=NUMBERS[kind], count=1))
+        column = np.ascontiguousarray(values.astype(order + kind))
+        parts.append(column.view(np.uint8).reshape(len(points), -1))
+        step += values.dtype.itemsize
+    return _with_data(replaced(msg, fields=fields, point_step=step), np.hstack(parts))
+
+
+def with_positions(msg: Any, positions: Floats) -> Any:
+    """Return a cloud whose points are at `positions` (height * width, 3), in their types."""
+    data = _bytes_of(msg).copy()
+    order = '>' if msg.is_bigendian else '<'
+    fields = {field.name: field for field in msg.fields}
+    for name, column in zip('xyz', positions.T, strict=True):
+        first = fields[name].offset
+        values = column.astype(order + DTYPES[fields[name].datatype])
+        data[:, first : first + values.itemsize] = values.view(np.uint8).reshape(len(data), -1)
+    return _with_data(msg, data)
+
+
+def _bytes_of(msg: Any) -> NDArray[np.uint8]:
+    """Return the bytes of each point, (height * width, point_step)."""
+    step = msg.point_step
+    data = np.frombuffer(msg.data, np.uint8)
+    row_step = msg.row_step if msg.height > 1 else msg.width * step
+    rows = np.lib.stride_tricks.as_strided(
+        data, (msg.height, msg.width, step), (row_step, step, 1), writeable=False
+    )
+    return rows.reshape(-1, step)
+
+
+def _with_data(msg: Any, points: NDArray[np.uint8]) -> Any:
+    """Return a cloud of these points (n, point_step), organised as before if they are as many."""
+    n, step = points.shape
+    is_whole = n == msg.height * msg.width
+    height, width = (msg.height, msg.width) if is_whole else (1, n)
+    data: Any = np.ascontiguousarray(points).reshape(-1)
+    if isinstance(msg.data, array):  # of rclpy
+        data = array('B', data.tobytes())
+    return replaced(msg, height=height, width=width, row_step=width * step, data=data)

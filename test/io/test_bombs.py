@@ -1,0 +1,179 @@
+"""Files of a few bytes that claim or hold any number: refused soon, in bounded memory."""
+
+from contextlib import closing
+import json
+import resource
+import sqlite3
+import struct
+import subprocess
+import sys
+
+from boxreg_ros.errors import TransferError
+from boxreg_ros.io.storage.files import Files, opened, part_of
+from lz4.frame import compress as compress_lz4
+from mcap.data_stream import RecordBuilder
+from mcap.reader import make_reader
+from mcap.records import Chunk, Footer
+from mcap_files import rewritten
+import pytest
+from ros_messages import Drive
+import zstandard
+
+CLAIM = 1000
+"""Size that a chunk claims [bytes]."""
+TINY_MESSAGE = struct.pack('<BQHIQQ', 5, 22, 1, 0, 0, 0)
+COUNT = 1_100_000
+MEMORY = 2**30
+SECONDS = 60
+READ = """
+import json, resource, sys
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.storage.files import opened
+resource.setrlimit(resource.RLIMIT_AS, ({memory}, {memory}))
+from pathlib import Path
+for path in sys.argv[1:]:
+    try:
+        file = opened(Path(path))
+        count = sum(1 for _ in file.messages(file.connections, None, None))
+        print(json.dumps([count, [damage.reason for damage in file.damages]]))
+    except RecordingError as error:
+        print(json.dumps([0, [str(error)]]))
+"""
+
+ENDLESS = (
+    'WITH RECURSIVE rows(id, topic_id, timestamp, data) AS '
+    "(SELECT 1, 1, 1, x'00' UNION ALL SELECT id + 1, 1, id, x'00' FROM rows) SELECT * FROM rows"
+)
+"""A view with rows without end."""
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('whole')
+    return rewritten(Drive(sweeps=2).write(folder / 'drive'), folder / 'whole.mcap')
+
+
+def with_chunk(whole, target, compression, size, data):
+    """Write the data section of a file with a chunk more, and without an index."""
+    with whole.open('rb') as file:
+        last = max(
+            index.chunk_start_offset + index.chunk_length
+            for index in make_reader(file).get_summary().chunk_indexes
+        )
+    record = RecordBuilder()
+    Chunk(compression, data, 1, 0, 0, size).write(record)
+    target.write_bytes(whole.read_bytes()[:last] + record.end())
+    return target
+
+
+def with_repeated_index(whole, target, times):
+    """Write a file whose summary names each chunk many times."""
+    with whole.open('rb') as file:
+        summary = make_reader(file).get_summary()
+    data = whole.read_bytes()
+    (begin,) = struct.unpack_from('<Q', data, len(data) - 28)
+    records = RecordBuilder()
+    summary.statistics.chunk_count *= times
+    for record in (
+        *summary.schemas.values(), *summary.channels.values(), summary.statistics,
+        *summary.chunk_indexes * times, Footer(begin, 0, 0),
+    ):  # fmt: skip
+        record.write(records)
+    target.write_bytes(data[:begin] + records.end() + data[-8:])
+    return target
+
+
+def database(folder, change):
+    (file,) = Drive(sweeps=2).write(folder, 'sqlite3').glob('*.db3')
+    with closing(sqlite3.connect(file)) as connected:
+        connected.executescript(f'ALTER TABLE messages RENAME TO others; {change}')
+        connected.commit()
+    return file
+
+
+def test_bombs_are_refused_in_bounded_time_and_memory(tmp_path, whole):
+    zeros = bytes(2**27)
+    files = {
+        'bytes in a chunk of 1000': with_chunk(
+            whole, tmp_path / 'lz4.mcap', 'lz4', CLAIM, compress_lz4(bytes(2**30))
+        ),
+        f'{len(zeros)} bytes in a chunk of 1000': with_chunk(
+            whole, tmp_path / 'zstd.mcap', 'zstd', CLAIM, zstandard.compress(zeros)
+        ),
+        'operation code 0': with_chunk(
+            whole, tmp_path / 'zeros.mcap', 'zstd', len(zeros), zstandard.compress(zeros)
+        ),
+        'more than 1048576 records': with_chunk(
+            whole, tmp_path / 'tiny.mcap', 'zstd', COUNT * len(TINY_MESSAGE),
+            zstandard.compress(TINY_MESSAGE * COUNT),
+        ),
+        'more than 1000 times': tmp_path / 'file.mcap.zstd',
+        "expected a plain table 'messages' of rosbag2, got a computed one (view)": database(
+            tmp_path / 'view', f'CREATE VIEW messages AS {ENDLESS}'
+        ),
+        'got a computed one (data)': database(
+            tmp_path / 'generated',
+            'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, '
+            'data GENERATED ALWAYS AS (zeroblob(1000000000))); '
+            'INSERT INTO messages SELECT id, topic_id, timestamp FROM others',
+        ),
+    }  # fmt: skip
+    compress = zstandard.ZstdCompressor().compress
+    bomb = compress(zeros) * 8
+    (tmp_path / 'file.mcap.zstd').write_bytes(compress(whole.read_bytes()) + bomb)
+    done = subprocess.run(
+        [sys.executable, '-c', READ.format(memory=MEMORY), *map(str, files.values())],
+        capture_output=True, text=True, timeout=SECONDS,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    for (reason, path), (count, reasons) in zip(files.items(), lines, strict=True):
+        assert any(reason in found for found in reasons), (reason, reasons)
+        assert (count > 0) == (path.suffix != '.db3'), path  # the chunks before are read
+
+
+def test_an_index_that_names_chunks_twice_is_not_used(tmp_path, whole):
+    path = with_repeated_index(whole, tmp_path / 'repeated.mcap', 1)
+    with closing(opened(path)) as file:
+        expected = sum(1 for _ in file.messages(file.connections, None, None))
+        assert file.is_indexed
+    path = with_repeated_index(whole, tmp_path / 'repeated.mcap', 1000)
+    with closing(opened(path)) as file:
+        assert not file.is_indexed
+        assert sum(1 for _ in file.messages(file.connections, None, None)) == expected
+
+
+def test_a_full_disk_of_temporary_files_is_named(tmp_path, whole, monkeypatch):
+    """Damage would be noted, and the run done, if the error were about the recording."""
+    folder = tmp_path / 'drive'
+    folder.mkdir()
+    (folder / 'a.mcap').write_bytes(whole.read_bytes())
+    packed = zstandard.ZstdCompressor().compress(whole.read_bytes())
+    (folder / 'b.mcap.zstd').write_bytes(packed)
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+    try:
+        with pytest.raises(TransferError) as caught:
+            Files(part_of(folder))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(caught.value).startswith(f'temporary files in {tmp_path}: expected room')
+    assert 'TMPDIR' in str(caught.value)
+
+
+def test_a_file_that_cannot_be_opened_is_no_damage(tmp_path, whole):
+    """Of the second file nothing is known: the limit of open files is reached before it."""
+    folder = tmp_path / 'drive'
+    folder.mkdir()
+    for name in ('a', 'b'):
+        (folder / f'{name}.mcap').write_bytes(whole.read_bytes())
+    part = part_of(folder)
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with open('/dev/null') as newest:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (newest.fileno() + 2, limits[1]))
+        try:
+            with pytest.raises(TransferError, match='raise the limit of open files'):
+                Files(part)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)

@@ -1,0 +1,52 @@
+"""Measurements for the pages of results; users have those of `boxreg bench`."""
+
+import argparse
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+import sys
+
+from boxreg_ros.allocation import collect_rarely, keep_freed_memory
+from boxreg_ros.bench import common
+from boxreg_ros.errors import BoxregError
+
+MEASUREMENTS = {
+    'kinds': 'gain of each class of objects, with standard errors',
+    'tracks': 'broken tracks before and after each completing step',
+    'sensitivity': 'accuracy with each setting halved and doubled',
+    'highway': 'accuracy at 5 and at 30 m/s, with boxes of either time',
+    'lidars': 'accuracy on a truck with LiDARs at its corners',
+    'covariance': 'covariances against errors, by estimate and class',
+    'review': 'how early the review list shows the bad tracks',
+    'report': 'first paint and frame times of report.html',
+    'scale': 'core hours and memory per hour, and a simulated fleet',
+    'load': 'latency and accuracy of the live node by number of tracks',
+    'node': 'latency and memory of the live node, over DDS',
+    'kills': 'loss of recorded labels when a process is killed',
+    'renew': 'run the command of each stored measurement again, and store its output',
+}
+"""Modules of this package, each with `add_arguments` and `run`, and their summaries."""
+PROGRAM = 'python test/measure'
+MEASURE = (sys.executable, str(Path(__file__).parent))
+"""The command in a process of its own, of this environment."""
+print_json = partial(common.print_json, program=PROGRAM)
+
+
+def main(words: list[str]) -> int:
+    """Run the measurement that the first word names, with the others as its options."""
+    name, *options = words or ['--help']
+    if name not in MEASUREMENTS:
+        listed = '\n'.join(f'  {key:12} {text}' for key, text in MEASUREMENTS.items())
+        print(f'usage: {PROGRAM} NAME [OPTION]...\n\n{listed}')
+        return 0 if name in ('-h', '--help') else 2
+    module = import_module(f'measure.{name}')
+    parser = argparse.ArgumentParser(f'{PROGRAM} {name}', description=f'{MEASUREMENTS[name]}.')
+    module.add_arguments(parser)
+    args = parser.parse_args(options)
+    keep_freed_memory()
+    collect_rarely()
+    try:
+        return int(module.run(args))
+    except BoxregError as error:
+        print(f'{PROGRAM} {name}: {error}', file=sys.stderr)
+        return 1

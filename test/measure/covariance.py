@@ -1,0 +1,85 @@
+"""
+`measure covariance`: the sizes of covariances against those of the errors.
+
+Of early, final and track estimates, for every class, along the axes of the true boxes.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES
+from boxreg_ros.bench.common import add_json_argument, progress_bar
+from boxreg_ros.config import Config
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.covariance_table import BoxCovariance
+from boxreg_ros.offline.box_scores import match
+from boxreg_ros.offline.consistency import Consistency, consistency, table
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.structures import REFINED, RefinedBoxes
+from measure import print_json
+import numpy as np
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure covariance`."""
+    parser.add_argument(
+        'data', type=Path, nargs='+', metavar='DATA', help='folder: one recording and truth.csv'
+    )
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print coverage and normalised squared errors of each estimate, per recording."""
+    report: dict[str, Any] = {}
+    with progress_bar(len(args.data), args) as bar:
+        for folder in args.data:
+            found = measure(Drive.read(folder))
+            bar.update()
+            if not args.json:
+                bar.clear()
+                for estimate, groups in found.items():
+                    print(f'{folder}, {estimate}')
+                    print(table(groups))
+            report[str(folder)] = {
+                estimate: {name: group._asdict() for name, group in groups.items()}
+                for estimate, groups in found.items()
+            }
+    if args.json:
+        print_json(report)
+    return 0
+
+
+def measure(drive: Drive) -> dict[str, dict[str, Consistency]]:
+    """Return the consistency of each estimate of a drive, by class; without small classes."""
+    found = {}
+    for estimate in ('final', 'track'):
+        for name, results in drive.refined(Config(estimate=estimate)).items():
+            boxes = BoxTable.from_arrays([result.boxes for result in results])
+            matches = match(boxes, drive.truth)
+            groups = consistency(matches, boxes, drive.truth, _covariances(results))
+            found[name] = {
+                group: values
+                for group, values in groups.items()
+                if group == 'all' or values.boxes >= MIN_CLASS_BOXES
+            }
+    return found
+
+
+def _covariances(results: list[RefinedBoxes]) -> dict[tuple[int, str], BoxCovariance]:
+    """Return the covariances of all refined boxes by stamp and track id; ranges are unknown."""
+    return {
+        (result.boxes.stamp_ns, track_id): BoxCovariance(np.nan, pose, extent)
+        for result in results
+        for track_id, status, pose, extent in zip(
+            result.boxes.track_ids,
+            result.status,
+            result.covariances,
+            result.extent_covariances,
+            strict=True,
+        )
+        if status == REFINED
+    }

@@ -1,0 +1,95 @@
+"""
+`measure highway`: the same highway at two speeds, with boxes of either time.
+
+At 30 m/s every vehicle moves by 3 m while the sensor turns. The boxes of a detector are where a
+vehicle was at the stamp of the sweep, or where it was when the sensor saw it; the method has to
+find out which (`sampling.box_time`).
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+
+from boxreg_ros.bench.common import add_json_argument, line, progress_bar
+from boxreg_ros.bench.methods import run_methods
+from boxreg_ros.offline.box_scores import match
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.simulation.scenarios import highway
+from measure import print_json
+import numpy as np
+
+SPEEDS = (5.0, 30.0)
+"""Of the vehicle with the sensor [m/s]; the others drive 0.83 to 1.33 times as fast."""
+CONVENTIONS = ('stamp', 'sight')
+"""Times that the boxes are of."""
+COMPARED = ('smoothing', 'ours')
+MIN_SEEN_POINTS = 10
+"""True boxes with fewer points are left out; chosen: there is little to register to."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure highway`."""
+    parser.add_argument(
+        '--seeds', type=int, default=3, metavar='N', help='number of drives (default: 3)'
+    )
+    parser.add_argument(
+        '--sweeps', type=int, default=60, metavar='N', help='sweeps of a drive (default: 60)'
+    )
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the mean 3D IoU of each method by speed, one table for each time of the boxes."""
+    results: dict[str, dict[str, dict[str, float]]] = {}
+    count = len(CONVENTIONS) * len(SPEEDS) * args.seeds
+    with progress_bar(count, args) as bar:
+        for convention in CONVENTIONS:
+            table: dict[str, dict[str, float]] = {}
+            for speed in SPEEDS:
+                for name, iou in _mean_ious(args, convention, speed, bar.update).items():
+                    table.setdefault(name, {})[f'{speed:g} m/s'] = iou
+            results[convention] = table
+    if args.json:
+        print_json(results)
+        return 0
+    for convention, table in results.items():
+        print(line(f'boxes of the time of {convention}', [f'{speed:g} m/s' for speed in SPEEDS]))
+        for name, found in table.items():
+            print(line(name, list(found.values())))
+    return 0
+
+
+def _mean_ious(
+    args: argparse.Namespace, convention: str, speed: float, done: Callable[[], object]
+) -> dict[str, float]:
+    """Return the mean 3D IoU of each method over all seeds; `done` is called after each seed."""
+    ious: dict[str, list[float]] = {}
+    for seed in range(args.seeds):
+        for name, iou in measured(seed, args.sweeps, convention, speed):
+            ious.setdefault(name, []).append(iou)
+        done()
+    return {name: float(np.mean(values)) for name, values in ious.items()}
+
+
+def measured(seed: int, sweeps: int, convention: str, speed: float) -> Iterator[tuple[str, float]]:
+    """
+    Yield the name of each method and its mean 3D IoU on one drive.
+
+    Parameters
+    ----------
+    seed, sweeps : int
+        Of the drive.
+    convention : str
+        One of `CONVENTIONS`.
+    speed : float
+        Of the sensor [m/s].
+
+    """
+    rng = np.random.default_rng(seed)
+    drive = Drive.from_scene(highway(rng, sweeps, convention == 'sight', speed))
+    for name, boxes in run_methods(drive, wanted=COMPARED).items():
+        if not isinstance(boxes, str):
+            matches = match(boxes, drive.truth, MIN_SEEN_POINTS)
+            yield name, float(matches.iou_3d[matches.is_matched].mean())

@@ -1,0 +1,119 @@
+"""
+`measure kinds`: gain of each class of objects, with standard errors over its tracks.
+
+On recordings with known truth, or on simulated streets, whose tracks are pooled: a recording has
+few pedestrians and cyclists, and the boxes of each share its errors.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.accuracy import MIN_CLASS_BOXES, print_comparison
+from boxreg_ros.bench.common import add_json_argument, progress_bar
+from boxreg_ros.bench.differences import Difference, paired, PairedBoxes, REFERENCE_METHODS
+from boxreg_ros.bench.methods import run_methods
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.offline.box_scores import match
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.simulation.simulate import simulate
+from measure import print_json
+import numpy as np
+
+COMPARED = ('smoothing', 'ours')
+FIRST_SEED = 1
+"""Of the simulated streets; the sample recording, with which the method was made, has seed 0."""
+
+Comparison = tuple[str, str, str]
+"""Class of the true boxes, method, and the method that it is compared with."""
+Differences = dict[str, dict[str, dict[str, Difference]]]
+"""By the same."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure kinds`."""
+    parser.add_argument(
+        'data', type=Path, nargs='*', metavar='DATA',
+        help='folder: one recording and truth.csv (default: simulated streets)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--seeds', type=int, default=16, metavar='N',
+        help='number of simulated streets (default: 16)',
+    )  # fmt: skip
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the differences of each class: a table per recording, or one of all streets."""
+    measured: dict[str, dict[Comparison, dict[str, PairedBoxes]]] = {}  # by table; pairs by drive
+    with progress_bar(len(args.data) or args.seeds, args) as bar:
+        for table, name, drive in _drives(args):
+            comparisons = measured.setdefault(table, {})
+            for comparison, pairs in compared(drive):
+                comparisons.setdefault(comparison, {})[name] = pairs
+            bar.update()
+    tables = {table: _differences(comparisons) for table, comparisons in measured.items()}
+    if args.json:
+        print_json(_plain(tables))
+        return 0
+    for table, classes in tables.items():
+        print(table)
+        for class_name, methods in classes.items():
+            boxes = methods['ours, track']['input'].boxes
+            print(f'{class_name}: {boxes} true boxes with points')
+            for method, found in methods.items():
+                print_comparison(f'{method}, minus', found)
+        print()
+    return 0
+
+
+def _drives(args: argparse.Namespace) -> Iterator[tuple[str, str, Drive]]:
+    """Yield the title of a table, and name and drive of each of its drives."""
+    for folder in args.data:
+        yield str(folder), folder.name, Drive.read(folder)
+    if not args.data:
+        for seed in range(FIRST_SEED, FIRST_SEED + args.seeds):
+            drive = Drive.from_scene(simulate('street', seed))
+            yield f'{args.seeds} simulated streets', str(seed), drive
+
+
+def compared(drive: Drive) -> Iterator[tuple[Comparison, PairedBoxes]]:
+    """Yield the true boxes with points of each class, by our estimates and by their references."""
+    truth = drive.truth
+    methods = run_methods(drive, wanted=COMPARED)
+    found = {
+        name: match(boxes, truth, min_points=1)
+        for name, boxes in methods.items()
+        if isinstance(boxes, BoxTable)
+    }
+    class_names = np.array(found['input'].class_names, str)
+    for class_name in np.unique(class_names).tolist():
+        scope = class_names == class_name
+        for method, others in REFERENCE_METHODS.items():
+            for other in others:
+                if other in found:
+                    pairs = paired(found[method], found[other], truth, scope)
+                    yield (class_name, method, other), pairs
+
+
+def _differences(comparisons: Mapping[Comparison, Mapping[str, PairedBoxes]]) -> Differences:
+    """Return the pooled difference of each comparison with enough boxes."""
+    found: Differences = {}
+    for (class_name, method, other), parts in sorted(comparisons.items()):
+        difference = PairedBoxes.pooled(parts).difference()
+        if difference.boxes >= MIN_CLASS_BOXES:
+            by_method = found.setdefault(class_name, {})
+            by_method.setdefault(method, {})[other] = difference
+    return found
+
+
+def _plain(found: Any) -> Any:
+    """Return nested differences as nested dictionaries of numbers."""
+    if isinstance(found, Difference):
+        return asdict(found)
+    return {key: _plain(inner) for key, inner in found.items()}

@@ -1,0 +1,105 @@
+"""
+`measure lidars`: accuracy on a truck with LiDARs at its corners.
+
+The same drives are recorded in four ways: a topic per LiDAR, a concatenated cloud with its info
+message, the concatenated cloud alone, and a single LiDAR on the roof. The concatenated cloud alone
+is read with and without the names of its LiDARs. The input boxes and the truth are the same.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import tempfile
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, line, progress_bar
+from boxreg_ros.config import Config
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.fixed_frame import input_boxes
+from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
+from boxreg_ros.io.recording import Recording
+from boxreg_ros.offline.box_scores import match
+from boxreg_ros.offline.relabel import relabel
+from boxreg_ros.offline.request import Request
+from boxreg_ros.simulation.truck import CORNER_LIDARS, truck_scene, write_truck
+from measure import print_json
+import numpy as np
+
+CLASSES = ('car', 'van', 'truck')
+WAYS = {
+    'corners': ('corners', Lidars(tuple(f'/points/{name}' for name in CORNER_LIDARS))),
+    'concatenated': ('concatenated', SINGLE_LIDAR),
+    'concatenated-alone': ('concatenated-alone', SINGLE_LIDAR),
+    'concatenated-named': ('concatenated-alone', Lidars(frames=tuple(CORNER_LIDARS))),
+    'roof': ('roof', SINGLE_LIDAR),
+}
+"""Name -> layout of `TRUCK_SENSORS`, and how it is read."""
+MIN_POINTS = 100
+"""True boxes with fewer points of all corners are left out, as in `boxreg bench real`."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure lidars`."""
+    parser.add_argument(
+        '--seeds', type=int, default=3, metavar='N', help='number of drives (default: 3)'
+    )
+    parser.add_argument('--sweeps', type=int, metavar='N', help='sweeps of a drive (default: 50)')
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the mean IoU of the input and of each way to record the LiDARs."""
+    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ('input', *WAYS)}
+    with progress_bar(args.seeds * len(WAYS), args) as bar:
+        for seed in range(args.seeds):
+            for name, ious in measured(seed, args.sweeps, bar.update).items():
+                rows[name].append(ious)
+    results = {
+        name: dict(zip(('bev', '3d'), np.mean(ious, axis=0).tolist(), strict=True))
+        for name, ious in rows.items()
+    }
+    if args.json:
+        print_json(results)
+        return 0
+    print(line('', ('BEV', '3D')))
+    for name, found in results.items():
+        print(line(name, list(found.values())))
+    return 0
+
+
+def measured(seed: int, sweeps: int | None, done: Any) -> dict[str, tuple[float, float]]:
+    """
+    Return mean BEV and 3D IoU of the input and of each way for one drive.
+
+    Parameters
+    ----------
+    seed, sweeps
+        Of the drive.
+    done : callable
+        Called after each way.
+
+    """
+    scene = truck_scene(seed, sweeps)
+    found: dict[str, tuple[float, float]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, (layout, lidars) in WAYS.items():
+            path = Path(folder) / f'{layout}.mcap'
+            out = Path(folder) / name
+            write_truck(path, scene, layout)
+            if not found:
+                arrays, _ = input_boxes(Recording([path], lidars))
+                found['input'] = _ious(BoxTable.from_arrays(arrays, 'input'), scene.truth)
+            request = Request((path,), lidars=lidars, formats=('csv',), config=Config())
+            relabel(request, out)
+            found[name] = _ious(BoxTable.read(out / 'boxes.csv'), scene.truth)
+            done()
+    return found
+
+
+def _ious(boxes: BoxTable, truth: BoxTable) -> tuple[float, float]:
+    """Return the mean BEV and 3D IoU of the boxes that there are."""
+    matches = match(boxes, truth, MIN_POINTS, CLASSES)
+    is_there = matches.is_matched
+    return float(matches.iou_bev[is_there].mean()), float(matches.iou_3d[is_there].mean())

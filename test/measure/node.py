@@ -1,0 +1,571 @@
+"""
+`measure node`: latency and memory of the live node under load, over DDS.
+
+Publisher, node and observer each run in a process of their own. The publisher simulates cars that
+drive in circles around a sensor; track ids are renewed as in traffic. Latency is the time from
+publishing the later of cloud and boxes until the refined boxes arrive at the observer.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, ExitStack
+from functools import partial
+import os
+from pathlib import Path
+import signal
+import struct
+import subprocess
+from tempfile import TemporaryDirectory
+from threading import Thread
+import time
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.errors import BoxregError, ConfigError
+from boxreg_ros.labels import module_of
+from boxreg_ros.structures import Floats, LENGTH, ROLL, YAW
+from measure import MEASURE, print_json
+from measure.recorded import RecordedLabels
+import numpy as np
+from paths import SHARE
+
+PROFILE = SHARE / 'fastdds.xml'
+CIRCLE_PERIOD = 5.0  # time until a car is back where it began [s]
+TRACK_LIFETIME = 200  # sweeps until a track gets a new id
+STARTUP_TIME = 5.0  # not measured at the beginning [s]
+CAR_EXTENT = (4.5, 1.9, 1.6)  # length, width and height of every car [m]
+CAR_SPACING = 14.0  # of the centres of the circles [m]
+CIRCLE_RADIUS = 4.0  # [m]
+POINTS_PER_CAR = 300
+ROAD_SIZE = 160.0  # side of the square with the other points [m]
+BOX_ERRORS = (0.1, 0.1, 0.05, 0.1, 0.1, 0.1, 0.0, 0.0, 0.03)  # standard deviations [m, rad]
+CDR_HEADER = 4  # bytes before the first member of a serialised message
+FIRST_MARKER = 8  # bytes before the first marker: the header and the length of the list
+COMPLETION_TIME = 60.0  # for the last segment of recorded labels [s]
+RECORDING_TURNS = 2  # runs without and with recording
+SETTLED_AFTER = 60.0  # queues, pools of memory and the heap have their size by then [s]
+SAMPLE_PERIOD = 1.0  # of memory, handles, threads and CPU time of the node [s]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure node`."""
+    parser.add_argument('--tracks', type=int, default=64, metavar='N', help='default: 64')
+    parser.add_argument(
+        '--points', type=int, default=130_000, metavar='N', help='per sweep (default: 130000)'
+    )
+    parser.add_argument(
+        '--rate', type=float, default=10.0, metavar='HZ', help='rate of the sensor (default: 10)'
+    )
+    parser.add_argument(
+        '--seconds', type=float, default=60.0, metavar='S', help='seconds of data (default: 60)'
+    )
+    parser.add_argument(
+        '--delay', type=float, default=0.05, metavar='S',
+        help='delay of the boxes after their cloud (default: 0.05)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--transport', choices=('large', 'default'), default='large',
+        help='large: shared memory sized for clouds (share/fastdds.xml); default: that of DDS',
+    )  # fmt: skip
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='KEY:=VALUE', help='parameter of the node'
+    )
+    parser.add_argument(
+        '--record', metavar='FORMAT,...',
+        help='also record labels in these formats, with their clouds',
+    )  # fmt: skip
+    parser.add_argument(
+        '--compare', action='store_true',
+        help='alternate runs without and with --record, and divide their latencies',
+    )  # fmt: skip
+    parser.add_argument(
+        '--keep-gigabytes', type=float, default=float('inf'), metavar='N',
+        help='delete the oldest recorded segments beyond N GB, after they were counted (default: '
+        'none)',
+    )  # fmt: skip
+    add_json_argument(parser)
+    parser.add_argument('--role', choices=('publish',), help=argparse.SUPPRESS)
+    parser.add_argument('--log', type=Path, help=argparse.SUPPRESS)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Measure and print.
+
+    Raises
+    ------
+    BoxregError
+        If rclpy cannot be imported, or the node or the publisher ends early.
+
+    """
+    try:
+        import rclpy  # noqa: F401
+    except ImportError as error:
+        raise BoxregError(f'{error}: source a ROS 2 installation') from None
+    if args.role:
+        publish(args)
+        return 0
+    if args.compare and args.record is None:
+        raise ConfigError('--compare: expected --record with formats, got none; add it')
+    report = compare(args) if args.compare else measure(args)
+    if args.json:
+        print_json(report)
+        return 0
+    for name, value in report.items():
+        text = value if isinstance(value, (str, dict)) else f'{value:g}'
+        print(f'{name:28} {text}')
+    return 0
+
+
+# ---------------------------------------------------------------- process of the publisher
+
+
+def true_boxes(args: argparse.Namespace, turn: int) -> Floats:
+    """Return the true boxes (n, 9) of a sweep, in the sensor frame."""
+    side = int(np.ceil(np.sqrt(args.tracks)))
+    index = np.arange(args.tracks)
+    phase = 2 * np.pi * (turn / (CIRCLE_PERIOD * args.rate) + index / args.tracks)
+    boxes = np.zeros((args.tracks, 9))
+    boxes[:, 0] = CAR_SPACING * (index % side - side / 2) + CIRCLE_RADIUS * np.sin(phase) + 5.0
+    boxes[:, 1] = CAR_SPACING * (index // side - side / 2) - CIRCLE_RADIUS * np.cos(phase) + 5.0
+    boxes[:, LENGTH:ROLL] = CAR_EXTENT
+    boxes[:, YAW] = phase
+    return boxes
+
+
+def scene(args: argparse.Namespace, turn: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return the points (M, 3) and noisy boxes (n, 9) of a sweep, in the sensor frame."""
+    boxes = true_boxes(args, turn)
+    phase = boxes[:, YAW]
+    # Cars make at most half of the points, as in `boxreg bench speed`.
+    points_per_car = min(POINTS_PER_CAR, args.points // (2 * args.tracks))
+    local = rng.uniform(-0.5, 0.5, (args.tracks, points_per_car, 3))  # (n, points, xyz)
+    near = -np.sign(boxes[:, :2])  # the end and the side that roughly face the sensor
+    half = points_per_car // 2
+    local[:, :half, 0] = 0.49 * near[:, :1]
+    local[:, half:, 1] = 0.49 * near[:, 1:]
+    local *= np.array(CAR_EXTENT)
+    cos = np.cos(phase)[:, None]
+    sin = np.sin(phase)[:, None]
+    x = cos * local[..., 0] - sin * local[..., 1]
+    y = sin * local[..., 0] + cos * local[..., 1]
+    points = np.stack([x, y, local[..., 2]], axis=-1) + boxes[:, None, :3]
+    rest = max(0, args.points - points[..., 0].size)
+    road = rng.uniform(-ROAD_SIZE / 2, ROAD_SIZE / 2, (rest, 3))
+    road[:, 2] = -CAR_EXTENT[2] / 2
+    noisy = boxes + np.array(BOX_ERRORS) * rng.normal(0, 1, boxes.shape)
+    return np.concatenate([points.reshape(-1, 3), road]), noisy
+
+
+def publish(args: argparse.Namespace) -> None:
+    """Publish in real time; log stamp and time of publishing of every box array [ns]."""
+    from nav_msgs.msg import Odometry
+    import rclpy
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from rclpy.serialization import serialize_message
+    from sensor_msgs.msg import PointCloud2
+    from visualization_msgs.msg import MarkerArray
+
+    rng = np.random.default_rng(0)
+    scenes = [scene(args, turn, rng) for turn in range(round(CIRCLE_PERIOD * args.rate))]
+    clouds = [_cloud_bytes(points) for points, _ in scenes]
+    arrays = [_marker_array(boxes) for _, boxes in scenes]
+    rclpy.init(args=[])
+    node = rclpy.create_node('bench_publisher')
+    best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    to_points = node.create_publisher(PointCloud2, 'points', best_effort)
+    to_boxes = node.create_publisher(MarkerArray, 'boxes', 10)
+    to_odom = node.create_publisher(Odometry, 'odom', 50)
+    while not all(p.get_subscription_count() for p in (to_points, to_boxes, to_odom)):
+        time.sleep(0.1)
+    odometry = Odometry(child_frame_id='lidar')
+    odometry.header.frame_id = 'odom'
+    period_ns = 1e9 / args.rate
+    begin_ns = time.time_ns()
+    with args.log.open('w') as log:
+        for turn in range(round(args.seconds * args.rate)):
+            stamp_ns = begin_ns + round(turn * period_ns)
+            _sleep_until(stamp_ns)
+            stamp = divmod(stamp_ns, 10**9)
+            odometry.header.stamp.sec, odometry.header.stamp.nanosec = stamp
+            to_odom.publish(odometry)
+            cloud = clouds[turn % len(clouds)]
+            struct.pack_into('<iI', cloud, CDR_HEADER, *stamp)
+            to_points.publish(bytes(cloud))
+            array = arrays[turn % len(arrays)]
+            _set_ids_and_stamp(array, turn, stamp)
+            message = serialize_message(array)  # 12 ms for 1,024 boxes, which a tracker spends
+            _sleep_until(stamp_ns + round(args.delay * 1e9))
+            moment_ns = time.monotonic_ns()
+            to_boxes.publish(message)
+            log.write(f'{stamp_ns} {moment_ns}\n')
+    time.sleep(1.0)  # the last messages are still under way
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def _set_ids_and_stamp(array: Any, turn: int, stamp: tuple[int, int]) -> None:
+    """Set the stamp of all markers of a sweep, and their ids, each new after `TRACK_LIFETIME`."""
+    tracks = len(array.markers)
+    for i, marker in enumerate(array.markers):
+        renewals = (turn + i * TRACK_LIFETIME // tracks) // TRACK_LIFETIME
+        marker.id = i + tracks * renewals
+        marker.header.stamp.sec, marker.header.stamp.nanosec = stamp
+
+
+def _sleep_until(moment_ns: int) -> None:
+    time.sleep(max(0.0, (moment_ns - time.time_ns()) * 1e-9))
+
+
+def _cloud_bytes(points: Any) -> bytearray:
+    """Return points (M, 3) as a serialised PointCloud2 with x, y, z and intensity."""
+    from rclpy.serialization import serialize_message
+    from sensor_msgs.msg import PointCloud2, PointField
+
+    table = np.zeros((len(points), 4), np.float32)
+    table[:, :3] = points
+    cloud = PointCloud2(height=1, width=len(table), point_step=16, row_step=16 * len(table))
+    cloud.header.frame_id = 'lidar'
+    cloud.fields = [
+        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
+        for i, name in enumerate(('x', 'y', 'z', 'intensity'))
+    ]
+    cloud.data.frombytes(table.tobytes())
+    return bytearray(serialize_message(cloud))
+
+
+def _marker_array(boxes: Any) -> Any:
+    """Return boxes (n, 9) as a MarkerArray of CUBE markers."""
+    from msg_adapters.poses import quaternions_of
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    markers = []
+    for box, quaternion_xyzw in zip(boxes.tolist(), quaternions_of(boxes).tolist(), strict=True):
+        marker = Marker(type=Marker.CUBE, ns='car')
+        marker.header.frame_id = 'lidar'
+        position = marker.pose.position
+        orientation = marker.pose.orientation
+        position.x, position.y, position.z = box[:3]
+        orientation.x, orientation.y, orientation.z, orientation.w = quaternion_xyzw
+        marker.scale.x, marker.scale.y, marker.scale.z = box[LENGTH:ROLL]
+        markers.append(marker)
+    return MarkerArray(markers=markers)
+
+
+# ----------------------------------------------------------------- process of the observer
+
+
+def compare(args: argparse.Namespace) -> dict[str, Any]:
+    """Measure without and with recording in turn, and return the latencies of all runs."""
+    formats = args.record
+    report: dict[str, Any] = {}
+    for turn in range(RECORDING_TURNS):
+        for args.record in (None, formats):
+            kind = 'recording' if args.record else 'not recording'
+            report |= {f'{kind} {turn + 1}: {k}': v for k, v in measure(args).items()}
+    for name in ('p50', 'p99'):
+        key = f': latency {name} [ms]'
+        sums = [
+            sum(report[f'{kind} {turn + 1}{key}'] for turn in range(RECORDING_TURNS))
+            for kind in ('recording', 'not recording')
+        ]
+        report[f'{name} with / without recording'] = sums[0] / sums[1]
+    return report
+
+
+def measure(args: argparse.Namespace, keeps_messages: bool = False) -> dict[str, Any]:
+    """
+    Run node and publisher, and return the report of the observer.
+
+    Parameters
+    ----------
+    args : Namespace
+        Options of `measure node`.
+    keeps_messages : bool
+        Whether the report has ``messages`` as well: for early and final boxes, each serialised
+        message by its sweep, after `STARTUP_TIME`.
+
+    """
+    set_environment(args.transport)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory()))
+        arrivals = stack.enter_context(observer(keeps_messages))
+        labels = RecordedLabels(folder / 'labels', 1e9 * args.keep_gigabytes, args.points)
+        parameters = [*args.set, *recording_parameters(args.record, folder / 'labels')]
+        node = stack.enter_context(process(node_command(parameters), folder / 'node.log'))
+        load = os.getloadavg()[0]
+        publisher = stack.enter_context(
+            process(publisher_command(args, folder / 'sent'), folder / 'sent.log')
+        )
+        samples = []
+        recorder_samples = []
+        while publisher.poll() is None:
+            if node.poll() is not None:
+                raise BoxregError(f'the node ended: {(folder / "node.log").read_text()}')
+            if arrivals['early']:
+                samples.append(vitals(node.pid))
+                recorder_samples += [vitals(child) for child in children_of(node.pid)]
+            labels.update()
+            time.sleep(SAMPLE_PERIOD)
+        if publisher.returncode:
+            raise BoxregError(f'the publisher failed: {(folder / "sent.log").read_text()}')
+        samples = samples or [vitals(node.pid)]
+        sent = np.loadtxt(folder / 'sent', dtype=np.int64, ndmin=2)
+        shutdown_time = _ended(node)
+        log = (folder / 'node.log').read_text()
+        recorded = recording(labels, args.record, sent) if args.record else {}
+        if recorder_samples:
+            recorded |= {f'recorder: {k}': v for k, v in growth(recorder_samples).items()}
+    return {
+        'load before, during': f'{load:.2f}, {os.getloadavg()[0]:.2f}',
+        **results(sent, arrivals, args.rate),
+        **growth(samples),
+        **recorded,
+        'shutdown [s]': shutdown_time,
+        'exit status': node.returncode,
+        'log lines': len(log.splitlines()),
+        'counters': arrivals['counters'],
+        **({'messages': _by_sweep(sent, arrivals, args.rate)} if keeps_messages else {}),
+    }
+
+
+def _ended(node: subprocess.Popen[bytes]) -> float:
+    """End a node and wait for its last messages; return the time that it took to end [s]."""
+    begin = time.monotonic()
+    node.send_signal(signal.SIGINT)
+    node.wait(timeout=30.0)
+    seconds = time.monotonic() - begin
+    time.sleep(0.5)
+    return seconds
+
+
+def set_environment(transport: str) -> None:
+    """Set the transport of DDS, and a domain apart from other nodes of this machine."""
+    if transport == 'large':
+        os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
+    else:
+        os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    os.environ.setdefault('ROS_DOMAIN_ID', '231')
+
+
+def node_command(parameters: Sequence[str]) -> list[str]:
+    """Return the command of a node with parameters as ``KEY:=VALUE``."""
+    options = [part for text in parameters for part in ('-p', text)]
+    return [*BOXREG, 'node', '--ros-args', *options]
+
+
+def publisher_command(args: argparse.Namespace, log: Path) -> list[str]:
+    """Return the command of the publisher, which logs the box arrays sent."""
+    names = ('tracks', 'points', 'rate', 'seconds', 'delay')
+    options = [f'--{name}={getattr(args, name)}' for name in names]
+    return [*MEASURE, 'node', '--role=publish', f'--log={log}', *options]
+
+
+def _by_sweep(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, dict[int, bytes]]:
+    """Return the serialised messages by the number of their sweep, after `STARTUP_TIME`."""
+    turns = {stamp_ns: turn for turn, stamp_ns in enumerate(sent[:, 0].tolist())}
+    begin = round(STARTUP_TIME * rate)
+    return {
+        name: {turns[s]: data for s, data in kept.items() if turns.get(s, -1) >= begin}
+        for name, kept in arrivals['messages'].items()
+    }
+
+
+def results(sent: Any, arrivals: dict[str, Any], rate: float) -> dict[str, float]:
+    """
+    Return the published shares and the latencies after `STARTUP_TIME`.
+
+    Parameters
+    ----------
+    sent : array, shape (n, 2)
+        Stamp and time of publishing of each box array [ns].
+    arrivals : dict
+        As `observer` yields it.
+    rate : float
+        Box arrays per second.
+
+    """
+    measured = sent[round(STARTUP_TIME * rate) :]
+    latencies = []
+    for stamp_ns, sent_ns in measured.tolist():
+        arrival_ns = arrivals['early'].get(stamp_ns)
+        if arrival_ns is not None:
+            latencies.append((arrival_ns - sent_ns) * 1e-6)
+    finals = sum(stamp_ns in arrivals['final'] for stamp_ns in measured[:, 0].tolist())
+    total = max(1, len(measured))
+    report = {
+        'box arrays sent': float(len(measured)),
+        'early published [%]': 100.0 * len(latencies) / total,
+        'final published [%]': 100.0 * finals / total,
+    }
+    if latencies:
+        half = len(latencies) // 2
+        report |= {
+            f'latency {name} [ms]': float(np.percentile(part, percentile))
+            for name, part, percentile in (
+                ('p50', latencies, 50),
+                ('p99', latencies, 99),
+                ('max', latencies, 100),
+                ('p50 of 1st half', latencies[: half + 1], 50),
+                ('p50 of 2nd half', latencies[half:], 50),
+            )
+        }
+    return report
+
+
+def recording_parameters(formats: str | None, folder: Path) -> list[str]:
+    """Return the parameters of a node that records labels and clouds; none without formats."""
+    if formats is None:
+        return []
+    return [f'record_to:={folder}', f'record_formats:=[{formats}]', 'record_points:=true']
+
+
+def recording(labels: RecordedLabels, formats: str, sent: Any) -> dict[str, float]:
+    """
+    Wait for the last segment; return the recorded parts of the box arrays sent and their clouds.
+
+    Parameters
+    ----------
+    labels : RecordedLabels
+        The segments recorded so far.
+    formats : str
+        As given to the recorder.
+    sent : array, shape (n, 2)
+        Stamp and time of publishing of each box array [ns].
+
+    """
+    deadline = time.monotonic() + COMPLETION_TIME
+    while labels.has_open_segment and time.monotonic() < deadline:
+        time.sleep(0.1)  # the recorder completes the last segment after the node has ended
+    labels.update()
+    with_clouds = sum(
+        'with_points' in module_of(name).FORMAT.options for name in formats.split(',')
+    )
+    return {
+        'recorded box arrays': float(len(labels.stamps)),
+        'recorded cloud files': float(labels.cloud_files),
+        'box arrays not recorded': float(len(set(sent[:, 0].tolist()) - labels.stamps)),
+        'cloud files not recorded': float(with_clouds * len(sent) - labels.cloud_files),
+        'recorded segments': float(len(labels.rows)),
+        'recorded [MB]': 1e-6 * sum(row.size for row in labels.rows),
+    }
+
+
+def growth(samples: list[tuple[float, int, int, float]]) -> dict[str, float]:
+    """
+    Return memory, handles, threads and cores used by the node.
+
+    A value that grows from the start, after `SETTLED_AFTER` or a third of the run, to the middle
+    and on to the end is a leak.
+
+    Parameters
+    ----------
+    samples : list of tuple
+        `vitals` of the node every `SAMPLE_PERIOD`, from the first refined boxes on.
+
+    """
+    end = len(samples) - 1
+    begin = min(round(SETTLED_AFTER / SAMPLE_PERIOD), end // 3)
+    rows = {'at the start': begin, 'in the middle': (begin + end) // 2, 'at the end': end}
+    cpu_time = samples[end][3] - samples[begin][3]
+    return {
+        **{f'memory {when} [MB]': samples[row][0] for when, row in rows.items()},
+        **{f'handles {when}': float(samples[row][1]) for when, row in rows.items()},
+        'threads': float(samples[end][2]),
+        'cores used': cpu_time / SAMPLE_PERIOD / max(1, end - begin),
+    }
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the processes that a process has started, in any of its threads."""
+    lists = Path(f'/proc/{pid}/task').glob('*/children')
+    return [int(word) for children in lists for word in children.read_text().split()]
+
+
+def vitals(pid: int) -> tuple[float, int, int, float]:
+    """Return resident memory [MB], open files, threads and CPU time [s] of a process."""
+    root = Path(f'/proc/{pid}')
+    status = dict(line.split(':', 1) for line in (root / 'status').read_text().splitlines())
+    times = (root / 'stat').read_text().rsplit(')', 1)[1].split()[11:13]
+    return (
+        int(status['VmRSS'].split()[0]) / 1024,
+        len(list((root / 'fd').iterdir())),
+        int(status['Threads']),
+        sum(map(int, times)) / os.sysconf('SC_CLK_TCK'),
+    )
+
+
+@contextmanager
+def process(command: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a process, which is killed at the end of the context if it still runs."""
+    with log.open('wb') as file:
+        popen = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+    try:
+        yield popen
+    finally:
+        if popen.poll() is None:
+            popen.kill()
+        popen.wait()
+
+
+@contextmanager
+def observer(keeps_messages: bool = False) -> Iterator[dict[str, Any]]:
+    """
+    Subscribe to the outputs of the node while the context lasts.
+
+    Parameters
+    ----------
+    keeps_messages : bool
+        Whether ``messages`` are kept.
+
+    Yields
+    ------
+    arrivals : dict
+        ``early`` and ``final``: time of arrival by stamp [ns]. ``counters``: the counters of the
+        diagnostics. ``messages``: of ``early`` and ``final``, serialised, by stamp.
+
+    """
+    from diagnostic_msgs.msg import DiagnosticArray
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.qos import QoSProfile
+    from rclpy.signals import SignalHandlerOptions
+    from visualization_msgs.msg import MarkerArray
+
+    arrivals: dict[str, Any] = {'early': {}, 'final': {}, 'counters': {}}
+    arrivals['messages'] = {'early': {}, 'final': {}}
+
+    def add_arrival(name: str, data: bytes) -> None:
+        sec, nanosec = struct.unpack_from('<iI', data, FIRST_MARKER)
+        stamp_ns = sec * 10**9 + nanosec
+        arrivals[name].setdefault(stamp_ns, time.monotonic_ns())
+        if keeps_messages:
+            arrivals['messages'][name].setdefault(stamp_ns, data)
+
+    def add_counters(message: DiagnosticArray) -> None:
+        for item in message.status[0].values:
+            if item.value.isdigit():
+                arrivals['counters'][item.key] = int(item.value)
+
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C ends the run
+    node = rclpy.create_node('bench_observer')
+    for name, topic in (('early', 'refined_boxes'), ('final', 'refined_boxes_final')):
+        node.create_subscription(
+            MarkerArray, topic, partial(add_arrival, name), QoSProfile(depth=1000), raw=True
+        )
+    node.create_subscription(DiagnosticArray, '/diagnostics', add_counters, 10)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    thread = Thread(target=executor.spin, daemon=True)
+    thread.start()
+    try:
+        yield arrivals
+    finally:
+        executor.shutdown()
+        thread.join(2.0)
+        node.destroy_node()
+        rclpy.shutdown()

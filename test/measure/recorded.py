@@ -1,0 +1,73 @@
+"""Labels that the node records during `measure node`: checked, counted, and deleted."""
+
+from __future__ import annotations
+
+from collections import deque
+import csv
+from pathlib import Path
+import shutil
+
+from boxreg_ros.labels.clouds import SUFFIXES
+from boxreg_ros.labels.segments import IndexRow, read_index
+
+XYZ_BYTES = 12
+"""Least size of a point in a file: x, y and z as float32."""
+
+
+class RecordedLabels:
+    """
+    Count the labels of each whole segment; delete the oldest segments beyond a size.
+
+    A robot uploads its segments and deletes them: a long run needs no larger disk than a short
+    one.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the segments; need not exist yet.
+    kept : float
+        Size of whole segments that stay on the disk [bytes].
+    points : int
+        Number of points of each cloud.
+
+    Attributes
+    ----------
+    stamps : set of int
+        Stamps of the box arrays in the segments [ns].
+    cloud_files : int
+        Files with a whole cloud.
+    rows : list of IndexRow
+        The segments that were counted.
+
+    """
+
+    def __init__(self, folder: Path, kept: float, points: int) -> None:
+        self.stamps: set[int] = set()
+        self.cloud_files = 0
+        self.rows: list[IndexRow] = []
+        self._folder = folder
+        self._kept = kept
+        self._cloud_bytes = XYZ_BYTES * points
+        self._on_disk = deque[IndexRow]()
+
+    def update(self) -> None:
+        """Count the segments that are new in the index, and delete the oldest."""
+        for row in read_index(self._folder)[len(self.rows) :]:
+            self._count(self._folder / row.segment)
+            self.rows.append(row)
+            self._on_disk.append(row)
+        while sum(row.size for row in self._on_disk) > self._kept:
+            shutil.rmtree(self._folder / self._on_disk.popleft().segment)
+
+    @property
+    def has_open_segment(self) -> bool:
+        """Return whether a segment is not whole yet."""
+        return any(self._folder.glob('.segment_*'))
+
+    def _count(self, segment: Path) -> None:
+        with (segment / 'boxes.csv').open(newline='', encoding='utf-8') as file:
+            self.stamps.update(int(cells['stamp_ns']) for cells in csv.DictReader(file))
+        self.cloud_files += sum(
+            path.name.endswith(SUFFIXES) and path.stat().st_size >= self._cloud_bytes
+            for path in segment.rglob('*')
+        )

@@ -1,0 +1,65 @@
+"""
+`measure renew`: run the command of each stored measurement again, and store its output.
+
+A stored measurement is a file ``docs/results/NAME.json``; it names the command that wrote it. Data
+are folders of recordings with known truth: ``DATA/street`` has one recording and ``truth.csv``.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import shlex
+import subprocess
+import sys
+
+from boxreg_ros.bench.common import BOXREG
+from boxreg_ros.errors import RecordingError
+from measure import MEASURE, PROGRAM
+from paths import ROOT
+
+STORE = ROOT / 'docs' / 'results'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure renew`."""
+    parser.add_argument('data', type=Path, metavar='DATA', help='folder with the recordings')
+    parser.add_argument(
+        '--only', default='*', metavar='NAMES', help="pattern, such as 'tracks_*' (default: all)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Write each chosen file anew, whole or not at all.
+
+    Raises
+    ------
+    RecordingError
+        If a command fails.
+
+    """
+    for path in sorted(STORE.glob(f'{args.only}.json')):
+        command = json.loads(path.read_text(encoding='utf-8'))['command']
+        print(command, file=sys.stderr)
+        done = subprocess.run(
+            resolved(command), cwd=args.data, stdout=subprocess.PIPE, encoding='utf-8'
+        )
+        if done.returncode:
+            raise RecordingError(f'{command}: ended with exit status {done.returncode}')
+        document = json.loads(done.stdout) | {'command': command}
+        path.write_text(f'{json.dumps(document)}\n', encoding='utf-8')
+    return 0
+
+
+def resolved(command: str) -> list[str]:
+    """Return a stored command as words that run in any folder, by the Python of this process."""
+    if command.startswith(PROGRAM):
+        program = MEASURE
+        words = shlex.split(command.removeprefix(PROGRAM))
+    else:
+        program = BOXREG
+        words = shlex.split(command)[1:]
+    return [*program, *(str(ROOT / word) if (ROOT / word).is_file() else word for word in words)]

@@ -1,0 +1,294 @@
+"""
+`measure scale`: core hours and memory per hour of recording, and a fleet of jobs.
+
+The drives are copies of one recording, and run by `boxreg batch` itself. A large recording is its
+repetition. The fleet is simulated with the measured time: jobs of random length, stragglers, and
+workers that are lost.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from heapq import heapify, heapreplace
+import json
+import os
+from pathlib import Path
+import resource
+import shutil
+import subprocess
+from tempfile import TemporaryDirectory
+import time
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, BOXREG
+from boxreg_ros.errors import RecordingError
+from boxreg_ros.offline.job import JOB_FAILED, jobs_of
+from boxreg_ros.offline.job_process import JobRunner
+from boxreg_ros.structures import Floats
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from measure import print_json
+import numpy as np
+from rosbags.typesys import get_typestore, Stores
+
+OPTIONS = ('--formats=csv', '--workers=1')
+FLEET_JOBS = 10_000
+FLEET_CORES = 500
+FLEET_HOURS = 10_000
+"""Size of the simulated fleet: an hour of recording per job; chosen, as in the issue of a user."""
+LENGTH_SPREAD = 0.5
+"""Standard deviation of the logarithm of a job's length; chosen: two thirds within 0.6 to 1.6."""
+STRAGGLER_PART, STRAGGLER_FACTOR = 0.01, 8.0
+"""Jobs that take longer, on slow nodes or with many objects, and how much; chosen."""
+LOSS_PART = 0.05
+"""Attempts whose node is lost; chosen: spot nodes are lost within hours."""
+UNIT_PART = 0.02
+"""Part of a job that a loss costs: a job of an hour has some 50 batches of windows."""
+PRICE = 0.04
+"""Price of a core for an hour [USD]; of the order of a list price on demand."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """
+    Results of a simulated fleet.
+
+    Attributes
+    ----------
+    hours : float
+        Time until the last job has ended [h].
+    least_hours : float
+        The same without losses, on cores that are never idle [h].
+    used : float
+        Part of the time of the cores in which they run jobs.
+    lost : float
+        Part of the work that is done twice.
+
+    """
+
+    hours: float
+    least_hours: float
+    used: float
+    lost: float
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure scale`."""
+    parser.add_argument('recording', type=Path, metavar='RECORDING', help='MCAP file of ROS 2')
+    parser.add_argument(
+        '--drives', type=int, default=4, metavar='N',
+        help='copies that are relabelled by one and by two workers (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--rounds', type=int, default=3, metavar='N',
+        help='how often one and two workers take turns (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--large', type=float, metavar='GB',
+        help='also measure a recording of this size, made by repetition; the fleet is of such '
+        'drives then',
+    )  # fmt: skip
+    parser.add_argument(
+        '--price', type=float, default=PRICE, metavar='USD',
+        help='of a core for an hour (default: %(default)s)',
+    )  # fmt: skip
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, simulate and print."""
+    report: dict[str, Any] = {'recording': args.recording.name, 'load': os.getloadavg()[0]}
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        report['workers'] = _workers(args.recording, args.drives, args.rounds, folder)
+        report['job'] = _measured(args.recording, folder)
+        if args.large:
+            path = folder / 'large.mcap'
+            repeated(args.recording, path, args.large)
+            report['large'] = _measured(path, folder)
+    basis = 'large' if args.large else 'job'
+    core_hours = FLEET_HOURS / report[basis]['hours_per_core_hour']
+    fleet = simulated(core_hours * 3600 / FLEET_JOBS, np.random.default_rng(0))
+    report['fleet'] = {
+        'basis': basis,
+        'core_hours': core_hours,
+        'usd_per_core_hour': args.price,
+        'usd': core_hours * args.price,
+        **{name: getattr(fleet, name) for name in Fleet.__slots__},
+    }
+    if args.json:
+        print_json(report)
+    else:
+        for name, value in report.items():
+            print(f'{name}: {value}')
+    return 0
+
+
+def simulated(
+    seconds: float, rng: np.random.Generator, count: int = FLEET_JOBS, cores: int = FLEET_CORES
+) -> Fleet:
+    """
+    Return the schedule of jobs, the largest drives first, each on the core that is free first.
+
+    Parameters
+    ----------
+    seconds : float
+        Mean length of a job without stragglers [s].
+    rng : Generator
+        Lengths, stragglers and losses.
+    count, cores : int
+        Jobs and cores.
+
+    """
+    lengths = seconds * rng.lognormal(-(LENGTH_SPREAD**2) / 2, LENGTH_SPREAD, count)
+    lengths = np.sort(lengths)[::-1].copy()  # the sizes are known; stragglers are not
+    lengths[rng.random(count) < STRAGGLER_PART] *= STRAGGLER_FACTOR
+    losses = rng.geometric(1 - LOSS_PART, count) - 1
+    work: Floats = lengths * (1 + UNIT_PART * losses)  # each is resumed from its journal
+    free = [0.0] * cores
+    heapify(free)
+    for length in work:
+        heapreplace(free, free[0] + float(length))
+    end = max(free)
+    least = float(max(lengths.sum() / cores, lengths.max()))
+    return Fleet(
+        end / 3600, least / 3600, float(work.sum() / (end * cores)),
+        float(work.sum() / lengths.sum() - 1),
+    )  # fmt: skip
+
+
+def _workers(recording: Path, drives: int, rounds: int, folder: Path) -> dict[str, Any]:
+    """
+    Return how much faster two workers are than one.
+
+    They take turns, so that other programs slow down both. Where others use the cores, two
+    workers get less than two of them, which ``cores_used`` shows.
+
+    Returns
+    -------
+    found : dict
+        Of ``one`` and ``two`` workers ``seconds`` and ``cores_used``, medians over the rounds, and
+        ``speedup``, the median of the ratios of each round.
+
+    """
+    copies = [folder / f'{i}{recording.suffix}' for i in range(drives)]
+    for copy in copies:
+        shutil.copyfile(recording, copy)
+    _run_batch(copies, 1, folder / 'compiled')
+    runs = [
+        [_run_batch(copies, workers, folder / f'{turn}-{workers}') for workers in (1, 2)]
+        for turn in range(rounds)
+    ]
+    seconds, used = np.moveaxis(np.array(runs), 2, 0)  # (round, workers) each
+    found: dict[str, Any] = {
+        name: {
+            'seconds': float(np.median(seconds[:, i])),
+            'cores_used': float(np.median(used[:, i] / seconds[:, i])),
+        }
+        for i, name in enumerate(('one', 'two'))
+    }
+    found['speedup'] = float(np.median(seconds[:, 0] / seconds[:, 1]))
+    return found
+
+
+def _run_batch(drives: Sequence[Path], workers: int, out: Path) -> tuple[float, float]:
+    """Run `boxreg batch`; return its duration and its CPU time [s]."""
+    command = [*BOXREG, 'batch', *map(str, drives), '-o', str(out), f'--workers={workers}']
+    begun = time.perf_counter()
+    before = _children_seconds()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - begun, _children_seconds() - before
+
+
+def _children_seconds() -> float:
+    """Return the CPU time of all processes that were started here and have ended [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _measured(recording: Path, folder: Path) -> dict[str, float]:
+    """Return size, time and memory of one job, and the time to inspect its recording."""
+    begun = time.perf_counter()
+    shown = subprocess.run(
+        [*BOXREG, 'inspect', str(recording), '--json'], check=True, stdout=subprocess.PIPE
+    )
+    inspect_s = time.perf_counter() - begun
+    facts = json.loads(shown.stdout)
+    (job,) = jobs_of([recording])
+    before = _children_seconds()
+    JobRunner(folder / 'jobs', OPTIONS, '')(job)
+    cpu_s = _children_seconds() - before
+    if job.status == JOB_FAILED:
+        raise RecordingError(f'{recording}: {job.last_line}')
+    return {
+        'gb': recording.stat().st_size / 1e9,
+        'recording_s': facts['seconds'],
+        'sweeps': job.summary['sweeps'],
+        'points_per_sweep': facts['sample']['points_per_sweep'],
+        'boxes': job.summary['boxes_in'],
+        'inspect_s': inspect_s,
+        'seconds': job.seconds,
+        'cpu_s': cpu_s,
+        'hours_per_core_hour': facts['seconds'] / cpu_s,
+        'peak_mb': job.peak_bytes / 1e6,
+    }
+
+
+def repeated(recording: Path, target: Path, gigabytes: float, copies: int = 12) -> None:
+    """
+    Write the messages of a recording again and again, each time later.
+
+    Parameters
+    ----------
+    recording, target : Path
+        MCAP files of ROS 2.
+    gigabytes : float
+        Size of `target` at least [GB].
+    copies : int
+        How often each cloud has its points.
+
+    """
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with recording.open('rb') as source, target.open('wb') as file:
+        found = list(make_reader(source).iter_messages())
+        span_ns = found[-1][2].log_time - found[0][2].log_time + 10**8
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start('ros2')
+        channels: dict[str, int] = {}
+        for schema, channel, _ in found:
+            if schema is not None and channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number
+                )
+        later_ns = 0
+        while file.tell() < gigabytes * 1e9:
+            for schema, channel, message in found:
+                data = _later(message.data, schema.name, later_ns) if schema else message.data
+                if schema is not None and schema.name.endswith('/PointCloud2'):
+                    data = _enlarged(store, data, schema.name, copies)
+                when = message.log_time + later_ns
+                writer.add_message(channels[channel.topic], when, data, when)
+            later_ns += span_ns
+        writer.finish()
+
+
+def _later(data: bytes, kind: str, later_ns: int) -> bytes:
+    """Return a message with a later stamp: the first 8 bytes of its header in CDR."""
+    first = 8 if kind.endswith('/TFMessage') else 4  # behind the length of its sequence
+    seconds, rest = np.frombuffer(data, '<u4', 2, first).tolist()
+    stamp_ns = seconds * 10**9 + rest + later_ns
+    stamp = np.array(divmod(stamp_ns, 10**9), '<u4').tobytes()
+    return data[:first] + stamp + data[first + 8 :]
+
+
+def _enlarged(store: Any, data: bytes, kind: str, copies: int) -> bytes:
+    """Return a cloud that has its points several times."""
+    cloud = store.deserialize_cdr(data, kind)
+    cloud.data = np.tile(cloud.data, copies)
+    cloud.width *= copies
+    cloud.row_step *= copies
+    return bytes(store.serialize_cdr(cloud, kind))

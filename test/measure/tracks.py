@@ -1,0 +1,249 @@
+"""
+`measure tracks`: broken tracks before and after each step of ``relabel --complete``.
+
+The tracks of each recording are broken by the same rules as in ``boxreg simulate --break``. All
+rows of a table have the same sweeps and the same broken boxes; each row has one step more. The
+first row is a reference: the tracks before they were broken, registered.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+import math
+from pathlib import Path
+from typing import Any
+
+from boxreg_ros.bench.common import add_json_argument, line, progress_bar
+from boxreg_ros.config import COMPLETE_STEPS, Config, KINDS
+from boxreg_ros.core.registrar import BoxRegistrar
+from boxreg_ros.io.box_table import BoxTable
+from boxreg_ros.io.session import hand_to_registrar
+from boxreg_ros.offline.completion import completed, first_pass
+from boxreg_ros.offline.drive import Drive
+from boxreg_ros.offline.overlap import overlaps
+from boxreg_ros.offline.track_scores import track_scores, TrackScores
+from boxreg_ros.review.rules.overlap import DUPLICATE_IOU
+from boxreg_ros.simulation.breaks import break_tracks, GHOST_PREFIX
+from boxreg_ros.structures import BoxArray, Ints, RefinedBoxes, REJECTED, Sweep
+from measure import print_json
+import numpy as np
+
+TITLES = ('recall', 'prec.', 'ids/obj', 'HOTA', 'IDF1', 'added', '3D added', 'ghosts', 'lost')
+ONE_LABEL = 'with one label'
+"""Objects of the truth without a second label at their place."""
+UNBROKEN = 'unbroken, refined'
+"""Row of the tracks before they were broken: the boxes that completion has to restore."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """
+    Scores after one step.
+
+    Attributes
+    ----------
+    scores : TrackScores
+        Of the boxes that are not rejected.
+    ghosts, lost : float
+        Rejected part of the ghosts, and of the other boxes of the input; NaN without any.
+    by_kind : dict of str to TrackScores
+        Scores of the boxes of each kind of object; and if some objects of the truth have two
+        labels, those of the `ONE_LABEL` others.
+
+    """
+
+    scores: TrackScores
+    ghosts: float
+    lost: float
+    by_kind: dict[str, TrackScores]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `measure tracks`."""
+    parser.add_argument(
+        'data', nargs='+', type=Path, metavar='FOLDER',
+        help='folder with one recording and truth.csv in the columns of boxes.csv',
+    )  # fmt: skip
+    parser.add_argument(
+        '--ghosts', type=float, default=0.0, metavar='N',
+        help='mean number of boxes per sweep that belong to no object (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--far-misses',
+        action='store_true',
+        help='misses in runs, as likely as the square of the distance, like those of a detector '
+        'that has too few points; default: independent ones',
+    )
+    parser.add_argument(
+        '--coast', type=float, default=0.0, metavar='S',
+        help='rows of the live estimates, without and with this `coast`, instead of the steps',
+    )  # fmt: skip
+    parser.add_argument(
+        '--seed',
+        type=int,
+        default=0,
+        metavar='N',
+        help='seed of the breaks (default: 0)',
+    )
+    add_json_argument(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the scores after each step, one table per recording."""
+    report: dict[str, Any] = {}
+    rows_per_drive = 4 if args.coast else 3 + len(COMPLETE_STEPS)
+    with progress_bar(len(args.data) * rows_per_drive, args) as bar:
+        for folder in args.data:
+            whole = Drive.read(folder)
+            drive = broken(whole, args.seed, args.ghosts, args.far_misses)
+            if not args.json:
+                bar.clear()
+                print(f'{folder}: {len(drive.truth.boxes)} true boxes')
+                print(line('', TITLES))
+            rows = {}
+            for name, row in _rows(whole, drive, args.coast):
+                rows[name] = asdict(row.scores) | {
+                    'ghosts_rejected': row.ghosts,
+                    'lost': row.lost,
+                    'by_kind': {kind: asdict(scores) for kind, scores in row.by_kind.items()},
+                }
+                bar.update()
+                if not args.json:
+                    print(line(name, _cells(row)))
+            if not args.json:
+                _print_kinds(UNBROKEN, rows[UNBROKEN]['by_kind'])
+                _print_kinds(name, rows[name]['by_kind'])
+            report[str(folder)] = rows
+    if args.json:
+        print_json(report)
+    return 0
+
+
+def broken(drive: Drive, seed: int, ghosts: float, far_misses: bool = False) -> Drive:
+    """Return a drive with broken tracks."""
+    stamps = np.array([array.stamp_ns for array in drive.boxes])
+    origins = np.array([sweep.origin for sweep in drive.sweeps_at(stamps)])
+    rng = np.random.default_rng(seed)
+    arrays = break_tracks(drive.boxes, rng, ghosts, origins, far_misses)
+    return replace(drive, boxes=tuple(arrays))
+
+
+def _rows(whole: Drive, drive: Drive, coast: float) -> Iterator[tuple[str, Row]]:
+    """Yield the scores of the registered tracks of the `whole` drive, then of the broken one."""
+    config = Config(estimate='final' if coast else 'track')
+    yield UNBROKEN, _row(_registered(_items(whole), config), whole)
+    yield from with_coast(drive, coast) if coast else after_each_step(drive)
+
+
+def after_each_step(drive: Drive) -> Iterator[tuple[str, Row]]:
+    """Yield the scores of the input, of registration alone, and with one more step each."""
+    items = _items(drive)
+    yield 'input', _input_row(drive)
+    config = Config()
+    first = first_pass(((item, False) for item in items), config)
+    yield 'refined', _row(first.results[0], drive)
+    for step in COMPLETE_STEPS:
+        config = config.updated({f'complete.{step}': True})
+        results, _ = completed(items, drive.truth.frame_id, config, first)
+        yield f'+ {step}', _row(results, drive)
+
+
+def with_coast(drive: Drive, seconds: float) -> Iterator[tuple[str, Row]]:
+    """Yield the scores of the input, and of final boxes without and with `coast` [s]."""
+    items = _items(drive)
+    yield 'input', _input_row(drive)
+    for name, coast in (('final', 0.0), (f'coast {seconds:g} s', seconds)):
+        config = Config(estimate='final', coast=coast)
+        yield name, _row(_registered(items, config), drive)
+
+
+def _items(drive: Drive) -> list[Sweep | BoxArray]:
+    """Return sweeps and boxes in the order of their stamps, each sweep before its boxes."""
+    items: list[Sweep | BoxArray] = [*drive.sweeps, *drive.boxes]
+    return sorted(items, key=lambda item: item.stamp_ns)
+
+
+def _registered(items: Sequence[Sweep | BoxArray], config: Config) -> list[RefinedBoxes]:
+    """Return the last estimates of all box arrays."""
+    registrar = BoxRegistrar(config)
+    results: list[RefinedBoxes] = []
+    for item in items:
+        results += hand_to_registrar(registrar, item, restarts=False)
+    results += registrar.flush()
+    return [result for result in results if result.is_final]
+
+
+def _input_row(drive: Drive) -> Row:
+    table = BoxTable.from_arrays(drive.boxes)
+    scores = track_scores(table, drive.truth)
+    return Row(scores, math.nan, math.nan, scores_by_kind(table, drive.truth))
+
+
+def _row(results: Sequence[RefinedBoxes], drive: Drive) -> Row:
+    """Return the scores of results, and which part of the input is rejected."""
+    is_rejected: dict[bool, list[bool]] = {True: [], False: []}  # of ghosts, and of other boxes
+    for given, result in zip(drive.boxes, results, strict=True):
+        for track_id, status in zip(given.track_ids, result.status, strict=False):
+            is_rejected[track_id.startswith(GHOST_PREFIX)].append(status == REJECTED)
+    ghosts, lost = (float(np.mean(rows)) if rows else math.nan for rows in is_rejected.values())
+    table = table_of(results)
+    scores = track_scores(table, drive.truth)
+    return Row(scores, ghosts, lost, scores_by_kind(table, drive.truth))
+
+
+def scores_by_kind(predicted: BoxTable, truth: BoxTable) -> dict[str, TrackScores]:
+    """Return the scores of each kind of object that the truth has, and of objects `ONE_LABEL`."""
+    scores = {}
+    for kind in KINDS:
+        true, found = (
+            table.rows(np.array([Config().kind(name) == kind for name in table.class_names], bool))
+            for table in (truth, predicted)
+        )
+        if len(true.boxes):
+            scores[kind] = track_scores(found, true)
+    rows = rows_with_one_label(truth)
+    if len(rows) < len(truth.boxes):
+        scores[ONE_LABEL] = track_scores(predicted, truth, rows)
+    return scores
+
+
+def rows_with_one_label(truth: BoxTable) -> Ints:
+    """Return the rows of objects that never share `DUPLICATE_IOU` with another one."""
+    doubles: set[str] = set()
+    for stamp in overlaps(truth, truth):
+        is_double = (stamp.iou >= DUPLICATE_IOU).sum(axis=1) > 1  # one is the box itself
+        doubles.update(truth.track_ids[row] for row in stamp.true[is_double])
+    return np.flatnonzero([track_id not in doubles for track_id in truth.track_ids])
+
+
+def table_of(results: Sequence[RefinedBoxes]) -> BoxTable:
+    """Return the boxes of results that are not rejected, with their status."""
+    table = BoxTable.from_arrays([result.boxes for result in results])
+    table = replace(table, status=tuple(word for r in results for word in r.status))
+    return table.rows(np.array([status != REJECTED for status in table.status], bool))
+
+
+def _print_kinds(name: str, by_kind: Mapping[str, Mapping[str, float]]) -> None:
+    """Print the scores of each kind of object in the row of a `name`."""
+    print(line(name, ('recall', 'prec.', 'ids/obj', 'added', '3D added', '3D others')))
+    for kind, s in by_kind.items():
+        found = (s['recall'], s['precision'], s['ids_per_object'])
+        print(line(kind, (*found, str(s['added']), s['added_iou'], s['given_iou'])))
+
+
+def _cells(row: Row) -> tuple[float | str, ...]:
+    scores = row.scores
+    return (
+        scores.recall,
+        scores.precision,
+        scores.ids_per_object,
+        scores.hota,
+        scores.idf1,
+        str(scores.added),
+        scores.added_iou,
+        row.ghosts,
+        row.lost,
+    )

@@ -1,0 +1,267 @@
+"""`boxreg relabel --label-points`, `--clouds`, `--undistort`: files, read by consumers."""
+
+from contextlib import closing
+import json
+
+from boxreg_ros import cli
+from boxreg_ros.errors import ConfigError
+from boxreg_ros.labels import check_options, Options
+from boxreg_ros.labels.semantickitti import class_of
+from boxreg_ros.offline.relabel import relabel
+from boxreg_ros.offline.request import Request
+from boxreg_ros.simulation.raycast import ROAD
+from boxreg_ros.simulation.recorder import write_recording
+from boxreg_ros.simulation.scene import FIXED_FRAME
+from boxreg_ros.simulation.simulate import simulate
+from consumers import consumer
+import numpy as np
+import pytest
+from relabel_results import QUICK
+from rosbags.highlevel import AnyReader
+
+SWEEPS = 12
+ALL_CLOUDS = ('static', 'background', 'object')
+
+
+@pytest.fixture(scope='module')
+def scene():
+    return simulate('street', 0, SWEEPS)
+
+
+@pytest.fixture(scope='module')
+def recording(scene, tmp_path_factory):
+    path = tmp_path_factory.mktemp('drive') / 'street.mcap'
+    write_scene(path, scene)
+    return path
+
+
+@pytest.fixture(scope='module')
+def results(recording, tmp_path_factory):
+    out = tmp_path_factory.mktemp('results') / 'out'
+    options = [f'--clouds={name}' for name in ALL_CLOUDS]
+    command = ['relabel', str(recording), '-o', str(out), '--formats=csv,mcap', '--label-points']
+    assert cli.main([*command, *options, '--undistort']) == 0
+    return out
+
+
+def write_scene(path, scene):
+    intensities = [np.zeros(len(owner)) for owner in scene.owners]
+    write_recording(
+        path, scene.sweeps, intensities, scene.detections, scene.T_fixed_sensor, FIXED_FRAME
+    )
+
+
+def true_motion(scene, sweep):
+    """Return which actors move at the stamp of a sweep."""
+    seconds = (sweep.stamp_ns - scene.sweeps[0].stamp_ns) * 1e-9
+    ends = np.array([seconds - 0.05, seconds + 0.05])
+    return [np.linalg.norm(np.diff(a.motion.at(ends)[:, :2], axis=0)) > 0.03 for a in scene.actors]
+
+
+def clouds_of(path, topic='/points'):
+    """Return a structured array per cloud of a recording, as rosbags reads it."""
+    found = []
+    with closing(AnyReader([path])) as reader:
+        reader.open()
+        for connection, _, data in reader.messages():
+            if connection.topic == topic:
+                message = reader.deserialize(data, connection.msgtype)
+                kinds = {2: 'u1', 4: '<u2', 7: '<f4'}
+                layout = np.dtype({
+                    'names': [field.name for field in message.fields],
+                    'formats': [kinds[field.datatype] for field in message.fields],
+                    'offsets': [field.offset for field in message.fields],
+                    'itemsize': message.point_step,
+                })  # fmt: skip
+                assert len(message.data) == message.row_step * message.height
+                found.append(np.frombuffer(message.data, layout))
+    return found
+
+
+def iou(found, true):
+    return (found & true).sum() / (found | true).sum()
+
+
+def test_semantickitti_has_the_true_classes_instances_and_poses(scene, results):
+    """The layout is that of semantic-kitti-api: 32 bits a point, class and instance."""
+    folder = results / 'semantickitti' / 'sequences' / '00'
+    names = json.loads((results / 'semantickitti' / 'boxreg.json').read_text())['tracks']
+    poses = np.loadtxt(folder / 'poses.txt').reshape(-1, 3, 4)
+    assert len(poses) == len(np.loadtxt(folder / 'times.txt')) == SWEEPS
+    first = np.linalg.inv(scene.T_fixed_sensor[0])
+    np.testing.assert_allclose(poses, (first @ scene.T_fixed_sensor)[:, :3], atol=1e-6)
+    assert 'Tr: 1.0 0.0 0.0 0.0' in (folder / 'calib.txt').read_text()
+    found, true, instances = [], [], []
+    for number, (sweep, owners) in enumerate(zip(scene.sweeps, scene.owners, strict=True)):
+        points = np.fromfile(folder / 'velodyne' / f'{number:06d}.bin', '<f4').reshape(-1, 4)
+        np.testing.assert_array_equal(points[:, :3], sweep.points)
+        labels = np.fromfile(folder / 'labels' / f'{number:06d}.label', '<u4')
+        found.append(labels & 0xFFFF)
+        ids = np.array([names.get(str(i), '') for i in range(len(names) + 1)])
+        instances.append(ids[labels >> 16])
+        moves = [np.ptp(one.motion.poses[:, :2], axis=0).max() > 0.5 for one in scene.actors]
+        of_actors = [
+            class_of(actor.class_name, moving)
+            for actor, moving in zip(scene.actors, moves, strict=True)
+        ]
+        true.append(np.array([*of_actors, 99])[owners])
+    found, true = np.concatenate(found), np.concatenate(true)
+    assert set(np.unique(found)) <= {0, 99, 10, 252, 18, 258, 30, 254, 31, 253}
+    for number in (10, 252, 258):
+        assert iou(found == number, true == number) > 0.9, number
+    owner_names = np.array([*(actor.track_id for actor in scene.actors), ''])
+    right = np.concatenate(instances) == owner_names[np.concatenate(scene.owners)]
+    assert right.mean() > 0.95
+
+
+def test_the_devkit_of_nuscenes_reads_lidarseg_and_panoptic(scene, results):
+    samples = consumer('lidarseg', results / 'lidarseg', 'v1.0-boxreg')
+    assert len(samples) == SWEEPS
+    for sample, sweep, owners in zip(samples, scene.sweeps, scene.owners, strict=True):
+        assert sample['timestamp'] == round(sweep.stamp_ns / 1000)
+        assert sample['size'] == 20 * len(owners)  # five float32 a point
+        assert sum(sample['categories'].values()) == len(owners)
+        names = np.array([*(actor.class_name for actor in scene.actors), ''])
+        cars = np.isin(names[owners], ['car', 'van']).sum()
+        assert sample['categories']['vehicle.car'] == pytest.approx(cars, rel=0.1)
+        assert sample['categories']['static.other'] >= np.sum(owners == ROAD) * 0.95
+        most = max(n for code, n in sample['instances'].items() if int(code) % 1000)
+        largest = np.bincount(owners[owners >= 0]).max()
+        assert most == pytest.approx(largest, rel=0.1)
+
+
+def test_clouds_of_the_overlay_have_fields_of_labels(scene, results):
+    clouds = clouds_of(results / 'overlay.mcap')
+    assert len(clouds) == SWEEPS
+    folder = results / 'semantickitti' / 'sequences' / '00' / 'labels'
+    for number, cloud in enumerate(clouds):
+        assert cloud.dtype.names[-4:] == ('t', 'label', 'instance', 'moving')
+        labels = np.fromfile(folder / f'{number:06d}.label', '<u4')
+        np.testing.assert_array_equal(cloud['label'], labels & 0xFFFF)
+        np.testing.assert_array_equal(cloud['instance'], labels >> 16)
+        true = np.append(true_motion(scene, scene.sweeps[number]), False)[scene.owners[number]]
+        assert iou(cloud['moving'] == 1, true) > 0.85
+    with closing(AnyReader([results / 'overlay.mcap'])) as reader:
+        reader.open()
+        assert {'/detections_refined', '/tf', '/odom'} <= set(reader.topics)
+        assert reader.topics['/detections_refined'].msgcount == SWEEPS
+
+
+def test_clouds_without_what_moves(scene, results, tmp_path):
+    clouds = results / 'clouds'
+    kept, moving_left, moving, parked_left, parked = 0, 0, 0, 0, 0
+    for index, cloud in enumerate(clouds_of(clouds / 'static.mcap')):
+        sweep, owners = scene.sweeps[index], scene.owners[index]
+        rows = {tuple(point): row for row, point in enumerate(sweep.points.tolist())}
+        kept_points = np.column_stack([cloud[axis] for axis in 'xyz']).tolist()
+        own = owners[[rows[tuple(point)] for point in kept_points]]
+        moves = np.append(true_motion(scene, sweep), False)
+        moving_left += moves[own].sum()
+        moving += moves[owners].sum()
+        parked_left += (~moves[own] & (own >= 0)).sum()
+        parked += (~moves[owners] & (owners >= 0)).sum()
+        kept += len(cloud)
+    assert moving_left < 0.1 * moving
+    assert parked_left > 0.9 * parked
+    empty = sum(map(len, clouds_of(clouds / 'background.mcap')))
+    assert empty < kept - 0.9 * parked_left
+    for name in ('static', 'background'):
+        points = consumer('cloud', clouds / f'{name}.ply')['rows']
+        cells = np.floor(np.array(points) / 0.1)
+        assert len(np.unique(cells, axis=0)) > 0.9 * len(points) > 100
+
+
+def test_objects_are_accumulated_in_their_boxes(scene, results):
+    returns = np.bincount(np.concatenate(scene.owners) + 1)[1:]
+    largest = scene.actors[int(returns.argmax())]
+    path = results / 'clouds' / 'objects' / f'{largest.track_id}.ply'
+    points = np.array(consumer('cloud', path)['rows'])
+    assert len(points) > 200
+    half = largest.extent / 2
+    assert (np.abs(points) < half + 0.35).all()
+    assert np.ptp(points[:, 0]) > 0.8 * largest.extent[0]
+
+
+def test_points_of_moving_objects_are_moved_to_the_stamp(tmp_path):
+    """On a highway: the points of a rigid body are moved by its own motion."""
+    scene = simulate('highway', 0, SWEEPS)
+    write_scene(tmp_path / 'way.mcap', scene)
+    options = ['--undistort', '--formats=csv', '--set=sampling.box_time=stamp']
+    out = tmp_path / 'out'
+    assert cli.main(['relabel', str(tmp_path / 'way.mcap'), '-o', str(out), *options]) == 0
+    errors, distances = [], []
+    for index, cloud in enumerate(clouds_of(out / 'clouds' / 'undistorted.mcap')):
+        sweep, owners = scene.sweeps[index], scene.owners[index]
+        seconds = (sweep.stamp_ns - scene.sweeps[0].stamp_ns) * 1e-9
+        after = np.column_stack([cloud[axis] for axis in 'xyz'])
+        for i, actor in enumerate(scene.actors):
+            rows = np.flatnonzero(owners == i)
+            there = actor.motion.at(seconds + sweep.times[rows])[:, :2]
+            stamp = actor.motion.at(np.full(len(rows), seconds))[:, :2]
+            true = (stamp - there) @ scene.T_fixed_sensor[index, :2, :2]
+            shift = (after[rows] - sweep.points[rows])[:, :2]
+            errors.append(np.linalg.norm(shift - true, axis=1))
+            distances.append(np.linalg.norm(true, axis=1))
+    assert np.concatenate(distances).mean() > 0.5
+    assert np.concatenate(errors).mean() < 0.1 * np.concatenate(distances).mean()
+
+
+def test_summary_counts_points_and_sweeps(results, scene):
+    summary = json.loads((results / 'summary.json').read_text())
+    found = summary['points']
+    assert found['sweeps'] == SWEEPS
+    assert found['points'] == sum(map(len, scene.owners))
+    assert found['points_on_moving'] > 0
+    assert summary['seconds']['points'] > 0
+    assert not (results / '.points').exists()
+
+
+def test_sweeps_without_boxes_are_unknown_and_copied_unchanged(scene, recording, tmp_path):
+    """The labels end after half of the sweeps; the clouds go on."""
+    half = SWEEPS // 2
+    labels = tmp_path / 'boxes.csv'
+    rows = scene.truth.stamps_ns < scene.sweeps[half].stamp_ns
+    scene.truth.rows(rows).write(labels)
+    request = Request(
+        (recording,), labels=('csv', labels), config=QUICK, formats=('semantickitti',),
+        clouds=('static',),
+    )  # fmt: skip
+    assert request.box_formats == ()
+    summary = relabel(request, tmp_path / 'out')
+    unknown = summary.points['sweeps_without_boxes']
+    assert unknown == half
+    folder = tmp_path / 'out' / 'semantickitti' / 'sequences' / '00' / 'labels'
+    last = np.fromfile(folder / f'{SWEEPS - 1:06d}.label', '<u4')
+    assert not last.any()
+    clouds = clouds_of(tmp_path / 'out' / 'clouds' / 'static.mcap')
+    assert [len(cloud) for cloud in clouds[half:]] == [
+        len(owners) for owners in scene.owners[half:]
+    ]
+
+
+def test_clouds_of_several_lidars_are_copied_each_on_its_topic(tmp_path):
+    path, out = tmp_path / 'truck.mcap', tmp_path / 'out'
+    assert cli.main(['simulate', '-o', str(path), '--sensors=corners', '--sweeps=5']) == 0
+    with closing(AnyReader([path])) as reader:
+        reader.open()
+        kind = 'sensor_msgs/msg/PointCloud2'
+        topics = [name for name, topic in reader.topics.items() if topic.msgtype == kind]
+    assert len(topics) > 1
+    options = [f'--points={topic}' for topic in topics]
+    command = ['relabel', str(path), '-o', str(out), *options, '--clouds=static', '--formats=csv']
+    assert cli.main([*command, '--set=min_observations=3']) == 0
+    dropped = 0
+    for topic in topics:
+        before, after = clouds_of(path, topic), clouds_of(out / 'clouds' / 'static.mcap', topic)
+        assert [cloud.dtype for cloud in after] == [cloud.dtype for cloud in before]
+        dropped += sum(map(len, before)) - sum(map(len, after))
+    counts = json.loads((out / 'summary.json').read_text())['points']
+    assert dropped == counts['points_dynamic'] > 0
+
+
+def test_formats_of_points_are_of_relabel_alone(tmp_path):
+    with pytest.raises(ConfigError, match="format 'semantickitti' labels the points"):
+        check_options(['semantickitti'], Options())
+    request = Request((tmp_path,), formats=('csv', 'lidarseg'))
+    assert (request.box_formats, request.point_formats) == (('csv',), ('lidarseg',))
+    assert not Request((tmp_path,)).needs_point_labels
