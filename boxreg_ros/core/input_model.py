@@ -9,10 +9,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from boxreg_ros.config import Config, FaceConfig, KINDS
-from boxreg_ros.core.input_noise import InputNoise, noise_by_kind
-from boxreg_ros.core.method.arrays import Faces, Inputs
-from boxreg_ros.core.method.constants import Constants, CONSTANTS
-from boxreg_ros.core.population import slopes_by_kind
+from boxreg_ros.core.input_noise import set_noise
+from boxreg_ros.core.method.arrays import INPUTS, TERMS
+from boxreg_ros.core.method.constants import CONSTANTS, Constants
+from boxreg_ros.core.method.faces import observe_faces
+from boxreg_ros.core.population import set_population
+from boxreg_ros.core.problem import Problem
+from boxreg_ros.core.threads import run
 from boxreg_ros.core.track_rows import TrackRows
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
@@ -23,6 +26,11 @@ QUARTILES_TO_DEVIATION = 0.74
 MIDMEAN_FACTOR = 1.1
 """Error of the mean of the middle half over that of the mean. Derived: sqrt(1.2), the efficiency
 of the midmean of a Gaussian."""
+Inputs = NDArray[np.void]
+MARGIN_FIELDS = (
+    'gap_correction', 'occlusion_inset', 'range_inset', 'gap_variance', 'gap_tracks', 'gap_noise',
+)  # fmt: skip
+"""Fields of `INPUTS` that follow from face observations."""
 FACE_GROUPS = ([0, 1], [2, 3], [4], [5])
 """Faces with one labelling margin: ends, sides, top, bottom."""
 GAP_DEVIATIONS = {
@@ -62,8 +70,7 @@ class InputModel:
         self.constants = constants
         self._estimates_margins = config.learn
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
-        # Of each track of each kind: sums over its face observations, see
-        # `add_face_observations`; its last input residuals; its extent evidence.
+        # Of each track of each kind: sums over its face observations, see `_add`; its last input residuals; its extent evidence.
         unknown = np.full((constants.max_fits, 9), np.nan)
         self._faces = [TrackRows(np.zeros((3, 3, 6)), constants.max_tracks) for _ in KINDS]
         # What follows from the present sums, see `_margins_of`.
@@ -75,42 +82,48 @@ class InputModel:
         """Return what was observed; margins that follow from it are computed again."""
         return {**vars(self), '_margins': [None] * len(KINDS)}
 
-    def add_face_observations(
-        self,
-        track_ids: Sequence[str],
-        kinds: Ints,
-        observations: Faces,
-        new: NDArray[np.bool_],
-        inputs: Inputs,
+    def observe_margins(
+        self, track_ids: Sequence[str], problem: Problem, poses: Floats, config: Config
     ) -> None:
         """
-        Add face observations at input boxes.
+        Add the face observations of some windows at their input boxes.
 
         Parameters
         ----------
         track_ids : sequence of B str
-            The tracks.
-        kinds : array, shape (B,)
-            Indices of their kinds among `KINDS`.
-        observations : Faces
-            Of their windows.
-        new : array, shape (B, N)
-            Which of them count.
-        inputs : Inputs
-            What `observations` were made with.
+            The tracks of the windows, all different.
+        problem : Problem
+            The windows; all their observations count.
+        poses : array, shape (B, N, 6)
+            Boxes at which faces are observed [m, rad].
+        config : Config
+            Settings.
 
         """
+        inputs = self.inputs(config, with_noise=False)
+        terms = np.zeros(problem.counts.shape, TERMS)
+        run(
+            observe_faces, len(poses), problem, np.ascontiguousarray(poses),
+            problem.expected_shared(inputs), inputs,
+            self.constants.with_settings(config).record(), terms,
+        )  # fmt: skip
+        self._add(track_ids, problem, terms, inputs)
+
+    def _add(
+        self, track_ids: Sequence[str], problem: Problem, terms: NDArray[np.void], inputs: Inputs
+    ) -> None:
+        """Add face observations, of records `TERMS` (B, N), that were made with `inputs`."""
+        kinds = problem.kind
         constants = self.constants
-        distance, weight = observations.distance, observations.weight
-        occluded, distant = np.moveaxis(observations.inset_shares, 2, 0)
+        distance, weight = terms['distance'], terms['visibility']
+        occluded, distant = np.moveaxis(terms['inset_shares'], 2, 0)
         gap_correction, occlusion_inset, range_inset = (
-            part[kinds][:, None]
-            for part in (inputs.gap_correction, inputs.occlusion_inset, inputs.range_inset)
+            inputs[name][kinds][:, None] for name in MARGIN_FIELDS[:3]
         )
         occluded = occluded * (occlusion_inset > 0)  # the bottom is observed by the road
         is_visible = occluded < constants.min_share / 2
         is_distant = distant > constants.min_share
-        has_points = (observations.num_points >= constants.min_box_points)[..., None]
+        has_points = (terms['num_points'] >= constants.min_box_points)[..., None]
         # Three quantities: gap, occlusion inset, range inset; all (3, B, N, 6).
         counts = np.stack([
             has_points & is_visible & ~is_distant,
@@ -118,7 +131,7 @@ class InputModel:
             is_visible & is_distant,
         ])  # fmt: skip
         counts &= (weight > 0) & (np.abs(distance) < constants.max_gap)
-        counts &= new[..., None]
+        counts &= problem.valid[..., None]
         values = np.stack([
             0 * occluded, occluded * occlusion_inset, distant * range_inset
         ]) - distance  # fmt: skip
@@ -159,24 +172,21 @@ class InputModel:
 
     def inputs(self, config: Config, with_noise: bool = True) -> Inputs:
         """
-        Return what is known of the errors of the input, as far as the method of `config` uses it.
+        Return what is known of the errors of the input, records `INPUTS` (K,).
 
-        Without noise, that of the settings.
+        As far as the method of `config` uses it; without noise, that of the settings.
 
         """
-        for k, known in enumerate(self._margins):
-            self._margins[k] = known or self._margins_of(k)
-        gap_correction, occlusion_inset, range_inset, *scatter = map(np.stack, zip(*self._margins))
-        noise = InputNoise(np.zeros((len(KINDS), 9)), np.zeros((len(KINDS), 9)), np.zeros(len(KINDS)))
+        inputs = np.zeros(len(KINDS), INPUTS)
+        for k in range(len(KINDS)):
+            self._margins[k] = self._margins[k] or self._margins_of(k)
+            for name, column in zip(MARGIN_FIELDS, self._margins[k], strict=True):
+                inputs[name][k] = column
         if with_noise and config.ingredients.noise_estimation:
-            noise = noise_by_kind(*_of_all_kinds(self._residuals), self.constants)
-        evidence, kind = self.extent_evidence()
-        if not config.ingredients.population_extents:
-            evidence, kind = evidence[:0], kind[:0]
-        median, slopes = slopes_by_kind(evidence, kind, self.constants)
-        return Inputs(
-            *noise, gap_correction, occlusion_inset, range_inset, median, slopes, *scatter
-        )
+            set_noise(inputs, *_of_all_kinds(self._residuals), self.constants)
+        if config.ingredients.population_extents:
+            set_population(inputs, *self.extent_evidence(), self.constants)
+        return inputs
 
     def extent_evidence(self) -> tuple[Floats, Ints]:
         """Return the evidence of the extents of the last fit of each track, and their kinds."""

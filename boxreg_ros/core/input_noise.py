@@ -9,7 +9,6 @@ from itertools import chain
 from typing import NamedTuple
 
 from boxreg_ros.config import KINDS
-from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.core.method.noise import estimate
 from boxreg_ros.core.problem import Problem
@@ -24,15 +23,15 @@ REPEATED_BOX_TOLERANCE = 1e-3
 
 class InputNoise(NamedTuple):
     """
-    Estimated errors of the input poses and extents: fields of `Inputs`.
+    Estimated errors of the input poses and extents, of tracks of one kind.
 
     Attributes
     ----------
-    deviation, correlation : array, shape (K, 9)
+    deviation, correlation : array, shape (9,)
         Robust standard deviation about the mean of a track, along the box axes: lon lat z roll
         pitch yaw, and the extents; correlation from one observation to the next. In units of the
         deviations of the settings.
-    weight : array, shape (K,)
+    weight : array, shape (1,)
         Weight of the estimate against the settings: 0 without observations, 1/2 after
         `half_weight`, near 1 after many.
 
@@ -43,9 +42,13 @@ class InputNoise(NamedTuple):
     weight: Floats
 
 
-def noise_by_kind(residuals: Floats, kind: Ints, constants: Constants) -> InputNoise:
+def set_noise(
+    inputs: NDArray[np.void], residuals: Floats, kind: Ints, constants: Constants
+) -> None:
     """
     Estimate the noise of each of `KINDS` from tracks (B, N, 9) of a `kind` (B,) (M14).
+
+    It is set in records `INPUTS` (K,).
 
     Of `normalised_residuals`; NaN is left out. The noise of all other kinds together is the prior
     of each: a kind of which few boxes were seen is expected to err as the others do, in proportion
@@ -66,47 +69,44 @@ def noise_by_kind(residuals: Floats, kind: Ints, constants: Constants) -> InputN
     )
     weight = own.weight + (1 - own.weight) * others.weight
     share = own.weight / weight.clip(1e-9)
-    return InputNoise(
-        others.deviation + share * (own.deviation - others.deviation),
-        others.correlation + share * (own.correlation - others.correlation),
-        weight[:, 0],
-    )
+    inputs['deviation'] = others.deviation + share * (own.deviation - others.deviation)
+    inputs['correlation'] = others.correlation + share * (own.correlation - others.correlation)
+    inputs['weight'] = weight[:, 0]
 
 
 def noise_of(residuals: Floats, constants: Constants) -> InputNoise:
     """Estimate the noise of tracks (B, N, 9) of one kind (M14), shapes (9,) and (1,)."""
     found = InputNoise(np.zeros(9), np.zeros(9), np.zeros(1))
     total = estimate(
-        np.ascontiguousarray(residuals), constants, found.deviation, found.correlation
+        np.ascontiguousarray(residuals), constants.record(), found.deviation, found.correlation
     )
     found.weight[:] = total / (total + constants.half_weight)
     return found
 
 
-def normalised_residuals(problem: Problem, solution: Solution) -> Floats:
+def normalised_residuals(problem: Problem, poses: Floats, extents: Floats) -> Floats:
     """
     Return input minus fit over the deviations of the settings, shape (B, N, 9).
 
-    Along the box axes, in the order of `InputNoise`. NaN for boxes that repeat the one before,
-    since boxes that a tracker holds have no new error, for those without points, since their fit
-    follows the input, and for padding.
+    Along the axes of the boxes at `poses` (B, N, 6) of `extents` (B, 3), in the order of
+    `InputNoise`. NaN for boxes that repeat the one before, since boxes that a tracker holds have
+    no new error, and for those without points, since their fit follows the input.
 
     """
     # The first box is compared with the last one: a track that is held throughout is left out.
     before = np.roll(problem.boxes, 1, axis=1)
-    extent = solution.shared[:, None, EXTENT:BIAS]
     has_points = problem.counts > 0
-    residuals = _residuals(problem.boxes, before, solution.poses, extent, has_points)
-    return residuals / problem.of_class.errors[:, None]
+    residuals = _residuals(problem.boxes, before, poses, extents[:, None], has_points)
+    return residuals / problem.errors[:, None]
 
 
-def residuals_at(problem: Problem, solution: Solution, columns: Ints) -> Floats:
+def residuals_at(problem: Problem, poses: Floats, extents: Floats, columns: Ints) -> Floats:
     """Return `normalised_residuals` (B, 9) of one observation of each window, in `columns`."""
     rows = np.arange(len(problem.boxes))
     boxes, before = problem.boxes[rows, columns], problem.boxes[rows, columns - 1]
-    extent, has_points = solution.shared[:, EXTENT:BIAS], problem.counts[rows, columns] > 0
-    residuals = _residuals(boxes, before, solution.poses[rows, columns], extent, has_points)
-    return residuals / problem.of_class.errors
+    has_points = problem.counts[rows, columns] > 0
+    residuals = _residuals(boxes, before, poses[rows, columns], extents, has_points)
+    return residuals / problem.errors
 
 
 def _residuals(

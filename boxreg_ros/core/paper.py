@@ -11,7 +11,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config, KINDS, PaperConfig
 from boxreg_ros.core.geometry import face_distances, rotation_from_rpy
 from boxreg_ros.core.lbfgs import HISTORY, minimize
-from boxreg_ros.core.method.arrays import PRIOR, Posterior, Solution
+from boxreg_ros.core.method.arrays import INPUTS, Posterior, PRIOR, Solution
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, POSE
@@ -223,10 +223,10 @@ def solve_paper(problem: Problem, config: Config) -> Solution:
         _, violation = total(boxes(x, every), seen, settings, multipliers, rounding)
         multipliers = multipliers + violation * penalty
     B = len(mean)
-    shared = problem.expected_shared(np.zeros((len(KINDS), 6)))
+    shared = problem.expected_shared(np.zeros(len(KINDS), INPUTS))
     of_poses, of_extents = np.zeros((B, length, 6, 6)), np.zeros((B, 3, 3))
-    of_poses[...] = _diagonal(problem.of_class.pose**2)[:, None]
-    of_extents[...] = _diagonal((mean * problem.of_class.extent[:, None]) ** 2)
+    of_poses[...] = _diagonal(problem.of_class['pose'] ** 2)[:, None]
+    of_extents[...] = _diagonal((mean * problem.of_class['extent'][:, None]) ** 2)
     posterior = Posterior(of_poses, of_extents, np.zeros((B, length, 6)))
     no_prior = np.zeros((0, PRIOR)), np.zeros((0, PRIOR)), np.zeros((0, PRIOR, PRIOR))
     poses = x.numpy().reshape(B, length, 6)

@@ -5,27 +5,29 @@ docs/method.md, section Input model, has the formulas.
 
 """
 
-from boxreg_ros.config import KINDS
 from boxreg_ros.core.method.constants import Constants
 from boxreg_ros.structures import Floats, Ints
 import numpy as np
+from numpy.typing import NDArray
 
 CROSS_SLOPE_INFORMATION = 4.0
 """Prior information of slopes over the other two extents. Chosen: half the deviation of the own
 one."""
 
 
-def slopes_by_kind(evidence: Floats, kind: Ints, constants: Constants) -> tuple[Floats, Floats]:
+def set_population(
+    inputs: NDArray[np.void], evidence: Floats, kind: Ints, constants: Constants
+) -> None:
     """
-    Return the `population_slopes` of each of K kinds, shapes (K, 3) and (K, 3, 3).
+    Set the `population_slopes` of each of K kinds in records `INPUTS` (K,).
 
-    Of the `evidence` (n, 3, 3) of tracks of a `kind` (n,); 0 without tracks.
+    Of the `evidence` (n, 3, 3) of tracks of a `kind` (n,).
 
     """
-    median, slopes = np.zeros((len(KINDS), 3)), np.zeros((len(KINDS), 3, 3))
     for k in set(kind.tolist()):
-        median[k], slopes[k] = population_slopes(evidence[kind == k], constants)
-    return median, slopes
+        inputs['median'][k], inputs['slopes'][k] = population_slopes(
+            evidence[kind == k], constants
+        )
 
 
 def population_slopes(evidence: Floats, constants: Constants) -> tuple[Floats, Floats]:
@@ -64,6 +66,8 @@ def population_slopes(evidence: Floats, constants: Constants) -> tuple[Floats, F
     A = similarity * off
     weighted = weight.T[..., None] * A  # (3, n, 3)
     ridge = np.full((3, 3), CROSS_SLOPE_INFORMATION) - (CROSS_SLOPE_INFORMATION - 1) * np.eye(3)
-    curvature = weighted.swapaxes(1, 2) @ A + ridge[:, None] * np.eye(3) / constants.slope_deviation**2
+    curvature = (
+        weighted.swapaxes(1, 2) @ A + ridge[:, None] * np.eye(3) / constants.slope_deviation**2
+    )
     pull = (similarity * correction).T[:, None] @ weighted  # (3, 1, 3)
     return median, np.linalg.solve(curvature, pull.swapaxes(1, 2))[..., 0]

@@ -53,52 +53,55 @@ NO_PRIOR = (
 """State, step, information and extents of a prior without information."""
 
 
-class ClassSettings(NamedTuple):
-    """
-    Settings of the class of each window.
+CLASS_SETTINGS = np.dtype(
+    [
+        ('acceleration', float, 6),
+        ('slip', float, 2),
+        ('drift', float),
+        ('pose', float, 6),
+        ('extent', float),
+        ('gap_spread', float),
+        ('sideslip', float),
+        ('roughness', float),
+        ('gaps', float, 6),
+        ('pivot', float),
+    ],
+    align=True,
+)
+"""
+Settings of the class of one window.
 
-    Attributes
-    ----------
-    acceleration : array, shape (B, 6)
-        Deviations of the accelerations along the axes of the body.
-    slip : array, shape (B, 2)
-        Of the velocity of the pivot along the y and z axes [m/s].
-    drift : array, shape (B,)
-        Of the step of a parked box [m].
-    pose : array, shape (B, 6)
-        Of the input poses [m, rad].
-    extent : array, shape (B,)
-        Of the input extents, as part of each.
-    gap_spread, sideslip : array, shape (B,)
-        Of labelling margins [m], and of the angle from heading to path [rad].
-    shape : array, shape (B,)
-        How far the surface is from rigid [m].
-    gaps : array, shape (B, 6)
-        Expected labelling margins [m].
-    pivot : array, shape (B,)
-        Distance of the pivot behind the centre, as part of the length.
-
-    """
-
-    acceleration: Floats
-    slip: Floats
-    drift: Floats
-    pose: Floats
-    extent: Floats
-    gap_spread: Floats
-    sideslip: Floats
-    shape: Floats
-    gaps: Floats
-    pivot: Floats
-
-    def take(self, rows: Ints) -> 'ClassSettings':
-        """Return the settings of some windows."""
-        return ClassSettings(*(part[rows] for part in self))
-
-    @property
-    def errors(self) -> Floats:
-        """Deviations of input poses and, as part of each, of extents, (B, 9)."""
-        return np.concatenate([self.pose, np.repeat(self.extent[:, None], 3, axis=1)], axis=1)
+acceleration
+    Deviations of the accelerations along the axes of the body, (6,).
+slip
+    Of the velocity of the pivot along the y and z axes, (2,) [m/s].
+drift
+    Of the step of a parked box [m].
+pose, extent
+    Of the input poses, (6,) [m, rad], and of the input extents, as part of each.
+gap_spread, sideslip
+    Of labelling margins [m], and of the angle from heading to path [rad].
+roughness
+    How far the surface is from rigid [m]: setting `shape`.
+gaps
+    Expected labelling margins, (6,) [m].
+pivot
+    Distance of the pivot behind the centre, as part of the length.
+"""
+ClassSettings = NDArray[np.void]
+SETTINGS_OF = {
+    'acceleration': ('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning'),
+    'slip': ('slip', 'climb'),
+    'drift': ('drift',),
+    'pose': ('position', 'lateral', 'height', 'tilt', 'tilt', 'heading'),
+    'extent': ('extent',),
+    'gap_spread': ('gap_spread',),
+    'sideslip': ('sideslip',),
+    'roughness': ('shape',),
+    'gaps': ('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom'),
+    'pivot': ('pivot',),
+}
+"""The settings of `ClassConfig` that make each field."""
 
 
 class Problem(NamedTuple):
@@ -137,7 +140,7 @@ class Problem(NamedTuple):
         Sum of the input extents of marginalised observations [m], and the number of these.
     kind : array, shape (B,)
         Index of the kind of each window's object among `KINDS`.
-    of_class : ClassSettings
+    of_class : array of `CLASS_SETTINGS`, shape (B,)
 
     """
 
@@ -159,6 +162,12 @@ class Problem(NamedTuple):
     marginalised_extents: Floats
     kind: Ints
     of_class: ClassSettings
+
+    @property
+    def errors(self) -> Floats:
+        """Deviations of input poses and, as part of each, of extents, (B, 9)."""
+        extent = np.repeat(self.of_class['extent'][:, None], 3, axis=1)
+        return np.concatenate([self.of_class['pose'], extent], axis=1)
 
     @property
     def length(self) -> int:
@@ -216,7 +225,7 @@ class Problem(NamedTuple):
             prior_information=np.zeros((b, PRIOR, PRIOR)),
             marginalised_extents=np.zeros((b, 4)),
             kind=self.kind[rows],
-            of_class=self.of_class.take(rows),
+            of_class=self.of_class[rows],
         )
 
     def thinned(self, points: float) -> 'Problem':
@@ -239,17 +248,17 @@ class Problem(NamedTuple):
         mean: Floats = total / (counted.sum(1) + marginalised[:, 3:])
         return mean
 
-    def expected_shared(self, gap_correction: Floats) -> Floats:
+    def expected_shared(self, inputs: NDArray[np.void]) -> Floats:
         """
         Return the means of the shared variables without a population, (B, 23).
 
-        `gap_correction` (K, 6) is that of `Inputs` [m].
+        `inputs` (K,) are records `INPUTS`.
 
         """
         shared = np.zeros((len(self.boxes), SHARED))
         shared[:, EXTENT:BIAS] = self.mean_extents()
-        shared[:, GAP:PIVOT] = self.of_class.gaps + gap_correction[self.kind]
-        shared[:, PIVOT] = shared[:, EXTENT] * self.of_class.pivot
+        shared[:, GAP:PIVOT] = self.of_class['gaps'] + inputs['gap_correction'][self.kind]
+        shared[:, PIVOT] = shared[:, EXTENT] * self.of_class['pivot']
         return shared
 
     def free_variables(self, config: Config) -> Floats:
@@ -458,23 +467,11 @@ def _of_classes(windows: Sequence[Window], config: Config) -> tuple[Ints, ClassS
     kind = np.array([KINDS.index(kinds[window.class_name]) for window in windows])
     numbers = np.array([numbers_of(getattr(config, name)) for name in KINDS], dtype=np.float64)
 
-    def of(*names: str) -> Floats:
+    found = np.zeros(len(kind), CLASS_SETTINGS)
+    for field, names in SETTINGS_OF.items():
         columns = [CLASS_NUMBERS.index(name) for name in names]
-        found: Floats = numbers[kind].take(columns, axis=1)
-        return found[:, 0].copy() if len(names) == 1 else found
-
-    return kind, ClassSettings(
-        acceleration=of('acceleration', 'cornering', 'vertical', 'tilting', 'tilting', 'turning'),
-        slip=of('slip', 'climb'),
-        drift=of('drift'),
-        pose=of('position', 'lateral', 'height', 'tilt', 'tilt', 'heading'),
-        extent=of('extent'),
-        gap_spread=of('gap_spread'),
-        sideslip=of('sideslip'),
-        shape=of('shape'),
-        gaps=of('gap_ends', 'gap_ends', 'gap_sides', 'gap_sides', 'gap_top', 'gap_bottom'),
-        pivot=of('pivot'),
-    )
+        found[field] = numbers[kind][:, columns].reshape(found[field].shape)
+    return kind, found
 
 
 def resolve_headings(

@@ -13,7 +13,7 @@ from boxreg_ros.config import Config, KINDS
 from boxreg_ros.core.box_time import BoxTimeEvidence, motion_to_sight, swept
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.matching import Pair, StampMatcher
-from boxreg_ros.core.method.constants import Constants, CONSTANTS
+from boxreg_ros.core.method.constants import CONSTANTS, Constants
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
 from boxreg_ros.core.support import is_owned, points_inside

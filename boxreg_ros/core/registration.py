@@ -19,15 +19,14 @@ from boxreg_ros.config import Config
 from boxreg_ros.core.input_model import InputModel
 from boxreg_ros.core.input_noise import residuals_at
 from boxreg_ros.core.method.arrays import BIAS, EXTENT, Solution
-from boxreg_ros.core.method.faces import count_held, observe_faces
-from boxreg_ros.core.method.round import empty_sums
+from boxreg_ros.core.method.faces import count_held
 from boxreg_ros.core.paper import solve_paper
 from boxreg_ros.core.problem import group_windows, Problem, stack_windows
 from boxreg_ros.core.solver import solve
 from boxreg_ros.core.threads import one_torch_thread, run, shared_between
 from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, Window
 from boxreg_ros.rotations import wrap_angle
-from boxreg_ros.structures import Floats, Ints, KEPT, POSE, REFINED
+from boxreg_ros.structures import Floats, Ints, KEPT, POSE, REFINED, ROLL
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,9 +73,7 @@ def register(windows: list[Window], config: Config, model: InputModel) -> list[E
             else:
                 solution = solve(problem, config, model, part[0].is_warm)
                 _update_noise(model, part, problem, solution, config)
-            found = _accepted(
-                part, problem, base, solution, config, model.constants.max_lost_part
-            )
+            found = _accepted(part, problem, base, solution, config, model.constants.max_lost_part)
             estimates.update(zip(rows, found, strict=True))
     return [estimates.get(i) for i in range(len(windows))]
 
@@ -95,16 +92,10 @@ def _update_margins(
     new = [row for row, part in enumerate(columns) if part]
     if not new:
         return
-    constants = model.constants.with_settings(config)
-    problem = problem.part(new, [columns[row] for row in new]).thinned(constants.coarse_points)
-    inputs = model.inputs(config, with_noise=False)
-    poses = np.concatenate([problem.boxes[..., :3], problem.start[..., 6:]], axis=-1)
-    shared = problem.expected_shared(inputs.gap_correction)
-    prior = problem.prior_mean, problem.prior_information
-    faces = empty_sums(*problem.counts.shape, *prior, uses_shape=False).faces
-    run(observe_faces, len(new), problem, poses, shared, inputs, constants, faces)
-    track_ids = [windows[row].track_id for row in new]
-    model.add_face_observations(track_ids, problem.kind, faces, problem.valid, inputs)
+    coarse = model.constants.coarse_points
+    problem = problem.part(new, [columns[row] for row in new]).thinned(coarse)
+    poses = np.concatenate([problem.boxes[..., :3], problem.start[..., ROLL:]], axis=-1)
+    model.observe_margins([windows[row].track_id for row in new], problem, poses, config)
 
 
 def _update_noise(
@@ -117,7 +108,8 @@ def _update_noise(
     """Update the noise with the best fit of each window, `lag` from its end, and its extents."""
     lag = min(config.lag, config.window - 1)
     best = problem.lengths - 1 - lag
-    residuals = residuals_at(problem, solution, best.clip(0))
+    extents = solution.shared[:, EXTENT:BIAS]
+    residuals = residuals_at(problem, solution.poses, extents, best.clip(0))
     # Each box counts once. The first one stays the best of its window as long as this grows.
     residuals[best < 0] = np.nan
     track_ids = [window.track_id for window in windows]

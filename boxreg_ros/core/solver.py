@@ -11,13 +11,13 @@ from math import inf
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.input_model import InputModel
-from boxreg_ros.core.input_noise import normalised_residuals, noise_by_kind
+from boxreg_ros.core.input_model import InputModel, Inputs
+from boxreg_ros.core.input_noise import normalised_residuals, set_noise
 from boxreg_ros.core.lbfgs import HISTORY, minimize
 from boxreg_ros.core.method import round as method
-from boxreg_ros.core.method.arrays import EXTENT, BIAS, Inputs, Posterior, PRIOR, SHARED, Solution
+from boxreg_ros.core.method.arrays import BIAS, EXTENT, Posterior, PRIOR, SHARED, Solution
 from boxreg_ros.core.method.constants import Constants
-from boxreg_ros.core.population import slopes_by_kind
+from boxreg_ros.core.population import set_population
 from boxreg_ros.core.problem import Problem
 from boxreg_ros.core.threads import run, shared_between
 from boxreg_ros.structures import Floats, Ints, POSE
@@ -88,7 +88,7 @@ class Batch(NamedTuple):
     problem : Problem
     free : array, shape (B, 6 N + 23)
         1 for variables that are estimated.
-    sums : Linearisation
+    sums : Sums
         The sums of residuals of the round.
     solution : Solution
         Where the round begins; the round writes its end.
@@ -97,7 +97,7 @@ class Batch(NamedTuple):
 
     problem: Problem
     free: Floats
-    sums: method.Linearisation
+    sums: method.Sums
     solution: Solution
 
 
@@ -149,13 +149,13 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
     """Return a batch where the first round starts, without covariances and prior."""
     B, N = problem.counts.shape
     free = problem.free_variables(config)
-    shared = problem.expected_shared(inputs.gap_correction)
+    shared = problem.expected_shared(inputs)
     evidence = np.zeros((B, 3, 3))
     evidence[:, 0] = np.log(shared[:, EXTENT:BIAS])
     if plan.starts_from_fit:
         is_free = free[:, -SHARED:][:, EXTENT:BIAS]
         shared[:, EXTENT:BIAS] += is_free * (problem.start[:, 0, 3:6] - shared[:, EXTENT:BIAS])
-    leaving = B if plan.marginalises and N == config.window else 0
+    leaving = B if plan.marginalises and config.window == N else 0
     solution = Solution(
         problem.start[..., POSE].copy(), shared, evidence,
         Posterior(np.zeros((B, N, 6, 6)), np.zeros((B, 3, 3)), np.zeros((B, N, 6))),
@@ -163,7 +163,7 @@ def start(problem: Problem, config: Config, plan: SolverPlan, inputs: Inputs) ->
         np.full((leaving, PRIOR, PRIOR), np.nan),
     )  # fmt: skip
     prior = problem.prior_mean, problem.prior_information
-    return Batch(problem, free, method.empty_sums(B, N, *prior, plan.uses_rigid_shape), solution)
+    return Batch(problem, free, method.empty_sums(B, N, *prior), solution)
 
 
 @torch.inference_mode()
@@ -187,12 +187,13 @@ def run_round(
     _, free, sums, solution = batch
     problem = batch.problem.thinned(points)
     uses_shape = plan.uses_rigid_shape and turn > 0
-    constants = constants.in_round(uses_shape, is_smooth=turn > 0 or plan.starts_from_fit)
+    is_smooth = turn > 0 or plan.starts_from_fit
+    record = constants.in_round(uses_shape, is_smooth).record()
     b, D = len(rows), free.shape[1]
     x, value, gradient = np.empty((b, D)), np.empty(b), np.empty((b, D))
     run(
         method.begin, b, rows, problem, problem.thinned(constants.shape_points), inputs, free,
-        constants, solution.poses, solution.shared, sums, x, value, gradient,
+        record, solution.poses, solution.shared, sums, x, value, gradient,
     )  # fmt: skip
     search, objective = config.solver, Objective(rows, free, sums)
     found = minimize(
@@ -201,7 +202,7 @@ def run_round(
     )  # fmt: skip
     is_done = np.empty(b, bool)
     run(
-        method.end, b, rows, found.x.numpy(), problem, free, constants, sums, solution,
+        method.end, b, rows, found.x.numpy(), problem, free, record, sums, solution,
         turn + 1 >= plan.rounds, turn > 0, is_done,
     )  # fmt: skip
     return is_done
@@ -221,7 +222,7 @@ class Objective(NamedTuple):
 
     rows: Ints
     free: Floats
-    sums: method.Linearisation
+    sums: method.Sums
 
     def __call__(self, x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
         """Return values (p,) and gradients (p, D) of the windows `rows[part]` at x (p, D)."""
@@ -245,16 +246,13 @@ def _from_batch(
 ) -> Inputs:
     """Return the estimates of the input with those of the batch itself, after a round."""
     problem, _, _, solution = batch
+    inputs = inputs.copy()
     if config.ingredients.noise_estimation and turn <= NOISE_ROUNDS:
-        residuals = normalised_residuals(problem, solution)
-        noise = noise_by_kind(residuals, problem.kind, model.constants)
-        inputs = inputs._replace(**noise._asdict())
+        extents = solution.shared[:, EXTENT:BIAS]
+        residuals = normalised_residuals(problem, solution.poses, extents)
+        set_noise(inputs, residuals, problem.kind, model.constants)
     if config.ingredients.population_extents:
         evidence, kind = model.extent_evidence()
-        median, slopes = slopes_by_kind(
-            np.concatenate([evidence, solution.evidence]),
-            np.concatenate([kind, problem.kind]),
-            model.constants,
-        )
-        inputs = inputs._replace(median=median, slopes=slopes)
+        evidence = np.concatenate([evidence, solution.evidence])
+        set_population(inputs, evidence, np.concatenate([kind, problem.kind]), model.constants)
     return inputs

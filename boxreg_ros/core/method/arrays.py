@@ -1,8 +1,8 @@
 """
-What the functions of a round pass to each other, as named tuples of arrays.
+What the functions of a round pass to each other: records, and named tuples of arrays.
 
-Letters of the shapes: B windows, N observations of a window, K kinds of objects. A tuple of a batch
-has all B windows in front; `of_window` functions return views of one. Only the first `lengths`
+Letters of the shapes: B windows, N observations of a window, K kinds of objects. The terms of a
+batch are an array (B, N) of records `TERMS`, and (B,) of `COMMON`. Only the first `lengths`
 observations of a window are read; the others are padding.
 
 """
@@ -10,6 +10,7 @@ observations of a window are read; the others are padding.
 from typing import Any, NamedTuple
 
 from boxreg_ros.core.method.compile import kernel
+import numpy as np
 
 POSE = 6
 """Variables of a pose: x y z roll pitch yaw."""
@@ -18,6 +19,8 @@ EXTENT, BIAS, GAP, PIVOT, ANCHOR, SIDESLIP, SHARED = 0, 3, 9, 15, 16, 22, 23
 labelling margins (6), pivot, anchor of the rigid shape (6), sideslip."""
 PRIOR = 2 * POSE + SHARED
 """Variables of the marginalisation prior: two poses and the shared ones."""
+NUM_RESIDUALS = 5
+"""Number of `residuals.RESIDUALS`."""
 BOTTOM = 5
 """The face that is observed by the road, not by points of the object."""
 SPAN = 3 * POSE
@@ -26,156 +29,117 @@ BOX_POSE = (0, 1, 2, 6, 7, 8)
 """Places of the pose in a box x y z length width height roll pitch yaw."""
 
 
-class Faces(NamedTuple):
-    """
-    The outermost points on each face of each box.
+TERMS = np.dtype(
+    [
+        ('time', float),
+        ('given', float, POSE),
+        ('start', float, POSE),
+        ('axes', float, (3, 3)),
+        ('num_points', float),
+        ('distance', float, 6),
+        ('visibility', float, 6),
+        ('inset', float, 6),
+        ('inset_shares', float, (2, 6)),
+        ('W_faces', float, (6, 4, 4)),
+        ('wanted', float, POSE),
+        ('root', float, (POSE, POSE)),
+        ('W', float, (NUM_RESIDUALS, POSE)),
+    ],
+    align=True,
+)
+"""
+Data and weights of the residuals of one observation in one round.
 
-    Attributes
-    ----------
-    moments : array, shape (B, N, 6, 4, 4)
-        Mean of (q, 1)(q, 1)' over the points q, from the centre of the input box [m]; once they
-        are weighed, times the weight of the face: `Terms.W_faces` is the same array.
-    distance : array, shape (B, N, 6)
-        Their mean signed distance from where they are expected, positive outside [m].
-    weight : array, shape (B, N, 6)
-        1 for a visible face, less for an occluded or distant one, 0 without points.
-    inset : array, shape (B, N, 6)
-        How far further inside than the labelling margin they are expected [m].
-    inset_shares : array, shape (B, N, 2, 6)
-        Multiples of occlusion inset and range inset in that.
-    num_points : array, shape (B, N)
-        Points in and near the box.
+time
+    Of the observation [s].
+given, start
+    Input pose, and pose at the start of the round, (6,) [m, rad].
+axes
+    Axes of the box at the start of the round, (3, 3).
+num_points
+    Points in and near the box.
+distance
+    Mean signed distance of the outermost points of each face from where they are expected,
+    positive outside, (6,) [m].
+visibility
+    1 for a visible face, less for an occluded or distant one, 0 without points, (6,).
+inset, inset_shares
+    How far further inside than the labelling margin the points are expected, (6,) [m]; multiples
+    of occlusion inset and range inset in that, (2, 6).
+W_faces
+    Faces (M2): mean of (q, 1)(q, 1)' over the outermost points q of each face, from the centre of
+    the input box [m], times the weight of the face, (6, 4, 4).
+wanted, root
+    Rigid shape (M4): wanted step (6,), and a root of its information (6, 6).
+W
+    Weights of the `RESIDUALS` that begin here, 0 where they are left out, (n, 6).
+"""
 
-    """
+COMMON = np.dtype(
+    [
+        ('shared', float, SHARED),
+        ('deviation', float, SHARED),
+        ('pose_deviation', float, POSE),
+        ('widened_deviation', float, POSE),
+        ('unmodelled_bias', float, POSE),
+        ('error', float, PIVOT),
+        ('W_shared', float, SHARED),
+        ('prior_mean', float, PRIOR),
+        ('W_prior', float, (PRIOR, PRIOR)),
+    ],
+    align=True,
+)
+"""
+What the observations of a window have in common in one round.
 
-    moments: Any
-    distance: Any
-    weight: Any
-    inset: Any
-    inset_shares: Any
-    num_points: Any
+shared, deviation
+    Expected means and deviations of the shared variables before points are used (M15), (23,).
+pose_deviation, widened_deviation
+    Deviation of the input poses along the axes of their boxes, without their bias; the same,
+    widened for the correlation of the errors of neighbours, (6,) [m, rad].
+unmodelled_bias
+    Deviation of the bias of windows with a pinned box, where no bias is estimated; else 0, (6,).
+error
+    Deviations of the errors of mean input extents, bias and margins, as far as known (M28), (15,).
+W_shared
+    Weights of the shared variables (M8), (23,).
+prior_mean, W_prior
+    Marginalisation prior (M9): minimum and information, (35,) and (35, 35).
+"""
 
+INPUTS = np.dtype(
+    [
+        ('deviation', float, 9),
+        ('correlation', float, 9),
+        ('weight', float),
+        ('gap_correction', float, 6),
+        ('occlusion_inset', float, 6),
+        ('range_inset', float, 6),
+        ('median', float, 3),
+        ('slopes', float, (3, 3)),
+        ('gap_variance', float, 6),
+        ('gap_tracks', float, 6),
+        ('gap_noise', float, 6),
+    ],
+    align=True,
+)
+"""
+Estimated errors of the input of a stream, for one kind of objects.
 
-class Expected(NamedTuple):
-    """
-    Means and deviations before the points of a window are used (M15).
-
-    Attributes
-    ----------
-    shared, deviation : array, shape (B, 23)
-        Means and deviations of the shared variables.
-    pose_deviation, widened_deviation : array, shape (B, 6)
-        Deviation of the input poses along the axes of their boxes, without their bias; the same,
-        widened for the correlation of the errors of neighbours [m, rad].
-    unmodelled_bias : array, shape (B, 6)
-        Deviation of the bias of windows with a pinned box, where no bias is estimated; else 0.
-    error : array, shape (B, 15)
-        Deviations of the errors of mean input extents, bias and margins, as far as known (M28).
-
-    """
-
-    shared: Any
-    deviation: Any
-    pose_deviation: Any
-    widened_deviation: Any
-    unmodelled_bias: Any
-    error: Any
-
-
-class Inputs(NamedTuple):
-    """
-    Estimated errors of the input of a stream, one row for each of K kinds of objects.
-
-    Lengths are in units of the deviations of the settings, but those in [m].
-
-    Attributes
-    ----------
-    deviation, correlation : array, shape (K, 9)
-        Of poses along the box axes and of extents (M14): deviation about the mean of a track;
-        correlation from one observation to the next.
-    weight : array, shape (K,)
-        Of this noise against the settings: 0 without observations, near 1 after many.
-    gap_correction, occlusion_inset, range_inset : array, shape (K, 6)
-        Labelling margin of each face less the one of the settings; how much further inside the
-        points of an occluded face are, and those of an object 70 m away [m].
-    median, slopes : array, shapes (K, 3) and (K, 3, 3)
-        Of the population of extents (M16); slopes are 0 where there is none.
-    gap_variance, gap_tracks, gap_noise : array, shape (K, 6)
-        Between the gaps of tracks (M18a): variance [m^2], number of tracks, and the share of the
-        variance of an observation in that of the mean of a track.
-
-    """
-
-    deviation: Any
-    correlation: Any
-    weight: Any
-    gap_correction: Any
-    occlusion_inset: Any
-    range_inset: Any
-    median: Any
-    slopes: Any
-    gap_variance: Any
-    gap_tracks: Any
-    gap_noise: Any
-
-
-class Terms(NamedTuple):
-    """
-    Data and weights of all residuals (M1) in one round.
-
-    Attributes
-    ----------
-    given, start : array, shape (B, N, 6)
-        Input poses, and poses at the start of the round.
-    axes : array, shape (B, N, 3, 3)
-        Axes of the boxes at the start of the round.
-    times : array, shape (B, N)
-        Time of each observation [s].
-    inset, W_faces : array, shapes (B, N, 6) and (B, N, 6, 4, 4)
-        Faces (M2).
-    wanted, root : array, shapes (B, N, 6) and (B, N, 6, 6)
-        Rigid shape (M4): wanted step, and a root of its information. No rows where it is off.
-    W : array, shape (B, n, N, 6)
-        Weights of the n `RESIDUALS`, by the observation where each begins; 0 where it is left out.
-    prior_mean, W_prior : array, shapes (B, 35) and (B, 35, 35)
-        Marginalisation prior (M9).
-    expected, W_shared : array, shape (B, 23)
-        Shared variables (M8).
-
-    """
-
-    given: Any
-    start: Any
-    axes: Any
-    times: Any
-    inset: Any
-    W_faces: Any
-    wanted: Any
-    root: Any
-    W: Any
-    prior_mean: Any
-    W_prior: Any
-    expected: Any
-    W_shared: Any
-
-
-@kernel
-def terms_of_window(b, terms):
-    """Return the terms of window `b`."""
-    return Terms(
-        terms.given[b], terms.start[b], terms.axes[b], terms.times[b], terms.inset[b],
-        terms.W_faces[b], terms.wanted[b], terms.root[b], terms.W[b], terms.prior_mean[b],
-        terms.W_prior[b], terms.expected[b], terms.W_shared[b],
-    )  # fmt: skip
-
-
-@kernel
-def expected_of_window(b, expected):
-    """Return the expectation of window `b`."""
-    return Expected(
-        expected.shared[b], expected.deviation[b], expected.pose_deviation[b],
-        expected.widened_deviation[b], expected.unmodelled_bias[b], expected.error[b],
-    )  # fmt: skip
+deviation, correlation
+    Of poses along the box axes and of extents (M14): deviation about the mean of a track, in units
+    of that of the settings; correlation from one observation to the next, (9,).
+weight
+    Of this noise against the settings: 0 without observations, near 1 after many.
+gap_correction, occlusion_inset, range_inset
+    Labelling margin of each face less the one of the settings; how much further inside the points
+    of an occluded face are, and those of an object 70 m away, (6,) [m].
+median, slopes
+    Of the population of extents (M16), (3,) and (3, 3); slopes are 0 where there is none.
+gap_variance, gap_tracks, gap_noise
+    Between the gaps of tracks (M18a): variance [m^2], number of tracks, and the share of the
+    variance of an observation in that of the mean of a track, (6,).
+"""
 
 
 class Arrowhead(NamedTuple):

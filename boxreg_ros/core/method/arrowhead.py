@@ -9,7 +9,7 @@ the matrix A. Large products are those of BLAS, since numba unrolls short loops 
 
 from math import sqrt
 
-from boxreg_ros.core.method.arrays import Arrowhead, POSE, SHARED, SPAN
+from boxreg_ros.core.method.arrays import POSE, SHARED, SPAN
 from boxreg_ros.core.method.compile import kernel
 import numpy as np
 

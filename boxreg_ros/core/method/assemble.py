@@ -32,7 +32,14 @@ from boxreg_ros.core.method.residuals import (
     fill_plane,
     RESIDUALS,
 )
-from boxreg_ros.core.method.weights import robustify, weigh_faces, weigh_shared, weighing_of
+from boxreg_ros.core.method.weights import (
+    fill_parked,
+    fill_pin_factor,
+    robustify,
+    weigh_faces,
+    weigh_shared,
+    Weighing,
+)
 from numba import literal_unroll
 import numpy as np
 
@@ -135,27 +142,27 @@ def add_plane(n, face, w, v, by_angles, pull, weighted, gradient, A):
 
 
 @kernel
-def add_shared_prior(shared, terms, gradient, A):
+def add_shared_prior(shared, common, gradient, A):
     """Add the deviation of the shared variables from those expected (M8)."""
     first = len(gradient) - SHARED
     value = 0.0
     for s in range(SHARED):
-        off = shared[s] - terms.expected[s]
-        value += 0.5 * terms.W_shared[s] * off**2
-        gradient[first + s] += terms.W_shared[s] * off
+        off = shared[s] - common.shared[s]
+        value += 0.5 * common.W_shared[s] * off**2
+        gradient[first + s] += common.W_shared[s] * off
         if is_wanted(A):
-            A.corner[s, s] += terms.W_shared[s]
+            A.corner[s, s] += common.W_shared[s]
     return value
 
 
 @kernel
-def add_marginal_prior(x, terms, gradient, A):
+def add_marginal_prior(x, common, gradient, A):
     """Add the quadratic form in the two oldest poses and the shared variables (M9)."""
-    W = terms.W_prior
+    W, mean = common.W_prior, common.prior_mean
     first = len(gradient) - SHARED
     r = np.empty(PRIOR)
     for k in range(PRIOR):
-        r[k] = x[k if k < NEXT else first + k - NEXT] - terms.prior_mean[k]
+        r[k] = x[k if k < NEXT else first + k - NEXT] - mean[k]
     value = 0.0
     for k in range(PRIOR):
         pull = 0.0
@@ -190,7 +197,7 @@ def add_all(poses, shared, last, terms, at, out, gradient, A):
     i = 0
     for row in literal_unroll(RESIDUALS):
         for n in range(min(last, number_of(len(poses), row.poses, True))):
-            W = terms.W[i, n]
+            W = terms[n].W[i]
             if W[0] != 0.0:
                 out.J[:] = 0.0
                 out.S[:] = 0.0
@@ -201,7 +208,7 @@ def add_all(poses, shared, last, terms, at, out, gradient, A):
 
 
 @kernel
-def accumulate(x, last, terms, at, out, gradient, A):
+def accumulate(x, last, terms, common, at, out, gradient, A):
     """
     Return the sum of the residuals of one window (M1); write its gradient and curvature.
 
@@ -212,7 +219,7 @@ def accumulate(x, last, terms, at, out, gradient, A):
     last : int
         Only residuals that begin at the first `last` observations; less than N leaves out the
         prior on the shared variables too, which belongs to no observation.
-    terms : Terms
+    terms, common : array of `TERMS`, shape (N,), and record `COMMON`
         Data and weights of the window.
     at, out : Axes, Linearised
         To work in.
@@ -232,20 +239,20 @@ def accumulate(x, last, terms, at, out, gradient, A):
     value = 0.0
     for n in range(min(last, N)):
         for face in range(6):
-            w = terms.W_faces[n, face]
+            w = terms[n].W_faces[face]
             if w[3, 3] != 0.0:
                 fill_plane(n, face, poses, shared, terms, at, v, by_angles)
                 value += add_plane(n, face, w, v, by_angles, pull, weighted, gradient, A)
     value += add_all(poses, shared, last, terms, at, out, gradient, A)
-    if terms.W_prior[0, 0] != 0.0:
-        value += add_marginal_prior(x, terms, gradient, A)
+    if common.W_prior[0, 0] != 0.0:
+        value += add_marginal_prior(x, common, gradient, A)
     if last >= N:
-        value += add_shared_prior(shared, terms, gradient, A)
+        value += add_shared_prior(shared, common, gradient, A)
     return value
 
 
 @kernel
-def weigh(b, problem, poses, shared, faces, expected, constants, at, out, terms):
+def weigh(b, problem, poses, shared, constants, at, out, terms, common):
     """
     Write data and weights of the terms of window `b` at the start of a round.
 
@@ -257,54 +264,51 @@ def weigh(b, problem, poses, shared, faces, expected, constants, at, out, terms)
         Input of the batch.
     poses, shared : array, shapes (N, 6) and (23,)
         Boxes and shared variables of the window.
-    faces : Faces
-        Face observations of the batch.
-    expected : Expected
-        Means and deviations of the window.
-    constants : Constants
+    constants : record of `Constants`
     at, out : Axes, Linearised
         To work in.
-    terms : Terms
-        Of the window: written, but for those of rigid shape and marginalisation prior.
+    terms, common : array of `TERMS`, shape (N,), and record `COMMON`
+        Of the window, with its face observations, rigid shape and expectation: the rest is
+        written.
 
     """
-    N, boxes = len(poses), problem.boxes[b]
-    window = weighing_of(b, problem, expected, constants)
-    terms.times[:] = problem.times[b]
-    terms.inset[:] = faces.inset[b]
-    terms.expected[:] = expected.shared
-    terms.start[:] = poses
-    for n in range(N):
-        for k in range(POSE):
-            terms.given[n, k] = boxes[n, BOX_POSE[k]]
+    N, length = len(poses), problem.lengths[b]
+    boxes, times, of_class = problem.boxes[b], problem.times[b], problem.of_class[b]
+    parked, pin_factor, face_weight = np.empty(N, np.bool_), np.empty(POSE), np.empty((N, 6))
+    yaw_deviation = max(common.pose_deviation[5], of_class.pose[5])
+    fill_parked(boxes, times, length, yaw_deviation, constants, parked)
+    fill_pin_factor(length, common, pin_factor)
     fill_axes(poses, 0, N, at)
-    terms.axes[:] = at.R
-    face_weight = np.empty((N, 6))
-    distance, shape = faces.distance[b], problem.of_class.shape[b]
-    weigh_faces(
-        window.length, shape, distance, faces.weight[b], constants, face_weight, terms.W_faces
-    )
-    weigh_shared(
-        window.length, shared, expected, distance, face_weight, constants, terms.W_shared
-    )
-    weigh_all(poses, shared, terms, window, at, out)
+    for n in range(N):
+        terms[n].time = times[n]
+        terms[n].axes[:] = at.R[n]
+        terms[n].start[:] = poses[n]
+        for k in range(POSE):
+            terms[n].given[k] = boxes[n, BOX_POSE[k]]
+        terms[n].W[:] = 0.0
+    weigh_faces(length, of_class.roughness, constants, terms, face_weight)
+    weigh_shared(length, shared, terms, common, face_weight, constants)
+    window = Weighing(
+        length, common.pose_deviation, common.widened_deviation, problem.pinned[b], pin_factor,
+        parked, of_class.acceleration, of_class.slip, of_class.drift,
+    )  # fmt: skip
+    weigh_each(poses, shared, terms, window, constants, at, out)
 
 
 @kernel
-def weigh_all(poses, shared, terms, window, at, out):
-    """Write the weights of all `RESIDUALS` at the start of a round."""
+def weigh_each(poses, shared, terms, window, constants, at, out):
+    """Write the weights of each of `RESIDUALS` where they are not zero."""
     squared = np.zeros(len(poses))
     i = 0
     for row in literal_unroll(RESIDUALS):
-        W = terms.W[i]
-        W[:] = 0.0
-        count = number_of(window.length, row.poses, window.constants.residuals[i])
+        count = number_of(window.length, row.poses, constants.residuals[i])
         for n in range(count):
+            W = terms[n].W[i]
             rows, _ = row.function(n, poses, shared, terms, at, out)
-            row.weight(n, out.r, window, W[n])
-            squared[n] = squared_norm(rows, W[n], out.r)
-        if row.is_robust and window.constants.is_robust:
-            robustify(count, squared, window.constants.outlier, W)
+            row.weight(n, out.r, window, constants, W)
+            squared[n] = squared_norm(rows, W, out.r)
+        if row.is_robust and constants.is_robust:
+            robustify(i, count, squared, constants.outlier, terms)
         i += 1
 
 
@@ -324,7 +328,7 @@ def squared_norm(rows, W, r):
 
 
 @kernel
-def linearise(x, terms, free, at, out, gradient, A):
+def linearise(x, terms, common, free, at, out, gradient, A):
     """
     Return the value of the terms of one window; write gradient and factor of the curvature.
 
@@ -332,7 +336,7 @@ def linearise(x, terms, free, at, out, gradient, A):
 
     """
     n = len(x) - SHARED
-    value = accumulate(x, n // POSE, terms, at, out, gradient, A)
+    value = accumulate(x, n // POSE, terms, common, at, out, gradient, A)
     for k in range(len(x)):
         gradient[k] *= free[k]
     fix_variables(A, free)

@@ -9,6 +9,7 @@ from data; all others are *chosen*, and `make results` halves and doubles each o
 from math import inf
 from typing import Any, NamedTuple
 
+import numpy as np
 
 RESIDUAL_NAMES = ('input', 'rigid shape', 'acceleration', 'zero motion', 'slip')
 """Names of `residuals.RESIDUALS`, in their order."""
@@ -200,5 +201,17 @@ class Constants(NamedTuple):
         is_robust = self.is_robust and is_smooth
         return self._replace(uses_shape=residuals[1], residuals=residuals, is_robust=is_robust)
 
+    def record(self) -> np.void:
+        """Return these numbers as one record, which kernels take by reference."""
+        record: np.void = np.array([tuple(self)], RECORD)[0]
+        return record
 
+
+def _field(name: str, value: Any) -> tuple[Any, ...]:
+    if isinstance(value, tuple):  # numba has no arrays of bool in records
+        return name, float if isinstance(value[0], float) else int, len(value)
+    return name, type(value)
+
+
+RECORD = np.dtype([_field(*item) for item in Constants._field_defaults.items()], align=True)
 CONSTANTS = Constants()

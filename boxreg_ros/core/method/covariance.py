@@ -78,35 +78,35 @@ def empty_covariance_work(N):
 
 
 @kernel
-def fill_face_distances(b, boxes, poses, shared, expected, faces, R, distances):
+def fill_face_distances(boxes, poses, shared, expected, terms, R, distances):
     """Write the residuals (N, 6) of all faces [m], 0 for those without weight."""
     for n in range(len(poses)):
         pose, box = poses[n], boxes[n]
         fill_rotation(pose[3], pose[4], pose[5], R)
         for face in range(FACES):
             distances[n, face] = 0.0
-            if not faces.weight[b, n, face] > 0.0:
+            if not terms[n].visibility[face] > 0.0:
                 continue
             axis = face // 2
             sign = 1.0 - 2.0 * (face % 2)
-            centroid = faces.moments[b, n, face, 3]
+            centroid = terms[n].W_faces[face, 3]
             outward = 0.0
             for k in range(3):
                 centre = centroid[k] / centroid[3]
                 outward += sign * R[k, axis] * (centre - (pose[k] - box[k]))
-            surface = shared[EXTENT + axis] / 2 - expected[GAP + face] - faces.inset[b, n, face]
+            surface = shared[EXTENT + axis] / 2 - expected[GAP + face] - terms[n].inset[face]
             distances[n, face] = outward - surface
 
 
 @kernel
-def remove_means(length, weight, distances, min_weight, work):
+def remove_means(length, terms, distances, min_weight, work):
     """Write the residuals of a window less their weighted mean, and the sums of its weights."""
     for face in range(FACES):
         total, count, mean = 0.0, 0, 0.0
         for n in range(length):
-            total += weight[n, face]
-            count += weight[n, face] > 0.0
-            mean += weight[n, face] * distances[n, face]
+            total += terms[n].visibility[face]
+            count += terms[n].visibility[face] > 0.0
+            mean += terms[n].visibility[face] * distances[n, face]
         mean /= max(total, min_weight)
         for n in range(length):
             work.off_mean[n, face] = distances[n, face] - mean
@@ -121,12 +121,12 @@ def weight_of(count, half_weight):
 
 
 @kernel
-def variance_of_mean(length, weight, constants, work):
+def variance_of_mean(length, terms, constants, work):
     """Return the variance of the mean of many residuals over that of independent ones."""
     power, products = 0.0, 0.0
     for n in range(length - 1):
         for face in range(FACES):
-            if weight[n, face] > 0.0 and weight[n + 1, face] > 0.0:
+            if terms[n].visibility[face] > 0.0 and terms[n + 1].visibility[face] > 0.0:
                 first, second = work.off_mean[n, face], work.off_mean[n + 1, face]
                 power += (first**2 + second**2) / 2 / work.claimed[face]
                 products += first * second / work.claimed[face]
@@ -134,9 +134,7 @@ def variance_of_mean(length, weight, constants, work):
     for face in range(FACES):
         faces += work.count[face] > 0
     n = max(work.count.sum() / max(faces, 1), 1.0)
-    unbiased = (products / max(power, MIN_POWER) + 1 / n) / max(
-        1 - 4 / n, constants.min_left
-    )
+    unbiased = (products / max(power, MIN_POWER) + 1 / n) / max(1 - 4 / n, constants.min_left)
     usual = constants.residual_correlation
     correlation = usual + weight_of(n, constants.half_weight) * (unbiased - usual)
     correlation = clamp(correlation, 0.0, constants.max_correlation)
@@ -144,14 +142,14 @@ def variance_of_mean(length, weight, constants, work):
 
 
 @kernel
-def fill_information_of_faces(length, marginalised, weight, spread, constants, work):
+def fill_information_of_faces(length, marginalised, terms, spread, constants, work):
     """Add the information of the labelling margins for the errors of faces (M28), (6,)."""
-    of_mean = variance_of_mean(length, weight, constants, work)
+    of_mean = variance_of_mean(length, terms, constants, work)
     for face in range(FACES):
         total, count, claimed = work.total[face], work.count[face], work.claimed[face]
         scatter = 0.0
         for n in range(length):
-            share = weight[n, face] / max(total, MIN_WEIGHT)
+            share = terms[n].visibility[face] / max(total, MIN_WEIGHT)
             scatter += share * work.off_mean[n, face] ** 2
         scatter /= max(1 - of_mean / max(count, 1.0), constants.min_left)
         shown = weight_of(count, constants.half_weight)
@@ -208,7 +206,7 @@ def fill_extent_covariance(corner, free, error, underrated, found):
 
 @kernel
 def fill_posterior(
-    b, problem, poses, shared, faces, expected, free, shared_weight, inverse, constants, work, found
+    b, problem, poses, shared, terms, common, free, inverse, constants, work, found
 ):
     """
     Write the covariances of window `b`, and the residuals of its faces.
@@ -221,36 +219,29 @@ def fill_posterior(
         Input of the batch.
     poses, shared : array, shapes (N, 6) and (23,)
         Estimate of the window.
-    faces : Faces
-        Face observations of the last round, of the batch.
-    expected : Expected
-        Means and deviations of the window in the last round.
+    terms, common : array of `TERMS`, shape (N,), and record `COMMON`
+        Of the window in the last round.
     free : array, shape (6 N + 23,)
         1 for variables that are estimated, 0 for those held fixed.
-    shared_weight : array, shape (23,)
-        Weights of the shared variables (M22) in the last round.
     inverse : Inverse
         Blocks of its inverse curvature.
-    constants : Constants
+    constants : record of `Constants`
     work : CovarianceWork
         Arrays to work in.
     found : Posterior
         Of the batch: written for the window.
 
     """
-    length, shape = problem.lengths[b], problem.of_class.shape[b]
+    length, shape = problem.lengths[b], problem.of_class[b].roughness
     distances, free_shared = found.face_distances[b], free[6 * len(poses) :]
-    deviation, error = expected.deviation, expected.error
+    deviation, error = common.deviation, common.error
     for face in range(FACES):
         work.claimed[face] = face_deviation(face, shape, constants) ** 2
-    fill_face_distances(
-        b, problem.boxes[b], poses, shared, expected.shared, faces, work.R, distances
-    )
-    weight = faces.weight[b]
-    remove_means(length, weight, distances, MIN_WEIGHT, work)
-    fill_underrated_information(deviation, error, shared_weight, free_shared, work.underrated)
+    fill_face_distances(problem.boxes[b], poses, shared, common.shared, terms, work.R, distances)
+    remove_means(length, terms, distances, MIN_WEIGHT, work)
+    fill_underrated_information(deviation, error, common.W_shared, free_shared, work.underrated)
     fill_information_of_faces(
-        length, problem.marginalised_extents[b, 3], weight, deviation[GAP:], constants, work
+        length, problem.marginalised_extents[b, 3], terms, deviation[GAP:], constants, work
     )
     fill_pose_covariances(
         length, problem.times[b], poses, inverse, work.underrated, constants, found.poses[b]

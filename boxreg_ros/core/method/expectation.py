@@ -94,18 +94,18 @@ def fill_mean_extents(b, problem, mean):
 @kernel
 def fill_ratios(b, problem, inputs, constants, work):
     """Write how large and how correlated the errors of the input of one window are."""
-    kind, length = problem.kind[b], problem.lengths[b]
-    weight = inputs.weight[kind]
+    length = problem.lengths[b]
+    weight = inputs.weight
     interval = problem.times[b, length - 1] / max(length - 1, 1)
     for j in range(POSE + SIZE):
         typical = constants.typical_correlation
-        correlation = typical + weight * (inputs.correlation[kind, j] - typical)
+        correlation = typical + weight * (inputs.correlation[j] - typical)
         work.widening[j] = sqrt((1 + correlation) / (1 - correlation))
         later = correlation ** (constants.correlation_interval / interval)
         slow = (later - constants.white_correlation) / constants.correlation_span
         work.slow[j] = clamp(slow, LEAST_PART, 1.0)
     for j in range(POSE):
-        deviation = inputs.deviation[kind, j]
+        deviation = inputs.deviation[j]
         lowered = deviation * min((deviation / constants.low_noise_ratio) ** 2, 1.0)
         lowered = clamp(lowered, LEAST_RATIO, MOST_RATIO)
         work.ratio[j] = sqrt(1 + weight * (lowered**2 - 1))
@@ -131,40 +131,40 @@ def population_factor(k, mean, part, median, slopes, radius):
 
 
 @kernel
-def fill_expectation(b, problem, inputs, constants, work, expected):
+def fill_expectation(b, problem, inputs, constants, work, common):
     """Write means and deviations of window `b`, given what `work` has of its input (M15)."""
-    kind, of_class = problem.kind[b], problem.of_class
+    of_class = problem.of_class[b]
     has_pin = problem.pinned[b].any()
-    usual, usual_extent = of_class.pose[b], of_class.extent[b]
-    shared, deviation, mean = expected.shared, expected.deviation, work.mean
+    usual, usual_extent = of_class.pose, of_class.extent
+    shared, deviation, mean = common.shared, common.deviation, work.mean
     shared[:] = 0.0
     for j in range(POSE):
         share = constants.yaw_bias if j == HEADING else 1.0
         bias = usual[j] * share * work.slow[j] * work.constant[j]
-        expected.pose_deviation[j] = usual[j] * work.ratio[j]
-        expected.widened_deviation[j] = usual[j] * work.ratio[j] * work.widening[j]
-        expected.unmodelled_bias[j] = bias if has_pin else 0.0
+        common.pose_deviation[j] = usual[j] * work.ratio[j]
+        common.widened_deviation[j] = usual[j] * work.ratio[j] * work.widening[j]
+        common.unmodelled_bias[j] = bias if has_pin else 0.0
         deviation[BIAS + j] = PINNED_DEVIATION if has_pin else bias
     for k in range(SIZE):
         part = usual_extent * work.slow[POSE + k] * min(2 * work.constant[k], 1.0)
         factor = population_factor(
-            k, mean, part, inputs.median[kind], inputs.slopes[kind], constants.population_radius
+            k, mean, part, inputs.median, inputs.slopes, constants.population_radius
         )
         shared[EXTENT + k] = mean[k] if has_pin else mean[k] * factor
         deviation[EXTENT + k] = PINNED_DEVIATION if has_pin else mean[k] * factor * part
     for face in range(6):
-        shared[GAP + face] = of_class.gaps[b, face] + inputs.gap_correction[kind, face]
-        deviation[GAP + face] = usual_spread(b, of_class, work)
-    shared[PIVOT] = mean[0] * of_class.pivot[b]
+        shared[GAP + face] = of_class.gaps[face] + inputs.gap_correction[face]
+        deviation[GAP + face] = usual_spread(of_class, work)
+    shared[PIVOT] = mean[0] * of_class.pivot
     deviation[PIVOT] = mean[0] * constants.pivot_deviation
     deviation[ANCHOR:SIDESLIP] = 1.0
-    deviation[SIDESLIP] = of_class.sideslip[b]
+    deviation[SIDESLIP] = of_class.sideslip
 
 
 @kernel
-def usual_spread(b, of_class, work):
+def usual_spread(of_class, work):
     """Return the spread of margins by the settings, twice as large for low-noise input [m]."""
-    return of_class.gap_spread[b] * max(2 - 2 * work.constant[0], 1.0)
+    return of_class.gap_spread * max(2 - 2 * work.constant[0], 1.0)
 
 
 @kernel
@@ -193,54 +193,52 @@ def margin_variance(variance, tracks, errors, usual):
 
 
 @kernel
-def fill_margin_error(b, problem, inputs, constants, work, expected):
+def fill_margin_error(b, problem, inputs, constants, work, common):
     """Write the deviations of the labelling margins of window `b` (M28), (6,)."""
-    kind, mean, of_class = problem.kind[b], work.mean, problem.of_class
-    usual = usual_spread(b, of_class, work)
-    distance = population_distance(mean, inputs.median[kind], constants.population_radius)
+    mean, of_class = work.mean, problem.of_class[b]
+    usual = usual_spread(of_class, work)
+    distance = population_distance(mean, inputs.median, constants.population_radius)
     similarity = 1 / (1 + distance)
     for face, twin in ((0, 1), (2, 3), (4, 4), (5, 5)):  # two faces of one kind share their tracks
         k = face // 2
-        bias = of_class.pose[b, k] * work.slow[k] * work.constant[k]
-        part = of_class.extent[b] * work.slow[POSE + k] * min(2 * work.constant[k], 1.0)
-        noise = inputs.gap_noise[kind, face] * expected.widened_deviation[k] ** 2
+        bias = of_class.pose[k] * work.slow[k] * work.constant[k]
+        part = of_class.extent * work.slow[POSE + k] * min(2 * work.constant[k], 1.0)
+        noise = inputs.gap_noise[face] * common.widened_deviation[k] ** 2
         errors = bias**2 + (mean[k] * part / 2) ** 2 + noise
-        square = margin_variance(
-            inputs.gap_variance[kind, face], inputs.gap_tracks[kind, face], errors, usual
-        )
+        square = margin_variance(inputs.gap_variance[face], inputs.gap_tracks[face], errors, usual)
         spread = sqrt(usual**2 + similarity * (square - usual**2))
-        expected.error[GAP + face] = spread
-        expected.error[GAP + twin] = spread
+        common.error[GAP + face] = spread
+        common.error[GAP + twin] = spread
 
 
 @kernel
-def fill_input_error(b, problem, inputs, constants, work, expected):
+def fill_input_error(b, problem, inputs, constants, work, common):
     """Write the deviations of the errors of mean extents and bias of window `b` (M28), (9,)."""
-    kind, of_class = problem.kind[b], problem.of_class
-    weight = inputs.weight[kind]
+    kind, of_class = problem.kind[b], problem.of_class[b]
+    weight = inputs.weight
     slow = max(work.slow[:ROLL].max(), work.slow[HEADING:].max())  # detectors set roll and pitch
-    deviation, error, mean = expected.deviation, expected.error, work.mean
+    deviation, error, mean = common.deviation, common.error, work.mean
     count = problem.lengths[b] + problem.marginalised_extents[b, 3]
     for k in range(SIZE):
         j = POSE + k
-        noise = sqrt(1 + weight * (inputs.deviation[kind, j] ** 2 - 1))
+        noise = sqrt(1 + weight * (inputs.deviation[j] ** 2 - 1))
         of_mean = min(work.widening[j] / sqrt(count), 1.0)
         constant = slow * noise
         if kind != VEHICLE:
             constant = max(min(noise / constants.low_noise_ratio, 1.0), noise)
         constant *= CONSTANT_EXTENT_ERRORS[kind][k]
-        error[EXTENT + k] = mean[k] * of_class.extent[b] * hypot(noise * of_mean, constant)
+        error[EXTENT + k] = mean[k] * of_class.extent * hypot(noise * of_mean, constant)
     for j in range(POSE):
-        noise = sqrt(1 + weight * (inputs.deviation[kind, j] ** 2 - 1))
+        noise = sqrt(1 + weight * (inputs.deviation[j] ** 2 - 1))
         share = constants.yaw_bias if j == HEADING else 1.0
-        error[BIAS + j] = of_class.pose[b, j] * noise * slow * share
+        error[BIAS + j] = of_class.pose[j] * noise * slow * share
     has_pin = problem.pinned[b].any()
     for s in range(GAP):
         error[s] = deviation[s] if has_pin else max(error[s], deviation[s])
 
 
 @kernel
-def expect(b, problem, inputs, constants, work, expected):
+def expect(b, problem, inputs, constants, work, common):
     """
     Write means and deviations of window `b`.
 
@@ -250,12 +248,12 @@ def expect(b, problem, inputs, constants, work, expected):
         The window.
     problem : Problem
         Input of the batch.
-    inputs : Inputs
-        Noise, margins and population of the input, by kind.
-    constants : Constants
+    inputs : record `INPUTS`
+        Noise, margins and population of the input, of its kind.
+    constants : record of `Constants`
     work : ExpectationWork
         Arrays to work in.
-    expected : Expected
+    common : record `COMMON`
         Of the window: written.
 
     Notes
@@ -269,13 +267,13 @@ def expect(b, problem, inputs, constants, work, expected):
     """
     fill_mean_extents(b, problem, work.mean)
     fill_ratios(b, problem, inputs, constants, work)
-    fill_expectation(b, problem, inputs, constants, work, expected)
-    fill_input_error(b, problem, inputs, constants, work, expected)
-    fill_margin_error(b, problem, inputs, constants, work, expected)
+    fill_expectation(b, problem, inputs, constants, work, common)
+    fill_input_error(b, problem, inputs, constants, work, common)
+    fill_margin_error(b, problem, inputs, constants, work, common)
 
 
 @kernel
-def fill_evidence(expected, shared, corner, min_gain, evidence):
+def fill_evidence(common, shared, corner, min_gain, evidence):
     """
     Write the evidence of the points alone about the extents (M17), see `Solution.evidence`.
 
@@ -284,7 +282,7 @@ def fill_evidence(expected, shared, corner, min_gain, evidence):
 
     """
     for k in range(SIZE):
-        deviation, mean = expected.deviation[EXTENT + k], expected.shared[EXTENT + k]
+        deviation, mean = common.deviation[EXTENT + k], common.shared[EXTENT + k]
         gain = 1 - corner[EXTENT + k, EXTENT + k] / deviation**2
         power = (deviation / mean) ** 2
         by_points = log(shared[EXTENT + k] / mean) / gain + log(mean)

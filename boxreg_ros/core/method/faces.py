@@ -305,20 +305,19 @@ def empty_face_work(begin, end, problem, constants):
 
 
 @kernel
-def clear_padding(length, b, faces):
-    """Set the face observations of the padding of window `b` to zero."""
-    faces.moments[b, length:] = 0.0
-    faces.distance[b, length:] = 0.0
-    faces.weight[b, length:] = 0.0
-    faces.inset[b, length:] = 0.0
-    faces.inset_shares[b, length:] = 0.0
-    faces.num_points[b, length:] = 0.0
+def clear_padding(length, terms):
+    """Set the face observations of padding to zero."""
+    for n in range(length, len(terms)):
+        terms[n].W_faces[:] = 0.0
+        terms[n].distance[:] = 0.0
+        terms[n].visibility[:] = 0.0
+        terms[n].inset[:] = 0.0
+        terms[n].inset_shares[:] = 0.0
+        terms[n].num_points = 0.0
 
 
 @kernel
-def observe_window(
-    b, problem, poses, shared, occlusion_inset, range_inset, constants, work, faces
-):
+def observe_window(b, problem, poses, shared, inputs, constants, work, terms):
     """
     Write the face observations of window `b`.
 
@@ -330,13 +329,13 @@ def observe_window(
         Input of the batch.
     poses, shared : array, shapes (N, 6) and (23,)
         Boxes of the window in this round.
-    occlusion_inset, range_inset : array, shape (6,)
-        As in `Inputs`, of its kind [m].
-    constants : Constants
+    inputs : record `INPUTS`
+        With the insets of its kind.
+    constants : record of `Constants`
     work : FaceWork
         Arrays to work in.
-    faces : Faces
-        Of the batch: written for the window, zero for padding.
+    terms : array of `TERMS`, shape (N,)
+        Of the window: its face observations are written, zero for padding.
 
     Notes
     -----
@@ -355,19 +354,20 @@ def observe_window(
     tangent = np.empty(6)
     velocity = np.zeros(3)
     length = problem.lengths[b]
-    clear_padding(length, b, faces)
+    clear_padding(length, terms)
     for k in range(3):
         half[k] = shared[EXTENT + k] / 2
     for n in range(length):
         m = problem.counts[b, n]
         box, pose, origins = problem.boxes[b, n], poses[n], problem.origins[b, n]
         ground = problem.ground[b, n]
-        distance, weight, inset = faces.distance[b, n], faces.weight[b, n], faces.inset[b, n]
+        term = terms[n]
+        distance, weight, inset = term.distance, term.visibility, term.inset
         points = returns_of(problem, problem.points, b, n)
         fill_visibility(box, origins, points, R, toward, tangent)
         fill_insets(
-            origins, tangent, occlusion_inset, range_inset, constants,
-            faces.inset_shares[b, n], inset, weight,
+            origins, tangent, inputs.occlusion_inset, inputs.range_inset, constants,
+            term.inset_shares, inset, weight,
         )  # fmt: skip
         for k in range(3):
             shift[k] = pose[k] - box[k]
@@ -381,27 +381,24 @@ def observe_window(
         near = fill_depths(m, half, level, constants, work)
         share = constants.outermost / constants.strips
         wanted = ceil(max(constants.min_face_points, share * near))
-        outermost_points(m, wanted, constants, work, faces.moments[b, n])
+        outermost_points(m, wanted, constants, work, term.W_faces)
         for face in range(FACES):
             distance[face] = -work.mean_depth[face]
             if work.number[face] < constants.min_face_points:
                 weight[face] = 0.0
         gap = shared[GAP + BOTTOM]
-        add_road(shift, ground, half[2], gap, faces.moments[b, n, BOTTOM], distance)
+        add_road(shift, ground, half[2], gap, term.W_faces[BOTTOM], distance)
         weight[BOTTOM] = 1.0 if isfinite(ground) else 0.0
-        faces.num_points[b, n] = near
+        terms[n].num_points = near
 
 
 @kernel
-def observe_faces(begin, end, problem, poses, shared, inputs, constants, faces):
-    """Write the face observations of the windows `begin` to `end`, see `observe_window`."""
-    work = empty_face_work(begin, end, problem, constants)
-    for b in range(begin, end):
+def observe_faces(first, last, problem, poses, shared, inputs, constants, terms):
+    """Write the face observations of windows `first` to `last` (B, N), see `observe_window`."""
+    work = empty_face_work(first, last, problem, constants)
+    for b in range(first, last):
         kind = problem.kind[b]
-        observe_window(
-            b, problem, poses[b], shared[b], inputs.occlusion_inset[kind],
-            inputs.range_inset[kind], constants, work, faces,
-        )  # fmt: skip
+        observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, work, terms[b])
 
 
 @kernel

@@ -104,10 +104,10 @@ def fill_plane(n, face, poses, shared, terms, at, v, by_angles):
     by half of the extent.
 
     """
-    R, dR, given = at.R[n], at.dR[n], terms.given[n]
+    R, dR, given = at.R[n], at.dR[n], terms[n].given
     axis = face // 2
     sign = 1.0 - 2.0 * (face % 2)
-    v[3] = terms.inset[n, face] + shared[GAP + face] - shared[EXTENT + axis] / 2
+    v[3] = terms[n].inset[face] + shared[GAP + face] - shared[EXTENT + axis] / 2
     for k in range(3):
         by_angles[3, k] = 0.0
     for j in range(3):
@@ -120,22 +120,21 @@ def fill_plane(n, face, poses, shared, terms, at, v, by_angles):
 
 
 @kernel
-def fill_step(n, poses, origin, terms, out):
-    """Write diag(axes', I)(p_n - origin_n), the step of a pose in the axes of its box."""
-    axes = terms.axes[n]
+def fill_step(pose, origin, axes, out):
+    """Write diag(axes', I)(p - origin), the step of a pose in the axes of its box."""
     for k in range(3):
         out.r[k] = 0.0
         for j in range(3):
-            out.r[k] += axes[j, k] * (poses[n, j] - origin[n, j])
+            out.r[k] += axes[j, k] * (pose[j] - origin[j])
             out.J[k, j] = axes[j, k]
-        out.r[3 + k] = poses[n, 3 + k] - origin[n, 3 + k]
+        out.r[3 + k] = pose[3 + k] - origin[3 + k]
         out.J[3 + k, 3 + k] = 1.0
 
 
 @kernel
 def input_pose(n, poses, shared, terms, at, out):
     """Write the step of a pose from its input, less the bias (M3)."""
-    fill_step(n, poses, terms.given, terms, out)
+    fill_step(poses[n], terms[n].given, terms[n].axes, out)
     for k in range(POSE):
         out.r[k] -= shared[BIAS + k]
         out.S[k, k] = -1.0
@@ -146,13 +145,12 @@ def input_pose(n, poses, shared, terms, at, out):
 @kernel
 def rigid_shape(n, poses, shared, terms, at, out):
     """Write root'(step - anchor - wanted step), the rigid shape of the track (M4)."""
-    fill_step(n, poses, terms.start, terms, out)
-    root = terms.root[n]
+    fill_step(poses[n], terms[n].start, terms[n].axes, out)
+    root, wanted, axes = terms[n].root, terms[n].wanted, terms[n].axes
     step = out.R.ravel()
     for k in range(POSE):
-        step[k] = out.r[k] - shared[ANCHOR + k] - terms.wanted[n, k]
+        step[k] = out.r[k] - shared[ANCHOR + k] - wanted[k]
         out.columns[k] = ANCHOR + k
-    axes = terms.axes[n]
     for k in range(POSE):
         out.r[k] = 0.0
         for m in range(POSE):
@@ -169,9 +167,9 @@ def rigid_shape(n, poses, shared, terms, at, out):
 @kernel
 def acceleration(n, poses, shared, terms, at, out):
     """Write the second difference of three poses over time, in the axes of the second (M5)."""
-    times, axes = terms.times, terms.axes[n + 1]
-    first = times[n + 1] - times[n]
-    second = times[n + 2] - times[n + 1]
+    axes = terms[n + 1].axes
+    first = terms[n + 1].time - terms[n].time
+    second = terms[n + 2].time - terms[n + 1].time
     mean = (first + second) / 2
     share = (1 / (first * mean), -(1 / first + 1 / second) / mean, 1 / (second * mean))
     change = out.R.ravel()
@@ -212,7 +210,7 @@ def slip(n, poses, shared, terms, at, out):
         (before[3] + after[3]) / 2, (before[4] + after[4]) / 2, (before[5] + after[5]) / 2,
         out.R, out.dR,
     )  # fmt: skip
-    rate = 1 / (terms.times[n + 1] - terms.times[n])
+    rate = 1 / (terms[n + 1].time - terms[n].time)
     out.columns[0] = PIVOT
     out.columns[1] = SIDESLIP
     for side in range(2):

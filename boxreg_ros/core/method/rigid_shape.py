@@ -175,7 +175,7 @@ def fill_root(information, root):
 
 
 @kernel
-def agree(b, problem, poses, extents, constants, work, root, wanted):
+def agree(b, problem, poses, extents, constants, work, terms):
     """
     Compare each observation of window `b` with the common shape of its track.
 
@@ -187,25 +187,24 @@ def agree(b, problem, poses, extents, constants, work, root, wanted):
         Input of the batch, of `constants.shape_points` points a box.
     poses, extents : array, shapes (N, 6) and (3,)
         Boxes of the window in this round [m, rad].
-    constants : Constants
+    constants : record of `Constants`
     work : ShapeWork
         Arrays to work in.
-    root : array, shape (N, 6, 6)
-        Written: root L of the information L L' about a step in x y z and the three rotations, in
-        box axes.
-    wanted : array, shape (N, 6)
-        Written: the step of each pose after which it agrees best with the shape [m, rad].
+    terms : array of `TERMS`, shape (N,)
+        Of the window. Written: the step of each pose after which it agrees best with the shape,
+        and the root L of the information L L' about it, in box axes [m, rad].
 
     """
     half = extents / 2
     information = np.empty((6, 6))
     fill_sums(b, problem, poses, half, constants, work)
-    fill_planes(work.sums, problem.of_class.shape[b], constants, work.planes, work.thickness)
+    fill_planes(work.sums, problem.of_class[b].roughness, constants, work.planes, work.thickness)
     for n in range(len(poses)):
         fill_agreement(
-            problem.counts[b, n], work.local[n], half, constants, work, information, wanted[n]
-        )
-        fill_root(information, root[n])
+            problem.counts[b, n], work.local[n], half, constants, work, information,
+            terms[n].wanted,
+        )  # fmt: skip
+        fill_root(information, terms[n].root)
 
 
 @kernel

@@ -13,17 +13,13 @@ from typing import Any, NamedTuple
 from boxreg_ros.core.method.arrays import (
     ANCHOR,
     Arrowhead,
-    Expected,
-    expected_of_window,
-    Faces,
+    COMMON,
     matrix_of_window,
-    PIVOT,
     POSE,
     SHARED,
     SIDESLIP,
     SPAN,
-    Terms,
-    terms_of_window,
+    TERMS,
 )
 from boxreg_ros.core.method.arrowhead import invert_corner, invert_poses, solve
 from boxreg_ros.core.method.assemble import (
@@ -38,30 +34,40 @@ from boxreg_ros.core.method.compile import kernel
 from boxreg_ros.core.method.covariance import empty_covariance_work, fill_posterior, Inverse
 from boxreg_ros.core.method.expectation import empty_expectation_work, expect, fill_evidence
 from boxreg_ros.core.method.faces import empty_face_work, observe_window
-from boxreg_ros.core.method.residuals import empty_linearised, RESIDUALS
+from boxreg_ros.core.method.residuals import empty_linearised
 from boxreg_ros.core.method.rigid_shape import agree, empty_shape_work
 import numpy as np
 
 
-class Linearisation(NamedTuple):
+class Sums(NamedTuple):
     """
-    The sum of the residuals of a batch in one round.
+    The sums of the residuals of B windows in one round.
 
     Attributes
     ----------
-    faces : Faces
-    expected : Expected
-    terms : Terms
+    terms, common : array of `TERMS` and `COMMON`, shapes (B, N) and (B,)
+        Data and weights.
     factor : Arrowhead
         Cholesky factor of the Gauss-Newton curvature at the start of the round; NaN where it is
         not positive definite.
 
     """
 
-    faces: Any
-    expected: Any
     terms: Any
+    common: Any
     factor: Any
+
+
+def empty_sums(B: int, N: int, prior_mean: Any, prior_information: Any) -> Sums:
+    """Return room for B windows of N observations with a prior (B, 35) and (B, 35, 35)."""
+    common = np.zeros(B, COMMON)
+    common['prior_mean'] = prior_mean
+    common['W_prior'] = prior_information
+    factor = Arrowhead(
+        np.zeros((B, N + 2, POSE, SPAN)), np.zeros((B, N + 2, POSE, SHARED)),
+        np.zeros((B, SHARED, SHARED)),
+    )  # fmt: skip
+    return Sums(np.zeros((B, N), TERMS), common, factor)
 
 
 @kernel
@@ -78,14 +84,14 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
         Windows of the batch that take part.
     problem, thinned : Problem
         Input of the batch, and the same with the points of the rigid shape.
-    inputs : Inputs
+    inputs : array of `INPUTS`, shape (K,)
         Noise, margins and population of the input, by kind.
     free : array, shape (B, 6 N + 23)
         1 for variables that are estimated, 0 for those held fixed.
-    constants : Constants
+    constants : record of `Constants`
     poses, shared : array, shapes (B, N, 6) and (B, 23)
         Start of the round.
-    sums : Linearisation
+    sums : Sums
         Of the batch: written.
     x, value, gradient : array, shapes (b, 6 N + 23), (b,) and (b, 6 N + 23)
         Written: variables of the windows, and the sum of the residuals there.
@@ -101,25 +107,18 @@ def begin(first, last, rows, problem, thinned, inputs, free, constants, poses, s
         b = rows[row]
         kind = problem.kind[b]
         shared[b, ANCHOR:SIDESLIP] = 0.0
-        expected = expected_of_window(b, sums.expected)
-        terms = terms_of_window(b, sums.terms)
-        expect(b, problem, inputs, constants, of_expectation, expected)
-        observe_window(
-            b, problem, poses[b], shared[b], inputs.occlusion_inset[kind],
-            inputs.range_inset[kind], constants, of_faces, sums.faces,
-        )  # fmt: skip
+        terms, common = sums.terms[b], sums.common[b]
+        expect(b, problem, inputs[kind], constants, of_expectation, common)
+        observe_window(b, problem, poses[b], shared[b], inputs[kind], constants, of_faces, terms)
         if constants.uses_shape:
-            agree(
-                b, thinned, poses[b], shared[b, :3], constants, of_shape, terms.root, terms.wanted
-            )
-        weigh(
-            b, problem, poses[b], shared[b], sums.faces, expected, constants, at, out, terms
-        )
+            agree(b, thinned, poses[b], shared[b, :3], constants, of_shape, terms)
+        weigh(b, problem, poses[b], shared[b], constants, at, out, terms, common)
         x[row, :n] = poses[b].ravel()
         x[row, n:] = shared[b]
         value[row] = linearise(
-            x[row], terms, free[b], at, out, gradient[row], matrix_of_window(b, sums.factor)
-        )
+            x[row], terms, common, free[b], at, out, gradient[row],
+            matrix_of_window(b, sums.factor),
+        )  # fmt: skip
 
 
 @kernel
@@ -134,8 +133,8 @@ def evaluate(first, last, rows, x, free, sums, value, gradient):
     N = (D - SHARED) // POSE
     at, out = empty_axes(N), empty_linearised()
     for row in range(first, last):
-        terms = terms_of_window(rows[row], sums.terms)
-        value[row] = accumulate(x[row], N, terms, at, out, gradient[row], no_matrix())
+        terms, common = sums.terms[rows[row]], sums.common[rows[row]]
+        value[row] = accumulate(x[row], N, terms, common, at, out, gradient[row], no_matrix())
         for k in range(D):
             gradient[row, k] *= free[rows[row], k]
 
@@ -191,59 +190,29 @@ def end(first, last, rows, x, problem, free, constants, sums, solution, is_last,
     )
     for row in range(first, last):
         b = rows[row]
-        expected = expected_of_window(b, sums.expected)
-        terms = terms_of_window(b, sums.terms)
+        terms, common = sums.terms[b], sums.common[b]
         A = matrix_of_window(b, sums.factor)
         found = x[row, :n].copy().reshape(N, POSE)
-        errors = problem.of_class.pose[b]
+        errors = problem.of_class[b].pose
         is_settled = has_settled(found, solution.poses[b], errors, constants.settled_step)
         is_done[row] = is_last or (may_settle and is_settled)
         solution.poses[b] = found
         solution.shared[b] = x[row, n:]
         invert_corner(A.corner, inverse.corner)
         fill_evidence(
-            expected, solution.shared[b], inverse.corner, constants.min_extent_gain,
+            common, solution.shared[b], inverse.corner, constants.min_extent_gain,
             solution.evidence[b],
         )  # fmt: skip
         if not is_done[row]:
             continue
         invert_poses(A, inverse.corner, inverse.poses, inverse.border)
         fill_posterior(
-            b, problem, found, solution.shared[b], sums.faces, expected, free[b],
-            terms.W_shared, inverse, constants, work, solution.posterior,
+            b, problem, found, solution.shared[b], terms, common, free[b], inverse, constants,
+            work, solution.posterior,
         )  # fmt: skip
         if len(solution.prior_state) and problem.lengths[b] == N:
-            accumulate(x[row], 1, terms, at, out, gradient, A)
+            accumulate(x[row], 1, terms, common, at, out, gradient, A)
             marginalise(
                 x[row], gradient, A, solution.prior_state[b], solution.prior_step[b],
                 solution.prior_information[b],
             )  # fmt: skip
-
-
-def empty_sums(
-    B: int, N: int, prior_mean: Any, prior_information: Any, uses_shape: bool
-) -> Linearisation:
-    """Return room for B windows of N observations with a prior (B, 35) and (B, 35, 35)."""
-    rows = N if uses_shape else 0
-    moments = np.zeros((B, N, 6, 4, 4))  # of the faces; then times their weights
-    return Linearisation(
-        Faces(
-            moments, np.empty((B, N, 6)), np.empty((B, N, 6)), np.empty((B, N, 6)),
-            np.empty((B, N, 2, 6)), np.empty((B, N)),
-        ),
-        Expected(
-            np.empty((B, SHARED)), np.empty((B, SHARED)), np.empty((B, POSE)),
-            np.empty((B, POSE)), np.empty((B, POSE)), np.empty((B, PIVOT)),
-        ),
-        Terms(
-            np.empty((B, N, POSE)), np.empty((B, N, POSE)), np.empty((B, N, 3, 3)),
-            np.empty((B, N)), np.empty((B, N, 6)), moments,
-            np.empty((B, rows, POSE)), np.empty((B, rows, POSE, POSE)),
-            np.zeros((B, len(RESIDUALS), N, POSE)), prior_mean, prior_information,
-            np.empty((B, SHARED)), np.empty((B, SHARED)),
-        ),
-        Arrowhead(
-            np.zeros((B, N + 2, POSE, SPAN)), np.zeros((B, N + 2, POSE, SHARED)),
-            np.zeros((B, SHARED, SHARED)),
-        ),
-    )  # fmt: skip

@@ -2,7 +2,7 @@
 The weights of all residuals of one window at the start of a round, (M20) to (M25).
 
 The weight of a residual of `residuals.RESIDUALS` is a function of an observation n, its residual r
-and a `Weighing`, and writes the diagonal of W (6,).
+a `Weighing` and the constants, and writes the diagonal of W (6,).
 
 """
 
@@ -24,7 +24,7 @@ class Weighing(NamedTuple):
     length : int
         Observations, without padding.
     deviation, widened : array, shape (6,)
-        Of the input poses, as in `Expected`.
+        Of the input poses, `pose_deviation` and `widened_deviation` of `COMMON`.
     pinned : array, shape (N,)
         Whether a person has corrected a box.
     pin_factor : array, shape (6,)
@@ -35,7 +35,6 @@ class Weighing(NamedTuple):
         Deviations of the settings.
     drift : float
         The same.
-    constants : Constants
 
     """
 
@@ -48,51 +47,50 @@ class Weighing(NamedTuple):
     acceleration: Any
     slip: Any
     drift: float
-    constants: Any
 
 
 @kernel
-def input_weight(n, r, window, w):
+def input_weight(n, r, window, constants, w):
     """Write Cauchy's weight of an input pose (M21); a pinned one has a deviation of its own."""
     for k in range(POSE):
-        off = r[k] / window.deviation[k] / window.constants.outlier
+        off = r[k] / window.deviation[k] / constants.outlier
         w[k] = window.pin_factor[k] / window.widened[k] ** 2 / (1 + off**2)
         if window.pinned[n]:
-            w[k] = 1 / window.constants.pin_deviations[k] ** 2
+            w[k] = 1 / constants.pin_deviations[k] ** 2
 
 
 @kernel
-def rigid_shape_weight(n, r, window, w):
+def rigid_shape_weight(n, r, window, constants, w):
     """Write ones: the residual is whitened by the root of its information (M4)."""
     w[:] = 1.0
 
 
 @kernel
-def acceleration_weight(n, r, window, w):
+def acceleration_weight(n, r, window, constants, w):
     """Write the weight of an acceleration along the axes of the body (M23)."""
     for k in range(POSE):
         w[k] = 1 / window.acceleration[k] ** 2
 
 
 @kernel
-def zero_motion_weight(n, r, window, w):
+def zero_motion_weight(n, r, window, constants, w):
     """Write the weight of the step of a parked object; zero where it drives (M25)."""
     for k in range(POSE):
-        deviation = window.drift * window.constants.drift_ratios[k]
+        deviation = window.drift * constants.drift_ratios[k]
         w[k] = 1 / deviation**2 if window.parked[n] else 0.0
 
 
 @kernel
-def slip_weight(n, r, window, w):
+def slip_weight(n, r, window, constants, w):
     """Write the weight of the velocity of the pivot across the path and upward (M7)."""
     for k in range(2):
         w[k] = 1 / window.slip[k] ** 2
 
 
 @kernel
-def robustify(length, squared, outlier, W):
+def robustify(i, length, squared, outlier, terms):
     """
-    Down-weight a motion residual (N, 6) far off at the start of the round (M24).
+    Down-weight residual `i` where it is far off at the start of the round (M24).
 
     By the `squared` Mahalanobis norms (N,) of it: as the square of Cauchy's weight, and no more
     than the two observations before, since the newest boxes are nearly as noisy as their input.
@@ -103,7 +101,7 @@ def robustify(length, squared, outlier, W):
         if n >= 2:
             least = min(squared[n], squared[n - 1], squared[n - 2])
         for k in range(POSE):
-            W[n, k] /= (1 + least / outlier**2) ** 2
+            terms[n].W[i, k] /= (1 + least / outlier**2) ** 2
 
 
 @kernel
@@ -164,22 +162,12 @@ def fill_parked(boxes, times, length, yaw_deviation, constants, parked):
 
 
 @kernel
-def weighing_of(b, problem, expected, constants):
-    """Return what the weights of window `b` follow from."""
-    length = problem.lengths[b]
-    boxes, times, of_class = problem.boxes[b], problem.times[b], problem.of_class
-    parked = np.empty(len(boxes), np.bool_)
-    yaw_deviation = max(expected.pose_deviation[5], of_class.pose[b, 5])
-    fill_parked(boxes, times, length, yaw_deviation, constants, parked)
-    pin_factor = np.ones(POSE)
-    for k in range(POSE):  # unmodelled is the bias of windows with pinned boxes only
-        variance = expected.widened_deviation[k] ** 2
-        unmodelled = sqrt(float(length)) * expected.unmodelled_bias[k] ** 2
-        pin_factor[k] = variance / (variance + unmodelled)
-    return Weighing(
-        length, expected.pose_deviation, expected.widened_deviation, problem.pinned[b], pin_factor,
-        parked, of_class.acceleration[b], of_class.slip[b], of_class.drift[b], constants,
-    )  # fmt: skip
+def fill_pin_factor(length, common, factor):
+    """Write the factor on the weights of the boxes beside pinned ones (M21a), (6,)."""
+    for k in range(POSE):
+        variance = common.widened_deviation[k] ** 2
+        unmodelled = sqrt(float(length)) * common.unmodelled_bias[k] ** 2  # 0 without pinned ones
+        factor[k] = variance / (variance + unmodelled)
 
 
 @kernel
@@ -190,7 +178,7 @@ def face_deviation(face, shape, constants):
 
 
 @kernel
-def weigh_faces(length, shape, distance, weight, constants, face_weight, moments):
+def weigh_faces(length, shape, constants, terms, face_weight):
     """
     Write the weights of the faces (M20), (N, 6) [1/m^2], and multiply their moments by them.
 
@@ -198,18 +186,19 @@ def weigh_faces(length, shape, distance, weight, constants, face_weight, moments
 
     """
     for n in range(length):
+        moments, distance, visibility = terms[n].W_faces, terms[n].distance, terms[n].visibility
         for face in range(6):
             deviation = face_deviation(face, shape, constants)
-            robust = 1 / (1 + (distance[n, face] / constants.face_outlier) ** 2) ** 2
-            w = weight[n, face] * robust / deviation**2
+            robust = 1 / (1 + (distance[face] / constants.face_outlier) ** 2) ** 2
+            w = visibility[face] * robust / deviation**2
             face_weight[n, face] = w
             for i in range(4):
                 for j in range(4):
-                    moments[n, face, i, j] *= w
+                    moments[face, i, j] *= w
 
 
 @kernel
-def weigh_shared(length, shared, expected, distance, face_weight, constants, W):
+def weigh_shared(length, shared, terms, common, face_weight, constants):
     """
     Write the weights of the shared variables (M22), (23,).
 
@@ -217,7 +206,7 @@ def weigh_shared(length, shared, expected, distance, face_weight, constants, W):
     is widened: points of a load, or of a branch above, must not raise the estimated roof.
 
     """
-    deviation = expected.deviation
+    deviation, W = common.deviation, common.W_shared
     for s in range(SHARED):
         W[s] = 1 / deviation[s] ** 2
     for face in range(6):
@@ -225,12 +214,12 @@ def weigh_shared(length, shared, expected, distance, face_weight, constants, W):
         total, pull = 0.0, 0.0
         for n in range(length):
             total += face_weight[n, face]
-            pull += distance[n, face] * face_weight[n, face]
+            pull += terms[n].distance[face] * face_weight[n, face]
         # Points and the face of the input are apart by margin, bias and half the extent's error.
         half_extent = deviation[EXTENT + axis] / 2
         spread = deviation[GAP + face]
         variance = spread**2 + deviation[BIAS + axis] ** 2 + half_extent**2
         of_points = (pull / max(total, 1e-9)) ** 2 / variance
-        of_gap = (shared[GAP + face] - expected.shared[GAP + face]) ** 2 / spread**2
+        of_gap = (shared[GAP + face] - common.shared[GAP + face]) ** 2 / spread**2
         off = max(of_points, of_gap)
         W[GAP + face] = 1 / (spread**2 * (1 + off / constants.gap_outlier**2))
