@@ -8,7 +8,7 @@ import re
 
 from boxreg_ros.config import settings
 from boxreg_ros.offline import formats
-from boxreg_ros.reasons import REASONS
+from boxreg_ros.reasons import Reason
 from msg_adapters import registry
 
 DOCS = Path(__file__).resolve().parent
@@ -55,7 +55,7 @@ def messages() -> str:
 
 def counters() -> str:
     """Return one row for each reason why a box or a cloud is not used."""
-    rows = [(name, *reason) for name, reason in REASONS.items()]
+    rows = [(one.value, one.unit, one.meaning, one.remedy) for one in Reason]
     return table(('counter', 'counts', 'meaning', 'remedy'), rows)
 
 

@@ -15,7 +15,7 @@ import time
 from boxreg_ros import cli
 from boxreg_ros.config import Config
 from boxreg_ros.errors import unreadable
-from boxreg_ros.reasons import REASONS
+from boxreg_ros.reasons import Reason
 from paths import ROOT
 import pytest
 from ros_messages import Drive
@@ -236,7 +236,7 @@ def test_run_that_refines_no_box_fails_and_keeps_the_result(tmp_path, capsys):
     assert status == 1
     assert ': 10 boxes in, 0 refined, 10 kept (no_sweep 8, short_track 2)' in out
     (line,) = err.splitlines()
-    reason = REASONS['no_sweep']
+    reason = Reason.NO_SWEEP
     expected = (
         f'boxreg: none of 10 boxes was refined; most frequent reason: no_sweep (8 boxes): '
         f'{reason.meaning}; remedy: {reason.remedy}; time ranges: boxes '
@@ -258,7 +258,7 @@ def test_run_that_refines_less_than_half_says_why(tmp_path, capsys):
     )
     assert (status, out.count(' refined')) == (0, 1)
     (line,) = err.splitlines()
-    reason = REASONS['no_sweep']
+    reason = Reason.NO_SWEEP
     assert 'of 24 boxes were refined; most frequent reason: no_sweep (14 boxes): ' in line
     assert f'{reason.meaning}; remedy: {reason.remedy}; time ranges: boxes ' in line
 

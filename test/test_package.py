@@ -161,7 +161,7 @@ def prefix(request, tmp_path_factory):
     command += ['--symlink-install'] if request.param == 'symlink' else []
     done = subprocess.run(command, cwd=workspace, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-    for kernels in (workspace / 'install').rglob('core/kernels'):
+    for kernels in (workspace / 'install').rglob('core/method'):
         copy_compiled(kernels)
     return workspace / 'install' / 'boxreg_ros'
 

@@ -70,7 +70,8 @@ class InputModel:
         self.constants = constants
         self._estimates_margins = config.learn
         self._occlusion_insets = (config.inset_ends, config.inset_sides, 0.0, 0.0)
-        # Of each track of each kind: sums over its face observations, see `_add`; its last input residuals; its extent evidence.
+        # Of each track of each kind: sums over its face observations, see `_add`; its last input
+        # residuals; its extent evidence.
         unknown = np.full((constants.max_fits, 9), np.nan)
         self._faces = [TrackRows(np.zeros((3, 3, 6)), constants.max_tracks) for _ in KINDS]
         # What follows from the present sums, see `_margins_of`.
@@ -179,8 +180,9 @@ class InputModel:
         """
         inputs = np.zeros(len(KINDS), INPUTS)
         for k in range(len(KINDS)):
-            self._margins[k] = self._margins[k] or self._margins_of(k)
-            for name, column in zip(MARGIN_FIELDS, self._margins[k], strict=True):
+            margins = self._margins[k] or self._margins_of(k)
+            self._margins[k] = margins
+            for name, column in zip(MARGIN_FIELDS, margins, strict=True):
                 inputs[name][k] = column
         if with_noise and config.ingredients.noise_estimation:
             set_noise(inputs, *_of_all_kinds(self._residuals), self.constants)

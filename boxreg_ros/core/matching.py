@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ShapeError
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Sweep
 
 
@@ -50,9 +51,9 @@ class StampMatcher:
     def add_sweep(self, sweep: Sweep) -> list[Pair]:
         """Add a sweep; return the pairs completed by it."""
         if sweep.stamp_ns < self._oldest_ns:
-            self._counts['sweep_late'] += 1
+            self._counts[Reason.SWEEP_LATE] += 1
         elif any(sweep.stamp_ns == other.stamp_ns for other in self._sweeps):
-            self._counts['sweep_duplicate'] += 1
+            self._counts[Reason.SWEEP_DUPLICATE] += 1
         else:
             insort(self._sweeps, sweep, key=lambda item: item.stamp_ns)
         self._newest_ns = max(self._newest_ns, sweep.stamp_ns)
@@ -101,7 +102,7 @@ class StampMatcher:
         while self._sweeps and self._sweeps[0].stamp_ns < oldest_ns:
             stamp_ns = self._sweeps.pop(0).stamp_ns
             if stamp_ns not in self._used_ns:
-                self._counts['sweep_without_boxes'] += 1
+                self._counts[Reason.SWEEP_WITHOUT_BOXES] += 1
             self._used_ns.discard(stamp_ns)
 
 

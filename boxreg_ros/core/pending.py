@@ -18,6 +18,7 @@ from boxreg_ros.core.observation import Observation, Observations
 from boxreg_ros.core.support import MIN_HITS, points_to_confirm
 from boxreg_ros.core.tables import by_table, column, joined
 from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, PRIOR_POSES
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
     BoxArray,
     COASTED,
@@ -94,11 +95,11 @@ class PendingArray:
         is_valid = is_valid_box(self.input.boxes)
         for row, track_id in enumerate(self.input.track_ids):
             if not is_valid[row]:
-                self.reasons[row] = 'invalid_box'
+                self.reasons[row] = Reason.INVALID_BOX
             elif not track_id:
-                self.reasons[row] = 'no_track_id'
+                self.reasons[row] = Reason.NO_TRACK_ID
             elif track_id in known:
-                self.reasons[row] = 'duplicate_track_id'
+                self.reasons[row] = Reason.DUPLICATE_TRACK_ID
             else:
                 self.reasons[row] = reason
             if is_valid[row]:
@@ -117,7 +118,7 @@ class PendingArray:
         entries = []
         places = table.boxes[:, : LENGTH + 1].tolist()
         for observation, row, place in zip(seen, rows, places, strict=True):
-            self.reasons[row] = 'short_track'  # until there is an estimate
+            self.reasons[row] = Reason.SHORT_TRACK  # until there is an estimate
             entries.append(PendingBox(observation, InputPlace(stamp_ns, *place), self, row))
         return entries
 
@@ -165,7 +166,7 @@ class PendingArray:
         whole = RefinedBoxes(
             replace(self.input, boxes=columns.boxes),
             tuple(columns.status.tolist()),
-            tuple(columns.reasons.tolist()),
+            tuple(map(str, columns.reasons)),
             self.num_points.copy(),
             columns.covariances,
             is_final,
@@ -256,7 +257,7 @@ class ObservedTrack:
         """
         self.num_carried += 1
         before, newest = self.entries[-2:]
-        newest.array.reasons[newest.row] = 'budget'
+        newest.array.reasons[newest.row] = Reason.BUDGET
         if before.estimate is not None:  # else the track is cold: its first window is to come
             newest.estimate = newest.observation
         excess = max(0, len(self.entries) - length)

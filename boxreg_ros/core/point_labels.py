@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.kernels import load
-from boxreg_ros.core.observation import crop, own_points, own_points_numpy
+from boxreg_ros.core.observation import crop, own_points
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import Floats, Ints, LENGTH, ROLL, Sweep, X, YAW, Z
 import numpy as np
@@ -301,8 +300,7 @@ class PointLabeller:
         limits = self._limits[objects.track].reshape(-1, 3, 2)  # (object, axis, positive side)
         side = np.where(local > 0, limits[owner, :, 0], limits[owner, :, 1])
         excess = (np.abs(local) - half[owner] - side).max(axis=1)
-        find = own_points if load() is not None else own_points_numpy
-        road = np.nan_to_num(find(sweep, boxes, self._config).road)
+        road = np.nan_to_num(own_points(sweep, boxes, self._config).road)
         height = local[:, Z] + half[owner, Z]
         is_above = height > road[owner] + ROAD_CLEARANCE
         return row[is_above], owner[is_above], local[is_above], excess[is_above]

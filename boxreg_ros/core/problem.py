@@ -172,7 +172,7 @@ class Problem(NamedTuple):
     @property
     def length(self) -> int:
         """Observations per window, padding included: N."""
-        return self.boxes.shape[1]
+        return int(self.boxes.shape[1])
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -205,7 +205,7 @@ class Problem(NamedTuple):
 
         """
         lengths = np.array(list(map(len, columns)))
-        valid = np.arange(lengths.max()) < lengths[:, None]
+        valid: NDArray[np.bool_] = np.arange(lengths.max()) < lengths[:, None]
         column = np.repeat([[of_window[-1]] for of_window in columns], valid.shape[1], axis=1)
         column[valid] = list(chain.from_iterable(columns))
         rows = np.array(windows)

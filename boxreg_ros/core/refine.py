@@ -7,6 +7,7 @@ from typing import NamedTuple
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.errors import ConfigError, ShapeError
+from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import (
     BOX_AXES,
@@ -269,7 +270,7 @@ def _refined_track(track: Track, rows: list[tuple[RefinedBoxes, int]]) -> Refine
     reasons = [result.reasons[i] for result, i in rows]
     covariances = np.array([result.covariances[i] for result, i in rows]).reshape(-1, 6, 6)
     extents = np.array([result.extent_covariances[i] for result, i in rows]).reshape(-1, 3, 3)
-    is_valid = np.array([reason != 'invalid_box' for reason in reasons], dtype=bool)
+    is_valid = np.array([reason != Reason.INVALID_BOX for reason in reasons], dtype=bool)
     if rows and not is_valid.any():
         raise ShapeError(
             f'boxes of track {track.track_id!r}: expected one finite box with positive extents at '

@@ -16,9 +16,11 @@ from boxreg_ros.core.matching import Pair, StampMatcher
 from boxreg_ros.core.method.constants import CONSTANTS, Constants
 from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.pending import BoxToObserve, ObservedTrack, PendingArray, PendingBox
+from boxreg_ros.core.problem import SETTINGS_OF
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import column, joined
 from boxreg_ros.core.track_window import Estimate, Window
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, is_valid_box, RefinedBoxes, Sweep, X, Z
 import numpy as np
 
@@ -163,11 +165,9 @@ class BoxRegistrar:
 
     def margins(self) -> Floats:
         """Return the labelling margin of each face, of each of `KINDS`, (K, 6) [m]."""
-        from boxreg_ros.core.batch import FACE_GAPS  # imports torch
-
         kinds = [getattr(self.config, kind) for kind in KINDS]
-        of_settings = np.array([[getattr(kind, name) for name in FACE_GAPS] for kind in kinds])
-        margins: Floats = of_settings + self._input_model.offsets().gap_correction.numpy()
+        of_settings = np.array([[getattr(kind, name) for name in SETTINGS_OF['gaps']] for kind in kinds])
+        margins: Floats = of_settings + self._input_model.inputs(self.config, with_noise=False)['gap_correction']
         return margins
 
     def _process(self, pairs: list[Pair]) -> Iterator[RefinedBoxes]:
@@ -189,14 +189,14 @@ class BoxRegistrar:
         self._pending.append(array)
         reason = ''
         if boxes.stamp_ns < self._newest_ns:
-            reason = 'late'
+            reason = Reason.LATE
         elif boxes.stamp_ns == self._newest_ns:
-            reason = 'duplicate_stamp'
+            reason = Reason.DUPLICATE_STAMP
         self._newest_ns = max(boxes.stamp_ns, self._newest_ns)
         array.is_observed = sweep is not None and not reason
         if sweep is None:
-            self.counts['boxes_without_sweep'] += 1
-            reason = reason or 'no_sweep'
+            self.counts[Reason.BOXES_WITHOUT_SWEEP] += 1
+            reason = reason or Reason.NO_SWEEP
         array.set_reasons(reason)
         self._end_silent_tracks(boxes.stamp_ns)
         if sweep is not None:
@@ -219,7 +219,7 @@ class BoxRegistrar:
         confirmed = _confirmed(coasting, seen[len(given) :])
         if len(confirmed) < len(coasting):
             # A box that is not confirmed owns no points.
-            self.counts['coast_unconfirmed'] += len(coasting) - len(confirmed)
+            self.counts[Reason.COAST_UNCONFIRMED] += len(coasting) - len(confirmed)
             seen, velocities = self._seen([*given, *confirmed], boxes, sweep)
         self.box_time.add(seen[: len(given)], velocities[: len(given)])
         rows = [item.row for item in given]
@@ -250,7 +250,7 @@ class BoxRegistrar:
                 continue
             box = track.predicted(boxes.stamp_ns, self.config)
             if is_owned(box, others):
-                self.counts['coast_unconfirmed'] += 1
+                self.counts[Reason.COAST_UNCONFIRMED] += 1
                 continue
             others = np.vstack([others, box])
             found.append(BoxToObserve(track, box))

@@ -25,6 +25,7 @@ from boxreg_ros.core.problem import group_windows, Problem, stack_windows
 from boxreg_ros.core.solver import solve
 from boxreg_ros.core.threads import one_torch_thread, run, shared_between
 from boxreg_ros.core.track_window import Estimate, Estimates, MarginalisationPrior, Window
+from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import wrap_angle
 from boxreg_ros.structures import Floats, Ints, KEPT, POSE, REFINED, ROLL
 import numpy as np
@@ -34,7 +35,7 @@ MAX_LOST_POINTS = 3
 """Points that a refined box may always hold less than its input box. Chosen."""
 HELD_MARGIN = 0.05
 """Points up to this far outside a box count as held by it [m]. Chosen."""
-KEPT_REASONS = ('no_points', 'not_finite', 'no_gain')
+KEPT_REASONS = (Reason.NO_POINTS, Reason.NOT_FINITE, Reason.NO_GAIN)
 """Why a box is kept, in the order of `_failed_tests`."""
 
 

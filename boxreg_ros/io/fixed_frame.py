@@ -21,6 +21,7 @@ from boxreg_ros.io.items import Item, ItemSource, not_measured, Stage
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING, MergedSweep
 from boxreg_ros.io.session import Admitted, is_placeholder, JumpConfirmation, Session
 from boxreg_ros.io.transforms import inverse, sweep_to_frame, TransformTree
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, Sweep
 from msg_adapters.convention import Convention, STANDARD
 import numpy as np
@@ -152,7 +153,7 @@ class FixedFrameItems:
                 yield from map(self._merged, self.session.unmerged())
                 # The tree, which is ahead of the items, has detected the jump itself.
                 self.session.restart()
-                self.counts['time_jump'] += 1
+                self.counts[Reason.TIME_JUMP] += 1
                 self._restarts = True
             for ready in confirmed:
                 yield from self._moved(ready)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from boxreg_ros.errors import ConfigError, TransformUnavailable, UnsupportedMessage
 from boxreg_ros.io.transforms import TransformTree
 from boxreg_ros.options import option
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, concatenation, pointcloud
 from msg_adapters.concatenation import ConcatenationInfo
@@ -35,14 +36,14 @@ Sweeps that wait for clouds at once; chosen.
 A cloud may arrive after the first cloud of the next period, but not after two periods.
 
 """
-CLOUD_MERGED, CLOUD_LATE, CLOUD_MISSING = 'merged', 'cloud_late', 'cloud_missing'
+CLOUD_MERGED, CLOUD_LATE, CLOUD_MISSING = 'merged', Reason.CLOUD_LATE, Reason.CLOUD_MISSING
 """Counters of a LiDAR; the last two are reasons of `boxreg_ros.reasons`."""
 
-Report = Callable[[str, str, int], None]
+Report = Callable[[Reason, str, int], None]
 """Takes reason, text and count of something that is not used."""
 
 
-def ignore(reason: str, text: str, count: int) -> None:
+def ignore(reason: Reason, text: str, count: int) -> None:
     """Report nothing."""
 
 
@@ -198,7 +199,7 @@ class SensorPlacement:
         stamps_ns = [] if info is None else [part.stamp_ns for part in info.sources]
         return max([sweep.stamp_ns, *stamps_ns])
 
-    def placed(self, sweep: Sweep, tree: TransformTree) -> tuple[Sweep, str, str]:
+    def placed(self, sweep: Sweep, tree: TransformTree) -> tuple[Sweep, Reason | None, str]:
         """
         Return a cloud with the positions of its LiDARs, each at the stamp of its own part.
 
@@ -217,26 +218,30 @@ class SensorPlacement:
         -------
         sweep : Sweep
             Unchanged where nothing is known of its LiDARs.
-        reason, detail : str
-            What is missing; empty if nothing is.
+        reason, detail : Reason and str
+            What is missing; None and empty if nothing is.
 
         """
         if self.lidars.info and not sweep.is_dropped:
             info = self._infos.get(sweep.stamp_ns)
             if info is None:
                 self._is_awaited = False  # later ones do not wait until there is one again
-                return sweep, 'cloud_without_info', f'no info of the cloud at {sweep.stamp_ns} ns'
+                return (
+                    sweep,
+                    Reason.CLOUD_WITHOUT_INFO,
+                    f'no info of the cloud at {sweep.stamp_ns} ns',
+                )
             return _divided(sweep, info, tree)
         frames = self._frames.get(sweep.topic, ())
         if not frames or sweep.is_dropped:
-            return sweep, '', ''
+            return sweep, None, ''
         try:
             origins = _positions([(frame, sweep.stamp_ns) for frame in frames], sweep, tree)
         except TransformUnavailable as error:
-            return sweep, 'sensor_without_transform', str(error)
+            return sweep, Reason.SENSOR_WITHOUT_TRANSFORM, str(error)
         if len(frames) == 1:
-            return replace(sweep, origin=origins[0]), '', ''
-        return _with_sensors(sweep, origins, _nearest(sweep.in_frame().points, origins)), '', ''
+            return replace(sweep, origin=origins[0]), None, ''
+        return _with_sensors(sweep, origins, _nearest(sweep.in_frame().points, origins)), None, ''
 
 
 def _positions(sensors: Sequence[tuple[str, int]], sweep: Sweep, tree: TransformTree) -> Floats:
@@ -257,7 +262,9 @@ def _with_sensors(sweep: Sweep, origins: Floats, sensors: NDArray[np.uint8]) -> 
     return replace(sweep, origin=origins.mean(axis=0), origins=origins, sensors=sensors)
 
 
-def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tuple[Sweep, str, str]:
+def _divided(
+    sweep: Sweep, info: ConcatenationInfo, tree: TransformTree
+) -> tuple[Sweep, Reason | None, str]:
     """
     Return a concatenated cloud with the positions and times of its LiDARs; as of `placed`.
 
@@ -273,13 +280,13 @@ def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tupl
         reason = (
             f'the info at {info.stamp_ns} ns is of {max(ends, default=0)} points, its cloud has'
         )
-        return sweep, 'cloud_without_info', f'{reason} {rows.max() + 1}'
+        return sweep, Reason.CLOUD_WITHOUT_INFO, f'{reason} {rows.max() + 1}'
     if not parts:
-        return sweep, '', ''
+        return sweep, None, ''
     try:
         origins = _positions([(part.frame_id, part.stamp_ns) for part in parts], sweep, tree)
     except TransformUnavailable as error:
-        return sweep, 'sensor_without_transform', str(error)
+        return sweep, Reason.SENSOR_WITHOUT_TRANSFORM, str(error)
     owner = np.zeros(max(ends), np.uint8)
     for number, part in enumerate(parts):
         owner[part.begin : part.begin + part.length] = number
@@ -288,7 +295,7 @@ def _divided(sweep: Sweep, info: ConcatenationInfo, tree: TransformTree) -> tupl
     times = delays[sensors]
     if sweep.times is not None:
         times = times + sweep.times
-    return replace(_with_sensors(sweep, origins, sensors), times=times, rows=None), '', ''
+    return replace(_with_sensors(sweep, origins, sensors), times=times, rows=None), None, ''
 
 
 class MergedSweep(NamedTuple):
@@ -454,7 +461,7 @@ class SweepMerger:
             merged([sweep for sweep, _ in there]), tuple(extra for _, extra in there)
         )
 
-    def _note(self, topic: str, reason: str, text: str) -> None:
+    def _note(self, topic: str, reason: Reason, text: str) -> None:
         self.counts[topic][reason] += 1
         self._report(reason, f'{topic}: {text}; the other LiDARs are used', 1)
 

@@ -8,6 +8,7 @@ from textwrap import fill
 from types import SimpleNamespace
 from typing import Any
 
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
     BoxArray,
     COASTED,
@@ -48,7 +49,7 @@ ARROW, CUBE, SPHERE, LINE_STRIP, TEXT = 0, 1, 2, 4, 9
 OUTLINE = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
 """Signs of x and y along the outline of a face."""
 ADD, DELETE, DELETEALL = 0, 2, 3
-BUDGET = 'budget'
+BUDGET = Reason.BUDGET
 """Reason of boxes that there was no time for, see `reasons`."""
 
 

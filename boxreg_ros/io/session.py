@@ -25,6 +25,7 @@ from boxreg_ros.io.lidars import (
 )
 from boxreg_ros.io.pose_check import PoseCheck
 from boxreg_ros.io.transforms import move_to_frame, TIME_JUMP, TransformTree
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, KEPT, RefinedBoxes, Sweep
 from msg_adapters.convention import Convention
 import numpy as np
@@ -45,7 +46,7 @@ class Admitted(NamedTuple):
         The item in the fixed frame, boxes with their ids; None where no transform is known.
     T_fixed_item : array, shape (4, 4), or None
         Maps the frame of the item to the fixed frame.
-    reason : str
+    reason : Reason or None
         ``no_transform`` for boxes or ``sweep_without_transform`` if `moved` is None; the reason
         why not all LiDARs of a cloud are known; else empty.
     detail : str
@@ -55,7 +56,7 @@ class Admitted(NamedTuple):
 
     moved: Sweep | BoxArray | None
     T_fixed_item: Floats | None
-    reason: str = ''
+    reason: Reason | None = None
     detail: str = ''
 
 
@@ -213,9 +214,9 @@ class Session:
             )
         except TransformUnavailable as error:
             is_sweep = isinstance(item, Sweep)
-            reason = 'sweep_without_transform' if is_sweep else 'no_transform'
-            return Admitted(None, None, reason, str(error))
-        reason, detail = '', ''
+            missing = Reason.SWEEP_WITHOUT_TRANSFORM if is_sweep else Reason.NO_TRANSFORM
+            return Admitted(None, None, missing, str(error))
+        reason, detail = None, ''
         moved = move_to_frame(item, T_fixed_item, self.fixed_frame)
         if isinstance(moved, Sweep):
             moved, reason, detail = self._placement.placed(moved, self.tree)

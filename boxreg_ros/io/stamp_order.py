@@ -95,4 +95,4 @@ def kept(boxes: BoxArray, reason: str) -> RefinedBoxes:
     """Return boxes as a result in which each is kept for the same reason."""
     n = len(boxes.track_ids)
     unknown = np.broadcast_to(np.eye(6), (n, 6, 6))
-    return RefinedBoxes(boxes, (KEPT,) * n, (reason,) * n, np.zeros(n, np.int64), unknown)
+    return RefinedBoxes(boxes, (KEPT,) * n, (str(reason),) * n, np.zeros(n, np.int64), unknown)

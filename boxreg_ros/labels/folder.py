@@ -11,6 +11,7 @@ from boxreg_ros.labels.clouds import write_cloud
 from boxreg_ros.labels.files import write_provenance
 from boxreg_ros.labels.protocol import LabelFrame, Options, Provenance
 from boxreg_ros.labels.sidecar import POSES_FILE, STAMPS_FILE
+from boxreg_ros.reasons import Reason
 import numpy as np
 
 NO_POINTS = np.zeros((0, 3))
@@ -76,7 +77,7 @@ class FolderWriter:
         T = frame.T_fixed_sensor
         if self.needs_pose and T is None:
             rows, _ = frame.boxes_in('fixed', self.dropped)
-            self.dropped['no_transform'] += len(rows)
+            self.dropped[Reason.NO_TRANSFORM] += len(rows)
             return
         stamp_ns = frame.refined.boxes.stamp_ns
         self.name = self._names.of(stamp_ns)

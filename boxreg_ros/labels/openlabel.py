@@ -20,6 +20,7 @@ from typing import Any
 from boxreg_ros.labels.files import following, from_json, to_json
 from boxreg_ros.labels.protocol import Format, LabelFrame, Options, Provenance
 from boxreg_ros.labels.records import refined_boxes
+from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import rpy_from_quaternion
 from boxreg_ros.structures import Floats, HEIGHT, is_valid_box, LENGTH, RefinedBoxes, X, Z
 from msg_adapters.poses import quaternions_of
@@ -81,7 +82,7 @@ class Writer:
         refined = frame.refined
         boxes = refined.boxes
         is_valid = is_valid_box(boxes.boxes)
-        self.dropped['invalid_box'] += int((~is_valid).sum())
+        self.dropped[Reason.INVALID_BOX] += int((~is_valid).sum())
         self._frame_ids.add(boxes.frame_id)
         objects: dict[int, Any] = {}
         for row, cuboid in zip(np.flatnonzero(is_valid), _cuboids(refined, is_valid), strict=True):

@@ -15,6 +15,7 @@ from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.options import option
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, Floats, Ints, is_valid_box, RefinedBoxes, Sweep
 import numpy as np
 
@@ -124,13 +125,13 @@ class LabelFrame:
         """
         boxes = self.refined.boxes
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
-        dropped['invalid_box'] += len(boxes.boxes) - len(rows)
+        dropped[Reason.INVALID_BOX] += len(boxes.boxes) - len(rows)
         target = self.fixed_frame if frame == 'fixed' else self.sensor_frame
         if boxes.frame_id == target:
             return rows, boxes.boxes[rows]
         is_known = boxes.frame_id in (self.fixed_frame, self.sensor_frame)
         if self.T_fixed_sensor is None or not is_known:
-            dropped['no_transform'] += len(rows)
+            dropped[Reason.NO_TRANSFORM] += len(rows)
             return rows[:0], boxes.boxes[:0]
         return rows, _boxes_moved(boxes, self.T_fixed_sensor, frame, target).boxes[rows]
 

@@ -8,7 +8,7 @@ from threading import Lock
 import time
 import traceback
 
-from boxreg_ros.reasons import FAULTS, REASONS
+from boxreg_ros.reasons import FAULTS, Reason
 from boxreg_ros.structures import REFINED
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -17,7 +17,7 @@ LOG_PERIOD = 10.0
 """The same reason is logged at most once in this time [s]."""
 WAITING = 'waiting'
 """Name of the log entry with the inputs that the node waits for."""
-REASONS_WITHOUT_CLOUDS = ('no_transform', 'no_sweep')
+REASONS_WITHOUT_CLOUDS = (Reason.NO_TRANSFORM, Reason.NO_SWEEP)
 """Reasons that boxes get when no cloud arrives at all."""
 RATES = ('points_received', 'boxes_received', 'early_published', 'final_published')
 """Counters that are also reported as a rate."""
@@ -69,7 +69,7 @@ class Health:
         with self._lock:
             self._static.append((seconds, cpu))
 
-    def report(self, reason: str, text: str, number: int = 1) -> None:
+    def report(self, reason: Reason, text: str, number: int = 1) -> None:
         """Count a reason and log the text, at most once per `LOG_PERIOD` and reason."""
         self.count(reason, number)
         if self.is_due(reason):
@@ -77,7 +77,7 @@ class Health:
 
     def report_failure(self, error: Exception) -> None:
         """Count an internal error as ``failed``; its traceback goes to the debug log."""
-        self.report('failed', f'{type(error).__name__}: {error}')
+        self.report(Reason.FAILED, f'{type(error).__name__}: {error}')
         self._logger.debug(''.join(traceback.format_exception(error)))
 
     def is_due(self, reason: str) -> bool:
@@ -95,10 +95,10 @@ class Health:
         with self._lock:
             counts = self._counts + self._core_counts
             unlogged = counts - self._logged
-        for name, reason in REASONS.items():
-            if unlogged[name] and reason.remedy and self.is_due(name):
-                text = f'{name} ({unlogged[name]} more): {reason.meaning}; {reason.remedy}'
-                self._log(name, text)
+        for reason in Reason:
+            if unlogged[reason] and reason.remedy and self.is_due(reason):
+                text = f'{reason} ({unlogged[reason]} more): {reason.meaning}; {reason.remedy}'
+                self._log(reason, text)
 
     def log_waiting(self, fixed_frame: str) -> None:
         """
@@ -164,11 +164,11 @@ def _awaited(counts: Mapping[str, int], fixed_frame: str) -> str:
         return f'messages on {" and ".join(missing)}'
     if not fixed_frame:
         return 'transforms from the frame of the clouds to a fixed frame'
-    reasons = [name for name, reason in REASONS.items() if reason.unit == 'box']
+    reasons = [reason for reason in Reason if reason.unit == 'box']
     why = max(reasons, key=lambda name: counts.get(name, 0))
     if not counts.get(why):
         return 'enough observations of a track'
-    return f'boxes that can be refined; so far most often {why}: {REASONS[why].meaning}'
+    return f'boxes that can be refined; so far most often {why}: {why.meaning}'
 
 
 def _latency_values(what: str, latencies: list[float]) -> dict[str, str]:
@@ -183,25 +183,25 @@ def _latency_values(what: str, latencies: list[float]) -> dict[str, str]:
 
 def _level_and_message(recent: Counter[str]) -> tuple[bytes, str]:
     """Return level and message of the counters of one status period."""
-    worst = next((name for name, why in REASONS.items() if recent[name] and why.remedy), None)
+    worst = next((one for one in Reason if recent[one] and one.remedy), None)
     if worst is not None:
         return _level_and_message_of(worst, recent)
     missing = [name for name in ('points', 'boxes') if not recent[f'{name}_received']]
     if missing:
         return DiagnosticStatus.WARN, f'nothing received on {" and ".join(missing)}'
     if recent['kept'] and not recent['refined']:
-        box_reasons = [name for name, reason in REASONS.items() if reason.unit == 'box']
+        box_reasons = [reason for reason in Reason if reason.unit == 'box']
         why = max(box_reasons, key=lambda name: recent[name])
-        text = f'no box was refined; most often {why}: {REASONS[why].meaning}'
+        text = f'no box was refined; most often {why}: {why.meaning}'
         return DiagnosticStatus.WARN, text
     return DiagnosticStatus.OK, 'refining'
 
 
-def _level_and_message_of(worst: str, recent: Counter[str]) -> tuple[bytes, str]:
+def _level_and_message_of(worst: Reason, recent: Counter[str]) -> tuple[bytes, str]:
     """Return level and message where `worst` is the gravest reason of the period."""
     is_idle = bool(recent['boxes_received']) and not recent['refined']
     level = DiagnosticStatus.ERROR if is_idle or worst in FAULTS else DiagnosticStatus.WARN
-    text = f'{worst}: {REASONS[worst].meaning}; {REASONS[worst].remedy}'
+    text = f'{worst}: {worst.meaning}; {worst.remedy}'
     if worst in REASONS_WITHOUT_CLOUDS and not recent['points_received']:
         text = 'nothing received on points'
     if is_idle:

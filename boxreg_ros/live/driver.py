@@ -24,6 +24,7 @@ from boxreg_ros.io.transforms import boxes_to_frame, inverse, TransformTree
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.label_tap import CloudPart, LabelTap
 from boxreg_ros.live.static_points import StaticPoints
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import BoxArray, COASTED, Floats, REFINED, RefinedBoxes, Sweep
 from msg_adapters import Adapter
 from msg_adapters.convention import Convention, STANDARD
@@ -174,7 +175,7 @@ class LiveRegistrar:
         fixed_frame: str,
         output_frame: str,
         transform_timeout: float,
-        trouble: Callable[[str, str, int], None],
+        trouble: Callable[[Reason, str, int], None],
         convention: Convention = STANDARD,
         lidars: Lidars = SINGLE_LIDAR,
         budget: TickBudget | None = None,
@@ -259,7 +260,7 @@ class LiveRegistrar:
             return confirmed, []
         stamp_ns = confirmed[0].content.stamp_ns
         self._trouble(
-            'time_jump',
+            Reason.TIME_JUMP,
             f'expected stamps of one clock, got some that went back to {stamp_ns} ns; tracks '
             f'start anew: unless a recording is played in a loop, let one clock set all stamps',
             1,
@@ -334,7 +335,7 @@ class LiveRegistrar:
             moved = self._with_ticket(item, content, moved, admitted.T_fixed_item)
         ready = self._outgoing(hand_to_registrar(self._registrar, moved, restarts=False))
         if moved is None:
-            ready += self.passed_through(item.message, 'no_transform')
+            ready += self.passed_through(item.message, Reason.NO_TRANSFORM)
         return ready
 
     def _note_unknown(self, sweep: Sweep) -> None:
@@ -439,7 +440,7 @@ class LiveRegistrar:
         self._detections = {}
         held = list(self._held)
         self._held.clear()
-        self.tap.keep_all('failed')
+        self.tap.keep_all(Reason.FAILED)
         ready = self._made
         self._made = []
         for waiting in held:
@@ -448,7 +449,7 @@ class LiveRegistrar:
             ready += self.last(waiting.message)
         is_held = item is None or any(waiting.message is item.message for waiting in held)
         if item is not None and isinstance(item.content, BoxArray) and not is_held:
-            ready += self.passed_through(item.message, 'failed')
+            ready += self.passed_through(item.message, Reason.FAILED)
         return ready
 
     def passed_through(self, message: Any, reason: str = '') -> list[Outgoing]:
@@ -476,7 +477,7 @@ class LiveRegistrar:
         return []
 
     def _report_missing_transform(
-        self, content: Sweep | BoxArray, reason: str, detail: str
+        self, content: Sweep | BoxArray, reason: Reason, detail: str
     ) -> None:
         """Report a sweep, or the boxes of an array, that no transform is known for."""
         count = 1 if isinstance(content, Sweep) else len(content.track_ids)
@@ -496,13 +497,13 @@ class LiveRegistrar:
                     self.output_frame, self.fixed_frame, content.stamp_ns
                 )
             except TransformUnavailable as error:
-                self._report_missing_transform(content, 'no_transform', str(error))
+                self._report_missing_transform(content, Reason.NO_TRANSFORM, str(error))
                 return None
             T_output_item = T_output_fixed @ T_fixed_item
             given = boxes_to_frame(content, T_output_item, self.output_frame)
         self._last_boxes = item.received
         if self._session.finding:
-            self._trouble('pose_reference', self._session.finding, 1)
+            self._trouble(Reason.POSE_REFERENCE, self._session.finding, 1)
         pending = _Pending(
             item.message, replace(given, track_ids=moved.track_ids), item.received,
             T_output_fixed, T_output_item, moved.track_ids != content.track_ids,

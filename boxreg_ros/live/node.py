@@ -92,11 +92,6 @@ class BoxregNode(Node):
         """
         Load or compile kernels, time a window, and make a registrar without any track.
 
-        Raises
-        ------
-        ConfigError
-            If torch cannot use the device.
-
         """
         config, options = self._settings
         warm_up(config)

@@ -22,6 +22,7 @@ from boxreg_ros.io.label_feed import (
     Tick,
 )
 from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.reasons import REASONS
 from boxreg_ros.structures import Floats, Sweep
 from msg_adapters import clouds, pointcloud
 import numpy as np
@@ -119,7 +120,7 @@ class RecorderProcess:
                 self._changed.notify()
         if is_full:
             self._health.report(
-                f'{kind}_unrecorded', 'the recorder, or its disk, is slower than the data'
+                REASONS[f'{kind}_unrecorded'], 'the recorder, or its disk, is slower than the data'
             )
 
     def finish(self) -> None:

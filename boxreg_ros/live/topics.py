@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from boxreg_ros.errors import ConfigError, UnsupportedMessage
 from boxreg_ros.live.diagnostics import Health
+from boxreg_ros.reasons import Reason
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from msg_adapters import canonical
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -305,13 +306,13 @@ class NodeTopics:
         if is_reliability and is_adaptive and executor is not None:
             executor.create_task(self._create_subscription, endpoint)
         else:
-            self._health.count('qos_incompatible')
+            self._health.count(Reason.QOS_INCOMPATIBLE)
 
     def _on_lost(self, endpoint: Endpoint, event: Any) -> None:
         self._health.count(f'{endpoint.topic}_lost', event.total_count_change)
 
     def _on_incompatible_subscription(self, event: Any) -> None:
-        self._health.count('qos_incompatible')
+        self._health.count(Reason.QOS_INCOMPATIBLE)
 
     def _silence(
         self, endpoint: Endpoint, peers: list[TopicEndpointInfo]
@@ -348,7 +349,7 @@ class NodeTopics:
 
     def _log(self, problem: TopicProblem) -> None:
         if problem.is_qos:
-            self._health.is_due('qos_incompatible')  # this entry replaces the general one
+            self._health.is_due(Reason.QOS_INCOMPATIBLE)  # this entry replaces the general one
         if problem.level == DiagnosticStatus.ERROR:
             self._node.get_logger().error(problem.text)
         else:

@@ -17,7 +17,7 @@ from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.diagnostics import Health
 from boxreg_ros.live.driver import LiveRegistrar, Outgoing, ReceivedMessage
 from boxreg_ros.live.inbox import Inbox, Message
-from boxreg_ros.reasons import REASONS
+from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import BoxArray, Sweep
 from msg_adapters import Adapter
 from msg_adapters.clouds import header_of
@@ -34,7 +34,7 @@ IDLE_PERIOD = 1.0
 """Longest pause while nothing is held [s]."""
 BOXES_PATIENCE = 10.0
 """Boxes wait for the solver this many times longer than clouds before they pass through."""
-NO_TIME = 'boxes_queue_full'
+NO_TIME = Reason.BOXES_QUEUE_FULL
 """Reason of boxes that the solver has no time for."""
 FULL_COLLECTION_PERIOD = 60.0
 """
@@ -170,8 +170,8 @@ class Worker:
         Either thread may call this.
 
         """
-        reason = f'{message.topic}_queue_full'
-        self._health.report(reason, REASONS[reason].remedy)
+        reason = REASONS[f'{message.topic}_queue_full']
+        self._health.report(reason, reason.remedy)
         if message.topic == 'boxes':
             self._publish([Outgoing(message.content, False)])
             self._inbox.put_passing(message)  # the final copy, in the order of all
@@ -226,7 +226,7 @@ class Worker:
                 assert self._live.adapter is not None  # set before boxes are subscribed to
                 content = self._live.adapter.from_msg(message.content)
         except UnsupportedMessage as error:
-            self._health.report('unreadable', f'{message.topic}: {error}')
+            self._health.report(Reason.UNREADABLE, f'{message.topic}: {error}')
         except Exception as error:
             self._health.report_failure(error)
         else:
@@ -299,7 +299,7 @@ class Worker:
         try:
             self._live.placement.add_info(message)
         except UnsupportedMessage as error:
-            self._health.report('unreadable', f'points_info: {error}')
+            self._health.report(Reason.UNREADABLE, f'points_info: {error}')
 
     def _process(self, item: ReceivedMessage) -> None:
         if isinstance(item.content, BoxArray):
@@ -365,8 +365,8 @@ class Worker:
             self._health.count('static_published')
             self._health.add_static(time.monotonic() - cloud.received, cloud.cpu)
             if cloud.is_late:
-                reason = REASONS['static_unchanged']
-                self._health.report('static_unchanged', f'{reason.meaning}; {reason.remedy}')
+                reason = Reason.STATIC_UNCHANGED
+                self._health.report(reason, f'{reason.meaning}; {reason.remedy}')
 
     def _finish(self, item: ReceivedMessage | None) -> None:
         """Publish held boxes, and pass waiting messages through unsolved."""

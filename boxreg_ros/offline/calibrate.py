@@ -24,6 +24,7 @@ from boxreg_ros.core.observation import Observation, Observations, observe
 from boxreg_ros.core.problem import group_windows, stack_windows
 from boxreg_ros.core.track_window import Window
 from boxreg_ros.errors import ConfigError, RecordingError
+from boxreg_ros.io.whole_files import written_whole
 from boxreg_ros.offline.arguments import (
     add_options,
     add_recordings,
@@ -236,8 +237,8 @@ def write_settings(path: Path, values: Mapping[str, Any], origin: str) -> None:
         inner[last] = value
     text = yaml.safe_dump({'/**': {'ros__parameters': nested}}, sort_keys=False)
     text = f'# boxreg calibrate, {origin}\n{text}'
-    # `origin` has file names, which may not be valid text.
-    path.write_text(text, encoding='utf-8', errors='backslashreplace')
+    with written_whole(path) as file:  # `origin` has file names, which may not be valid text
+        file.write(text.encode(errors='backslashreplace').decode())
 
 
 def table(measured: Mapping[str, Measured], config: Config) -> list[str]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-import hashlib
+from dataclasses import dataclass, replace
 import json
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,11 @@ from boxreg_ros import __version__
 from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.fixed_frame import FixedFrameItems, StoredCloud
-from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
+from boxreg_ros.io.lidars import SINGLE_LIDAR
 from boxreg_ros.labels import (
     check_options,
     frames_of,
     LabelFrame,
-    module_of,
-    Options,
     Provenance,
     writer_for,
 )
@@ -30,44 +27,7 @@ from boxreg_ros.offline.arguments import add_options, values_of
 from boxreg_ros.offline.labelled_recording import label_frame_of
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import SUMMARY, whole_folder
-from boxreg_ros.offline.sources import source_of
 from boxreg_ros.structures import BoxArray, Sweep
-
-
-@dataclass(frozen=True, slots=True)
-class Conversion:
-    """
-    Settings of a conversion.
-
-    Attributes
-    ----------
-    source : Path
-        Label file or folder to read.
-    source_format : str
-        Its format.
-    target_formats : tuple of str
-        Formats to write.
-    options : Options
-        Settings of the formats to write.
-    recordings : tuple of Path
-        Recordings of the labels, from which sensor poses and clouds are read. Not needed if the
-        label files contain the poses.
-    lidars : Lidars
-        Topics of the clouds, as for `boxreg relabel`.
-    fixed_frame, label_frame, odometry : str or None
-        As for `boxreg relabel`.
-
-    """
-
-    source: Path
-    source_format: str
-    target_formats: tuple[str, ...]
-    options: Options = field(default_factory=Options)
-    recordings: tuple[Path, ...] = ()
-    lidars: Lidars = SINGLE_LIDAR
-    fixed_frame: str | None = None
-    label_frame: str | None = None
-    odometry: str | None = None
 
 
 @dataclass(slots=True)
@@ -78,7 +38,7 @@ class _Unused:
     text: str = ''
 
 
-def convert(request: Conversion, out: Path) -> dict[str, Any]:
+def convert(request: Request, out: Path) -> dict[str, Any]:
     """
     Write labels in other formats.
 
@@ -86,8 +46,9 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
 
     Parameters
     ----------
-    request : Conversion
-        Settings.
+    request : Request
+        Its labels are converted to its formats. Recordings, for the poses of the sensor and the
+        clouds, are needed only where the label files lack the poses.
     out : Path
         Folder of results. As that of `relabel`, it appears complete or not at all.
 
@@ -106,14 +67,13 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
 
     """
     _check(request)
-    provenance = Provenance.of(request.recordings or (request.source,))
+    source_format, source = _labels(request)
+    provenance = Provenance.of(request.recordings or (source,))
     counts: Counter[str] = Counter()
     unused = _Unused()
-    inputs = (request.source, *request.recordings, request.options.camera)
-    with whole_folder(out, inputs) as folder:
+    with whole_folder(out, request.inputs()) as folder:
         writers = {
-            name: writer_for(name, folder, provenance, request.options)
-            for name in request.target_formats
+            name: writer_for(name, folder, provenance, request.options) for name in request.formats
         }
         for frame in _read_frames(request, folder, unused):
             counts['frames'] += 1
@@ -125,75 +85,73 @@ def convert(request: Conversion, out: Path) -> dict[str, Any]:
         left_out = {name: dict(+writer.dropped) for name, writer in writers.items()}
         _require_boxes(request, left_out, counts['boxes'])
         summary = {
-            'source': str(request.source),
+            'source': str(source),
             'recordings': [str(path) for path in request.recordings],
-            'from': request.source_format,
-            'to': list(request.target_formats),
+            'from': source_format,
+            'to': list(request.formats),
             'frames': counts['frames'],
             'boxes': counts['boxes'],
             'unreadable': unused.unreadable,
             'unused': unused.text,
             'left_out_of_labels': {name: found for name, found in left_out.items() if found},
             'versions': {'boxreg_ros': __version__},
-            'fingerprint': hashlib.sha256(repr((__version__, request)).encode()).hexdigest(),
+            'fingerprint': request.fingerprint(),
         }
         (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
     return summary
 
 
-def _check(request: Conversion) -> None:
-    """Raise `ConfigError` for settings that contradict each other."""
-    module_of(request.source_format)
-    recording_settings = (
+def _labels(request: Request) -> tuple[str, Path]:
+    """Return format and path of the labels to convert."""
+    if request.labels is None:
+        raise ConfigError('labels: expected label files to convert, got none; name them')
+    return request.labels
+
+
+def _check(request: Request) -> None:
+    """Raise `ConfigError` for options of a recording without one, and for formats of points."""
+    of_recording = (
         request.options.with_points,
         request.lidars != SINGLE_LIDAR,
         request.odometry,
         request.fixed_frame,
         request.label_frame,
     )
-    if not request.recordings and any(recording_settings):
+    if not request.recordings and any(of_recording):
         raise ConfigError(
             '--with-points, --points, --sensor-frame, --points-info, --time-unit, --odometry, '
             '--fixed-frame, --label-frame: expected a recording to apply them to, got none; give '
             'it with --recording'
         )
-    check_options(request.target_formats, request.options)
+    check_options(request.formats, request.options)
 
 
-def _require_boxes(
-    request: Conversion, left_out: dict[str, dict[str, int]], num_boxes: int
-) -> None:
+def _require_boxes(request: Request, left_out: dict[str, dict[str, int]], num_boxes: int) -> None:
     """Raise `RecordingError` if a format has left out all boxes."""
     for name, counts in left_out.items():
         if num_boxes and sum(counts.values()) == num_boxes:
             reasons = ', '.join(f'{reason} {count}' for reason, count in counts.items())
             raise RecordingError(
-                f'{request.source}: format {name!r} can represent none of {num_boxes} boxes: '
+                f'labels: format {name!r} can represent none of {num_boxes} boxes: '
                 f'{reasons}; if the sensor poses are missing, give --recording'
             )
 
 
-def _read_frames(request: Conversion, folder: Path, unused: _Unused) -> Iterator[LabelFrame]:
+def _read_frames(request: Request, folder: Path, unused: _Unused) -> Iterator[LabelFrame]:
     """Yield the labels, in the fixed frame where the transform is known."""
     if request.recordings:
         yield from _read_with_recording(request, folder, unused)
         return
-    for frame in frames_of(request.source_format, request.source):
+    for frame in frames_of(*_labels(request)):
         yield frame.moved('fixed')
 
 
-def _read_with_recording(
-    request: Conversion, folder: Path, unused: _Unused
-) -> Iterator[LabelFrame]:
+def _read_with_recording(request: Request, folder: Path, unused: _Unused) -> Iterator[LabelFrame]:
     """Yield the labels with poses and clouds of the recording; note what could not be used."""
-    labels = (request.source_format, request.source)
     config = Config()
     waiting = deque[LabelFrame]()  # merged clouds are complete later than the boxes of their time
     spool = Spool(folder, config) if request.options.with_points else None
-    source = source_of(
-        request.recordings, request.lidars, odometry=request.odometry, labels=labels
-    )
-    with source as recording:
+    with request.recording() as recording:
         items = FixedFrameItems(recording, config, fixed_frame=request.fixed_frame)
         fixed_frame = items.fixed_frame
         sensor_frame = label_frame_of(recording, items.tree, fixed_frame, request.label_frame)
@@ -262,11 +220,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert, and print one line with the counts."""
-    request = Conversion(
-        args.source, args.source_format, args.target_formats,
-        Options(**values_of(args, Options)), tuple(args.recording),
-        Lidars(**values_of(args, Lidars)), args.fixed_frame, args.label_frame, args.odometry,
-    )  # fmt: skip
+    request = Request(
+        tuple(args.recording),
+        labels=(args.source_format, args.source),
+        formats=args.target_formats,
+        **values_of(args, Request),
+    )
     summary = convert(request, args.out)
     parts = [
         f'{args.out}: {summary["boxes"]:,} boxes of {summary["frames"]:,} frames from '

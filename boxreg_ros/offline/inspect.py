@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -45,6 +45,8 @@ SAMPLE_ITEMS = 60
 """Clouds and box arrays that are read at most: those of this time at 10 Hz."""
 REPORT_PACKAGES = ('jinja2', 'plotly')
 """Without them ``--report`` is not proposed; those that a plain installation lacks."""
+DEFAULTS = Config()
+"""Settings of the proposed command."""
 GAP_PERIODS = 3.0
 """A pause longer than this many median periods is a gap."""
 
@@ -112,7 +114,7 @@ def inspect(args: argparse.Namespace) -> dict[str, Any]:
 
 def _contents(paths: list[Path]) -> dict[str, Any]:
     """Return files, times, topics and damages, from the index."""
-    from boxreg_ros.io.storage.files import part_of, size_of
+    from boxreg_ros.io.storage.files import part_of
     from boxreg_ros.io.storage.reader import Reader
 
     parts = [part_of(path) for path in paths]
@@ -126,22 +128,37 @@ def _contents(paths: list[Path]) -> dict[str, Any]:
             counts[connection.topic, connection.msgtype] += connection.msgcount
         presence = reader.presence()
         damages = [damage._asdict() for damage in reader.damages]
+    topics = [
+        {
+            'topic': topic,
+            'type': kind,
+            'messages': count,
+            'rate': _rate(count, seconds),
+            'presence_s': merged_spans(presence[topic], begin_ns, seconds),
+            'gaps_s': _pauses(presence[topic], begin_ns, _rate(count, seconds)),
+        }
+        for (topic, kind), count in sorted(counts.items())
+    ]
+    files = [file for part in parts for file in part.files]
+    return _facts(files, begin_ns, seconds, topics, damages)
+
+
+def _facts(
+    files: Sequence[Path],
+    begin_ns: int,
+    seconds: float,
+    topics: list[dict[str, Any]],
+    damages: list[dict[str, Any]],
+) -> dict[str, Any]:
+    """Return what is known of a recording before a message is read."""
+    from boxreg_ros.io.storage.files import size_of
+
     return {
-        'files': [str(file) for part in parts for file in part.files],
-        'bytes': sum(size_of(file) for part in parts for file in part.files),
+        'files': [str(file) for file in files],
+        'bytes': sum(map(size_of, files)),
         'begin_ns': begin_ns,
         'seconds': seconds,
-        'topics': [
-            {
-                'topic': topic,
-                'type': kind,
-                'messages': count,
-                'rate': _rate(count, seconds),
-                'presence_s': merged_spans(presence[topic], begin_ns, seconds),
-                'gaps_s': _pauses(presence[topic], begin_ns, _rate(count, seconds)),
-            }
-            for (topic, kind), count in sorted(counts.items())
-        ],
+        'topics': topics,
         'damage': damages,
         'problems': [],
         'warnings': [],
@@ -182,16 +199,7 @@ def _scene_contents(paths: list[Path]) -> dict[str, Any]:
             for name, count in recording.topics.items()
         ]
         begin_ns = recording.start_ns
-    return {
-        'files': [str(file) for file in files],
-        'bytes': sum(file.stat().st_size for file in files),
-        'begin_ns': begin_ns,
-        'seconds': seconds,
-        'topics': topics,
-        'damage': [],
-        'problems': [],
-        'warnings': [],
-    }
+    return _facts(files, begin_ns, seconds, topics, [])
 
 
 def _rate(count: int, seconds: float) -> float:
@@ -250,7 +258,7 @@ def _sampled(recording: ItemSource, convention: Any) -> dict[str, Any]:
     """Return the figures of the first seconds of a recording."""
     from boxreg_ros.io.session import Session
 
-    session = Session(convention, Config(), placement=recording.placement)
+    session = Session(convention, DEFAULTS, placement=recording.placement)
     session.fixed_frame = recording.choose_fixed_frame(session.tree)
     sample = _Sample()
     begin_ns = recording.start_ns
@@ -306,7 +314,7 @@ def _summary(sample: _Sample) -> dict[str, Any]:
         'gaps': {'sweeps': _gaps(sample.sweeps), 'box_arrays': _gaps(sample.arrays)},
         'stamp_offset_s': max(offsets) * 1e-9 if offsets else None,
         'received_after_stamp_s': float(np.median(sample.late)) * 1e-9 if sample.late else None,
-        'classes': {name: _kind(name) for name, _ in sample.classes.most_common()},
+        'classes': {name: DEFAULTS.kind(name) for name, _ in sample.classes.most_common()},
         'tracks': len(lengths),
         'boxes_per_track': lengths[len(lengths) // 2] if lengths else 0,
         'boxes_without_id': sample.without_id,
@@ -338,11 +346,10 @@ def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[
         first = next(iter(recording.first_errors.values()))
         yield f'{recording.unreadable.total()} messages cannot be read; first: {first}'
     offset = _summary(sample)['stamp_offset_s']
-    config = Config()
-    if offset is not None and offset > config.reach:
+    if offset is not None and offset > DEFAULTS.reach:
         yield (
             f'boxes are up to {offset:.3f} s away from the nearest cloud; those beyond reach '
-            f'({config.reach:g} s) are not refined'
+            f'({DEFAULTS.reach:g} s) are not refined'
         )
 
 
@@ -365,14 +372,6 @@ def _gaps(stamps: list[int]) -> list[list[float]]:
         for first, second in pairwise(ordered)
         if (second - first) * 1e-9 > GAP_PERIODS * period
     ]
-
-
-def _kind(class_name: str) -> str:
-    """Return the group of settings that a class is treated by."""
-    config = Config()
-    found = config.class_config(class_name)
-    names = ('vehicle', 'cyclist', 'pedestrian')
-    return next(name for name in names if getattr(config, name) is found)
 
 
 def _command(args: argparse.Namespace, facts: dict[str, Any]) -> str:

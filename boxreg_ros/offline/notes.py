@@ -11,7 +11,7 @@ from boxreg_ros.io.storage.record import Damage
 from boxreg_ros.io.times import time_range
 from boxreg_ros.offline.result_folder import SUMMARY
 from boxreg_ros.offline.summary import Summary
-from boxreg_ros.reasons import REASONS
+from boxreg_ros.reasons import Reason, REASONS
 from boxreg_ros.structures import (
     COASTED,
     EXTENDED,
@@ -50,7 +50,7 @@ def closing_line(summary: Summary, out: Path) -> str:
     if summary.recorded_apart:
         apart = [f'{topic} ({late:+,.1f} s)' for topic, late in summary.recorded_apart.items()]
         line += f'; merged by stamp: {", ".join(apart)}'
-    if 'unreadable' in summary.dropped:
+    if Reason.UNREADABLE in summary.dropped:
         line += f'; {summary.dropped["unreadable"]:,} messages could not be read'
     return line
 
@@ -83,7 +83,7 @@ def _lidar_notes(summary: Summary) -> Iterator[str]:
     if summary.first_unplaced:
         clouds = sum(
             summary.dropped.get(name, 0)
-            for name in ('sensor_without_transform', 'cloud_without_info')
+            for name in (Reason.SENSOR_WITHOUT_TRANSFORM, Reason.CLOUD_WITHOUT_INFO)
         )
         yield (
             f'the LiDARs of {clouds:,} clouds are not all known, the origin of their frame is '
@@ -130,8 +130,8 @@ def _input_notes(summary: Summary) -> Iterator[str]:
             f'was used; first: {summary.first_unreadable}'
         )
     if summary.first_missing_transform:
-        boxes = summary.reasons.get('no_transform', 0)
-        sweeps = summary.dropped.get('sweep_without_transform', 0)
+        boxes = summary.reasons.get(Reason.NO_TRANSFORM, 0)
+        sweeps = summary.dropped.get(Reason.SWEEP_WITHOUT_TRANSFORM, 0)
         yield (
             f'{boxes:,} boxes and {sweeps:,} clouds have no transform; first: '
             f'{summary.first_missing_transform}'

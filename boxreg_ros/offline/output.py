@@ -15,6 +15,7 @@ from boxreg_ros.offline.background import Background
 from boxreg_ros.offline.reader import ReadItem, Source, uses_one_core
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.stopwatch import Stopwatch
+from boxreg_ros.reasons import Reason
 from boxreg_ros.review.decisions import Corrections, read_decisions
 from boxreg_ros.structures import (
     ADDED,
@@ -202,7 +203,7 @@ class Sink:
             moved = replace(self.corrections.pinned(item.moved), ticket=self._last_ticket)
             item = item._replace(moved=moved)
         elif count:
-            result = kept(given, 'no_transform')
+            result = kept(given, Reason.NO_TRANSFORM)
             self._order.expect(Slot(given, item.T_fixed_sensor, item.T_fixed_given, result))
         return item
 

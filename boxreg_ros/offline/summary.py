@@ -11,6 +11,7 @@ from typing import Any, Self, TYPE_CHECKING
 
 from boxreg_ros import __version__
 from boxreg_ros.io.lidars import CLOUD_LATE, CLOUD_MISSING
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import HUMAN, REFINED
 
 if TYPE_CHECKING:
@@ -159,7 +160,7 @@ class Summary:
             boxes_out=sink.boxes_out,
             status=dict(sink.status),
             reasons=dict(sink.reasons.most_common()),
-            time_jumps=findings.counts['time_jump'],
+            time_jumps=findings.counts[Reason.TIME_JUMP],
             recorded_apart={topic: round(late, 3) for topic, late in findings.apart.items()},
             heading_flips=sink.heading_flips,
             box_time=registrar.box_time.summary(request.config),
@@ -196,7 +197,7 @@ class Summary:
     @property
     def is_complete(self) -> bool:
         """Return whether all messages of the recording were read, with usable stamps."""
-        return not (self.damage or self.without_stamp or 'unreadable' in self.dropped)
+        return not (self.damage or self.without_stamp or Reason.UNREADABLE in self.dropped)
 
     @property
     def has_failed(self) -> bool:
@@ -227,12 +228,16 @@ def _dropped(registered: Counter[str], findings: Findings) -> dict[str, int]:
     counts = {
         name: count for name, count in registered.items() if name.startswith(UNUSED_PREFIXES)
     }
-    for name in ('sweep_without_transform', 'sensor_without_transform', 'cloud_without_info'):
+    for name in (
+        Reason.SWEEP_WITHOUT_TRANSFORM,
+        Reason.SENSOR_WITHOUT_TRANSFORM,
+        Reason.CLOUD_WITHOUT_INFO,
+    ):
         counts[name] = findings.counts[name]
     for lidar in findings.lidars.values():
         for name in (CLOUD_LATE, CLOUD_MISSING):
             counts[name] = counts.get(name, 0) + lidar[name]
-    counts['unreadable'] = findings.unreadable
+    counts[Reason.UNREADABLE] = findings.unreadable
     return {name: count for name, count in sorted(counts.items()) if count}
 
 

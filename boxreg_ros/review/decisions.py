@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from boxreg_ros.errors import RecordingError, unreadable
+from boxreg_ros.reasons import Reason
 from boxreg_ros.rotations import quaternion_from_rpy, rpy_from_quaternion
 from boxreg_ros.structures import (
     BOX_EXTENT,
@@ -36,8 +37,6 @@ DECISIONS = 'decisions.csv'
 DECISION_KINDS = ('accept', 'reject', 'unsure', 'pin', 'none')
 PINNED_BOX_COLUMNS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'length', 'width', 'height')
 DECISION_COLUMNS = ('track_id', 'stamp_ns', 'decision', 'comment', 'frame_id', *PINNED_BOX_COLUMNS)
-REJECTED = 'rejected'
-"""Reason of boxes that are kept because a person rejected the refined ones."""
 MAX_COMMENT = 2000
 """Longest comment [characters]; chosen: a row fits a page of memory, which is written at once."""
 
@@ -283,7 +282,7 @@ class Corrections:
                 status[row], reasons[row] = HUMAN, ''
             elif found.kind == 'reject':
                 boxes[row] = given.boxes[row]
-                status[row], reasons[row] = KEPT, REJECTED
+                status[row], reasons[row] = KEPT, str(Reason.REJECTED)
                 covariances[row] = np.eye(6)
         return replace(
             refined,

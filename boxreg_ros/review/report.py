@@ -204,9 +204,9 @@ def _warnings(summary: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def _explained(counts: Mapping[str, int]) -> list[tuple[str, int, Reason]]:
+def _explained(counts: Mapping[str, int]) -> list[tuple[str, int, Reason | None]]:
     """Return reasons with their count and explanation, the most frequent first."""
-    found = [(name, count, REASONS.get(name, Reason('', ''))) for name, count in counts.items()]
+    found = [(name, count, REASONS.get(name)) for name, count in counts.items()]
     return sorted(found, key=lambda item: -item[1])
 
 

@@ -123,10 +123,10 @@ class Usual(NamedTuple):
         return cls(usual, sizes)
 
 
-UNKNOWN = Usual()
+UNKNOWN_USUAL = Usual()
 
 
-def assess(track: TrackChanges, usual: Usual = UNKNOWN) -> Risk:
+def assess(track: TrackChanges, usual: Usual = UNKNOWN_USUAL) -> Risk:
     """
     Return the risk of each box of a track among tracks of which `usual` is known.
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from boxreg_ros.config import Config
+from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
     BoxArray,
     EXTENDED,
@@ -223,14 +224,14 @@ def complete(
     tracks = tracklets_of(results, num_points, fixed_frame, config)
     plan = CompletionPlan([PlannedArray([*a.track_ids], [*a.class_names]) for a in given], [])
     if steps.prune:  # first: a duplicate could be stitched to its object
-        tracks = _rejected(tracks, duplicates(tracks, config), 'duplicate', plan)
+        tracks = _rejected(tracks, duplicates(tracks, config), Reason.DUPLICATE, plan)
     ambiguous: list[tuple[str, str]] = []
     if steps.stitch:
         tracks, ambiguous = stitch(tracks, config)
     if steps.static:
         tracks = join_static(tracks, config)
     if steps.prune:  # last: a fragment of an object may look like a ghost
-        tracks = _rejected(tracks, ghosts(tracks), 'ghost', plan)
+        tracks = _rejected(tracks, ghosts(tracks), Reason.GHOST, plan)
     for track in tracks:
         _place(track, '', plan)
     array_of = _array_of_stamp(given, fixed_frame)

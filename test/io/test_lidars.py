@@ -189,7 +189,7 @@ def placement_of(drive, lidars, frame_id='base'):
 
 def test_the_info_names_the_lidar_and_the_time_of_every_point():
     sweep, reason, _ = placement_of(LidarDrive(2, 'info'), Lidars(info='/points_info'))
-    assert reason == ''
+    assert reason is None
     half = len(sweep.points) // 2
     assert sweep.sensors.tolist() == [0] * half + [1] * half
     np.testing.assert_allclose(sweep.origins, list(LIDARS.values()))
@@ -225,7 +225,7 @@ def test_rows_of_the_info_count_points_that_are_not_finite():
 def test_without_info_points_belong_to_the_nearest_lidar_that_is_named():
     drive = LidarDrive(1, 'alone')
     sweep, reason, _ = placement_of(drive, Lidars(frames=('front', 'rear')))
-    assert reason == ''
+    assert reason is None
     to_front = np.hypot(*(sweep.points[:, :2] - [2, 0]).T)
     to_rear = np.hypot(*(sweep.points[:, :2] - [-2, 0]).T)
     np.testing.assert_array_equal(sweep.sensors, to_rear < to_front)

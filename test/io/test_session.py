@@ -51,7 +51,7 @@ def test_items_are_moved_into_the_fixed_frame_with_their_transform():
         T = session.tree.lookup('odom', 'lidar', item.stamp_ns)
         np.testing.assert_array_equal(admitted.T_fixed_item, T)
         assert admitted.moved.frame_id == 'odom'
-        assert (admitted.reason, admitted.detail) == ('', '')
+        assert (admitted.reason, admitted.detail) == (None, '')
         if isinstance(item, Sweep):
             np.testing.assert_allclose(admitted.moved.origin, T[:3, 3])
         else:
@@ -155,7 +155,7 @@ def test_an_array_without_boxes_stamp_and_frame_is_a_placeholder():
     placeholder = BoxArray(0, '', (), (), np.zeros(0), empty)
     assert is_placeholder(placeholder)
     for _ in range(3):
-        assert session.admit(placeholder) == (None, None, '', '')
+        assert session.admit(placeholder) == (None, None, None, '')
     assert not is_placeholder(replace(placeholder, stamp_ns=START, frame_id='map'))
 
 

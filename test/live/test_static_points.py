@@ -37,9 +37,7 @@ def test_static_points(graph: Graph, tmp_path):
     scene = simulate('street', 0, SWEEPS)
     path = tmp_path / 'street.mcap'
     zeros = [np.zeros(len(owner)) for owner in scene.owners]
-    write_recording(
-        path, scene.sweeps, zeros, scene.detections, scene.T_fixed_sensor, FIXED_FRAME
-    )
+    write_recording(path, scene.sweeps, zeros, scene.detections, scene.T_fixed_sensor, FIXED_FRAME)
     records = records_of(path, '/detections')
     last = [boxes.stamp_ns for boxes in scene.detections[-WITHOUT_BOXES:]]
     records = [record for record in records if record.boxes_stamp_ns not in last]

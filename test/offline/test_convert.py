@@ -9,7 +9,8 @@ from boxreg_ros.errors import ConfigError, RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.fixed_frame import FixedFrameItems, input_boxes
 from boxreg_ros.labels import FORMATS, frames_of, Options
-from boxreg_ros.offline.convert import Conversion, convert
+from boxreg_ros.labels.registry import labels_points
+from boxreg_ros.offline.convert import convert
 from boxreg_ros.offline.formats import FORMAT_COLUMNS, rows
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.sources import source_of
@@ -24,7 +25,10 @@ R_rect: 1 0 0 0 1 0 0 0 1
 Tr_velo_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
 """
 
-WITH_STATUS = tuple(sorted(set(FORMATS) - {'kitti', 'tracklets', 'mcap'}))
+NO_STATUS = {'kitti', 'tracklets', 'mcap'}
+WITH_STATUS = tuple(
+    sorted(name for name in FORMATS if not labels_points(name) and name not in NO_STATUS)
+)
 """Formats that can say that a person has placed a box."""
 
 
@@ -42,6 +46,10 @@ def drive(tmp_path):
     table = tmp_path / 'input.csv'
     BoxTable.from_arrays(input_boxes(source_of([recording]))[0]).write(table)
     return recording, table
+
+
+def conversion(table, formats, options, recordings=()):
+    return Request(recordings, labels=('csv', table), formats=formats, options=options)
 
 
 def assert_same_boxes(found, expected, atol):
@@ -78,7 +86,7 @@ def test_labels_with_other_frame_names_are_refined_alike(tmp_path, drive, camera
         pytest.importorskip(package)
     recording, table = drive
     options = Options(camera=camera if name == 'kitti' else None)
-    asked = Conversion(table, 'csv', (name,), options, (recording,))
+    asked = conversion(table, (name,), options, (recording,))
     convert(asked, tmp_path / 'made')
     folder = tmp_path / 'made' / name
     if (folder / 'boxreg.json').exists():
@@ -100,7 +108,7 @@ def test_boxes_of_a_person_stay_as_they_are(tmp_path, drive):
     status[6] = status[7] = 'human'
     replace(corrected, status=tuple(status)).write(table)
     options = Options(with_points=True)
-    convert(Conversion(table, 'csv', WITH_STATUS, options, (recording,)), tmp_path / 'made')
+    convert(conversion(table, WITH_STATUS, options, (recording,)), tmp_path / 'made')
     for name in WITH_STATUS:
         labels = (name, tmp_path / 'made' / ('boxes.csv' if name == 'csv' else name))
         with source_of([recording], labels=labels) as source:
@@ -237,7 +245,7 @@ def test_convert_with_poses_and_clouds_of_a_recording(tmp_path, drive, camera):
     recording, table = drive
     options = Options(with_points=True, camera=camera)
     wanted = ('kitti', 'nuscenes', 'argoverse2', 'csv')
-    asked = Conversion(table, 'csv', wanted, options, (recording,))
+    asked = conversion(table, wanted, options, (recording,))
     summary = convert(asked, tmp_path / 'out')
     out = tmp_path / 'out'
     assert sorted(item.name for item in out.iterdir()) == [
@@ -253,10 +261,10 @@ def test_convert_with_poses_and_clouds_of_a_recording(tmp_path, drive, camera):
 def test_convert_without_poses_is_refused(tmp_path, drive, camera):
     _, table = drive
     with pytest.raises(RecordingError, match=r"'kitti' can represent none of .* give --recording"):
-        convert(Conversion(table, 'csv', ('kitti',), Options(camera=camera)), tmp_path / 'out')
+        convert(conversion(table, ('kitti',), Options(camera=camera)), tmp_path / 'out')
     assert not (tmp_path / 'out').exists()
     with pytest.raises(ConfigError, match='give it with --recording'):
-        convert(Conversion(table, 'csv', ('csv',), Options(with_points=True)), tmp_path / 'out')
+        convert(conversion(table, ('sustechpoints',), Options(with_points=True)), tmp_path / 'out')
 
 
 def test_convert_skips_unreadable_clouds(tmp_path, drive, capsys):

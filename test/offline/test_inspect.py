@@ -77,7 +77,7 @@ def test_warnings_gaps_and_damage(tmp_path, capsys):
     assert 'damage: ' in out and 'interrupted' in out
     assert 'warning: 60 boxes have no track id' in out
     assert 'away from the nearest cloud' in out
-    assert out.splitlines()[-1].endswith('--associate')
+    assert ' --associate --complete' in out.splitlines()[-1]
 
 
 @pytest.mark.parametrize('storage', ['rosbag1', 'sqlite3'])

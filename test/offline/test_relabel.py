@@ -15,7 +15,7 @@ from boxreg_ros.io.fixed_frame import input_boxes
 from boxreg_ros.io.lidars import Lidars
 from boxreg_ros.labels import Options
 from boxreg_ros.labels.cloud_spool import Spool
-from boxreg_ros.offline.convert import Conversion, convert
+from boxreg_ros.offline.convert import convert
 from boxreg_ros.offline.notes import closing_line, notes
 from boxreg_ros.offline.relabel import relabel, Request
 from boxreg_ros.offline.sources import source_of
@@ -642,7 +642,7 @@ def test_output_that_contains_an_input_is_refused(tmp_path, capsys, given):
     labels = 'csv', out / 'boxes.csv'
     with pytest.raises(ConfigError, match=r"contains no input, got one with .*boxes\.csv'"):
         run(bag, out, labels=labels)
-    conversion = Conversion(out, 'csv', ('openlabel',))
+    conversion = Request((), labels=('csv', out), formats=('openlabel',))
     with pytest.raises(ConfigError, match='choose another'):
         convert(conversion, out)
     assert sorted(out.rglob('*')) == before

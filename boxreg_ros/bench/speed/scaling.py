@@ -23,8 +23,6 @@ PROBED_TICKS = 20
 def scaling(config: Config, quick: bool) -> dict[str, list[tuple[int, float]]]:
     """Return the time per window [ms] over number of windows, their length, and points per box."""
     counts, lengths, points = [1, 8, 64, 512], [5, 10, 20, 40, 80], [128, 512, 2048, 4096]
-    if config.device != 'cpu':
-        counts = [64, 1024, 16384]
     if quick:
         counts, lengths, points = [1, 8], [5, 10], [128, 512]
     cases = {

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, cast, TypeVar
+from typing import Any
 from warnings import warn
 
 import numba
@@ -15,10 +15,8 @@ REORDER = {'contract', 'reassoc'}
 DIGEST_LENGTH = 12
 """Letters of the digest of the sources. Chosen: 48 bits."""
 
-_F = TypeVar('_F', bound=Callable[..., Any])
 
-
-def kernel(function: _F) -> _F:
+def kernel(function: Callable[..., Any]) -> Any:
     """
     Compile a function of numbers and arrays at its first call.
 
@@ -47,10 +45,10 @@ def kernel(function: _F) -> _F:
                 RuntimeWarning,
                 stacklevel=2,
             )
-        return cast(_F, numba.njit(function, **options))
+        return numba.njit(function, **options)
     _recover_from_damage(dispatcher._cache)
     _go_on_without_room(dispatcher._cache)
-    return cast(_F, dispatcher)
+    return dispatcher
 
 
 def _recover_from_damage(cache: Any) -> None:

@@ -121,7 +121,8 @@ class Constants(NamedTuple):
     yaw_bias: float = 0.5
     """Bias of the input yaw over that of the other variables, in deviations. Chosen."""
     population_radius: float = 0.5
-    """Distance in logarithms of extents at which objects have weight 1/2 for each other. Chosen."""
+    """Distance in logarithms of extents at which objects have weight 1/2 for each other.
+    Chosen."""
     slope_deviation: float = 240.0
     """Prior deviation of the slope of extent corrections, per squared error. Derived: 0.6 for
     input whose extents err by 5 %, 0.6 / 0.05^2."""
